@@ -1,0 +1,29 @@
+"""What all tests share: the device they run on, and floating-point errors that count as errors."""
+
+import numpy as np
+import pytest
+
+
+def pytest_addoption(parser):
+    parser.addoption("--device", default="cpu", help="Warp device that the tests run on (default: cpu)")
+
+
+def pytest_collection_modifyitems(config, items):
+    if not config.getoption("--device").startswith("cuda"):
+        skip = pytest.mark.skip(reason="needs `--device cuda:0`")
+        for item in items:
+            if "gpu" in item.keywords:
+                item.add_marker(skip)
+
+
+@pytest.fixture(scope="session")
+def device(request) -> str:
+    """The Warp device under test."""
+    return request.config.getoption("--device")
+
+
+@pytest.fixture(autouse=True)
+def strict_numpy():
+    """An overflow, an invalid operation or a division by zero on the host fails the test."""
+    with np.errstate(over="raise", invalid="raise", divide="raise"):
+        yield
