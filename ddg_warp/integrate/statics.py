@@ -1,0 +1,255 @@
+"""Equilibria: load stepping with Newton on the exact tangent.
+
+Every load step holds supports where their motion has them at the load parameter t and scales loads by t. Newton uses the exact
+tangent where it is positive definite; where it is not, mode "minimise" shifts it until it is (so that only minima attract), and
+mode "follow" takes it as it is, with the residual as merit, to follow equilibria that are not stable.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+from scipy import sparse
+
+from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.kernels import step
+from ddg_warp.linear.direct import Factorisation
+from ddg_warp.state import State
+from ddg_warp.tangent import Tangent
+
+
+@dataclass(frozen=True)
+class StaticsOptions:
+    """How an equilibrium is searched.
+
+    Attributes:
+        rtol: residual over load scale (sum of outer forces, or largest support force) at which a dof is in equilibrium.
+        floor_factor: rounding units of the forces that meet at a dof which count as rounding.
+        max_iterations: Newton iterations of one load step.
+        rotation_cap: largest turn of an edge or change of an angle in one update [rad].
+        mode: "minimise" or "follow".
+        max_cuts: how often a load increment is halved before the search is given up.
+    """
+
+    rtol: float = 1e-10
+    floor_factor: float = 16.0
+    max_iterations: int = 100
+    rotation_cap: float = 0.5
+    mode: str = "minimise"
+    max_cuts: int = 10
+
+
+def solve(
+    model, state: State | None = None, *, load_steps: int = 1, start: float = 0.0, end: float = 1.0, **options
+) -> State:
+    """The equilibrium at load parameter `end`, reached from `start` in `load_steps` increments or more.
+
+    Args:
+        model: what to equilibrate.
+        state: where to begin; the rest state by default. It is not changed.
+        load_steps: increments; one that fails is halved.
+        start, end: load parameter, which scales gravity and loads and is the time of motions and amplitudes.
+        options: see `StaticsOptions`.
+
+    Raises:
+        SolverError: no equilibrium was found; carries the last good state.
+        SceneError: nothing holds the rods.
+    """
+    return Equilibrium(model, StaticsOptions(**options)).load(state or model.state(), load_steps, start, end)
+
+
+class Equilibrium:
+    """A static solver of one model; keeps its tangent between solves.
+
+    Attributes:
+        tangent: energy, gradient and Hessian of the model.
+        iterations: Newton iterations so far.
+        outcome: of the last solve, `converged` or `converged_to_rounding`.
+    """
+
+    def __init__(self, model, options: StaticsOptions | None = None):
+        self.model, self.options = model, options or StaticsOptions()
+        if self.options.mode not in ("minimise", "follow"):
+            raise SceneError(f"statics mode {self.options.mode!r}: it is 'minimise' or 'follow'")
+        self.tangent = Tangent(model)
+        if self.tangent.free.all():
+            raise SceneError("nothing is held: a static solve needs supports; add scene.clamp(...) or scene.fix(...)")
+        self.iterations = 0
+        self.outcome = ""
+
+    def load(self, state: State, load_steps: int, start: float = 0.0, end: float = 1.0) -> State:
+        """Load stepping; see `solve`."""
+        at, increment, cuts = start, (end - start) / max(1, load_steps), 0
+        state = state.copy()
+        while at != end:
+            target = end if abs(end - at) <= abs(increment) * (1.0 + 1e-12) else at + increment
+            try:
+                state = self.solve(state, at, target)
+                at = target
+            except SolverError as error:
+                cuts += 1
+                if cuts > self.options.max_cuts:
+                    raise SolverError(
+                        f"{error} (load parameter {at:g} of {end:g} reached, {cuts - 1} increments halved)",
+                        state=state,
+                        outcome=error.outcome,
+                    ) from None
+                increment *= 0.5
+        state.time = end
+        return state
+
+    def solve(self, state: State, before: float, at: float) -> State:
+        """The equilibrium at load parameter `at`, from a state that belongs to `before`."""
+        tangent, options = self.tangent, self.options
+        state = state.copy()
+        _move_supports(self.model, state, before, at)
+        free = tangent.free
+        energies, q = tangent.element_energies(state), tangent.dofs(state)
+        outer = tangent.loads(at, q)
+        gradient = tangent.gradient(state)
+        scale = None
+        for _ in range(options.max_iterations):
+            residual = outer - gradient
+            hessian = tangent.hessian(state)
+            following = tangent.load_stiffness(at, q)
+            if following is not None:
+                hessian = hessian + following
+            if not np.isfinite(residual).all() or not np.isfinite(hessian.data).all():
+                raise SolverError(self._where("non_finite", residual, at), state=state, outcome="non_finite")
+            outer_sum = np.abs(outer[free & ~tangent.angle]).sum()
+            scale = max(outer_sum, np.abs(gradient[~free & ~tangent.angle]).max(initial=0.0), scale or 0.0)
+            if scale == 0.0:
+                scale = np.abs(residual[free]).max()
+            excess = self._excess(residual, gradient, hessian, q, scale)
+            if excess <= 0.0:
+                state.time = at
+                return state
+            self.iterations += 1
+            direction, decrease = self._direction(hessian, residual)
+            direction *= min(1.0, options.rotation_cap / max(1e-300, self._rotation(q, direction)))
+            taken, found = 1.0, False
+            merit = np.linalg.norm(self._scaled(residual)[free])
+            for _ in range(30):
+                trial = tangent.retract(q, taken * direction)
+                candidate = state.copy()
+                tangent.assign(candidate, trial)
+                new_gradient = tangent.gradient(candidate)
+                new_energies = tangent.element_energies(candidate)
+                new_outer = tangent.loads(at, trial)
+                change = (new_energies - energies).sum() - 0.5 * (outer + new_outer) @ (trial - q)
+                noise = 64 * self.model.types.eps * (np.abs(energies).sum() + np.abs(gradient) @ np.abs(q))
+                new_merit = np.linalg.norm(self._scaled(new_outer - new_gradient)[free])
+                if not np.isfinite(change) or not np.isfinite(new_merit):
+                    found = False
+                elif options.mode == "follow":
+                    found = new_merit < (1.0 - 1e-4 * taken) * merit or (taken == 1.0 and new_merit < 10.0 * merit)
+                elif taken * decrease > 10.0 * noise:
+                    found = change <= -1e-4 * taken * decrease + noise
+                else:
+                    found = new_merit <= 2.0 * merit
+                if found:
+                    break
+                taken *= 0.5
+            if not found:
+                raise SolverError(
+                    self._where("line_search_failed", residual, at), state=state, outcome="line_search_failed"
+                )
+            state, q, energies, gradient, outer = (
+                candidate,
+                tangent.dofs(candidate),
+                new_energies,
+                new_gradient,
+                new_outer,
+            )
+        raise SolverError(self._where("max_iterations", outer - gradient, at), state=state, outcome="max_iterations")
+
+    def _scaled(self, residual: np.ndarray) -> np.ndarray:
+        """Moments over an edge length, so that they compare with forces."""
+        return np.where(self.tangent.angle, residual / self.tangent.edge_length(), residual)
+
+    def _rotation(self, q: np.ndarray, direction: np.ndarray) -> float:
+        """Largest turn of an edge, or change of an angle, that a full step would make."""
+        worst = np.abs(direction[self.tangent.angle]).max(initial=0.0)
+        for part in self.tangent.groups:
+            span = slice(part.offset, part.offset + part.size)
+            kind = part.group.kind
+            edges = (part.incidence @ q[span]).reshape(-1, kind.window)[:, : kind.dim]
+            turns = (part.incidence @ direction[span]).reshape(-1, kind.window)[:, : kind.dim]
+            length = np.linalg.norm(edges, axis=1)
+            real = length > 0.0
+            worst = max(worst, (np.linalg.norm(turns[real], axis=1) / length[real]).max(initial=0.0))
+        return worst
+
+    def _direction(self, hessian, residual: np.ndarray) -> tuple[np.ndarray, float]:
+        """Newton direction on the free dofs and the decrease of energy it promises."""
+        free = np.flatnonzero(self.tangent.free)
+        matrix, right = hessian[free][:, free], residual[free]
+        factor = Factorisation(matrix)
+        if self.options.mode == "minimise" and (factor.negative or not factor.reliable):
+            shift = 1e-6
+            diagonal = sparse.diags(np.abs(matrix.diagonal()))
+            while (factor.negative or not factor.reliable) and shift < 10.0:
+                factor = Factorisation((matrix + shift * diagonal).tocsc())
+                shift *= 4.0
+        solution = factor.solve(right)
+        direction = np.zeros(self.tangent.size)
+        direction[free] = solution
+        return direction, float(right @ solution)
+
+    def _excess(self, residual, gradient, hessian, q, scale: float) -> float:
+        """How far the worst dof is from equilibrium; not positive when all are."""
+        free, angle = self.tangent.free, self.tangent.angle
+        reach = np.abs(q[free & ~angle]).max(initial=1.0)
+        rounding = self.options.floor_factor * self.model.types.eps
+        floor = rounding * (np.asarray(abs(hessian).sum(axis=1)).ravel() * reach + np.abs(gradient))
+        length = self.tangent.edge_length()
+        limit = np.where(angle, length, 1.0) * self.options.rtol * scale
+        size = np.abs(residual)
+        self.outcome = "converged" if (size <= limit)[free].all() else "converged_to_rounding"
+        return float((size - np.maximum(limit, floor))[free].max())
+
+    def _where(self, outcome: str, residual: np.ndarray, at: float) -> str:
+        masked = np.where(self.tangent.free, np.abs(self._scaled(residual)), -1.0)
+        worst = int(np.argmax(np.where(np.isfinite(masked), masked, np.inf)))
+        for part in self.tangent.groups:
+            if part.offset <= worst < part.offset + part.size:
+                group = part.group
+                column, k = divmod((worst - part.offset) // group.kind.block, group.nodes)
+                rod = int(group.host.rods[column % group.rods])
+                node = k - int(group.host.first[column % group.rods])
+                return (
+                    f"no equilibrium at load parameter {at:g}: {outcome}, largest residual {residual[worst]:.3g} at node {node} "
+                    f"of rod {rod}; take more load steps, or hold what can still move freely"
+                )
+        return outcome
+
+
+def _move_supports(model, state: State, before: float, at: float) -> None:
+    """Put held dofs where their motions have them."""
+    if not model.motions:
+        return
+    real, device = model.types.real, model.wp_device
+    pose = wp.array(np.array([motion.pose(before, at) for motion in model.motions]), dtype=real, device=device)
+    for group, data in zip(model.groups, state.groups, strict=True):
+        moving = group.moving
+        if moving is None:
+            continue
+        nodes, angles = step.motion_kernels(group.kind, real, False)
+        progress = wp.zeros(group.columns, dtype=real, device=device)
+        portion = wp.full(group.columns, 1.0, dtype=real, device=device)
+        wp.launch(
+            nodes,
+            moving.nodes.shape[0],
+            [moving.nodes, moving.node_rest, pose, group.fixed, progress, portion],
+            [data.x],
+            device=device,
+        )
+        if moving.edges.shape[0]:
+            wp.launch(
+                angles,
+                moving.edges.shape[0],
+                [moving.edges, moving.edge_rest, pose, group.count, progress, portion, data.x, data.frame],
+                [data.theta],
+                device=device,
+            )
+    model.carry_frames(state)

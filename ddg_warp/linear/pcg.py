@@ -1,0 +1,133 @@
+"""Newton on chains with preconditioned conjugate gradients: closed rods, and open ones as a check of the chain sweep."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels import block_band, pcg
+from ddg_warp.newton import ChainNewton, NewtonOptions
+
+
+class PcgNewton(ChainNewton):
+    """As `ChainNewton`, with the system assembled in blocks and solved by conjugate gradients.
+
+    Args:
+        preconditioner: "jacobi", "block_jacobi", or "chain" (block LDL^T of the open part of the chain: exact for an open rod,
+            a few iterations for a closed one).
+    """
+
+    def __init__(self, model, group, options: NewtonOptions, preconditioner: str = "chain", linear=None):
+        if preconditioner not in pcg.PRECONDITIONERS:
+            raise SceneError(f"preconditioner {preconditioner!r}: it is one of {', '.join(pcg.PRECONDITIONERS)}")
+        super().__init__(model, group, options, linear)
+        kind, device = group.kind, model.wp_device
+        nodes, columns = (group.nodes, group.columns), group.columns
+
+        def vectors(rows=kind.block):
+            return arrays.allocate((rows, *nodes), self.linear, device)
+
+        self.blocks = vectors(3 * kind.block**2)
+        self.factors = vectors(3 * kind.block**2 + kind.block) if preconditioner == "chain" else self.blocks
+        self.right, self.rest, self.z, self.p, self.q = (vectors() for _ in range(5))
+        self.change, self.noise = (arrays.allocate(nodes, self.real, device) for _ in range(2))
+        self.merit = wp.zeros(columns, dtype=self.real, device=device)
+        self.rho, self.rho_first = (wp.zeros(columns, dtype=self.linear, device=device) for _ in range(2))
+        self.wanted, self.iterations = (wp.zeros(columns, dtype=int, device=device) for _ in range(2))
+        self.busy = wp.zeros(1, dtype=int, device=device)
+        self.pcg_work = wp.zeros(1, dtype=wp.int64, device=device)
+        self._assemble = block_band.assemble_kernel(kind, self.real, self.linear)
+        self._judge = pcg.judge_kernel(kind, self.real, self.linear)
+        self._factor = block_band.factor_kernel(kind, self.linear) if preconditioner == "chain" else None
+        self._start, self._product, self._advance = pcg.solver_kernels(kind, self.linear, preconditioner)
+        self._take = pcg.take_kernel(kind, self.real, self.linear)
+        self._limit = 10 * kind.block * group.nodes
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        own = [self._assemble, self._judge, self._start, self._product, self._advance, self._take]
+        return [self._evaluate, self._check, *own, *([self._factor] if self._factor else [])]
+
+    def sweep(self) -> None:
+        """Assemble, decide, solve for a direction and take it."""
+        group, options, device = self.group, self.options, self.device
+        grid = (group.nodes, group.columns)
+        wp.launch(
+            self._assemble,
+            grid,
+            [self.factor, self.gradient, self.energy, group.count, group.mass, group.rotary, self.coefficient]
+            + [self.x, self.theta, self.target, self.target_angle, group.gravity, group.load, group.load_angle]
+            + [int(group.host.loaded), group.fixed, self.direction, self.base, self.status]
+            + [self.unbalanced, self.slot]
+            + [self.iteration, self.step_length],
+            [self.blocks, self.right, self.change, self.noise],
+            device=device,
+        )
+        wp.launch(
+            self._judge,
+            group.columns,
+            [self.right, self.change, self.noise, group.count, options.floor_factor * self.eps]
+            + [options.max_iterations, options.max_halvings, self.direction, group.fixed, self.base]
+            + [self.x, self.theta, self.frame]
+            + [self.status, self.unbalanced, self.drowned, self.slot, self.iteration, self.halvings]
+            + [self.step_length, self.decrement, self.merit, self.load_scale, self.residual, self.turned]
+            + [self.wanted, self.active],
+            device=device,
+        )
+        if self._factor:
+            wp.launch(
+                self._factor,
+                group.columns,
+                [self.blocks, group.count, self.wanted],
+                [self.factors, self.lost],
+                device=device,
+            )
+        self.busy.zero_()
+        wp.launch(
+            self._start,
+            group.columns,
+            [self.blocks, self.factors, group.count, self.wanted, self.right],
+            [self.rest, self.direction, self.z, self.p, self.rho, self.rho_first, self.iterations, self.busy],
+            device=device,
+        )
+        wp.capture_while(self.busy, self._iterate_pcg)
+        wp.launch(
+            self._take,
+            group.columns,
+            [self.right, self.iterations, group.count, options.rotation_cap],
+            [
+                self.direction,
+                group.fixed,
+                self.base,
+                self.x,
+                self.theta,
+                self.wanted,
+                self.step_length,
+                self.decrement,
+                self.pcg_work,
+            ],
+            device=device,
+        )
+
+    def _iterate_pcg(self) -> None:
+        group, device = self.group, self.device
+        wp.launch(
+            self._product,
+            (group.nodes, group.columns),
+            [self.blocks, self.p, group.count, self.wanted],
+            [self.q, self.busy],
+            device=device,
+        )
+        wp.launch(
+            self._advance,
+            group.columns,
+            [self.blocks, self.factors, group.count, self.options.linear_rtol, self._limit],
+            [self.q, self.rest, self.direction, self.z, self.p, self.rho, self.rho_first]
+            + [self.iterations, self.wanted, self.busy],
+            device=device,
+        )
+
+    def pcg_iterations(self) -> int:
+        """Iterations of all solves so far."""
+        return int(np.asarray(self.pcg_work.numpy())[0])

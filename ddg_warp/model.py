@@ -1,0 +1,365 @@
+"""Model: a scene frozen for a device. Constant arrays, terms, dof map, and what can be asked of a state."""
+
+from functools import cached_property
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays, precision
+from ddg_warp.chains import ChainGroup, compile_chains, scene_motions
+from ddg_warp.errors import SceneError
+from ddg_warp.io import Curves
+from ddg_warp.kernels import element, step
+from ddg_warp.state import GroupState, State
+
+
+class Group:
+    """Constant device arrays of one group of rods, all worlds side by side (columns world * R + rod)."""
+
+    def __init__(self, host: ChainGroup, scene, worlds: int, device, real):
+        kind = host.kind
+        vector = wp.types.vector(kind.dim, real)
+        self.host, self.kind, self.worlds, self.device = host, kind, worlds, device
+        self.rods = len(host.rods)
+        self.nodes = host.shape[0]
+        self.columns = self.rods * worlds
+        self.elements = self.nodes if kind.closed else self.nodes - 1
+
+        def put(values, dtype):
+            return arrays.upload(np.concatenate([values] * worlds, axis=-1) if worlds > 1 else values, dtype, device)
+
+        self.count = put(host.count, int)
+        self.length = put(host.length, real)
+        self.world = wp.array(np.repeat(np.arange(worlds), self.rods), dtype=int, device=device)
+        self.mass = put(host.mass, real)
+        self.rotary = put(host.rotary, real)
+        self.fixed = put(host.fixed, wp.uint8)
+        load = np.concatenate([host.load] * worlds, axis=1) if host.loaded else np.zeros((1, 1, kind.dim))
+        self.load = arrays.upload(load, vector, device)
+        self.load_angle = (
+            put(host.load_angle, real) if host.loaded and kind.twist else wp.zeros((1, 1), dtype=real, device=device)
+        )
+        gravity = np.asarray(scene.gravity, float)
+        self.gravity_host = gravity[[0, 2]] if kind.dim == 2 else gravity
+        self.gravity = wp.array(self.gravity_host[None], dtype=vector, device=device)
+        self.outer = put(_outer_forces(host, self.gravity_host), real)
+        self.moving = Moving(host, worlds, self.rods, device, real) if host.moving_nodes or host.moving_edges else None
+        self._parameters = [np.tile(p, (1, worlds)) if p.shape[1] > 1 else p for p in host.parameters]
+        self.upload_parameters(real)
+
+    def upload_parameters(self, real) -> None:
+        """One buffer with all parameters, and the table (offset, stride along the rod, stride across rods) of its rows."""
+        offset, table = 0, []
+        for values in self._parameters:
+            along, across = values.shape
+            table.append((offset, across if along > 1 else 0, 1 if across > 1 else 0))
+            offset += values.size
+        self.buffer = wp.array(np.concatenate([p.ravel() for p in self._parameters]), dtype=real, device=self.device)
+        self.table = wp.array(np.array(table, np.int32), dtype=int, device=self.device)
+
+    def parameter(self, row: int) -> np.ndarray:
+        """Row of the parameter table on the host, broadcastable to (node, column)."""
+        return self._parameters[row]
+
+
+class Moving:
+    """Device lists of the dofs of a group that have a prescribed motion.
+
+    Attributes:
+        nodes: (node, column, motion) of held nodes; node_rest: their rest positions (., 3) [m].
+        edges: (edge, column, motion) of held angles; edge_rest: first directors of these edges at rest (., 3).
+    """
+
+    def __init__(self, host: ChainGroup, worlds: int, rods: int, device, real):
+        def where(places):
+            rows = np.concatenate(places) if places else np.zeros((0, 3), int)
+            tiled = np.concatenate([rows + [0, world * rods, 0] for world in range(worlds)])
+            return rows, wp.array(tiled.astype(np.int32), dtype=int, device=device)
+
+        def rest(values):
+            return wp.array(np.concatenate([values] * worlds), dtype=real, device=device)
+
+        rows, self.nodes = where(host.moving_nodes)
+        points = np.zeros((len(rows), 3))
+        points[:, [0, 2] if host.kind.dim == 2 else [0, 1, 2]] = host.x[rows[:, 0], rows[:, 1]]
+        self.node_rest = rest(points)
+        rows, self.edges = where(host.moving_edges)
+        self.edge_rest = rest(
+            np.moveaxis(host.frame[0:3], 0, -1)[rows[:, 0], rows[:, 1]] if len(rows) else np.zeros((0, 3))
+        )
+
+
+class Model:
+    """A built scene; see `Scene.build`.
+
+    Attributes:
+        scene: what it was built from.
+        curves: rods in the user's order.
+        groups: rods of one kind and similar length each.
+        held: what each support of the scene holds.
+        precision: scalar types.
+        worlds: number of independent copies.
+    """
+
+    def __init__(self, scene, *, device=None, precision: str | None = None, worlds: int = 1):
+        if worlds < 1:
+            raise SceneError(f"worlds = {worlds}; there is at least one")
+        self.scene = scene
+        self.wp_device = wp.get_device(device or ("cuda:0" if wp.is_cuda_available() else "cpu"))
+        self.types = _precision(precision, self.wp_device)
+        self.worlds = worlds
+        self.chains, self.held = compile_chains(scene)
+        self.motions = scene_motions(scene)
+        self.groups = [Group(chain, scene, worlds, self.wp_device, self.types.real) for chain in self.chains]
+
+    @property
+    def device(self) -> str:
+        """Name of the Warp device."""
+        return str(self.wp_device)
+
+    @property
+    def precision(self) -> str:
+        """Name of the precision."""
+        return self.types.name
+
+    @cached_property
+    def curves(self) -> Curves:
+        batches = self.scene.batches
+        counts = np.concatenate([np.full(b.rods, b.nodes) for b in batches])
+        radius = [np.broadcast_to(_node_radius(b), (b.rods, b.nodes)).ravel() for b in batches]
+        return Curves(
+            counts=counts,
+            closed=np.concatenate([np.full(b.rods, b.closed) for b in batches]),
+            radius=np.concatenate(radius),
+            names=np.concatenate([np.full(b.rods, b.name, dtype=object) for b in batches]),
+            batch=np.concatenate([np.full(b.rods, i) for i, b in enumerate(batches)]),
+        )
+
+    def report(self) -> str:
+        """What is in the model, what it costs, and what is left out."""
+        from ddg_warp.report import report
+
+        return report(self)
+
+    def energies(self, state: State) -> dict[str, float]:
+        """Energies by term at a state [J]; see `ddg_warp.inquiry`."""
+        from ddg_warp.inquiry import energies
+
+        return energies(self, state)
+
+    def reactions(self, state: State, **options) -> list:
+        """Forces and moments of the supports; see `ddg_warp.inquiry.reactions`."""
+        from ddg_warp.inquiry import reactions
+
+        return reactions(self, state, **options)
+
+    def stresses(self, state: State) -> dict:
+        """Axial forces and moments along the rods; see `ddg_warp.inquiry.stresses`."""
+        from ddg_warp.inquiry import stresses
+
+        return stresses(self, state)
+
+    def parameters(self) -> dict[str, np.ndarray]:
+        """Parameters of all terms by name, `group/term/parameter`, broadcastable to (node, column of the group)."""
+        result = {}
+        for i, group in enumerate(self.groups):
+            for term, place in zip(group.kind.terms, group.kind.places(), strict=True):
+                for j, name in enumerate(term.parameter_names):
+                    result[f"{i}/{term.name}/{name}"] = group.parameter(place[0] + j)
+            result |= {f"{i}/mass": group.host.mass, f"{i}/rotary_inertia": group.host.rotary}
+        return result
+
+    def state(self, points=None, velocities=None, spins=None) -> State:
+        """A first state: the rest state at rest, or with other positions and velocities.
+
+        Args:
+            points: positions (P, 3) or (worlds, P, 3) [m] in the order of `curves`. Reference frames are carried from rest to
+                these positions; ghost nodes of clamped ends stay.
+            velocities: (P, 3) or (worlds, P, 3) [m/s].
+            spins: rate of the edges' angles (edges,) or (worlds, edges) [rad/s].
+
+        Raises:
+            ValueError: a shape does not fit, or a value is not finite.
+        """
+        state = self.empty_state()
+        for group, data in zip(self.groups, state.groups, strict=True):
+            x = np.concatenate([group.host.x] * self.worlds, axis=1)
+            if points is not None:
+                self._scatter_nodes(group, points, x, "points")
+            arrays.assign(data.x, x)
+            if velocities is not None:
+                v = np.zeros_like(x)
+                self._scatter_nodes(group, velocities, v, "velocities")
+                arrays.assign(data.v, v)
+            if group.kind.twist:
+                arrays.assign(data.frame, np.concatenate([group.host.frame] * self.worlds, axis=-1))
+                if spins is not None:
+                    omega = np.zeros((group.nodes, group.columns))
+                    self._scatter_edges(group, spins, omega)
+                    arrays.assign(data.omega, omega)
+        if points is not None:
+            self.carry_frames(state)
+        self.update_strains(state)
+        return state
+
+    def _scatter_nodes(self, group: Group, values, out: np.ndarray, what: str) -> None:
+        """Put values in the user's order (P, 3) into (node, column, dim) of a group."""
+        counts = self.curves.counts
+        values = np.asarray(values, float)
+        if values.shape not in ((counts.sum(), 3), (self.worlds, counts.sum(), 3)):
+            raise ValueError(
+                f"{what} have shape {values.shape}; they are ({counts.sum()}, 3), or one such array a world"
+            )
+        if not np.isfinite(values).all():
+            raise ValueError(f"{what}: node {int(np.argwhere(~np.isfinite(values))[0][-2])} is not finite")
+        start = np.concatenate([[0], np.cumsum(counts)])
+        axes = [0, 2] if group.kind.dim == 2 else [0, 1, 2]
+        k, column, index = _user_index(group, group.host.own, start)
+        for world in range(self.worlds):
+            own = values if values.ndim == 2 else values[world]
+            out[k, column + world * group.rods] = own[index][:, axes]
+
+    def _scatter_edges(self, group: Group, values, out: np.ndarray) -> None:
+        counts = self.curves.counts - np.where(self.curves.closed, 0, 1)
+        start = np.concatenate([[0], np.cumsum(counts)])
+        values = np.asarray(values, float)
+        own = group.host.own - (0 if group.kind.closed else 1)
+        k, column, index = _user_index(group, own, start)
+        for world in range(self.worlds):
+            out[k, column + world * group.rods] = (values if values.ndim == 1 else values[world])[index]
+
+    def empty_state(self) -> State:
+        """Arrays of a state, not yet filled."""
+        return State(self, [self._group_state(group) for group in self.groups])
+
+    def restore(self, snapshot: dict[str, np.ndarray]) -> State:
+        """The state that `State.snapshot` saved, bit by bit.
+
+        Raises:
+            ValueError: the snapshot is of another model.
+        """
+        state = self.empty_state()
+        for i, group in enumerate(state.groups):
+            for name, array in group.arrays().items():
+                values = np.asarray(snapshot[f"{i}/{name}"])
+                if values.shape[: array.ndim] != array.shape:
+                    raise ValueError(
+                        f"snapshot is of another model: {name} has shape {values.shape}, not {array.shape}"
+                    )
+                arrays.assign(array, values)
+        state.time = float(snapshot["time"])
+        return state
+
+    def _group_state(self, group: Group) -> GroupState:
+        kind, real = group.kind, self.types.real
+        vector = wp.types.vector(kind.dim, real)
+        nodes = (group.nodes, group.columns)
+
+        def make(shape, dtype, needed=True):
+            return arrays.allocate(shape if needed else (1,) * len(shape), dtype, self.wp_device)
+
+        return GroupState(
+            x=make(nodes, vector),
+            v=make(nodes, vector),
+            theta=make(nodes, real, kind.twist),
+            omega=make(nodes, real, kind.twist),
+            frame=make((7, *nodes), real, kind.twist),
+            last=make((kind.strain_rows, *nodes), real, kind.viscous),
+        )
+
+    def carry_frames(self, state: State) -> None:
+        """Transport the reference frames of a state to its current tangents."""
+        for group, data in zip(self.groups, state.groups, strict=True):
+            if group.kind.twist:
+                new = arrays.allocate(data.frame.shape, self.types.real, self.wp_device)
+                wp.launch(
+                    step.finish_frames_kernel(group.kind, self.types.real),
+                    (group.elements, group.columns),
+                    [data.x, data.frame, group.count],
+                    [new],
+                    device=self.wp_device,
+                )
+                wp.copy(data.frame, new)
+
+    def update_strains(self, state: State) -> None:
+        """Store the strains of a state where strain-rate damping looks for them."""
+        for group, data in zip(self.groups, state.groups, strict=True):
+            if group.kind.viscous:
+                self.strains(group, data, data.last)
+
+    def strains(self, group: Group, data: GroupState, out: wp.array, stress: wp.array | None = None) -> None:
+        """Launch the strain kernel of a group; stresses go to `stress`, if given (viscous parts at rest)."""
+        real = self.types.real
+        stress = stress or arrays.allocate((group.kind.strain_rows, group.nodes, group.columns), real, self.wp_device)
+        still = wp.zeros(group.columns, dtype=real, device=self.wp_device)
+        wp.launch(
+            element.strain_kernel(group.kind, real),
+            (group.elements, group.columns),
+            [data.x, data.theta, data.frame, data.last, still, group.buffer, group.table, group.count],
+            [out, stress],
+            device=self.wp_device,
+        )
+
+    def gather_nodes(self, values: list[np.ndarray]) -> np.ndarray:
+        """From arrays (node, column, dim) of every group to the user's order, in three dimensions."""
+        counts = self.curves.counts
+        start = np.concatenate([[0], np.cumsum(counts)])
+        out = np.zeros((self.worlds, start[-1], 3))
+        for group, value in zip(self.groups, values, strict=True):
+            axes = [0, 2] if group.kind.dim == 2 else [0, 1, 2]
+            k, column, index = _user_index(group, group.host.own, start)
+            for world in range(self.worlds):
+                out[world][index[:, None], axes] = value[k, column + world * group.rods]
+        return out[0] if self.worlds == 1 else out
+
+    def gather_edges(self, values: list[np.ndarray], width: int = 0) -> np.ndarray | None:
+        """The same for edges; None without twist."""
+        if not any(group.kind.twist for group in self.groups):
+            return None
+        counts = self.curves.counts - np.where(self.curves.closed, 0, 1)
+        start = np.concatenate([[0], np.cumsum(counts)])
+        out = np.zeros((self.worlds, start[-1], *([width] if width else [])))
+        for group, value in zip(self.groups, values, strict=True):
+            if group.kind.twist:
+                own = group.host.own - (0 if group.kind.closed else 1)
+                k, column, index = _user_index(group, own, start)
+                for world in range(self.worlds):
+                    out[world][index] = value[k, column + world * group.rods]
+        return out[0] if self.worlds == 1 else out
+
+    def gather_directors(self, state: State) -> np.ndarray | None:
+        """First material directors of a state; see `State.directors`."""
+        values = []
+        for data in state.groups:
+            frame, theta = arrays.download(data.frame), arrays.download(data.theta)
+            u, t = np.moveaxis(frame[0:3], 0, -1), np.moveaxis(frame[3:6], 0, -1)
+            values.append(u * np.cos(theta)[..., None] + np.cross(t, u) * np.sin(theta)[..., None])
+        return self.gather_edges(values, 3)
+
+
+_precision = precision.choose
+
+
+def _outer_forces(host: ChainGroup, gravity: np.ndarray) -> np.ndarray:
+    """Sum of the magnitudes of the outer forces on every rod (R,) [N]: the scale that residuals are compared with."""
+    inside = np.arange(host.shape[0])[:, None] < host.count
+    forces = np.abs(host.mass[..., None] * gravity + host.load).sum(-1) * inside
+    total = forces.sum(0) + np.abs(host.load_angle).sum(0) / host.length
+    for load in host.timed_loads:
+        size = np.abs(load.force).sum() + (abs(load.moment) + np.abs(load.couple).sum()) / host.length[load.columns]
+        np.add.at(total, load.columns, size)
+    return total
+
+
+def _node_radius(batch) -> np.ndarray:
+    radius = np.asarray(batch.section.radius, float)
+    if radius.ndim == 0 or radius.shape[-1] == 1:
+        return radius
+    return 0.5 * (np.concatenate([radius[..., :1], radius], -1) + np.concatenate([radius, radius[..., -1:]], -1))
+
+
+def _user_index(group: Group, own: np.ndarray, start: np.ndarray):
+    """For nodes or edges of a group's rods: place along the rod with ghosts, column, place in the user's order."""
+    column = np.repeat(np.arange(group.rods), own)
+    at = np.arange(own.sum()) - np.repeat(np.concatenate([[0], np.cumsum(own)[:-1]]), own)
+    return at + group.host.first[column], column, at + start[group.host.rods[column]]

@@ -1,0 +1,61 @@
+"""Prescribed motion of supports: rigid motions that count their turns."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+def _still(t: float) -> tuple[float, float, float]:
+    return (0.0, 0.0, 0.0)
+
+
+def _unturned(t: float) -> float:
+    return 0.0
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A rigid motion of supports: rotation about an axis through `pivot`, then translation.
+
+    A point X of the rest state is at pivot + R(angle(t)) (X - pivot) + translation(t). The angle is cumulative: it counts turns
+    past 2 pi, however far it goes in a step, so that an end can be wound up. In statics t is the load parameter.
+
+    Attributes:
+        translation: t -> displacement (3,) [m].
+        angle: t -> cumulative angle about `axis` [rad].
+        axis: direction of the rotation (3,), any length.
+        pivot: a point on the axis (3,) [m].
+    """
+
+    translation: Callable[[float], tuple] = _still
+    angle: Callable[[float], float] = _unturned
+    axis: tuple = (0.0, 0.0, 1.0)
+    pivot: tuple = (0.0, 0.0, 0.0)
+    _unit: np.ndarray = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self):
+        axis = np.asarray(self.axis, float)
+        length = np.linalg.norm(axis)
+        if not (axis.shape == (3,) and np.isfinite(length) and length > 0.0):
+            raise ValueError(f"Motion: axis {self.axis} is no direction; give three numbers, not all zero")
+        object.__setattr__(self, "_unit", axis / length)
+
+    def pose(self, t0: float, t1: float) -> np.ndarray:
+        """What the device needs of a step from t0 to t1: turn (3), rotation at t0 (9), pivot (3), translations (3, 3)."""
+        a0, a1 = float(self.angle(t0)), float(self.angle(t1))
+        return np.concatenate(
+            [
+                self._unit * (a1 - a0),
+                self.rotation(a0).ravel(),
+                self.pivot,
+                np.asarray(self.translation(t0), float),
+                np.asarray(self.translation(t1), float),
+            ]
+        )
+
+    def rotation(self, angle: float) -> np.ndarray:
+        """Rotation matrix about the axis (Rodrigues)."""
+        k = self._unit
+        cross = np.array([[0.0, -k[2], k[1]], [k[2], 0.0, -k[0]], [-k[1], k[0], 0.0]])
+        return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)

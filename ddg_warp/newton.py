@@ -1,0 +1,151 @@
+"""Projected Newton on chains: every rod has its own loop, line search and outcome, all on the device."""
+
+from dataclasses import dataclass
+
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.kernels import chain, element
+
+
+@dataclass(frozen=True)
+class NewtonOptions:
+    """How a Newton solve searches and when it stops.
+
+    Attributes:
+        rtol: a dof is in equilibrium where its residual is below rtol times the load scale of the rod (sum of its outer forces;
+            without any, the first residual), or below what rounding leaves of it.
+        floor_factor: how many rounding units of the forces that meet at a node count as rounding.
+        max_iterations: Newton iterations of one solve.
+        max_halvings: shortenings of one step by the line search.
+        rotation_cap: largest turn of an edge in one update [rad].
+        linear_rtol: reduction of the residual by PCG, in the norm of the preconditioner.
+    """
+
+    rtol: float = 1e-8
+    floor_factor: float = 4.0
+    max_iterations: int = 50
+    max_halvings: int = 20
+    rotation_cap: float = 1.0
+    linear_rtol: float = 1e-8
+
+
+class ChainNewton:
+    """Newton on one group of uncoupled open rods by the chain sweep. Owns what is needed while a solve runs.
+
+    Attributes:
+        x, theta, frame: the iterate and its lagged frames; base: the accepted positions it was reached from.
+        target, target_angle, coefficient: the quadratic of inertia, coefficient * m |x - target|^2 / 2.
+        status, iteration, ...: state of every rod's search; see `kernels.chain`.
+    """
+
+    def __init__(self, model, group, options: NewtonOptions, linear=None):
+        self.group, self.options = group, options
+        self.real, self.linear = model.types.real, linear or model.types.linear
+        self.eps = model.types.eps
+        kind, device = group.kind, model.wp_device
+        vector = wp.types.vector(kind.dim, self.real)
+        nodes, columns = (group.nodes, group.columns), group.columns
+
+        def make(*shape, dtype=self.real):
+            return arrays.allocate(shape, dtype, device)
+
+        def flags():
+            return wp.zeros(columns, dtype=int, device=device)
+
+        def scalars():
+            return wp.zeros(columns, dtype=self.real, device=device)
+
+        twisted = nodes if kind.twist else (1, 1)
+        self.x, self.base, self.target = (make(*nodes, dtype=vector) for _ in range(3))
+        self.theta, self.target_angle = make(*twisted), make(*twisted)
+        self.frame = make(7, *twisted)
+        self.factor = make(kind.factor_rows, *nodes, dtype=self.linear)
+        self.gradient = make(kind.window, *nodes)
+        self.energy = make(2, *nodes)
+        self.stiffness = make(*nodes, dtype=self.linear)
+        self.elimination = make(2 * kind.block**2 + kind.block, *nodes, dtype=self.linear) if not kind.closed else None
+        self.direction = make(kind.block, *nodes, dtype=self.linear)
+        self.status, self.slot, self.iteration, self.halvings = flags(), flags(), flags(), flags()
+        self.lost, self.turned, self.unbalanced, self.drowned = flags(), flags(), flags(), flags()
+        self.coefficient, self.rate = scalars(), scalars()
+        self.step_length, self.decrement, self.load_scale, self.residual = scalars(), scalars(), scalars(), scalars()
+        self.active = wp.zeros(1, dtype=int, device=device)
+        self.device = device
+        self._evaluate = element.evaluate_kernel(kind, self.real, self.linear)
+        self._check = chain.check_kernel(kind, self.real, self.linear)
+        self._sweep = None if kind.closed else chain.sweep_kernel(kind, self.real, self.linear)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [self._evaluate, self._check, self._sweep]
+
+    def pcg_iterations(self) -> int:
+        """None: the sweep is direct."""
+        return 0
+
+    def solve(self, last: wp.array) -> None:
+        """Iterate until no rod is active; can be captured. `last` holds the strains of the last step."""
+        wp.capture_while(self.active, lambda: self.iterate(last))
+
+    def iterate(self, last: wp.array) -> None:
+        """One iteration of every active rod."""
+        self.evaluate(last)
+        self.check()
+        self.sweep()
+
+    def evaluate(self, last: wp.array) -> None:
+        """Energies, gradients and factors of all elements at the iterate."""
+        group = self.group
+        wp.launch(
+            self._evaluate,
+            (group.elements, group.columns),
+            [
+                self.x,
+                self.theta,
+                self.frame,
+                last,
+                self.rate,
+                group.buffer,
+                group.table,
+                group.count,
+                self.status,
+                self.slot,
+            ],
+            [self.factor, self.gradient, self.energy, self.stiffness, self.turned, self.active],
+            device=self.device,
+            block_dim=128,
+        )
+
+    def check(self) -> None:
+        """Find the rods that are out of equilibrium."""
+        group, options = self.group, self.options
+        wp.launch(
+            self._check,
+            (group.nodes, group.columns),
+            [self.gradient, self.stiffness, group.count, group.mass, group.rotary, self.coefficient]
+            + [self.x, self.theta, self.target, self.target_angle]
+            + [group.gravity, group.load, group.load_angle, int(group.host.loaded), group.fixed, group.length]
+            + [options.rtol, options.floor_factor * self.eps, self.load_scale, self.status],
+            [self.unbalanced, self.drowned],
+            device=self.device,
+        )
+
+    def sweep(self) -> None:
+        """Factor, decide, and take the next step."""
+        group, options = self.group, self.options
+        wp.launch(
+            self._sweep,
+            group.columns,
+            [self.factor, self.gradient, self.energy, group.count]
+            + [group.mass, group.rotary, self.coefficient, self.target, self.target_angle, group.gravity]
+            + [group.load, group.load_angle, int(group.host.loaded), group.fixed, group.length]
+            + [options.floor_factor * self.eps, options.rotation_cap]
+            + [options.max_iterations, options.max_halvings]
+            + [self.x, self.theta, self.frame, self.base, self.elimination, self.direction]
+            + [self.status, self.slot, self.iteration, self.halvings, self.step_length, self.decrement]
+            + [self.load_scale, self.residual, self.lost, self.turned, self.unbalanced, self.drowned, self.active],
+            device=self.device,
+            block_dim=32,
+        )

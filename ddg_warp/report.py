@@ -1,0 +1,39 @@
+"""The report of a model: terms, elements, dofs, solver, kernels, memory, and what the scene does without."""
+
+from ddg_warp.kernels.terms import REGISTRY
+
+
+def report(model) -> str:
+    """A few lines of text for a person; a test compares them with what is launched."""
+    rods, nodes = model.scene.rod_count, int(model.curves.counts.sum())
+    lines = [f"{rods} rods, {nodes} nodes, worlds {model.worlds}, {model.precision} on {model.device}"]
+    present = set()
+    for i, group in enumerate(model.groups):
+        kind, host = group.kind, group.host
+        shape = "closed" if kind.closed else "open"
+        lines.append(
+            f"group {i}: {group.rods} {shape} rods of {host.count.min()} to {host.count.max()} nodes, "
+            f"{kind.block} dofs a node, {kind.window} a window"
+        )
+        for term in kind.terms:
+            present.add(term.name)
+            elements = int((host.count - (0 if kind.closed else term.measure.span)).sum()) * model.worlds
+            lines.append(f"  {term.name}: {elements} elements, {term.measure.name} x {term.density.name}")
+        solver = "PCG (closed chains)" if kind.closed else "chain sweep, one Newton loop a rod"
+        lines.append(f"  solver: {solver}, linear algebra in {model.types.linear.__name__}")
+        lines.append(f"  memory: {bytes_per_node(model, kind)} bytes a node")
+    absent = sorted(name for name in REGISTRY if name not in present)
+    lines.append("not in this scene: " + ", ".join(absent))
+    if not any(group.kind.twist for group in model.groups):
+        lines.append("no angles, no frames, no rotary inertia")
+    return "\n".join(lines)
+
+
+def bytes_per_node(model, kind) -> int:
+    """Device memory of states, iterate and solver for one node of a chain."""
+    real, linear = (4 if t.__name__ == "float32" else 8 for t in (model.types.real, model.types.linear))
+    state = 2 * kind.dim + (9 if kind.twist else 0) + (kind.strain_rows if kind.viscous else 0)
+    iterate = 2 * kind.dim + (9 if kind.twist else 0) + kind.window + 2
+    solver = kind.factor_rows + 2 * kind.block**2 + 2 * kind.block + 1
+    constant = 2 * real + 1
+    return 2 * state * real + iterate * real + solver * linear + constant

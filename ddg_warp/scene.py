@@ -1,0 +1,241 @@
+"""The description of a simulation: rods, supports, loads. NumPy only; nothing here knows a device."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ddg_warp.errors import SceneError
+from ddg_warp.material import Material, Stiffness
+from ddg_warp.motion import Motion
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """Advance in time: step dt [s] to duration [s] by `scheme` (`implicit_euler` or `implicit_midpoint`)."""
+
+    dt: float = 0.01
+    duration: float = 1.0
+    scheme: str = "implicit_euler"
+
+
+@dataclass(frozen=True)
+class Statics:
+    """Find the equilibrium: loads and motions grow with the load parameter from 0 to 1 in `load_steps` increments."""
+
+    load_steps: int = 1
+
+
+@dataclass
+class RodBatch:
+    """Rods of one `add_rods` call: same node count and closedness; section, shape and rest shape may differ."""
+
+    points: np.ndarray  # (R, n, 3) [m]
+    section: Stiffness
+    closed: bool
+    natural: object
+    director: np.ndarray | None  # (3,), (R, 3) or (R, edges, 3)
+    twist: bool
+    bend: bool
+    name: str
+    first: int  # index of its first rod
+
+    @property
+    def rods(self) -> int:
+        return self.points.shape[0]
+
+    @property
+    def nodes(self) -> int:
+        return self.points.shape[1]
+
+    @property
+    def edges(self) -> int:
+        return self.nodes if self.closed else self.nodes - 1
+
+
+@dataclass(frozen=True)
+class Support:
+    """Dofs held on some rods: nodes (with components), edge angles, or an end frame (`end` is "first" or "last")."""
+
+    rods: np.ndarray
+    nodes: tuple[int, ...] = ()
+    components: str = "xyz"
+    edges: tuple[int, ...] = ()
+    end: str = ""
+    motion: Motion | None = None
+
+
+@dataclass(frozen=True)
+class Load:
+    """A dead force on a node [N], or on an edge a twisting moment or a couple [N m]; times amplitude(t) if given."""
+
+    rods: np.ndarray
+    node: int = 0
+    force: tuple = (0.0, 0.0, 0.0)
+    edge: int | None = None
+    moment: float = 0.0
+    couple: tuple = (0.0, 0.0, 0.0)
+    amplitude: Callable[[float], float] | None = None
+
+
+@dataclass
+class Scene:
+    """Rods with supports and loads, ready to be built for a device.
+
+    Args:
+        gravity: acceleration (3,) [m/s^2].
+        dimension: 3, or 2 for a scene that stays in the plane of x and z (y of every point is then ignored).
+        analysis: `Dynamics` or `Statics`: what `ddg-warp run` does with the scene.
+        mass_damping: mass-proportional damping alpha [1/s].
+        initial: makes the first state of a run from the model; the rest state by default.
+        callbacks: functions of the state, called between steps.
+    """
+
+    gravity: tuple = (0.0, 0.0, -9.81)
+    dimension: int = 3
+    analysis: Dynamics | Statics = field(default_factory=Dynamics)
+    mass_damping: float = 0.0
+    initial: Callable | None = None
+    batches: list[RodBatch] = field(default_factory=list)
+    supports: list[Support] = field(default_factory=list)
+    loads: list[Load] = field(default_factory=list)
+    masses: list[tuple[np.ndarray, int, float]] = field(default_factory=list)
+    callbacks: list[Callable] = field(default_factory=list)
+
+    @property
+    def rod_count(self) -> int:
+        """Number of rods added so far."""
+        return sum(batch.rods for batch in self.batches)
+
+    def add_rod(self, points, **options) -> int:
+        """Add one rod with points (n, 3); options as in `add_rods`. Returns its index."""
+        return self.add_rods(np.asarray(points, float)[None], **options)[0]
+
+    def add_rods(
+        self,
+        points,
+        *,
+        section,
+        material: Material | None = None,
+        closed: bool = False,
+        natural="shape",
+        director=None,
+        twist: bool = True,
+        bend: bool = True,
+        name: str = "rod",
+    ) -> range:
+        """Add rods of equal node count.
+
+        Args:
+            points: nodes at rest (R, n, 3) [m]; their distances are the rest lengths.
+            section: `Circle`, `Ellipse`, `Rectangle` (with a material) or `Stiffness`.
+            material: `Material`; not needed with `Stiffness`.
+            closed: whether the last node is joined to the first.
+            natural: "shape" takes curvature and twist at rest from the points and directors; "straight" sets both to zero; or
+                three arrays (curvature 1, curvature 2, twist) [1/m] that broadcast to (R, vertices), of vertices between edges.
+            director: first director of the first edge (3,) or (R, 3), carried along without twist, or of all edges
+                (R, edges, 3); made perpendicular to the tangents. By default one is chosen.
+            twist: False leaves twist out: 3 dofs a node, for isotropic rods that are straight at rest.
+            bend: False leaves bending and twist out: a chain of springs.
+            name: shown in reports and output.
+
+        Returns:
+            Indices of the rods.
+
+        Raises:
+            SceneError: what is given cannot be a rod; the message names rod and node.
+        """
+        points = np.array(points, float)
+        if points.ndim == 2:
+            points = points[None]
+        if points.ndim != 3 or points.shape[2] != 3:
+            raise SceneError(f"rods '{name}': points have shape {points.shape}; give (rods, nodes, 3)")
+        stiffness = getattr(section, "stiffness", None)
+        if stiffness is None:
+            raise SceneError(f"rods '{name}': section {section!r} is none; use Circle, Ellipse, Rectangle or Stiffness")
+        if material is None and not isinstance(section, Stiffness):
+            raise SceneError(f"rods '{name}': a {type(section).__name__} needs a material; give material=Material(...)")
+        planar = self.dimension == 2
+        batch = RodBatch(
+            points,
+            stiffness(material),
+            closed,
+            natural,
+            None if director is None else np.asarray(director, float),
+            twist and bend and not planar,
+            bend,
+            name,
+            self.rod_count,
+        )
+        self.batches.append(batch)
+        return range(batch.first, batch.first + batch.rods)
+
+    def clamp(self, rods, edges: Iterable[int] = (0,), motion: Motion | None = None) -> None:
+        """Hold edges: both nodes and the angle. The continuum clamp then lies at the middle of the edge.
+
+        Negative indices count from the last edge. `motion` moves them; without it they stay where they are at rest.
+        """
+        edges = tuple(edges)
+        nodes = tuple(dict.fromkeys(n for e in edges for n in ((e, e + 1) if e >= 0 else (e - 1, e))))
+        self.supports.append(Support(self._rods(rods), nodes=nodes, edges=edges, motion=motion))
+
+    def clamp_end(self, rods, end: str = "first", motion: Motion | None = None, components: str = "xyz") -> None:
+        """Hold position and frame exactly at an end node: the tangent is prescribed there and the end cell is half a cell.
+
+        `components` leaves the others free, so that a clamped end can slide along an axis of space.
+        """
+        if end not in ("first", "last"):
+            raise SceneError(f"clamp_end: end is {end!r}; it is 'first' or 'last'")
+        self.supports.append(Support(self._rods(rods), components=components, end=end, motion=motion))
+
+    def fix(self, rods, nodes: Iterable[int], components: str = "xyz", motion: Motion | None = None) -> None:
+        """Hold components of nodes (a hinge)."""
+        self.supports.append(Support(self._rods(rods), nodes=tuple(nodes), components=components, motion=motion))
+
+    def fix_twist(self, rods, edges: Iterable[int], motion: Motion | None = None) -> None:
+        """Hold the angle of edges."""
+        self.supports.append(Support(self._rods(rods), edges=tuple(edges), motion=motion))
+
+    def add_force(self, rods, node: int, force, amplitude: Callable[[float], float] | None = None) -> None:
+        """Dead force [N] on a node, times amplitude(t). In statics it grows with the load parameter if amplitude is None."""
+        self.loads.append(Load(self._rods(rods), node=node, force=tuple(force), amplitude=amplitude))
+
+    def add_twisting_moment(self, rods, edge: int, moment: float, amplitude=None) -> None:
+        """Moment [N m] about the tangent of an edge, conjugate to its angle."""
+        self.loads.append(Load(self._rods(rods), edge=edge, moment=moment, amplitude=amplitude))
+
+    def add_couple(self, rods, edge: int, couple, amplitude=None) -> None:
+        """Couple (3,) [N m] on an edge, its axis fixed in space: a pair of forces across the edge and a moment about it.
+
+        Outside the plane it has no potential (Ziegler, Principles of Structural Stability, 1968). Statics takes it as it is; in
+        dynamics its forces are those on the predicted edge and stay as they are within a step.
+        """
+        self.loads.append(Load(self._rods(rods), edge=edge, couple=tuple(couple), amplitude=amplitude))
+
+    def add_mass(self, rods, node: int, mass: float) -> None:
+        """Point mass [kg] on a node."""
+        if not mass > 0.0:
+            raise SceneError(f"add_mass: {mass} kg at node {node}; a point mass is positive")
+        self.masses.append((self._rods(rods), node, float(mass)))
+
+    def build(self, device=None, precision: str | None = None, worlds: int = 1):
+        """Freeze the scene into a `Model` on a device.
+
+        Args:
+            device: Warp device, such as "cpu" or "cuda:0"; by default CUDA if there is one.
+            precision: "float64" (default on the CPU), "mixed" (default on CUDA) or "float32".
+            worlds: independent copies.
+
+        Raises:
+            SceneError: see `ddg_warp.validate`.
+        """
+        from ddg_warp.model import Model
+
+        return Model(self, device=device, precision=precision, worlds=worlds)
+
+    def _rods(self, rods) -> np.ndarray:
+        index = np.atleast_1d(np.asarray(rods, int))
+        bad = index[(index < 0) | (index >= self.rod_count)]
+        if bad.size:
+            raise SceneError(f"rod {bad[0]} does not exist; the scene has {self.rod_count} rods so far")
+        return index

@@ -1,0 +1,94 @@
+"""Stability and vibration of equilibria: eigenvalues of the constrained tangent, and the load at which the lowest vanishes."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg, sparse
+from scipy.optimize import brentq
+from scipy.sparse.linalg import eigsh
+
+from ddg_warp.linear.direct import Factorisation
+from ddg_warp.tangent import Tangent
+
+DENSE = 600  # free dofs up to which a dense eigenvalue solver is the quicker and safer choice
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Lowest eigenvalues of a constrained tangent.
+
+    Attributes:
+        eigenvalues: in ascending order; with the mass as metric they are squared angular frequencies [1/s^2].
+        modes: (dofs, number), normalised in the metric; zero at held dofs.
+        negative: number of negative eigenvalues (inertia).
+    """
+
+    eigenvalues: np.ndarray
+    modes: np.ndarray
+    negative: int
+
+    @property
+    def stable(self) -> bool:
+        """Whether the second variation is positive."""
+        return self.negative == 0
+
+    @property
+    def frequencies(self) -> np.ndarray:
+        """Angular frequencies [rad/s]; NaN where an eigenvalue is negative."""
+        with np.errstate(invalid="ignore"):
+            return np.sqrt(self.eigenvalues)
+
+
+def spectrum(model, state, count: int = 4, metric: str = "mass", tangent: Tangent | None = None) -> Spectrum:
+    """The `count` lowest eigenvalues of the constrained tangent at a state.
+
+    Args:
+        model, state: an equilibrium; the tangent is exact, without any projection.
+        count: how many.
+        metric: "mass" (lumped, rotary inertia included) or "unit" (identity, angles times an edge length squared), for
+            questions of stability alone.
+        tangent: reuse this instead of making one.
+    """
+    tangent = tangent or Tangent(model)
+    free = np.flatnonzero(tangent.free)
+    matrix = tangent.hessian(state)[free][:, free]
+    if metric == "mass":
+        weights = tangent.mass[free]
+        if (weights <= 0.0).any():
+            raise ValueError("a free dof has no mass; ask for metric='unit'")
+    else:
+        weights = np.where(tangent.angle[free], tangent.edge_length() ** 2, 1.0)
+    scaling = 1.0 / np.sqrt(weights)
+    scaled = sparse.diags(scaling) @ matrix @ sparse.diags(scaling)
+    count = min(count, len(free))
+    if len(free) <= DENSE:
+        values, vectors = linalg.eigh(scaled.toarray(), subset_by_index=(0, count - 1))
+        negative = int((values < 0.0).sum()) if values[-1] > 0.0 else Factorisation(sparse.csc_matrix(matrix)).negative
+    else:
+        negative = Factorisation(sparse.csc_matrix(matrix)).negative
+        wanted = min(count + negative, len(free) - 1)
+        values, vectors = eigsh(sparse.csc_matrix(scaled), k=wanted, sigma=0.0, which="LM", v0=np.ones(len(free)))
+        order = np.argsort(values)[:count]
+        values, vectors = values[order], vectors[:, order]
+    modes = np.zeros((tangent.size, count))
+    modes[free] = scaling[:, None] * vectors
+    return Spectrum(values, modes, negative)
+
+
+def critical(equilibrium_at: Callable, low: float, high: float, tolerance: float = 1e-8) -> float:
+    """The parameter between low and high at which the lowest eigenvalue of the tangent vanishes.
+
+    Args:
+        equilibrium_at: parameter -> (model, state) in equilibrium, stable at `low` and not at `high` (or the other way).
+        tolerance: of the parameter, relative to high - low.
+
+    Raises:
+        ValueError: the lowest eigenvalue has the same sign at both ends.
+    """
+
+    def lowest(parameter: float) -> float:
+        model, state = equilibrium_at(parameter)
+        return float(spectrum(model, state, 1, "unit").eigenvalues[0])
+
+    return float(brentq(lowest, low, high, xtol=tolerance * abs(high - low)))

@@ -1,0 +1,79 @@
+"""State: what a step writes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+
+
+@dataclass
+class GroupState:
+    """Device arrays of one group of rods; n nodes, R rods.
+
+    Attributes:
+        x, v: position [m] and velocity [m/s] of nodes, vectors (n, R).
+        theta, omega: angle [rad] and its rate [rad/s] of edges (n, R); empty without twist.
+        frame: lagged reference frames (7, n, R): first director, tangent, reference twist; empty without twist.
+        last: strains at this state (strains, n, R); empty without strain-rate damping.
+    """
+
+    x: wp.array
+    v: wp.array
+    theta: wp.array
+    omega: wp.array
+    frame: wp.array
+    last: wp.array
+
+    def arrays(self) -> dict[str, wp.array]:
+        """All arrays by name."""
+        return self.__dict__
+
+
+class State:
+    """Positions, velocities, frames and time of a model's rods. A step returns another state and does not change this one.
+
+    The integrator writes into two states in turn: a state stays valid until the step after the next; `copy()` keeps it.
+    """
+
+    def __init__(self, model, groups: list[GroupState], time: float = 0.0):
+        self.model = model
+        self.groups = groups
+        self.time = time
+
+    def points(self) -> np.ndarray:
+        """Positions of nodes in the order of `model.curves` (P, 3) [m]; (worlds, P, 3) if there are several."""
+        return self.model.gather_nodes([arrays.download(group.x) for group in self.groups])
+
+    def velocities(self) -> np.ndarray:
+        """Velocities of nodes, ordered as `points` [m/s]."""
+        return self.model.gather_nodes([arrays.download(group.v) for group in self.groups])
+
+    def angles(self) -> np.ndarray | None:
+        """Angles theta of edges [rad] (edges,) or (worlds, edges); None if no rod has twist."""
+        return self.model.gather_edges([arrays.download(group.theta) for group in self.groups])
+
+    def directors(self) -> np.ndarray | None:
+        """First material director of every edge (edges, 3) or (worlds, edges, 3); None if no rod has twist."""
+        return self.model.gather_directors(self)
+
+    def copy(self) -> "State":
+        """An independent copy."""
+        other = self.model.empty_state()
+        other.assign(self)
+        return other
+
+    def assign(self, other: "State") -> None:
+        """Take over everything of another state of the same model."""
+        for mine, theirs in zip(self.groups, other.groups, strict=True):
+            for name, array in mine.arrays().items():
+                wp.copy(array, getattr(theirs, name))
+        self.time = other.time
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Everything a bitwise restart needs."""
+        data = {"time": np.float64(self.time)}
+        for i, group in enumerate(self.groups):
+            data |= {f"{i}/{name}": arrays.download(array) for name, array in group.arrays().items()}
+        return data

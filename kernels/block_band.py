@@ -1,0 +1,331 @@
+"""The system of a chain as blocks, open or closed: assembly by gather, product, and its block LDL^T.
+
+Node k has the blocks D_k, its coupling E_k to node k + 1 and F_k to node k + 2 (modulo the nodes of a closed rod), which lie in
+one array of 3 nb^2 rows: [component][node][rod]. Every block is gathered by one thread, so sums come in one order, without
+atomics. Rows and columns of held dofs are those of the identity.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels import pivot
+from ddg_warp.kernels.chain import node_functions
+from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions
+
+
+@cache
+def block_functions(kind: ChainKind, linear):
+    """load(A, row, k, r), store(A, row, k, r, M), vector(v, row, k, r), put(v, row, k, r, u) for blocks and block vectors."""
+    nb = kind.block
+    H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
+
+    @wp.func
+    def load(A: wp.array3d(dtype=linear), row: int, k: int, r: int):
+        m = M()
+        for i in range(wp.static(nb)):
+            for j in range(wp.static(nb)):
+                m[i, j] = A[row + i * wp.static(nb) + j, k, r]
+        return m
+
+    @wp.func
+    def store(A: wp.array3d(dtype=linear), row: int, k: int, r: int, m: M):
+        for i in range(wp.static(nb)):
+            for j in range(wp.static(nb)):
+                A[row + i * wp.static(nb) + j, k, r] = m[i, j]
+
+    @wp.func
+    def vector(v: wp.array3d(dtype=linear), row: int, k: int, r: int):
+        u = H()
+        for i in range(wp.static(nb)):
+            u[i] = v[row + i, k, r]
+        return u
+
+    @wp.func
+    def put(v: wp.array3d(dtype=linear), row: int, k: int, r: int, u: H):
+        for i in range(wp.static(nb)):
+            v[row + i, k, r] = u[i]
+
+    return load, store, vector, put
+
+
+@cache
+def assemble_kernel(kind: ChainKind, real, linear):
+    """Blocks of H and the residual of every active rod; per node its share of the energy's change and of the rounding in it."""
+    dim, nb, nb2, twist, span, closed = kind.dim, kind.block, kind.block**2, kind.twist, kind.span, kind.closed
+    window, vertex_rows, edge_rows, tensions = kind.window, kind.vertex_strains, kind.edge_strains, kind.tensions
+    V, H, M = wp.types.vector(dim, real), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
+    edge_row, tension_row = vertex_rows * window, vertex_rows * window + edge_rows * dim
+    _, store, _, put = block_functions(kind, linear)
+    _, behind, balance = node_functions(kind, real)
+    along, *_ = gather_functions(kind, real)
+
+    @wp.func
+    def part(F: wp.array3d(dtype=linear), row: int, k: int, r: int):
+        v = H()
+        for d in range(wp.static(dim)):
+            v[d] = F[row + d, k, r]
+        return v
+
+    @wp.func
+    def own(F: wp.array3d(dtype=linear), row: int, k: int, r: int, which: int):
+        """Row of the factor as seen by the first (0), second (1) or third (2) node of the vertex."""
+        v = H()
+        if which == 0:
+            v = -part(F, row, k, r)
+        if which == 1:
+            v = part(F, row, k, r) - part(F, row + wp.static(dim), k, r)
+        if which == 2:
+            v = part(F, row + wp.static(dim), k, r)
+        if wp.static(twist):
+            if which < 2:
+                v[wp.static(nb - 1)] = F[row + wp.static(2 * dim) + which, k, r]
+        return v
+
+    @wp.func
+    def edge_block(F: wp.array3d(dtype=linear), k: int, r: int):
+        m = M()
+        for i in range(wp.static(edge_rows)):
+            t = part(F, wp.static(edge_row) + i * wp.static(dim), k, r)
+            m += wp.outer(t, t)
+        for i in range(wp.static(tensions)):
+            for d in range(wp.static(dim)):
+                m[d, d] = m[d, d] + F[wp.static(tension_row) + i, k, r]
+        return m
+
+    @wp.func
+    def free_of(fixed: wp.array2d(dtype=wp.uint8), k: int, r: int):
+        free = H()
+        for d in range(wp.static(nb)):
+            free[d] = linear(1 - ((int(fixed[k, r]) >> d) & 1))
+        return free
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+    def assemble(
+        F: wp.array3d(dtype=linear),
+        g: wp.array3d(dtype=real),
+        energy: wp.array3d(dtype=real),
+        count: wp.array(dtype=int),
+        mass: wp.array2d(dtype=real),
+        rotary: wp.array2d(dtype=real),
+        coefficient: wp.array(dtype=real),
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        target: wp.array2d(dtype=V),
+        target_angle: wp.array2d(dtype=real),
+        gravity: wp.array(dtype=V),
+        load: wp.array2d(dtype=V),
+        load_angle: wp.array2d(dtype=real),
+        loaded: int,
+        fixed: wp.array2d(dtype=wp.uint8),
+        direction: wp.array3d(dtype=linear),
+        base: wp.array2d(dtype=V),
+        status: wp.array(dtype=int),
+        unbalanced: wp.array(dtype=int),
+        slot: wp.array(dtype=int),
+        iteration: wp.array(dtype=int),
+        step_length: wp.array(dtype=real),
+        blocks_out: wp.array3d(dtype=linear),
+        residual_out: wp.array3d(dtype=linear),
+        change_out: wp.array2d(dtype=real),
+        noise_out: wp.array2d(dtype=real),
+    ):
+        k, r = wp.tid()
+        n = count[r]
+        if status[r] != 0 or unbalanced[r] == 0 or k >= n:
+            return
+        c = coefficient[r]
+        D = M()
+        E = M()
+        G = M()
+        b = behind(k, n)
+        if wp.static(span == 2):
+            bb = int(-1)
+            if b >= 0:
+                bb = behind(b, n)
+            for m in range(wp.static(vertex_rows)):
+                row = m * wp.static(window)
+                if wp.static(closed) or k < n - 2:
+                    A = own(F, row, k, r, 0)
+                    D += wp.outer(A, A)
+                    E += wp.outer(A, own(F, row, k, r, 1))
+                    G += wp.outer(A, own(F, row, k, r, 2))
+                if b >= 0 and (wp.static(closed) or k < n - 1):
+                    B = own(F, row, b, r, 1)
+                    D += wp.outer(B, B)
+                    E += wp.outer(B, own(F, row, b, r, 2))
+                if bb >= 0:
+                    C = own(F, row, bb, r, 2)
+                    D += wp.outer(C, C)
+        if wp.static(closed) or k < n - 1:
+            S = edge_block(F, k, r)
+            D += S
+            E -= S
+        if b >= 0:
+            D += edge_block(F, b, r)
+        f, moment, size, _elastic = balance(
+            g, mass, rotary, c, x, theta, target, target_angle, gravity, load, load_angle, loaded, k, n, r
+        )
+        m_k = mass[k, r]
+        rhs = H()
+        for d in range(wp.static(dim)):
+            rhs[d] = linear(f[d])
+            D[d, d] = D[d, d] + linear(c * m_k)
+        if wp.static(twist):
+            rhs[wp.static(nb - 1)] = linear(moment)
+            D[wp.static(nb - 1), wp.static(nb - 1)] = D[wp.static(nb - 1), wp.static(nb - 1)] + linear(c * rotary[k, r])
+        free = free_of(fixed, k, r)
+        D = wp.cw_mul(D, wp.outer(free, free)) + wp.diag(H(linear(1.0)) - free)
+        store(blocks_out, 0, k, r, D)
+        store(blocks_out, wp.static(nb2), k, r, wp.cw_mul(E, wp.outer(free, free_of(fixed, along(k + 1, n), r))))
+        if wp.static(span == 2):
+            ahead = along(k + 2, n)
+            if wp.static(closed) or k < n - 2:
+                G = wp.cw_mul(G, wp.outer(free, free_of(fixed, ahead, r)))
+            store(blocks_out, wp.static(2 * nb2), k, r, G)
+        put(residual_out, 0, k, r, wp.cw_mul(rhs, free))
+
+        # change of the energy since the accepted iterate: elements, then inertia and loads along the last step
+        change = real(0.0)
+        noise = size * wp.max(wp.abs(x[k, r]))
+        if wp.static(closed) or k < n - 1:
+            e_new = energy[1 - slot[r], k, r]
+            noise += wp.abs(e_new)
+            change = e_new - energy[slot[r], k, r]
+        if iteration[r] > 0:
+            work = real(0.0)
+            taken = step_length[r]
+            away = x[k, r] - target[k, r]
+            outer = gravity[0] * m_k
+            if loaded != 0:
+                outer += load[k, r]
+            u = x[k, r] - base[k, r]
+            work += wp.dot(u, (away - u * real(0.5)) * (c * m_k) - outer)
+            if wp.static(twist):
+                du = taken * real(direction[wp.static(nb - 1), k, r])
+                away_angle = theta[k, r] - target_angle[k, r]
+                work += du * c * rotary[k, r] * (away_angle - real(0.5) * du)
+                if loaded != 0:
+                    work -= du * load_angle[k, r]
+            change += work
+            noise += wp.abs(work)
+        change_out[k, r] = change
+        noise_out[k, r] = noise
+
+    return assemble
+
+
+@cache
+def product_function(kind: ChainKind, linear):
+    """times(blocks, v, k, n, r): row k of H v."""
+    nb2, span, closed = kind.block**2, kind.span, kind.closed
+    load, _, vector, _ = block_functions(kind, linear)
+    _, behind, _ = node_functions(kind, wp.float64)
+    along, *_ = gather_functions(kind, wp.float64)
+
+    @wp.func
+    def times(blocks: wp.array3d(dtype=linear), v: wp.array3d(dtype=linear), k: int, n: int, r: int):
+        y = load(blocks, 0, k, r) * vector(v, 0, k, r)
+        if wp.static(closed) or k < n - 1:
+            y += load(blocks, wp.static(nb2), k, r) * vector(v, 0, along(k + 1, n), r)
+        b = behind(k, n)
+        if b >= 0:
+            y += vector(v, 0, b, r) * load(blocks, wp.static(nb2), b, r)
+        if wp.static(span == 2):
+            if wp.static(closed) or k < n - 2:
+                y += load(blocks, wp.static(2 * nb2), k, r) * vector(v, 0, along(k + 2, n), r)
+            if b >= 0:
+                bb = behind(b, n)
+                if bb >= 0:
+                    y += vector(v, 0, bb, r) * load(blocks, wp.static(2 * nb2), bb, r)
+        return y
+
+    return times
+
+
+@cache
+def factor_kernel(kind: ChainKind, linear):
+    """Block LDL^T of the open chain's part of H: per node U = D^-1 E, D^-1 F, L and inverse pivots (3 nb^2 + nb rows)."""
+    nb, nb2, span = kind.block, kind.block**2, kind.span
+    M = wp.types.matrix((nb, nb), linear)
+    load, store, _, put = block_functions(kind, linear)
+    factor, lower, upper, _, _, congruence = pivot.functions(nb, linear)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+    def factorise(
+        blocks: wp.array3d(dtype=linear),
+        count: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        factor_out: wp.array3d(dtype=linear),
+        lost: wp.array(dtype=int),
+    ):
+        r = wp.tid()
+        if wanted[r] == 0:
+            return
+        n = count[r]
+        minus = M()  # what the nodes before take from the block of this node, of its coupling, and of the next node
+        minus_couple = M()
+        minus_next = M()
+        for j in range(n):
+            A = load(blocks, 0, j, r) - minus
+            L, inverse, bad = factor(A)
+            lost[r] = lost[r] + bad
+            B = M()
+            if j < n - 1:
+                B = load(blocks, wp.static(nb2), j, r) - minus_couple
+            Zb = lower(L, B)
+            store(factor_out, 0, j, r, upper(L, inverse, Zb))
+            minus = minus_next + congruence(Zb, inverse, Zb)
+            if wp.static(span == 2):
+                C = M()
+                if j < n - 2:
+                    C = load(blocks, wp.static(2 * nb2), j, r)
+                Zc = lower(L, C)
+                store(factor_out, wp.static(nb2), j, r, upper(L, inverse, Zc))
+                minus_couple = congruence(Zb, inverse, Zc)
+                minus_next = congruence(Zc, inverse, Zc)
+            store(factor_out, wp.static(2 * nb2), j, r, L)
+            put(factor_out, wp.static(3 * nb2), j, r, inverse)
+
+    return factorise
+
+
+@cache
+def substitute_function(kind: ChainKind, linear):
+    """substitute(factor, v, out, n, r): out = (L D L^T)^-1 v along one rod; returns v . out."""
+    nb, nb2, span = kind.block, kind.block**2, kind.span
+    H = wp.types.vector(nb, linear)
+    load, _, vector, put = block_functions(kind, linear)
+    _, _, _, lower_vector, upper_vector, _ = pivot.functions(nb, linear)
+
+    @wp.func
+    def substitute(
+        factor: wp.array3d(dtype=linear), v: wp.array3d(dtype=linear), out: wp.array3d(dtype=linear), n: int, r: int
+    ):
+        before = H()
+        before2 = H()
+        for j in range(n):
+            # z = D^-1 (v - E^T z_before - ...): with U = D^-1 E stored, E^T D^-1 w = U^T w
+            w = vector(v, 0, j, r) - before
+            put(out, 0, j, r, w)
+            before = before2 + w * load(factor, 0, j, r)
+            if wp.static(span == 2):
+                before2 = w * load(factor, wp.static(nb2), j, r)
+        e1 = H()
+        e2 = H()
+        total = linear(0.0)
+        for i in range(n):
+            j = n - 1 - i
+            L = load(factor, wp.static(2 * nb2), j, r)
+            inverse = vector(factor, wp.static(3 * nb2), j, r)
+            u = upper_vector(L, inverse, lower_vector(L, vector(out, 0, j, r)))
+            u -= load(factor, 0, j, r) * e1
+            if wp.static(span == 2):
+                u -= load(factor, wp.static(nb2), j, r) * e2
+            total += wp.dot(vector(v, 0, j, r), u)
+            put(out, 0, j, r, u)
+            e2 = e1
+            e1 = u
+        return total
+
+    return substitute

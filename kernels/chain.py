@@ -1,0 +1,660 @@
+"""The chain sweep: one thread a rod takes a Newton iteration from element factors and forces to new dofs.
+
+The Gauss-Newton matrix of an open rod is block-pentadiagonal (block: position of a node and angle of the edge that starts
+there): H = sum F^T F + c I (edges) + inertia. The sweep forms its blocks in registers, adds inertia and loads, eliminates node by
+node, and at the end of the rod knows the change of the energy and the Newton decrement r^T H^-1 r. It then either rejects the
+iterate and shortens the step, or substitutes back and takes the next step. No physics here: strains are rows.
+
+Line search (Armijo, c = 1e-4) on the energy, summed as differences element by element. Where the expected decrease drowns in
+rounding, the decrement decides instead (natural monotonicity test; Deuflhard, Newton Methods for Nonlinear Problems, 2004).
+
+`check`, one thread a node, runs before it and decides where a rod has converged, so that the last iterate costs no sweep: at
+every free dof |residual| <= max(rtol * load scale, floor), where floor bounds what rounding of coordinates and forces leaves,
+floor_factor * eps * (H_ii |x| + sum of |element forces|). Moments are compared over the length of the rod.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels import frames, outcome, pivot
+from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions
+
+TURNED = 0.02  # largest turn of an edge in a step that is still taken straight [rad]; its stretch is TURNED^2 / 2
+
+
+@cache
+def node_functions(kind: ChainKind, real):
+    """Gathers for one node: force(g, row, k, r), and balance(...) -> residual and what it is judged by.
+
+    balance returns the residual force and moment, the size of the element forces that meet, and the elastic part of the moment.
+    """
+    dim, twist, span, window, closed = kind.dim, kind.twist, kind.span, kind.window, kind.closed
+    V = wp.types.vector(dim, real)
+
+    @wp.func
+    def force(g: wp.array3d(dtype=real), row: int, k: int, r: int):
+        v = V()
+        for d in range(wp.static(dim)):
+            v[d] = g[row + d, k, r]
+        return v
+
+    @wp.func
+    def behind(k: int, n: int):
+        """The element or edge before k, of a closed rod the last before the first; -1 where there is none."""
+        if wp.static(closed):
+            if k == 0:
+                return n - 1
+        return k - 1
+
+    @wp.func
+    def edge_force(g: wp.array3d(dtype=real), k: int, n: int, r: int):
+        """dE/de of edge k."""
+        total = force(g, 0, k, r)
+        if wp.static(span == 2):
+            b = behind(k, n)
+            if b >= 0:
+                total += force(g, wp.static(dim), b, r)
+        return total
+
+    @wp.func
+    def balance(
+        g: wp.array3d(dtype=real),
+        mass: wp.array2d(dtype=real),
+        rotary: wp.array2d(dtype=real),
+        c: real,
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        target: wp.array2d(dtype=V),
+        target_angle: wp.array2d(dtype=real),
+        gravity: wp.array(dtype=V),
+        load: wp.array2d(dtype=V),
+        load_angle: wp.array2d(dtype=real),
+        loaded: int,
+        k: int,
+        n: int,
+        r: int,
+    ):
+        m = mass[k, r]
+        f = gravity[0] * m - (x[k, r] - target[k, r]) * (c * m)
+        moment = real(0.0)
+        if loaded != 0:
+            f += load[k, r]
+            if wp.static(twist):
+                moment = load_angle[k, r]
+        size = real(0.0)
+        b = behind(k, n)
+        if wp.static(closed) or k < n - 1:
+            total = edge_force(g, k, n, r)
+            f += total
+            size = wp.max(wp.abs(total))
+        if b >= 0:
+            total = edge_force(g, b, n, r)
+            f -= total
+            size += wp.max(wp.abs(total))
+        elastic = real(0.0)
+        if wp.static(twist):
+            if wp.static(closed) or k < n - 2:
+                elastic = g[wp.static(window - 2), k, r]
+            if b >= 0 and (wp.static(closed) or k < n - 1):
+                elastic += g[wp.static(window - 1), b, r]
+            moment -= elastic + c * rotary[k, r] * (theta[k, r] - target_angle[k, r])
+        return f, moment, size, elastic
+
+    return force, behind, balance
+
+
+@cache
+def check_kernel(kind: ChainKind, real, linear):
+    """Raises `unbalanced` for a rod with a dof out of equilibrium, `drowned` where only rounding excuses a residual."""
+    dim, twist, closed = kind.dim, kind.twist, kind.closed
+    V = wp.types.vector(dim, real)
+    _, behind, balance = node_functions(kind, real)
+    along, *_ = gather_functions(kind, real)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+    def check(
+        g: wp.array3d(dtype=real),
+        stiffness: wp.array2d(dtype=linear),
+        count: wp.array(dtype=int),
+        mass: wp.array2d(dtype=real),
+        rotary: wp.array2d(dtype=real),
+        coefficient: wp.array(dtype=real),
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        target: wp.array2d(dtype=V),
+        target_angle: wp.array2d(dtype=real),
+        gravity: wp.array(dtype=V),
+        load: wp.array2d(dtype=V),
+        load_angle: wp.array2d(dtype=real),
+        loaded: int,
+        fixed: wp.array2d(dtype=wp.uint8),
+        length: wp.array(dtype=real),
+        rtol: real,
+        floor: real,
+        load_scale: wp.array(dtype=real),
+        status: wp.array(dtype=int),
+        unbalanced_out: wp.array(dtype=int),
+        drowned_out: wp.array(dtype=int),
+    ):
+        k, r = wp.tid()
+        n = count[r]
+        if status[r] != 0 or k >= n:
+            return
+        c = coefficient[r]
+        f, moment, size, elastic = balance(
+            g, mass, rotary, c, x, theta, target, target_angle, gravity, load, load_angle, loaded, k, n, r
+        )
+        stiff = real(0.0)
+        b = behind(k, n)
+        if wp.static(closed) or k < n - 1:
+            stiff = real(stiffness[k, r])
+        if b >= 0:
+            stiff = wp.max(stiff, real(stiffness[b, r]))
+        here = x[k, r]
+        reach = wp.max(wp.abs(here))
+        limit = rtol * load_scale[r]
+        least = floor * ((real(2.0) * stiff + c * mass[k, r]) * reach + size)
+        mask = int(fixed[k, r])
+        for d in range(wp.static(dim)):
+            if ((mask >> d) & 1) == 0 and not wp.abs(f[d]) <= limit:
+                drowned_out[r] = 1
+                if not wp.abs(f[d]) <= least:
+                    unbalanced_out[r] = 1
+        if wp.static(twist):
+            if ((mask >> wp.static(dim)) & 1) == 0 and not wp.abs(moment) <= limit * length[r]:
+                drowned_out[r] = 1
+                arm = wp.length(x[along(k + 1, n), r] - here)
+                least = floor * (
+                    real(2.0) * stiff * arm * arm * reach / length[r]
+                    + c * rotary[k, r] * (real(1.0) + wp.abs(theta[k, r]))
+                    + wp.abs(elastic)
+                )
+                if not wp.abs(moment) <= least:
+                    unbalanced_out[r] = 1
+
+    return check
+
+
+@cache
+def search_functions(kind: ChainKind, real, linear):
+    """What every solver's line search does to a rod: place(...), turn_angles(...), relag(...), shorter(...)."""
+    dim, twist, angle, every = kind.dim, kind.twist, kind.block - 1, (1 << kind.dim) - 1
+    V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
+    transport, reference_twist, _ = frames.functions(real)
+    along, *_ = gather_functions(kind, real)
+    closed = kind.closed
+
+    @wp.func
+    def step_of(direction: wp.array3d(dtype=linear), j: int, r: int):
+        v = V()
+        for d in range(wp.static(dim)):
+            v[d] = real(direction[d, j, r])
+        return v
+
+    @wp.func
+    def excess(base: wp.array2d(dtype=V), direction: wp.array3d(dtype=linear), amount: real, j: int, n: int, r: int):
+        """Edge j turned and lengthened by its step, less the same edge with its step added."""
+        ahead = along(j + 1, n)
+        e = base[ahead, r] - base[j, r]
+        de = (step_of(direction, ahead, r) - step_of(direction, j, r)) * amount
+        length = wp.length(e)
+        t = e / length
+        stretch = wp.dot(t, de)
+        across = (de - t * stretch) / length
+        angle = wp.length(across)
+        sinc = real(1.0)
+        if angle > real(0.0):
+            sinc = wp.sin(angle) / angle
+        return (t * wp.cos(angle) + across * sinc) * wp.max(length + stretch, real(0.1) * length) - e - de
+
+    @wp.func
+    def put(
+        x: wp.array2d(dtype=V),
+        base: wp.array2d(dtype=V),
+        direction: wp.array3d(dtype=linear),
+        fixed: wp.array2d(dtype=wp.uint8),
+        amount: real,
+        shift: V,
+        j: int,
+        r: int,
+    ):
+        moved = base[j, r] + step_of(direction, j, r) * amount
+        for d in range(wp.static(dim)):
+            if ((int(fixed[j, r]) >> d) & 1) == 0:
+                moved[d] = moved[d] + shift[d]
+        x[j, r] = moved
+
+    @wp.func
+    def place(
+        x: wp.array2d(dtype=V),
+        base: wp.array2d(dtype=V),
+        direction: wp.array3d(dtype=linear),
+        fixed: wp.array2d(dtype=wp.uint8),
+        amount: real,
+        n: int,
+        r: int,
+    ):
+        """x = base moved along the direction, with edges turned instead of sheared.
+
+        A straight step stretches an edge that it turns, to second order, which in a nearly inextensible rod limits steps to
+        small turns. Turned edges are summed from held nodes; what misses between two of them is spread over the edges between.
+        """
+        first = int(0)
+        while first < n and (int(fixed[first, r]) & wp.static(every)) != wp.static(every):
+            first += 1
+        free = first == n
+        if free:
+            first = 0
+        put(x, base, direction, fixed, amount, V(), first, r)
+        nodes = n - first
+        if wp.static(closed):
+            nodes = n + 1
+        i = int(0)
+        while i < nodes - 1:
+            # the next held node, or the end
+            stop = i + 1
+            miss = excess(base, direction, amount, along(first + i, n), n, r)
+            while stop < nodes - 1 and (int(fixed[along(first + stop, n), r]) & wp.static(every)) != wp.static(every):
+                miss += excess(base, direction, amount, along(first + stop, n), n, r)
+                stop += 1
+            held = wp.static(closed) and stop == nodes - 1
+            if (int(fixed[along(first + stop, n), r]) & wp.static(every)) == wp.static(every):
+                held = True
+            slope = V()
+            if held:
+                slope = miss / real(stop - i)
+            shift = V()
+            for j in range(i + 1, stop + 1):
+                shift += excess(base, direction, amount, along(first + j - 1, n), n, r) - slope
+                if not (wp.static(closed) and j == nodes - 1):
+                    put(x, base, direction, fixed, amount, shift, along(first + j, n), r)
+            i = stop
+        back = V()
+        if not wp.static(closed):
+            for i in range(first):
+                j = first - 1 - i
+                back -= excess(base, direction, amount, j, n, r)
+                put(x, base, direction, fixed, amount, back, j, r)
+        if free:
+            # nothing holds the rod: leave the mean of its nodes where the straight step takes it
+            mean = V()
+            for j in range(n):
+                mean += x[j, r] - base[j, r] - step_of(direction, j, r) * amount
+            mean /= real(n)
+            for j in range(n):
+                x[j, r] = x[j, r] - mean
+
+    @wp.func
+    def turn_angles(theta: wp.array2d(dtype=real), direction: wp.array3d(dtype=linear), amount: real, n: int, r: int):
+        if wp.static(twist):
+            for j in range(n):
+                theta[j, r] = theta[j, r] + amount * real(direction[wp.static(angle), j, r])
+
+    @wp.func
+    def relag(x: wp.array2d(dtype=V), frame: wp.array3d(dtype=real), n: int, r: int):
+        """Take the frames of the accepted iterate as lagged ones; strains are as before, the transport regular again."""
+        u0 = X()
+        t0 = X()
+        u_first = X()
+        t_first = X()
+        for j in range(n - wp.static(0 if closed else 1)):
+            t = wp.normalize(x[along(j + 1, n), r] - x[j, r])
+            u = transport(
+                X(frame[0, j, r], frame[1, j, r], frame[2, j, r]), X(frame[3, j, r], frame[4, j, r], frame[5, j, r]), t
+            )
+            if j > 0:
+                frame[6, j - 1, r] = reference_twist(u0, u, t0, t, frame[6, j - 1, r])
+            for c in range(3):
+                frame[c, j, r] = u[c]
+                frame[3 + c, j, r] = t[c]
+            u_first = u
+            t_first = t
+            u0 = u
+            t0 = t
+        if wp.static(closed):
+            frame[6, n - 1, r] = reference_twist(u0, u_first, t0, t_first, frame[6, n - 1, r])
+
+    @wp.func
+    def shorter(taken: real, expected: real, change: real, finite: bool):
+        """Length after a rejected step: minimum of the parabola through energy, slope and new energy, within bounds."""
+        if not finite:
+            return real(0.1) * taken
+        bowl = change + expected
+        if bowl > real(0.0):
+            return taken * wp.clamp(real(0.5) * expected / bowl, real(0.1), real(0.5))
+        return real(0.5) * taken
+
+    return place, turn_angles, relag, shorter
+
+
+@cache
+def sweep_kernel(kind: ChainKind, real, linear):
+    """The sweep for one kind of chain; see the module's text."""
+    dim, nb, twist, span = kind.dim, kind.block, kind.twist, kind.span
+    window, nb2 = kind.window, kind.block**2
+    V, H, M = wp.types.vector(dim, real), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
+    factor_block, lower, upper, lower_vector, upper_vector, congruence = pivot.functions(nb, linear)
+    place, turn_angles, relag, shorter = search_functions(kind, real, linear)
+    force, *_ = node_functions(kind, real)
+    angle = nb - 1
+    vertex_rows, edge_rows, tensions = kind.vertex_strains, kind.edge_strains, kind.tensions
+
+    @wp.func
+    def part(F: wp.array3d(dtype=linear), row: int, k: int, r: int):
+        v = H()
+        for d in range(wp.static(dim)):
+            v[d] = F[row + d, k, r]
+        return v
+
+    @wp.func
+    def with_angle(F: wp.array3d(dtype=linear), row: int, k: int, r: int, v: H):
+        u = v
+        if wp.static(twist):
+            u[wp.static(angle)] = F[row, k, r]
+        return u
+
+    @wp.func
+    def positions(c: linear):
+        u = M()
+        for d in range(wp.static(dim)):
+            u[d, d] = c
+        return u
+
+    @wp.func
+    def store(Y: wp.array3d(dtype=linear), row: int, k: int, r: int, m: M):
+        for i in range(wp.static(nb)):
+            for j in range(wp.static(nb)):
+                Y[row + i * wp.static(nb) + j, k, r] = m[i, j]
+
+    @wp.func
+    def times(Y: wp.array3d(dtype=linear), row: int, k: int, r: int, e: H):
+        v = H()
+        for i in range(wp.static(nb)):
+            for j in range(wp.static(nb)):
+                v[i] = v[i] + Y[row + i * wp.static(nb) + j, k, r] * e[j]
+        return v
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+    def sweep(
+        # element path
+        F: wp.array3d(dtype=linear),
+        g: wp.array3d(dtype=real),
+        energy: wp.array3d(dtype=real),
+        count: wp.array(dtype=int),
+        # inertia and loads
+        mass: wp.array2d(dtype=real),
+        rotary: wp.array2d(dtype=real),
+        coefficient: wp.array(dtype=real),
+        target: wp.array2d(dtype=V),
+        target_angle: wp.array2d(dtype=real),
+        gravity: wp.array(dtype=V),
+        load: wp.array2d(dtype=V),
+        load_angle: wp.array2d(dtype=real),
+        loaded: int,
+        fixed: wp.array2d(dtype=wp.uint8),
+        length: wp.array(dtype=real),
+        # options
+        floor: real,
+        rotation_cap: real,
+        max_iterations: int,
+        max_halvings: int,
+        # iterate
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        frame: wp.array3d(dtype=real),
+        base: wp.array2d(dtype=V),
+        Y: wp.array3d(dtype=linear),
+        direction: wp.array3d(dtype=linear),
+        # state of the search
+        status: wp.array(dtype=int),
+        slot: wp.array(dtype=int),
+        iteration: wp.array(dtype=int),
+        halvings: wp.array(dtype=int),
+        step_length: wp.array(dtype=real),
+        decrement: wp.array(dtype=real),
+        load_scale: wp.array(dtype=real),
+        residual: wp.array(dtype=real),
+        lost: wp.array(dtype=int),
+        turned: wp.array(dtype=int),
+        unbalanced: wp.array(dtype=int),
+        drowned: wp.array(dtype=int),
+        active: wp.array(dtype=int),
+    ):
+        r = wp.tid()
+        if status[r] != 0:
+            return
+        if unbalanced[r] == 0:
+            status[r] = wp.where(
+                drowned[r] == 0, int(wp.static(outcome.CONVERGED)), int(wp.static(outcome.CONVERGED_TO_ROUNDING))
+            )
+            return
+        unbalanced[r] = 0
+        drowned[r] = 0
+        n = count[r]
+        first = iteration[r] == 0
+        taken = step_length[r]
+        c = coefficient[r]
+        over_length = real(1.0) / length[r]
+        accepted_slot = slot[r]
+        Waa = M()
+        Wab = M()
+        Wac = M()
+        Wbb = M()
+        Wbc = M()
+        Wcc = M()
+        ra = H()
+        rb = H()
+        before = V()
+        ahead = V()
+        ahead_angle = real(0.0)
+        worst = real(0.0)  # largest residual
+        change = real(0.0)  # of the energy, from the accepted iterate to this one
+        noise = real(0.0)  # rounding of `change`
+        newton = real(0.0)  # r^T H^-1 r
+        lost_here = int(0)
+        for j in range(n):
+            total = V()
+            ahead_next = V()
+            own_angle = ahead_angle
+            ahead_angle = real(0.0)
+            if j < n - 1:
+                e_new = energy[1 - accepted_slot, j, r]
+                noise += wp.abs(e_new)
+                change += e_new - energy[accepted_slot, j, r]
+                total = force(g, 0, j, r)
+                if wp.static(span == 2):
+                    if j < n - 2:
+                        ahead_next = force(g, wp.static(dim), j, r)
+                        if wp.static(twist):
+                            own_angle += g[wp.static(2 * dim), j, r]
+                            ahead_angle = g[wp.static(2 * dim + 1), j, r]
+                        for m in range(wp.static(vertex_rows)):
+                            row = m * wp.static(window)
+                            a = part(F, row, j, r)
+                            C = part(F, row + wp.static(dim), j, r)
+                            A = with_angle(F, row + wp.static(2 * dim), j, r, -a)
+                            B = with_angle(F, row + wp.static(2 * dim + 1), j, r, a - C)
+                            Waa += wp.outer(A, A)
+                            Wab += wp.outer(A, B)
+                            Wac += wp.outer(A, C)
+                            Wbb += wp.outer(B, B)
+                            Wbc += wp.outer(B, C)
+                            Wcc += wp.outer(C, C)
+                edge_row = wp.static(vertex_rows * window)
+                for m in range(wp.static(edge_rows)):
+                    t = part(F, edge_row + m * wp.static(dim), j, r)
+                    S = wp.outer(t, t)
+                    Waa += S
+                    Wab -= S
+                    Wbb += S
+                for m in range(wp.static(tensions)):
+                    T = positions(F[edge_row + wp.static(edge_rows * dim) + m, j, r])
+                    Waa += T
+                    Wab -= T
+                    Wbb += T
+            total += ahead
+            ahead = ahead_next
+
+            # residual r = -dE/dq, in the precision of the state
+            m_j = mass[j, r]
+            away = x[j, r] - target[j, r]
+            outer_force = gravity[0] * m_j
+            outer_moment = real(0.0)
+            if loaded != 0:
+                outer_force += load[j, r]
+                if wp.static(twist):
+                    outer_moment = load_angle[j, r]
+            f = outer_force + total - before - away * (c * m_j)
+            mask = fixed[j, r]
+            rj = H()
+            for d in range(wp.static(dim)):
+                rj[d] = linear(f[d])
+                Waa[d, d] = Waa[d, d] + linear(c * m_j)
+            moment = real(0.0)
+            away_angle = real(0.0)
+            inertia = real(0.0)
+            if wp.static(twist):
+                inertia = c * rotary[j, r]
+                away_angle = theta[j, r] - target_angle[j, r]
+                moment = outer_moment - own_angle - inertia * away_angle
+                rj[wp.static(angle)] = linear(moment)
+                Waa[wp.static(angle), wp.static(angle)] = Waa[wp.static(angle), wp.static(angle)] + linear(inertia)
+
+            noise += wp.max(wp.abs(total)) * wp.max(wp.abs(x[j, r]))
+            for d in range(wp.static(dim)):
+                if ((int(mask) >> d) & 1) == 0:
+                    worst = wp.max(worst, wp.abs(f[d]))
+            if wp.static(twist):
+                if ((int(mask) >> wp.static(dim)) & 1) == 0:
+                    worst = wp.max(worst, wp.abs(moment) * over_length)
+            before = total
+
+            # change of inertia's and loads' energy along the last step, exact products of small numbers
+            if not first:
+                work = real(0.0)
+                u = x[j, r] - base[j, r]
+                work += wp.dot(u, (away - u * real(0.5)) * (c * m_j) - outer_force)
+                if wp.static(twist):
+                    du = taken * real(direction[wp.static(angle), j, r])
+                    work += du * (inertia * (away_angle - real(0.5) * du) - outer_moment)
+                change += work
+                noise += wp.abs(work)
+
+            if mask != wp.uint8(0):
+                free = H()
+                for d in range(wp.static(nb)):
+                    free[d] = linear(1 - ((int(mask) >> d) & 1))
+                rows = wp.outer(free, H(linear(1.0)))
+                Waa = wp.cw_mul(Waa, wp.outer(free, free)) + wp.diag(H(linear(1.0)) - free)
+                Wab = wp.cw_mul(Wab, rows)
+                Wac = wp.cw_mul(Wac, rows)
+                rj = wp.cw_mul(rj, free)
+                ra = wp.cw_mul(ra, free)
+            # columns of the fixed dofs ahead: Wab^T acts on free dofs only once their own rows are masked,
+            # since a fixed dof's solution is zero
+
+            L, inverse, bad = factor_block(Waa)
+            lost_here += bad
+            z = lower_vector(L, rj + ra)
+            newton += real(wp.dot(wp.cw_mul(z, inverse), z))
+            y = upper_vector(L, inverse, z)
+            for d in range(wp.static(nb)):
+                Y[wp.static(2 * nb2) + d, j, r] = y[d]
+            Zb = lower(L, Wab)
+            store(Y, 0, j, r, upper(L, inverse, Zb))
+            zd = wp.cw_mul(z, inverse)
+            ra = rb - zd * Zb
+            Waa = Wbb - congruence(Zb, inverse, Zb)
+            if wp.static(span == 2):
+                Zc = lower(L, Wac)
+                store(Y, wp.static(nb2), j, r, upper(L, inverse, Zc))
+                rb = -(zd * Zc)
+                Wab = Wbc - congruence(Zb, inverse, Zc)
+                Wbb = Wcc - congruence(Zc, inverse, Zc)
+            else:
+                Wab = M()
+                Wbb = M()
+            Wac = M()
+            Wbc = M()
+            Wcc = M()
+
+        residual[r] = worst
+        if first:
+            if load_scale[r] == real(0.0):
+                load_scale[r] = worst
+            lost[r] = 0
+            change = real(0.0)
+        finite = wp.isfinite(worst) and wp.isfinite(newton) and wp.isfinite(change)
+        accept = first and finite
+        if first and not finite:
+            status[r] = wp.static(outcome.NON_FINITE)
+            return
+        if not first and finite:
+            expected = taken * decrement[r]
+            rounding = floor * noise
+            if expected > real(10.0) * rounding:
+                accept = change <= real(-1.0e-4) * expected + rounding
+            else:
+                accept = newton <= decrement[r]
+        if not accept:
+            halvings[r] = halvings[r] + 1
+            if halvings[r] > max_halvings:
+                status[r] = wp.static(outcome.LINE_SEARCH_FAILED)
+                return
+            less = shorter(taken, taken * decrement[r], change, finite)
+            place(x, base, direction, fixed, less, n, r)
+            turn_angles(theta, direction, less - taken, n, r)
+            step_length[r] = less
+            active[0] = 1
+            return
+
+        iteration[r] = iteration[r] + 1
+        if iteration[r] > max_iterations:
+            status[r] = wp.static(outcome.MAX_ITERATIONS)
+            return
+        active[0] = 1
+        slot[r] = 1 - accepted_slot
+        decrement[r] = newton
+        halvings[r] = 0
+        lost[r] = lost[r] + lost_here
+        if wp.static(twist):
+            if turned[r] != 0:
+                relag(x, frame, n, r)
+                turned[r] = 0
+        e1 = H()
+        e2 = H()
+        rotation = real(0.0)
+        x_ahead = V()
+        for i in range(n):
+            j = n - 1 - i
+            step = -times(Y, 0, j, r, e1)
+            if wp.static(span == 2):
+                step -= times(Y, wp.static(nb2), j, r, e2)
+            for d in range(wp.static(nb)):
+                step[d] = step[d] + Y[wp.static(2 * nb2) + d, j, r]
+                direction[d, j, r] = step[d]
+            here = x[j, r]
+            dx = V()
+            bent = V()
+            for d in range(wp.static(dim)):
+                dx[d] = real(step[d])
+                bent[d] = real(e1[d] - step[d])
+            if i > 0:
+                rotation = wp.max(rotation, wp.length_sq(bent) / wp.length_sq(x_ahead - here))
+            x_ahead = here
+            base[j, r] = here
+            x[j, r] = here + dx
+            if wp.static(twist):
+                theta[j, r] = theta[j, r] + real(step[wp.static(angle)])
+            e2 = e1
+            e1 = step
+        whole = real(1.0)
+        if rotation > rotation_cap * rotation_cap:
+            whole = rotation_cap / wp.sqrt(rotation)
+            turn_angles(theta, direction, whole - real(1.0), n, r)
+        if rotation > real(wp.static(TURNED**2)):
+            place(x, base, direction, fixed, whole, n, r)
+        step_length[r] = whole
+
+    return sweep

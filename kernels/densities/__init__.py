@@ -1,0 +1,26 @@
+"""Densities: the constitutive laws. A density gives the energy per rest measure of n strains, psi(e; p)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Density:
+    """One constitutive law of n strains.
+
+    Attributes:
+        name: field's name of the law.
+        parameters: n -> names of the parameters, in the order of p.
+        lagged: whether p ends with the strains of the last step (n) and the reciprocal of the time step (1).
+        functions: (real, n) -> (energy(e, p), slope(e, p), root(e, p, shift)), where root is the square root of the diagonal
+            of psi'' + diag(shift), made positive semi-definite.
+    """
+
+    name: str
+    parameters: Callable
+    functions: Callable
+    lagged: bool = False
+
+    def parameter_size(self, strains: int) -> int:
+        """Reals in p, those of the last step included."""
+        return len(self.parameters(strains)) + (strains + 1 if self.lagged else 0)

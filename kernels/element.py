@@ -1,0 +1,497 @@
+"""The element path, written once: gather -> strains and Jacobian -> energy | gradient | factor | Hessian -> scatter.
+
+Rods lie in chains: arrays run [component][node][rod], element k of a rod starts at its node k, and edge k runs from node k to
+node k + 1 (modulo the nodes of a closed rod). The *window* of an element is q = [edge k, edge k + 1, theta k, theta k + 1], cut to
+what the chain has. Element forces and factors are derivatives with respect to the window; forces on nodes are differences.
+
+Parameters of all terms lie in one buffer. Row i of `table` is (offset, stride along the rod, stride across rods), so that one
+number, one a rod, one an element or one each are read by the same code.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.terms import Term
+
+# Fused multiply-adds are what a CUDA build uses too. They and inlining halve the CPU's time for a sweep (1.9 to 0.9 of it each).
+CPU_OPTIONS = {
+    "cpu_compiler_flags": "-march=native -ffp-contract=fast"
+    " -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000"
+}
+
+
+@dataclass(frozen=True)
+class ChainKind:
+    """What a group of rods has: decides every array and kernel of the group."""
+
+    dim: int
+    twist: bool
+    closed: bool
+    terms: tuple[Term, ...]
+
+    @property
+    def span(self) -> int:
+        """Edges of the window."""
+        return max(term.measure.span for term in self.terms)
+
+    @property
+    def window(self) -> int:
+        """Dofs of the window."""
+        return self.dim * self.span + (2 if self.twist else 0)
+
+    @property
+    def block(self) -> int:
+        """Dofs of a node: its position and the angle of the edge that starts there."""
+        return self.dim + (1 if self.twist else 0)
+
+    @property
+    def vertex_strains(self) -> int:
+        """Factor rows that span two edges."""
+        return sum(len(term.measure.strains) for term in self.terms if term.measure.span == 2)
+
+    @property
+    def edge_strains(self) -> int:
+        """Factor rows that span one edge."""
+        return sum(len(term.measure.strains) for term in self.terms if term.measure.span == 1)
+
+    @property
+    def tensions(self) -> int:
+        """Scalars c of the geometric stiffness c I of an edge."""
+        return sum(term.measure.has_tension for term in self.terms)
+
+    @property
+    def factor_rows(self) -> int:
+        """Reals of the factor of one element: vertex rows, edge rows, tensions, in this order."""
+        return self.vertex_strains * self.window + self.edge_strains * self.dim + self.tensions
+
+    @property
+    def strain_rows(self) -> int:
+        """Strains of one element, of all terms."""
+        return sum(len(term.measure.strains) for term in self.terms)
+
+    @property
+    def lagged_rows(self) -> int:
+        """Reals of the reference frame of an edge and the reference twist of its vertex."""
+        return 7 if self.twist else 0
+
+    @property
+    def viscous(self) -> bool:
+        """Whether a term reads the strains of the last step."""
+        return any(term.density.lagged for term in self.terms)
+
+    def places(self) -> list[tuple[int, int, int, int]]:
+        """Of each term: first row in the parameter table, in the factor, of its tension, and in the strains."""
+        parameter, strain = 0, 0
+        vertex, edge, tension = 0, self.vertex_strains * self.window, self.factor_rows - self.tensions
+        result = []
+        for term in self.terms:
+            rows = len(term.measure.strains)
+            if term.measure.span == 2:
+                result.append((parameter, vertex, tension, strain))
+                vertex += rows * self.window
+            else:
+                result.append((parameter, edge, tension, strain))
+                edge += rows * self.dim
+            tension += term.measure.has_tension
+            parameter += len(term.parameter_names)
+            strain += rows
+        return result
+
+
+@cache
+def gather_functions(kind: ChainKind, real):
+    """Device functions that read the window, its lagged data and one parameter."""
+    V = wp.types.vector(kind.dim, real)
+    W = wp.types.vector(kind.window, real)
+    S = wp.types.vector(13, real)
+    dim, span, twist, closed = kind.dim, kind.span, kind.twist, kind.closed
+
+    @wp.func
+    def along(k: int, n: int):
+        """Node k of a rod of n nodes; only a closed rod has nodes past its last."""
+        if wp.static(closed):
+            if k >= n:
+                k -= n
+        return k
+
+    @wp.func
+    def window(x: wp.array2d(dtype=V), theta: wp.array2d(dtype=real), k: int, n: int, whole: bool, r: int):
+        """Window of element k; `whole` is False at the last edge of an open rod, which has no edge ahead."""
+        q = W()
+        a = x[k, r]
+        b = x[along(k + 1, n), r]
+        for d in range(wp.static(dim)):
+            q[d] = b[d] - a[d]
+        if wp.static(twist):
+            q[wp.static(dim * span)] = theta[k, r]
+        if wp.static(span == 2):
+            if whole:
+                c = x[along(k + 2, n), r]
+                for d in range(wp.static(dim)):
+                    q[wp.static(dim) + d] = c[d] - b[d]
+                if wp.static(twist):
+                    q[wp.static(dim * span + 1)] = theta[along(k + 1, n), r]
+        return q
+
+    @wp.func
+    def lagged(frame: wp.array3d(dtype=real), k: int, n: int, whole: bool, r: int):
+        """(u, t) of both edges and the reference twist of the vertex between them."""
+        s = S()
+        if wp.static(twist):
+            if whole:
+                ahead = along(k + 1, n)
+                for c in range(6):
+                    s[c] = frame[c, k, r]
+                    s[6 + c] = frame[c, ahead, r]
+                s[12] = frame[6, k, r]
+        return s
+
+    @wp.func
+    def parameter(buffer: wp.array(dtype=real), table: wp.array2d(dtype=int), row: int, k: int, r: int):
+        return buffer[table[row, 0] + k * table[row, 1] + r * table[row, 2]]
+
+    return along, window, lagged, parameter
+
+
+@cache
+def term_functions(kind: ChainKind, index: int, real):
+    """Of term `index` in a chain of this kind: its measure's and density's functions on the window.
+
+    Returns:
+        load(buffer, table, last, rate, k, r) -> (w, p); local(window) -> q; short(s) -> lagged data as the measure takes them;
+        spread(f) -> derivative with respect to the window.
+    """
+    term = kind.terms[index]
+    measure, density = term.measure, term.density
+    n = len(measure.strains)
+    size, at = density.parameter_size(n), kind.places()[index]
+    Q, S, E, _ = measure.types(real)
+    W, S13, P = wp.types.vector(kind.window, real), wp.types.vector(13, real), wp.types.vector(size, real)
+    *_, parameter = gather_functions(kind, real)
+    first, strain_row, static_size = at[0], at[3], len(term.parameter_names) - 1
+    edge_dofs, window_angles, angles, lag_size = (
+        kind.dim * measure.span,
+        kind.dim * kind.span,
+        measure.angles,
+        measure.lag_size,
+    )
+    lagged_density = density.lagged
+
+    @wp.func
+    def load(
+        buffer: wp.array(dtype=real),
+        table: wp.array2d(dtype=int),
+        last: wp.array3d(dtype=real),
+        rate: real,
+        k: int,
+        r: int,
+    ):
+        p = P()
+        for i in range(wp.static(static_size)):
+            p[i] = parameter(buffer, table, wp.static(first + 1) + i, k, r)
+        if wp.static(lagged_density):
+            for i in range(wp.static(n)):
+                p[wp.static(static_size) + i] = last[wp.static(strain_row) + i, k, r]
+            p[wp.static(size - 1)] = rate
+        return parameter(buffer, table, wp.static(first), k, r), p
+
+    @wp.func
+    def local(w: W):
+        q = Q()
+        for i in range(wp.static(edge_dofs)):
+            q[i] = w[i]
+        for i in range(wp.static(angles)):
+            q[wp.static(edge_dofs) + i] = w[wp.static(window_angles) + i]
+        return q
+
+    @wp.func
+    def short(s: S13):
+        if wp.static(lag_size > 0):
+            return s
+        else:
+            return S()
+
+    @wp.func
+    def spread(f: Q):
+        w = W()
+        for i in range(wp.static(edge_dofs)):
+            w[i] = f[i]
+        for i in range(wp.static(angles)):
+            w[wp.static(window_angles) + i] = f[wp.static(edge_dofs) + i]
+        return w
+
+    return load, local, short, spread
+
+
+@cache
+def term_kernels(kind: ChainKind, index: int, real):
+    """Kernels of one term: its energy, its gradient on the window (both with reverse mode), its Hessian on the window."""
+    term = kind.terms[index]
+    V, W = wp.types.vector(kind.dim, real), wp.types.vector(kind.window, real)
+    S13 = wp.types.vector(13, real)
+    P = wp.types.vector(term.density.parameter_size(len(term.measure.strains)), real)
+    strains_of, jacobian_of, _ = term.measure.functions(real)
+    energy_of, slope_of, _ = term.density.functions(real, len(term.measure.strains))
+    _, window, lagged, _ = gather_functions(kind, real)
+    load, local, short, spread = term_functions(kind, index, real)
+    size = kind.window
+    missing = 0 if kind.closed else term.measure.span
+
+    @wp.func
+    def gradient_at(q: W, s: S13, w: real, p: P):
+        e, jacobian = jacobian_of(local(q), short(s), w)
+        return spread((slope_of(e, p) * w) * jacobian)
+
+    @wp.func
+    def along(q: W, s: S13, w: real, p: P, v: W):
+        return wp.dot(gradient_at(q, s, w, p), v)
+
+    @wp.kernel(module="unique", enable_backward=True)
+    def energy(
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        frame: wp.array3d(dtype=real),
+        last: wp.array3d(dtype=real),
+        rate: wp.array(dtype=real),
+        buffer: wp.array(dtype=real),
+        table: wp.array2d(dtype=int),
+        count: wp.array(dtype=int),
+        energy_out: wp.array2d(dtype=real),
+    ):
+        k, r = wp.tid()
+        n = count[r]
+        if k < n - wp.static(missing):
+            whole = wp.static(term.measure.span) == 2
+            w, p = load(buffer, table, last, rate[r], k, r)
+            q = local(window(x, theta, k, n, whole, r))
+            energy_out[k, r] = w * energy_of(strains_of(q, short(lagged(frame, k, n, whole, r)), w), p)
+
+    @wp.kernel(module="unique", enable_backward=True)
+    def gradient(
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        frame: wp.array3d(dtype=real),
+        last: wp.array3d(dtype=real),
+        rate: wp.array(dtype=real),
+        buffer: wp.array(dtype=real),
+        table: wp.array2d(dtype=int),
+        count: wp.array(dtype=int),
+        gradient_out: wp.array3d(dtype=real),
+    ):
+        k, r = wp.tid()
+        n = count[r]
+        if k < n - wp.static(missing):
+            whole = wp.static(term.measure.span) == 2
+            w, p = load(buffer, table, last, rate[r], k, r)
+            f = gradient_at(window(x, theta, k, n, whole, r), lagged(frame, k, n, whole, r), w, p)
+            for i in range(wp.static(size)):
+                gradient_out[i, k, r] = f[i]
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def hessian(
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        frame: wp.array3d(dtype=real),
+        last: wp.array3d(dtype=real),
+        rate: wp.array(dtype=real),
+        buffer: wp.array(dtype=real),
+        table: wp.array2d(dtype=int),
+        count: wp.array(dtype=int),
+        hessian_out: wp.array3d(dtype=real),
+    ):
+        """Exact Hessian on the window, column by column: the reverse of the gradient, seeded with unit vectors. Adds."""
+        k, r, column = wp.tid()
+        n = count[r]
+        if k < n - wp.static(missing):
+            whole = wp.static(term.measure.span) == 2
+            w, p = load(buffer, table, last, rate[r], k, r)
+            v = W()
+            v[column] = real(1.0)
+            dq, _ds, _dw, _dp, _dv = wp.grad(along)(
+                window(x, theta, k, n, whole, r), lagged(frame, k, n, whole, r), w, p, v
+            )
+            for i in range(wp.static(size)):
+                hessian_out[i * wp.static(size) + column, k, r] = (
+                    hessian_out[i * wp.static(size) + column, k, r] + dq[i]
+                )
+
+    return energy, gradient, hessian
+
+
+@cache
+def evaluate_functions(kind: ChainKind, index: int, real, linear):
+    """evaluate_at of one term: writes its factor rows; returns its energy, derivative with respect to the window, stiffness."""
+    term = kind.terms[index]
+    W, S13 = wp.types.vector(kind.window, real), wp.types.vector(13, real)
+    n, size = len(term.measure.strains), term.measure.size
+    _, jacobian_of, tension_of = term.measure.functions(real)
+    energy_of, slope_of, root_of = term.density.functions(real, n)
+    load, local, short, spread = term_functions(kind, index, real)
+    _, row, tension_row, _ = kind.places()[index]
+    E = wp.types.vector(n, real)
+    has_tension, dim = term.measure.has_tension, kind.dim
+
+    @wp.func
+    def evaluate_at(
+        window: W,
+        s: S13,
+        buffer: wp.array(dtype=real),
+        table: wp.array2d(dtype=int),
+        last: wp.array3d(dtype=real),
+        rate: real,
+        factor: wp.array3d(dtype=linear),
+        k: int,
+        r: int,
+    ):
+        w, p = load(buffer, table, last, rate, k, r)
+        q = local(window)
+        e, jacobian = jacobian_of(q, short(s), w)
+        slope = slope_of(e, p)
+        shift = E()
+        if wp.static(has_tension):
+            c, shift = tension_of(q, w, slope)
+            factor[wp.static(tension_row), k, r] = linear(c)
+        root = root_of(e, p, shift) * wp.sqrt(w)
+        stiffness = real(0.0)
+        for m in range(wp.static(n)):
+            edge = real(0.0)
+            for i in range(wp.static(size)):
+                factor[wp.static(row) + m * wp.static(size) + i, k, r] = linear(root[m] * jacobian[m, i])
+            for i in range(wp.static(dim)):
+                edge += jacobian[m, i] * jacobian[m, i]
+            stiffness = wp.max(stiffness, root[m] * root[m] * edge)
+        return w * energy_of(e, p), spread((slope * w) * jacobian), stiffness
+
+    return evaluate_at
+
+
+@cache
+def evaluate_kernel(kind: ChainKind, real, linear):
+    """The fused kernel of a Newton iteration: energy, gradient on the window and Gauss-Newton factor of all terms.
+
+    Energies go to the slot that the line search does not hold (`1 - slot[r]`). `turned` is raised where an edge has turned by
+    more than 90 degrees from its lagged tangent. `stiffness` is the largest a term has against moving its first edge [N/m].
+    Thread (0, 0) clears `active`, which the sweep then raises.
+    """
+    V, W = wp.types.vector(kind.dim, real), wp.types.vector(kind.window, real)
+    _, window, lagged, _ = gather_functions(kind, real)
+    each = tuple(evaluate_functions(kind, i, real, linear) for i in range(len(kind.terms)))
+    spans = tuple(term.measure.span for term in kind.terms)
+    terms, size, twist, closed = len(kind.terms), kind.window, kind.twist, kind.closed
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+    def evaluate(
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        frame: wp.array3d(dtype=real),
+        last: wp.array3d(dtype=real),
+        rate: wp.array(dtype=real),
+        buffer: wp.array(dtype=real),
+        table: wp.array2d(dtype=int),
+        count: wp.array(dtype=int),
+        status: wp.array(dtype=int),
+        slot: wp.array(dtype=int),
+        factor_out: wp.array3d(dtype=linear),
+        gradient_out: wp.array3d(dtype=real),
+        energy_out: wp.array3d(dtype=real),
+        stiffness_out: wp.array2d(dtype=linear),
+        turned_out: wp.array(dtype=int),
+        active_out: wp.array(dtype=int),
+    ):
+        k, r = wp.tid()
+        if k == 0 and r == 0:
+            active_out[0] = 0
+        n = count[r]
+        if status[r] != 0 or k >= n - wp.static(0 if closed else 1):
+            return
+        whole = wp.static(closed) or k < n - 2
+        q = window(x, theta, k, n, whole, r)
+        s = lagged(frame, k, n, whole, r)
+        total = real(0.0)
+        stiffest = real(0.0)
+        f = W()
+        for i in range(wp.static(terms)):
+            if whole or wp.static(spans[i]) == 1:
+                energy, part, stiff = wp.static(each[i])(q, s, buffer, table, last, rate[r], factor_out, k, r)
+                total += energy
+                f += part
+                stiffest = wp.max(stiffest, stiff)
+        energy_out[1 - slot[r], k, r] = total
+        stiffness_out[k, r] = linear(stiffest)
+        for i in range(wp.static(size)):
+            gradient_out[i, k, r] = f[i]
+        if wp.static(twist):
+            if whole and q[0] * s[3] + q[1] * s[4] + q[2] * s[5] < real(0.0):
+                turned_out[r] = 1
+
+    return evaluate
+
+
+@cache
+def strain_kernel(kind: ChainKind, real):
+    """Strains of all terms, and their conjugate stresses (force, moments) if asked for."""
+    V = wp.types.vector(kind.dim, real)
+    _, window, lagged, _ = gather_functions(kind, real)
+    each = tuple(_strain_functions(kind, i, real) for i in range(len(kind.terms)))
+    spans, closed = tuple(term.measure.span for term in kind.terms), kind.closed
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def strains(
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        frame: wp.array3d(dtype=real),
+        last: wp.array3d(dtype=real),
+        rate: wp.array(dtype=real),
+        buffer: wp.array(dtype=real),
+        table: wp.array2d(dtype=int),
+        count: wp.array(dtype=int),
+        strain_out: wp.array3d(dtype=real),
+        stress_out: wp.array3d(dtype=real),
+    ):
+        k, r = wp.tid()
+        n = count[r]
+        if k >= n - wp.static(0 if closed else 1):
+            return
+        whole = wp.static(closed) or k < n - 2
+        q = window(x, theta, k, n, whole, r)
+        s = lagged(frame, k, n, whole, r)
+        for i in range(wp.static(len(spans))):
+            if whole or wp.static(spans[i]) == 1:
+                wp.static(each[i])(q, s, buffer, table, last, rate[r], strain_out, stress_out, k, r)
+
+    return strains
+
+
+@cache
+def _strain_functions(kind: ChainKind, index: int, real):
+    term = kind.terms[index]
+    W, S13 = wp.types.vector(kind.window, real), wp.types.vector(13, real)
+    n = len(term.measure.strains)
+    strains_of, *_ = term.measure.functions(real)
+    _, slope_of, _ = term.density.functions(real, n)
+    load, local, short, _ = term_functions(kind, index, real)
+    row = kind.places()[index][3]
+
+    @wp.func
+    def strains_at(
+        window: W,
+        s: S13,
+        buffer: wp.array(dtype=real),
+        table: wp.array2d(dtype=int),
+        last: wp.array3d(dtype=real),
+        rate: real,
+        strain_out: wp.array3d(dtype=real),
+        stress_out: wp.array3d(dtype=real),
+        k: int,
+        r: int,
+    ):
+        w, p = load(buffer, table, last, rate, k, r)
+        e = strains_of(local(window), short(s), w)
+        stress = slope_of(e, p)
+        for m in range(wp.static(n)):
+            strain_out[wp.static(row) + m, k, r] = e[m]
+            stress_out[wp.static(row) + m, k, r] = stress[m]
+
+    return strains_at

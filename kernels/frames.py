@@ -1,0 +1,33 @@
+"""Parallel transport, reference frames and their twist (Bergou et al. 2008, 2010)."""
+
+from functools import cache
+
+import warp as wp
+
+
+@cache
+def functions(real):
+    """transport(d, t0, t1), reference_twist(u, v, te, tf, lagged), rotate(d, t, angle) of 3-vectors of `real`."""
+    V = wp.types.vector(3, real)
+    turn = wp.constant(real(6.283185307179586476925286766559))
+
+    @wp.func
+    def transport(d: V, t0: V, t1: V):
+        """Rotate d by the smallest rotation that takes the unit vector t0 to t1. Singular where t1 = -t0."""
+        b = wp.cross(t0, t1)
+        c = wp.dot(t0, t1)
+        return d * c + wp.cross(b, d) + b * (wp.dot(b, d) / (real(1.0) + c))
+
+    @wp.func
+    def reference_twist(ue: V, uf: V, te: V, tf: V, lagged: real):
+        """Angle about tf from the transported ue to uf, taken on the branch nearest to its lagged value."""
+        up = transport(ue, te, tf)
+        angle = wp.atan2(wp.dot(wp.cross(up, uf), tf), wp.dot(up, uf))
+        return angle - turn * wp.round((angle - lagged) / turn)
+
+    @wp.func
+    def rotate(d: V, t: V, angle: real):
+        """Rotate d, perpendicular to the unit vector t, by `angle` about t."""
+        return d * wp.cos(angle) + wp.cross(t, d) * wp.sin(angle)
+
+    return transport, reference_twist, rotate

@@ -1,0 +1,18 @@
+"""Outcomes of a Newton solve, as the device writes them into `status`."""
+
+ACTIVE = 0
+CONVERGED = 1
+CONVERGED_TO_ROUNDING = 2
+MAX_ITERATIONS = 3
+LINE_SEARCH_FAILED = 4
+NON_FINITE = 5
+GIVEN_UP = 6  # an earlier step failed for good; the rod rests at its last good state
+
+NAMES = {
+    CONVERGED: "converged",
+    CONVERGED_TO_ROUNDING: "converged_to_rounding",
+    MAX_ITERATIONS: "max_iterations",
+    LINE_SEARCH_FAILED: "line_search_failed",
+    NON_FINITE: "non_finite",
+    GIVEN_UP: "given_up",
+}

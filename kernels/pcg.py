@@ -1,0 +1,331 @@
+"""Preconditioned conjugate gradients on chains: every rod is a problem of its own, with its own scalars on the device.
+
+An iteration is: product and partial p . H p (a thread a node), step length (a thread a rod), update of solution and residual and
+preconditioning (a node; the chain preconditioner: a rod), test and new direction. Residuals are judged in the norm of the
+preconditioner, relative to the first one. Curvature that is not positive beyond rounding ends a solve where it is.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels import outcome, pivot
+from ddg_warp.kernels.block_band import block_functions, product_function, substitute_function
+from ddg_warp.kernels.chain import TURNED, search_functions
+from ddg_warp.kernels.element import ChainKind
+
+PRECONDITIONERS = ("jacobi", "block_jacobi", "chain")
+
+
+@cache
+def judge_kernel(kind: ChainKind, real, linear):
+    """Line search of a rod: stop it where it balances, accept the iterate (and ask for a direction), or shorten the step."""
+    V = wp.types.vector(kind.dim, real)
+    place, turn_angles, relag, shorter = search_functions(kind, real, linear)
+    twist, nb = kind.twist, kind.block
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def judge(
+        residual: wp.array3d(dtype=linear),
+        change: wp.array2d(dtype=real),
+        noise: wp.array2d(dtype=real),
+        count: wp.array(dtype=int),
+        floor: real,
+        max_iterations: int,
+        max_halvings: int,
+        direction: wp.array3d(dtype=linear),
+        fixed: wp.array2d(dtype=wp.uint8),
+        base: wp.array2d(dtype=V),
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        frame: wp.array3d(dtype=real),
+        status: wp.array(dtype=int),
+        unbalanced: wp.array(dtype=int),
+        drowned: wp.array(dtype=int),
+        slot: wp.array(dtype=int),
+        iteration: wp.array(dtype=int),
+        halvings: wp.array(dtype=int),
+        step_length: wp.array(dtype=real),
+        decrement: wp.array(dtype=real),
+        merit: wp.array(dtype=real),
+        load_scale: wp.array(dtype=real),
+        largest: wp.array(dtype=real),
+        turned: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        active: wp.array(dtype=int),
+    ):
+        r = wp.tid()
+        wanted[r] = 0
+        if status[r] != 0:
+            return
+        if unbalanced[r] == 0:
+            status[r] = wp.where(
+                drowned[r] == 0, int(wp.static(outcome.CONVERGED)), int(wp.static(outcome.CONVERGED_TO_ROUNDING))
+            )
+            return
+        unbalanced[r] = 0
+        drowned[r] = 0
+        n = count[r]
+        total = real(0.0)
+        rounding = real(0.0)
+        square = real(0.0)
+        worst = real(0.0)
+        for k in range(n):
+            total += change[k, r]
+            rounding += noise[k, r]
+            for d in range(wp.static(nb)):
+                size = wp.abs(real(residual[d, k, r]))
+                worst = wp.max(worst, size)
+                square += size * size
+        rounding *= floor
+        first = iteration[r] == 0
+        largest[r] = worst
+        if first:
+            total = real(0.0)
+            if load_scale[r] == real(0.0):
+                load_scale[r] = worst
+        finite = wp.isfinite(square) and wp.isfinite(total)
+        if first and not finite:
+            status[r] = wp.static(outcome.NON_FINITE)
+            return
+        taken = step_length[r]
+        expected = taken * decrement[r]
+        accept = first
+        if not first and finite:
+            if expected > real(10.0) * rounding:
+                accept = total <= real(-1.0e-4) * expected + rounding
+            else:
+                accept = square <= real(4.0) * merit[r]
+        if not accept:
+            halvings[r] = halvings[r] + 1
+            if halvings[r] > max_halvings:
+                status[r] = wp.static(outcome.LINE_SEARCH_FAILED)
+                return
+            less = shorter(taken, expected, total, finite)
+            place(x, base, direction, fixed, less, n, r)
+            turn_angles(theta, direction, less - taken, n, r)
+            step_length[r] = less
+            active[0] = 1
+            return
+        iteration[r] = iteration[r] + 1
+        if iteration[r] > max_iterations:
+            status[r] = wp.static(outcome.MAX_ITERATIONS)
+            return
+        merit[r] = square
+        slot[r] = 1 - slot[r]
+        halvings[r] = 0
+        if wp.static(twist):
+            if turned[r] != 0:
+                relag(x, frame, n, r)
+                turned[r] = 0
+        wanted[r] = 1
+        active[0] = 1
+
+    return judge
+
+
+@cache
+def solver_kernels(kind: ChainKind, linear, preconditioner: str):
+    """Kernels start, product, length, update, turn, and finish of one preconditioner; see the module's text."""
+    nb = kind.block
+    H = wp.types.vector(nb, linear)
+    load, _, vector, put = block_functions(kind, linear)
+    times = product_function(kind, linear)
+    substitute = substitute_function(kind, linear)
+    factor, _, _, lower_vector, upper_vector, _ = pivot.functions(nb, linear)
+    eps = wp.constant(linear(1.0e-15 if linear == wp.float64 else 1.0e-7))
+    by_chain = preconditioner == "chain"
+
+    if preconditioner == "jacobi":
+
+        @wp.func
+        def precondition(blocks: wp.array3d(dtype=linear), v: H, k: int, r: int):
+            u = H()
+            for d in range(wp.static(nb)):
+                u[d] = v[d] / blocks[d * wp.static(nb + 1), k, r]
+            return u
+
+    else:
+
+        @wp.func
+        def precondition(blocks: wp.array3d(dtype=linear), v: H, k: int, r: int):
+            L, inverse, _lost = factor(load(blocks, 0, k, r))
+            return upper_vector(L, inverse, lower_vector(L, v))
+
+    @wp.func
+    def apply(
+        blocks: wp.array3d(dtype=linear),
+        factors: wp.array3d(dtype=linear),
+        v: wp.array3d(dtype=linear),
+        z: wp.array3d(dtype=linear),
+        n: int,
+        r: int,
+    ):
+        """z = M^-1 v along one rod; returns v . z."""
+        if wp.static(by_chain):
+            return substitute(factors, v, z, n, r)
+        total = linear(0.0)
+        for k in range(n):
+            here = vector(v, 0, k, r)
+            u = precondition(blocks, here, k, r)
+            put(z, 0, k, r, u)
+            total += wp.dot(here, u)
+        return total
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def start(
+        blocks: wp.array3d(dtype=linear),
+        factors: wp.array3d(dtype=linear),
+        count: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        right: wp.array3d(dtype=linear),
+        residual: wp.array3d(dtype=linear),
+        solution: wp.array3d(dtype=linear),
+        z: wp.array3d(dtype=linear),
+        p: wp.array3d(dtype=linear),
+        rho: wp.array(dtype=linear),
+        rho_first: wp.array(dtype=linear),
+        iterations: wp.array(dtype=int),
+        busy: wp.array(dtype=int),
+    ):
+        """Solution zero, residual the right-hand side, first direction M^-1 r; raises `busy`."""
+        r = wp.tid()
+        if wanted[r] == 0:
+            return
+        n = count[r]
+        total = apply(blocks, factors, right, z, n, r)
+        for k in range(n):
+            put(residual, 0, k, r, vector(right, 0, k, r))
+            put(p, 0, k, r, vector(z, 0, k, r))
+            put(solution, 0, k, r, H())
+        rho[r] = total
+        rho_first[r] = total
+        iterations[r] = 0
+        if total > linear(0.0):
+            busy[0] = 1
+        else:
+            wanted[r] = 2
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def product(
+        blocks: wp.array3d(dtype=linear),
+        p: wp.array3d(dtype=linear),
+        count: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        q_out: wp.array3d(dtype=linear),
+        busy_out: wp.array(dtype=int),
+    ):
+        """q = H p."""
+        k, r = wp.tid()
+        if k == 0 and r == 0:
+            busy_out[0] = 0
+        if wanted[r] == 1 and k < count[r]:
+            put(q_out, 0, k, r, times(blocks, p, k, count[r], r))
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def advance(
+        blocks: wp.array3d(dtype=linear),
+        factors: wp.array3d(dtype=linear),
+        count: wp.array(dtype=int),
+        rtol: linear,
+        limit: int,
+        q: wp.array3d(dtype=linear),
+        residual: wp.array3d(dtype=linear),
+        solution: wp.array3d(dtype=linear),
+        z: wp.array3d(dtype=linear),
+        p: wp.array3d(dtype=linear),
+        rho: wp.array(dtype=linear),
+        rho_first: wp.array(dtype=linear),
+        iterations: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        busy: wp.array(dtype=int),
+    ):
+        """Step length, new residual, preconditioning, test, new direction; `wanted` becomes 2 where a rod is done."""
+        r = wp.tid()
+        if wanted[r] != 1:
+            return
+        n = count[r]
+        curvature = linear(0.0)
+        size = linear(0.0)
+        for k in range(n):
+            pk = vector(p, 0, k, r)
+            qk = vector(q, 0, k, r)
+            curvature += wp.dot(pk, qk)
+            size += wp.length(pk) * wp.length(qk)
+        if not curvature > eps * size:
+            wanted[r] = 2
+            return
+        alpha = rho[r] / curvature
+        for k in range(n):
+            put(solution, 0, k, r, vector(solution, 0, k, r) + alpha * vector(p, 0, k, r))
+            put(residual, 0, k, r, vector(residual, 0, k, r) - alpha * vector(q, 0, k, r))
+        total = apply(blocks, factors, residual, z, n, r)
+        iterations[r] = iterations[r] + 1
+        if not total > rtol * rtol * rho_first[r] or iterations[r] >= limit:
+            wanted[r] = 2
+            return
+        beta = total / rho[r]
+        rho[r] = total
+        for k in range(n):
+            put(p, 0, k, r, vector(z, 0, k, r) + beta * vector(p, 0, k, r))
+        busy[0] = 1
+
+    return start, product, advance
+
+
+@cache
+def take_kernel(kind: ChainKind, real, linear):
+    """Take the direction that was found: cap its rotation, move, and keep its decrement r . d."""
+    dim = kind.dim
+    V = wp.types.vector(dim, real)
+    place, turn_angles, _, _ = search_functions(kind, real, linear)
+    nb = kind.block
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def take(
+        first_residual: wp.array3d(dtype=linear),
+        iterations: wp.array(dtype=int),
+        count: wp.array(dtype=int),
+        rotation_cap: real,
+        direction: wp.array3d(dtype=linear),
+        fixed: wp.array2d(dtype=wp.uint8),
+        base: wp.array2d(dtype=V),
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        wanted: wp.array(dtype=int),
+        step_length: wp.array(dtype=real),
+        decrement: wp.array(dtype=real),
+        work: wp.array(dtype=wp.int64),
+    ):
+        r = wp.tid()
+        if wanted[r] == 0:
+            return
+        n = count[r]
+        rotation = real(0.0)
+        total = real(0.0)
+        for k in range(n):
+            base[k, r] = x[k, r]
+            for d in range(wp.static(nb)):
+                total += real(first_residual[d, k, r]) * real(direction[d, k, r])
+            if k > 0:
+                bent = V()
+                for d in range(wp.static(dim)):
+                    bent[d] = real(direction[d, k, r] - direction[d, k - 1, r])
+                rotation = wp.max(rotation, wp.length_sq(bent) / wp.length_sq(x[k, r] - x[k - 1, r]))
+        whole = real(1.0)
+        if rotation > rotation_cap * rotation_cap:
+            whole = rotation_cap / wp.sqrt(rotation)
+        turn_angles(theta, direction, whole, n, r)
+        if rotation > real(wp.static(TURNED**2)):
+            place(x, base, direction, fixed, whole, n, r)
+        else:
+            for k in range(n):
+                step = V()
+                for d in range(wp.static(dim)):
+                    step[d] = real(direction[d, k, r])
+                x[k, r] = x[k, r] + step
+        step_length[r] = whole
+        decrement[r] = total
+        wp.atomic_add(work, 0, wp.int64(iterations[r]))
+
+    return take

@@ -1,0 +1,490 @@
+"""What surrounds the Newton loop of a time step: predictor, prescribed motion, end update, retry with a smaller step.
+
+Both schemes solve one implicit Euler step of length s (s = h, or h/2 for the implicit midpoint rule):
+
+    m (x - x_n - s v_n) / s^2 + alpha m (x - x_n) / s + dE/dx = 0,
+
+so inertia and mass-proportional damping alpha are one quadratic, coefficient * m |x - target|^2 / 2. The midpoint rule then
+extrapolates, x_n+1 = 2 x - x_n and v_n+1 = 2 (x - x_n) / s - v_n.
+
+A rod whose solve fails first starts again from x_n instead of the predictor, then takes the step in halves (`portion`); rods
+are uncoupled, so each does so for itself. `progress` is the part of the step already taken; both are powers of two, exact.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels import frames, outcome
+from ddg_warp.kernels.chain import TURNED, search_functions
+from ddg_warp.kernels.element import ChainKind, gather_functions
+
+POSE = 21  # reals of a motion over a step: rotation vector of the step, rotation at its start, pivot, both translations
+
+
+@cache
+def begin_kernel(kind: ChainKind, real, midpoint: bool):
+    """Predictor, target of the inertia, copy of the lagged frames; restarts the search of every rod that still has to move."""
+    dim, twist = kind.dim, kind.twist
+    V = wp.types.vector(dim, real)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def begin(
+        x0: wp.array2d(dtype=V),
+        v0: wp.array2d(dtype=V),
+        theta0: wp.array2d(dtype=real),
+        omega0: wp.array2d(dtype=real),
+        frame0: wp.array3d(dtype=real),
+        fixed: wp.array2d(dtype=wp.uint8),
+        count: wp.array(dtype=int),
+        world: wp.array(dtype=int),
+        dt: wp.array(dtype=real),
+        damping: wp.array(dtype=real),
+        outer: wp.array(dtype=real),
+        progress: wp.array(dtype=real),
+        portion: wp.array(dtype=real),
+        cautious: wp.array(dtype=int),
+        x_out: wp.array2d(dtype=V),
+        theta_out: wp.array2d(dtype=real),
+        frame_out: wp.array3d(dtype=real),
+        target_out: wp.array2d(dtype=V),
+        target_angle_out: wp.array2d(dtype=real),
+        coefficient_out: wp.array(dtype=real),
+        rate_out: wp.array(dtype=real),
+        status_out: wp.array(dtype=int),
+        iteration_out: wp.array(dtype=int),
+        halvings_out: wp.array(dtype=int),
+        turned_out: wp.array(dtype=int),
+        unbalanced_out: wp.array(dtype=int),
+        drowned_out: wp.array(dtype=int),
+        load_scale_out: wp.array(dtype=real),
+        bent_out: wp.array(dtype=int),
+        active_out: wp.array(dtype=int),
+    ):
+        k, r = wp.tid()
+        if progress[r] >= real(1.0) or k >= count[r]:
+            return
+        s = dt[world[r]] * portion[r]
+        if wp.static(midpoint):
+            s *= real(0.5)
+        rate = real(1.0) / s
+        coefficient = rate * (rate + damping[0])
+        if k == 0:
+            coefficient_out[r] = coefficient
+            rate_out[r] = rate
+            status_out[r] = 0
+            iteration_out[r] = 0
+            halvings_out[r] = 0
+            turned_out[r] = 0
+            unbalanced_out[r] = 0
+            drowned_out[r] = 0
+            load_scale_out[r] = outer[r]
+            active_out[0] = 1
+        mask = int(fixed[k, r])
+        ahead = wp.where(cautious[r] == 0, s, real(0.0))
+        here = x0[k, r]
+        v = v0[k, r]
+        target_out[k, r] = here + v * (rate / coefficient)
+        for d in range(wp.static(dim)):
+            if ((mask >> d) & 1) == 0:
+                here[d] = here[d] + ahead * v[d]
+        x_out[k, r] = here
+        if cautious[r] == 0 and k + 1 < count[r]:
+            turn = (v0[k + 1, r] - v) * s
+            edge = x0[k + 1, r] - x0[k, r]
+            if wp.length_sq(turn) > real(wp.static(TURNED**2)) * wp.length_sq(edge):
+                bent_out[r] = 1
+        if wp.static(twist):
+            angle = theta0[k, r]
+            spin = omega0[k, r]
+            target_angle_out[k, r] = angle + spin * (rate / coefficient)
+            if ((mask >> wp.static(dim)) & 1) == 0:
+                angle += ahead * spin
+            theta_out[k, r] = angle
+            for c in range(7):
+                frame_out[c, k, r] = frame0[c, k, r]
+
+    return begin
+
+
+@cache
+def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
+    """Redo the predictor of a rod whose edges it turns: along its velocity, with edges turned instead of stretched."""
+    dim = kind.dim
+    V = wp.types.vector(dim, real)
+    place, *_ = search_functions(kind, real, linear)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def predict(
+        x0: wp.array2d(dtype=V),
+        v0: wp.array2d(dtype=V),
+        fixed: wp.array2d(dtype=wp.uint8),
+        count: wp.array(dtype=int),
+        rate: wp.array(dtype=real),
+        progress: wp.array(dtype=real),
+        bent: wp.array(dtype=int),
+        base: wp.array2d(dtype=V),
+        direction: wp.array3d(dtype=linear),
+        x: wp.array2d(dtype=V),
+    ):
+        r = wp.tid()
+        if progress[r] >= real(1.0) or bent[r] == 0:
+            return
+        n = count[r]
+        for k in range(n):
+            base[k, r] = x0[k, r]
+            v = v0[k, r] / rate[r]
+            for d in range(wp.static(dim)):
+                direction[d, k, r] = linear(wp.where(((int(fixed[k, r]) >> d) & 1) == 0, v[d], real(0.0)))
+        place(x, base, direction, fixed, real(1.0), n, r)
+
+    return predict
+
+
+@cache
+def start_kernel(real):
+    """Starts a step: every rod that has not been given up has all of it to do."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def start(
+        status: wp.array(dtype=int),
+        progress_out: wp.array(dtype=real),
+        portion_out: wp.array(dtype=real),
+        cautious_out: wp.array(dtype=int),
+        retries_out: wp.array(dtype=int),
+    ):
+        r = wp.tid()
+        portion_out[r] = real(1.0)
+        cautious_out[r] = 0
+        retries_out[r] = 0
+        progress_out[r] = wp.where(status[r] == wp.static(outcome.GIVEN_UP), real(1.0), real(0.0))
+
+    return start
+
+
+@cache
+def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
+    """Positions, angles and their velocities at the end of the step, of the rods that converged."""
+    V, twist = wp.types.vector(kind.dim, real), kind.twist
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def finish(
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        x0: wp.array2d(dtype=V),
+        v0: wp.array2d(dtype=V),
+        theta0: wp.array2d(dtype=real),
+        omega0: wp.array2d(dtype=real),
+        count: wp.array(dtype=int),
+        status: wp.array(dtype=int),
+        progress: wp.array(dtype=real),
+        rate: wp.array(dtype=real),
+        x_out: wp.array2d(dtype=V),
+        v_out: wp.array2d(dtype=V),
+        theta_out: wp.array2d(dtype=real),
+        omega_out: wp.array2d(dtype=real),
+    ):
+        k, r = wp.tid()
+        if k >= count[r]:
+            return
+        start = x0[k, r]
+        v = v0[k, r]
+        angle0 = real(0.0)
+        spin = real(0.0)
+        if wp.static(twist):
+            angle0 = theta0[k, r]
+            spin = omega0[k, r]
+        end = start
+        angle = angle0
+        if progress[r] < real(1.0) and status[r] <= wp.static(outcome.CONVERGED_TO_ROUNDING):
+            end = x[k, r]
+            change = (end - start) * rate[r]
+            if wp.static(midpoint):
+                end = real(2.0) * end - start
+                v = real(2.0) * change - v
+            else:
+                v = change
+            if wp.static(twist):
+                angle = theta[k, r]
+                turn = (angle - angle0) * rate[r]
+                if wp.static(midpoint):
+                    angle = real(2.0) * angle - angle0
+                    spin = real(2.0) * turn - spin
+                else:
+                    spin = turn
+        x_out[k, r] = end
+        v_out[k, r] = v
+        if wp.static(twist):
+            theta_out[k, r] = angle
+            omega_out[k, r] = spin
+
+    return finish
+
+
+@cache
+def finish_frames_kernel(kind: ChainKind, real):
+    """Reference frames transported to the tangents of the new state, orthonormalised, and the reference twist between them."""
+    V, X = wp.types.vector(kind.dim, real), wp.types.vector(3, real)
+    along, *_ = gather_functions(kind, real)
+    transport, reference_twist, _ = frames.functions(real)
+    closed = kind.closed
+
+    @wp.func
+    def carried(x: wp.array2d(dtype=V), frame: wp.array3d(dtype=real), k: int, n: int, r: int):
+        t = wp.normalize(x[along(k + 1, n), r] - x[along(k, n), r])
+        j = along(k, n)
+        u = transport(
+            X(frame[0, j, r], frame[1, j, r], frame[2, j, r]), X(frame[3, j, r], frame[4, j, r], frame[5, j, r]), t
+        )
+        return wp.normalize(u - t * wp.dot(u, t)), t
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def finish(
+        x: wp.array2d(dtype=V),
+        frame: wp.array3d(dtype=real),
+        count: wp.array(dtype=int),
+        frame_out: wp.array3d(dtype=real),
+    ):
+        k, r = wp.tid()
+        n = count[r]
+        if k >= n - wp.static(0 if closed else 1):
+            return
+        u, t = carried(x, frame, k, n, r)
+        for c in range(3):
+            frame_out[c, k, r] = u[c]
+            frame_out[3 + c, k, r] = t[c]
+        if wp.static(closed) or k < n - 2:
+            u1, t1 = carried(x, frame, k + 1, n, r)
+            frame_out[6, k, r] = reference_twist(u, u1, t, t1, frame[6, k, r])
+
+    return finish
+
+
+@cache
+def advance_kernel(real):
+    """After a (partial) step: count its outcome, go on, retry, or give the rod up.
+
+    `tally` counts outcomes by their code; `work` holds Newton iterations (sum, largest), solves, retries, lost pivots.
+    """
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def advance(
+        iteration: wp.array(dtype=int),
+        lost: wp.array(dtype=int),
+        retry_limit: int,
+        status: wp.array(dtype=int),
+        progress: wp.array(dtype=real),
+        portion: wp.array(dtype=real),
+        cautious: wp.array(dtype=int),
+        retries: wp.array(dtype=int),
+        reason: wp.array(dtype=int),
+        tally: wp.array(dtype=wp.int64),
+        work: wp.array(dtype=wp.int64),
+        remaining: wp.array(dtype=int),
+    ):
+        r = wp.tid()
+        if progress[r] >= real(1.0):
+            return
+        result = status[r]
+        wp.atomic_add(tally, result, wp.int64(1))
+        wp.atomic_add(work, 0, wp.int64(iteration[r]))
+        wp.atomic_max(work, 1, wp.int64(iteration[r]))
+        wp.atomic_add(work, 2, wp.int64(1))
+        if lost[r] > 0:
+            wp.atomic_add(work, 4, wp.int64(lost[r]))
+        if result <= wp.static(outcome.CONVERGED_TO_ROUNDING):
+            progress[r] = progress[r] + portion[r]
+            cautious[r] = 0
+        else:
+            wp.atomic_add(work, 3, wp.int64(1))
+            retries[r] = retries[r] + 1
+            if cautious[r] == 0:
+                cautious[r] = 1
+            else:
+                cautious[r] = 0
+                portion[r] = real(0.5) * portion[r]
+            if retries[r] > retry_limit:
+                reason[r] = result
+                status[r] = wp.static(outcome.GIVEN_UP)
+                progress[r] = real(1.0)
+        if progress[r] < real(1.0):
+            remaining[0] = 1
+
+    return advance
+
+
+@cache
+def motion_kernels(kind: ChainKind, real, midpoint: bool):
+    """Kernels that put prescribed nodes and edge angles where their motion has them at the end of the (partial) step."""
+    dim = kind.dim
+    V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
+    along, *_ = gather_functions(kind, real)
+    transport, *_ = frames.functions(real)
+    turn = wp.constant(real(6.283185307179586476925286766559))
+
+    @wp.func
+    def row(pose: wp.array2d(dtype=real), m: int, at: int):
+        return X(pose[m, at], pose[m, at + 1], pose[m, at + 2])
+
+    @wp.func
+    def turned(pose: wp.array2d(dtype=real), m: int, s: real, v: X):
+        """v of the rest state, rotated to the fraction s of the step (Rodrigues)."""
+        w = X(wp.dot(row(pose, m, 3), v), wp.dot(row(pose, m, 6), v), wp.dot(row(pose, m, 9), v))
+        rotation = row(pose, m, 0) * s
+        angle = wp.length(rotation)
+        if angle > real(0.0):
+            axis = rotation / angle
+            w = (
+                w * wp.cos(angle)
+                + wp.cross(axis, w) * wp.sin(angle)
+                + axis * (wp.dot(axis, w) * (real(1.0) - wp.cos(angle)))
+            )
+        return w
+
+    @wp.func
+    def placed(pose: wp.array2d(dtype=real), m: int, s: real, rest: X):
+        pivot = row(pose, m, 12)
+        shift = row(pose, m, 15) * (real(1.0) - s) + row(pose, m, 18) * s
+        return turned(pose, m, s, rest - pivot) + pivot + shift
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def nodes(
+        where: wp.array2d(dtype=int),
+        rest: wp.array2d(dtype=real),
+        pose: wp.array2d(dtype=real),
+        fixed: wp.array2d(dtype=wp.uint8),
+        progress: wp.array(dtype=real),
+        portion: wp.array(dtype=real),
+        x: wp.array2d(dtype=V),
+    ):
+        """`where` is (node, rod, motion), `rest` the positions in the rest state."""
+        i = wp.tid()
+        k = where[i, 0]
+        r = where[i, 1]
+        m = where[i, 2]
+        if progress[r] >= real(1.0):
+            return
+        at = X(rest[i, 0], rest[i, 1], rest[i, 2])
+        p = placed(pose, m, progress[r] + portion[r], at)
+        if wp.static(midpoint):
+            p = real(0.5) * (p + placed(pose, m, progress[r], at))
+        here = x[k, r]
+        for d in range(wp.static(dim)):
+            if ((int(fixed[k, r]) >> d) & 1) == 1:
+                here[d] = p[d]
+        x[k, r] = here
+
+    @wp.func
+    def angle_at(
+        pose: wp.array2d(dtype=real),
+        m: int,
+        s0: real,
+        s1: real,
+        rest: X,
+        frame: wp.array3d(dtype=real),
+        k: int,
+        r: int,
+        t: X,
+        angle0: real,
+    ):
+        """Angle of the material frame at s1, on the branch that the rotation since s0 leads to from angle0."""
+        u = transport(
+            X(frame[0, k, r], frame[1, k, r], frame[2, k, r]), X(frame[3, k, r], frame[4, k, r], frame[5, k, r]), t
+        )
+        d = turned(pose, m, s1, rest)
+        angle = wp.atan2(wp.dot(wp.cross(u, d), t), wp.dot(u, d))
+        expected = angle0 + wp.dot(row(pose, m, 0), t) * (s1 - s0)
+        return angle - turn * wp.round((angle - expected) / turn)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def angles(
+        where: wp.array2d(dtype=int),
+        rest: wp.array2d(dtype=real),
+        pose: wp.array2d(dtype=real),
+        count: wp.array(dtype=int),
+        progress: wp.array(dtype=real),
+        portion: wp.array(dtype=real),
+        x: wp.array2d(dtype=V),
+        frame: wp.array3d(dtype=real),
+        theta: wp.array2d(dtype=real),
+    ):
+        """`where` is (edge, rod, motion), `rest` the first material director in the rest state."""
+        i = wp.tid()
+        k = where[i, 0]
+        r = where[i, 1]
+        m = where[i, 2]
+        if progress[r] >= real(1.0):
+            return
+        t = wp.normalize(x[along(k + 1, count[r]), r] - x[k, r])
+        director = X(rest[i, 0], rest[i, 1], rest[i, 2])
+        start = progress[r]
+        end = start + portion[r]
+        if wp.static(midpoint):
+            end = start + real(0.5) * portion[r]
+        theta[k, r] = angle_at(pose, m, start, end, director, frame, k, r, t, theta[k, r])
+
+    return nodes, angles
+
+
+@cache
+def load_kernels(kind: ChainKind, real):
+    """Kernels for loads that change: reset nodes to their constant loads, add forces and moments, add couples."""
+    dim, twist = kind.dim, kind.twist
+    V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
+
+    if dim == 2:
+
+        @wp.func
+        def across(couple: X, e: V):
+            return V(couple[1] * e[1], -couple[1] * e[0])
+
+    else:
+
+        @wp.func
+        def across(couple: X, e: V):
+            return wp.cross(couple, e)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add(
+        where: wp.array2d(dtype=int),
+        values: wp.array2d(dtype=real),
+        x: wp.array2d(dtype=V),
+        load_out: wp.array2d(dtype=V),
+        load_angle_out: wp.array2d(dtype=real),
+    ):
+        """`where` is (node or edge, rod); `values` are force (3), moment about the edge, couple (3)."""
+        i = wp.tid()
+        k = where[i, 0]
+        r = where[i, 1]
+        force = V()
+        for d in range(wp.static(dim)):
+            force[d] = values[i, d]
+        wp.atomic_add(load_out, k, r, force)
+        if wp.static(twist):
+            wp.atomic_add(load_angle_out, k, r, values[i, 3])
+        couple = X(values[i, 4], values[i, 5], values[i, 6])
+        if wp.length_sq(couple) > real(0.0):
+            e = x[k + 1, r] - x[k, r]
+            pair = across(couple, e) / wp.length_sq(e)
+            wp.atomic_add(load_out, k + 1, r, pair)
+            wp.atomic_add(load_out, k, r, -pair)
+            if wp.static(twist):
+                wp.atomic_add(load_angle_out, k, r, wp.dot(couple, e) / wp.length(e))
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def reset(
+        where: wp.array2d(dtype=int),
+        values: wp.array2d(dtype=real),
+        load_out: wp.array2d(dtype=V),
+        load_angle_out: wp.array2d(dtype=real),
+    ):
+        """`where` is (node, rod), each once; `values` are its constant force (3) and moment."""
+        i = wp.tid()
+        force = V()
+        for d in range(wp.static(dim)):
+            force[d] = values[i, d]
+        load_out[where[i, 0], where[i, 1]] = force
+        if wp.static(twist):
+            load_angle_out[where[i, 0], where[i, 1]] = values[i, 3]
+
+    return reset, add
