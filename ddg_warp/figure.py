@@ -1,0 +1,156 @@
+"""Pictures with matplotlib: rods at a few times, and errors in a double logarithmic diagram."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
+DPI = 160
+FLAT = 1e-3  # thickness over size below which rods are drawn in their plane
+MARGIN = 0.06  # of the size, around the rods
+GREY = "0.35"
+TIME_COLORS = LinearSegmentedColormap.from_list("time", ["#c9d6e8", "#6f9bd1", "#3b5fa8", "#7a2f79", "#d1495b"])
+MARKERS = "osD^vP"
+
+
+def rods_picture(
+    rods, points_by_time: Mapping[float, np.ndarray] | Iterable[tuple[float, np.ndarray]], path, title: str = ""
+) -> None:
+    """Draws rods at a few times, the latest on top; flat where the rods stay in a coordinate plane.
+
+    Args:
+        rods: A model, its curves, or a `CurveSet`.
+        points_by_time: Time [s] and positions [m], (P, 3) or (worlds, P, 3), of each shape to draw.
+        path: The picture to write; its suffix is the format.
+        title: A line above.
+    """
+    curves = getattr(rods, "curves", rods)
+    frames = sorted(dict(points_by_time).items())
+    if not frames:
+        raise ValueError("there is no shape to draw: give the points of at least one time")
+    times = np.array([time for time, _ in frames])
+    points = np.array([np.reshape(shape, (-1, 3)) for _, shape in frames], dtype=np.float64)
+    worlds = points.shape[1] // int(np.sum(curves.counts))
+    counts, closed = np.tile(curves.counts, worlds), np.tile(curves.closed, worlds)
+    low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
+    flat = np.flatnonzero(high - low <= FLAT * np.max(high - low))
+    axes = [k for k in range(3) if k != (flat[0] if len(flat) else None)]
+    norm = Normalize(times[0], times[-1] if len(times) > 1 else times[0] + 1.0)
+    figure = Figure(figsize=(7.0, 5.2), layout="constrained")
+    plot = _flat_axes(figure, axes, low, high) if len(flat) else _solid_axes(figure, low, high)
+    kind = LineCollection if len(flat) else Line3DCollection
+    for time, shape in zip(times, points, strict=True):
+        latest = time == times[-1]
+        color = TIME_COLORS(norm(time)) if len(times) > 1 else TIME_COLORS(0.5)
+        lines = kind(
+            _polylines(shape[:, axes], counts, closed), colors=[color], linewidths=_line_width(len(counts), latest)
+        )
+        lines.set(capstyle="round", joinstyle="round")
+        plot.add_collection(lines)
+    _explain_times(figure, plot, times, norm)
+    plot.set_title(title, loc="left", fontsize=11)
+    _save(figure, path)
+
+
+def error_plot(path, rows: Iterable[Mapping], x: str, y: str, series: str, title: str = "") -> None:
+    """Draws a table with logarithmic axes, one line for each value of a column.
+
+    Args:
+        path: The picture to write; its suffix is the format.
+        rows: Rows of the table; those in which `x` or `y` is not positive are left out.
+        x: Column along the horizontal axis, and its label.
+        y: Column along the vertical axis, and its label.
+        series: Column that tells the lines apart.
+        title: A line above.
+    """
+    rows = [row for row in rows if (row[x] or 0.0) > 0.0 and (row[y] or 0.0) > 0.0]
+    names = list(dict.fromkeys(row[series] for row in rows))
+    figure = Figure(figsize=(6.0, 4.4), layout="constrained")
+    plot = figure.add_subplot()
+    for k, name in enumerate(names):
+        line = sorted((row[x], row[y]) for row in rows if row[series] == name)
+        color = TIME_COLORS(0.3 + 0.7 * k / max(1, len(names) - 1))
+        marker = MARKERS[k % len(MARKERS)]
+        plot.loglog(*zip(*line, strict=True), marker=marker, markersize=5, linewidth=1.4, color=color, label=str(name))
+    plot.set(xlabel=x, ylabel=y)
+    plot.set_title(title, loc="left", fontsize=11)
+    plot.grid(which="major", color="0.85", linewidth=0.7)
+    plot.grid(which="minor", color="0.94", linewidth=0.4)
+    plot.spines[["top", "right"]].set_visible(False)
+    if names:
+        plot.legend(frameon=False, fontsize=9, title=series, title_fontsize=9)
+    _save(figure, path)
+
+
+def _polylines(points: np.ndarray, counts: np.ndarray, closed: np.ndarray) -> list[np.ndarray]:
+    """The polyline of each rod; a closed one returns to its first point."""
+    lines = np.split(points, np.cumsum(counts)[:-1])
+    return [np.vstack([line, line[:1]]) if shut else line for line, shut in zip(lines, closed, strict=True)]
+
+
+def _line_width(rod_count: int, latest: bool) -> float:
+    """Line width in points: thin for many rods, and for shapes of the past."""
+    few = np.interp(np.log10(rod_count), [0.0, 1.0, 3.0], [2.2, 1.4, 0.45])
+    return few if latest else 0.7 * few
+
+
+def _flat_axes(figure: Figure, axes: list[int], low: np.ndarray, high: np.ndarray):
+    plot = figure.add_subplot(aspect="equal")
+    margin = MARGIN * np.max(high - low)
+    limits = [(low[k] - margin, high[k] + margin) for k in axes]
+    names = [f"{'xyz'[k]} [m]" for k in axes]
+    plot.set(xlim=limits[0], ylim=limits[1], xlabel=names[0], ylabel=names[1])
+    plot.grid(color="0.92", linewidth=0.6)
+    plot.set_axisbelow(True)
+    plot.spines[["top", "right"]].set_visible(False)
+    return plot
+
+
+def _solid_axes(figure: Figure, low: np.ndarray, high: np.ndarray):
+    plot = figure.add_subplot(projection="3d", computed_zorder=False)
+    plot.set_proj_type("ortho")
+    plot.view_init(elev=18.0, azim=-58.0)
+    margin = MARGIN * np.max(high - low)
+    limits = np.stack([low - margin, high + margin], axis=1)
+    plot.set(xlim=limits[0], ylim=limits[1], zlim=limits[2])
+    plot.set_box_aspect(limits[:, 1] - limits[:, 0], zoom=1.1)
+    for axis, name in zip((plot.xaxis, plot.yaxis, plot.zaxis), "xyz", strict=True):
+        axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
+        axis.set_label_text(f"{name} [m]", fontsize=9)
+        axis.set_major_locator(_few_ticks())
+        axis._axinfo["grid"].update(color="0.9", linewidth=0.5)
+    plot.tick_params(labelsize=8, colors=GREY)
+    return plot
+
+
+def _few_ticks():
+    from matplotlib.ticker import MaxNLocator
+
+    return MaxNLocator(nbins=4)
+
+
+def _explain_times(figure: Figure, plot, times: np.ndarray, norm: Normalize) -> None:
+    """A color bar with a tick at each time drawn."""
+    if len(times) == 1:
+        return
+    gap = 0.10 if plot.name == "3d" else 0.03  # room for the label of the z axis
+    bar = figure.colorbar(ScalarMappable(norm, TIME_COLORS), ax=plot, shrink=0.6, aspect=28, pad=gap)
+    bar.set_label("time [s]", fontsize=9)
+    bar.set_ticks(times, labels=[f"{time:.3g}" for time in times])
+    bar.ax.tick_params(labelsize=8)
+    bar.outline.set_visible(False)
+
+
+def _save(figure: Figure, path) -> None:
+    """Writes a figure without touching pyplot, whose state belongs to the user."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    FigureCanvasAgg(figure)
+    figure.savefig(path, dpi=DPI)

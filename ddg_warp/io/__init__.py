@@ -1,0 +1,153 @@
+"""Reading and writing curves and trajectories; every format's library is loaded only by its own module.
+
+`usd` (BasisCurves in, curves or tubes out), `hdf5` (trajectory.h5 in and out), `dismech` (text in).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+
+class CurveError(ValueError):
+    """A file holds no usable curves; the message names the file, the object, the index and the remedy."""
+
+
+class MissingFileError(CurveError, FileNotFoundError):
+    """The file to read does not exist."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
+@dataclass(frozen=True)
+class Curves:
+    """How the points of a trajectory are joined to rods; the attributes of `model.curves`.
+
+    Attributes:
+        counts: Points of each rod, shape (R,), int; their sum is P.
+        closed: Whether a rod's last point is joined to its first, shape (R,), bool.
+        radius: Radius at each point [m], shape (P,), float64.
+        names: Name of each rod, shape (R,), str.
+        batch: Batch of each rod, shape (R,), int; the rods of a batch share a material.
+    """
+
+    counts: np.ndarray
+    closed: np.ndarray
+    radius: np.ndarray
+    names: np.ndarray
+    batch: np.ndarray
+
+    @classmethod
+    def tiled(cls, curves, worlds: int) -> Curves:
+        """`worlds` copies of a model's curves, one after the other."""
+        return cls(**{field.name: np.tile(getattr(curves, field.name), worlds) for field in fields(cls)})
+
+
+@dataclass(frozen=True)
+class CurveSet:
+    """Polylines that were stored together; z is up, lengths are in metres.
+
+    It has the attributes of `model.curves`, so that writers and pictures take either.
+
+    Attributes:
+        points: Positions [m], shape (P, 3), float64; the rods one after the other.
+        counts: Points of each rod, shape (R,), int; their sum is P.
+        closed: Whether a rod's last point is joined to its first, shape (R,), bool.
+        radius: Radius at each point [m], shape (P,), float64; None where the file gives none.
+        path: Where the curves stood in the file: a USD prim path, an HDF5 dataset, a section.
+    """
+
+    points: np.ndarray
+    counts: np.ndarray
+    closed: np.ndarray
+    radius: np.ndarray | None
+    path: str
+
+    @property
+    def names(self) -> np.ndarray:
+        """The name of each rod, shape (R,), str: the last part of `path`, the same for all."""
+        return np.full(len(self.counts), self.path.rstrip("/").rpartition("/")[2] or "rods")
+
+    @property
+    def batch(self) -> np.ndarray:
+        """The batch of each rod, shape (R,), int: one for all."""
+        return np.zeros(len(self.counts), dtype=int)
+
+    def rods(self) -> list[np.ndarray]:
+        """The points of each rod [m], each of shape (n, 3)."""
+        return np.split(self.points, np.cumsum(self.counts)[:-1])
+
+
+def checked_curves(points, counts, closed, radius, path: str, source: str) -> CurveSet:
+    """A `CurveSet` from raw arrays, refused where a rod could not be built from it.
+
+    Args:
+        points: Positions [m], shape (P, 3).
+        counts: Points of each rod, shape (R,).
+        closed: One flag or one for each rod.
+        radius: Radius [m], one value, or shape (P,), or None.
+        path: Where in the file the curves stand.
+        source: File name, for messages.
+    """
+    points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    counts = np.asarray(counts, dtype=int).reshape(-1)
+    where = f"{source}, {path}"
+    if counts.sum() != len(points):
+        raise CurveError(
+            f"{where}: the curves' vertex counts sum to {counts.sum()}, but there are {len(points)} points; "
+            "write the counts and the points of the same frame"
+        )
+    closed = np.broadcast_to(np.asarray(closed, dtype=bool), counts.shape).copy()
+    if radius is not None:
+        radius = np.broadcast_to(np.asarray(radius, dtype=np.float64), (len(points),)).copy()
+    _refuse_unusable(points, counts, closed, radius, where)
+    return CurveSet(points, counts, closed, radius, path)
+
+
+def _refuse_unusable(points, counts, closed, radius, where: str) -> None:
+    """Names the first curve that is too short, not finite, or of no thickness."""
+    if not len(counts):
+        raise CurveError(f"{where}: there is not a single curve; export it with its curves")
+    least = np.where(closed, 3, 2)
+    if (counts < least).any():
+        curve = np.flatnonzero(counts < least)[0]
+        raise CurveError(
+            f"{where}: curve {curve} has {counts[curve]} vertices, it needs {least[curve]}; delete it or resample it"
+        )
+    owner = np.repeat(np.arange(len(counts)), counts)
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.all():
+        curve = owner[np.argmin(finite)]
+        raise CurveError(f"{where}: curve {curve} has a point that is not finite; re-export it or delete it")
+    if radius is not None and not (positive := np.isfinite(radius) & (radius > 0.0)).all():
+        bad = np.argmin(positive)
+        raise CurveError(f"{where}: curve {owner[bad]} has a radius of {radius[bad]} m; give it a positive width")
+
+
+def existing(path) -> Path:
+    """`path` as a Path, refused where there is no such file."""
+    path = Path(path)
+    if not path.is_file():
+        raise MissingFileError(f"{path}: there is no such file; check the path")
+    return path
+
+
+def read(path) -> list[CurveSet]:
+    """The curves of a USD, HDF5 or DisMech text file, told apart by the suffix."""
+    suffix = Path(path).suffix.lower()
+    if suffix in {".usd", ".usda", ".usdc", ".usdz"}:
+        from ddg_warp.io.usd import read_curves
+
+        return read_curves(path)
+    if suffix in {".h5", ".hdf5"}:
+        from ddg_warp.io.hdf5 import read_rods
+
+        return read_rods(path)
+    if suffix == ".txt":
+        from ddg_warp.io.dismech import read_rods as read_text
+
+        return [read_text(path)]
+    raise CurveError(f"{path}: curves are read from .usd, .usda, .usdc, .usdz, .h5, .hdf5 and .txt (DisMech) files")

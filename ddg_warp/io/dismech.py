@@ -1,0 +1,144 @@
+"""Rods from the text files of the DisMech family (MATLAB, Python: sections; C++: bare coordinates).
+
+    *Nodes               one `x, y, z` a line, metres (also `*rodNodes`)
+    0.0, 0.0, 0.0
+    ...
+    *Edges               one `i, j` a line (also `*rodEdges`), counted from 1
+    1, 2
+
+The MATLAB and Python programs count nodes from 1. A file in which an edge names node 0 is taken to count from 0.
+The C++ program has no sections: its files hold one node a line, separated by blanks, in order along a single rod.
+Sections that those programs derive from the edges (`*elStretchRod`, ...) are skipped. Separators are commas or
+blanks; what follows a `#` or `%` is a comment.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ddg_warp.io import CurveError, CurveSet, checked_curves, existing
+
+COLUMNS = {"nodes": (3, float), "edges": (2, int), "triangles": (3, int)}
+ALIASES = {"rodnodes": "nodes", "rodedges": "edges", "shelltriangles": "triangles"}
+DERIVED_PREFIX = "el"
+
+
+def read_rods(path) -> CurveSet:
+    """The rods of a DisMech text file; its edges must form separate paths and cycles.
+
+    Nodes are returned in the order in which the edges run through them. The format stores no radius.
+    """
+    path = existing(path)
+    sections = _sections(path)
+    nodes = np.array(sections["nodes"], dtype=np.float64).reshape(-1, 3)
+    if not len(nodes):
+        raise CurveError(f"{path}: there are no nodes; write one `x, y, z` a line below `*Nodes`")
+    if sections["triangles"]:
+        raise CurveError(f"{path}: the file holds a shell (`*Triangles`), which cannot be read as rods; remove them")
+    edges, base = _edges(sections, len(nodes), path)
+    neighbours = _neighbours(edges, len(nodes))
+    for node, others in enumerate(neighbours):
+        _refuse_joint(f"{path}: node {node + base}", others)
+    chains = _chains(neighbours)
+    order = np.concatenate([chain for chain, _ in chains])
+    counts, closed = [len(chain) for chain, _ in chains], [closed for _, closed in chains]
+    return checked_curves(nodes[order], counts, closed, None, "Nodes", str(path))
+
+
+def _sections(path) -> dict[str, list[tuple]]:
+    """Rows of numbers by section name; lines before the first header are nodes."""
+    sections: dict[str, list[tuple]] = {name: [] for name in COLUMNS}
+    sections["headers"] = []
+    current = "nodes"
+    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1):
+        text = line.partition("#")[0].partition("%")[0].strip()
+        if text.startswith("*"):
+            current = _section(text, f"{path}:{number}")
+            sections["headers"].append(current)
+        elif text and current in COLUMNS:
+            sections[current].append(_row(text, current, f"{path}:{number}"))
+    return sections
+
+
+def _section(header: str, where: str) -> str:
+    name = header[1:].strip().lower()
+    name = ALIASES.get(name, name)
+    if name not in COLUMNS and not name.startswith(DERIVED_PREFIX):
+        raise CurveError(f"{where}: unknown section `{header}`; known are *Nodes, *Edges, *rodNodes, *rodEdges")
+    return name
+
+
+def _row(text: str, section: str, where: str) -> tuple:
+    width, number = COLUMNS[section]
+    try:
+        row = tuple(number(word) for word in text.replace(",", " ").split())
+    except ValueError:
+        row = ()
+    if len(row) != width:
+        raise CurveError(
+            f"{where}: `{text}` is not a line of *{section}: {width} {number.__name__} values are expected"
+        )
+    return row
+
+
+def _edges(sections: dict[str, list[tuple]], node_count: int, path) -> tuple[np.ndarray, int]:
+    """(node pairs counted from 0, shape (E, 2); the file's first node, 0 or 1); one rod where there are no sections."""
+    if not sections["headers"]:
+        first = np.arange(node_count - 1)
+        return np.column_stack([first, first + 1]), 0
+    if not sections["edges"]:
+        raise CurveError(f"{path}: there are no edges; write one `i, j` a line below `*Edges`")
+    edges = np.array(sections["edges"], dtype=int)
+    base = 0 if (edges == 0).any() else 1
+    out_of_range = np.flatnonzero(((edges < base) | (edges >= node_count + base)).any(axis=1))
+    if len(out_of_range):
+        i, j = edges[out_of_range[0]]
+        raise CurveError(
+            f"{path}: edge {i}, {j} names a node that does not exist; nodes run from {base} to {node_count - 1 + base}"
+        )
+    if (edges[:, 0] == edges[:, 1]).any():
+        i = edges[edges[:, 0] == edges[:, 1]][0, 0]
+        raise CurveError(f"{path}: an edge joins node {i} to itself; remove it")
+    return edges - base, base
+
+
+def _neighbours(edges: np.ndarray, node_count: int) -> list[list[int]]:
+    neighbours: list[list[int]] = [[] for _ in range(node_count)]
+    for i, j in edges.tolist():
+        neighbours[i].append(j)
+        neighbours[j].append(i)
+    return neighbours
+
+
+def _refuse_joint(node: str, others: list[int]) -> None:
+    """A rod's node has one or two neighbours, each once."""
+    if not others:
+        raise CurveError(f"{node} belongs to no edge; remove it or join it")
+    if len(others) > 2:
+        raise CurveError(f"{node} joins {len(others)} edges; networks are not supported yet, split the rods there")
+    if len(set(others)) < len(others):
+        raise CurveError(f"{node}: an edge is listed twice; remove one")
+
+
+def _chains(neighbours: list[list[int]]) -> list[tuple[list[int], bool]]:
+    """Paths and cycles as (nodes in order, closed), by their first node in the file."""
+    ends = [node for node, others in enumerate(neighbours) if len(others) == 1]
+    seen: set[int] = set()
+    chains = []
+    for start in ends + list(range(len(neighbours))):
+        if start not in seen:
+            chain = _walk(start, neighbours)
+            seen.update(chain)
+            chains.append((chain, len(neighbours[start]) == 2))
+    return sorted(chains, key=lambda chain: min(chain[0]))
+
+
+def _walk(start: int, neighbours: list[list[int]]) -> list[int]:
+    """The nodes met from `start` until an end or until the cycle closes."""
+    chain, previous, node = [start], None, start
+    while True:
+        onward = [other for other in neighbours[node] if other != previous]
+        if not onward or onward[0] == start:
+            return chain
+        previous, node = node, onward[0]
+        chain.append(node)

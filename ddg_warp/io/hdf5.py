@@ -1,0 +1,232 @@
+"""trajectory.h5: what a run recorded, what it was made of, and where it can go on.
+
+    /trajectory   time (F,) [s], points (F, P, 3) [m], velocities (F, P, 3) [m/s] and directors (F, E, 3) if wanted,
+                  series/NAME (F,); with several worlds (F, B, P, 3) and (F, B, E, 3)
+    /model        curves/{counts, closed, radius, names, batch}, parameters/NAME
+    /control      how the run was driven
+    /checkpoint   a and b, in turn the state at the last frame, at full precision; the attribute current says which
+    /VTKHDF       the same points for ParaView, see `vtkhdf`
+    attributes    provenance: version, date, machine and what the caller adds
+
+Frames are appended a block at a time, each block with its checkpoint in one transaction (see `journal`): a process
+killed at any time leaves a file that ends with a complete block, from which the run resumes.
+"""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+import platform
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from ddg_warp.io import Curves, existing
+from ddg_warp.io.hdf5_read import CURVE_FIELDS, TrajectoryError, TrajectoryReader, read_rods
+from ddg_warp.io.journal import recover, transaction
+from ddg_warp.io.vtkhdf import write_view
+
+__all__ = ["TrajectoryError", "TrajectoryReader", "TrajectoryWriter", "read_rods"]
+
+CHUNK_BYTES = 2**20
+BLOCK_BYTES = 2**27  # frames held in memory at most
+OTHER_SLOT = {"a": "b", "b": "a"}
+
+
+class TrajectoryWriter:
+    """Appends frames to a trajectory file.
+
+    Args:
+        path: The file; an existing one is replaced. `resume` continues one instead.
+        model: The model whose states are recorded.
+        block: Frames written together; fewer where they would fill 128 MiB.
+        velocities: Whether to record velocities.
+        directors: Whether to record the first material director of every edge.
+        provenance: Attributes of the file; what is neither text nor a number is stored as JSON.
+        control: How the run is driven, stored in /control: names and numbers, texts or arrays.
+    """
+
+    def __init__(
+        self,
+        path,
+        model,
+        *,
+        block: int = 64,
+        velocities: bool = False,
+        directors: bool = False,
+        provenance: Mapping | None = None,
+        control: Mapping | None = None,
+    ):
+        names = ["points"] + ["velocities"] * velocities + ["directors"] * directors
+        self._prepare(path, model, block, names)
+        partial = self.path.with_name(self.path.name + ".partial")
+        with h5py.File(partial, "w") as file:
+            _write_attributes(file, _origin() | dict(provenance or {}))
+            _write_model(file.create_group("model"), model)
+            _write_control(file.create_group("control"), control or {})
+            trajectory = file.create_group("trajectory")
+            _extend(trajectory, "time", np.zeros(0), block)
+            for name in names:
+                _extend(trajectory, name, np.zeros((0, *self._shape(name))), block)
+        self.path.with_name(self.path.name + ".journal").unlink(missing_ok=True)
+        os.replace(partial, self.path)
+
+    @classmethod
+    def resume(cls, path, model, *, block: int = 64) -> TrajectoryWriter:
+        """Continues a trajectory after the frame of its checkpoint; later frames are cut off."""
+        path = existing(path)
+        recover(path)
+        with TrajectoryReader(path) as reader:
+            frame, slot, names = reader.checkpoint_frame, reader.checkpoint_slot, reader.recorded
+            same = np.array_equal(reader.curves.counts, model.curves.counts)
+            if not (same and np.array_equal(reader.curves.closed, model.curves.closed)):
+                raise TrajectoryError(f"{path}: the file holds other rods than the model; resume with its own scene")
+        writer = cls.__new__(cls)
+        writer._prepare(path, model, block, names)
+        writer._slot = OTHER_SLOT[slot]
+        if frame < writer.frame_count:
+            writer._cut(frame)
+        return writer
+
+    def __enter__(self) -> TrajectoryWriter:
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()
+
+    @property
+    def frame_count(self) -> int:
+        """Complete frames in the file."""
+        with TrajectoryReader(self.path) as reader:
+            return len(reader)
+
+    def append(self, state, observed: Mapping[str, float] | None = None) -> None:
+        """Adds the frame of a state and what was observed of it; every frame observes the same names."""
+        observed = dict(observed or {})
+        if self._frames and observed.keys() != self._frames[0]["series"].keys():
+            raise TrajectoryError(f"observed {sorted(observed)}, before {sorted(self._frames[0]['series'])}")
+        fields = {name: np.array(getattr(state, name)()) for name in self._names}
+        self._frames.append({"time": state.time, "series": observed, **fields})
+        # The solver may reuse the state's buffers before the block is written: keep a copy now.
+        self._snapshot = {name: np.array(value) for name, value in state.snapshot().items()}
+        if len(self._frames) == self._block:
+            self.flush()
+
+    def flush(self) -> None:
+        """Writes the frames held in memory, with the checkpoint of the last one, as one transaction."""
+        if not self._frames:
+            return
+        slot = self._slot
+        with transaction(self.path, scratch=f"checkpoint/{slot}") as file:
+            trajectory = file["trajectory"]
+            for name in ("time", *self._names):
+                _extend(trajectory, name, np.stack([frame[name] for frame in self._frames]), self._block)
+            self._extend_series(trajectory)
+            write_view(file, self._curves)
+            checkpoint = file.require_group(f"checkpoint/{slot}")
+            checkpoint.attrs["frame"] = len(trajectory["time"])
+            for name, value in self._snapshot.items():
+                _overwrite(checkpoint, name, value)
+            file["checkpoint"].attrs["current"] = slot
+        self._slot = OTHER_SLOT[slot]
+        self._frames.clear()
+
+    def close(self) -> None:
+        """Writes what is left."""
+        self.flush()
+
+    def _prepare(self, path, model, block: int, names: list[str]) -> None:
+        self.path = Path(path)
+        self._model = model
+        self._names = names
+        self._slot = "a"
+        self._curves = Curves.tiled(model.curves, model.worlds)
+        self._frames: list[dict] = []
+        self._snapshot: dict[str, np.ndarray] = {}
+        frame_bytes = sum(8 * int(np.prod(self._shape(name))) for name in names)
+        self._block = max(1, min(block, BLOCK_BYTES // frame_bytes))
+
+    def _shape(self, name: str) -> tuple[int, ...]:
+        """Shape of one frame of a field."""
+        curves, worlds = self._model.curves, self._model.worlds
+        points = int(np.sum(curves.counts))
+        rows = points - np.count_nonzero(~np.asarray(curves.closed)) if name == "directors" else points
+        return (rows, 3) if worlds == 1 else (worlds, rows, 3)
+
+    def _extend_series(self, trajectory: h5py.Group) -> None:
+        names, group = self._frames[0]["series"].keys(), trajectory.require_group("series")
+        if len(trajectory["time"]) > len(self._frames) and set(group) != set(names):
+            raise TrajectoryError(f"{self.path}: observed {sorted(names)}, but the file holds {sorted(group)}")
+        for name in names:
+            values = np.array([frame["series"][name] for frame in self._frames], dtype=np.float64)
+            _extend(group, name, values, self._block)
+
+    def _cut(self, frame: int) -> None:
+        """Drops the frames from `frame` on."""
+        with transaction(self.path) as file:
+            trajectory = file["trajectory"]
+            for name in ("time", *self._names, *(f"series/{name}" for name in trajectory.get("series", ()))):
+                trajectory[name].resize(frame, axis=0)
+            write_view(file, self._curves)
+
+
+def _origin() -> dict[str, str]:
+    """Where and when a file was made."""
+    try:
+        ours = version("ddg_warp")
+    except PackageNotFoundError:
+        ours = "unknown"
+    date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
+    return {"program": "ddg_warp", "version": ours, "date": date, "machine": platform.platform()}
+
+
+def _write_attributes(group: h5py.Group, values: Mapping) -> None:
+    for name, value in values.items():
+        group.attrs[name] = value if isinstance(value, str | int | float) else json.dumps(value, default=str)
+
+
+def _write_model(group: h5py.Group, model) -> None:
+    curves, parameters = group.create_group("curves"), group.create_group("parameters")
+    for name in CURVE_FIELDS:
+        _overwrite(curves, name, np.asarray(getattr(model.curves, name)))
+    for name, value in model.parameters().items():
+        _overwrite(parameters, name, np.asarray(value))
+
+
+def _write_control(group: h5py.Group, control: Mapping) -> None:
+    arrays = {name: value for name, value in control.items() if isinstance(value, np.ndarray)}
+    for name, value in arrays.items():
+        _overwrite(group, name, value)
+    _write_attributes(group, {name: value for name, value in control.items() if name not in arrays})
+
+
+def _extend(group: h5py.Group, name: str, rows: np.ndarray, block: int) -> None:
+    """Appends rows to a dataset, which is made if there is none.
+
+    Chunks hold a power of two of rows, at most a block and about a mebibyte: a block of 64 then fills whole chunks.
+    """
+    if name not in group:
+        row_bytes = max(8, 8 * int(np.prod(rows.shape[1:])))
+        chunk = 1 << int(np.log2(max(1, min(block, CHUNK_BYTES // row_bytes))))
+        options = {"maxshape": (None, *rows.shape[1:]), "chunks": (chunk, *rows.shape[1:])}
+        group.create_dataset(name, shape=(0, *rows.shape[1:]), dtype=np.float64, **options)
+    dataset = group[name]
+    start = len(dataset)
+    dataset.resize(start + len(rows), axis=0)
+    dataset[start:] = rows
+
+
+def _overwrite(group: h5py.Group, name: str, value: np.ndarray) -> None:
+    """Writes a dataset, in place where one of the same kind exists."""
+    if value.dtype.kind in "UO":
+        value = value.astype(h5py.string_dtype())
+    if name in group and (group[name].shape, group[name].dtype) == (value.shape, value.dtype):
+        group[name][...] = value
+        return
+    if name in group:
+        del group[name]
+    group[name] = value

@@ -1,0 +1,161 @@
+"""The reading half of `hdf5`: trajectories, and rods from either kind of HDF5 file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from ddg_warp.io import CurveError, Curves, CurveSet, checked_curves, existing
+from ddg_warp.io.journal import open_to_read
+
+CURVE_FIELDS = ("counts", "closed", "radius", "names", "batch")
+
+
+class TrajectoryError(ValueError):
+    """A trajectory cannot be read or continued."""
+
+
+class TrajectoryReader:
+    """Reads a trajectory file, also one that is being written or whose writer was killed.
+
+    Attributes:
+        time: Times of the frames [s], shape (F,).
+        points: Positions [m], shape (F, P, 3) or (F, B, P, 3), read when indexed: `reader.points[f]`.
+        velocities: Velocities [m/s], like `points`, or None.
+        directors: First material directors, shape (F, E, 3) or (F, B, E, 3), read when indexed, or None.
+        series: Observed values by name, each of shape (F,).
+        curves: How the points are joined to rods.
+        parameters: The model's parameters by name.
+        provenance: The attributes of the file.
+        recorded: Names of the recorded fields.
+    """
+
+    def __init__(self, path):
+        self.path = existing(path)
+        self._file = open_to_read(self.path)
+        if "trajectory" not in self._file:
+            self._file.close()
+            raise TrajectoryError(f"{path}: there is no group /trajectory; is it a trajectory.h5?")
+        trajectory, model = self._file["trajectory"], self._file["model"]
+        self.time = trajectory["time"][:]
+        self.points = trajectory["points"]
+        self.velocities = trajectory.get("velocities")
+        self.directors = trajectory.get("directors")
+        self.recorded = [name for name in ("points", "velocities", "directors") if name in trajectory]
+        self.series = {name: values[:] for name, values in trajectory.get("series", {}).items()}
+        self.curves = Curves(**{name: _array(model["curves"][name]) for name in CURVE_FIELDS})
+        self.parameters = _all_arrays(model["parameters"])
+        self.provenance = {name: _plain(value) for name, value in self._file.attrs.items()}
+
+    def __enter__(self) -> TrajectoryReader:
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def counts(self) -> np.ndarray:
+        """Points of each rod, shape (R,), int."""
+        return self.curves.counts
+
+    @property
+    def closed(self) -> np.ndarray:
+        """Whether each rod is closed, shape (R,), bool."""
+        return self.curves.closed
+
+    @property
+    def radius(self) -> np.ndarray:
+        """Radius at each point [m], shape (P,)."""
+        return self.curves.radius
+
+    @property
+    def checkpoint_slot(self) -> str:
+        """Which of the two places holds the last checkpoint."""
+        if "checkpoint" not in self._file:
+            raise TrajectoryError(f"{self.path}: the run ended before its first block was written; start it again")
+        return self._file["checkpoint"].attrs["current"]
+
+    @property
+    def checkpoint_frame(self) -> int:
+        """Number of frames up to and with the checkpoint's."""
+        return int(self._file["checkpoint"][self.checkpoint_slot].attrs["frame"])
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """The last complete state, for `model.restore`."""
+        frame = self.checkpoint_frame
+        if frame > len(self):
+            raise TrajectoryError(f"{self.path}: the checkpoint is of frame {frame}, but there are {len(self)}")
+        return _all_arrays(self._file["checkpoint"][self.checkpoint_slot])
+
+    def close(self) -> None:
+        """Closes the file; arrays already read stay."""
+        self._file.close()
+
+
+def read_rods(path, frame: int = -1, world: int = 0) -> list[CurveSet]:
+    """Rods from an HDF5 file, of either kind.
+
+    A trajectory gives one set for each batch of rods, at one frame (by default the last) of one world.
+    Any other file has at its root `points`, (R, n, 3) or (P, 3) [m]; with the latter `counts`, (R,); and it may have
+    `closed`, one flag or (R,), and `radius`, one value or (P,) [m].
+    """
+    path = existing(path)
+    with open_to_read(path) as file:
+        if "points" in file:
+            return [_read_plain(file, path)]
+    with TrajectoryReader(path) as reader:
+        if not len(reader):
+            raise CurveError(f"{path}: the trajectory has no frames; read a file of a run that wrote a block")
+        points = reader.points[frame]
+        return _by_batch(reader.curves, points if points.ndim == 2 else points[world], path)
+
+
+def _read_plain(file: h5py.File, path: Path) -> CurveSet:
+    points = file["points"][()]
+    if "counts" in file:
+        counts = file["counts"][()]
+    elif points.ndim == 3:
+        counts = np.full(points.shape[0], points.shape[1])
+    else:
+        raise CurveError(f"{path}: `points` has shape {points.shape} and there are no `counts`; add the points per rod")
+    closed = file["closed"][()] if "closed" in file else False
+    radius = file["radius"][()] if "radius" in file else None
+    return checked_curves(points, counts, closed, radius, "points", str(path))
+
+
+def _by_batch(curves: Curves, points: np.ndarray, path: Path) -> list[CurveSet]:
+    sets = []
+    for batch in np.unique(curves.batch):
+        rods = curves.batch == batch
+        mine = np.repeat(rods, curves.counts)
+        name = str(curves.names[rods][0])
+        radius = curves.radius[mine]
+        sets.append(checked_curves(points[mine], curves.counts[rods], curves.closed[rods], radius, name, str(path)))
+    return sets
+
+
+def _array(dataset: h5py.Dataset) -> np.ndarray:
+    """A dataset in memory; texts as str."""
+    return dataset.asstr()[()].astype(str) if h5py.check_string_dtype(dataset.dtype) else dataset[()]
+
+
+def _all_arrays(group: h5py.Group) -> dict[str, np.ndarray]:
+    """Every dataset below a group, by its path from there."""
+    arrays = {}
+    group.visititems(lambda name, item: arrays.update({name: _array(item)} if isinstance(item, h5py.Dataset) else {}))
+    return arrays
+
+
+def _plain(value):
+    """An attribute as a Python value; JSON is decoded where it is an object or a list."""
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, str) and value[:1] in {"{", "["}:
+        return json.loads(value)
+    return value

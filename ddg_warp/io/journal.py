@@ -1,0 +1,235 @@
+"""Atomic changes to one file: all of a transaction's writes happen, or none, even if the process is killed.
+
+HDF5 updates its metadata in place, so that a process killed while a file is open for writing can leave it unreadable.
+Here HDF5 writes through a file object instead. Bytes beyond the old end go straight to the file, where nothing refers
+to them yet. Changes to older bytes stay in memory, as pages; at the end they are written to a journal beside the file,
+with a checksum, and only then to the file. A process killed
+    before the journal is complete    leaves the old content (and a tail that nothing refers to),
+    after it                          leaves a journal from which a reader, or the next writer, has the new content.
+This is redo logging as databases do it; appended data are written once, only the few changed pages twice.
+
+A program that knows no journals sees the file inconsistent only while its changed pages are being written, some ten
+microseconds a transaction. To keep it so short, large data that are replaced, such as checkpoints, alternate between
+two places: the one not in use is declared `scratch` and written straight to the file.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import h5py
+
+PAGE = 4096  # bytes
+MAGIC = b"ddgwal01"
+HEADER = struct.Struct("<8sQQ")  # magic, size of the file afterwards, number of pages
+CHECKSUM = struct.Struct("<I")
+Pages = dict[int, bytearray]
+
+
+class PagedFile(io.RawIOBase):
+    """A file whose bytes below its initial end change only in memory, page by page.
+
+    Args:
+        path: The file; it must exist.
+        mode: "rb" or "r+b".
+        pages: Content by page number that replaces the file's own.
+        size: Length of the file with those pages [bytes]; by default its length on disk.
+    """
+
+    def __init__(self, path: Path, mode: str, pages: Pages | None = None, size: int | None = None):
+        self._file = open(path, mode, buffering=0)
+        self.size = os.fstat(self._file.fileno()).st_size if size is None else size
+        self.pages: Pages = dict(pages or {})
+        self._limit = -(-self.size // PAGE) * PAGE
+        self._position = 0
+        self.scratch: list[tuple[int, int]] = []
+        """Ranges (start, stop) of old bytes whose content nobody needs: writes inside go straight to the file."""
+
+    def readable(self) -> bool:
+        return True
+
+    def writable(self) -> bool:
+        return self._file.writable()
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        self._position = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self.size}[whence]
+        return self._position
+
+    def tell(self) -> int:
+        return self._position
+
+    def readinto(self, buffer) -> int:
+        start, stop = self._position, min(self._position + len(buffer), max(self.size, self._position))
+        content = bytearray(self._on_disk(start, stop - start))
+        for page in range(start // PAGE, -(-min(stop, self._limit) // PAGE)):
+            if page in self.pages:
+                low, high = max(start, page * PAGE), min(stop, (page + 1) * PAGE)
+                content[low - start : high - start] = self.pages[page][low - page * PAGE : high - page * PAGE]
+        buffer[: len(content)] = content
+        self._position = stop
+        return len(content)
+
+    def write(self, data) -> int:
+        data = memoryview(data).cast("B")
+        start, stop = self._position, self._position + len(data)
+        straight = any(low <= start and stop <= high for low, high in self.scratch)
+        inside = min(stop, self._limit)
+        for page in range(start // PAGE, -(-inside // PAGE)):
+            low, high = max(start, page * PAGE), min(stop, (page + 1) * PAGE)
+            if page not in self.pages and not straight:
+                self.pages[page] = bytearray(self._on_disk(page * PAGE, PAGE))
+            if page in self.pages:
+                self.pages[page][low - page * PAGE : high - page * PAGE] = data[low - start : high - start]
+        position = start if straight else max(start, self._limit)
+        while position < stop:
+            position += os.pwrite(self._file.fileno(), data[position - start :], position)
+        self._position = stop
+        self.size = max(self.size, stop)
+        return len(data)
+
+    def truncate(self, size: int | None = None) -> int:
+        """Sets the length that a commit gives the file; bytes on disk stay until then."""
+        self.size = self._position if size is None else size
+        return self.size
+
+    def sync(self) -> None:
+        """Waits until the appended bytes are on the disk."""
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+    def _on_disk(self, start: int, length: int) -> bytes:
+        """`length` bytes of the file from `start`; zeros beyond its end."""
+        pieces, position = [], start
+        while position < start + length:
+            piece = os.pread(self._file.fileno(), start + length - position, position)
+            if not piece:
+                break
+            pieces.append(piece)
+            position += len(piece)
+        return b"".join(pieces).ljust(length, b"\0")
+
+
+@contextmanager
+def transaction(path, scratch: str = "") -> Iterator[h5py.File]:
+    """Opens an existing HDF5 file for changes that become part of it together, at the end, or not at all.
+
+    Args:
+        path: The file.
+        scratch: A group whose datasets nobody reads until this transaction is through; what is written to them stays
+            written even if it is not.
+    """
+    import h5py
+
+    path = Path(path)
+    recover(path)
+    old_size = path.stat().st_size
+    raw = PagedFile(path, "r+b")
+    try:
+        with h5py.File(raw, "r+") as file:
+            if scratch in file:
+                raw.scratch = _places(file[scratch])
+            yield file
+        raw.sync()
+    except BaseException:
+        raw.close()
+        os.truncate(path, old_size)
+        raise
+    _write_journal(_journal_of(path), raw.size, raw.pages)
+    raw.close()
+    recover(path)
+
+
+def _places(group: h5py.Group) -> list[tuple[int, int]]:
+    """Where in the file the values of the datasets below a group lie, (start, stop) in bytes."""
+    places = []
+
+    def note(_, item) -> None:
+        offset = item.id.get_offset() if hasattr(item, "shape") else None  # None: no values, or in chunks
+        if offset is not None:
+            places.append((offset, offset + item.id.get_storage_size()))
+
+    group.visititems(note)
+    return places
+
+
+def open_to_read(path) -> h5py.File:
+    """Opens an HDF5 file for reading, with the changes of a complete journal and without touching the disk."""
+    import h5py
+
+    path = Path(path)
+    journal = _read_journal(_journal_of(path))
+    if journal is None:
+        return h5py.File(path, "r")
+    size, pages = journal
+    return h5py.File(PagedFile(path, "rb", pages, size), "r")
+
+
+def recover(path) -> None:
+    """Carries out what a complete journal holds; removes the journal."""
+    path = Path(path)
+    journal = _read_journal(_journal_of(path))
+    if journal is not None:
+        size, pages = journal
+        with open(path, "r+b", buffering=0) as file:
+            for start, content in _runs(pages):
+                file.seek(start)
+                file.write(content)
+            file.truncate(size)
+            os.fsync(file.fileno())
+    _journal_of(path).unlink(missing_ok=True)
+
+
+def _runs(pages: Pages) -> list[tuple[int, bytearray]]:
+    """(first byte, content) of neighbouring pages taken together, so that few writes do it."""
+    runs: list[tuple[int, bytearray]] = []
+    for page in sorted(pages):
+        if runs and runs[-1][0] + len(runs[-1][1]) == page * PAGE:
+            runs[-1][1].extend(pages[page])
+        else:
+            runs.append((page * PAGE, bytearray(pages[page])))
+    return runs
+
+
+def _journal_of(path: Path) -> Path:
+    return path.with_name(path.name + ".journal")
+
+
+def _write_journal(path: Path, size: int, pages: Pages) -> None:
+    numbers = struct.pack(f"<{len(pages)}Q", *pages)
+    content = b"".join([HEADER.pack(MAGIC, size, len(pages)), numbers, *pages.values()])
+    with open(path, "wb") as file:
+        file.write(content)
+        file.write(CHECKSUM.pack(zlib.crc32(content)))
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _read_journal(path: Path) -> tuple[int, Pages] | None:
+    """(size of the file, pages), or None where there is no complete journal."""
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    if len(content) < HEADER.size + CHECKSUM.size:
+        return None
+    body, checksum = content[: -CHECKSUM.size], content[-CHECKSUM.size :]
+    magic, size, count = HEADER.unpack_from(body)
+    if magic != MAGIC or CHECKSUM.unpack(checksum)[0] != zlib.crc32(body):
+        return None
+    numbers = struct.unpack_from(f"<{count}Q", body, HEADER.size)
+    start = HEADER.size + 8 * count
+    return size, {page: bytearray(body[start + k * PAGE : start + (k + 1) * PAGE]) for k, page in enumerate(numbers)}

@@ -1,0 +1,85 @@
+"""A check of USD files: the validators that come with USD, and what they miss (counts, extents, NaN)."""
+
+from __future__ import annotations
+
+import numpy as np
+from pxr import Tf, Usd, UsdGeom
+
+from ddg_warp.io import existing
+
+EXTENT_SLACK = 1e-5  # of the extent's size: positions and extents are float32
+
+
+def validate(path) -> list[str]:
+    """What is wrong with a USD file, a sentence each; empty where all is well.
+
+    USD's own validators run where the installed USD has them. Beside them, for every BasisCurves and Mesh at every
+    time sample: counts match the points, all is finite, widths are positive and the extent contains the points.
+    """
+    path = existing(path)
+    try:
+        stage = Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        return [f"{path}: cannot be opened: {error}"]
+    problems = _from_validators(stage)
+    shapes = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.BasisCurves) or prim.IsA(UsdGeom.Mesh)]
+    if not shapes:
+        problems.append(f"{path}: there are neither BasisCurves nor meshes")
+    return problems + [f"{prim.GetPath()}: {problem}" for prim in shapes for problem in _problems(prim)]
+
+
+def _from_validators(stage: Usd.Stage) -> list[str]:
+    try:
+        from pxr import UsdValidation
+    except ImportError:
+        return []
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    return [error.GetErrorAsString() for error in UsdValidation.ValidationContext(validators).Validate(stage)]
+
+
+def _problems(prim: Usd.Prim) -> list[str]:
+    shape = UsdGeom.PointBased(prim)
+    times = shape.GetPointsAttr().GetTimeSamples() or [Usd.TimeCode.Default()]
+    if prim.IsA(UsdGeom.Mesh):
+        count, problems = _check_faces(UsdGeom.Mesh(prim))
+        widths = np.zeros(1)
+    else:
+        curves = UsdGeom.BasisCurves(prim)
+        count = int(np.sum(curves.GetCurveVertexCountsAttr().Get(times[0]) or [0]))
+        widths = np.array(curves.GetWidthsAttr().Get(times[0]) or [np.nan])
+        problems = [] if (widths > 0.0).all() else ["the widths are missing or not positive"]
+        if len(widths) not in {1, len(curves.GetCurveVertexCountsAttr().Get(times[0]) or []), count}:
+            problems.append(f"there are {len(widths)} widths for {count} points")
+    for time in times:
+        problems += [f"at time {time}, {each}" for each in _check_frame(shape, time, count, 0.5 * widths.max())]
+    return problems
+
+
+def _check_faces(mesh: UsdGeom.Mesh) -> tuple[int, list[str]]:
+    """(points that the faces use, problems)."""
+    counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [0])
+    indices = np.array(mesh.GetFaceVertexIndicesAttr().Get() or [-1])
+    matches = counts.sum() == len(indices)
+    return indices.max() + 1, [] if matches else [f"faces have {counts.sum()} corners, but {len(indices)} are listed"]
+
+
+def _check_frame(shape: UsdGeom.PointBased, time, count: int, margin: float) -> list[str]:
+    """Problems of the points, velocities and extent at one time; `margin` is half the largest width."""
+    points = np.array(shape.GetPointsAttr().Get(time) or [], dtype=np.float64).reshape(-1, 3)
+    if len(points) != count:
+        return [f"there are {len(points)} points, but the topology takes {count}"]
+    if not np.isfinite(points).all():
+        return [f"point {np.flatnonzero(~np.isfinite(points).all(axis=1))[0]} is not finite"]
+    problems = []
+    velocities = shape.GetVelocitiesAttr().Get(time)
+    if velocities is not None and (len(velocities) != count or not np.isfinite(np.array(velocities)).all()):
+        problems.append("the velocities do not match the points or are not finite")
+    extent = np.array(shape.GetExtentAttr().Get(time) or [], dtype=np.float64)
+    if extent.shape != (2, 3):
+        return [*problems, "there is no extent"]
+    slack = EXTENT_SLACK * max(np.ptp(extent), np.abs(extent).max())
+    if (points.min(axis=0) - margin < extent[0] - slack).any() or (
+        points.max(axis=0) + margin > extent[1] + slack
+    ).any():
+        problems.append("the extent does not contain the curves")
+    return problems

@@ -1,0 +1,141 @@
+"""Curves from USD files: every BasisCurves prim becomes a `CurveSet`; transforms, metersPerUnit and upAxis are applied.
+
+Attributes are taken at the default time, or at their first sample where they have no default. Widths are diameters;
+under a transform that scales, they scale by the cube root of its volume change. A cubic curve is replaced by the
+polyline through its knots: its vertices (Catmull-Rom), every third vertex (Bezier), or (p0 + 4 p1 + p2)/6 (B-spline);
+resample it more finely before if that is too coarse.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from pxr import Tf, Usd, UsdGeom
+
+from ddg_warp.io import CurveError, CurveSet, checked_curves, existing
+
+Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+BEZIER_STEP = 3
+
+
+def read_curves(path, prim: str | None = None) -> list[CurveSet]:
+    """The curves of a USD file, one set for each BasisCurves prim, in metres with z up.
+
+    Args:
+        path: A .usd, .usda, .usdc or .usdz file.
+        prim: Path of the prim to read, with all below it; by default the whole file.
+    """
+    path = existing(path)
+    try:
+        stage = Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        raise CurveError(f"{path}: this is not a USD file that can be read ({error}); export it again") from error
+    root = stage.GetPrimAtPath(prim) if prim else stage.GetPseudoRoot()
+    if not root:
+        raise CurveError(f"{path}: there is no prim {prim}; `usdtree {path}` lists them")
+    within = Usd.PrimRange(root, Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate))
+    curves = [UsdGeom.BasisCurves(each) for each in within if each.IsA(UsdGeom.BasisCurves)]
+    if not curves:
+        raise CurveError(
+            f"{path}: there are no BasisCurves{f' below {prim}' if prim else ''}; export curves, not meshes"
+        )
+    return [_read_prim(each, path) for each in curves]
+
+
+def _read_prim(curves: UsdGeom.BasisCurves, path: Path) -> CurveSet:
+    name = str(curves.GetPath())
+    attribute = curves.GetPointsAttr()
+    if not attribute.HasValue():
+        raise CurveError(f"{path}, {name}: the curves have no points; export them with their points")
+    # EarliestTime means the first sample of an attribute, and its default where it has no samples.
+    time = Usd.TimeCode.EarliestTime() if attribute.Get() is not None else Usd.TimeCode(attribute.GetTimeSamples()[0])
+    points = np.array(attribute.Get() if attribute.Get() is not None else attribute.Get(time), dtype=np.float64)
+    points = points.reshape(-1, 3)
+    counts = np.array(_value(curves.GetCurveVertexCountsAttr(), time) or [], dtype=int)
+    closed = curves.GetWrapAttr().Get() == UsdGeom.Tokens.periodic
+    checked_curves(points, counts, closed, None, name, str(path))
+    knots = _knots(curves, counts, closed, f"{path}, {name}")
+    knot_counts = np.array([len(each) for each in knots])
+    widths = _widths(curves, time, knots, knot_counts, f"{path}, {name}")
+    to_world, scale = _placement(curves, time)
+    points = np.concatenate([_blend(each, points) for each in knots]) @ to_world[:3, :3] + to_world[3, :3]
+    radius = None if widths is None else 0.5 * scale * widths
+    return checked_curves(points, knot_counts, closed, radius, name, str(path))
+
+
+def _value(attribute: Usd.Attribute, time: Usd.TimeCode):
+    """The default value, or that at `time` where there is none."""
+    default = attribute.Get()
+    return attribute.Get(time) if default is None else default
+
+
+def _placement(curves: UsdGeom.BasisCurves, time: Usd.TimeCode) -> tuple[np.ndarray, float]:
+    """(matrix for row vectors to metres with z up, shape (4, 4); its mean scale)."""
+    stage = curves.GetPrim().GetStage()
+    matrix = np.array(curves.ComputeLocalToWorldTransform(time)) * UsdGeom.GetStageMetersPerUnit(stage)
+    if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
+        matrix[:, :3] = matrix[:, :3] @ Y_UP_TO_Z_UP.T
+    return matrix, abs(np.linalg.det(matrix[:3, :3])) ** (1.0 / 3.0)
+
+
+def _knots(curves: UsdGeom.BasisCurves, counts: np.ndarray, closed: bool, where: str) -> list[np.ndarray]:
+    """For each curve the vertices that its knots are blended from, shape (knots, 3), see `_blend`."""
+    starts = np.cumsum(counts) - counts
+    if curves.GetTypeAttr().Get() == UsdGeom.Tokens.linear:
+        return [
+            np.repeat(first + np.arange(count), 3).reshape(-1, 3) for first, count in zip(starts, counts, strict=True)
+        ]
+    basis, wrap = curves.GetBasisAttr().Get(), curves.GetWrapAttr().Get()
+    local = [_cubic_knots(basis, wrap, count) for count in counts]
+    for curve, knots in enumerate(local):
+        if len(knots) < 2 + closed:
+            raise CurveError(
+                f"{where}: curve {curve} is a cubic {basis} of {counts[curve]} vertices, too few; resample it"
+            )
+    return [first + knots for first, knots in zip(starts, local, strict=True)]
+
+
+def _cubic_knots(basis: str, wrap: str, count: int) -> np.ndarray:
+    """Vertices before, at and after each knot of a cubic curve, shape (knots, 3); three times the same to keep it."""
+    vertex = np.arange(count)
+    if basis == UsdGeom.Tokens.bezier:
+        return np.repeat(vertex[::BEZIER_STEP], 3).reshape(-1, 3)
+    neighbours = np.stack([vertex - 1, vertex, vertex + 1], axis=1)
+    if basis == UsdGeom.Tokens.catmullRom:
+        neighbours = np.repeat(vertex, 3).reshape(-1, 3)
+    if wrap == UsdGeom.Tokens.periodic:
+        return neighbours % count
+    if wrap == UsdGeom.Tokens.pinned:  # the curve begins and ends at its first and last vertex
+        neighbours[[0, -1]] = [[0], [count - 1]]
+        return neighbours
+    return neighbours[1:-1]
+
+
+def _blend(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values at the knots of a curve; the weights of a B-spline leave three equal vertices as they are."""
+    before, at, after = (values[knots[:, k]] for k in range(3))
+    return (before + 4.0 * at + after) / 6.0
+
+
+def _widths(curves, time, knots: list[np.ndarray], knot_counts: np.ndarray, where: str) -> np.ndarray | None:
+    """Width at each knot, in the prim's units, shape (knots of all curves,); None where the prim has no widths."""
+    primvar = UsdGeom.PrimvarsAPI(curves).GetPrimvar("widths")  # takes precedence over the attribute
+    if primvar.HasValue():
+        value, kind = primvar.ComputeFlattened(time), primvar.GetInterpolation()
+    else:
+        value, kind = _value(curves.GetWidthsAttr(), time), curves.GetWidthsInterpolation()
+    if not value:
+        return None
+    widths = np.array(value, dtype=np.float64)
+    if kind == UsdGeom.Tokens.constant or len(widths) == 1:
+        return np.full(knot_counts.sum(), widths[0])
+    vertex_count = sum(_value(curves.GetCurveVertexCountsAttr(), time))
+    expected = {UsdGeom.Tokens.uniform: len(knots), UsdGeom.Tokens.varying: knot_counts.sum()}.get(kind, vertex_count)
+    if len(widths) != expected:
+        raise CurveError(
+            f"{where}: there are {len(widths)} widths, but `{kind}` interpolation takes {expected}; fix either"
+        )
+    if kind == UsdGeom.Tokens.uniform:
+        return np.repeat(widths, knot_counts)
+    return widths if kind == UsdGeom.Tokens.varying else np.concatenate([_blend(each, widths) for each in knots])

@@ -1,0 +1,104 @@
+"""A view of a trajectory that ParaView opens: the group /VTKHDF, a transient PolyData (VTKHDF 2.0) of polylines.
+
+Points and velocities are virtual datasets over /trajectory, and the times a link to it, so that nothing is stored
+twice. The topology is stored once: every step points to the same part, which begins at offset 0.
+Source: the VTKHDF specification, docs.vtk.org, "Poly data" and "Temporal Data".
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import h5py
+
+    from ddg_warp.io import Curves
+
+VERSION = (2, 0)
+CELL_KINDS = ("Vertices", "Lines", "Polygons", "Strips")
+STEP_CHUNK = 64
+STATIC_OFFSETS = {"PartOffsets": (), "CellOffsets": (len(CELL_KINDS),), "ConnectivityIdOffsets": (len(CELL_KINDS),)}
+
+
+def write_view(file: h5py.File, curves: Curves) -> None:
+    """Makes /VTKHDF show all frames of /trajectory.
+
+    Args:
+        file: Open for writing.
+        curves: The rods of one frame, all worlds one after the other.
+    """
+    if "VTKHDF" not in file:
+        _write_topology(file.create_group("VTKHDF"), curves)
+    view, trajectory = file["VTKHDF"], file["trajectory"]
+    _write_steps(view, trajectory, int(curves.counts.sum()))
+    _flatten(view, "Points", trajectory["points"])
+    if "velocities" in trajectory:
+        _flatten(view["PointData"], "velocity", trajectory["velocities"])
+
+
+def _write_topology(view: h5py.Group, curves: Curves) -> None:
+    """What does not change from step to step."""
+    view.attrs["Version"] = np.array(VERSION)
+    view.attrs.create("Type", np.bytes_("PolyData"))  # VTK reads fixed-length ASCII only
+    view["NumberOfPoints"] = [int(curves.counts.sum())]
+    connectivity, offsets = _polylines(curves)
+    for kind in CELL_KINDS:
+        _write_cells(view.create_group(kind), *((connectivity, offsets) if kind == "Lines" else ([], [0])))
+    view.create_group("PointData")["radius"] = curves.radius
+    steps = view.create_group("Steps")
+    steps["Values"] = view.file["trajectory/time"]
+    steps.create_group("PointDataOffsets")
+
+
+def _write_cells(group: h5py.Group, connectivity, offsets) -> None:
+    group["Connectivity"] = np.asarray(connectivity, dtype=np.int64)
+    group["Offsets"] = np.asarray(offsets, dtype=np.int64)
+    group["NumberOfConnectivityIds"] = [len(connectivity)]
+    group["NumberOfCells"] = [len(offsets) - 1]
+
+
+def _polylines(curves: Curves) -> tuple[np.ndarray, np.ndarray]:
+    """(connectivity, offsets) of one polyline a rod; a closed one returns to its first point."""
+    ends = np.cumsum(curves.counts)
+    starts = ends - curves.counts
+    connectivity = np.insert(np.arange(ends[-1]), ends[curves.closed], starts[curves.closed])
+    return connectivity, np.concatenate([[0], np.cumsum(curves.counts + curves.closed)])
+
+
+def _write_steps(view: h5py.Group, trajectory: h5py.Group, point_count: int) -> None:
+    """Where each step begins in every array."""
+    frame_count, steps = len(trajectory["time"]), view["Steps"]
+    steps.attrs["NSteps"] = frame_count
+    _resize(steps, "NumberOfParts", frame_count, fill=1)
+    for name, shape in STATIC_OFFSETS.items():
+        _resize(steps, name, frame_count, shape)
+    _resize(steps["PointDataOffsets"], "radius", frame_count)
+    moving = [_resize(steps, "PointOffsets", frame_count)]
+    if "velocities" in trajectory:
+        moving.append(_resize(steps["PointDataOffsets"], "velocity", frame_count))
+    for dataset, known in moving:
+        dataset[known:] = point_count * np.arange(known, frame_count)
+
+
+def _resize(group: h5py.Group, name: str, length: int, shape: tuple[int, ...] = (), fill: int = 0):
+    """(dataset of that length, its length before); what is not written has the value `fill` and takes no space."""
+    dataset = group.get(name)
+    if dataset is None:
+        options = {"maxshape": (None, *shape), "chunks": (STEP_CHUNK, *shape), "fillvalue": fill}
+        dataset = group.create_dataset(name, shape=(0, *shape), dtype=np.int64, **options)
+    known = min(len(dataset), length)
+    dataset.resize(length, axis=0)
+    return dataset, known
+
+
+def _flatten(group: h5py.Group, name: str, source: h5py.Dataset) -> None:
+    """Shows `source`, shape (F, ..., 3), as a virtual dataset of shape (all points of all frames, 3)."""
+    import h5py
+
+    if name in group:
+        del group[name]
+    layout = h5py.VirtualLayout((source.size // 3, 3), dtype=source.dtype)
+    layout[...] = h5py.VirtualSource(".", source.name, shape=source.shape, dtype=source.dtype)
+    group.create_virtual_dataset(name, layout)
