@@ -1,0 +1,118 @@
+"""What can be run: the scenes of `ddg_warp.scenes`, or a scene file of the user's own; parameters become flags."""
+
+import argparse
+import ast
+import importlib
+import importlib.util
+import inspect
+from difflib import get_close_matches
+from pathlib import Path
+from types import ModuleType
+
+RUN_SETTINGS = ("dt", "precision", "worlds")  # what a resumed run cannot change, beside the scene's parameters
+RESERVED = ("command", "scene", "device", "duration", "out", "resume", "json", "help", *RUN_SETTINGS)
+
+
+class InputError(ValueError):
+    """A mistake in what the user asked for; the message says in one line what to do."""
+
+
+def scene_files() -> dict[str, Path]:
+    """Name of each scene -> its file, without importing it."""
+    import ddg_warp.scenes
+
+    files = (path for folder in ddg_warp.scenes.__path__ for path in sorted(Path(folder).glob("[!_]*.py")))
+    return {path.stem: path for path in files}
+
+
+def one_liner(path: Path) -> str:
+    """First line of a file's docstring."""
+    return (ast.get_docstring(ast.parse(path.read_text())) or "").partition("\n")[0]
+
+
+def load_scene(name: str) -> ModuleType:
+    """The module of a scene, given by name or as the path of a Python file.
+
+    Raises:
+        InputError: There is no such scene, or it has no `build`.
+    """
+    if name.endswith(".py"):
+        path = Path(name)
+        if not path.is_file():
+            raise InputError(f"there is no scene file {name}")
+        spec = importlib.util.spec_from_file_location(path.stem, path)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+    else:
+        scenes = scene_files()
+        if name not in scenes:
+            near = get_close_matches(name, scenes, 1)
+            hint = f"did you mean {near[0]}?" if near else "`ddg-warp list` shows them"
+            raise InputError(f"there is no scene '{name}'; {hint}")
+        module = importlib.import_module(f"ddg_warp.scenes.{name}")
+    if not hasattr(module, "build"):
+        raise InputError(f"scene '{name}' has no build(**parameters) -> Scene")
+    return module
+
+
+def scene_name(name: str) -> str:
+    """Name under which a scene's results are filed: that of its file."""
+    return Path(name).stem
+
+
+def add_parameters(parser: argparse.ArgumentParser, module: ModuleType) -> None:
+    """Add a flag for every parameter of the scene's `build`; flags that are not given leave no trace in the result.
+
+    Raises:
+        InputError: A parameter has no default, an unknown type, or the name of an option of `run`.
+    """
+    texts = parameter_texts(module.build)
+    for name, parameter in inspect.signature(module.build, eval_str=True).parameters.items():
+        kind, default = parameter.annotation, parameter.default
+        where = f"build({name}) of {module.__name__}"
+        if kind not in (bool, int, float, str) or default is parameter.empty:
+            raise InputError(f"{where} needs a default, and a type of int, float, str or bool")
+        if name in RESERVED:
+            raise InputError(f"{where} has the name of an option of `run`; rename it")
+        options = {"dest": name, "default": argparse.SUPPRESS, "help": f"{texts.get(name, '')} (default: {default})"}
+        if kind is bool:
+            options["action"] = argparse.BooleanOptionalAction
+        else:
+            options |= {"type": kind, "metavar": kind.__name__}
+        parser.add_argument(f"--{name.replace('_', '-')}", **options)
+
+
+def parameter_texts(build) -> dict[str, str]:
+    """What the `Args:` section of a Google docstring says about each parameter."""
+    section = (inspect.getdoc(build) or "").partition("Args:\n")[2].partition("\n\n")[0]
+    lines = (line.strip().partition(":") for line in section.splitlines())
+    # argparse fills in what follows a percent sign; two of them are one.
+    return {name: text.strip().replace("%", "%%") for name, colon, text in lines if colon and name.isidentifier()}
+
+
+def parameters(module: ModuleType, given: dict) -> dict:
+    """All parameters of a scene's `build`: its defaults, and what is given."""
+    defaults = {name: p.default for name, p in inspect.signature(module.build).parameters.items()}
+    return {**defaults, **given}
+
+
+def stored_settings(directory: Path, scene: str, given: dict) -> dict:
+    """Parameters of the scene, dt, precision and worlds of the run in `directory`, to resume it.
+
+    Raises:
+        InputError: The directory holds no run of this scene, or its settings differ from those given.
+    """
+    from ddg_warp.io.hdf5 import TrajectoryReader
+
+    path = Path(directory) / "trajectory.h5"
+    if not path.is_file():
+        raise InputError(f"there is no run to resume in {directory}: {path} is missing")
+    with TrajectoryReader(path) as reader:
+        provenance = reader.provenance
+    if provenance.get("scene") != scene:
+        raise InputError(f"{directory} holds a run of '{provenance.get('scene')}', not of '{scene}'")
+    stored = provenance["parameters"] | {name: provenance[name] for name in RUN_SETTINGS}
+    for name, value in given.items():
+        if stored.get(name) != value:
+            raise InputError(f"the run in {directory} has {name} = {stored.get(name)}; resume it without --{name}")
+    return stored

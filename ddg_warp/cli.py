@@ -1,0 +1,267 @@
+"""The command line: `ddg-warp run | list | check | bench | export | info`.
+
+Exit codes: 0 done; 1 a check or the solver failed; 2 a mistake in what was asked for; 130 interrupted.
+"""
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+
+from ddg_warp.catalog import (
+    RUN_SETTINGS,
+    InputError,
+    add_parameters,
+    load_scene,
+    one_liner,
+    parameters,
+    scene_files,
+    scene_name,
+    stored_settings,
+)
+
+DONE, FAILED, MISTAKE, INTERRUPTED = 0, 1, 2, 130
+PRECISIONS = ("float64", "mixed", "float32")
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def __init__(self, **options):
+        super().__init__(allow_abbrev=False, **options)
+
+    def error(self, message: str):
+        raise InputError(message)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; returns its exit code."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        chosen = parser(arguments).parse_args(arguments)
+        return chosen.command(chosen)
+    except (InputError, OSError) as error:
+        print(f"ddg-warp: {error}", file=sys.stderr)
+        return MISTAKE
+    except KeyboardInterrupt:
+        print("\nddg-warp: interrupted; what was recorded is kept", file=sys.stderr)
+        return INTERRUPTED
+
+
+def parser(arguments: list[str]) -> Parser:
+    """The parser of these arguments; `run SCENE` adds the flags of the scene."""
+    top = Parser(prog="ddg-warp", description="Simulate flexible slender structures on NVIDIA Warp.")
+    commands = top.add_subparsers(metavar="COMMAND", required=True)
+
+    run = commands.add_parser("run", help="run a scene and check it", description="Run a scene and check it.")
+    run.set_defaults(command=run_scene)
+    run.add_argument("scene", metavar="SCENE", help="a scene of `ddg-warp list`, or a Python file; comes first")
+    add_settings(run)
+    run.add_argument("--dt", type=float, metavar="S", help="time step [s] (default: the scene's)")
+    run.add_argument("--duration", type=float, metavar="S", help="end of the run [s] (default: the scene's)")
+    run.add_argument("--worlds", type=int, metavar="N", help="independent copies (default: 1)")
+    run.add_argument("--out", type=Path, metavar="DIR", help="where results go (default: out/SCENE)")
+    run.add_argument("--resume", type=Path, metavar="DIR", help="continue the run recorded in DIR")
+    run.add_argument("--json", type=Path, metavar="FILE", help="write the summary to FILE too")
+    if arguments[:1] == ["run"] and len(arguments) > 1 and not arguments[1].startswith("-"):
+        add_parameters(run.add_argument_group(f"parameters of {arguments[1]}"), load_scene(arguments[1]))
+
+    show = commands.add_parser("list", help="list scenes and terms")
+    show.set_defaults(command=list_all)
+
+    check = commands.add_parser("check", help="compare the derivatives of terms with automatic differentiation")
+    check.set_defaults(command=check_terms)
+    check.add_argument("term", nargs="?", metavar="TERM", help="one term (default: all)")
+    check.add_argument("--precision", choices=("float64", "float32"), default="float64", help="default: float64")
+    check.add_argument("--device", default="cpu", help="Warp device (default: cpu)")
+
+    bench = commands.add_parser("bench", help="measure a scene's error against its time")
+    bench.set_defaults(command=bench_scene)
+    bench.add_argument("scene", nargs="?", metavar="NAME", help="a scene with a benchmark (default: list them)")
+    add_settings(bench)
+    bench.add_argument("--out", type=Path, default=Path("out/bench"), metavar="DIR", help="default: out/bench")
+
+    export = commands.add_parser("export", help="write a recorded run as USD")
+    export.set_defaults(command=export_run)
+    export.add_argument("directory", type=Path, metavar="DIR", help="directory of a run")
+    export.add_argument("--to", type=Path, metavar="FILE", help="a .usdc or .usda file (default: DIR/export.usdc)")
+    export.add_argument("--tube", action="store_true", help="write tube meshes, not curves")
+
+    info = commands.add_parser("info", help="show versions, devices and machine")
+    info.set_defaults(command=show_info)
+    return top
+
+
+def add_settings(command: argparse.ArgumentParser) -> None:
+    """Add the flags that say where and how accurately to compute."""
+    command.add_argument("--device", help="Warp device, such as cpu or cuda:0 (default: CUDA if there is one)")
+    command.add_argument("--precision", choices=PRECISIONS, help="default: float64 on the CPU, mixed on CUDA")
+
+
+def run_scene(chosen: argparse.Namespace) -> int:
+    """`run`: simulate, record, check, summarise."""
+    module, name = load_scene(chosen.scene), scene_name(chosen.scene)
+    settings, run_settings = settings_of(chosen, module, name)
+    require_device(chosen.device)
+
+    from ddg_warp.errors import SceneError
+    from ddg_warp.io.hdf5 import TrajectoryError
+    from ddg_warp.simulate import simulate
+    from ddg_warp.summary import summary, write_json
+
+    try:
+        scene = module.build(**settings)
+    except ValueError as error:
+        raise InputError(f"scene '{name}': {error}") from error
+    directory = chosen.resume or chosen.out or Path("out") / name
+    try:
+        result = simulate(
+            scene,
+            device=chosen.device,
+            out=directory,
+            duration=chosen.duration,
+            resume=chosen.resume,
+            observe=getattr(module, "observe", None),
+            provenance={"scene": name, "parameters": settings, "command": shlex.join(["ddg-warp", *sys.argv[1:]])},
+            progress=sys.stderr.isatty(),
+            **run_settings,
+        )
+    except (SceneError, TrajectoryError) as error:
+        raise InputError(str(error)) from error
+    checks = module.check(result) if hasattr(module, "check") and not result.failure else []
+    content = summary(name, settings, result, checks)
+    for path in filter(None, (directory / "summary.json", chosen.json)):
+        write_json(path, content)
+    draw(directory, one_liner(Path(module.__file__)))
+    say(result, content, checks, directory)
+    return DONE if not result.failure and all(check.passed for check in checks) else FAILED
+
+
+def settings_of(chosen: argparse.Namespace, module, name: str) -> tuple[dict, dict]:
+    """Parameters of the scene, and dt, precision and worlds as far as they are given, here or by the run to resume."""
+    known = parameters(module, {})
+    asked = {key: value for key, value in vars(chosen).items() if value is not None}
+    given = {key: value for key, value in asked.items() if key in known or key in RUN_SETTINGS}
+    if chosen.resume is not None:
+        if chosen.out is not None:
+            raise InputError("a resumed run stays in its directory: give --resume or --out")
+        given = stored_settings(chosen.resume, name, given)
+    if given.get("worlds", 1) < 1:
+        raise InputError(f"--worlds {chosen.worlds}: there must be at least one")
+    run_settings = {key: given.pop(key) for key in RUN_SETTINGS if key in given}
+    return parameters(module, given), run_settings
+
+
+def say(result, content: dict, checks: list, directory: Path) -> None:
+    """Print what a run did."""
+    from ddg_warp.summary import checks_table
+
+    print(result.model.report(), end="\n\n")
+    steps = f"{content['steps']} steps of {content['ms_per_step']:.3g} ms"
+    print(
+        f"{content['scene']}: {content['sim_time']:g} s in {steps}; "
+        f"{content['wall_time']:.3g} s in all, {content['compile_time']:.3g} s to build and compile"
+    )
+    if checks:
+        print(checks_table(checks))
+    print(f"results are in {directory}")
+    if result.failure:
+        print(f"ddg-warp: the solver failed: {result.failure}", file=sys.stderr)
+
+
+def draw(directory: Path, title: str, shapes: int = 6) -> None:
+    """Draw the rods of the first world at a few times into DIR/picture.png, where matplotlib is installed."""
+    try:
+        from ddg_warp.figure import rods_picture
+    except ModuleNotFoundError as error:
+        print(f"no picture without {error.name}: `pip install matplotlib`", file=sys.stderr)
+        return
+    from ddg_warp.io.hdf5 import TrajectoryReader
+
+    with TrajectoryReader(directory / "trajectory.h5") as reader:
+        frames = {round((len(reader) - 1) * k / (shapes - 1)) for k in range(shapes)}
+        count = sum(reader.counts)
+        points = {float(reader.time[frame]): reader.points[frame].reshape(-1, 3)[:count] for frame in frames}
+        rods_picture(reader.curves, points, directory / "picture.png", title)
+
+
+def list_all(chosen: argparse.Namespace) -> int:
+    """`list`: scenes and terms with what they are, in one line each."""
+    from ddg_warp.kernels.terms import REGISTRY
+
+    listed = {
+        "scenes": {name: one_liner(path) for name, path in scene_files().items()},
+        "terms": {name: term.text for name, term in REGISTRY.items()},
+    }
+    for title, entries in listed.items():
+        width = max(map(len, entries), default=0)
+        print(f"{title}:")
+        for name, text in entries.items():
+            print(f"  {name:{width}}  {text}")
+    return DONE
+
+
+def check_terms(chosen: argparse.Namespace) -> int:
+    """`check`: the derivative table of a term, or of all."""
+    from ddg_warp.kernels.terms import REGISTRY
+    from ddg_warp.summary import table
+
+    if chosen.term is not None and chosen.term not in REGISTRY:
+        raise InputError(f"there is no term '{chosen.term}'; there are {', '.join(REGISTRY)}")
+
+    require_device(chosen.device)
+    from ddg_warp import derivatives
+
+    rows = derivatives.table(chosen.term, chosen.precision, chosen.device)
+    print(table([{**row, "passed": "passed" if row["passed"] else "FAILED"} for row in rows]))
+    return DONE if all(row["passed"] for row in rows) else FAILED
+
+
+def bench_scene(chosen: argparse.Namespace) -> int:
+    """`bench`: a scene's error against its time."""
+    from ddg_warp.bench import benchmark, scenes_with_benchmark
+
+    if chosen.scene is None:
+        print("\n".join(scenes_with_benchmark()))
+        return DONE
+    require_device(chosen.device)
+    return DONE if benchmark(chosen.scene, chosen.out, device=chosen.device, precision=chosen.precision) else FAILED
+
+
+def export_run(chosen: argparse.Namespace) -> int:
+    """`export`: trajectory.h5 as USD."""
+    from ddg_warp.record import export_usd
+
+    source = chosen.directory / "trajectory.h5"
+    if not source.is_file():
+        raise InputError(f"there is no run in {chosen.directory}: {source} is missing")
+    target = chosen.to or chosen.directory / "export.usdc"
+    if target.suffix not in (".usda", ".usdc"):
+        raise InputError(f"--to {target}: the file must end in .usdc or .usda")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    export_usd(source, target, tube=chosen.tube)
+    print(f"wrote {target}")
+    return DONE
+
+
+def show_info(chosen: argparse.Namespace) -> int:
+    """`info`: versions, devices, machine."""
+    from ddg_warp.summary import machine
+
+    require_device(None)
+    for name, value in machine().items():
+        items = [f"{key} {item}" for key, item in value.items()] if isinstance(value, dict) else value
+        print(f"{name + ':':11} {', '.join(items) if isinstance(items, list) else items}")
+    return DONE
+
+
+def require_device(name: str | None) -> None:
+    """Start Warp without its chatter; refuse a device that it does not have."""
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_WARNING
+    if name is None:
+        return
+    known = [device.alias for device in wp.get_devices()]
+    if name not in known and name != "cuda":
+        raise InputError(f"there is no device '{name}' here; there is {', '.join(known)}")

@@ -1,0 +1,263 @@
+"""Run a scene's analysis and record it. The loop is short on purpose: copy it where you need another one."""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ddg_warp.catalog import InputError
+from ddg_warp.errors import SolverError
+from ddg_warp.scene import Dynamics, Scene
+
+
+@dataclass
+class Result:
+    """What a run leaves behind; `check(result)` of a scene judges it.
+
+    Attributes:
+        scene: The scene that was run.
+        model: Its model.
+        state: The last good state.
+        times: Time of each recorded state [s], the initial one first; in statics, the load parameter.
+        series: Observed values by name, one a recorded state.
+        statistics: `integrator.statistics()`, and the like of a static run.
+        energies: Energies by term [J] at "start" and "end".
+        dt: Time step [s]; None in statics.
+        step_times: Time that each step of this run took [s], by the clock of the run; the first includes compilation.
+        wall_time: Time from the scene to the end [s].
+        compile_time: Time from the scene to the end of the first step, less a steady step [s].
+        failure: Why the run ended early; empty where it did not.
+    """
+
+    scene: Scene
+    model: Any
+    state: Any
+    times: list[float] = field(default_factory=list)
+    series: dict[str, list[float]] = field(default_factory=dict)
+    statistics: dict = field(default_factory=dict)
+    energies: dict[str, dict[str, float]] = field(default_factory=dict)
+    dt: float | None = None
+    step_times: list[float] = field(default_factory=list)
+    wall_time: float = 0.0
+    compile_time: float = 0.0
+    failure: str = ""
+
+    @property
+    def seconds_per_step(self) -> float:
+        """Mean time of a step [s]; without the first, which compiles, unless it is the only one."""
+        steady = self.step_times[1:] or self.step_times
+        return sum(steady) / len(steady) if steady else 0.0
+
+    def at(self, t: float, name: str) -> float:
+        """Observed value `name` of the recorded state at time t [s], to a thousandth of a step.
+
+        Raises:
+            KeyError: No state was recorded at that time.
+        """
+        index = self._index(t)
+        if index is None:
+            raise KeyError(f"no state was recorded at {t} s")
+        return self.series[name][index]
+
+    def reached(self, t: float) -> bool:
+        """Whether a state was recorded at time t [s]."""
+        return self._index(t) is not None
+
+    def _index(self, t: float) -> int | None:
+        if not self.times:
+            return None
+        nearest = min(range(len(self.times)), key=lambda i: abs(self.times[i] - t))
+        return nearest if abs(self.times[nearest] - t) <= 1e-3 * (self.dt or 1e-6) else None
+
+
+def simulate(
+    scene: Scene,
+    *,
+    device: str | None = None,
+    precision: str | None = None,
+    worlds: int = 1,
+    out: str | Path | None = None,
+    dt: float | None = None,
+    duration: float | None = None,
+    resume: str | Path | None = None,
+    observe: Callable[[Any, Any], Mapping[str, float]] | None = None,
+    provenance: Mapping | None = None,
+    options: Mapping | None = None,
+    clock: Callable[[], float] | None = None,
+    progress: bool = True,
+) -> Result:
+    """Run the analysis of a scene.
+
+    Args:
+        scene: What to run.
+        device: Warp device; by default CUDA if there is one.
+        precision: "float64", "mixed" or "float32"; by default what suits the device.
+        worlds: Independent copies.
+        out: Directory for trajectory.h5 and scene.usdc; None records nothing.
+        dt: Time step [s] instead of the scene's.
+        duration: End of the run [s] instead of the scene's.
+        resume: Directory of an earlier run, which this one continues.
+        observe: (model, state) -> values by name, taken at the start and after every step.
+        provenance: Attributes of the trajectory: scene, parameters, command.
+        options: Keyword arguments of the `Integrator`, or of `StaticsOptions`: rtol and others.
+        clock: Clock of `step_times` [s]; by default wall time, of finished work on CUDA.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        The result; `failure` says why where the run ended early.
+
+    Raises:
+        SceneError: The scene cannot be built.
+        InputError: The duration is no whole number of steps, or a static scene is to move.
+    """
+    from tqdm import tqdm
+
+    began = time.perf_counter()
+    analysis = scene.analysis
+    dynamic = isinstance(analysis, Dynamics)
+    if not dynamic and (dt, duration, resume) != (None, None, None):
+        raise InputError("this scene is static: it takes no dt, no duration and nothing to resume")
+    if dynamic:
+        dt = analysis.dt if dt is None else dt
+        duration = analysis.duration if duration is None else duration
+    steps = step_count(dt, duration) if dynamic else analysis.load_steps
+
+    model = scene.build(device=device, precision=precision, worlds=worlds)
+    result = Result(scene, model, model.state(), dt=dt)
+    if resume is not None:
+        continue_from(result, Path(resume))
+    result.energies["start"] = energies(model, result.state)
+    options = dict(options or {})
+    with ExitStack() as stack:
+        recorder = None
+        if out is not None or resume is not None:
+            attributes = {**(provenance or {}), "dt": dt or 0.0, "precision": model.precision, "worlds": worlds}
+            recorder = stack.enter_context(open_recorder(model, out, resume, dt, attributes))
+        if recorder is not None and dynamic:
+            options.setdefault("check_every", 1)  # recording waits for every step as it is
+        done = max(0, len(result.times) - 1)
+        text = "compiling, once"
+        bar = stack.enter_context(tqdm(total=steps, initial=done, desc=text, unit="step", disable=not progress))
+
+        def keep(state) -> None:
+            if len(result.step_times) == 1:
+                result.compile_time = time.perf_counter() - began
+                bar.set_description()
+            result.state = state
+            result.times.append(float(state.time))
+            observed = {} if observe is None else dict(observe(model, state))
+            for name, value in observed.items():
+                result.series.setdefault(name, []).append(value)
+            if recorder is not None:
+                recorder.record(state, observed=observed)
+
+        try:
+            if resume is None:
+                keep(result.state)
+            run = advance if dynamic else equilibrate
+            run(result, steps, keep, options=options, clock=clock or wall_clock(model.device), bar=bar)
+        except SolverError as error:
+            result.failure = str(error)
+            result.state = error.state if error.state is not None else result.state
+    result.compile_time = max(0.0, result.compile_time - result.seconds_per_step)
+    result.energies["end"] = energies(model, result.state)
+    result.wall_time = time.perf_counter() - began
+    return result
+
+
+def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clock, bar) -> None:
+    """Step to the end and `keep` each state. The scene's callbacks run inside of `integrator.step`."""
+    from ddg_warp.integrate.dynamics import Integrator
+
+    integrator = Integrator(result.model, scheme=result.scene.analysis.scheme, **options)
+    state = result.state
+    try:
+        for _ in range(round(float(state.time) / result.dt), steps):
+            started = clock()
+            state = integrator.step(state, result.dt)
+            result.step_times.append(clock() - started)
+            keep(state)
+            bar.update()
+        integrator.check(state)
+    finally:
+        result.statistics = integrator.statistics()
+
+
+def equilibrate(result: Result, steps: int, keep: Callable, *, options: Mapping, clock, bar) -> None:
+    """Load step by step and `keep` each equilibrium."""
+    from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
+
+    equilibrium = Equilibrium(result.model, StaticsOptions(**options))
+    state, iterations, outcomes = result.state, [], Counter()
+    try:
+        for step in range(steps):
+            started, before = clock(), equilibrium.iterations
+            state = equilibrium.load(state, 1, step / steps, (step + 1) / steps)
+            result.step_times.append(clock() - started)
+            iterations.append(equilibrium.iterations - before)
+            outcomes[equilibrium.outcome] += 1
+            keep(state)
+            bar.update()
+    except SolverError as error:
+        outcomes[error.outcome] += 1
+        raise
+    finally:
+        mean = sum(iterations) / max(1, len(iterations))
+        newton = {"mean": mean, "max": max(iterations, default=0)}
+        result.statistics = {"newton_iterations": newton, "pcg_iterations": 0, "outcomes": dict(outcomes)}
+
+
+def step_count(dt: float, duration: float) -> int:
+    """Steps of dt [s] in `duration` [s].
+
+    Raises:
+        InputError: One of them is not positive, or they do not fit.
+    """
+    if not (dt > 0.0 and duration > 0.0):
+        raise InputError(f"dt = {dt} s and duration = {duration} s must be positive")
+    steps = round(duration / dt)
+    if steps < 1 or abs(steps * dt - duration) > 1e-6 * dt:
+        raise InputError(f"a duration of {duration} s is no whole number of steps of {dt} s; change one of them")
+    return steps
+
+
+def continue_from(result: Result, directory: Path) -> None:
+    """Put the checkpoint of the run in `directory`, and what was observed up to it, into a new result."""
+    from ddg_warp.io.hdf5 import TrajectoryReader
+
+    with TrajectoryReader(directory / "trajectory.h5") as reader:
+        frames = reader.checkpoint_frame
+        result.state = result.model.restore(reader.checkpoint())
+        result.times = reader.time[:frames].tolist()
+        result.series = {name: values[:frames].tolist() for name, values in reader.series.items()}
+
+
+def open_recorder(model, out, resume, dt, provenance):
+    """The recorder of a run in `out`, or of the run that it resumes."""
+    from ddg_warp.record import Recorder
+
+    fps = round(1.0 / dt, 6) if dt else None  # one time code a step
+    return Recorder(model, Path(resume or out), fps=fps, resume=resume is not None, provenance=provenance)
+
+
+def wall_clock(device: str) -> Callable[[], float]:
+    """Wall time [s], read once the device has finished what it was given."""
+    import warp as wp
+
+    if not wp.get_device(device).is_cuda:
+        return time.perf_counter
+
+    def finished() -> float:
+        wp.synchronize_device(device)
+        return time.perf_counter()
+
+    return finished
+
+
+def energies(model, state) -> dict[str, float]:
+    """Energies by term and their total [J]; lists of one a world where there are several."""
+    terms = model.energies(state)
+    return {**terms, "total": sum(terms.values())}

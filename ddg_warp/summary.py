@@ -1,0 +1,128 @@
+"""What a run says at its end: summary.json, and the same in a few lines on the terminal."""
+
+import json
+import math
+import os
+import platform
+import subprocess
+from collections.abc import Iterable, Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+PACKAGES = ("ddg-warp", "warp-lang", "numpy", "scipy", "h5py", "usd-core", "matplotlib", "torch")
+
+
+def summary(scene: str, parameters: Mapping, result, checks: Iterable) -> dict:
+    """The content of summary.json; `failure` is there only where the solver failed."""
+    statistics = result.statistics
+    content = {
+        "scene": scene,
+        "parameters": dict(parameters),
+        "device": str(result.model.device),
+        "precision": result.model.precision,
+        "dt": result.dt,
+        "steps": max(0, len(result.times) - 1),
+        "sim_time": float(result.state.time),
+        "wall_time": result.wall_time,
+        "compile_time": result.compile_time,
+        "ms_per_step": 1e3 * result.seconds_per_step,
+        "newton_iterations": statistics.get("newton_iterations", {}),
+        "pcg_iterations": statistics.get("pcg_iterations", 0),
+        "outcomes": statistics.get("outcomes", {}),
+        "energy": result.energies,
+        "checks": [check.as_dict() for check in checks],
+    }
+    return content | ({"failure": result.failure} if result.failure else {})
+
+
+def write_json(path: str | Path, content) -> None:
+    """Write JSON in one piece: a reader finds the old file or the new one. Numbers that are not finite become null."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    partial.write_text(json.dumps(plain(content), indent=2, allow_nan=False) + "\n")
+    partial.replace(path)
+
+
+def plain(value):
+    """A value made of what JSON knows."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if hasattr(value, "tolist"):  # NumPy arrays and scalars
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def table(rows: list[Mapping]) -> str:
+    """Rows as text in aligned columns, headed by the keys of the first."""
+    if not rows:
+        return ""
+    columns = list(rows[0])
+    lines = [columns, *([_cell(row[column]) for column in columns] for row in rows)]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(columns))]
+    padded = ([cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines)
+    return "\n".join("  ".join(cells).rstrip() for cells in padded)
+
+
+def checks_table(checks: Iterable) -> str:
+    """The checks of a scene as a table."""
+    return table(
+        [
+            {
+                "check": check.name,
+                "measured": float(check.measured),
+                "reference": float(check.reference),
+                "error": check.error,
+                "tolerance": f"{check.tolerance:g}" + (" relative" if check.relative else ""),
+                "result": "passed" if check.passed else "FAILED",
+            }
+            for check in checks
+        ]
+    )
+
+
+def machine() -> dict:
+    """Where results are made: versions, processor, devices and the git commit, as far as they can be known."""
+    import warp as wp
+
+    return {
+        "python": platform.python_version(),
+        "versions": {name: found for name in PACKAGES if (found := _version(name))},
+        "system": platform.platform(),
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "devices": [f"{device.alias}: {device.name}" for device in wp.get_devices()],
+        "commit": _commit(),
+    }
+
+
+def _cell(value) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def _commit() -> str:
+    """Commit of the source tree, with a mark where files differ from it; empty outside of a git checkout."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return ""

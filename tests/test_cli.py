@@ -1,0 +1,282 @@
+"""The commands: what they write, how they end, and what they say to a mistake."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from ddg_warp.cli import main
+from ddg_warp.errors import SolverError
+from ddg_warp.io.hdf5 import TrajectoryReader
+
+SCENE = '''"""A rod that falls freely."""
+
+import numpy as np
+
+import ddg_warp as ddg
+
+
+def build(n: int = 4, shift: float = 0.0, label: str = "rod", level: bool = True) -> ddg.Scene:
+    """A rod along x.
+
+    Args:
+        n: nodes, 100 % of them free
+        shift: spoils the check [m]
+    """
+    scene = ddg.Scene(analysis=ddg.Dynamics(dt=0.01, duration=0.05))
+    points = np.linspace([0.0, 0.0, 0.0], [1.0, 0.0, 0.0 if level else 1.0], n)
+    scene.add_rod(points, section=ddg.Circle(0.01), material=ddg.Material(1e6), name=label)
+    build.shift = shift
+    return scene
+
+
+def observe(model, state):
+    return {"z": state.points()[..., 0, 2].flat[0]}
+
+
+def check(result):
+    # Implicit Euler falls by g h^2 k (k + 1) / 2 in k steps.
+    k = len(result.times) - 1
+    fall = 9.81 * result.dt**2 * k * (k + 1) / 2
+    return [ddg.Check("fall [m]", -result.series["z"][-1] + build.shift, fall, 1e-9, "implicit Euler")]
+
+
+def benchmark():
+    return ddg.bench.Study(
+        grid={"dt": (0.01, 0.005), "precision": ("float64",)},
+        measure=lambda result: result.series["z"][-1],
+        reference=-9.81 * 0.02**2 / 2,
+        fixed={"duration": 0.02},
+    )
+'''
+SUMMARY = (
+    "scene parameters device precision dt steps sim_time wall_time compile_time ms_per_step newton_iterations "
+    "pcg_iterations outcomes energy checks"
+).split()
+
+
+@pytest.fixture
+def fall(tmp_path, monkeypatch, device):
+    """Runs a command on the falling rod, in a directory of its own."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "fall.py").write_text(SCENE)
+    return lambda command, *flags: main([command, "fall.py", *flags, "--device", device])
+
+
+def summary(directory="out/fall"):
+    with open(f"{directory}/summary.json") as file:
+        return json.load(file)
+
+
+def points(directory):
+    with TrajectoryReader(f"{directory}/trajectory.h5") as reader:
+        return reader.points[:]
+
+
+def test_run_writes_everything(fall, tmp_path, capsys):
+    assert fall("run", "--json", "copy/summary.json") == 0
+    content = summary()
+    assert list(content) == SUMMARY
+    assert content == json.loads((tmp_path / "copy/summary.json").read_text())
+    assert content["scene"] == "fall"
+    assert content["parameters"] == {"n": 4, "shift": 0.0, "label": "rod", "level": True}
+    assert content["steps"] == 5
+    assert content["sim_time"] == pytest.approx(0.05)
+    assert content["outcomes"]["converged"] == 5
+    assert set(content["energy"]) == {"start", "end"}
+    assert [check["passed"] for check in content["checks"]] == [True]
+    files = {path.name for path in (tmp_path / "out/fall").iterdir()}
+    assert files == {"scene.usdc", "trajectory.h5", "summary.json", "picture.png"}
+    assert "fall [m]" in capsys.readouterr().out
+
+
+def test_parameters_and_settings_become_flags(fall):
+    flags = "--n 6 --label x --no-level --dt 0.005 --duration 0.01 --out o".split()
+    assert fall("run", *flags) == 0
+    content = summary("o")
+    assert content["parameters"] == {"n": 6, "shift": 0.0, "label": "x", "level": False}
+    assert (content["dt"], content["steps"]) == (0.005, 2)
+    assert points("o").shape == (3, 6, 3)
+
+
+def test_worlds_are_recorded_side_by_side(fall):
+    assert fall("run", "--worlds", "2") == 0
+    assert points("out/fall").shape == (6, 2, 4, 3)
+
+
+def test_failed_check_fails_the_run(fall):
+    assert fall("run", "--shift", "0.1") == 1
+    assert summary()["checks"][0]["passed"] is False
+
+
+def test_failed_solver_keeps_what_is_complete(fall, monkeypatch, capsys):
+    from ddg_warp.integrate.dynamics import Integrator
+
+    step = Integrator.step
+
+    def fail(self, state, dt):
+        if state.time > 0.015:
+            raise SolverError("rod 0 could not be stepped", state=state)
+        return step(self, state, dt)
+
+    monkeypatch.setattr(Integrator, "step", fail)
+    assert fall("run") == 1
+    content = summary()
+    assert (content["failure"], content["steps"], content["checks"]) == ("rod 0 could not be stepped", 2, [])
+    assert len(points("out/fall")) == 3
+    assert "rod 0 could not be stepped" in capsys.readouterr().err
+
+
+def test_resumed_equals_straight(fall):
+    settings = ("--n", "5", "--dt", "0.005", "--worlds", "2")
+    assert fall("run", *settings, "--out", "straight") == 0
+    assert fall("run", *settings, "--out", "parts", "--duration", "0.02") == 0
+    assert fall("run", "--resume", "parts") == 0
+    np.testing.assert_array_equal(points("parts"), points("straight"))
+    assert summary("parts")["parameters"] == summary("straight")["parameters"]
+    assert summary("parts")["steps"] == 10
+
+
+def test_static_scene_records_every_load_step(tmp_path, monkeypatch, device):
+    monkeypatch.chdir(tmp_path)
+    code = SCENE.replace("ddg.Dynamics(dt=0.01, duration=0.05)", "ddg.Statics(load_steps=3)")
+    code = code.replace("    build.shift = shift", "    scene.clamp(0)")
+    (tmp_path / "sag.py").write_text(code.partition("def check")[0] + "def check(result):\n    return []\n")
+    assert main(["run", "sag.py", "--device", device]) == 0
+    content = summary("out/sag")
+    assert (content["steps"], content["sim_time"], content["dt"]) == (3, 1.0, None)
+    assert content["newton_iterations"]["max"] > 0
+    assert len(points("out/sag")) == 4
+    assert main(["run", "sag.py", "--dt", "0.1"]) == 2
+
+
+MISTAKES = {
+    "parameter": (["run", "fall.py", "--m", "3"], "unrecognized arguments: --m 3"),
+    "abbreviation": (["run", "fall.py", "--dura", "3"], "unrecognized arguments"),
+    "value": (["run", "fall.py", "--n", "few"], "invalid int value: 'few'"),
+    "scene": (["run", "cantileve"], "did you mean cantilever?"),
+    "file": (["run", "nowhere.py"], "no scene file nowhere.py"),
+    "points": (["run", "fall.py", "--n", "1", "--device", "cpu"], "rod"),
+    "device": (["run", "fall.py", "--device", "cuda:99"], "no device 'cuda:99'"),
+    "steps": (["run", "fall.py", "--dt", "0.03", "--device", "cpu"], "no whole number of steps"),
+    "step": (["run", "fall.py", "--dt", "-1", "--device", "cpu"], "must be positive"),
+    "worlds": (["run", "fall.py", "--worlds", "0"], "at least one"),
+    "nothing to resume": (["run", "fall.py", "--resume", "nowhere"], "no run to resume in nowhere"),
+    "both directories": (["run", "fall.py", "--resume", "a", "--out", "b"], "--resume or --out"),
+    "term": (["check", "spring"], "no term 'spring'"),
+    "benchmark": (["bench", "spring"], "no scene 'spring'"),
+    "export": (["export", "nowhere"], "no run in nowhere"),
+    "command": (["walk"], "invalid choice: 'walk'"),
+    "no command": ([], "required: COMMAND"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistake_is_told_in_one_line(name, fall, capfd):
+    arguments, message = MISTAKES[name]
+    assert main(arguments) == 2
+    errors = [line for line in capfd.readouterr().err.splitlines() if line.startswith("ddg-warp: ")]
+    assert len(errors) == 1
+    assert message in errors[0]
+
+
+@pytest.mark.parametrize(("flag", "stored"), [("--n", "n = 4"), ("--dt", "dt = 0.01"), ("--worlds", "worlds = 1")])
+def test_resume_with_another_setting_is_a_mistake(fall, capsys, flag, stored):
+    assert fall("run") == 0
+    assert fall("run", "--resume", "out/fall", flag, "9") == 2
+    assert f"has {stored}; resume it without {flag}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        ("def build(n):\n    pass\n", "needs a default"),
+        ("def build(n: list = ()):\n    pass\n", "type of int, float, str or bool"),
+        ("def build(dt: float = 1.0):\n    pass\n", "name of an option of `run`"),
+        ("def build(scene: str = ''):\n    pass\n", "name of an option of `run`"),
+        ("def make():\n    pass\n", "has no build"),
+    ],
+)
+def test_scene_that_cannot_become_flags(tmp_path, capsys, code, message):
+    (tmp_path / "odd.py").write_text(code)
+    assert main(["run", str(tmp_path / "odd.py")]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_help_shows_the_parameters_of_the_scene(fall, capsys):
+    with pytest.raises(SystemExit) as exit_info:
+        fall("run", "--help")
+    assert exit_info.value.code == 0
+    assert "100 % of them free (default: 4)" in " ".join(capsys.readouterr().out.split())
+
+
+def test_list_names_scenes_and_terms(capsys):
+    assert main(["list"]) == 0
+    shown = capsys.readouterr().out
+    assert "cantilever  " in shown
+    assert "rod_bend_twist  " in shown
+
+
+def test_info_names_versions(capsys):
+    assert main(["info"]) == 0
+    assert "warp-lang 1." in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("passed", [True, False])
+def test_check_prints_the_derivative_table(monkeypatch, capsys, device, passed):
+    from ddg_warp import derivatives
+
+    asked = []
+
+    def table(*arguments):
+        asked.append(arguments)
+        return [{"term": "rod_bend", "check": "gradient", "error": 1e-9, "tolerance": 1e-7, "passed": passed}]
+
+    monkeypatch.setattr(derivatives, "table", table)
+    assert main(["check", "rod_bend", "--precision", "float32", "--device", device]) == (0 if passed else 1)
+    assert asked == [("rod_bend", "float32", device)]
+    assert ("passed" if passed else "FAILED") in capsys.readouterr().out.splitlines()[1]
+
+
+@pytest.mark.parametrize("flags", [[], ["--tube"]])
+def test_export(fall, tmp_path, flags):
+    from pxr import Usd, UsdGeom
+
+    assert fall("run") == 0
+    assert main(["export", "out/fall", "--to", "again.usda", *flags]) == 0
+    kind = UsdGeom.Mesh if flags else UsdGeom.BasisCurves
+    stage = Usd.Stage.Open("again.usda")
+    shapes = [prim for prim in stage.Traverse() if prim.IsA(kind)]
+    assert len(shapes) == 1
+    assert kind(shapes[0]).GetPointsAttr().GetNumTimeSamples() == 6
+
+
+def test_bench_gives_error_and_time_together(fall, tmp_path):
+    assert fall("bench") == 0
+    with open("out/bench/fall.json") as file:
+        rows = json.load(file)["rows"]
+    assert [row["dt"] for row in rows] == [0.01, 0.005]
+    # Implicit Euler falls too far by g h T / 2.
+    assert [row["error"] for row in rows] == pytest.approx([9.81 * dt * 0.02 / 2 for dt in (0.01, 0.005)], rel=1e-6)
+    assert all(row["ms_per_step"] > 0 for row in rows)
+    assert (tmp_path / "out/bench/fall.csv").read_text().startswith("dt,precision,error,ms_per_step")
+    assert (tmp_path / "out/bench/fall.png").is_file()
+
+
+def test_cantilever_swings_as_published(tmp_path, device):
+    assert main(["run", "cantilever", "--device", device, "--out", str(tmp_path)]) == 0
+    assert len(summary(tmp_path)["checks"]) == 6
+
+
+def test_import_is_light():
+    code = "import sys, ddg_warp.cli; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert {"warp", "torch", "pxr", "h5py", "scipy", "matplotlib", "numpy"}.isdisjoint(loaded)
+
+
+def test_module_is_the_command():
+    run = subprocess.run([sys.executable, "-m", "ddg_warp"], capture_output=True, text=True, check=False)
+    assert run.returncode == 2
+    assert run.stderr.startswith("ddg-warp: ")
