@@ -169,6 +169,8 @@ def _kind(dimension: int, batch: RodBatch) -> ChainKind:
 def _piece(dimension: int, batch: RodBatch, rows: np.ndarray, ghosts: tuple[int, int]) -> Piece:
     before, after = ghosts
     points = batch.points[rows]
+    if dimension == 2:
+        points = points * [1.0, 0.0, 1.0]
     if before:
         points = np.concatenate([_ghost(points, 0, 1), points], axis=1)
     if after:

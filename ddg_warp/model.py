@@ -329,6 +329,8 @@ class Model:
 
     def gather_directors(self, state: State) -> np.ndarray | None:
         """First material directors of a state; see `State.directors`."""
+        if not any(group.kind.twist for group in self.groups):
+            return None
         values = []
         for data in state.groups:
             frame, theta = arrays.download(data.frame), arrays.download(data.theta)

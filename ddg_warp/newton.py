@@ -24,7 +24,7 @@ class NewtonOptions:
 
     rtol: float = 1e-8
     floor_factor: float = 4.0
-    max_iterations: int = 50
+    max_iterations: int = 100
     max_halvings: int = 20
     rotation_cap: float = 1.0
     linear_rtol: float = 1e-8
@@ -67,7 +67,8 @@ class ChainNewton:
         self.elimination = make(2 * kind.block**2 + kind.block, *nodes, dtype=self.linear) if not kind.closed else None
         self.direction = make(kind.block, *nodes, dtype=self.linear)
         self.status, self.slot, self.iteration, self.halvings = flags(), flags(), flags(), flags()
-        self.lost, self.turned, self.unbalanced, self.drowned = flags(), flags(), flags(), flags()
+        self.lost, self.turned, self.clamped, self.unbalanced, self.drowned = (flags() for _ in range(5))
+        self.without_compression = self.clamped  # rods whose matrix leaves the stiffness that compression takes away
         self.coefficient, self.rate = scalars(), scalars()
         self.step_length, self.decrement, self.load_scale, self.residual = scalars(), scalars(), scalars(), scalars()
         self.active = wp.zeros(1, dtype=int, device=device)
@@ -101,18 +102,8 @@ class ChainNewton:
         wp.launch(
             self._evaluate,
             (group.elements, group.columns),
-            [
-                self.x,
-                self.theta,
-                self.frame,
-                last,
-                self.rate,
-                group.buffer,
-                group.table,
-                group.count,
-                self.status,
-                self.slot,
-            ],
+            [self.x, self.theta, self.frame, last, self.rate, group.buffer, group.table, group.count]
+            + [self.status, self.slot, self.without_compression],
             [self.factor, self.gradient, self.energy, self.stiffness, self.turned, self.active],
             device=self.device,
             block_dim=128,
@@ -145,7 +136,16 @@ class ChainNewton:
             + [options.max_iterations, options.max_halvings]
             + [self.x, self.theta, self.frame, self.base, self.elimination, self.direction]
             + [self.status, self.slot, self.iteration, self.halvings, self.step_length, self.decrement]
-            + [self.load_scale, self.residual, self.lost, self.turned, self.unbalanced, self.drowned, self.active],
+            + [
+                self.load_scale,
+                self.residual,
+                self.lost,
+                self.turned,
+                self.clamped,
+                self.unbalanced,
+                self.drowned,
+                self.active,
+            ],
             device=self.device,
             block_dim=32,
         )

@@ -126,7 +126,7 @@ def simulate(
     steps = step_count(dt, duration) if dynamic else analysis.load_steps
 
     model = scene.build(device=device, precision=precision, worlds=worlds)
-    result = Result(scene, model, model.state(), dt=dt)
+    result = Result(scene, model, scene.initial(model) if scene.initial else model.state(), dt=dt)
     if resume is not None:
         continue_from(result, Path(resume))
     result.energies["start"] = energies(model, result.state)

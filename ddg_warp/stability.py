@@ -55,25 +55,45 @@ def spectrum(model, state, count: int = 4, metric: str = "mass", tangent: Tangen
     matrix = tangent.hessian(state)[free][:, free]
     if metric == "mass":
         weights = tangent.mass[free]
-        if (weights <= 0.0).any():
-            raise ValueError("a free dof has no mass; ask for metric='unit'")
+        matrix, kept = _condensed(matrix, weights > 0.0)
+        weights = weights[kept]
     else:
-        weights = np.where(tangent.angle[free], tangent.edge_length() ** 2, 1.0)
+        weights, kept = np.where(tangent.angle[free], tangent.edge_length() ** 2, 1.0), np.arange(len(free))
     scaling = 1.0 / np.sqrt(weights)
-    scaled = sparse.diags(scaling) @ matrix @ sparse.diags(scaling)
-    count = min(count, len(free))
-    if len(free) <= DENSE:
-        values, vectors = linalg.eigh(scaled.toarray(), subset_by_index=(0, count - 1))
-        negative = int((values < 0.0).sum()) if values[-1] > 0.0 else Factorisation(sparse.csc_matrix(matrix)).negative
+    scaled = sparse.csc_matrix(sparse.diags(scaling) @ matrix @ sparse.diags(scaling))
+    count = min(count, len(kept))
+    if len(kept) <= DENSE:
+        values, vectors = linalg.eigh(scaled.toarray())
+        negative = int((values < 0.0).sum())
     else:
-        negative = Factorisation(sparse.csc_matrix(matrix)).negative
-        wanted = min(count + negative, len(free) - 1)
-        values, vectors = eigsh(sparse.csc_matrix(scaled), k=wanted, sigma=0.0, which="LM", v0=np.ones(len(free)))
-        order = np.argsort(values)[:count]
-        values, vectors = values[order], vectors[:, order]
+        negative = Factorisation(scaled).negative
+        values, vectors = _lowest(scaled, count, negative)
     modes = np.zeros((tangent.size, count))
-    modes[free] = scaling[:, None] * vectors
-    return Spectrum(values, modes, negative)
+    modes[free[kept]] = scaling[:, None] * vectors[:, :count]
+    return Spectrum(values[:count], modes, negative)
+
+
+def _condensed(matrix, massive: np.ndarray):
+    """The stiffness of the dofs with mass, those without following them in equilibrium; and which dofs are kept."""
+    kept, slaves = np.flatnonzero(massive), np.flatnonzero(~massive)
+    if not slaves.size:
+        return matrix, kept
+    coupling = matrix[kept][:, slaves]
+    inner = Factorisation(sparse.csc_matrix(matrix[slaves][:, slaves]))
+    follow = np.column_stack([inner.solve(column) for column in coupling.toarray()])
+    return matrix[kept][:, kept] - sparse.csc_matrix(coupling @ follow), kept
+
+
+def _lowest(matrix, count: int, negative: int) -> tuple[np.ndarray, np.ndarray]:
+    """The `count` lowest eigenpairs: eigenvalues nearest to zero, more and more of them until all negative ones are there."""
+    wanted = count + negative
+    while True:
+        wanted = min(wanted, matrix.shape[0] - 1)
+        values, vectors = eigsh(matrix, k=wanted, sigma=0.0, which="LM", v0=np.ones(matrix.shape[0]))
+        if (values < 0.0).sum() >= negative or wanted == matrix.shape[0] - 1:
+            order = np.argsort(values)
+            return values[order], vectors[:, order]
+        wanted *= 2
 
 
 def critical(equilibrium_at: Callable, low: float, high: float, tolerance: float = 1e-8) -> float:

@@ -283,7 +283,11 @@ def search_functions(kind: ChainKind, real, linear):
                 mean += x[j, r] - base[j, r] - step_of(direction, j, r) * amount
             mean /= real(n)
             for j in range(n):
-                x[j, r] = x[j, r] - mean
+                back_j = x[j, r]
+                for d in range(wp.static(dim)):
+                    if ((int(fixed[j, r]) >> d) & 1) == 0:
+                        back_j[d] = back_j[d] - mean[d]
+                x[j, r] = back_j
 
     @wp.func
     def turn_angles(theta: wp.array2d(dtype=real), direction: wp.array3d(dtype=linear), amount: real, n: int, r: int):
@@ -417,6 +421,7 @@ def sweep_kernel(kind: ChainKind, real, linear):
         residual: wp.array(dtype=real),
         lost: wp.array(dtype=int),
         turned: wp.array(dtype=int),
+        clamped: wp.array(dtype=int),
         unbalanced: wp.array(dtype=int),
         drowned: wp.array(dtype=int),
         active: wp.array(dtype=int),
@@ -586,6 +591,11 @@ def sweep_kernel(kind: ChainKind, real, linear):
             lost[r] = 0
             change = real(0.0)
         finite = wp.isfinite(worst) and wp.isfinite(newton) and wp.isfinite(change)
+        if lost_here > 0 and clamped[r] == 0:
+            # compression has made the matrix indefinite: the same iterate again, without what compression takes away
+            clamped[r] = 1
+            active[0] = 1
+            return
         accept = first and finite
         if first and not finite:
             status[r] = wp.static(outcome.NON_FINITE)
@@ -620,8 +630,14 @@ def sweep_kernel(kind: ChainKind, real, linear):
         lost[r] = lost[r] + lost_here
         if wp.static(twist):
             if turned[r] != 0:
+                # angles mean something else now: take no step, and ask for a direction in the new frames
                 relag(x, frame, n, r)
                 turned[r] = 0
+                decrement[r] = real(1.0e30)
+                step_length[r] = real(0.0)
+                for j in range(n):
+                    base[j, r] = x[j, r]
+                return
         e1 = H()
         e2 = H()
         rotation = real(0.0)

@@ -13,6 +13,7 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels import frames
 from ddg_warp.kernels.terms import Term
 
 # Fused multiply-adds are what a CUDA build uses too. They and inlining halve the CPU's time for a sweep (1.9 to 0.9 of it each).
@@ -341,6 +342,7 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear):
         table: wp.array2d(dtype=int),
         last: wp.array3d(dtype=real),
         rate: real,
+        clamped: int,
         factor: wp.array3d(dtype=linear),
         k: int,
         r: int,
@@ -352,6 +354,9 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear):
         shift = E()
         if wp.static(has_tension):
             c, shift = tension_of(q, w, slope)
+            if clamped != 0 and c < real(0.0):
+                c = real(0.0)
+                shift = E()
             factor[wp.static(tension_row), k, r] = linear(c)
         root = root_of(e, p, shift) * wp.sqrt(w)
         stiffness = real(0.0)
@@ -371,6 +376,7 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear):
 def evaluate_kernel(kind: ChainKind, real, linear):
     """The fused kernel of a Newton iteration: energy, gradient on the window and Gauss-Newton factor of all terms.
 
+    Compression lowers the stiffness across an edge, which can make the matrix indefinite: `clamped` rods do without that.
     Energies go to the slot that the line search does not hold (`1 - slot[r]`). `turned` is raised where an edge has turned by
     more than 90 degrees from its lagged tangent. `stiffness` is the largest a term has against moving its first edge [N/m].
     Thread (0, 0) clears `active`, which the sweep then raises.
@@ -378,6 +384,8 @@ def evaluate_kernel(kind: ChainKind, real, linear):
     V, W = wp.types.vector(kind.dim, real), wp.types.vector(kind.window, real)
     _, window, lagged, _ = gather_functions(kind, real)
     each = tuple(evaluate_functions(kind, i, real, linear) for i in range(len(kind.terms)))
+    X = wp.types.vector(3, real)
+    transport, reference_twist, _ = frames.functions(real)
     spans = tuple(term.measure.span for term in kind.terms)
     terms, size, twist, closed = len(kind.terms), kind.window, kind.twist, kind.closed
 
@@ -393,6 +401,7 @@ def evaluate_kernel(kind: ChainKind, real, linear):
         count: wp.array(dtype=int),
         status: wp.array(dtype=int),
         slot: wp.array(dtype=int),
+        clamped: wp.array(dtype=int),
         factor_out: wp.array3d(dtype=linear),
         gradient_out: wp.array3d(dtype=real),
         energy_out: wp.array3d(dtype=real),
@@ -414,7 +423,9 @@ def evaluate_kernel(kind: ChainKind, real, linear):
         f = W()
         for i in range(wp.static(terms)):
             if whole or wp.static(spans[i]) == 1:
-                energy, part, stiff = wp.static(each[i])(q, s, buffer, table, last, rate[r], factor_out, k, r)
+                energy, part, stiff = wp.static(each[i])(
+                    q, s, buffer, table, last, rate[r], clamped[r], factor_out, k, r
+                )
                 total += energy
                 f += part
                 stiffest = wp.max(stiffest, stiff)
@@ -423,8 +434,18 @@ def evaluate_kernel(kind: ChainKind, real, linear):
         for i in range(wp.static(size)):
             gradient_out[i, k, r] = f[i]
         if wp.static(twist):
-            if whole and q[0] * s[3] + q[1] * s[4] + q[2] * s[5] < real(0.0):
-                turned_out[r] = 1
+            if whole:
+                te = wp.normalize(X(q[0], q[1], q[2]))
+                tf = wp.normalize(X(q[3], q[4], q[5]))
+                te0 = X(s[3], s[4], s[5])
+                tf0 = X(s[9], s[10], s[11])
+                least = wp.min(wp.dot(te, te0), wp.dot(tf, tf0))
+                if least < real(0.9):
+                    m = reference_twist(
+                        transport(X(s[0], s[1], s[2]), te0, te), transport(X(s[6], s[7], s[8]), tf0, tf), te, tf, s[12]
+                    )
+                    if least < real(0.0) or wp.abs(m - s[12]) > real(1.5):
+                        turned_out[r] = 1
 
     return evaluate
 

@@ -95,7 +95,7 @@ def judge_kernel(kind: ChainKind, real, linear):
             if expected > real(10.0) * rounding:
                 accept = total <= real(-1.0e-4) * expected + rounding
             else:
-                accept = square <= real(4.0) * merit[r]
+                accept = square <= real(4.0) * merit[r] or taken == real(0.0)
         if not accept:
             halvings[r] = halvings[r] + 1
             if halvings[r] > max_halvings:
@@ -116,8 +116,15 @@ def judge_kernel(kind: ChainKind, real, linear):
         halvings[r] = 0
         if wp.static(twist):
             if turned[r] != 0:
+                # angles mean something else now: take no step, and ask for a direction in the new frames
                 relag(x, frame, n, r)
                 turned[r] = 0
+                decrement[r] = real(1.0e30)
+                step_length[r] = real(0.0)
+                for k in range(n):
+                    base[k, r] = x[k, r]
+                active[0] = 1
+                return
         wanted[r] = 1
         active[0] = 1
 

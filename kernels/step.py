@@ -55,6 +55,7 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
         iteration_out: wp.array(dtype=int),
         halvings_out: wp.array(dtype=int),
         turned_out: wp.array(dtype=int),
+        clamped_out: wp.array(dtype=int),
         unbalanced_out: wp.array(dtype=int),
         drowned_out: wp.array(dtype=int),
         load_scale_out: wp.array(dtype=real),
@@ -76,6 +77,7 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
             iteration_out[r] = 0
             halvings_out[r] = 0
             turned_out[r] = 0
+            clamped_out[r] = 0
             unbalanced_out[r] = 0
             drowned_out[r] = 0
             load_scale_out[r] = outer[r]
@@ -262,7 +264,7 @@ def finish_frames_kernel(kind: ChainKind, real):
 
 @cache
 def advance_kernel(real):
-    """After a (partial) step: count its outcome, go on, retry, or give the rod up.
+    """After a (partial) step: count its outcome, go on (with longer parts again), retry, or give the rod up.
 
     `tally` counts outcomes by their code; `work` holds Newton iterations (sum, largest), solves, retries, lost pivots.
     """
@@ -295,6 +297,11 @@ def advance_kernel(real):
         if result <= wp.static(outcome.CONVERGED_TO_ROUNDING):
             progress[r] = progress[r] + portion[r]
             cautious[r] = 0
+            retries[r] = 0
+            # a step twice as long, where it starts at a multiple of its length, so that all end together
+            longer = real(2.0) * portion[r]
+            if progress[r] < real(1.0) and wp.floor(progress[r] / longer) * longer == progress[r]:
+                portion[r] = longer
         else:
             wp.atomic_add(work, 3, wp.int64(1))
             retries[r] = retries[r] + 1

@@ -33,8 +33,8 @@ class Integrator:
         linear: "auto" (the chain sweep for open rods, PCG with the chain preconditioner for closed ones), "sweep", or PCG with
             "jacobi", "block_jacobi" or "chain" as preconditioner.
         rtol, max_iterations, ...: see `NewtonOptions`.
-        retry_limit: how often a rod's failed step is tried again: first from the last state instead of the predictor, then in
-            halves, and so on.
+        retry_limit: how often in a row a rod's failed step is tried again: first from the last state instead of the predictor,
+            then in halves, and so on.
         check_every: steps between readings of the outcomes; by default 1 on the CPU and 32 on CUDA.
 
     Raises:
@@ -47,7 +47,7 @@ class Integrator:
         scheme: str = "implicit_euler",
         *,
         linear: str = "auto",
-        retry_limit: int = 8,
+        retry_limit: int = 20,
         check_every: int | None = None,
         **options,
     ):
@@ -223,7 +223,15 @@ class _ChainStep:
             [before.x, before.v, before.theta, before.omega, before.frame, group.fixed, group.count, group.world, dt]
             + [self.damping, group.outer, self.progress, self.portion, self.cautious],
             [newton.x, newton.theta, newton.frame, newton.target, newton.target_angle, newton.coefficient, newton.rate]
-            + [newton.status, newton.iteration, newton.halvings, newton.turned, newton.unbalanced, newton.drowned]
+            + [
+                newton.status,
+                newton.iteration,
+                newton.halvings,
+                newton.turned,
+                newton.clamped,
+                newton.unbalanced,
+                newton.drowned,
+            ]
             + [newton.load_scale, self.bent, newton.active],
         )
         self._launch(

@@ -13,7 +13,7 @@ from scipy import sparse
 
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels import step
-from ddg_warp.linear.direct import Factorisation
+from ddg_warp.linear.direct import Factorisation, SingularError
 from ddg_warp.state import State
 from ddg_warp.tangent import Tangent
 
@@ -79,6 +79,8 @@ class Equilibrium:
 
     def load(self, state: State, load_steps: int, start: float = 0.0, end: float = 1.0) -> State:
         """Load stepping; see `solve`."""
+        if start == end:
+            return self.solve(state, start, end)
         at, increment, cuts = start, (end - start) / max(1, load_steps), 0
         state = state.copy()
         while at != end:
@@ -184,17 +186,22 @@ class Equilibrium:
         """Newton direction on the free dofs and the decrease of energy it promises."""
         free = np.flatnonzero(self.tangent.free)
         matrix, right = hessian[free][:, free], residual[free]
-        factor = Factorisation(matrix)
-        if self.options.mode == "minimise" and (factor.negative or not factor.reliable):
-            shift = 1e-6
-            diagonal = sparse.diags(np.abs(matrix.diagonal()))
-            while (factor.negative or not factor.reliable) and shift < 10.0:
-                factor = Factorisation((matrix + shift * diagonal).tocsc())
-                shift *= 4.0
-        solution = factor.solve(right)
+        solution = self._factor(matrix).solve(right)
         direction = np.zeros(self.tangent.size)
         direction[free] = solution
         return direction, float(right @ solution)
+
+    def _factor(self, matrix) -> Factorisation:
+        """The tangent's factors; shifted until it is definite, or in mode "follow" until it is regular."""
+        diagonal = sparse.diags(np.abs(matrix.diagonal()) + 1e-12 * np.abs(matrix.diagonal()).max())
+        for shift in (0.0, *np.geomspace(1e-6, 16.0, 13)):
+            try:
+                factor = Factorisation((matrix + shift * diagonal).tocsc())
+            except SingularError:
+                continue
+            if self.options.mode == "follow" or (factor.reliable and not factor.negative):
+                break
+        return factor
 
     def _excess(self, residual, gradient, hessian, q, scale: float) -> float:
         """How far the worst dof is from equilibrium; not positive when all are."""

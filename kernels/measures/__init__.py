@@ -24,8 +24,8 @@ class Measure:
         lag_size: reals of lagged data of the stencil; 0 for a measure without frames.
         strains: names and units of the strains.
         functions: real -> (strains, jacobian, tension). `strains(q, s, w) -> E`; `jacobian(q, s, w) -> (E, J)`; `tension` is
-            None, or `tension(q, w, slope) -> (c, shift)` with the positive semi-definite part of the second derivative,
-            w slope : d2e = c I + w J^T diag(shift) J on the first edge vector.
+            None, or `tension(q, w, slope) -> (c, shift)` with the second derivative of a strain of one edge,
+            w slope : d2e = c I + w J^T diag(shift) J; its other terms are left to the exact Hessian.
     """
 
     name: str

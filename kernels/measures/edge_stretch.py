@@ -1,6 +1,6 @@
 """Stretch of an edge, lambda = |x1 - x0| / w with w the rest length [m]. Singular where the edge has no length.
 
-The second derivative of lambda is (I - t t^T) / (|e| w): positive semi-definite under tension, dropped under compression.
+The second derivative of lambda is (I - t t^T) / (|e| w): positive semi-definite under tension, negative under compression.
 """
 
 from functools import cache
@@ -26,7 +26,7 @@ def _functions(measure_of):
 
         @wp.func
         def tension(q: Q, w: real, slope: E):
-            c = wp.max(slope[0], real(0.0)) / wp.length(q)
+            c = slope[0] / wp.length(q)
             return c, E(-c * w)
 
         return strains, jacobian, tension

@@ -1,0 +1,144 @@
+"""Only what a scene needs: no twist in a chain of springs, nothing heavy in the import."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import warp as wp
+
+import ddg_warp as ddg
+
+TWIST = ("transport", "reference_twist", "rotate", "relag", "atan2")
+HEAVY = ("warp", "torch", "pxr", "h5py", "scipy", "matplotlib")
+
+
+@pytest.fixture
+def launched(monkeypatch) -> list:
+    """Kernels launched while the test runs."""
+    kernels, launch = [], wp.launch
+
+    def record(kernel, *arguments, **options):
+        kernels.append(kernel)
+        return launch(kernel, *arguments, **options)
+
+    monkeypatch.setattr(wp, "launch", record)
+    return kernels
+
+
+def run(device, steps=3, **options):
+    """A hanging chain after some steps: model, integrator and state."""
+    scene = ddg.Scene(dimension=options.pop("dimension", 3))
+    points = np.zeros((6, 3))
+    points[:, 0] = np.arange(6.0)
+    section = ddg.Stiffness(EA=50.0, EI1=1.0, GJ=1.0, mass_per_length=1.0, rotary_inertia=0.1)
+    rod = scene.add_rod(points, section=section, **options)
+    scene.fix(rod, [0, 1])
+    if options.get("twist", options.get("bend", True)) and scene.dimension == 3:
+        scene.fix_twist(rod, [0])
+    model = scene.build(device=device)
+    integrator, state = ddg.Integrator(model), model.state()
+    for _ in range(steps):
+        state = integrator.step(state, 0.01)
+    return model, integrator, state
+
+
+def sources(kernels) -> dict[str, str]:
+    """Generated code of kernels by name."""
+    result = {}
+    for kernel in kernels:
+        folder = Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier()
+        (code,) = (f.read_text() for f in folder.iterdir() if f.suffix in (".cpp", ".cu"))
+        result[kernel.key] = code
+    return result
+
+
+def test_chain_of_springs_has_no_angles_and_no_frames(device):
+    model, integrator, state = run(device, bend=False)
+    (group,) = model.groups
+    assert [term.name for term in group.kind.terms] == ["rod_stretch"]
+    assert (group.kind.block, group.kind.window, group.kind.factor_rows) == (3, 3, 4)
+    (data,) = state.groups
+    for name in ("theta", "omega", "frame", "last"):
+        assert getattr(data, name).size == 1, name  # a placeholder for the kernels' signatures
+    assert data.x.shape == data.v.shape == (6, 1)
+    newton = integrator._chains[0].newton
+    assert newton.direction.shape[0] == 3
+    assert newton.elimination.shape[0] == 2 * 9 + 3
+    assert newton.theta.size == newton.target_angle.size == 1
+    assert state.points()[-1, 2] < 0.0  # it falls
+
+
+@pytest.mark.parametrize(
+    ("options", "block"),
+    [({}, 4), ({"twist": False}, 3), ({"bend": False}, 3), ({"dimension": 2}, 2), ({"dimension": 2, "bend": False}, 2)],
+    ids=["full", "untwisted", "stretch", "planar", "planar stretch"],
+)
+def test_twist_is_launched_only_where_it_is(device, launched, options, block):
+    model, _, state = run(device, **options)
+    code = sources(launched)
+    found = {word for text in code.values() for word in TWIST if word in text}
+    names = {key.split("_kernel")[0] for key in code}
+    assert model.groups[0].kind.block == block
+    assert {"evaluate", "sweep", "begin", "finish_nodes", "advance"} <= names
+    if block == 4:
+        assert found == set(TWIST)
+        assert "finish_frames" in names
+        assert state.angles().shape == (5,)
+    else:
+        assert not found
+        assert not names & {"finish_frames", "motion", "load", "strain"}
+        assert state.angles() is None
+
+
+@pytest.mark.parametrize("options", [{"twist": False}, {"bend": False}, {"dimension": 2}])
+def test_no_directors_without_twist(device, options):
+    _, _, state = run(device, steps=0, **options)
+    assert state.directors() is None
+
+
+def test_no_bending_kernels_in_a_chain_of_springs(device, launched):
+    """Its element kernel knows no second edge: the window is one edge."""
+    run(device, bend=False)
+    springs = sources(launched)
+    launched.clear()
+    run(device, twist=False)
+    bending = sources(launched)
+    evaluate = "evaluate_kernel__locals__evaluate"
+    assert "cross" in bending[evaluate]
+    assert "cross" not in springs[evaluate]
+    assert len(springs[evaluate]) < 0.6 * len(bending[evaluate])
+
+
+def test_import_is_light_and_fast():
+    """`import ddg_warp` in a fresh interpreter: best of three under half a second, and nothing heavy comes with it."""
+    program = (
+        "import sys, time\n"
+        "before = set(sys.modules)\n"
+        "start = time.perf_counter()\n"
+        "import ddg_warp\n"
+        "print(time.perf_counter() - start)\n"
+        "print(*{name.split('.')[0] for name in set(sys.modules) - before})\n"
+    )
+    times = []
+    for _ in range(3):
+        output = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+        seconds, names = output.splitlines()
+        times.append(float(seconds))
+        assert "ddg_warp" in names.split()
+        assert not set(names.split()) & set(HEAVY)
+    assert min(times) < 0.5
+
+
+def test_describing_a_scene_needs_no_warp():
+    """A scene is NumPy only; Warp comes with `build`."""
+    program = (
+        "import sys, numpy as np, ddg_warp as ddg\n"
+        "scene = ddg.Scene()\n"
+        "rod = scene.add_rod(np.eye(3), section=ddg.Circle(0.01), material=ddg.Material(1e6))\n"
+        "scene.clamp(rod)\n"
+        "print(*sys.modules)\n"
+    )
+    output = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert not {name.split(".")[0] for name in output.split()} & set(HEAVY)

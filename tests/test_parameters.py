@@ -1,0 +1,131 @@
+"""Parameters of any shape are read by the same code: one number, one a rod, one an element, one each; and worlds."""
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+
+RODS, NODES = 3, 8
+RANDOM = np.random.default_rng(2)
+FORMS = {
+    "number": 1.0,
+    "per rod": RANDOM.uniform(0.7, 1.3, size=(RODS, 1)),
+    "per element": RANDOM.uniform(0.7, 1.3, size=NODES - 1),
+    "each": RANDOM.uniform(0.7, 1.3, size=(RODS, NODES - 1)),
+}
+STRIDES = {"number": (0, 0), "per rod": (0, 1), "per element": (1, 0), "each": (RODS, 1)}
+KINDS = {"full": {}, "untwisted": {"twist": False}, "planar": {"dimension": 2}, "stretch": {"bend": False}}
+
+
+def build(device, scale=1.0, kind="full", worlds=1, viscosity=0.0):
+    """Three cantilevers of random rest lengths, all sections `scale` times a common one."""
+    options = dict(KINDS[kind])
+    scene = ddg.Scene(gravity=(0.0, 1.0, -9.81), dimension=options.pop("dimension", 3))
+    points = np.zeros((RODS, NODES, 3))
+    points[..., 0] = np.cumsum(np.random.default_rng(3).uniform(0.05, 0.15, size=NODES))
+    section = ddg.Stiffness(
+        EA=200.0 * scale,
+        EI1=0.02 * scale,
+        EI2=(0.03 if kind == "full" else 0.02) * scale,
+        GJ=0.01 * scale,
+        mass_per_length=0.3 * scale,
+        rotary_inertia=1e-5 * scale,
+        viscosity=viscosity * scale,
+    )
+    rods = scene.add_rods(points, section=section, natural="straight", **options)
+    scene.clamp(rods, edges=[0])
+    scene.add_force(rods, NODES - 1, (0.1, 0.05, 0.0))
+    return scene.build(device=device, precision="float64", worlds=worlds)
+
+
+def simulate(model, steps=5):
+    """Points and angles after some steps."""
+    integrator, state = ddg.Integrator(model), model.state()
+    for _ in range(steps):
+        state = integrator.step(state, 0.01)
+    return state.points(), state.angles()
+
+
+def set_parameters(model, change):
+    """Replace every row of the parameter table by change(row, nodes, rods)."""
+    for group in model.groups:
+        group._parameters = [change(values, group.nodes, group.columns) for values in group._parameters]
+        group.upload_parameters(model.types.real)
+    return model
+
+
+def expand(model):
+    """Write every parameter of every element out."""
+    return set_parameters(model, lambda values, nodes, rods: np.broadcast_to(values, (nodes, rods)).copy())
+
+
+def assert_same(one, other):
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("form", STRIDES)
+@pytest.mark.parametrize("viscosity", [0.0, 0.01], ids=["elastic", "damped"])
+def test_every_stride_reads_the_same(device, form, viscosity):
+    """All rows in one form, rest measures and rest strains too, against the same numbers written out."""
+
+    def in_form(values, nodes, rods):
+        shape = (nodes if STRIDES[form][0] else 1, rods if STRIDES[form][1] else 1)
+        return values[:1, :1] * np.random.default_rng(4).uniform(0.9, 1.1, size=shape)
+
+    model = set_parameters(build(device, viscosity=viscosity), in_form)
+    expanded = expand(set_parameters(build(device, viscosity=viscosity), in_form))
+    (group,), (full,) = model.groups, expanded.groups
+    assert (group.table.numpy()[:, 1:] == STRIDES[form]).all()
+    assert (full.table.numpy()[:, 1:] == STRIDES["each"]).all()
+    assert_same(simulate(model), simulate(expanded))
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("viscosity", [0.0, 0.01], ids=["elastic", "damped"])
+def test_shape_of_section_does_not_matter(device, form, viscosity):
+    """A section given in one form, against the same section given for each element of each rod."""
+    every = np.broadcast_to(FORMS[form], (RODS, NODES - 1)).copy()
+    model, written_out = (build(device, scale, viscosity=viscosity) for scale in (FORMS[form], every))
+    points, angles = simulate(model)
+    assert_same((points, angles), simulate(written_out))
+    assert_same((points, angles), simulate(expand(model)))
+    assert np.abs(points - model.state().points()).max() > 0.01  # something happened
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_reads_every_shape(device, kind):
+    for form, scale in FORMS.items():
+        points, _ = simulate(build(device, scale, kind))
+        expanded, _ = simulate(expand(build(device, scale, kind)))
+        np.testing.assert_array_equal(points, expanded, err_msg=form)
+
+
+def test_parameters_belong_to_their_rod(device):
+    """Each rod moves as it does alone with its parameters; rods with others move otherwise."""
+    each = FORMS["each"]
+    together, _ = simulate(build(device, each))
+    together = together.reshape(RODS, NODES, 3)
+    for rod in range(RODS):
+        alone, _ = simulate(build(device, each[rod]))  # all three rods with the parameters of this one
+        np.testing.assert_allclose(alone.reshape(RODS, NODES, 3)[rod], together[rod], rtol=0, atol=1e-14)
+    assert np.abs(together[0] - together[1]).max() > 1e-6
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_worlds_are_bitwise_equal(device, form):
+    scale = FORMS[form]
+    points, angles = simulate(build(device, scale, worlds=3))
+    assert points.shape == (3, RODS * NODES, 3)
+    alone, alone_angles = simulate(build(device, scale))
+    for world in range(3):
+        np.testing.assert_array_equal(points[world], alone)
+        np.testing.assert_array_equal(angles[world], alone_angles)
+
+
+@pytest.mark.parametrize("kind", ["untwisted", "planar", "stretch"])
+def test_worlds_of_other_kinds(device, kind):
+    points, _ = simulate(build(device, FORMS["each"], kind, worlds=3))
+    alone, _ = simulate(build(device, FORMS["each"], kind))
+    for world in range(3):
+        np.testing.assert_array_equal(points[world], alone)
