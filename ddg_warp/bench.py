@@ -8,7 +8,7 @@ import csv
 import itertools
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,16 +27,20 @@ class Study:
 
     Attributes:
         grid: Values by name; every combination is run. A name is a parameter of `build`, a setting of the run (dt,
-            duration, precision) or an option of the integrator (solver, linear, rtol).
+            duration, precision) or an option of the integrator (scheme, solver, linear, rtol).
         measure: What is compared: a number or an array, from a result.
         reference: What `measure` should give; or settings, by name, that turn a case into its reference run.
         fixed: Settings of all runs.
+        series: Names of the grid that tell the lines of the plot apart; a line then joins the cases that no other of its
+            series beats in both error and time, and the table shows these. By default all names but the first, and
+            every case.
     """
 
     grid: Mapping[str, tuple]
     measure: Callable[[Result], Any]
     reference: Any
     fixed: Mapping[str, Any] = field(default_factory=dict)
+    series: tuple[str, ...] = ()
 
     def cases(self) -> list[dict]:
         """Every combination of the grid, the last name varying fastest."""
@@ -81,7 +85,7 @@ def benchmark(name: str, out: str | Path, *, device: str | None = None, precisio
         writer.writeheader()
         writer.writerows(plain(rows))
     plot(study, rows, stem.with_suffix(".png"), name)
-    print(table(rows))
+    print(table(best(study, rows)))
     return not any(row["failure"] for row in rows)
 
 
@@ -115,7 +119,7 @@ def measure(module, study: Study, *, device: str | None = None, precision: str |
                 "error": float(error),
                 "ms_per_step": 1e3 * result.seconds_per_step,
                 "seconds": seconds,
-                "relative_time": seconds / rows[0]["seconds"] if rows else 1.0,
+                "relative_time": seconds / first if (first := rows[0]["seconds"] if rows else seconds) else np.nan,
                 "steps": len(result.step_times),
                 "newton_iterations": result.statistics.get("newton_iterations", {}).get("mean", 0.0),
                 "failure": failure,
@@ -131,11 +135,14 @@ def run(module, settings: Mapping, device: str | None) -> Result:
         InputError: A setting is neither a parameter of the scene, nor of the run, nor of the integrator.
     """
     known = parameters(module, {})
-    unknown = [name for name in settings if name not in (*known, *RUN_SETTINGS, *SOLVER_OPTIONS)]
+    unknown = [name for name in settings if name not in (*known, *RUN_SETTINGS, *SOLVER_OPTIONS, "scheme")]
     if unknown:
         raise InputError(f"the benchmark of {module.__name__} sets '{unknown[0]}', which is no setting of a run")
+    scene = module.build(**{name: value for name, value in settings.items() if name in known})
+    if "scheme" in settings:
+        scene.analysis = replace(scene.analysis, scheme=settings["scheme"])
     return simulate(
-        module.build(**{name: value for name, value in settings.items() if name in known}),
+        scene,
         device=device,
         observe=getattr(module, "observe", None),
         options={name: value for name, value in settings.items() if name in SOLVER_OPTIONS},
@@ -152,13 +159,39 @@ def clock_of(device: str | None) -> Callable[[], float] | None:
     return None if wp.get_device(device).is_cuda else time.process_time
 
 
+def best(study: Study, rows: list[dict]) -> list[dict]:
+    """The cases that no other of their series beats in both error and time, if the study names series; else all.
+
+    Cases that failed have no error, and are not among the best; they are left out only where there are series.
+    """
+    if not study.series:
+        return rows
+    front = []
+    lowest: dict[tuple, float] = {}
+    for row in sorted(rows, key=lambda row: row["seconds"]):
+        line = tuple(row[name] for name in study.series)
+        if row["error"] < lowest.get(line, np.inf):
+            lowest[line] = row["error"]
+            front.append(row)
+    order = list(dict.fromkeys(tuple(row[name] for name in study.series) for row in rows))
+    return sorted(front, key=lambda row: order.index(tuple(row[name] for name in study.series)))
+
+
 def plot(study: Study, rows: list[dict], path: Path, title: str) -> None:
-    """Error over stepping time, one line for each combination of all but the first name of the grid."""
+    """Error over stepping time, a line a series; see `Study.series`."""
     try:
         from ddg_warp.figure import error_plot
     except ModuleNotFoundError as error:
         print(f"no plot without {error.name}: `pip install matplotlib`")
         return
-    rest = list(study.grid)[1:]
-    lines = [{**row, "line": ", ".join(f"{name} {row[name]}" for name in rest) or title} for row in rows]
-    error_plot(path, lines, x="seconds", y="error", series="line", title=title)
+    names = list(study.series or list(study.grid)[1:])
+    label = " / ".join(names) or "scene"
+    lines = [
+        {
+            "stepping time [s]": row["seconds"],
+            "error": row["error"],
+            label: ", ".join(str(row[name]) if name in study.series else f"{name} {row[name]}" for name in names) or title,
+        }
+        for row in best(study, rows)
+    ]
+    error_plot(path, lines, x="stepping time [s]", y="error", series=label, title=title)

@@ -104,7 +104,7 @@ class Sample:
             element.evaluate_kernel(kind, real, real),
             real,
             [(kind.factor_rows, *self.shape), (kind.window, *self.shape), (2, *self.shape), self.shape],
-            before=[*flags[:2], clamped],
+            before=[*flags[:2], clamped, flags[0], 0],
             after=flags[2:],
         )
         return out[0], out[1], out[2][1]

@@ -39,6 +39,8 @@ class ChainNewton:
         status, iteration, ...: state of every rod's search; see `kernels.chain`.
     """
 
+    reuse = False  # whether the matrix of a step's first iterate serves the whole step
+
     def __init__(self, model, group, options: NewtonOptions, linear=None):
         self.group, self.options = group, options
         self.real, self.linear = model.types.real, linear or model.types.linear
@@ -103,7 +105,7 @@ class ChainNewton:
             self._evaluate,
             (group.elements, group.columns),
             [self.x, self.theta, self.frame, last, self.rate, group.buffer, group.table, group.count]
-            + [self.status, self.slot, self.without_compression],
+            + [self.status, self.slot, self.without_compression, self.iteration, int(self.reuse)],
             [self.factor, self.gradient, self.energy, self.stiffness, self.turned, self.active],
             device=self.device,
             block_dim=128,

@@ -124,6 +124,7 @@ def assemble_kernel(kind: ChainKind, real, linear):
         unbalanced: wp.array(dtype=int),
         slot: wp.array(dtype=int),
         iteration: wp.array(dtype=int),
+        reuse: int,
         step_length: wp.array(dtype=real),
         blocks_out: wp.array3d(dtype=linear),
         residual_out: wp.array3d(dtype=linear),
@@ -135,55 +136,61 @@ def assemble_kernel(kind: ChainKind, real, linear):
         if status[r] != 0 or unbalanced[r] == 0 or k >= n:
             return
         c = coefficient[r]
-        D = M()
-        E = M()
-        G = M()
         b = behind(k, n)
-        if wp.static(span == 2):
-            bb = int(-1)
-            if b >= 0:
-                bb = behind(b, n)
-            for m in range(wp.static(vertex_rows)):
-                row = m * wp.static(window)
-                if wp.static(closed) or k < n - 2:
-                    A = own(F, row, k, r, 0)
-                    D += wp.outer(A, A)
-                    E += wp.outer(A, own(F, row, k, r, 1))
-                    G += wp.outer(A, own(F, row, k, r, 2))
-                if b >= 0 and (wp.static(closed) or k < n - 1):
-                    B = own(F, row, b, r, 1)
-                    D += wp.outer(B, B)
-                    E += wp.outer(B, own(F, row, b, r, 2))
-                if bb >= 0:
-                    C = own(F, row, bb, r, 2)
-                    D += wp.outer(C, C)
-        if wp.static(closed) or k < n - 1:
-            S = edge_block(F, k, r)
-            D += S
-            E -= S
-        if b >= 0:
-            D += edge_block(F, b, r)
+        free = free_of(fixed, k, r)
+        m_k = mass[k, r]
         f, moment, size, _elastic = balance(
             g, mass, rotary, c, x, theta, target, target_angle, gravity, load, load_angle, loaded, k, n, r
         )
-        m_k = mass[k, r]
         rhs = H()
         for d in range(wp.static(dim)):
             rhs[d] = linear(f[d])
-            D[d, d] = D[d, d] + linear(c * m_k)
         if wp.static(twist):
             rhs[wp.static(nb - 1)] = linear(moment)
-            D[wp.static(nb - 1), wp.static(nb - 1)] = D[wp.static(nb - 1), wp.static(nb - 1)] + linear(c * rotary[k, r])
-        free = free_of(fixed, k, r)
-        D = wp.cw_mul(D, wp.outer(free, free)) + wp.diag(H(linear(1.0)) - free)
-        store(blocks_out, 0, k, r, D)
-        store(blocks_out, wp.static(nb2), k, r, wp.cw_mul(E, wp.outer(free, free_of(fixed, along(k + 1, n), r))))
-        if wp.static(span == 2):
-            ahead = along(k + 2, n)
-            if wp.static(closed) or k < n - 2:
-                G = wp.cw_mul(G, wp.outer(free, free_of(fixed, ahead, r)))
-            store(blocks_out, wp.static(2 * nb2), k, r, G)
         put(residual_out, 0, k, r, wp.cw_mul(rhs, free))
+
+        if reuse == 0 or iteration[r] == 0:
+            D = M()
+            E = M()
+            G = M()
+            if wp.static(span == 2):
+                bb = int(-1)
+                if b >= 0:
+                    bb = behind(b, n)
+                for m in range(wp.static(vertex_rows)):
+                    row = m * wp.static(window)
+                    if wp.static(closed) or k < n - 2:
+                        A = own(F, row, k, r, 0)
+                        D += wp.outer(A, A)
+                        E += wp.outer(A, own(F, row, k, r, 1))
+                        G += wp.outer(A, own(F, row, k, r, 2))
+                    if b >= 0 and (wp.static(closed) or k < n - 1):
+                        B = own(F, row, b, r, 1)
+                        D += wp.outer(B, B)
+                        E += wp.outer(B, own(F, row, b, r, 2))
+                    if bb >= 0:
+                        C = own(F, row, bb, r, 2)
+                        D += wp.outer(C, C)
+            if wp.static(closed) or k < n - 1:
+                S = edge_block(F, k, r)
+                D += S
+                E -= S
+            if b >= 0:
+                D += edge_block(F, b, r)
+            for d in range(wp.static(dim)):
+                D[d, d] = D[d, d] + linear(c * m_k)
+            if wp.static(twist):
+                D[wp.static(nb - 1), wp.static(nb - 1)] = D[wp.static(nb - 1), wp.static(nb - 1)] + linear(
+                    c * rotary[k, r]
+                )
+            D = wp.cw_mul(D, wp.outer(free, free)) + wp.diag(H(linear(1.0)) - free)
+            store(blocks_out, 0, k, r, D)
+            store(blocks_out, wp.static(nb2), k, r, wp.cw_mul(E, wp.outer(free, free_of(fixed, along(k + 1, n), r))))
+            if wp.static(span == 2):
+                ahead = along(k + 2, n)
+                if wp.static(closed) or k < n - 2:
+                    G = wp.cw_mul(G, wp.outer(free, free_of(fixed, ahead, r)))
+                store(blocks_out, wp.static(2 * nb2), k, r, G)
 
         # change of the energy since the accepted iterate: elements, then inertia and loads along the last step
         change = real(0.0)
@@ -256,11 +263,13 @@ def factor_kernel(kind: ChainKind, linear):
         blocks: wp.array3d(dtype=linear),
         count: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
+        iteration: wp.array(dtype=int),
+        reuse: int,
         factor_out: wp.array3d(dtype=linear),
         lost: wp.array(dtype=int),
     ):
         r = wp.tid()
-        if wanted[r] == 0:
+        if wanted[r] == 0 or (reuse != 0 and iteration[r] > 1):
             return
         n = count[r]
         minus = M()  # what the nodes before take from the block of this node, of its coupling, and of the next node
@@ -329,3 +338,23 @@ def substitute_function(kind: ChainKind, linear):
         return total
 
     return substitute
+
+
+@cache
+def direct_kernel(kind: ChainKind, linear):
+    """Direction of every rod that wants one, straight from the factors."""
+    substitute = substitute_function(kind, linear)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+    def direct(
+        factor: wp.array3d(dtype=linear),
+        right: wp.array3d(dtype=linear),
+        count: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        solution: wp.array3d(dtype=linear),
+    ):
+        r = wp.tid()
+        if wanted[r] != 0:
+            _decrement = substitute(factor, right, solution, count[r], r)
+
+    return direct

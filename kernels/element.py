@@ -343,6 +343,7 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear):
         last: wp.array3d(dtype=real),
         rate: real,
         clamped: int,
+        frozen: bool,
         factor: wp.array3d(dtype=linear),
         k: int,
         r: int,
@@ -357,13 +358,15 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear):
             if clamped != 0 and c < real(0.0):
                 c = real(0.0)
                 shift = E()
-            factor[wp.static(tension_row), k, r] = linear(c)
+            if not frozen:
+                factor[wp.static(tension_row), k, r] = linear(c)
         root = root_of(e, p, shift) * wp.sqrt(w)
         stiffness = real(0.0)
         for m in range(wp.static(n)):
             edge = real(0.0)
             for i in range(wp.static(size)):
-                factor[wp.static(row) + m * wp.static(size) + i, k, r] = linear(root[m] * jacobian[m, i])
+                if not frozen:
+                    factor[wp.static(row) + m * wp.static(size) + i, k, r] = linear(root[m] * jacobian[m, i])
             for i in range(wp.static(dim)):
                 edge += jacobian[m, i] * jacobian[m, i]
             stiffness = wp.max(stiffness, root[m] * root[m] * edge)
@@ -377,9 +380,10 @@ def evaluate_kernel(kind: ChainKind, real, linear):
     """The fused kernel of a Newton iteration: energy, gradient on the window and Gauss-Newton factor of all terms.
 
     Compression lowers the stiffness across an edge, which can make the matrix indefinite: `clamped` rods do without that.
-    Energies go to the slot that the line search does not hold (`1 - slot[r]`). `turned` is raised where an edge has turned by
-    more than 90 degrees from its lagged tangent. `stiffness` is the largest a term has against moving its first edge [N/m].
-    Thread (0, 0) clears `active`, which the sweep then raises.
+    With `reuse` the factor is written once a step, at the first iterate. Energies go to the slot that the line search does not
+    hold (`1 - slot[r]`). `turned` is raised where an edge has turned by more than 90 degrees from its lagged tangent, or the
+    reference twist nears a jump. `stiffness` is the largest a term has against moving its first edge [N/m]. Thread (0, 0) clears
+    `active`, which the sweep then raises.
     """
     V, W = wp.types.vector(kind.dim, real), wp.types.vector(kind.window, real)
     _, window, lagged, _ = gather_functions(kind, real)
@@ -402,6 +406,8 @@ def evaluate_kernel(kind: ChainKind, real, linear):
         status: wp.array(dtype=int),
         slot: wp.array(dtype=int),
         clamped: wp.array(dtype=int),
+        iteration: wp.array(dtype=int),
+        reuse: int,
         factor_out: wp.array3d(dtype=linear),
         gradient_out: wp.array3d(dtype=real),
         energy_out: wp.array3d(dtype=real),
@@ -418,13 +424,14 @@ def evaluate_kernel(kind: ChainKind, real, linear):
         whole = wp.static(closed) or k < n - 2
         q = window(x, theta, k, n, whole, r)
         s = lagged(frame, k, n, whole, r)
+        frozen = reuse != 0 and iteration[r] > 0
         total = real(0.0)
         stiffest = real(0.0)
         f = W()
         for i in range(wp.static(terms)):
             if whole or wp.static(spans[i]) == 1:
                 energy, part, stiff = wp.static(each[i])(
-                    q, s, buffer, table, last, rate[r], clamped[r], factor_out, k, r
+                    q, s, buffer, table, last, rate[r], clamped[r], frozen, factor_out, k, r
                 )
                 total += energy
                 f += part

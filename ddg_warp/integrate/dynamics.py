@@ -8,10 +8,12 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels import outcome, step
-from ddg_warp.linear.pcg import PcgNewton
+from ddg_warp.linear.pcg import PcgNewton, ProjectiveNewton
 from ddg_warp.newton import ChainNewton, NewtonOptions
+from ddg_warp.precision import FLOAT32_LIMIT, float32_error
 from ddg_warp.state import State
 
+SOLVERS = ("newton", "projective")
 SCHEMES = ("implicit_euler", "implicit_midpoint")
 
 
@@ -23,6 +25,9 @@ class Integrator:
         for _ in range(100):
             state = integrator.step(state, dt=0.01)
 
+    In mixed precision, groups whose float32 factors would be poor at the step taken (stiff, finely divided rods and long steps)
+    are solved in float64; `statistics()["linear"]` says which.
+
     A step is one captured graph: nothing in it allocates or waits for the host. On CUDA, outcomes are read every
     `check_every` steps; a rod that failed rests at its last good state meanwhile, and the others go on.
 
@@ -30,8 +35,9 @@ class Integrator:
         model: what to integrate.
         scheme: "implicit_euler" (first order, damps what the step does not resolve) or "implicit_midpoint" (second order,
             A-stable, keeps the energy of linear oscillations).
-        linear: "auto" (the chain sweep for open rods, PCG with the chain preconditioner for closed ones), "sweep", or PCG with
-            "jacobi", "block_jacobi" or "chain" as preconditioner.
+        solver: "newton", or "projective": the matrix of a step's first iterate serves all of its iterations.
+        linear: of Newton: "auto" (the chain sweep for open rods, PCG with the chain preconditioner for closed ones), "sweep", or
+            PCG with "jacobi", "block_jacobi" or "chain" as preconditioner.
         rtol, max_iterations, ...: see `NewtonOptions`.
         retry_limit: how often in a row a rod's failed step is tried again: first from the last state instead of the predictor,
             then in halves, and so on.
@@ -46,6 +52,7 @@ class Integrator:
         model,
         scheme: str = "implicit_euler",
         *,
+        solver: str = "newton",
         linear: str = "auto",
         retry_limit: int = 20,
         check_every: int | None = None,
@@ -53,7 +60,9 @@ class Integrator:
     ):
         if scheme not in SCHEMES:
             raise SceneError(f"scheme {scheme!r}: it is one of {', '.join(SCHEMES)}")
-        self.model, self.scheme, self.linear = model, scheme, linear
+        if solver not in SOLVERS:
+            raise SceneError(f"solver {solver!r}: it is one of {', '.join(SOLVERS)}")
+        self.model, self.scheme, self.solver, self.linear = model, scheme, solver, linear
         self.options = NewtonOptions(**options)
         self.retry_limit = retry_limit
         self.check_every = check_every or (32 if model.wp_device.is_cuda else 1)
@@ -64,6 +73,7 @@ class Integrator:
         self._steps_since_check = 0
         self._dt = wp.zeros(model.worlds, dtype=model.types.real, device=model.wp_device)
         self._dt_host = None
+        self._longest = 0.0
 
     def step(self, state: State, dt: float) -> State:
         """The state after a step of dt [s].
@@ -78,6 +88,7 @@ class Integrator:
         if dt != self._dt_host:
             self._dt.fill_(dt)
             self._dt_host = dt
+        self._promote(dt)
         start = self._buffers[source].time
         for chain in self._chains:
             chain.prescribe(start, start + dt)
@@ -110,8 +121,20 @@ class Integrator:
             "pcg_iterations": sum(chain.newton.pcg_iterations() for chain in self._chains),
             "retries": int(work[:, 3].sum()),
             "lost_pivots": int(work[:, 4].sum()),
+            "linear": [chain.newton.linear.__name__ for chain in self._chains],
             "outcomes": {name: int(tally[code]) for code, name in outcome.NAMES.items() if tally[code]},
         }
+
+    def _promote(self, dt: float) -> None:
+        """Solve in float64 where float32 factors would not be good enough for a step of dt, from now on."""
+        if dt <= self._longest or self.model.precision != "mixed":
+            return
+        self._longest = dt
+        s = 0.5 * dt if self.scheme == "implicit_midpoint" else dt
+        for i, chain in enumerate(self._chains):
+            if chain.newton.linear is wp.float32 and float32_error(chain.group, s) > FLOAT32_LIMIT:
+                self._chains[i] = _ChainStep(self, self.model, chain.group, wp.float64, counts_of=chain)
+                self._graphs.clear()
 
     def _own(self, state: State) -> int:
         for i, buffer in enumerate(self._buffers):
@@ -139,14 +162,16 @@ class Integrator:
         wp.capture_launch(capture.graph)
 
 
-def _newton(model, group, integrator: Integrator) -> ChainNewton:
+def _newton(model, group, integrator: Integrator, precision) -> ChainNewton:
     """The solver of a group that the integrator's `linear` asks for."""
     linear = integrator.linear
+    if integrator.solver == "projective":
+        return ProjectiveNewton(model, group, integrator.options, precision)
     if linear == "sweep" and group.kind.closed:
         raise SceneError(f"linear 'sweep': rod {group.host.rods[0]} is closed; use 'auto' or a preconditioner of PCG")
     if linear == "sweep" or (linear == "auto" and not group.kind.closed):
-        return ChainNewton(model, group, integrator.options)
-    return PcgNewton(model, group, integrator.options, "chain" if linear == "auto" else linear)
+        return ChainNewton(model, group, integrator.options, precision)
+    return PcgNewton(model, group, integrator.options, "chain" if linear == "auto" else linear, precision)
 
 
 def _require_mass(model) -> None:
@@ -169,10 +194,10 @@ def _require_mass(model) -> None:
 class _ChainStep:
     """A time step of one group of rods."""
 
-    def __init__(self, integrator: Integrator, model, group):
+    def __init__(self, integrator: Integrator, model, group, precision=None, counts_of=None):
         self.integrator, self.model, self.group = integrator, model, group
         self.index = model.groups.index(group)
-        self.newton = _newton(model, group, integrator)
+        self.newton = _newton(model, group, integrator, precision)
         kind, real, device = group.kind, model.types.real, model.wp_device
         midpoint = integrator.scheme == "implicit_midpoint"
         self.kernels = {
@@ -192,6 +217,10 @@ class _ChainStep:
         self.remaining = wp.zeros(1, dtype=int, device=device)
         self.tally = wp.zeros(len(outcome.NAMES) + 1, dtype=wp.int64, device=device)
         self.work = wp.zeros(5, dtype=wp.int64, device=device)
+        if counts_of is not None:
+            self.tally, self.work = counts_of.tally, counts_of.work
+            self.newton.status = counts_of.newton.status
+            self.reason = counts_of.reason
         self.damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
         self.moving = _Moving(model, group, midpoint) if group.moving else None
         self.loads = _Loads(model, group, midpoint) if group.host.timed_loads else None

@@ -52,16 +52,28 @@ class PcgNewton(ChainNewton):
 
     def sweep(self) -> None:
         """Assemble, decide, solve for a direction and take it."""
+        self.assemble()
+        self.direct()
+        group, device = self.group, self.device
+        wp.launch(
+            self._take,
+            group.columns,
+            [self.right, self.iterations, group.count, self.options.rotation_cap],
+            [self.direction, group.fixed, self.base, self.x, self.theta, self.wanted, self.step_length, self.decrement]
+            + [self.pcg_work],
+            device=device,
+        )
+
+    def assemble(self) -> None:
+        """Blocks and residual of active rods; accept or shorten the last step; factors where a direction is wanted."""
         group, options, device = self.group, self.options, self.device
-        grid = (group.nodes, group.columns)
         wp.launch(
             self._assemble,
-            grid,
+            (group.nodes, group.columns),
             [self.factor, self.gradient, self.energy, group.count, group.mass, group.rotary, self.coefficient]
             + [self.x, self.theta, self.target, self.target_angle, group.gravity, group.load, group.load_angle]
-            + [int(group.host.loaded), group.fixed, self.direction, self.base, self.status]
-            + [self.unbalanced, self.slot]
-            + [self.iteration, self.step_length],
+            + [int(group.host.loaded), group.fixed, self.direction, self.base, self.status, self.unbalanced, self.slot]
+            + [self.iteration, int(self.reuse), self.step_length],
             [self.blocks, self.right, self.change, self.noise],
             device=device,
         )
@@ -70,46 +82,32 @@ class PcgNewton(ChainNewton):
             group.columns,
             [self.right, self.change, self.noise, group.count, options.floor_factor * self.eps]
             + [options.max_iterations, options.max_halvings, self.direction, group.fixed, self.base]
-            + [self.x, self.theta, self.frame]
-            + [self.status, self.unbalanced, self.drowned, self.slot, self.iteration, self.halvings]
-            + [self.step_length, self.decrement, self.merit, self.load_scale, self.residual, self.turned]
-            + [self.wanted, self.active],
+            + [self.x, self.theta, self.frame, self.status, self.unbalanced, self.drowned, self.slot]
+            + [self.iteration, self.halvings, self.step_length, self.decrement, self.merit, self.load_scale]
+            + [self.residual, self.turned, self.wanted, self.active],
             device=device,
         )
         if self._factor:
             wp.launch(
                 self._factor,
                 group.columns,
-                [self.blocks, group.count, self.wanted],
+                [self.blocks, group.count, self.wanted, self.iteration, int(self.reuse)],
                 [self.factors, self.lost],
                 device=device,
             )
+
+    def direct(self) -> None:
+        """Directions by conjugate gradients."""
+        group = self.group
         self.busy.zero_()
         wp.launch(
             self._start,
             group.columns,
             [self.blocks, self.factors, group.count, self.wanted, self.right],
             [self.rest, self.direction, self.z, self.p, self.rho, self.rho_first, self.iterations, self.busy],
-            device=device,
+            device=self.device,
         )
         wp.capture_while(self.busy, self._iterate_pcg)
-        wp.launch(
-            self._take,
-            group.columns,
-            [self.right, self.iterations, group.count, options.rotation_cap],
-            [
-                self.direction,
-                group.fixed,
-                self.base,
-                self.x,
-                self.theta,
-                self.wanted,
-                self.step_length,
-                self.decrement,
-                self.pcg_work,
-            ],
-            device=device,
-        )
 
     def _iterate_pcg(self) -> None:
         group, device = self.group, self.device
@@ -132,3 +130,32 @@ class PcgNewton(ChainNewton):
     def pcg_iterations(self) -> int:
         """Iterations of all solves so far."""
         return int(np.asarray(self.pcg_work.numpy())[0])
+
+
+class ProjectiveNewton(PcgNewton):
+    """Newton with the matrix frozen: that of a step's first iterate is projected, factorised once and used for the whole step.
+
+    An iteration costs a gradient and a substitution instead of a sweep, and converges linearly: it pays where the matrix hardly
+    changes within a step, so for small steps and loose tolerances. The frozen matrix of a closed rod is that of its open part.
+    """
+
+    reuse = True
+
+    def __init__(self, model, group, options: NewtonOptions, linear=None):
+        super().__init__(model, group, options, "chain", linear)
+        self._direct = block_band.direct_kernel(group.kind, self.linear)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [self._evaluate, self._check, self._assemble, self._judge, self._factor, self._direct, self._take]
+
+    def direct(self) -> None:
+        """Directions by the factors of the first iterate."""
+        wp.launch(
+            self._direct,
+            self.group.columns,
+            [self.factors, self.right, self.group.count, self.wanted],
+            [self.direction],
+            device=self.device,
+        )
