@@ -10,7 +10,8 @@ from pathlib import Path
 from types import ModuleType
 
 RUN_SETTINGS = ("dt", "precision", "worlds")  # what a resumed run cannot change, beside the scene's parameters
-RESERVED = ("command", "scene", "device", "duration", "out", "resume", "json", "help", *RUN_SETTINGS)
+RESERVED = ("command", "scene", "device", "out", "resume", "json", "help", *RUN_SETTINGS)
+SHARED = ("dt", "duration")  # flags of `run` that a scene's build may take too, to fit its motions to them
 
 
 class InputError(ValueError):
@@ -72,6 +73,8 @@ def add_parameters(parser: argparse.ArgumentParser, module: ModuleType) -> None:
         where = f"build({name}) of {module.__name__}"
         if kind not in (bool, int, float, str) or default is parameter.empty:
             raise InputError(f"{where} needs a default, and a type of int, float, str or bool")
+        if name in SHARED:
+            continue
         if name in RESERVED:
             raise InputError(f"{where} has the name of an option of `run`; rename it")
         options = {"dest": name, "default": argparse.SUPPRESS, "help": f"{texts.get(name, '')} (default: {default})"}

@@ -142,6 +142,7 @@ def settings_of(chosen: argparse.Namespace, module, name: str) -> tuple[dict, di
     known = parameters(module, {})
     asked = {key: value for key, value in vars(chosen).items() if value is not None}
     given = {key: value for key, value in asked.items() if key in known or key in RUN_SETTINGS}
+    duration = {"duration": given.pop("duration")} if "duration" in given else {}
     if chosen.resume is not None:
         if chosen.out is not None:
             raise InputError("a resumed run stays in its directory: give --resume or --out")
@@ -149,7 +150,8 @@ def settings_of(chosen: argparse.Namespace, module, name: str) -> tuple[dict, di
     if given.get("worlds", 1) < 1:
         raise InputError(f"--worlds {chosen.worlds}: there must be at least one")
     run_settings = {key: given.pop(key) for key in RUN_SETTINGS if key in given}
-    return parameters(module, given), run_settings
+    shared = {"dt": run_settings["dt"]} if "dt" in known and "dt" in run_settings else {}
+    return parameters(module, given | duration | shared), run_settings
 
 
 def say(result, content: dict, checks: list, directory: Path) -> None:

@@ -92,7 +92,7 @@ class Sample:
     def strains(self, real=wp.float64, **changed) -> list[np.ndarray]:
         """Strains and stresses of all terms (strains, n, R) each."""
         return self._launch(
-            element.strain_kernel(self.kind, real), real, [(self.kind.strain_rows, *self.shape)] * 2, **changed
+            element.strain_kernel(self.kind, real), real, [(self.kind.strain_rows, *self.shape)] * 2, [1], **changed
         )
 
     def evaluate(self, real) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -31,6 +31,7 @@ class Group:
         self.count = put(host.count, int)
         self.length = put(host.length, real)
         self.world = wp.array(np.repeat(np.arange(worlds), self.rods), dtype=int, device=device)
+        self.still = wp.zeros(self.columns, dtype=real, device=device)
         self.mass = put(host.mass, real)
         self.rotary = put(host.rotary, real)
         self.fixed = put(host.fixed, wp.uint8)
@@ -288,15 +289,13 @@ class Model:
                 self.strains(group, data, data.last)
 
     def strains(self, group: Group, data: GroupState, out: wp.array, stress: wp.array | None = None) -> None:
-        """Launch the strain kernel of a group; stresses go to `stress`, if given (viscous parts at rest)."""
-        real = self.types.real
-        stress = stress or arrays.allocate((group.kind.strain_rows, group.nodes, group.columns), real, self.wp_device)
-        still = wp.zeros(group.columns, dtype=real, device=self.wp_device)
+        """Launch the strain kernel of a group; stresses go to `stress`, if given (viscous parts at rest). Can be captured."""
         wp.launch(
-            element.strain_kernel(group.kind, real),
+            element.strain_kernel(group.kind, self.types.real),
             (group.elements, group.columns),
-            [data.x, data.theta, data.frame, data.last, still, group.buffer, group.table, group.count],
-            [out, stress],
+            [data.x, data.theta, data.frame, data.last, group.still, group.buffer, group.table, group.count]
+            + [int(stress is not None)],
+            [out, out if stress is None else stress],
             device=self.wp_device,
         )
 

@@ -475,6 +475,7 @@ def strain_kernel(kind: ChainKind, real):
         buffer: wp.array(dtype=real),
         table: wp.array2d(dtype=int),
         count: wp.array(dtype=int),
+        stressed: int,
         strain_out: wp.array3d(dtype=real),
         stress_out: wp.array3d(dtype=real),
     ):
@@ -487,7 +488,7 @@ def strain_kernel(kind: ChainKind, real):
         s = lagged(frame, k, n, whole, r)
         for i in range(wp.static(len(spans))):
             if whole or wp.static(spans[i]) == 1:
-                wp.static(each[i])(q, s, buffer, table, last, rate[r], strain_out, stress_out, k, r)
+                wp.static(each[i])(q, s, buffer, table, last, rate[r], stressed, strain_out, stress_out, k, r)
 
     return strains
 
@@ -510,6 +511,7 @@ def _strain_functions(kind: ChainKind, index: int, real):
         table: wp.array2d(dtype=int),
         last: wp.array3d(dtype=real),
         rate: real,
+        stressed: int,
         strain_out: wp.array3d(dtype=real),
         stress_out: wp.array3d(dtype=real),
         k: int,
@@ -520,6 +522,7 @@ def _strain_functions(kind: ChainKind, index: int, real):
         stress = slope_of(e, p)
         for m in range(wp.static(n)):
             strain_out[wp.static(row) + m, k, r] = e[m]
-            stress_out[wp.static(row) + m, k, r] = stress[m]
+            if stressed != 0:
+                stress_out[wp.static(row) + m, k, r] = stress[m]
 
     return strains_at

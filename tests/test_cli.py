@@ -194,7 +194,7 @@ def test_resume_with_another_setting_is_a_mistake(fall, capsys, flag, stored):
     [
         ("def build(n):\n    pass\n", "needs a default"),
         ("def build(n: list = ()):\n    pass\n", "type of int, float, str or bool"),
-        ("def build(dt: float = 1.0):\n    pass\n", "name of an option of `run`"),
+        ("def build(device: str = ''):\n    pass\n", "name of an option of `run`"),
         ("def build(scene: str = ''):\n    pass\n", "name of an option of `run`"),
         ("def make():\n    pass\n", "has no build"),
     ],

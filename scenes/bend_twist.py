@@ -1,0 +1,99 @@
+"""Bend-twist: a naturally curved rod hangs in a plane until weight and curvature push it out.
+
+The top of an arc of natural curvature k0 is clamped with its tangent straight down; its weight per length w grows, G = w L^3 / B.
+The equilibrium in the plane of the arc loses its stability to bending out of the plane with twist (Miller et al., Phys. Rev. Lett.
+112, 2014; Romero et al., ACM Trans. Graph. 40, 2021), and below k0 L of about 5.5 it never does. Reference: second variation of the
+inextensible Kirchhoff rod, by a spectral method and by a determinant.
+"""
+
+import numpy as np
+
+import ddg_warp as ddg
+
+LENGTH = 1.0  # m
+B, C = 1.0, 2.0 / 3.0  # bending and twisting stiffness [N m^2]; Poisson's ratio is 0.5
+EA = 1.0e7  # N; so stiff that the rod counts as inextensible
+GRAVITY = 9.81  # m/s^2
+SOURCE = "second variation of the Kirchhoff rod, spectral against determinant to 1e-7"
+
+# k0 L -> G at which the planar equilibrium loses stability, regains it, and so on, as G grows from zero.
+FLIPS = {
+    4.0: (),
+    5.0: (),
+    5.5: (),
+    6.0: (11.86875074, 37.76390898),
+    7.0: (14.53972482,),
+    8.0: (19.24842318,),
+    10.0: (28.7697064,),
+}
+
+
+def build(curvature: float = 7.0, weight: float = 14.0, n: int = 100) -> ddg.Scene:
+    """The arc in the plane of x and z, under its weight.
+
+    Args:
+        curvature: natural curvature over 1 / L; there are reference numbers for 4, 5, 5.5, 6, 7, 8 and 10
+        weight: G = w L^3 / B
+        n: edges of the rod
+    """
+    gravity = (0.0, 0.0, -GRAVITY)
+    scene = ddg.Scene(gravity=gravity, analysis=ddg.Statics(load_steps=max(2, round(0.5 * weight))))
+    angle = curvature * np.linspace(0.0, 1.0, n + 1)
+    points = LENGTH / curvature * np.stack([1.0 - np.cos(angle), 0.0 * angle, -np.sin(angle)], axis=1)
+    density = weight * B / (LENGTH**3 * GRAVITY)
+    section = ddg.Stiffness(EA=EA, EI1=B, GJ=C, mass_per_length=density, radius=0.01)
+    rod = scene.add_rod(points, section=section, name="curl")
+    scene.clamp_end(rod, "first")
+    return scene
+
+
+class PlanarBranch:
+    """Planar equilibria of one arc and their stability: symmetry keeps what starts in the plane there.
+
+    Attributes:
+        unit: G at load parameter 1.
+    """
+
+    def __init__(self, curvature: float, n: int, device: str = "cpu", unit: float = 1000.0):
+        from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
+        from ddg_warp.tangent import Tangent
+
+        self.unit = unit
+        self.model = build(curvature, unit, n).build(device, "float64")
+        self.tangent = Tangent(self.model)
+        self._equilibrium = Equilibrium(self.model, StaticsOptions(mode="follow"))
+        self._known = {0.0: self.model.state()}
+
+    def at(self, weight: float):
+        """Model and equilibrium at G = weight, followed from the nearest one known below."""
+        below = max(known for known in self._known if known <= weight)
+        if below < weight:
+            steps = max(1, int(np.ceil((weight - below) / (1.0 + 0.1 * below))))
+            start = self._known[below]
+            self._known[weight] = self._equilibrium.load(start, steps, below / self.unit, weight / self.unit)
+        return self.model, self._known[weight]
+
+    def lowest(self, weight: float) -> float:
+        """Lowest eigenvalue of the tangent at G = weight."""
+        from ddg_warp import stability
+
+        return float(stability.spectrum(*self.at(weight), 1, "unit", self.tangent).eigenvalues[0])
+
+    def flip(self, low: float, high: float) -> float:
+        """G between low and high at which the lowest eigenvalue vanishes."""
+        from ddg_warp import stability
+
+        return stability.critical(self.at, low, high)
+
+
+def check(result) -> list[ddg.Check]:
+    """Where the planar equilibrium gains or loses stability, for the curvatures for which it was computed."""
+    first, second = np.diff(result.model.scene.batches[0].points[0], axis=0)[:2]
+    n = result.model.curves.counts[0] - 1
+    turn = np.arccos(first @ second / np.linalg.norm(first) ** 2)
+    flips = FLIPS.get(float(np.round(turn * n, 6)), ())
+    branch = PlanarBranch(turn * n, n, result.model.device) if flips else None
+    return [
+        ddg.Check(f"critical weight {i} [B/L^3]", branch.flip(0.8 * G, 1.2 * G), G, 0.02, SOURCE, relative=True)
+        for i, G in enumerate(flips, 1)
+    ]

@@ -1,0 +1,68 @@
+"""Michell ring: a ring with twist in it leaves its plane.
+
+A straight rod is bent to a circle and closed with a total twist Tw. The circle is stable up to Tw = 2 pi sqrt(3) B / C, whatever its
+radius (Michell 1889; Zajac, J. Appl. Mech. 29, 1962). Here the frames are closed without a jump and the twist is one that the rod
+would have when free.
+"""
+
+import numpy as np
+
+import ddg_warp as ddg
+
+RADIUS = 1.0  # m
+B = 1.0  # bending stiffness [N m^2]
+EA = 1.0e7  # N; so stiff that the ring counts as inextensible
+SOURCE = "2 pi sqrt(3) B / C (Michell 1889, Zajac 1962)"
+
+
+def build(twist: float = 0.95, ratio: float = 1.0, n: int = 200) -> ddg.Scene:
+    """The ring in the plane of x and y.
+
+    Args:
+        twist: total twist over the critical one
+        ratio: twisting over bending stiffness, C / B
+        n: edges of the ring, a multiple of four
+    """
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), analysis=ddg.Statics(load_steps=1))
+    angle = 2.0 * np.pi * np.arange(n) / n
+    points = RADIUS * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    length = n * np.linalg.norm(points[1] - points[0])
+    ring = scene.add_rod(
+        points,
+        section=ddg.Stiffness(EA=EA, EI1=B, GJ=ratio * B, radius=0.03),
+        closed=True,
+        natural=(0.0, 0.0, -twist * exact(ratio) / length),
+        name="ring",
+    )
+    # Six components keep it from moving as a rigid body, and an angle its frames from turning along: none of them strains it.
+    scene.fix(ring, [0])
+    scene.fix(ring, [n // 4], "yz")
+    scene.fix(ring, [n // 2], "z")
+    scene.fix_twist(ring, [0])
+    return scene
+
+
+def exact(ratio: float) -> float:
+    """Critical twist [rad] for a ratio C / B."""
+    return 2.0 * np.pi * np.sqrt(3.0) / ratio
+
+
+def critical_twist(ratio: float, n: int, device: str = "cpu") -> float:
+    """Total twist [rad] at which the lowest eigenvalue of the tangent vanishes, for a ring of n edges."""
+    from ddg_warp import stability
+    from ddg_warp.integrate import statics
+
+    def twisted(fraction):
+        model = build(fraction, ratio, n).build(device, "float64")
+        return model, statics.solve(model, mode="follow")
+
+    return exact(ratio) * stability.critical(twisted, 0.9, 1.1, tolerance=1e-7)
+
+
+def check(result) -> list[ddg.Check]:
+    """The critical twist against the closed form, to what edges of this length can resolve."""
+    section = result.model.scene.batches[0].section
+    n = result.model.curves.counts[0]
+    ratio = section.GJ / section.EI1
+    measured = critical_twist(ratio, n, result.model.device)
+    return [ddg.Check("critical twist [rad]", measured, exact(ratio), 40.0 / n**2, SOURCE, relative=True)]
