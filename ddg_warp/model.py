@@ -58,6 +58,25 @@ class Group:
         self.buffer = wp.array(np.concatenate([p.ravel() for p in self._parameters]), dtype=real, device=self.device)
         self.table = wp.array(np.array(table, np.int32), dtype=int, device=self.device)
 
+    def set_parameter(self, row: int, values: np.ndarray, name: str) -> None:
+        """Replace a row by values of shape (), (worlds,), (elements,) or (worlds, elements)."""
+        elements = self.nodes
+        if values.ndim == 0:
+            new = values.reshape(1, 1)
+        elif values.shape == (self.worlds,) and self.worlds > 1:
+            new = np.repeat(values, self.rods)[None]
+        else:
+            along = np.atleast_2d(values)
+            if along.shape[0] not in (1, self.worlds) or not elements - 2 <= along.shape[1] <= elements:
+                raise ValueError(
+                    f"{name} has shape {values.shape}; give one number, ({self.worlds},), (elements,) or ({self.worlds}, elements)"
+                    f" with {elements - 2} vertices or {elements - 1} edges"
+                )
+            along = np.pad(along, ((0, 0), (0, elements - along.shape[1])), mode="edge")
+            new = np.repeat(np.broadcast_to(along, (self.worlds, elements)), self.rods, axis=0).T
+        self._parameters[row] = np.ascontiguousarray(new)
+        self.upload_parameters(self.buffer.dtype)
+
     def parameter(self, row: int) -> np.ndarray:
         """Row of the parameter table on the host, broadcastable to (node, column)."""
         return self._parameters[row]
@@ -109,6 +128,7 @@ class Model:
         self.wp_device = wp.get_device(device or ("cuda:0" if wp.is_cuda_available() else "cpu"))
         self.types = _precision(precision, self.wp_device)
         self.worlds = worlds
+        self.version = 0  # rises with every change of a constant array, so that captured steps are captured anew
         self.chains, self.held = compile_chains(scene)
         self.motions = scene_motions(scene)
         self.groups = [Group(chain, scene, worlds, self.wp_device, self.types.real) for chain in self.chains]
@@ -159,6 +179,38 @@ class Model:
         from ddg_warp.inquiry import stresses
 
         return stresses(self, state)
+
+    def set_parameter(self, term: str, parameter: str, values) -> None:
+        """Change a parameter of a term for all rods that have it, in every world or one by one.
+
+        Args:
+            term, parameter: names as `parameters` gives them, such as "rod_bend_twist", "stiffness_1".
+            values: one number, one a world (worlds,), one an element (elements,), or (worlds, elements); elements of the longest
+                rod of a group, those of clamped ends included.
+
+        Raises:
+            ValueError: no rod has the term, the term has no such parameter, or the shape or a value is wrong.
+        """
+        values = np.asarray(values, float)
+        if not np.isfinite(values).all():
+            raise ValueError(f"{term}.{parameter}: value {int(np.flatnonzero(~np.isfinite(values))[0])} is not finite")
+        found = False
+        for group in self.groups:
+            for candidate, place in zip(group.kind.terms, group.kind.places(), strict=True):
+                if candidate.name == term:
+                    if parameter not in candidate.parameter_names:
+                        raise ValueError(
+                            f"{term} has no parameter {parameter!r}; it has {', '.join(candidate.parameter_names)}"
+                        )
+                    row = place[0] + candidate.parameter_names.index(parameter)
+                    group.set_parameter(row, values, f"{term}.{parameter}")
+                    found = True
+        if not found:
+            raise ValueError(f"no rod has the term {term!r}; this model has {', '.join(self._term_names())}")
+        self.version += 1
+
+    def _term_names(self) -> list[str]:
+        return sorted({term.name for group in self.groups for term in group.kind.terms})
 
     def parameters(self) -> dict[str, np.ndarray]:
         """Parameters of all terms by name, `group/term/parameter`, broadcastable to (node, column of the group)."""
