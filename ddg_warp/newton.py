@@ -7,6 +7,8 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.kernels import chain, element
 
+MANY = 50_000  # rods from which full blocks of the sweep pay on a GPU; below, small ones reach more multiprocessors
+
 
 @dataclass(frozen=True)
 class NewtonOptions:
@@ -73,16 +75,18 @@ class ChainNewton:
         self.without_compression = self.clamped  # rods whose matrix leaves the stiffness that compression takes away
         self.coefficient, self.rate = scalars(), scalars()
         self.step_length, self.decrement, self.load_scale, self.residual = scalars(), scalars(), scalars(), scalars()
+        self.todo, self.angle_change = flags(), scalars()
         self.active = wp.zeros(1, dtype=int, device=device)
         self.device = device
         self._evaluate = element.evaluate_kernel(kind, self.real, self.linear)
         self._check = chain.check_kernel(kind, self.real, self.linear)
         self._sweep = None if kind.closed else chain.sweep_kernel(kind, self.real, self.linear)
+        self._adjust = None if kind.closed else chain.adjust_kernel(kind, self.real, self.linear)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [self._evaluate, self._check, self._sweep]
+        return [self._evaluate, self._check, self._sweep, self._adjust]
 
     def pcg_iterations(self) -> int:
         """None: the sweep is direct."""
@@ -136,18 +140,17 @@ class ChainNewton:
             + [group.load, group.load_angle, int(group.host.loaded), group.fixed, group.length]
             + [options.floor_factor * self.eps, options.rotation_cap]
             + [options.max_iterations, options.max_halvings]
-            + [self.x, self.theta, self.frame, self.base, self.elimination, self.direction]
+            + [self.x, self.theta, self.base, self.elimination, self.direction]
             + [self.status, self.slot, self.iteration, self.halvings, self.step_length, self.decrement]
-            + [
-                self.load_scale,
-                self.residual,
-                self.lost,
-                self.turned,
-                self.clamped,
-                self.unbalanced,
-                self.drowned,
-                self.active,
-            ],
+            + [self.load_scale, self.residual, self.lost, self.turned, self.clamped, self.unbalanced, self.drowned]
+            + [self.angle_change, self.todo, self.active],
             device=self.device,
-            block_dim=32,
+            block_dim=32 if group.columns < MANY else 128,
+        )
+        wp.launch(
+            self._adjust,
+            group.columns,
+            [group.count, group.fixed, self.direction, self.step_length, self.angle_change],
+            [self.x, self.theta, self.frame, self.base, self.todo],
+            device=self.device,
         )

@@ -20,6 +20,7 @@ import warp as wp
 from ddg_warp.kernels import frames, outcome, pivot
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions
 
+PLACE, RELAG = 1, 2  # what a sweep leaves to `adjust`
 TURNED = 0.02  # largest turn of an edge in a step that is still taken straight [rad]; its stretch is TURNED^2 / 2
 
 
@@ -339,7 +340,7 @@ def sweep_kernel(kind: ChainKind, real, linear):
     window, nb2 = kind.window, kind.block**2
     V, H, M = wp.types.vector(dim, real), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     factor_block, lower, upper, lower_vector, upper_vector, congruence = pivot.functions(nb, linear)
-    place, turn_angles, relag, shorter = search_functions(kind, real, linear)
+    *_, shorter = search_functions(kind, real, linear)
     force, *_ = node_functions(kind, real)
     angle = nb - 1
     vertex_rows, edge_rows, tensions = kind.vertex_strains, kind.edge_strains, kind.tensions
@@ -406,7 +407,6 @@ def sweep_kernel(kind: ChainKind, real, linear):
         # iterate
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
-        frame: wp.array3d(dtype=real),
         base: wp.array2d(dtype=V),
         Y: wp.array3d(dtype=linear),
         direction: wp.array3d(dtype=linear),
@@ -424,6 +424,8 @@ def sweep_kernel(kind: ChainKind, real, linear):
         clamped: wp.array(dtype=int),
         unbalanced: wp.array(dtype=int),
         drowned: wp.array(dtype=int),
+        angle_change: wp.array(dtype=real),
+        todo: wp.array(dtype=int),
         active: wp.array(dtype=int),
     ):
         r = wp.tid()
@@ -613,9 +615,9 @@ def sweep_kernel(kind: ChainKind, real, linear):
                 status[r] = wp.static(outcome.LINE_SEARCH_FAILED)
                 return
             less = shorter(taken, taken * decrement[r], change, finite)
-            place(x, base, direction, fixed, less, n, r)
-            turn_angles(theta, direction, less - taken, n, r)
             step_length[r] = less
+            angle_change[r] = less - taken
+            todo[r] = wp.static(PLACE)
             active[0] = 1
             return
 
@@ -630,13 +632,11 @@ def sweep_kernel(kind: ChainKind, real, linear):
         lost[r] = lost[r] + lost_here
         if wp.static(twist):
             if turned[r] != 0:
-                # angles mean something else now: take no step, and ask for a direction in the new frames
-                relag(x, frame, n, r)
+                # angles mean something else in new frames: take no step, and ask for a direction there
                 turned[r] = 0
                 decrement[r] = real(1.0e30)
                 step_length[r] = real(0.0)
-                for j in range(n):
-                    base[j, r] = x[j, r]
+                todo[r] = wp.static(RELAG)
                 return
         e1 = H()
         e2 = H()
@@ -668,9 +668,42 @@ def sweep_kernel(kind: ChainKind, real, linear):
         whole = real(1.0)
         if rotation > rotation_cap * rotation_cap:
             whole = rotation_cap / wp.sqrt(rotation)
-            turn_angles(theta, direction, whole - real(1.0), n, r)
         if rotation > real(wp.static(TURNED**2)):
-            place(x, base, direction, fixed, whole, n, r)
+            angle_change[r] = whole - real(1.0)
+            todo[r] = wp.static(PLACE)
         step_length[r] = whole
 
     return sweep
+
+
+@cache
+def adjust_kernel(kind: ChainKind, real, linear):
+    """What a sweep leaves to do for few rods: put a shortened or far turning step, or take the frames of its iterate."""
+    V, twist = wp.types.vector(kind.dim, real), kind.twist
+    place, turn_angles, relag, _ = search_functions(kind, real, linear)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def adjust(
+        count: wp.array(dtype=int),
+        fixed: wp.array2d(dtype=wp.uint8),
+        direction: wp.array3d(dtype=linear),
+        step_length: wp.array(dtype=real),
+        angle_change: wp.array(dtype=real),
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        frame: wp.array3d(dtype=real),
+        base: wp.array2d(dtype=V),
+        todo: wp.array(dtype=int),
+    ):
+        r = wp.tid()
+        if todo[r] == wp.static(PLACE):
+            place(x, base, direction, fixed, step_length[r], count[r], r)
+            turn_angles(theta, direction, angle_change[r], count[r], r)
+        if wp.static(twist):
+            if todo[r] == wp.static(RELAG):
+                relag(x, frame, count[r], r)
+                for j in range(count[r]):
+                    base[j, r] = x[j, r]
+        todo[r] = 0
+
+    return adjust

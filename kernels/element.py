@@ -442,16 +442,22 @@ def evaluate_kernel(kind: ChainKind, real, linear):
             gradient_out[i, k, r] = f[i]
         if wp.static(twist):
             if whole:
-                te = wp.normalize(X(q[0], q[1], q[2]))
-                tf = wp.normalize(X(q[3], q[4], q[5]))
+                e = X(q[0], q[1], q[2])
+                f1 = X(q[3], q[4], q[5])
                 te0 = X(s[3], s[4], s[5])
                 tf0 = X(s[9], s[10], s[11])
-                least = wp.min(wp.dot(te, te0), wp.dot(tf, tf0))
-                if least < real(0.9):
-                    m = reference_twist(
-                        transport(X(s[0], s[1], s[2]), te0, te), transport(X(s[6], s[7], s[8]), tf0, tf), te, tf, s[12]
-                    )
-                    if least < real(0.0) or wp.abs(m - s[12]) > real(1.5):
+                along_e = wp.dot(e, te0)
+                along_f = wp.dot(f1, tf0)
+                far = real(0.81)  # squared cosine of the turn from which the reference twist can matter
+                if along_e * wp.abs(along_e) < far * wp.length_sq(e) or along_f * wp.abs(along_f) < far * wp.length_sq(
+                    f1
+                ):
+                    te = wp.normalize(e)
+                    tf = wp.normalize(f1)
+                    ue = transport(X(s[0], s[1], s[2]), te0, te)
+                    uf = transport(X(s[6], s[7], s[8]), tf0, tf)
+                    m = reference_twist(ue, uf, te, tf, s[12])
+                    if wp.min(along_e, along_f) < real(0.0) or wp.abs(m - s[12]) > real(1.5):
                         turned_out[r] = 1
 
     return evaluate

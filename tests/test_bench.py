@@ -1,0 +1,99 @@
+"""Benchmarks: error and time come together, of every case; `tools/bench_rods.py` runs and finds the published tip."""
+
+import csv
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp import bench
+from ddg_warp.catalog import InputError, load_scene
+
+ROOT = Path(__file__).parents[1]
+COLUMNS = "study rods nodes precision rtol ms_per_step newton_mean newton_max outcomes residual error".split()
+
+
+@pytest.fixture
+def cantilever() -> ModuleType:
+    return load_scene("cantilever")
+
+
+@pytest.fixture
+def study(cantilever) -> bench.Study:
+    """The cantilever's study on a grid that takes a moment."""
+    grid = {"dt": (0.02, 0.01), "n": (8,), "scheme": ("implicit_euler", "implicit_midpoint"), "rtol": (1e-6,)}
+    reference = {"dt": 0.0025, "n": 8, "scheme": "implicit_midpoint", "rtol": 1e-8}
+    fixed = {"duration": 0.1, "precision": "float64"}
+    return replace(cantilever.benchmark(), grid=grid, reference=reference, fixed=fixed, series=("scheme",))
+
+
+def test_every_case_has_its_error_and_its_time(cantilever, study, device):
+    rows = bench.measure(cantilever, study, device=device)
+    assert [{name: row[name] for name in study.grid} for row in rows] == study.cases()
+    assert all(row["error"] > 0.0 and row["ms_per_step"] > 0.0 and row["seconds"] > 0.0 for row in rows)
+    assert all(row["newton_iterations"] >= 1.0 and not row["failure"] for row in rows)
+    assert rows[0]["relative_time"] == 1.0
+    assert [row["steps"] for row in rows] == [5, 5, 10, 10]
+    euler, midpoint = ([row["error"] for row in rows if row["scheme"] == scheme] for scheme in study.grid["scheme"])
+    assert euler[1] < euler[0]  # the step is what makes the error: nodes are those of the reference
+    assert max(midpoint) < min(euler)
+
+
+def test_reference_is_run_once(cantilever, study, device, monkeypatch):
+    asked = []
+    run = bench.run
+    monkeypatch.setattr(bench, "run", lambda module, case, where: asked.append(case) or run(module, case, where))
+    bench.measure(cantilever, study, device=device)
+    assert len(asked) == len(study.cases()) + 1
+    assert [case["dt"] for case in asked].count(study.reference["dt"]) == 1
+
+
+def test_failed_case_has_no_error(cantilever, study, device, monkeypatch):
+    def fail(self, state, dt):
+        raise ddg.SolverError("rod 0 could not be stepped", state=state)
+
+    monkeypatch.setattr(ddg.Integrator, "step", fail)
+    rows = bench.measure(cantilever, study, device=device)
+    assert all(np.isnan(row["error"]) and np.isnan(row["relative_time"]) for row in rows)
+    assert {row["failure"] for row in rows} == {"rod 0 could not be stepped"}
+    assert bench.best(study, rows) == []
+
+
+def test_best_cases_are_those_that_none_of_their_series_beats(study):
+    def row(scheme, seconds, error):
+        return {"scheme": scheme, "seconds": seconds, "error": error}
+
+    rows = [row("a", 2.0, 0.1), row("b", 1.0, 0.5), row("a", 1.0, 0.2), row("a", 3.0, 0.15), row("a", 4.0, np.nan)]
+    assert bench.best(study, rows) == [row("a", 1.0, 0.2), row("a", 2.0, 0.1), row("b", 1.0, 0.5)]
+    assert bench.best(replace(study, series=()), rows) == rows
+
+
+def test_unknown_setting_is_told(cantilever, device):
+    with pytest.raises(InputError, match="sets 'color'"):
+        bench.run(cantilever, {"color": 1}, device)
+
+
+def test_many_rods(tmp_path):
+    command = [sys.executable, str(ROOT / "tools/bench_rods.py"), "--cpu", "--quick", "--out", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    with open(tmp_path / "rods_cpu.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["study"] for row in rows} == {"published", "rods", "nodes"}
+    assert set(COLUMNS) <= set(rows[0])
+    header = next(line for line in done.stdout.splitlines() if line.startswith("study "))
+    assert set(COLUMNS) <= set(header.split())
+    content = json.loads((tmp_path / "rods_cpu.json").read_text())
+    assert {"commit", "versions", "processor"} <= set(content["machine"])
+    assert "--cpu --quick" in content["command"]
+    for row in content["rows"]:
+        assert row["ms_per_step"] > 0.0
+        assert row["error"] <= 1e-5
+        assert (row["retries"], row["lost_pivots"], row["failure"], row["passed"]) == (0, 0, "", True)
+    assert (tmp_path / "rods_cpu.png").stat().st_size > 0
