@@ -21,7 +21,7 @@ from ddg_warp.kernels import frames, outcome, pivot
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions
 
 PLACE, RELAG = 1, 2  # what a sweep leaves to `adjust`
-TURNED = 0.02  # largest turn of an edge in a step that is still taken straight [rad]; its stretch is TURNED^2 / 2
+TURNED = 0.1  # largest turn of an edge in a step that is still taken straight [rad]; its stretch is TURNED^2 / 2
 
 
 @cache

@@ -274,6 +274,7 @@ def advance_kernel(real):
         iteration: wp.array(dtype=int),
         lost: wp.array(dtype=int),
         retry_limit: int,
+        smallest: real,
         status: wp.array(dtype=int),
         progress: wp.array(dtype=real),
         portion: wp.array(dtype=real),
@@ -310,7 +311,7 @@ def advance_kernel(real):
             else:
                 cautious[r] = 0
                 portion[r] = real(0.5) * portion[r]
-            if retries[r] > retry_limit:
+            if retries[r] > retry_limit or portion[r] < smallest:
                 reason[r] = result
                 status[r] = wp.static(outcome.GIVEN_UP)
                 progress[r] = real(1.0)
