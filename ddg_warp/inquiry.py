@@ -64,7 +64,7 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
                 here[axes] = x[column, node, : kind.dim]
                 if about is None:
                     about = here
-                if not held.components:
+                if not held.components and kind.twist:
                     along = x[column, (node + 1) % part.group.nodes, : kind.dim] - x[column, node, : kind.dim]
                     moment += f[column, node, kind.dim] * along / np.linalg.norm(along)
                 else:
@@ -100,17 +100,27 @@ def writhe(points: np.ndarray) -> float:
     """Writhe of a closed polygon (n, 3): the exact Gauss integral over pairs of edges (Klenin and Langowski 2000, method 1a)."""
     a, b = points, np.roll(points, -1, axis=0)
     i, j = np.triu_indices(len(points), 2)
+    apart = (i > 0) | (
+        j < len(points) - 1
+    )  # the first and last edge meet: their solid angle is zero, up to a sign of rounding
+    i, j = i[apart], j[apart]
     r13, r14, r23, r24 = a[j] - a[i], b[j] - a[i], a[j] - b[i], b[j] - b[i]
     normals = [np.cross(r13, r14), np.cross(r14, r24), np.cross(r24, r23), np.cross(r23, r13)]
     lengths = [np.linalg.norm(n, axis=1, keepdims=True) for n in normals]
     n1, n2, n3, n4 = (n / np.where(s > 0.0, s, 1.0) for n, s in zip(normals, lengths, strict=True))
-    solid = sum(np.arcsin(np.clip((p * q).sum(1), -1.0, 1.0)) for p, q in ((n1, n2), (n2, n3), (n3, n4), (n4, n1)))
+    pairs = ((n1, n2), (n2, n3), (n3, n4), (n4, n1))
+    # arcsin(p . q), without its loss of half the digits where p and q are parallel
+    solid = sum(np.arctan2((p * q).sum(1), np.linalg.norm(np.cross(p, q), axis=1)) for p, q in pairs)
     sign = np.sign((np.cross(b[j] - a[j], b[i] - a[i]) * r13).sum(1))
     return float((sign * solid).sum() / (2.0 * np.pi))
 
 
 def total_twist(model, state, rod: int = 0) -> float:
-    """Twist of a rod relative to its reference frame's rest, in turns: the sum of its vertices' integrated twist over 2 pi."""
+    """Turns of a rod's directors about its centreline: the sum of the angles between neighbours, after parallel transport.
+
+    Full turns between neighbours count as they were wound. Of a closed rod, this plus `writhe` is the link of its centreline and
+    a first director's edge, a whole number (Calugareanu, White, Fuller), exactly so for polygons.
+    """
     for group, data in zip(model.groups, state.groups, strict=True):
         column = np.flatnonzero(group.host.rods == rod)
         if column.size and group.kind.twist:

@@ -5,6 +5,8 @@ from math import pi
 
 import numpy as np
 
+from ddg_warp.errors import SceneError
+
 
 @dataclass(frozen=True)
 class Material:
@@ -21,6 +23,12 @@ class Material:
     poisson: float = 0.5
     density: float = 1000.0
     viscosity: float = 0.0
+
+    def __post_init__(self):
+        _require("Material: young", self.young, "it is positive [Pa]", lambda v: v > 0.0)
+        _require("Material: poisson", self.poisson, "it is above -1 and at most 0.5", lambda v: (v > -1.0) & (v <= 0.5))
+        _require("Material: density", self.density, "it is not negative [kg/m^3]", lambda v: v >= 0.0)
+        _require("Material: viscosity", self.viscosity, "it is not negative [s]", lambda v: v >= 0.0)
 
     @property
     def shear(self) -> float:
@@ -56,6 +64,21 @@ class Stiffness:
         return self if self.EI2 is not None else Stiffness(**{**self.__dict__, "EI2": self.EI1})
 
 
+def _require(what: str, value, rule: str, holds) -> None:
+    """Refuse what is no finite number, or numbers, that fulfil a rule."""
+    try:
+        numbers = np.asarray(value, float)
+    except (TypeError, ValueError):
+        numbers = np.array(np.nan)
+    if not (np.isfinite(numbers).all() and np.all(holds(numbers))):
+        raise SceneError(f"{what} = {value!r}; {rule}")
+
+
+def _require_sizes(section) -> None:
+    for what, value in section.__dict__.items():
+        _require(f"{type(section).__name__}: {what}", value, "it is positive [m]", lambda v: v > 0.0)
+
+
 def _elastic(material: Material, area, i1, i2, torsion) -> Stiffness:
     return Stiffness(
         EA=material.young * area,
@@ -75,6 +98,9 @@ class Circle:
 
     radius: float
 
+    def __post_init__(self):
+        _require_sizes(self)
+
     def stiffness(self, material: Material) -> Stiffness:
         """A = pi r^2, I = pi r^4 / 4, J = 2 I."""
         i = pi * np.asarray(self.radius) ** 4 / 4.0
@@ -87,6 +113,9 @@ class Ellipse:
 
     a: float
     b: float
+
+    def __post_init__(self):
+        _require_sizes(self)
 
     def stiffness(self, material: Material) -> Stiffness:
         """I1 = pi a^3 b / 4, I2 = pi a b^3 / 4, J = pi a^3 b^3 / (a^2 + b^2) (Saint-Venant, exact)."""
@@ -101,6 +130,9 @@ class Rectangle:
 
     width: float
     height: float
+
+    def __post_init__(self):
+        _require_sizes(self)
 
     def stiffness(self, material: Material) -> Stiffness:
         """I1 = h w^3 / 12, I2 = w h^3 / 12, J by Saint-Venant's series (Timoshenko and Goodier, section 109)."""

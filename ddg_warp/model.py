@@ -276,6 +276,10 @@ class Model:
         counts = self.curves.counts - np.where(self.curves.closed, 0, 1)
         start = np.concatenate([[0], np.cumsum(counts)])
         values = np.asarray(values, float)
+        if values.shape not in ((counts.sum(),), (self.worlds, counts.sum())):
+            raise ValueError(f"spins have shape {values.shape}; they are ({counts.sum()},), or one such array a world")
+        if not np.isfinite(values).all():
+            raise ValueError(f"spins: edge {int(np.argwhere(~np.isfinite(values))[0][-1])} is not finite")
         own = group.host.own - (0 if group.kind.closed else 1)
         k, column, index = _user_index(group, own, start)
         for world in range(self.worlds):
@@ -292,6 +296,9 @@ class Model:
             ValueError: the snapshot is of another model.
         """
         state = self.empty_state()
+        names = {"time"} | {f"{i}/{name}" for i, group in enumerate(state.groups) for name in group.arrays()}
+        if names ^ set(snapshot):
+            raise ValueError(f"snapshot is of another model: it differs by {', '.join(sorted(names ^ set(snapshot)))}")
         for i, group in enumerate(state.groups):
             for name, array in group.arrays().items():
                 values = np.asarray(snapshot[f"{i}/{name}"])

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ddg_warp import validate
 from ddg_warp.errors import SceneError
 from ddg_warp.material import Material, Stiffness
 from ddg_warp.motion import Motion
@@ -109,7 +110,7 @@ class Scene:
 
     def add_rod(self, points, **options) -> int:
         """Add one rod with points (n, 3); options as in `add_rods`. Returns its index."""
-        return self.add_rods(np.asarray(points, float)[None], **options)[0]
+        return self.add_rods([points], **options)[0]
 
     def add_rods(
         self,
@@ -145,7 +146,13 @@ class Scene:
         Raises:
             SceneError: what is given cannot be a rod; the message names rod and node.
         """
-        points = np.array(points, float)
+        try:
+            points = np.array(points, float)
+            director = None if director is None else np.asarray(director, float)
+        except (TypeError, ValueError):
+            raise SceneError(
+                f"rods '{name}': points or director are no arrays of numbers; points are (rods, nodes, 3)"
+            ) from None
         if points.ndim == 2:
             points = points[None]
         if points.ndim != 3 or points.shape[2] != 3:
@@ -153,7 +160,7 @@ class Scene:
         stiffness = getattr(section, "stiffness", None)
         if stiffness is None:
             raise SceneError(f"rods '{name}': section {section!r} is none; use Circle, Ellipse, Rectangle or Stiffness")
-        if material is None and not isinstance(section, Stiffness):
+        if not isinstance(material, Material) and not isinstance(section, Stiffness):
             raise SceneError(f"rods '{name}': a {type(section).__name__} needs a material; give material=Material(...)")
         planar = self.dimension == 2
         batch = RodBatch(
@@ -161,7 +168,7 @@ class Scene:
             stiffness(material),
             closed,
             natural,
-            None if director is None else np.asarray(director, float),
+            director,
             twist and bend and not planar,
             bend,
             name,
@@ -175,9 +182,9 @@ class Scene:
 
         Negative indices count from the last edge. `motion` moves them; without it they stay where they are at rest.
         """
-        edges = tuple(edges)
+        edges = validate.indices("clamp: edges", edges)
         nodes = tuple(dict.fromkeys(n for e in edges for n in ((e, e + 1) if e >= 0 else (e - 1, e))))
-        self.supports.append(Support(self._rods(rods), nodes=nodes, edges=edges, motion=motion))
+        self._support(rods, nodes=nodes, edges=edges, motion=motion)
 
     def clamp_end(self, rods, end: str = "first", motion: Motion | None = None, components: str = "xyz") -> None:
         """Hold position and frame exactly at an end node: the tangent is prescribed there and the end cell is half a cell.
@@ -186,23 +193,30 @@ class Scene:
         """
         if end not in ("first", "last"):
             raise SceneError(f"clamp_end: end is {end!r}; it is 'first' or 'last'")
-        self.supports.append(Support(self._rods(rods), components=components, end=end, motion=motion))
+        self._support(rods, components=components, end=end, motion=motion)
 
     def fix(self, rods, nodes: Iterable[int], components: str = "xyz", motion: Motion | None = None) -> None:
         """Hold components of nodes (a hinge)."""
-        self.supports.append(Support(self._rods(rods), nodes=tuple(nodes), components=components, motion=motion))
+        self._support(rods, nodes=validate.indices("fix: nodes", nodes), components=components, motion=motion)
 
     def fix_twist(self, rods, edges: Iterable[int], motion: Motion | None = None) -> None:
         """Hold the angle of edges."""
-        self.supports.append(Support(self._rods(rods), edges=tuple(edges), motion=motion))
+        self._support(rods, edges=validate.indices("fix_twist: edges", edges), motion=motion)
 
     def add_force(self, rods, node: int, force, amplitude: Callable[[float], float] | None = None) -> None:
         """Dead force [N] on a node, times amplitude(t). In statics it grows with the load parameter if amplitude is None."""
-        self.loads.append(Load(self._rods(rods), node=node, force=tuple(force), amplitude=amplitude))
+        force = validate.vector(f"add_force: force on node {node}", force)
+        self._load(rods, amplitude, node=validate.index("add_force: node", node), force=force)
 
     def add_twisting_moment(self, rods, edge: int, moment: float, amplitude=None) -> None:
         """Moment [N m] about the tangent of an edge, conjugate to its angle."""
-        self.loads.append(Load(self._rods(rods), edge=edge, moment=moment, amplitude=amplitude))
+        for batch in self._batches(self._rods(rods)):
+            if not batch.twist:
+                raise SceneError(
+                    f"add_twisting_moment: rod {batch.first} ('{batch.name}') has no twist; add it with twist=True, in dimension 3"
+                )
+        moment = validate.number(f"add_twisting_moment: moment on edge {edge}", moment)
+        self._load(rods, amplitude, edge=validate.index("add_twisting_moment: edge", edge), moment=moment)
 
     def add_couple(self, rods, edge: int, couple, amplitude=None) -> None:
         """Couple (3,) [N m] on an edge, its axis fixed in space: a pair of forces across the edge and a moment about it.
@@ -210,13 +224,14 @@ class Scene:
         Outside the plane it has no potential (Ziegler, Principles of Structural Stability, 1968). Statics takes it as it is; in
         dynamics its forces are those on the predicted edge and stay as they are within a step.
         """
-        self.loads.append(Load(self._rods(rods), edge=edge, couple=tuple(couple), amplitude=amplitude))
+        couple = validate.vector(f"add_couple: couple on edge {edge}", couple)
+        self._load(rods, amplitude, edge=validate.index("add_couple: edge", edge), couple=couple)
 
     def add_mass(self, rods, node: int, mass: float) -> None:
         """Point mass [kg] on a node."""
-        if not mass > 0.0:
-            raise SceneError(f"add_mass: {mass} kg at node {node}; a point mass is positive")
-        self.masses.append((self._rods(rods), node, float(mass)))
+        if not 0.0 < mass < np.inf:
+            raise SceneError(f"add_mass: {mass} kg at node {node}; a point mass is positive and finite")
+        self.masses.append((self._rods(rods), validate.index("add_mass: node", node), float(mass)))
 
     def build(self, device=None, precision: str | None = None, worlds: int = 1):
         """Freeze the scene into a `Model` on a device.
@@ -231,11 +246,30 @@ class Scene:
         """
         from ddg_warp.model import Model
 
+        validate.check_scene(self)
+        worlds = validate.index("worlds", worlds)
         return Model(self, device=device, precision=precision, worlds=worlds)
 
     def _rods(self, rods) -> np.ndarray:
-        index = np.atleast_1d(np.asarray(rods, int))
+        index = np.array(validate.indices("rods", rods), int)
         bad = index[(index < 0) | (index >= self.rod_count)]
         if bad.size:
             raise SceneError(f"rod {bad[0]} does not exist; the scene has {self.rod_count} rods so far")
         return index
+
+    def _support(self, rods, *, motion, components: str = "xyz", **held) -> None:
+        if not components or set(components) - set("xyz"):
+            raise SceneError(f"fix: components {components!r}; they are letters of 'xyz', one at least")
+        if motion is not None and not isinstance(motion, Motion):
+            raise SceneError(f"motion is {motion!r}; give Motion(translation=..., angle=...)")
+        self.supports.append(Support(self._rods(rods), components=components, motion=motion, **held))
+
+    def _load(self, rods, amplitude, **load) -> None:
+        if amplitude is not None and not callable(amplitude):
+            raise SceneError(f"amplitude is {amplitude!r}; give a function of the time, or None")
+        self.loads.append(Load(self._rods(rods), amplitude=amplitude, **load))
+
+    def _batches(self, rods: np.ndarray) -> list[RodBatch]:
+        """The batches that some rods belong to."""
+        starts = [batch.first for batch in self.batches]
+        return [self.batches[i] for i in np.unique(np.searchsorted(starts, rods, side="right") - 1)]

@@ -47,8 +47,8 @@ class Result:
 
     @property
     def seconds_per_step(self) -> float:
-        """Mean time of a step [s]; without the first, which compiles, unless it is the only one."""
-        steady = self.step_times[1:] or self.step_times
+        """Mean time of a step [s]; without the first two, which compile and capture, unless there are no others."""
+        steady = self.step_times[2:] or self.step_times
         return sum(steady) / len(steady) if steady else 0.0
 
     def at(self, t: float, name: str) -> float:

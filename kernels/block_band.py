@@ -122,6 +122,7 @@ def assemble_kernel(kind: ChainKind, real, linear):
         base: wp.array2d(dtype=V),
         status: wp.array(dtype=int),
         unbalanced: wp.array(dtype=int),
+        drowned: wp.array(dtype=int),
         slot: wp.array(dtype=int),
         iteration: wp.array(dtype=int),
         reuse: int,
@@ -133,7 +134,9 @@ def assemble_kernel(kind: ChainKind, real, linear):
     ):
         k, r = wp.tid()
         n = count[r]
-        if status[r] != 0 or unbalanced[r] == 0 or k >= n:
+        if status[r] != 0 or k >= n:
+            return
+        if unbalanced[r] == 0 and (drowned[r] == 0 or iteration[r] > 0):
             return
         c = coefficient[r]
         b = behind(k, n)

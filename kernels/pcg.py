@@ -58,7 +58,8 @@ def judge_kernel(kind: ChainKind, real, linear):
         wanted[r] = 0
         if status[r] != 0:
             return
-        if unbalanced[r] == 0:
+        # rounding excuses a residual only after an iteration: the predictor's may be all of a coarse precision's load
+        if unbalanced[r] == 0 and (drowned[r] == 0 or iteration[r] > 0):
             status[r] = wp.where(
                 drowned[r] == 0, int(wp.static(outcome.CONVERGED)), int(wp.static(outcome.CONVERGED_TO_ROUNDING))
             )

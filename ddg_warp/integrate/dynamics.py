@@ -5,7 +5,7 @@ import gc
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import arrays, geometry
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels import outcome, step
 from ddg_warp.linear.pcg import PcgNewton, ProjectiveNewton
@@ -15,6 +15,7 @@ from ddg_warp.state import State
 
 SOLVERS = ("newton", "projective")
 SCHEMES = ("implicit_euler", "implicit_midpoint")
+FOLDED = 1e-5  # how close to opposite [rad] edges that meet are called folded, in messages
 
 
 class Integrator:
@@ -40,7 +41,7 @@ class Integrator:
             PCG with "jacobi", "block_jacobi" or "chain" as preconditioner.
         rtol, max_iterations, ...: see `NewtonOptions`.
         retry_limit: how often in a row a rod's failed step is tried again: first from the last state instead of the predictor,
-            then in halves, and so on.
+            then in halves, and so on, down to 2^-(retry_limit / 2) of the step.
         check_every: steps between readings of the outcomes; by default 1 on the CPU and 32 on CUDA.
 
     Raises:
@@ -69,7 +70,7 @@ class Integrator:
         _require_mass(model)
         self._chains = [_ChainStep(self, model, group) for group in model.groups]
         self._buffers = [model.empty_state(), model.empty_state()]
-        self._graphs = {}
+        self._graphs, self._version = {}, model.version
         self._steps_since_check = 0
         self._dt = wp.zeros(model.worlds, dtype=model.types.real, device=model.wp_device)
         self._dt_host = None
@@ -140,11 +141,16 @@ class Integrator:
         for i, buffer in enumerate(self._buffers):
             if state is buffer:
                 return i
+        if state.model is not self.model:
+            raise SceneError("the state is of another model; step states that this integrator's model made")
         self._buffers[0].assign(state)
         return 0
 
     def _launch(self, source: int) -> None:
         """Replay the captured step from one buffer to the other; the first time, run it (which compiles) and capture it."""
+        if self.model.version != self._version:
+            self._graphs.clear()
+            self._version = self.model.version
         if source in self._graphs:
             wp.capture_launch(self._graphs[source])
             return
@@ -267,7 +273,7 @@ class _ChainStep:
             "predict",
             group.columns,
             [before.x, before.v, group.fixed, group.count, newton.rate, self.progress, self.bent],
-            [newton.base, newton.direction, newton.x],
+            [newton.base, newton.direction, newton.x, newton.frame],
         )
         self.bent.zero_()
         if self.moving:
@@ -290,7 +296,7 @@ class _ChainStep:
         self._launch(
             "advance",
             group.columns,
-            [newton.iteration, newton.lost, self.integrator.retry_limit],
+            [newton.iteration, newton.lost, self.integrator.retry_limit, 0.5 ** (self.integrator.retry_limit // 2)],
             [newton.status, self.progress, self.portion, self.cautious, self.retries, self.reason]
             + [self.tally, self.work, self.remaining],
         )
@@ -321,8 +327,7 @@ class _ChainStep:
         node, size = self._worst_node(column)
         raise SolverError(
             f"rod {rod} ('{self.model.curves.names[rod]}') could not be stepped to t = {state.time:g} s: {name} after "
-            f"{self.integrator.retry_limit} retries, residual {size:.3g} N at node {node}; "
-            "take a smaller dt, a looser rtol, or check its loads and supports",
+            f"{self.integrator.retry_limit} retries, residual {size:.3g} N at node {node}; {self._remedy(state, column)}",
             state=state,
             outcome=name,
             rods=[int(host.rods[c % self.group.rods]) for c in failed],
@@ -332,7 +337,28 @@ class _ChainStep:
         """Where the largest residual was, estimated by the element forces that meet there."""
         size = float(self.newton.residual.numpy()[column])
         direction = np.abs(arrays.download(self.newton.direction)[:, :, column]).max(0)
-        return int(np.nanargmax(direction)) - int(self.group.host.first[column % self.group.rods]), size
+        largest = int(np.argmax(np.where(np.isfinite(direction), direction, np.inf)))
+        return largest - int(self.group.host.first[column % self.group.rods]), size
+
+    def _remedy(self, state: State, column: int) -> str:
+        """What to do about a rod that was given up: edges of its last good state that no step can start from, or advice."""
+        host, closed, rod = self.group.host, self.group.kind.closed, column % self.group.rods
+        x = arrays.download(state.groups[self.index].x)[: host.count[rod], column][None]
+        edges, first = geometry.edge_vectors(x.astype(float), closed), int(host.first[rod])
+        lengths = np.linalg.norm(edges, axis=-1)
+        if not (lengths > 0.0).all():
+            k = int(np.argmin(lengths[0] > 0.0)) - first
+            return f"edge {k} has no length in the last good state; move a node of the state it starts from"
+        if self.group.kind.span == 2:
+            before, after = geometry.ahead(edges / lengths[..., None], closed)
+            k = int(np.argmin(np.sum(before * after, -1)[0]))
+            if np.linalg.norm(before[0, k] + after[0, k]) < FOLDED:
+                k, after = k - first, (k + 1) % lengths.shape[1] - first
+                return (
+                    f"edges {k} and {after} fold back by 180 degrees in the last good state, where curvature is infinite; "
+                    f"move node {after} of the state it starts from, or take a smaller dt if it folded on the way"
+                )
+        return "take a smaller dt, a looser rtol, or check its loads and supports"
 
 
 class _Moving:

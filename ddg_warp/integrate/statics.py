@@ -72,8 +72,7 @@ class Equilibrium:
         if self.options.mode not in ("minimise", "follow"):
             raise SceneError(f"statics mode {self.options.mode!r}: it is 'minimise' or 'follow'")
         self.tangent = Tangent(model)
-        if self.tangent.free.all():
-            raise SceneError("nothing is held: a static solve needs supports; add scene.clamp(...) or scene.fix(...)")
+        _require_supports(model)
         self.iterations = 0
         self.outcome = ""
 
@@ -109,7 +108,7 @@ class Equilibrium:
         energies, q = tangent.element_energies(state), tangent.dofs(state)
         outer = tangent.loads(at, q)
         gradient = tangent.gradient(state)
-        scale = None
+        scale, polished = None, False
         for _ in range(options.max_iterations):
             residual = outer - gradient
             hessian = tangent.hessian(state)
@@ -123,12 +122,14 @@ class Equilibrium:
             if scale == 0.0:
                 scale = np.abs(residual[free]).max()
             excess = self._excess(residual, gradient, hessian, q, scale)
-            if excess <= 0.0:
+            if excess <= 0.0 and (self.outcome == "converged" or polished):
                 state.time = at
                 return state
+            polished = excess <= 0.0  # the floor is a bound: one more iteration gives what rounding allows
             self.iterations += 1
             direction, decrease = self._direction(hessian, residual)
-            direction *= min(1.0, options.rotation_cap / max(1e-300, self._rotation(q, direction)))
+            shortened = min(1.0, options.rotation_cap / max(1e-300, self._rotation(q, direction)))
+            direction, decrease = shortened * direction, shortened * decrease
             taken, found = 1.0, False
             merit = np.linalg.norm(self._scaled(residual)[free])
             for _ in range(30):
@@ -152,6 +153,9 @@ class Equilibrium:
                 if found:
                     break
                 taken *= 0.5
+            if not found and polished:
+                state.time = at
+                return state
             if not found:
                 raise SolverError(
                     self._where("line_search_failed", residual, at), state=state, outcome="line_search_failed"
@@ -229,6 +233,20 @@ class Equilibrium:
                     f"of rod {rod}; take more load steps, or hold what can still move freely"
                 )
         return outcome
+
+
+def _require_supports(model) -> None:
+    """Refuse a rod that can be shifted as a whole: no node of it holds some component. It may still turn."""
+    for group in model.groups:
+        host, axes = group.host, "xz" if group.kind.dim == 2 else "xyz"
+        held = np.bitwise_or.reduce(host.fixed, axis=0)
+        for d, axis in enumerate(axes):
+            loose = np.flatnonzero((held >> d) & 1 == 0)
+            if loose.size:
+                raise SceneError(
+                    f"rod {host.rods[loose[0]]} is not held along {axis}: a static solve needs supports; "
+                    "add scene.clamp(...) or scene.fix(...)"
+                )
 
 
 def _move_supports(model, state: State, before: float, at: float) -> None:

@@ -72,8 +72,16 @@ class PcgNewton(ChainNewton):
             (group.nodes, group.columns),
             [self.factor, self.gradient, self.energy, group.count, group.mass, group.rotary, self.coefficient]
             + [self.x, self.theta, self.target, self.target_angle, group.gravity, group.load, group.load_angle]
-            + [int(group.host.loaded), group.fixed, self.direction, self.base, self.status, self.unbalanced, self.slot]
-            + [self.iteration, int(self.reuse), self.step_length],
+            + [
+                int(group.host.loaded),
+                group.fixed,
+                self.direction,
+                self.base,
+                self.status,
+                self.unbalanced,
+                self.drowned,
+            ]
+            + [self.slot, self.iteration, int(self.reuse), self.step_length],
             [self.blocks, self.right, self.change, self.noise],
             device=device,
         )

@@ -1,0 +1,122 @@
+"""A cable gripped at both ends, as by two robots: brought together and turned, it throws loops; drawn apart, it comes back.
+
+Position and frame of both end nodes are prescribed; one end turns about the axis of the cable by several turns, counted, while both
+approach each other. A rod that does not pass through itself keeps its link (Calugareanu 1959, White 1969, Fuller 1971): the turns
+of one end against the other are twist and writhe together, however much of the former the loops take up. The motion is slow and
+damped, so that the way back ends in the equilibrium that the way out began in. The cable does not feel itself: wound up further, to
+five turns, its loops close and pass through themselves, which loses two turns for good.
+"""
+
+import numpy as np
+
+import ddg_warp as ddg
+
+LENGTH = 1.0  # m
+FAR = 1.0e4  # m; where the cable, prolonged along its end tangents, is closed
+HANG = 1.0  # s; until then the ends stay, and the cable, released straight, comes to hang
+BACK = 7.0  # s; then the ends are where they were
+LINK = "turns of the ends = twist + writhe (Calugareanu, White, Fuller)"
+MOTION = "prescribed motion"
+
+
+def build(
+    turns: float = 4.0,
+    approach: float = 0.5,
+    n: int = 80,
+    stiffness: float = 0.05,
+) -> ddg.Scene:
+    """The cable along x, under its weight.
+
+    Args:
+        turns: of the last end about x, at half the time
+        approach: of the ends over the length of the cable, at half the time
+        n: edges of the cable
+        stiffness: EI [N m^2]; a stranded cable, it resists twist by a quarter of that
+    """
+    scene = ddg.Scene(
+        mass_damping=4.0,
+        analysis=ddg.Dynamics(dt=0.01, duration=BACK + 1.0, scheme="implicit_euler"),
+    )
+    points = np.zeros((n + 1, 3))
+    points[:, 0] = np.linspace(0.0, LENGTH, n + 1)
+    cable = scene.add_rod(
+        points,
+        section=ddg.Stiffness(
+            EA=8000.0,
+            EI1=stiffness,
+            GJ=0.25 * stiffness,
+            mass_per_length=0.08,
+            rotary_inertia=1e-6,
+            radius=0.005,
+            viscosity=0.01,
+        ),
+        name="cable",
+    )
+
+    def way(t: float) -> float:
+        """0 until HANG, up to 1 in the middle, 0 from BACK on; smooth between."""
+        s = min(1.0, max(0.0, 2.0 * min(t - HANG, BACK - t) / (BACK - HANG)))
+        return s * s * (3.0 - 2.0 * s)
+
+    shift = 0.5 * approach * LENGTH
+    scene.clamp_end(cable, "first", motion=ddg.Motion(translation=lambda t: (shift * way(t), 0.0, 0.0)))
+    scene.clamp_end(
+        cable,
+        "last",
+        motion=ddg.Motion(
+            translation=lambda t: (-shift * way(t), 0.0, 0.0),
+            angle=lambda t: 2.0 * np.pi * turns * way(t),
+            axis=(1.0, 0.0, 0.0),
+        ),
+    )
+    return scene
+
+
+def equilibrium(model):
+    """How the cable hangs before it is moved: statics loads it while motions go from 0 to 1 s, and until then they rest."""
+    from ddg_warp.integrate.statics import solve
+
+    return solve(model)
+
+
+def writhe(points: np.ndarray) -> float:
+    """Writhe of the cable (n, 3), prolonged along x and closed far away."""
+    from ddg_warp.inquiry import writhe
+
+    first, last = points[0], points[-1]
+    along, aside = np.array([FAR, 0.0, 0.0]), np.array([0.0, 0.0, FAR])
+    return writhe(np.vstack([points, last + along, last + along + aside, first - along + aside, first - along]))
+
+
+def observe(model, state) -> dict[str, float]:
+    """Turns of the last end, twist and writhe, and the error of the end nodes [m]."""
+    from ddg_warp.inquiry import total_twist
+
+    points = state.points().reshape(-1, 3)[: model.curves.counts[0]]
+    rest, supports = model.scene.batches[0].points[0], model.scene.supports
+    ends = [
+        rest[node] + support.motion.translation(state.time) for node, support in zip((0, -1), supports, strict=True)
+    ]
+    return {
+        "turns": supports[1].motion.angle(state.time) / (2.0 * np.pi),
+        "twist": total_twist(model, state),
+        "writhe": writhe(points),
+        "end_error": float(np.abs(points[[0, -1]] - ends).max()),
+    }
+
+
+def check(result) -> list[ddg.Check]:
+    """Ends where they belong, turns = twist + writhe at all times, no failed solve, and the way back."""
+    series = {name: np.array(values) for name, values in result.series.items()}
+    failed = sum(number for name, number in result.statistics["outcomes"].items() if not name.startswith("converged"))
+    link = series["twist"] + series["writhe"] - series["turns"]
+    passes = np.round(0.5 * link)  # passing through itself changes the link of a curve by two
+    model = result.model
+    back = np.abs(result.state.points() - equilibrium(model).points()).max()
+    return [
+        ddg.Check("solves that did not converge", failed, 0.0, 0.0),
+        ddg.Check("end nodes from where their motion has them [m]", series["end_error"].max(), 0.0, 1e-12, MOTION),
+        ddg.Check("twist + writhe - turns, largest", np.abs(link - 2.0 * passes).max(), 0.0, 1e-5, LINK),
+        ddg.Check("how often the cable passed through itself", np.abs(passes).max(), 0.0, 0.0, LINK),
+        ddg.Check("cable from where it was, at the end [m]", back, 0.0, 1e-5, "equilibrium"),
+    ]

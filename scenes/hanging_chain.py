@@ -1,0 +1,102 @@
+"""A hanging chain without any stiffness to bending swings in shapes of Bessel's function.
+
+Daniel Bernoulli (1733): a chain of length L that hangs from its top has the frequencies omega = j sqrt(g / L) / 2, with j the zeros
+of J0, and the shapes J0(j sqrt(s / L)), s from the free end. Tension alone, which falls to nothing at that end, brings it back. The
+tangent at the hanging equilibrium gives all frequencies; a run with the implicit midpoint rule follows one of them.
+"""
+
+import numpy as np
+
+import ddg_warp as ddg
+
+LENGTH = 1.0  # m
+GRAVITY = 9.81  # m/s^2
+MASS_PER_LENGTH = 0.1  # kg/m
+EA = 1.0e6 * MASS_PER_LENGTH * GRAVITY * LENGTH  # N; stretches by half a millionth under its weight
+FREQUENCIES = (1.202412779, 2.760039055, 4.326863956)  # omega sqrt(L / g)
+SOURCE = "half the zeros of J0 (Bernoulli 1733)"
+
+
+def build(n: int = 50, mode: int = 1, steps: int = 60, periods: float = 1.0, amplitude: float = 1e-3) -> ddg.Scene:
+    """The chain along z, displaced along x by one of its modes.
+
+    Args:
+        n: edges of the chain
+        mode: which mode, from 1
+        steps: time steps in a period
+        periods: periods that the run lasts
+        amplitude: deflection of the free end over the length
+    """
+    period = 2.0 * np.pi / (FREQUENCIES[mode - 1] * np.sqrt(GRAVITY / LENGTH))
+    dt = period / steps
+    scene = ddg.Scene(
+        gravity=(0.0, 0.0, -GRAVITY),
+        dimension=2,
+        analysis=ddg.Dynamics(dt=dt, duration=round(periods * steps) * dt, scheme="implicit_midpoint"),
+        initial=lambda model: swinging(model, mode, amplitude),
+    )
+    points = np.zeros((n + 1, 3))
+    points[:, 2] = np.linspace(0.0, -LENGTH, n + 1)
+    section = ddg.Stiffness(EA=EA, mass_per_length=MASS_PER_LENGTH, radius=0.004)
+    chain = scene.add_rod(points, section=section, bend=False, name="chain")
+    scene.fix(chain, [0])
+    return scene
+
+
+def hanging(model):
+    """The equilibrium. The search begins stretched, since an unstretched chain offers no resistance sideways."""
+    from ddg_warp.integrate.statics import solve
+
+    points = model.scene.batches[0].points[0].copy()
+    points[:, 2] *= 1.0 + 0.5 * MASS_PER_LENGTH * GRAVITY * LENGTH / EA
+    return solve(model, model.state(points=points))
+
+
+def modes(model, count: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest frequencies omega sqrt(L / g) about the equilibrium, and sideways shapes (modes, nodes), 1 at the free end."""
+    from ddg_warp.stability import spectrum
+
+    found = spectrum(model, hanging(model), count)
+    shapes = found.modes.reshape(-1, 2, count)[:, 0]
+    return found.frequencies * np.sqrt(LENGTH / GRAVITY), (shapes / shapes[-1]).T
+
+
+def swinging(model, mode: int, amplitude: float):
+    """The equilibrium, displaced by a mode: edges are turned, not stretched, since so stiff a chain would jump at that."""
+    from ddg_warp.tangent import Tangent
+
+    state, tangent = hanging(model), Tangent(model)
+    rest = tangent.dofs(state)
+    aside = np.zeros_like(rest).reshape(-1, 2)
+    aside[:, 0] = amplitude * LENGTH * modes(model, mode)[1][mode - 1]
+    tangent.assign(state, tangent.retract(rest, aside.ravel()))
+    state.time = 0.0
+    return state
+
+
+def observe(model, state) -> dict[str, float]:
+    """Deflection of the free end [m]."""
+    return {"tip_x": state.points().reshape(-1, 3)[model.curves.counts[0] - 1, 0]}
+
+
+def check(result) -> list[ddg.Check]:
+    """Frequencies from eigenvalues, and that of the run."""
+    from ddg_warp.scenes.vibration import step_factor
+
+    edges = int(result.model.curves.counts[0]) - 1
+    measured, _ = modes(result.model)
+    space = (50.0 / edges) ** 2
+    checks = [
+        ddg.Check(
+            f"frequency {k + 1}, omega sqrt(L / g)", value, exact, 1e-3 * (k + 1) ** 2 * max(1.0, space), SOURCE, True
+        )
+        for k, (value, exact) in enumerate(zip(measured, FREQUENCIES, strict=True))
+    ]
+    factor, phase = step_factor(result.series["tip_x"])
+    frequency = (
+        2.0 * np.tan(0.5 * phase) / result.dt * np.sqrt(LENGTH / GRAVITY)
+    )  # of which the midpoint rule makes that phase
+    nearest = measured[np.abs(measured - frequency).argmin()]
+    checks.append(ddg.Check("frequency of the run over that of its mode", frequency / nearest, 1.0, 1e-4, "eigenvalue"))
+    checks.append(ddg.Check("amplitude factor of a step", factor, 1.0, 1e-5, "implicit midpoint, linear mode"))
+    return checks

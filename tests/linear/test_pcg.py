@@ -1,0 +1,271 @@
+"""Blocks, product, factors and conjugate gradients on open and closed chains, against dense matrices and the chain sweep."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import ddg_warp as ddg
+from ddg_warp import arrays
+from ddg_warp.kernels import block_band, pcg
+from ddg_warp.linear.pcg import PcgNewton
+from ddg_warp.newton import NewtonOptions
+
+KINDS = {"twist": {}, "planar": {"dimension": 2}, "stretch": {"bend": False}}
+EVERY_CHAIN = pytest.mark.parametrize(
+    ("name", "closed"), [(name, closed) for name in KINDS for closed in (False, True)]
+)
+
+
+def section(name) -> ddg.Stiffness:
+    given = {"EI2": 0.9, "rotary_inertia": 0.2} if name == "twist" else {}
+    return ddg.Stiffness(EA=9.0, EI1=0.6, GJ=0.5, mass_per_length=0.7, **given)
+
+
+def scene_of(name, closed, counts=(7, 6)) -> ddg.Scene:
+    """Rods of 7 and 6 nodes on rough polygons, with supports and loads."""
+    given = {"dimension": 3} | KINDS[name]
+    random, scene = np.random.default_rng(5), ddg.Scene(gravity=(0.3, -0.5, -2.0), dimension=given.pop("dimension"))
+    for nodes in counts:
+        s = 2.0 * np.pi * np.arange(nodes) / nodes
+        points = np.stack([np.cos(s), 0.3 * np.cos(2.0 * s), np.sin(s)], -1) if closed else np.outer(s, [1.0, 0.0, 0.2])
+        points += 0.1 * random.normal(size=points.shape)
+        points[:, 1] *= scene.dimension == 3
+        scene.add_rod(points, section=section(name), natural="straight", closed=closed, **given)
+    scene.fix(0, [0])
+    scene.fix(0, [3], components="z")
+    scene.fix(1, [2], components="x")
+    scene.add_force(0, 5, (0.4, 0.2, -0.6))
+    if name == "twist":
+        scene.fix_twist(0, [0, 4])
+        scene.add_twisting_moment(1, 4, 0.3)
+    return scene
+
+
+class Problem:
+    """A Newton iteration of two rods in two worlds at a random state: dense matrices, and what the kernels made of them."""
+
+    def __init__(self, name, closed, device, preconditioner="chain", precision="float64"):
+        random = np.random.default_rng(11)
+        self.model = scene_of(name, closed).build(device, precision, worlds=2)
+        (self.group,) = self.model.groups
+        self.kind, self.device, self.count = self.group.kind, device, np.tile(self.group.host.count, 2)
+        newton = self.newton = PcgNewton(self.model, self.group, NewtonOptions(linear_rtol=1e-13), preconditioner)
+        state = self.model.state().groups[0]
+        x = arrays.download(state.x)
+        arrays.assign(newton.x, x + 0.1 * random.normal(size=x.shape))
+        arrays.assign(newton.target, x + 0.1 * random.normal(size=x.shape))
+        if self.kind.twist:
+            wp.copy(newton.frame, state.frame)
+            arrays.assign(newton.theta, 0.2 * random.normal(size=newton.theta.shape))
+            arrays.assign(newton.target_angle, 0.2 * random.normal(size=newton.theta.shape))
+        newton.coefficient.assign(random.uniform(1.0, 3.0, size=4))
+        newton.rate.fill_(1.0)
+        self.before = self.dofs()
+        newton.iterate(state.last)
+
+    def dofs(self) -> np.ndarray:
+        q = np.moveaxis(arrays.download(self.newton.x), 0, 1)
+        return np.concatenate([q, arrays.download(self.newton.theta).T[..., None]], -1) if self.kind.twist else q
+
+    def dense(self, column: int):
+        """Matrix (identity on held dofs) and residual (zero there), from the elements' factors and gradients."""
+        kind, host, n = self.kind, self.group.host, int(self.count[column])
+        F, g = (arrays.download(a)[:, :, column] for a in (self.newton.factor, self.newton.gradient))
+        c, rod = float(arrays.download(self.newton.coefficient)[column]), column % 2
+        diagonal, force = np.zeros((n, kind.block)), np.zeros((n, kind.block))
+        diagonal[:, : kind.dim] = c * host.mass[:n, rod, None]
+        force[:, : kind.dim] = host.mass[:n, rod, None] * self.group.gravity_host + host.load[:n, rod]
+        target = np.moveaxis(arrays.download(self.newton.target), 0, 1)[column, :n]
+        if kind.twist:
+            diagonal[:, kind.dim], force[:, kind.dim] = c * host.rotary[:n, rod], host.load_angle[:n, rod]
+            target = np.concatenate([target, arrays.download(self.newton.target_angle).T[column, :n, None]], -1)
+        H, r = np.diag(diagonal.ravel()), (force - diagonal * (self.before[column, :n] - target)).ravel()
+        edge_row, tension_row = kind.vertex_strains * kind.window, kind.factor_rows - kind.tensions
+        for k in range(n if kind.closed else n - 1):
+            B = self.window(k, n)
+            r -= B.T @ g[:, k]
+            if kind.closed or k < n - 2:
+                J = F[:edge_row, k].reshape(-1, kind.window) @ B
+                H += J.T @ J
+            J = F[edge_row:tension_row, k].reshape(-1, kind.dim) @ B[: kind.dim]
+            H += J.T @ J + F[tension_row:, k].sum() * B[: kind.dim].T @ B[: kind.dim]
+        bits = host.fixed[:n, rod, None] >> np.arange(kind.block)
+        free = (bits & 1 == 0).ravel()
+        return np.where(np.outer(free, free), H, np.eye(len(H))), np.where(free, r, 0.0), free
+
+    def window(self, k: int, n: int) -> np.ndarray:
+        """From a rod's dofs to the window of element k; indices run on past the seam of a closed rod."""
+        kind = self.kind
+        B = np.zeros((kind.window, n, kind.block))
+        for edge in range(kind.span):
+            if kind.closed or k + edge + 1 < n:
+                for d in range(kind.dim):
+                    B[edge * kind.dim + d, (k + edge + 1) % n, d] += 1.0
+                    B[edge * kind.dim + d, (k + edge) % n, d] -= 1.0
+                if kind.twist:
+                    B[kind.dim * kind.span + edge, (k + edge) % n, kind.dim] = 1.0
+        return B.reshape(kind.window, -1)
+
+    def blocks(self, column: int) -> np.ndarray:
+        """The dense matrix that the kernel's blocks stand for."""
+        nb, n = self.kind.block, int(self.count[column])
+        stored = arrays.download(self.newton.blocks)[:, :, column].reshape(3, nb, nb, -1)
+        H = np.zeros((n, nb, n, nb))
+        for k in range(n):
+            H[k, :, k] += stored[0, ..., k]
+            for ahead in range(1, self.kind.span + 1):
+                if self.kind.closed or k + ahead < n:
+                    j = (k + ahead) % n
+                    H[k, :, j] += stored[ahead, ..., k]
+                    H[j, :, k] += stored[ahead, ..., k].T
+        return H.reshape(n * nb, n * nb)
+
+    def vector(self, array) -> np.ndarray:
+        """(columns, n, block) of a block vector on the device."""
+        return arrays.download(array).transpose(2, 1, 0)
+
+    def launch(self, kernel, dim, inputs, outputs):
+        wp.launch(kernel, dim, inputs, outputs, device=self.device)
+
+
+@EVERY_CHAIN
+def test_blocks_and_residual(device, name, closed):
+    problem = Problem(name, closed, device)
+    right = problem.vector(problem.newton.right)
+    for column, n in enumerate(problem.count):
+        H, r, free = problem.dense(column)
+        assert 0 < (~free).sum() < free.sum()
+        np.testing.assert_allclose(problem.blocks(column), H, rtol=0, atol=1e-13 * np.abs(H).max())
+        np.testing.assert_allclose(right[column, :n].ravel(), r, rtol=0, atol=1e-13 * np.abs(r).max())
+        if closed:
+            assert (
+                np.abs(H[problem.kind.block :, :][: problem.kind.dim, -problem.kind.block :]).max() > 0.0
+                or name == "stretch"
+            )
+
+
+@EVERY_CHAIN
+def test_product(device, name, closed):
+    """H v, and that a column that wants nothing is left alone."""
+    problem = Problem(name, closed, device)
+    newton, (nodes, columns) = problem.newton, (problem.group.nodes, problem.group.columns)
+    random = np.random.default_rng(2)
+    v = random.normal(size=(problem.kind.block, nodes, columns))
+    arrays.assign(newton.p, v)
+    arrays.assign(newton.q, np.full_like(v, 7.0))
+    newton.wanted.assign(np.array([1, 1, 0, 1], np.int32))
+    _, product, _ = pcg.solver_kernels(problem.kind, newton.linear, "chain")
+    problem.launch(
+        product,
+        (nodes, columns),
+        [newton.blocks, newton.p, problem.group.count, newton.wanted],
+        [newton.q, newton.busy],
+    )
+    found = problem.vector(newton.q)
+    for column, n in enumerate(problem.count):
+        if column == 2:
+            assert (found[column] == 7.0).all()
+            continue
+        expected = problem.dense(column)[0] @ v[:, :n, column].T.ravel()
+        np.testing.assert_allclose(found[column, :n].ravel(), expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+
+
+@EVERY_CHAIN
+def test_factorisation_and_substitution(device, name, closed):
+    """Solves with the open part of the chain: the couplings across the seam left out."""
+    problem = Problem(name, closed, device)
+    newton, kind = problem.newton, problem.kind
+    substitute = block_band.substitute_function(kind, newton.linear)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def solve(
+        factor: wp.array3d(dtype=wp.float64),
+        v: wp.array3d(dtype=wp.float64),
+        out: wp.array3d(dtype=wp.float64),
+        count: wp.array(dtype=int),
+        total: wp.array(dtype=wp.float64),
+    ):
+        r = wp.tid()
+        total[r] = substitute(factor, v, out, count[r], r)
+
+    total = wp.zeros(problem.group.columns, dtype=wp.float64, device=device)
+    problem.launch(solve, problem.group.columns, [newton.factors, newton.right], [newton.z, problem.group.count, total])
+    found = problem.vector(newton.z)
+    for column, n in enumerate(problem.count):
+        H, r, _ = problem.dense(column)
+        node = np.arange(len(H)) // kind.block
+        H = np.where(np.abs(node[:, None] - node) <= kind.span, H, 0.0)
+        expected = np.linalg.solve(H, r)
+        np.testing.assert_allclose(found[column, :n].ravel(), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+        assert total.numpy()[column] == pytest.approx(r @ expected, rel=1e-12)
+    assert (arrays.download(newton.lost) == 0).all()
+
+
+@EVERY_CHAIN
+@pytest.mark.parametrize("preconditioner", pcg.PRECONDITIONERS)
+def test_direction_is_a_dense_solve(device, name, closed, preconditioner):
+    """And the chain preconditioner, exact on open rods, takes one iteration there."""
+    problem = Problem(name, closed, device, preconditioner)
+    newton = problem.newton
+    direction, decrement = problem.vector(newton.direction), arrays.download(newton.decrement)
+    iterations = arrays.download(newton.iterations)
+    for column, n in enumerate(problem.count):
+        H, r, _ = problem.dense(column)
+        expected = np.linalg.solve(H, r)
+        np.testing.assert_allclose(direction[column, :n].ravel(), expected, rtol=0, atol=1e-10 * np.abs(expected).max())
+        assert decrement[column] == pytest.approx(r @ expected, rel=1e-10)
+    if preconditioner == "chain" and not closed:
+        assert (iterations == 1).all()
+    elif preconditioner == "chain":
+        assert (iterations <= 4 * problem.kind.block * problem.kind.span + 2).all()  # rank of what crosses the seam
+    else:
+        assert (iterations > 3).all()
+
+
+def falling(name, closed, device, precision="float64", **options):
+    """Points after 10 steps, with the statistics."""
+    model = scene_of(name, closed, (9, 8)).build(device, precision)
+    integrator, state = ddg.Integrator(model, **options), model.state()
+    for _ in range(10):
+        state = integrator.step(state, 0.02)
+    integrator.check(state)
+    return state.points(), integrator.statistics(), model.state().points()
+
+
+@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("preconditioner", pcg.PRECONDITIONERS)
+def test_open_rods_move_as_by_the_sweep(device, name, preconditioner):
+    """Two solvers stop at slightly different iterates; asked for all digits, they agree to rounding."""
+    exact, swept, start = falling(name, False, device, linear="sweep", rtol=1e-14)
+    found, statistics, _ = falling(name, False, device, linear=preconditioner, rtol=1e-14, linear_rtol=1e-12)
+    assert np.abs(exact - start).max() > 0.05
+    np.testing.assert_allclose(found, exact, rtol=0, atol=1e-11)
+    assert swept["pcg_iterations"] == 0
+    assert set(statistics["outcomes"]) <= {"converged", "converged_to_rounding"}
+    if preconditioner == "chain":
+        iterations = statistics["newton_iterations"]["mean"] * sum(statistics["outcomes"].values())
+        assert 0 < statistics["pcg_iterations"] <= 1.2 * iterations
+
+
+@pytest.mark.parametrize("precision", ["float64", "mixed"])
+def test_closed_ring_with_every_preconditioner(device, precision):
+    """A ring with one edge clamped falls alike, whatever the preconditioner."""
+    angle = 2.0 * np.pi * np.arange(40) / 40
+    points = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], -1)
+    ends, iterations = [], []
+    for preconditioner in ("auto", *pcg.PRECONDITIONERS):
+        scene = ddg.Scene()
+        ring = scene.add_rod(points, section=ddg.Circle(0.02), material=ddg.Material(1e7, 0.5, 1000.0), closed=True)
+        scene.clamp(ring, [0])
+        model = scene.build(device, precision)
+        integrator, state = ddg.Integrator(model, linear=preconditioner), model.state()
+        for _ in range(10):
+            state = integrator.step(state, 0.02)
+        integrator.check(state)
+        ends.append(state.points())
+        iterations.append(integrator.statistics()["pcg_iterations"])
+    assert np.abs(ends[0] - points).max() > 0.05
+    np.testing.assert_array_equal(ends[0], ends[3])  # "auto" is the chain preconditioner
+    for end in ends[1:]:
+        np.testing.assert_allclose(end, ends[0], rtol=0, atol=1e-7)
+    assert iterations[3] < iterations[2] < iterations[1]

@@ -1,0 +1,318 @@
+"""Hard cases of dynamics: stiff, thin, fine, folded, wound, random, unequal, curled, in steps of any length, pulled and pushed.
+
+Every run must end in finite states, by converged steps only (attempts that failed must have been retried), or in an error that
+names the outcome, the rod and the remedy; and what can be known of the motion must hold.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.optimize import fsolve
+
+import ddg_warp as ddg
+from ddg_warp.integrate import statics
+
+slow = pytest.mark.slow
+GRAVITY = 9.81
+STEEL = ddg.Material(young=2e11, poisson=0.3, density=7800.0)
+RUBBER = ddg.Material(young=1e7, poisson=0.5, density=1000.0)
+
+
+@dataclass
+class Run:
+    """What a run ended with; `error` is None if all steps were taken."""
+
+    model: ddg.Model
+    points: np.ndarray
+    energy: np.ndarray  # total after every step, the start first [J]
+    terms: dict  # energies at the end [J]
+    statistics: dict
+    error: ddg.SolverError | None
+
+    @property
+    def tip(self) -> np.ndarray:
+        return self.points[-1]
+
+    def stretch(self, rest: float = 1.0) -> float:
+        """Largest change of an edge's length, relative."""
+        edges = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
+        return float(np.abs(edges / (rest / len(edges)) - 1.0).max())
+
+
+def run(scene, device, dt, steps, *, start=None, precision="float64", may_fail=False, **options) -> Run:
+    """Take steps from the rest state, or from points `start`, and check what holds for every run."""
+    model = scene.build(device, precision)
+    state = model.state(points=start)
+    integrator, error = ddg.Integrator(model, check_every=1, **options), None
+    energy = [sum(model.energies(state).values())]
+    for _ in range(steps):
+        try:
+            state = integrator.step(state, dt)
+        except ddg.SolverError as raised:
+            assert may_fail, raised
+            error, state = raised, raised.state
+            break
+        assert np.isfinite(state.points()).all()
+        energy.append(sum(model.energies(state).values()))
+    statistics = integrator.statistics()
+    failed = {k: v for k, v in statistics["outcomes"].items() if k not in ("converged", "converged_to_rounding")}
+    assert sum(failed.values()) == statistics["retries"]  # no attempt that failed was called done
+    assert np.isfinite(state.points()).all()
+    assert np.isfinite(state.velocities()).all()
+    if error:
+        assert error.outcome in failed
+        for word in (error.outcome, "rod 0", "node", "smaller dt"):
+            assert word in str(error)
+    return Run(model, state.points(), np.array(energy), model.energies(state), statistics, error)
+
+
+def straight(nodes: int) -> np.ndarray:
+    """A rod of 1 m along x."""
+    points = np.zeros((nodes, 3))
+    points[:, 0] = np.linspace(0.0, 1.0, nodes)
+    return points
+
+
+def cantilever(nodes, section, material=None, gravity=GRAVITY, **options) -> ddg.Scene:
+    scene = ddg.Scene(gravity=(0.0, 0.0, -gravity))
+    scene.clamp_end(scene.add_rod(straight(nodes), section=section, material=material, **options))
+    return scene
+
+
+def fall(dt: float, steps: int) -> float:
+    """Free fall by implicit Euler: g h^2 n (n + 1) / 2."""
+    return GRAVITY * dt**2 * steps * (steps + 1) / 2.0
+
+
+def assert_no_energy_is_made(result: Run) -> None:
+    """Implicit Euler loses energy; without work of supports it never gains."""
+    scale = np.ptp(result.energy) + np.abs(result.energy).max()
+    assert np.diff(result.energy).max(initial=0.0) <= 1e-8 * scale
+
+
+@pytest.mark.parametrize("axial", [1e4, 1e6, 1e8, 1e10])
+def test_stretching_far_stiffer_than_bending(device, axial):
+    """EA L^2 / EI; lengths change by less than a few weights over EA, and the tip no longer depends on EA."""
+    tips = []
+    for stiffness in (axial, 1e7):
+        section = ddg.Stiffness(EA=stiffness, EI1=1.0, GJ=0.7, mass_per_length=1.0, rotary_inertia=1e-6)
+        result = run(cantilever(64, section), device, 0.01, 20)
+        assert result.statistics["retries"] == 0
+        assert result.stretch() < 5.0 * GRAVITY / stiffness + 1e-12
+        assert_no_energy_is_made(result)
+        tips.append(result.tip)
+    np.testing.assert_allclose(tips[0], tips[1], atol=20.0 / axial + 1e-5)
+    assert tips[0][2] < -0.2
+
+
+@pytest.mark.parametrize("slenderness", [1e-3, 1e-4, 1e-5])
+def test_thin(device, slenderness):
+    """Steel of radius r / L: no stretch; the thinnest wire hangs back only near its clamp, and its tip falls freely."""
+    result = run(cantilever(64, ddg.Circle(slenderness), STEEL), device, 0.01, 20)
+    assert result.stretch() < 5.0 * STEEL.density * GRAVITY / STEEL.young
+    assert_no_energy_is_made(result)
+    if slenderness == 1e-5:
+        assert result.tip[2] == pytest.approx(-fall(0.01, 20), rel=0.01)
+
+
+@pytest.mark.parametrize("material", [STEEL, RUBBER], ids=["steel", "soft"])
+def test_fine_with_long_steps(device, material):
+    """512 nodes, 30 steps of 1/30 s: no retry, and the tip of 256 nodes."""
+    results = [run(cantilever(n, ddg.Circle(2e-3), material), device, 1.0 / 30.0, 30) for n in (256, 512)]
+    for result in results:
+        assert result.statistics["retries"] == 0
+        assert_no_energy_is_made(result)
+        assert result.stretch() < 50.0 * material.density * GRAVITY / material.young
+    np.testing.assert_allclose(results[0].tip, results[1].tip, atol=1e-3)
+    assert results[1].tip[2] < -0.02
+
+
+def folded(gap: float) -> np.ndarray:
+    """Folded back at node 10 of 21 and spread by an angle of about `gap` at the fold."""
+    points = straight(21)
+    points[11:, 0] = 1.0 - points[11:, 0]
+    points[11:, 2] = gap * np.arange(1, 11) / 20.0
+    return points
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e-12])
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_folded_back_by_half_a_turn(device, gap, precision):
+    """Curvature is infinite there: the error says so, names the edges and what to do, and keeps the state."""
+    scene = cantilever(21, ddg.Circle(0.02), RUBBER)
+    result = run(scene, device, 0.01, 1, start=folded(gap), precision=precision, may_fail=True)
+    for words in ("edges 9 and 10", "fold back by 180 degrees", "curvature is infinite", "move node 10"):
+        assert words in str(result.error)
+    assert result.error.outcome == "non_finite"
+    np.testing.assert_allclose(result.points, folded(gap), atol=1e-6)
+
+
+@pytest.mark.parametrize("gap", [1e-3, 0.05])
+def test_nearly_folded(device, gap):
+    """Springs open: bending energy becomes motion, none is made, and the rod ends up unfolded, unstretched."""
+    result = run(cantilever(21, ddg.Circle(0.02), RUBBER), device, 0.01, 30, start=folded(gap))
+    assert result.statistics["retries"] == 0
+    assert_no_energy_is_made(result)
+    assert result.tip[0] > 0.5
+    assert result.stretch() < 0.02
+
+
+def wound(nodes: int, turns: float, axial: float = 1e3) -> ddg.Scene:
+    """Wound up at its last end within a second."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, -1e-3), mass_damping=1.0)
+    section = ddg.Stiffness(EA=axial, EI1=1e-2, GJ=0.8e-2, mass_per_length=0.01, rotary_inertia=1e-7)
+    rod = scene.add_rod(straight(nodes), section=section)
+    scene.clamp_end(rod)
+    motion = ddg.Motion(angle=lambda t: 2.0 * np.pi * turns * min(t, 1.0), axis=(1.0, 0.0, 0.0))
+    scene.clamp_end(rod, "last", motion=motion)
+    return scene
+
+
+@pytest.mark.parametrize(("nodes", "turns"), [(41, 3.0), pytest.param(101, 20.0, marks=slow)])
+def test_wound_up(device, nodes, turns):
+    """Turns stay in the rod, as twist and writhe; what the coils shorten, tension holds against."""
+    result = run(wound(nodes, turns), device, 0.01, 110)
+    assert result.points[-1] == pytest.approx((1.0, 0.0, 0.0))
+    assert result.stretch() < 0.2
+    # Twisting moment <= GJ 2 pi turns / L, elastic energy <= that of the straight rod, GJ (2 pi turns)^2 / 2 L.
+    straight_energy = 0.5 * 0.8e-2 * (2.0 * np.pi * turns) ** 2
+    assert 0.02 * straight_energy < result.energy[-1] < 1.01 * straight_energy
+
+
+@pytest.mark.parametrize(
+    ("amplitude", "nodes", "steps"),
+    [(0.1, 64, 50), (0.5, 16, 2), (1.0, 16, 2), (0.5, 64, 1), (1.0, 64, 1), pytest.param(0.5, 32, 20, marks=slow)],
+)
+def test_random_start(device, amplitude, nodes, steps):
+    """From anywhere: converges, or fails by name; from a tenth of the length it converges and becomes a rod again."""
+    start = straight(nodes)
+    start[2:] += amplitude * np.random.default_rng(0).normal(size=(nodes - 2, 3))
+    scene = ddg.Scene()
+    scene.clamp(scene.add_rod(straight(nodes), section=ddg.Circle(0.01), material=RUBBER))
+    result = run(scene, device, 0.01, steps, start=start, may_fail=amplitude > 0.1, retry_limit=8)
+    assert_no_energy_is_made(result)
+    if amplitude == 0.1:
+        assert result.stretch() < 0.05
+
+
+def test_mass_ratio_of_a_million(device):
+    """A tip mass of a million nodes swings as a point on a spring, stepped by the same rule."""
+    axial, mass, dt, steps = 1e5, 1.6e3, 0.01, 50
+    section = ddg.Stiffness(EA=axial, EI1=0.1, GJ=0.1, mass_per_length=0.1, rotary_inertia=1e-8)
+    scene = cantilever(64, section)
+    scene.add_mass(0, -1, mass)
+    result = run(scene, device, dt, steps)
+    assert result.statistics["retries"] == 0
+    assert_no_energy_is_made(result)
+    x, v = np.array([1.0, 0.0]), np.zeros(2)
+    for _ in range(steps):
+
+        def balance(end, x=x, v=v):
+            length = np.linalg.norm(end)
+            return mass * (end - x - dt * v) / dt**2 + axial * (length - 1.0) * end / length + [0.0, mass * GRAVITY]
+
+        end = fsolve(balance, x + dt * v, xtol=1e-12)
+        x, v = end, (end - x) / dt
+    np.testing.assert_allclose(result.tip[[0, 2]], x, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("turns", "nodes", "dt", "steps"),
+    [(5, 51, 1e-3, 30), (5, 51, 1e-4, 100), (20, 201, 1e-3, 1), pytest.param(20, 401, 1e-4, 200, marks=slow)],
+)
+def test_curls_up(device, turns, nodes, dt, steps):
+    """Straightened from a helix of many turns and let go: 5 turns converge, 20 do or fail by name; no energy is made."""
+    natural = (2.0 * np.pi * turns, 0.0, 6.0 * np.pi)
+    scene = cantilever(nodes, ddg.Circle(2e-3), ddg.Material(1e9, 0.5, 1000.0), natural=natural)
+    result = run(scene, device, dt, steps, may_fail=turns > 5, retry_limit=8)
+    assert_no_energy_is_made(result)
+    assert result.stretch() < 0.02
+    if turns == 5:
+        assert result.energy[-1] < (0.7 if dt == 1e-3 else 0.99) * result.energy[0]
+
+
+@pytest.mark.parametrize("material", [STEEL, RUBBER], ids=["steel", "soft"])
+@pytest.mark.parametrize("dt", [1e-6, 1e-4, 1e-2, 0.1, 1.0])
+def test_any_step(device, dt, material):
+    """Short steps fall freely, long ones go to the equilibrium."""
+    scene = cantilever(64, ddg.Circle(2e-3), material)
+    result = run(scene, device, dt, 10 if dt < 1.0 else 40)
+    assert result.statistics["retries"] == 0
+    assert_no_energy_is_made(result)
+    assert result.stretch() < 50.0 * material.density * GRAVITY / material.young
+    if dt <= 1e-4:
+        assert result.tip[2] == pytest.approx(-fall(dt, 10), rel=1e-3, abs=1e-15)
+    if dt == 1.0:
+        equilibrium = statics.solve(result.model, load_steps=10).points()[-1]
+        np.testing.assert_allclose(result.tip, equilibrium, atol=1e-3)
+
+
+def gripped(material, motion) -> ddg.Scene:
+    scene = ddg.Scene()
+    rod = scene.add_rod(straight(64), section=ddg.Circle(2e-3), material=material)
+    scene.clamp_end(rod)
+    scene.clamp_end(rod, "last", motion=ddg.Motion(translation=motion))
+    return scene
+
+
+def test_pulled_past_its_length(device):
+    """To thrice its length in a second; the tension is EA times the mean strain."""
+    result = run(gripped(RUBBER, lambda t: (2.0 * t, 0.0, 0.3 * t)), device, 0.01, 100)
+    assert result.tip == pytest.approx((3.0, 0.0, 0.3))
+    edges = np.linalg.norm(np.diff(result.points, axis=0), axis=1) * 63.0
+    chord = np.hypot(3.0, 0.3)
+    np.testing.assert_allclose(edges, chord, rtol=0.02)
+    section = ddg.Circle(2e-3).stiffness(RUBBER)
+    axial = 0.5 * section.EA * (chord - 1.0) ** 2
+    assert 0.999 * axial < result.terms["rod_stretch"] < 1.01 * axial
+
+
+def test_pushed_together(device):
+    """Steel, to half its length in a second: it bends and does not shorten."""
+    result = run(gripped(STEEL, lambda t: (-0.5 * t, 0.0, 0.0)), device, 0.01, 100)
+    assert result.tip == pytest.approx((0.5, 0.0, 0.0))
+    assert result.stretch() < 1e-4
+    assert np.abs(result.points[:, [1, 2]]).max() > 0.3
+
+
+# Less precision. Where a node weighs less than the rounding of its stretch forces, float32 says nothing; these are not such.
+SOFT = {
+    "cantilever": lambda device, p: run(
+        cantilever(64, ddg.Stiffness(EA=1e4, EI1=1.0, GJ=0.7, mass_per_length=1.0)), device, 0.01, 20, precision=p
+    ),
+    "rubber": lambda device, p: run(cantilever(64, ddg.Circle(2e-3), RUBBER), device, 0.1, 10, precision=p),
+    "fold": lambda device, p: run(
+        cantilever(21, ddg.Circle(0.02), RUBBER), device, 0.01, 30, start=folded(0.05), precision=p
+    ),
+    "pulled": lambda device, p: run(
+        gripped(RUBBER, lambda t: (2.0 * t, 0.0, 0.3 * t)), device, 0.01, 30, precision=p, may_fail=True
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SOFT)
+@pytest.mark.parametrize(("precision", "tolerance"), [("mixed", 1e-5), ("float32", 5e-3)])
+def test_less_precision(device, name, precision, tolerance):
+    result, exact = SOFT[name](device, precision), SOFT[name](device, "float64")
+    if result.error is None:
+        np.testing.assert_allclose(result.points, exact.points, atol=tolerance)
+
+
+@pytest.mark.parametrize("precision", ["mixed", "float32"])
+@pytest.mark.parametrize("amplitude", [0.1, 1.0])
+def test_random_start_with_less_precision(device, precision, amplitude):
+    start = straight(16)
+    start[2:] += amplitude * np.random.default_rng(0).normal(size=(14, 3))
+    scene = cantilever(16, ddg.Circle(0.01), RUBBER)
+    run(scene, device, 0.01, 5, start=start, precision=precision, may_fail=True, retry_limit=8)
+
+
+@pytest.mark.parametrize("precision", ["mixed", "float32"])
+def test_stiff_with_less_precision(device, precision):
+    """Steel at r / L = 1e-4: nothing stretches, nothing gains energy; mixed falls as float64 does."""
+    scene = cantilever(64, ddg.Circle(1e-4), STEEL)
+    result = run(scene, device, 0.01, 20, precision=precision, may_fail=True)
+    assert result.stretch() < 1e-3
+    if precision == "mixed":
+        np.testing.assert_allclose(result.tip, run(scene, device, 0.01, 20).tip, atol=1e-5)

@@ -1,0 +1,240 @@
+"""Equilibria: modes, load stepping, failures with their last good state; and the spectrum of the tangent."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy import linalg
+
+import ddg_warp as ddg
+from ddg_warp import stability
+from ddg_warp.integrate.statics import Equilibrium, StaticsOptions, solve
+from ddg_warp.stability import spectrum
+from ddg_warp.tangent import Tangent
+
+SECTION = ddg.Stiffness(EA=1e4, EI1=1.0, EI2=1.5, GJ=0.8, mass_per_length=0.5, rotary_inertia=1e-3)
+
+
+def straight(nodes: int, axis: int = 0) -> np.ndarray:
+    points = np.zeros((nodes, 3))
+    points[:, axis] = np.linspace(0.0, 1.0, nodes)
+    return points
+
+
+def column(device, load: float):
+    """A planar column of EI = L = 1 on a clamp, pressed from above; it buckles at pi^2 / 4 = 2.467."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2)
+    rod = scene.add_rod(straight(31, 2), section=ddg.Stiffness(EA=1e5, EI1=1.0, mass_per_length=1.0))
+    scene.clamp_end(rod)
+    scene.add_force(rod, -1, (0.0, 0.0, -load))
+    return scene.build(device, "float64")
+
+
+def cantilever(device, nodes: int = 31, gravity: float = 9.81, **options):
+    scene = ddg.Scene(gravity=(0.0, 0.0, -gravity))
+    rod = scene.add_rod(straight(nodes), section=SECTION, **options)
+    scene.clamp_end(rod)
+    return scene.build(device, "float64")
+
+
+def residual(model, state) -> float:
+    """Largest free residual [N]."""
+    tangent = Tangent(model)
+    return np.abs((tangent.loads(1.0, tangent.dofs(state)) - tangent.gradient(state))[tangent.free]).max()
+
+
+# Elastica under P / P_cr = 1.2: the tip of the buckled column stands at about 0.69 L.
+def test_follow_stays_where_minimise_leaves(device):
+    """From a column bent a little, at 1.2 times the critical load: one goes on to the minimum, the other finds the saddle."""
+    model = column(device, 1.2 * np.pi**2 / 4.0)
+    bent = straight(31, 2)
+    bent[:, 0] = 1e-3 * bent[:, 2] ** 2
+    start = model.state(points=bent)
+    straight_state = Equilibrium(model, StaticsOptions(mode="follow")).load(start, 1, 1.0, 1.0)
+    buckled = Equilibrium(model, StaticsOptions(mode="minimise")).load(start, 1, 1.0, 1.0)
+    for state in (straight_state, buckled):
+        assert residual(model, state) < 1e-6
+    assert np.abs(straight_state.points()[:, 0]).max() < 1e-6
+    assert spectrum(model, straight_state).negative == 1
+    assert abs(buckled.points()[-1, 0]) > 0.3
+    assert spectrum(model, buckled).stable
+    tip = model.energies(buckled)["planar_bend"]
+    work = 1.2 * np.pi**2 / 4.0 * (1.0 - buckled.points()[-1, 2])
+    assert tip < work  # its total energy is below that of the straight column
+
+
+def test_follow_passes_the_critical_load(device):
+    """Loaded from zero, the exactly straight column stays an equilibrium, with one negative eigenvalue past the critical load."""
+    model = column(device, 4.0)
+    solver = Equilibrium(model, StaticsOptions(mode="follow"))
+    state, before = model.state(), 0.0
+    for at, negative in ((0.5, 0), (0.6, 0), (0.65, 1), (1.0, 1)):
+        state, before = solver.load(state, 2, before, at), at
+        assert state.time == at
+        assert spectrum(model, state).negative == negative
+    np.testing.assert_allclose(state.points()[-1], (0.0, 0.0, 1.0 - 4.0 / 1e5), atol=1e-9)
+
+
+def test_increments_are_halved(device, monkeypatch):
+    """With few iterations the whole load is too much at once; the halves lead to the same equilibrium."""
+    model = cantilever(device)
+    tried, taken = [], []
+    search = Equilibrium.solve
+
+    def recorded(self, state, before, at):
+        tried.append((before, at))
+        result = search(self, state, before, at)
+        taken.append((before, at))
+        return result
+
+    monkeypatch.setattr(Equilibrium, "solve", recorded)
+    state = solve(model, max_iterations=3)
+    assert tried[:2] == [(0.0, 1.0), (0.0, 0.5)]
+    assert len(taken) > 1
+    assert taken[0][0] == 0.0
+    assert taken[-1][1] == 1.0
+    assert all(a[1] == b[0] for a, b in pairwise(taken))  # without gaps
+    np.testing.assert_allclose(state.points(), solve(model, load_steps=8).points(), atol=1e-8)
+
+
+def test_failure_keeps_the_last_good_state(device):
+    """A load that jumps by more than iterations and halvings allow: the error holds the state at the load before the jump."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    rod = scene.add_rod(straight(31), section=SECTION)
+    scene.clamp_end(rod)
+    scene.add_force(rod, -1, (0.0, 0.0, -1.0), amplitude=lambda t: t if t <= 0.5 else 500.0)
+    model = scene.build(device, "float64")
+    with pytest.raises(
+        ddg.SolverError, match=r"max_iterations.*node \d+ of rod 0.*load steps.*2 increments halved"
+    ) as caught:
+        solve(model, load_steps=8, max_iterations=8, max_cuts=2)
+    good = caught.value.state
+    assert caught.value.outcome == "max_iterations"
+    assert good.time == 0.5
+    tangent = Tangent(model)
+    rest = tangent.loads(0.5, tangent.dofs(good)) - tangent.gradient(good)
+    assert np.abs(rest[tangent.free]).max() < 1e-7
+    np.testing.assert_allclose(good.points(), solve(model, end=0.5).points(), atol=1e-8)
+    assert good.points()[-1, 2] < -0.1
+
+
+def test_failure_by_one_iteration(device):
+    model = cantilever(device)
+    with pytest.raises(ddg.SolverError, match="max_iterations") as caught:
+        solve(model, max_iterations=1, max_cuts=2)
+    np.testing.assert_array_equal(caught.value.state.points(), model.state().points())  # nothing good but the start
+
+
+@pytest.mark.parametrize("mode", ["minimise", "follow"])
+def test_reaction_is_the_weight_and_the_start_is_kept(device, mode):
+    model = cantilever(device)
+    state = model.state()
+    before = state.snapshot()
+    found = solve(model, state, load_steps=4, mode=mode)
+    for name, value in state.snapshot().items():
+        np.testing.assert_array_equal(value, before[name])
+    assert found.points()[-1, 2] < -0.3
+    assert residual(model, found) < 1e-7
+    (reaction,) = model.reactions(found)
+    np.testing.assert_allclose(reaction.force, (0.0, 0.0, 0.5 * 9.81), atol=1e-7)
+    again = solve(model, found, start=1.0, mode=mode)
+    np.testing.assert_allclose(again.points(), found.points(), atol=1e-9)
+
+
+# Every node in equilibrium: the horizontal force is the same in all edges, the vertical one grows by the weight of a node.
+def test_hanging_chain_from_its_straight_rest_shape(device):
+    """Springs without bending: at rest the tangent has no lateral stiffness at all."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
+    rod = scene.add_rod(straight(21), section=ddg.Stiffness(EA=1e3, mass_per_length=2.0), bend=False)
+    scene.fix(rod, [0, -1])
+    model = scene.build(device, "float64")
+    state = solve(model)
+    edges = np.diff(state.points(), axis=0)
+    lengths = np.linalg.norm(edges, axis=1, keepdims=True)
+    force = 1e3 * (lengths / 0.05 - 1.0) * edges / lengths
+    np.testing.assert_allclose(force[:, 0], force[0, 0], rtol=1e-7)
+    np.testing.assert_allclose(np.diff(force[:, 2]), 0.1 * 9.81, rtol=1e-6)
+    np.testing.assert_allclose(edges[:, 1], 0.0, atol=1e-9)
+    assert state.points()[10, 2] < -0.05
+    assert spectrum(model, state).stable
+
+
+def test_chain_by_one_end(device):
+    """Along its weight, from its rest shape: every edge carries what hangs below."""
+    scene = ddg.Scene(gravity=(9.81, 0.0, 0.0))
+    rod = scene.add_rod(straight(11), section=ddg.Stiffness(EA=1e3, mass_per_length=2.0), bend=False)
+    scene.fix(rod, [0])
+    state = solve(scene.build(device, "float64"))
+    below = 0.2 * 9.81 * (np.arange(10, 0, -1) - 0.5)
+    np.testing.assert_allclose(state.points()[1:, 0], np.cumsum(0.1 * (1.0 + below / 1e3)), rtol=1e-9)
+    np.testing.assert_allclose(state.points()[:, 1:], 0.0, atol=1e-9)
+
+
+def pressed(device, nodes: int = 31, load: float = 60.0, slide: bool = False):
+    """A clamped rod in space pressed far above its critical loads, straight, with its equilibrium there."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    rod = scene.add_rod(straight(nodes), section=SECTION)
+    scene.clamp_end(rod)
+    if slide:
+        scene.clamp_end(rod, "last", components="yz")
+    scene.add_force(rod, -1, (-load, 0.0, 0.0))
+    model = scene.build(device, "float64")
+    return model, solve(model, mode="follow")
+
+
+def dense(model, state):
+    """Tangent and mass of the free dofs."""
+    tangent = Tangent(model)
+    free = np.flatnonzero(tangent.free)
+    return tangent.hessian(state).toarray()[np.ix_(free, free)], tangent.mass[free], tangent
+
+
+@pytest.mark.parametrize("metric", ["mass", "unit"])
+def test_inertia_is_the_count_of_negative_eigenvalues(device, monkeypatch, metric):
+    """Dense and sparse path, against the eigenvalues of the dense tangent; Sylvester: the metric does not change the count."""
+    model, state = pressed(device)
+    matrix, mass, tangent = dense(model, state)
+    values = np.linalg.eigvalsh(matrix)
+    # Clamped-free: P_k = (2 k - 1)^2 pi^2 EI / 4 L^2: below 60 lie 2.47, 22.2 (EI 1), 3.7, 33.3 (EI 1.5).
+    assert (values < 0.0).sum() == 4
+    weights = mass if metric == "mass" else np.where(tangent.angle[tangent.free], tangent.edge_length() ** 2, 1.0)
+    exact = linalg.eigh(matrix, np.diag(weights), eigvals_only=True)
+    found = {}
+    for name, limit in (("dense", 10**6), ("sparse", 1)):
+        monkeypatch.setattr(stability, "DENSE", limit)
+        found[name] = spectrum(model, state, 6, metric)
+        assert found[name].negative == 4
+        assert not found[name].stable
+        np.testing.assert_allclose(found[name].eigenvalues, exact[:6], rtol=1e-6)
+        modes = found[name].modes
+        assert (modes[~tangent.free] == 0.0).all()
+        overlap = modes[tangent.free].T @ (weights[:, None] * modes[tangent.free])
+        np.testing.assert_allclose(overlap, np.eye(6), atol=1e-6)
+    np.testing.assert_allclose(found["sparse"].eigenvalues, found["dense"].eigenvalues, rtol=1e-6)
+    same = np.abs(np.sum(found["sparse"].modes * found["dense"].modes * tangent.mass[:, None], 0))
+    if metric == "mass":
+        np.testing.assert_allclose(same, 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("limit", [1, 10**6], ids=["sparse", "dense"])
+def test_ghosts_without_mass_are_condensed(device, monkeypatch, limit):
+    """A clamp that slides leaves its ghost node a free dof without mass: it follows in equilibrium."""
+    monkeypatch.setattr(stability, "DENSE", limit)
+    model, state = pressed(device, load=5.0, slide=True)
+    matrix, mass, _ = dense(model, state)
+    massless = mass == 0.0
+    assert massless.any()
+    a, b, c = (matrix[np.ix_(i, j)] for i, j in ((~massless, ~massless), (~massless, massless), (massless, massless)))
+    exact = linalg.eigh(a - b @ np.linalg.solve(c, b.T), np.diag(mass[~massless]), eigvals_only=True)
+    found = spectrum(model, state, 5)
+    np.testing.assert_allclose(found.eigenvalues, exact[:5], rtol=1e-6)
+    np.testing.assert_allclose(found.frequencies**2, found.eigenvalues)
+    assert found.stable
+
+
+def test_lowest_frequency_of_a_cantilever(device):
+    """1.8751^2 sqrt(EI / (rho A L^4)), EI = 1: both paths' first eigenvalue is a frequency squared."""
+    model = cantilever(device, 61)
+    found = spectrum(model, model.state(), 2)
+    assert found.frequencies[0] == pytest.approx(1.87510407**2 / np.sqrt(0.5), rel=1e-3)
+    assert found.frequencies[1] == pytest.approx(1.87510407**2 * np.sqrt(1.5 / 0.5), rel=1e-3)
