@@ -75,7 +75,7 @@ class ChainNewton:
         self.without_compression = self.clamped  # rods whose matrix leaves the stiffness that compression takes away
         self.coefficient, self.rate = scalars(), scalars()
         self.step_length, self.decrement, self.load_scale, self.residual = scalars(), scalars(), scalars(), scalars()
-        self.todo, self.angle_change = flags(), scalars()
+        self.todo, self.placed, self.angle_change = flags(), flags(), scalars()
         self.active = wp.zeros(1, dtype=int, device=device)
         self.device = device
         self._evaluate = element.evaluate_kernel(kind, self.real, self.linear)
@@ -143,7 +143,7 @@ class ChainNewton:
             + [self.x, self.theta, self.base, self.elimination, self.direction]
             + [self.status, self.slot, self.iteration, self.halvings, self.step_length, self.decrement]
             + [self.load_scale, self.residual, self.lost, self.turned, self.clamped, self.unbalanced, self.drowned]
-            + [self.angle_change, self.todo, self.active],
+            + [self.angle_change, self.todo, self.placed, self.active],
             device=self.device,
             block_dim=32 if group.columns < MANY else 128,
         )
@@ -151,6 +151,6 @@ class ChainNewton:
             self._adjust,
             group.columns,
             [group.count, group.fixed, self.direction, self.step_length, self.angle_change],
-            [self.x, self.theta, self.frame, self.base, self.todo],
+            [self.x, self.theta, self.frame, self.base, self.todo, self.placed],
             device=self.device,
         )

@@ -426,6 +426,7 @@ def sweep_kernel(kind: ChainKind, real, linear):
         drowned: wp.array(dtype=int),
         angle_change: wp.array(dtype=real),
         todo: wp.array(dtype=int),
+        placed: wp.array(dtype=int),
         active: wp.array(dtype=int),
     ):
         r = wp.tid()
@@ -541,7 +542,12 @@ def sweep_kernel(kind: ChainKind, real, linear):
             # change of inertia's and loads' energy along the last step, exact products of small numbers
             if not first:
                 work = real(0.0)
-                u = x[j, r] - base[j, r]
+                u = V()
+                if placed[r] != 0:
+                    u = x[j, r] - base[j, r]
+                else:
+                    for d in range(wp.static(dim)):
+                        u[d] = taken * real(direction[d, j, r])
                 work += wp.dot(u, (away - u * real(0.5)) * (c * m_j) - outer_force)
                 if wp.static(twist):
                     du = taken * real(direction[wp.static(angle), j, r])
@@ -630,6 +636,7 @@ def sweep_kernel(kind: ChainKind, real, linear):
         slot[r] = 1 - accepted_slot
         decrement[r] = newton
         halvings[r] = 0
+        placed[r] = 0
         lost[r] = lost[r] + lost_here
         if wp.static(twist):
             if turned[r] != 0:
@@ -660,7 +667,6 @@ def sweep_kernel(kind: ChainKind, real, linear):
             if i > 0:
                 rotation = wp.max(rotation, wp.length_sq(bent) / wp.length_sq(x_ahead - here))
             x_ahead = here
-            base[j, r] = here
             x[j, r] = here + dx
             if wp.static(twist):
                 theta[j, r] = theta[j, r] + real(step[wp.static(angle)])
@@ -680,7 +686,8 @@ def sweep_kernel(kind: ChainKind, real, linear):
 @cache
 def adjust_kernel(kind: ChainKind, real, linear):
     """What a sweep leaves to do for few rods: put a shortened or far turning step, or take the frames of its iterate."""
-    V, twist = wp.types.vector(kind.dim, real), kind.twist
+    dim, twist = kind.dim, kind.twist
+    V = wp.types.vector(dim, real)
     place, turn_angles, relag, _ = search_functions(kind, real, linear)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -695,16 +702,24 @@ def adjust_kernel(kind: ChainKind, real, linear):
         frame: wp.array3d(dtype=real),
         base: wp.array2d(dtype=V),
         todo: wp.array(dtype=int),
+        placed: wp.array(dtype=int),
     ):
         r = wp.tid()
         if todo[r] == wp.static(PLACE):
+            if placed[r] == 0:
+                # the sweep stepped straight; from now on the positions it came from are needed
+                placed[r] = 1
+                straight = step_length[r] - angle_change[r]
+                for j in range(count[r]):
+                    back = V()
+                    for d in range(wp.static(dim)):
+                        back[d] = straight * real(direction[d, j, r])
+                    base[j, r] = x[j, r] - back
             place(x, base, direction, fixed, step_length[r], count[r], r)
             turn_angles(theta, direction, angle_change[r], count[r], r)
         if wp.static(twist):
             if todo[r] == wp.static(RELAG):
                 relag(x, frame, count[r], r)
-                for j in range(count[r]):
-                    base[j, r] = x[j, r]
         todo[r] = 0
 
     return adjust
