@@ -361,12 +361,13 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear):
             if not frozen:
                 factor[wp.static(tension_row), k, r] = linear(c)
         root = root_of(e, p, shift) * wp.sqrt(w)
+        if not frozen:
+            for m in range(wp.static(n)):
+                for i in range(wp.static(size)):
+                    factor[wp.static(row) + m * wp.static(size) + i, k, r] = linear(root[m] * jacobian[m, i])
         stiffness = real(0.0)
         for m in range(wp.static(n)):
             edge = real(0.0)
-            for i in range(wp.static(size)):
-                if not frozen:
-                    factor[wp.static(row) + m * wp.static(size) + i, k, r] = linear(root[m] * jacobian[m, i])
             for i in range(wp.static(dim)):
                 edge += jacobian[m, i] * jacobian[m, i]
             stiffness = wp.max(stiffness, root[m] * root[m] * edge)
