@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -56,7 +57,7 @@ def rods_picture(
         lines.set(capstyle="round", joinstyle="round")
         plot.add_collection(lines)
     _explain_times(figure, plot, times, norm)
-    plot.set_title(title, loc="left", fontsize=11)
+    plot.set_title(textwrap.fill(title, 80), loc="left", fontsize=11)
     _save(figure, path)
 
 
@@ -81,7 +82,7 @@ def error_plot(path, rows: Iterable[Mapping], x: str, y: str, series: str, title
         marker = MARKERS[k % len(MARKERS)]
         plot.loglog(*zip(*line, strict=True), marker=marker, markersize=5, linewidth=1.4, color=color, label=str(name))
     plot.set(xlabel=x, ylabel=y)
-    plot.set_title(title, loc="left", fontsize=11)
+    plot.set_title(textwrap.fill(title, 80), loc="left", fontsize=11)
     plot.grid(which="major", color="0.85", linewidth=0.7)
     plot.grid(which="minor", color="0.94", linewidth=0.4)
     plot.spines[["top", "right"]].set_visible(False)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels import chain, element
+from ddg_warp.kernels import balance, chain, element, search
 
 MANY = 50_000  # rods from which full blocks of the sweep pay on a GPU; below, small ones reach more multiprocessors
 
@@ -79,9 +79,9 @@ class ChainNewton:
         self.active = wp.zeros(1, dtype=int, device=device)
         self.device = device
         self._evaluate = element.evaluate_kernel(kind, self.real, self.linear)
-        self._check = chain.check_kernel(kind, self.real, self.linear)
+        self._check = balance.check_kernel(kind, self.real, self.linear)
         self._sweep = None if kind.closed else chain.sweep_kernel(kind, self.real, self.linear)
-        self._adjust = None if kind.closed else chain.adjust_kernel(kind, self.real, self.linear)
+        self._adjust = None if kind.closed else search.adjust_kernel(kind, self.real, self.linear)
 
     @property
     def kernels(self) -> list:

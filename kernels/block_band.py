@@ -10,7 +10,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import pivot
-from ddg_warp.kernels.chain import node_functions
+from ddg_warp.kernels.balance import node_functions
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions
 
 

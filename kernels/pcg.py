@@ -11,8 +11,8 @@ import warp as wp
 
 from ddg_warp.kernels import outcome, pivot
 from ddg_warp.kernels.block_band import block_functions, product_function, substitute_function
-from ddg_warp.kernels.chain import TURNED, search_functions
 from ddg_warp.kernels.element import ChainKind
+from ddg_warp.kernels.search import TURNED, search_functions
 
 PRECONDITIONERS = ("jacobi", "block_jacobi", "chain")
 

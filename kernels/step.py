@@ -16,8 +16,8 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import frames, outcome
-from ddg_warp.kernels.chain import TURNED, search_functions
 from ddg_warp.kernels.element import ChainKind, gather_functions
+from ddg_warp.kernels.search import TURNED, search_functions
 
 POSE = 21  # reals of a motion over a step: rotation vector of the step, rotation at its start, pivot, both translations
 

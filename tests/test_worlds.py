@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import warp as wp
 
 import ddg_warp as ddg
 
@@ -96,3 +97,22 @@ def test_one_bad_world_does_not_stop_the_others(device):
     np.testing.assert_array_equal(state.points()[0], points[0])
     with pytest.raises(ddg.SolverError, match="non_finite"):
         integrator.check(state)
+
+
+def test_a_step_reads_nothing_back(device, monkeypatch):
+    """Between two readings of the outcomes a step neither copies from the device nor waits for it."""
+    model = cantilever().build(device, "float64")
+    integrator, state = ddg.Integrator(model, check_every=10**9), model.state()
+    for _ in range(2):
+        state = integrator.step(state, 0.01)
+
+    def forbidden(*_, **__):
+        raise AssertionError("the host waits for the device inside a step")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(wp.array, "numpy", forbidden)
+        for name in ("synchronize", "synchronize_device", "synchronize_stream", "synchronize_event"):
+            patched.setattr(wp, name, forbidden)
+        for _ in range(5):
+            state = integrator.step(state, 0.01)
+    assert state.points()[-1, 2] < -1e-3

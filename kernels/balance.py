@@ -1,0 +1,165 @@
+"""Balance of forces at the nodes of a chain, and where a rod has converged.
+
+`check`, one thread a node, runs before a sweep and decides where a rod has converged, so that the last iterate costs no sweep: at
+every free dof |residual| <= max(rtol * load scale, floor), where floor bounds what rounding of coordinates and forces leaves,
+floor_factor * eps * (H_ii |x| + sum of |element forces|). Moments are compared over the length of the rod.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions
+
+
+@cache
+def node_functions(kind: ChainKind, real):
+    """Gathers for one node: force(g, row, k, r), and balance(...) -> residual and what it is judged by.
+
+    balance returns the residual force and moment, the size of the element forces that meet, and the elastic part of the moment.
+    """
+    dim, twist, span, window, closed = kind.dim, kind.twist, kind.span, kind.window, kind.closed
+    V = wp.types.vector(dim, real)
+
+    @wp.func
+    def force(g: wp.array3d(dtype=real), row: int, k: int, r: int):
+        v = V()
+        for d in range(wp.static(dim)):
+            v[d] = g[row + d, k, r]
+        return v
+
+    @wp.func
+    def behind(k: int, n: int):
+        """The element or edge before k, of a closed rod the last before the first; -1 where there is none."""
+        if wp.static(closed):
+            if k == 0:
+                return n - 1
+        return k - 1
+
+    @wp.func
+    def edge_force(g: wp.array3d(dtype=real), k: int, n: int, r: int):
+        """dE/de of edge k."""
+        total = force(g, 0, k, r)
+        if wp.static(span == 2):
+            b = behind(k, n)
+            if b >= 0:
+                total += force(g, wp.static(dim), b, r)
+        return total
+
+    @wp.func
+    def balance(
+        g: wp.array3d(dtype=real),
+        mass: wp.array2d(dtype=real),
+        rotary: wp.array2d(dtype=real),
+        c: real,
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        target: wp.array2d(dtype=V),
+        target_angle: wp.array2d(dtype=real),
+        gravity: wp.array(dtype=V),
+        load: wp.array2d(dtype=V),
+        load_angle: wp.array2d(dtype=real),
+        loaded: int,
+        k: int,
+        n: int,
+        r: int,
+    ):
+        m = mass[k, r]
+        f = gravity[0] * m - (x[k, r] - target[k, r]) * (c * m)
+        moment = real(0.0)
+        if loaded != 0:
+            f += load[k, r]
+            if wp.static(twist):
+                moment = load_angle[k, r]
+        size = real(0.0)
+        b = behind(k, n)
+        if wp.static(closed) or k < n - 1:
+            total = edge_force(g, k, n, r)
+            f += total
+            size = wp.max(wp.abs(total))
+        if b >= 0:
+            total = edge_force(g, b, n, r)
+            f -= total
+            size += wp.max(wp.abs(total))
+        elastic = real(0.0)
+        if wp.static(twist):
+            if wp.static(closed) or k < n - 2:
+                elastic = g[wp.static(window - 2), k, r]
+            if b >= 0 and (wp.static(closed) or k < n - 1):
+                elastic += g[wp.static(window - 1), b, r]
+            moment -= elastic + c * rotary[k, r] * (theta[k, r] - target_angle[k, r])
+        return f, moment, size, elastic
+
+    return force, behind, balance
+
+
+@cache
+def check_kernel(kind: ChainKind, real, linear):
+    """Raises `unbalanced` for a rod with a dof out of equilibrium, `drowned` where only rounding excuses a residual."""
+    dim, twist, closed = kind.dim, kind.twist, kind.closed
+    V = wp.types.vector(dim, real)
+    _, behind, balance = node_functions(kind, real)
+    along, *_ = gather_functions(kind, real)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+    def check(
+        g: wp.array3d(dtype=real),
+        stiffness: wp.array2d(dtype=linear),
+        count: wp.array(dtype=int),
+        mass: wp.array2d(dtype=real),
+        rotary: wp.array2d(dtype=real),
+        coefficient: wp.array(dtype=real),
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        target: wp.array2d(dtype=V),
+        target_angle: wp.array2d(dtype=real),
+        gravity: wp.array(dtype=V),
+        load: wp.array2d(dtype=V),
+        load_angle: wp.array2d(dtype=real),
+        loaded: int,
+        fixed: wp.array2d(dtype=wp.uint8),
+        length: wp.array(dtype=real),
+        rtol: real,
+        floor: real,
+        load_scale: wp.array(dtype=real),
+        status: wp.array(dtype=int),
+        unbalanced_out: wp.array(dtype=int),
+        drowned_out: wp.array(dtype=int),
+    ):
+        k, r = wp.tid()
+        n = count[r]
+        if status[r] != 0 or k >= n:
+            return
+        c = coefficient[r]
+        f, moment, size, elastic = balance(
+            g, mass, rotary, c, x, theta, target, target_angle, gravity, load, load_angle, loaded, k, n, r
+        )
+        stiff = real(0.0)
+        b = behind(k, n)
+        if wp.static(closed) or k < n - 1:
+            stiff = real(stiffness[k, r])
+        if b >= 0:
+            stiff = wp.max(stiff, real(stiffness[b, r]))
+        here = x[k, r]
+        reach = wp.max(wp.abs(here))
+        limit = rtol * load_scale[r]
+        least = floor * ((real(2.0) * stiff + c * mass[k, r]) * reach + size)
+        mask = int(fixed[k, r])
+        for d in range(wp.static(dim)):
+            if ((mask >> d) & 1) == 0 and not wp.abs(f[d]) <= limit:
+                drowned_out[r] = 1
+                if not wp.abs(f[d]) <= least:
+                    unbalanced_out[r] = 1
+        if wp.static(twist):
+            if ((mask >> wp.static(dim)) & 1) == 0 and not wp.abs(moment) <= limit * length[r]:
+                drowned_out[r] = 1
+                arm = wp.length(x[along(k + 1, n), r] - here)
+                least = floor * (
+                    real(2.0) * stiff * arm * arm * reach / length[r]
+                    + c * rotary[k, r] * (real(1.0) + wp.abs(theta[k, r]))
+                    + wp.abs(elastic)
+                )
+                if not wp.abs(moment) <= least:
+                    unbalanced_out[r] = 1
+
+    return check

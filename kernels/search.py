@@ -1,0 +1,209 @@
+"""What a line search does to a rod: turn edges along a step, shorten it, take the frames of an iterate as lagged ones."""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels import frames
+from ddg_warp.kernels.element import ChainKind, gather_functions
+
+PLACE, RELAG = 1, 2  # what a sweep leaves to `adjust`
+TURNED = 0.1  # largest turn of an edge in a step that is still taken straight [rad]; its stretch is TURNED^2 / 2
+
+
+@cache
+def search_functions(kind: ChainKind, real, linear):
+    """What every solver's line search does to a rod: place(...), turn_angles(...), relag(...), shorter(...)."""
+    dim, twist, angle, every = kind.dim, kind.twist, kind.block - 1, (1 << kind.dim) - 1
+    V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
+    transport, reference_twist, _ = frames.functions(real)
+    along, *_ = gather_functions(kind, real)
+    closed = kind.closed
+
+    @wp.func
+    def step_of(direction: wp.array3d(dtype=linear), j: int, r: int):
+        v = V()
+        for d in range(wp.static(dim)):
+            v[d] = real(direction[d, j, r])
+        return v
+
+    @wp.func
+    def excess(base: wp.array2d(dtype=V), direction: wp.array3d(dtype=linear), amount: real, j: int, n: int, r: int):
+        """Edge j turned and lengthened by its step, less the same edge with its step added."""
+        ahead = along(j + 1, n)
+        e = base[ahead, r] - base[j, r]
+        de = (step_of(direction, ahead, r) - step_of(direction, j, r)) * amount
+        length = wp.length(e)
+        t = e / length
+        stretch = wp.dot(t, de)
+        across = (de - t * stretch) / length
+        angle = wp.length(across)
+        sinc = real(1.0)
+        if angle > real(0.0):
+            sinc = wp.sin(angle) / angle
+        return (t * wp.cos(angle) + across * sinc) * wp.max(length + stretch, real(0.1) * length) - e - de
+
+    @wp.func
+    def put(
+        x: wp.array2d(dtype=V),
+        base: wp.array2d(dtype=V),
+        direction: wp.array3d(dtype=linear),
+        fixed: wp.array2d(dtype=wp.uint8),
+        amount: real,
+        shift: V,
+        j: int,
+        r: int,
+    ):
+        moved = base[j, r] + step_of(direction, j, r) * amount
+        for d in range(wp.static(dim)):
+            if ((int(fixed[j, r]) >> d) & 1) == 0:
+                moved[d] = moved[d] + shift[d]
+        x[j, r] = moved
+
+    @wp.func
+    def place(
+        x: wp.array2d(dtype=V),
+        base: wp.array2d(dtype=V),
+        direction: wp.array3d(dtype=linear),
+        fixed: wp.array2d(dtype=wp.uint8),
+        amount: real,
+        n: int,
+        r: int,
+    ):
+        """x = base moved along the direction, with edges turned instead of sheared.
+
+        A straight step stretches an edge that it turns, to second order, which in a nearly inextensible rod limits steps to
+        small turns. Turned edges are summed from held nodes; what misses between two of them is spread over the edges between.
+        """
+        first = int(0)
+        while first < n and (int(fixed[first, r]) & wp.static(every)) != wp.static(every):
+            first += 1
+        free = first == n
+        if free:
+            first = 0
+        put(x, base, direction, fixed, amount, V(), first, r)
+        nodes = n - first
+        if wp.static(closed):
+            nodes = n + 1
+        i = int(0)
+        while i < nodes - 1:
+            # the next held node, or the end
+            stop = i + 1
+            miss = excess(base, direction, amount, along(first + i, n), n, r)
+            while stop < nodes - 1 and (int(fixed[along(first + stop, n), r]) & wp.static(every)) != wp.static(every):
+                miss += excess(base, direction, amount, along(first + stop, n), n, r)
+                stop += 1
+            held = wp.static(closed) and stop == nodes - 1
+            if (int(fixed[along(first + stop, n), r]) & wp.static(every)) == wp.static(every):
+                held = True
+            slope = V()
+            if held:
+                slope = miss / real(stop - i)
+            shift = V()
+            for j in range(i + 1, stop + 1):
+                shift += excess(base, direction, amount, along(first + j - 1, n), n, r) - slope
+                if not (wp.static(closed) and j == nodes - 1):
+                    put(x, base, direction, fixed, amount, shift, along(first + j, n), r)
+            i = stop
+        back = V()
+        if not wp.static(closed):
+            for i in range(first):
+                j = first - 1 - i
+                back -= excess(base, direction, amount, j, n, r)
+                put(x, base, direction, fixed, amount, back, j, r)
+        if free:
+            # nothing holds the rod: leave the mean of its nodes where the straight step takes it
+            mean = V()
+            for j in range(n):
+                mean += x[j, r] - base[j, r] - step_of(direction, j, r) * amount
+            mean /= real(n)
+            for j in range(n):
+                back_j = x[j, r]
+                for d in range(wp.static(dim)):
+                    if ((int(fixed[j, r]) >> d) & 1) == 0:
+                        back_j[d] = back_j[d] - mean[d]
+                x[j, r] = back_j
+
+    @wp.func
+    def turn_angles(theta: wp.array2d(dtype=real), direction: wp.array3d(dtype=linear), amount: real, n: int, r: int):
+        if wp.static(twist):
+            for j in range(n):
+                theta[j, r] = theta[j, r] + amount * real(direction[wp.static(angle), j, r])
+
+    @wp.func
+    def relag(x: wp.array2d(dtype=V), frame: wp.array3d(dtype=real), n: int, r: int):
+        """Take the frames of the accepted iterate as lagged ones; strains are as before, the transport regular again."""
+        u0 = X()
+        t0 = X()
+        u_first = X()
+        t_first = X()
+        for j in range(n - wp.static(0 if closed else 1)):
+            t = wp.normalize(x[along(j + 1, n), r] - x[j, r])
+            u = transport(
+                X(frame[0, j, r], frame[1, j, r], frame[2, j, r]), X(frame[3, j, r], frame[4, j, r], frame[5, j, r]), t
+            )
+            if j > 0:
+                frame[6, j - 1, r] = reference_twist(u0, u, t0, t, frame[6, j - 1, r])
+            for c in range(3):
+                frame[c, j, r] = u[c]
+                frame[3 + c, j, r] = t[c]
+            u_first = u
+            t_first = t
+            u0 = u
+            t0 = t
+        if wp.static(closed):
+            frame[6, n - 1, r] = reference_twist(u0, u_first, t0, t_first, frame[6, n - 1, r])
+
+    @wp.func
+    def shorter(taken: real, expected: real, change: real, finite: bool):
+        """Length after a rejected step: minimum of the parabola through energy, slope and new energy, within bounds."""
+        if not finite:
+            return real(0.1) * taken
+        bowl = change + expected
+        if bowl > real(0.0):
+            return taken * wp.clamp(real(0.5) * expected / bowl, real(0.1), real(0.5))
+        return real(0.5) * taken
+
+    return place, turn_angles, relag, shorter
+
+
+@cache
+def adjust_kernel(kind: ChainKind, real, linear):
+    """What a sweep leaves to do for few rods: put a shortened or far turning step, or take the frames of its iterate."""
+    dim, twist = kind.dim, kind.twist
+    V = wp.types.vector(dim, real)
+    place, turn_angles, relag, _ = search_functions(kind, real, linear)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def adjust(
+        count: wp.array(dtype=int),
+        fixed: wp.array2d(dtype=wp.uint8),
+        direction: wp.array3d(dtype=linear),
+        step_length: wp.array(dtype=real),
+        angle_change: wp.array(dtype=real),
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        frame: wp.array3d(dtype=real),
+        base: wp.array2d(dtype=V),
+        todo: wp.array(dtype=int),
+        placed: wp.array(dtype=int),
+    ):
+        r = wp.tid()
+        if todo[r] == wp.static(PLACE):
+            if placed[r] == 0:
+                # the sweep stepped straight; from now on the positions it came from are needed
+                placed[r] = 1
+                straight = step_length[r] - angle_change[r]
+                for j in range(count[r]):
+                    back = V()
+                    for d in range(wp.static(dim)):
+                        back[d] = straight * real(direction[d, j, r])
+                    base[j, r] = x[j, r] - back
+            place(x, base, direction, fixed, step_length[r], count[r], r)
+            turn_angles(theta, direction, angle_change[r], count[r], r)
+        if wp.static(twist):
+            if todo[r] == wp.static(RELAG):
+                relag(x, frame, count[r], r)
+        todo[r] = 0
+
+    return adjust
