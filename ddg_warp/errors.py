@@ -19,3 +19,19 @@ class SolverError(RuntimeError):
         self.state = state
         self.outcome = outcome
         self.rods = tuple(rods)
+
+
+def check_options(options, positive: tuple[str, ...], counts: tuple[str, ...]) -> None:
+    """Refuse an option that is no positive finite number, or no whole number of at least one.
+
+    Raises:
+        SceneError: names the option.
+    """
+    for name in positive:
+        value = getattr(options, name)
+        if not (isinstance(value, int | float) and 0.0 < value < float("inf")):
+            raise SceneError(f"{name} = {value!r}; it is a positive number")
+    for name in counts:
+        value = getattr(options, name)
+        if not (isinstance(value, int) and value >= 1):
+            raise SceneError(f"{name} = {value!r}; it is a whole number of at least 1")

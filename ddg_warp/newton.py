@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from ddg_warp import arrays
+from ddg_warp.errors import check_options
 from ddg_warp.kernels import balance, chain, element, search
 
 MANY = 50_000  # rods from which full blocks of the sweep pay on a GPU; below, small ones reach more multiprocessors
@@ -30,6 +31,9 @@ class NewtonOptions:
     max_halvings: int = 20
     rotation_cap: float = 1.0
     linear_rtol: float = 1e-8
+
+    def __post_init__(self):
+        check_options(self, ("rtol", "floor_factor", "rotation_cap", "linear_rtol"), ("max_iterations", "max_halvings"))
 
 
 class ChainNewton:

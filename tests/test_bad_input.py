@@ -357,3 +357,36 @@ def test_statics_without_supports(device, held, axis):
     if held:
         scene.fix(1, [0, 2, 4], components=held)
     refused(lambda: statics.solve(scene.build(device)), "rod 1", f"along {axis}", "supports", "clamp")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"rtol": NAN}, ("rtol", "positive")),
+        ({"rtol": 0.0}, ("rtol", "positive")),
+        ({"rotation_cap": -1.0}, ("rotation_cap", "positive")),
+        ({"linear_rtol": float("inf")}, ("linear_rtol", "positive")),
+        ({"max_iterations": 0}, ("max_iterations", "at least 1")),
+        ({"max_halvings": 2.5}, ("max_halvings", "whole number")),
+        ({"retry_limit": -1}, ("retry_limit", "0 for no retry")),
+    ],
+)
+def test_newton_options(device, options, words):
+    scene = scene_of()
+    scene.clamp(1)
+    refused(lambda: ddg.Integrator(scene.build(device), **options), *words)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"rtol": NAN}, ("rtol", "positive")),
+        ({"max_iterations": 0}, ("max_iterations", "at least 1")),
+        ({"load_steps": 0}, ("load_steps", "at least 1")),
+        ({"mode": "saddle"}, ("mode", "minimise")),
+    ],
+)
+def test_statics_options(device, options, words):
+    scene = scene_of()
+    scene.clamp([0, 1])
+    refused(lambda: statics.solve(scene.build(device), **options), *words)

@@ -65,6 +65,8 @@ class Integrator:
             raise SceneError(f"solver {solver!r}: it is one of {', '.join(SOLVERS)}")
         self.model, self.scheme, self.solver, self.linear = model, scheme, solver, linear
         self.options = NewtonOptions(**options)
+        if not (isinstance(retry_limit, int) and retry_limit >= 0):
+            raise SceneError(f"retry_limit = {retry_limit!r}; it is a whole number, 0 for no retry")
         self.retry_limit = retry_limit
         self.check_every = check_every or (32 if model.wp_device.is_cuda else 1)
         _require_mass(model)

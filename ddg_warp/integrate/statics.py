@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 from scipy import sparse
 
-from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.errors import SceneError, SolverError, check_options
 from ddg_warp.kernels import step
 from ddg_warp.linear.direct import Factorisation, SingularError
 from ddg_warp.state import State
@@ -37,6 +37,11 @@ class StaticsOptions:
     rotation_cap: float = 0.5
     mode: str = "minimise"
     max_cuts: int = 10
+
+    def __post_init__(self):
+        check_options(self, ("rtol", "floor_factor", "rotation_cap"), ("max_iterations", "max_cuts"))
+        if self.mode not in ("minimise", "follow"):
+            raise SceneError(f"statics mode {self.mode!r}: it is 'minimise' or 'follow'")
 
 
 def solve(
@@ -69,8 +74,6 @@ class Equilibrium:
 
     def __init__(self, model, options: StaticsOptions | None = None):
         self.model, self.options = model, options or StaticsOptions()
-        if self.options.mode not in ("minimise", "follow"):
-            raise SceneError(f"statics mode {self.options.mode!r}: it is 'minimise' or 'follow'")
         self.tangent = Tangent(model)
         _require_supports(model)
         self.iterations = 0
@@ -78,9 +81,11 @@ class Equilibrium:
 
     def load(self, state: State, load_steps: int, start: float = 0.0, end: float = 1.0) -> State:
         """Load stepping; see `solve`."""
+        if not (isinstance(load_steps, int) and load_steps >= 1):
+            raise SceneError(f"load_steps = {load_steps!r}; it is a whole number of at least 1")
         if start == end:
             return self.solve(state, start, end)
-        at, increment, cuts = start, (end - start) / max(1, load_steps), 0
+        at, increment, cuts = start, (end - start) / load_steps, 0
         state = state.copy()
         while at != end:
             target = end if abs(end - at) <= abs(increment) * (1.0 + 1e-12) else at + increment
