@@ -29,18 +29,22 @@ def _functions(real):
 
     @wp.func
     def material_frames(q: Q, s: S):
-        te = wp.normalize(V(q[0], q[1], q[2]))
-        tf = wp.normalize(V(q[3], q[4], q[5]))
+        e = V(q[0], q[1], q[2])
+        f = V(q[3], q[4], q[5])
+        ie = real(1.0) / wp.length(e)
+        i_f = real(1.0) / wp.length(f)
+        te = e * ie
+        tf = f * i_f
         ue = transport(V(s[0], s[1], s[2]), V(s[3], s[4], s[5]), te)
         uf = transport(V(s[6], s[7], s[8]), V(s[9], s[10], s[11]), tf)
         twist = q[7] - q[6] + reference_twist(ue, uf, te, tf, s[12])
         m1e = rotate(ue, te, q[6])
         m1f = rotate(uf, tf, q[7])
-        return te, tf, m1e, wp.cross(te, m1e), m1f, wp.cross(tf, m1f), twist
+        return te, tf, m1e, wp.cross(te, m1e), m1f, wp.cross(tf, m1f), twist, ie, i_f
 
     @wp.func
     def strains(q: Q, s: S, w: real):
-        te, tf, m1e, m2e, m1f, m2f, twist = material_frames(q, s)
+        te, tf, m1e, m2e, m1f, m2f, twist, _ie, _if = material_frames(q, s)
         kb = wp.cross(te, tf) * (real(1.0) / (real(1.0) + wp.dot(te, tf)))
         return E(wp.dot(kb, m2e + m2f) / w, -wp.dot(kb, m1e + m1f) / w, twist / w)
 
@@ -50,10 +54,10 @@ def _functions(real):
 
     @wp.func
     def jacobian(q: Q, s: S, w: real):
-        te, tf, m1e, m2e, m1f, m2f, twist = material_frames(q, s)
+        te, tf, m1e, m2e, m1f, m2f, twist, inverse_e, inverse_f = material_frames(q, s)
         iw = real(1.0) / w
-        ie = iw / wp.length(V(q[0], q[1], q[2]))
-        i_f = iw / wp.length(V(q[3], q[4], q[5]))
+        ie = iw * inverse_e
+        i_f = iw * inverse_f
         ic = real(1.0) / (real(1.0) + wp.dot(te, tf))
         kb = wp.cross(te, tf) * ic  # half of the curvature binormal
         tt = (te + tf) * ic
