@@ -251,8 +251,7 @@ def sweep_kernel(kind: ChainKind, real, linear):
                 Wac = wp.cw_mul(Wac, rows)
                 rj = wp.cw_mul(rj, free)
                 ra = wp.cw_mul(ra, free)
-            # columns of the fixed dofs ahead: Wab^T acts on free dofs only once their own rows are masked,
-            # since a fixed dof's solution is zero
+            # columns of held dofs ahead stay: their solution is zero, and what they gather is masked with their rows
 
             L, inverse, bad = factor_block(Waa)
             lost_here += bad

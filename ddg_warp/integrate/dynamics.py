@@ -7,7 +7,8 @@ import warp as wp
 
 from ddg_warp import arrays, geometry
 from ddg_warp.errors import SceneError, SolverError
-from ddg_warp.kernels import outcome, step
+from ddg_warp.integrate.prescribed import PrescribedMotion, TimedLoads
+from ddg_warp.kernels import element, outcome, step
 from ddg_warp.linear.pcg import PcgNewton, ProjectiveNewton
 from ddg_warp.newton import ChainNewton, NewtonOptions
 from ddg_warp.precision import FLOAT32_LIMIT, float32_error
@@ -158,7 +159,7 @@ class Integrator:
             return
         if not self._graphs:
             for chain in self._chains:
-                chain.load_modules(source)
+                chain.load_modules()
         gc.disable()  # a collection while capturing would free arrays into the graph
         try:
             with wp.ScopedCapture(device=self.model.wp_device, force_module_load=False) as capture:
@@ -186,13 +187,11 @@ def _require_mass(model) -> None:
     for group in model.groups:
         host, kind = group.host, group.kind
         positions = (1 << kind.dim) - 1
-        inside = np.arange(group.nodes)[:, None] < host.count
-        bad = (host.mass <= 0.0) & ((host.fixed & positions) != positions) & inside
-        ghost = (np.arange(group.nodes)[:, None] < host.first) | (
-            np.arange(group.nodes)[:, None] >= host.first + host.own
-        )
-        if (bad & ~ghost).any():
-            k, column = np.argwhere(bad & ~ghost)[0]
+        k = np.arange(group.nodes)[:, None]
+        own = (k >= host.first) & (k < host.first + host.own)
+        bad = (host.mass <= 0.0) & ((host.fixed & positions) != positions) & own
+        if bad.any():
+            k, column = np.argwhere(bad)[0]
             raise SceneError(
                 f"node {k - host.first[column]} of rod {host.rods[column]} is free and has no mass; "
                 "give the material a density, or the section a mass_per_length"
@@ -230,8 +229,8 @@ class _ChainStep:
             self.newton.status = counts_of.newton.status
             self.reason = counts_of.reason
         self.damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
-        self.moving = _Moving(model, group, midpoint) if group.moving else None
-        self.loads = _Loads(model, group, midpoint) if group.host.timed_loads else None
+        self.moving = PrescribedMotion(model, group, midpoint) if group.moving else None
+        self.loads = TimedLoads(model, group, midpoint) if group.host.timed_loads else None
 
     def prescribe(self, t0: float, t1: float) -> None:
         """Hand the device what supports and timed loads do between t0 and t1."""
@@ -260,15 +259,8 @@ class _ChainStep:
             [before.x, before.v, before.theta, before.omega, before.frame, group.fixed, group.count, group.world, dt]
             + [self.damping, group.outer, self.progress, self.portion, self.cautious],
             [newton.x, newton.theta, newton.frame, newton.target, newton.target_angle, newton.coefficient, newton.rate]
-            + [
-                newton.status,
-                newton.iteration,
-                newton.halvings,
-                newton.turned,
-                newton.clamped,
-                newton.unbalanced,
-                newton.drowned,
-            ]
+            + [newton.status, newton.iteration, newton.halvings, newton.turned, newton.clamped]
+            + [newton.unbalanced, newton.drowned]
             + [newton.load_scale, self.bent, newton.active],
         )
         self._launch(
@@ -279,9 +271,9 @@ class _ChainStep:
         )
         self.bent.zero_()
         if self.moving:
-            self.moving.apply(self)
+            self.moving.apply(self.progress, self.portion, newton.x, newton.frame, newton.theta)
         if self.loads:
-            self.loads.apply(newton)
+            self.loads.apply(newton.x)
         newton.solve(before.last)
         self._launch(
             "nodes",
@@ -306,9 +298,11 @@ class _ChainStep:
     def _launch(self, name: str, dim, inputs: list, outputs: list) -> None:
         wp.launch(self.kernels[name], dim, inputs, outputs, device=self.model.wp_device)
 
-    def load_modules(self, source: int) -> None:
+    def load_modules(self) -> None:
         """Compile and load every kernel before a capture."""
         kernels = [*self.kernels.values(), *self.newton.kernels]
+        if self.group.kind.viscous:
+            kernels.append(element.strain_kernel(self.group.kind, self.model.types.real))
         for part in (self.moving, self.loads):
             kernels += part.kernels if part else ()
         for kernel in kernels:
@@ -361,81 +355,3 @@ class _ChainStep:
                     f"move node {after} of the state it starts from, or take a smaller dt if it folded on the way"
                 )
         return "take a smaller dt, a looser rtol, or check its loads and supports"
-
-
-class _Moving:
-    """Prescribed motion of a group's supports."""
-
-    def __init__(self, model, group, midpoint: bool):
-        real, device = model.types.real, model.wp_device
-        self.model, self.group = model, group
-        self.kernels = step.motion_kernels(group.kind, real, midpoint)
-        self.pose = wp.zeros((len(model.motions), step.POSE), dtype=real, device=device)
-
-    def upload(self, t0: float, t1: float) -> None:
-        """Poses of all motions between t0 and t1."""
-        self.pose.assign(np.array([motion.pose(t0, t1) for motion in self.model.motions]))
-
-    def apply(self, owner: _ChainStep) -> None:
-        """Put held dofs where they belong at the end of the (partial) step."""
-        newton, device = owner.newton, self.model.wp_device
-        nodes, angles = self.kernels
-        held, common = self.group.moving, [owner.progress, owner.portion]
-        wp.launch(
-            nodes,
-            held.nodes.shape[0],
-            [held.nodes, held.node_rest, self.pose, self.group.fixed, *common],
-            [newton.x],
-            device=device,
-        )
-        if held.edges.shape[0]:
-            wp.launch(
-                angles,
-                held.edges.shape[0],
-                [held.edges, held.edge_rest, self.pose, self.group.count, *common, newton.x, newton.frame],
-                [newton.theta],
-                device=device,
-            )
-
-
-class _Loads:
-    """Loads of a group that change from step to step, and couples, which change with the edge they act on."""
-
-    def __init__(self, model, group, midpoint: bool):
-        real, device, host = model.types.real, model.wp_device, group.host
-        self.group, self.device, self.midpoint = group, device, midpoint
-        self.kernels = step.load_kernels(group.kind, real)
-        timed = host.timed_loads
-        self._load_of = np.concatenate([np.full(len(load.k), i) for i, load in enumerate(timed)])
-        rows = np.concatenate([np.column_stack([load.k, load.columns]) for load in timed])
-        touched = np.unique(np.concatenate([rows, rows + [1, 0]]), axis=0)
-        touched = touched[touched[:, 0] < group.nodes]
-        base = np.zeros((len(touched), 4))
-        base[:, : group.kind.dim] = host.load[touched[:, 0], touched[:, 1]]
-        base[:, 3] = host.load_angle[touched[:, 0], touched[:, 1]]
-
-        def worlds(values, shift=0):
-            return np.concatenate([values + shift * world * group.rods for world in range(model.worlds)])
-
-        self.where = wp.array(worlds(rows, np.array([0, 1])).astype(np.int32), dtype=int, device=device)
-        self.touched = wp.array(worlds(touched, np.array([0, 1])).astype(np.int32), dtype=int, device=device)
-        self.base = wp.array(worlds(base), dtype=real, device=device)
-        self.values = wp.zeros((self.where.shape[0], 7), dtype=real, device=device)
-
-    def upload(self, t0: float, t1: float) -> None:
-        """Values at the time that the scheme balances forces at."""
-        at = 0.5 * (t0 + t1) if self.midpoint else t1
-        table = np.zeros((len(self.group.host.timed_loads), 7))
-        for row, load in zip(table, self.group.host.timed_loads, strict=True):
-            row[: self.group.kind.dim] = load.force
-            row[3] = load.moment
-            row[4:] = load.couple
-            row *= load.at(at, 1.0)
-        self.values.assign(np.tile(table[self._load_of], (self.group.worlds, 1)))
-
-    def apply(self, newton: ChainNewton) -> None:
-        """Constant loads plus these, on the predicted state."""
-        reset, add = self.kernels
-        out = [self.group.load, self.group.load_angle]
-        wp.launch(reset, self.touched.shape[0], [self.touched, self.base], out, device=self.device)
-        wp.launch(add, self.where.shape[0], [self.where, self.values, newton.x], out, device=self.device)

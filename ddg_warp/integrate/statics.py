@@ -12,7 +12,7 @@ import warp as wp
 from scipy import sparse
 
 from ddg_warp.errors import SceneError, SolverError, check_options
-from ddg_warp.kernels import step
+from ddg_warp.integrate.prescribed import PrescribedMotion
 from ddg_warp.linear.direct import Factorisation, SingularError
 from ddg_warp.state import State
 from ddg_warp.tangent import Tangent
@@ -258,28 +258,10 @@ def _move_supports(model, state: State, before: float, at: float) -> None:
     """Put held dofs where their motions have them."""
     if not model.motions:
         return
-    real, device = model.types.real, model.wp_device
-    pose = wp.array(np.array([motion.pose(before, at) for motion in model.motions]), dtype=real, device=device)
     for group, data in zip(model.groups, state.groups, strict=True):
-        moving = group.moving
-        if moving is None:
-            continue
-        nodes, angles = step.motion_kernels(group.kind, real, False)
-        progress = wp.zeros(group.columns, dtype=real, device=device)
-        portion = wp.full(group.columns, 1.0, dtype=real, device=device)
-        wp.launch(
-            nodes,
-            moving.nodes.shape[0],
-            [moving.nodes, moving.node_rest, pose, group.fixed, progress, portion],
-            [data.x],
-            device=device,
-        )
-        if moving.edges.shape[0]:
-            wp.launch(
-                angles,
-                moving.edges.shape[0],
-                [moving.edges, moving.edge_rest, pose, group.count, progress, portion, data.x, data.frame],
-                [data.theta],
-                device=device,
-            )
+        if group.moving is not None:
+            motion = PrescribedMotion(model, group)
+            motion.upload(before, at)
+            whole = wp.full(group.columns, 1.0, dtype=model.types.real, device=model.wp_device)
+            motion.apply(group.still, whole, data.x, data.frame, data.theta)
     model.carry_frames(state)

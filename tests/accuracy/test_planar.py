@@ -2,23 +2,12 @@
 
 import numpy as np
 import pytest
+from convergence import equilibrium, order
 
 import ddg_warp as ddg
 from ddg_warp import stability
 from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
 from ddg_warp.scenes import post_buckling, roll_up, tip_load
-
-
-def equilibrium(scene, device, **options):
-    """Model and state of a static scene; the floor is at the rounding of forces, as errors here are small."""
-    model = scene.build(device, "float64")
-    solver = Equilibrium(model, StaticsOptions(floor_factor=1.0, **options))
-    return model, solver.load(model.state(), scene.analysis.load_steps)
-
-
-def order(edges, errors) -> float:
-    """Observed order in the edge length, by least squares."""
-    return -np.polyfit(np.log(edges), np.log(np.abs(errors)), 1)[0]
 
 
 # Tip of a circle of curvature 2 pi turns / L: (sin a, 1 - cos a) L / a.

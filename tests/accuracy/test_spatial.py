@@ -2,22 +2,10 @@
 
 import numpy as np
 import pytest
+from convergence import equilibrium, order
 from scipy.optimize import newton
 
-from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
 from ddg_warp.scenes import bend_45, helical_spring
-
-
-def equilibrium(scene, device, **options):
-    """Model and state of a static scene; the floor is at the rounding of forces, as errors here are small."""
-    model = scene.build(device, "float64")
-    solver = Equilibrium(model, StaticsOptions(floor_factor=1.0, **options))
-    return model, solver.load(model.state(), scene.analysis.load_steps)
-
-
-def order(edges, errors) -> float:
-    """Observed order in the edge length, by least squares."""
-    return -np.polyfit(np.log(edges), np.log(np.abs(errors)), 1)[0]
 
 
 # Tip of the 45-degree bend [in], by shooting and by collocation. Inextensible: EA R^2 / EI = 1.2e9; extensible: EA = 1e7 lbf.

@@ -2,14 +2,10 @@
 
 import numpy as np
 import pytest
+from convergence import order
 
 from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
 from ddg_warp.scenes import bend_twist, greenhill, localized_helix, michell_ring
-
-
-def order(edges, errors) -> float:
-    """Observed order in the edge length, by least squares."""
-    return -np.polyfit(np.log(edges), np.log(np.abs(errors)), 1)[0]
 
 
 # Critical M [B/L] for a tension T [B/L^2], from the determinant (Greenhill 1883). EA L^2 / B = 1e9.
