@@ -73,7 +73,8 @@ class ChainNewton:
         self.energy = make(2, *nodes)
         self.stiffness = make(*nodes, dtype=self.linear)
         self.elimination = make(2 * kind.block**2 + kind.block, *nodes, dtype=self.linear) if not kind.closed else None
-        self.direction = make(kind.block, *nodes, dtype=self.linear)
+        self.right, self.direction = (make(kind.block, *nodes, dtype=self.linear) for _ in range(2))
+        self.energy_change, self.energy_noise = make(*nodes), make(*nodes, dtype=self.linear)
         self.status, self.slot, self.iteration, self.halvings = flags(), flags(), flags(), flags()
         self.lost, self.turned, self.clamped, self.unbalanced, self.drowned = (flags() for _ in range(5))
         self.without_compression = self.clamped  # rods whose matrix leaves the stiffness that compression takes away
@@ -120,16 +121,17 @@ class ChainNewton:
         )
 
     def check(self) -> None:
-        """Find the rods that are out of equilibrium."""
+        """Residuals, the change of the energy, and the rods that are out of equilibrium."""
         group, options = self.group, self.options
         wp.launch(
             self._check,
             (group.nodes, group.columns),
-            [self.gradient, self.stiffness, group.count, group.mass, group.rotary, self.coefficient]
-            + [self.x, self.theta, self.target, self.target_angle]
+            [self.gradient, self.energy, self.stiffness, group.count, group.mass, group.rotary, self.coefficient]
+            + [self.x, self.theta, self.base, self.direction, self.target, self.target_angle]
             + [group.gravity, group.load, group.load_angle, int(group.host.loaded), group.fixed, group.length]
-            + [options.rtol, options.floor_factor * self.eps, self.load_scale, self.status],
-            [self.unbalanced, self.drowned],
+            + [options.rtol, options.floor_factor * self.eps, self.load_scale, self.status]
+            + [self.slot, self.iteration, self.step_length, self.placed],
+            [self.right, self.energy_change, self.energy_noise, self.unbalanced, self.drowned],
             device=self.device,
         )
 
@@ -139,9 +141,8 @@ class ChainNewton:
         wp.launch(
             self._sweep,
             group.columns,
-            [self.factor, self.gradient, self.energy, group.count]
-            + [group.mass, group.rotary, self.coefficient, self.target, self.target_angle, group.gravity]
-            + [group.load, group.load_angle, int(group.host.loaded), group.fixed, group.length]
+            [self.factor, self.right, self.energy_change, self.energy_noise, group.count]
+            + [group.mass, group.rotary, self.coefficient, group.fixed]
             + [options.floor_factor * self.eps, options.rotation_cap]
             + [options.max_iterations, options.max_halvings]
             + [self.x, self.theta, self.base, self.elimination, self.direction]

@@ -1,7 +1,8 @@
 """Balance of forces at the nodes of a chain, and where a rod has converged.
 
-`check`, one thread a node, runs before a sweep and decides where a rod has converged, so that the last iterate costs no sweep: at
-every free dof |residual| <= max(rtol * load scale, floor), where floor bounds what rounding of coordinates and forces leaves,
+`check`, one thread a node, runs before a sweep: it writes the residual, and every node's share of the change of the energy since
+the accepted iterate. It decides where a rod has converged, so that the last iterate costs no sweep: at every free dof
+|residual| <= max(rtol * load scale, floor), where floor bounds what rounding of coordinates and forces leaves,
 floor_factor * eps * (H_ii |x| + sum of |element forces|). Moments are compared over the length of the rod.
 """
 
@@ -95,15 +96,20 @@ def node_functions(kind: ChainKind, real):
 
 @cache
 def check_kernel(kind: ChainKind, real, linear):
-    """Raises `unbalanced` for a rod with a dof out of equilibrium, `drowned` where only rounding excuses a residual."""
-    dim, twist, closed = kind.dim, kind.twist, kind.closed
+    """Residual and change of the energy at every node; raises `unbalanced` for a rod with a dof out of equilibrium.
+
+    `drowned` is raised where only rounding excuses a residual. Residuals of held dofs are written as zero. `noise` bounds the
+    rounding in `change`, which sums the differences of the element energies and the work of inertia and loads along the step.
+    """
+    dim, nb, twist, closed = kind.dim, kind.block, kind.twist, kind.closed
     V = wp.types.vector(dim, real)
     _, behind, balance = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def check(
         g: wp.array3d(dtype=real),
+        energy: wp.array3d(dtype=real),
         stiffness: wp.array2d(dtype=linear),
         count: wp.array(dtype=int),
         mass: wp.array2d(dtype=real),
@@ -111,6 +117,8 @@ def check_kernel(kind: ChainKind, real, linear):
         coefficient: wp.array(dtype=real),
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
+        base: wp.array2d(dtype=V),
+        direction: wp.array3d(dtype=linear),
         target: wp.array2d(dtype=V),
         target_angle: wp.array2d(dtype=real),
         gravity: wp.array(dtype=V),
@@ -123,6 +131,13 @@ def check_kernel(kind: ChainKind, real, linear):
         floor: real,
         load_scale: wp.array(dtype=real),
         status: wp.array(dtype=int),
+        slot: wp.array(dtype=int),
+        iteration: wp.array(dtype=int),
+        step_length: wp.array(dtype=real),
+        placed: wp.array(dtype=int),
+        right_out: wp.array3d(dtype=linear),
+        change_out: wp.array2d(dtype=real),
+        noise_out: wp.array2d(dtype=linear),
         unbalanced_out: wp.array(dtype=int),
         drowned_out: wp.array(dtype=int),
     ):
@@ -141,17 +156,22 @@ def check_kernel(kind: ChainKind, real, linear):
         if b >= 0:
             stiff = wp.max(stiff, real(stiffness[b, r]))
         here = x[k, r]
+        m = mass[k, r]
         reach = wp.max(wp.abs(here))
         limit = rtol * load_scale[r]
-        least = floor * ((real(2.0) * stiff + c * mass[k, r]) * reach + size)
+        least = floor * ((real(2.0) * stiff + c * m) * reach + size)
         mask = int(fixed[k, r])
         for d in range(wp.static(dim)):
-            if ((mask >> d) & 1) == 0 and not wp.abs(f[d]) <= limit:
+            held = ((mask >> d) & 1) == 1
+            right_out[d, k, r] = linear(wp.where(held, real(0.0), f[d]))
+            if not held and not wp.abs(f[d]) <= limit:
                 drowned_out[r] = 1
                 if not wp.abs(f[d]) <= least:
                     unbalanced_out[r] = 1
         if wp.static(twist):
-            if ((mask >> wp.static(dim)) & 1) == 0 and not wp.abs(moment) <= limit * length[r]:
+            held = ((mask >> wp.static(dim)) & 1) == 1
+            right_out[wp.static(nb - 1), k, r] = linear(wp.where(held, real(0.0), moment))
+            if not held and not wp.abs(moment) <= limit * length[r]:
                 drowned_out[r] = 1
                 arm = wp.length(x[along(k + 1, n), r] - here)
                 least = floor * (
@@ -161,5 +181,33 @@ def check_kernel(kind: ChainKind, real, linear):
                 )
                 if not wp.abs(moment) <= least:
                     unbalanced_out[r] = 1
+        if iteration[r] == 0:
+            return
+        change = real(0.0)
+        noise = real(0.5) * size * reach
+        if wp.static(closed) or k < n - 1:
+            accepted = slot[r]
+            new = energy[1 - accepted, k, r]
+            change = new - energy[accepted, k, r]
+            noise += wp.abs(new)
+        # the change of inertia's and loads' energy along the step, in exact products of small numbers
+        taken = step_length[r]
+        u = V()
+        if placed[r] != 0:
+            u = here - base[k, r]
+        else:
+            for d in range(wp.static(dim)):
+                u[d] = taken * real(direction[d, k, r])
+        outer = gravity[0] * m
+        if loaded != 0:
+            outer += load[k, r]
+        work = wp.dot(u, (here - target[k, r] - u * real(0.5)) * (c * m) - outer)
+        if wp.static(twist):
+            turned = taken * real(direction[wp.static(nb - 1), k, r])
+            work += turned * c * rotary[k, r] * (theta[k, r] - target_angle[k, r] - real(0.5) * turned)
+            if loaded != 0:
+                work -= turned * load_angle[k, r]
+        change_out[k, r] = change + work
+        noise_out[k, r] = linear(noise + wp.abs(work))
 
     return check

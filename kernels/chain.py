@@ -1,9 +1,10 @@
 """The chain sweep: one thread a rod takes a Newton iteration from element factors and forces to new dofs.
 
 The Gauss-Newton matrix of an open rod is block-pentadiagonal (block: position of a node and angle of the edge that starts
-there): H = sum F^T F + c I (edges) + inertia. The sweep forms its blocks in registers, adds inertia and loads, eliminates node by
-node, and at the end of the rod knows the change of the energy and the Newton decrement r^T H^-1 r. It then either rejects the
-iterate and shortens the step, or substitutes back and takes the next step. No physics here: strains are rows.
+there): H = sum F^T F + c I (edges) + inertia. The sweep forms its blocks in registers, takes the residual of `balance`,
+eliminates node by node, and at the end of the rod knows the change of the energy and the Newton decrement r^T H^-1 r. It then
+either rejects the iterate and shortens the step, or substitutes back and takes the next step. No physics here: strains are
+rows.
 
 Line search (Armijo, c = 1e-4) on the energy, summed as differences element by element. Where the expected decrease drowns in
 rounding, the decrement decides instead (natural monotonicity test; Deuflhard, Newton Methods for Nonlinear Problems, 2004).
@@ -14,7 +15,6 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import outcome, pivot
-from ddg_warp.kernels.balance import node_functions
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind
 from ddg_warp.kernels.search import PLACE, RELAG, TURNED, search_functions
 
@@ -27,7 +27,6 @@ def sweep_kernel(kind: ChainKind, real, linear):
     V, H, M = wp.types.vector(dim, real), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     factor_block, lower, upper, lower_vector, upper_vector, congruence = pivot.functions(nb, linear)
     *_, shorter = search_functions(kind, real, linear)
-    force, *_ = node_functions(kind, real)
     angle = nb - 1
     vertex_rows, edge_rows, tensions = kind.vertex_strains, kind.edge_strains, kind.tensions
 
@@ -66,25 +65,27 @@ def sweep_kernel(kind: ChainKind, real, linear):
                 v[i] = v[i] + Y[row + i * wp.static(nb) + j, k, r] * e[j]
         return v
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+    # what exceeds 255 registers goes to shared memory: 8 % on an H200
+    @wp.kernel(
+        module="unique",
+        enable_backward=False,
+        grid_stride=False,
+        launch_bounds=128,
+        enable_cuda_smem_spilling=True,
+        module_options=CPU_OPTIONS,
+    )
     def sweep(
-        # element path
         F: wp.array3d(dtype=linear),
-        g: wp.array3d(dtype=real),
-        energy: wp.array3d(dtype=real),
+        # balance
+        right: wp.array3d(dtype=linear),
+        energy_change: wp.array2d(dtype=real),
+        energy_noise: wp.array2d(dtype=linear),
         count: wp.array(dtype=int),
-        # inertia and loads
+        # inertia
         mass: wp.array2d(dtype=real),
         rotary: wp.array2d(dtype=real),
         coefficient: wp.array(dtype=real),
-        target: wp.array2d(dtype=V),
-        target_angle: wp.array2d(dtype=real),
-        gravity: wp.array(dtype=V),
-        load: wp.array2d(dtype=V),
-        load_angle: wp.array2d(dtype=real),
-        loaded: int,
         fixed: wp.array2d(dtype=wp.uint8),
-        length: wp.array(dtype=real),
         # options
         floor: real,
         rotation_cap: real,
@@ -130,7 +131,6 @@ def sweep_kernel(kind: ChainKind, real, linear):
         first = iteration[r] == 0
         taken = step_length[r]
         c = coefficient[r]
-        over_length = real(1.0) / length[r]
         accepted_slot = slot[r]
         Waa = M()
         Wab = M()
@@ -140,42 +140,27 @@ def sweep_kernel(kind: ChainKind, real, linear):
         Wcc = M()
         ra = H()
         rb = H()
-        before = V()
-        ahead = V()
-        ahead_angle = real(0.0)
-        worst = real(0.0)  # largest residual
+        worst = linear(0.0)  # largest residual
         change = real(0.0)  # of the energy, from the accepted iterate to this one
         noise = real(0.0)  # rounding of `change`
         newton = real(0.0)  # r^T H^-1 r
         lost_here = int(0)
         for j in range(n):
-            total = V()
-            ahead_next = V()
-            own_angle = ahead_angle
-            ahead_angle = real(0.0)
+            if wp.static(span == 2):
+                if j < n - 2:
+                    for m in range(wp.static(vertex_rows)):
+                        row = m * wp.static(window)
+                        a = part(F, row, j, r)
+                        C = part(F, row + wp.static(dim), j, r)
+                        A = with_angle(F, row + wp.static(2 * dim), j, r, -a)
+                        B = with_angle(F, row + wp.static(2 * dim + 1), j, r, a - C)
+                        Waa += wp.outer(A, A)
+                        Wab += wp.outer(A, B)
+                        Wac += wp.outer(A, C)
+                        Wbb += wp.outer(B, B)
+                        Wbc += wp.outer(B, C)
+                        Wcc += wp.outer(C, C)
             if j < n - 1:
-                e_new = energy[1 - accepted_slot, j, r]
-                noise += wp.abs(e_new)
-                change += e_new - energy[accepted_slot, j, r]
-                total = force(g, 0, j, r)
-                if wp.static(span == 2):
-                    if j < n - 2:
-                        ahead_next = force(g, wp.static(dim), j, r)
-                        if wp.static(twist):
-                            own_angle += g[wp.static(2 * dim), j, r]
-                            ahead_angle = g[wp.static(2 * dim + 1), j, r]
-                        for m in range(wp.static(vertex_rows)):
-                            row = m * wp.static(window)
-                            a = part(F, row, j, r)
-                            C = part(F, row + wp.static(dim), j, r)
-                            A = with_angle(F, row + wp.static(2 * dim), j, r, -a)
-                            B = with_angle(F, row + wp.static(2 * dim + 1), j, r, a - C)
-                            Waa += wp.outer(A, A)
-                            Wab += wp.outer(A, B)
-                            Wac += wp.outer(A, C)
-                            Wbb += wp.outer(B, B)
-                            Wbc += wp.outer(B, C)
-                            Wcc += wp.outer(C, C)
                 edge_row = wp.static(vertex_rows * window)
                 for m in range(wp.static(edge_rows)):
                     t = part(F, edge_row + m * wp.static(dim), j, r)
@@ -188,59 +173,19 @@ def sweep_kernel(kind: ChainKind, real, linear):
                     Waa += T
                     Wab -= T
                     Wbb += T
-            total += ahead
-            ahead = ahead_next
-
-            # residual r = -dE/dq, in the precision of the state
-            m_j = mass[j, r]
-            away = x[j, r] - target[j, r]
-            outer_force = gravity[0] * m_j
-            outer_moment = real(0.0)
-            if loaded != 0:
-                outer_force += load[j, r]
-                if wp.static(twist):
-                    outer_moment = load_angle[j, r]
-            f = outer_force + total - before - away * (c * m_j)
-            mask = fixed[j, r]
-            rj = H()
+            inertia = linear(c * mass[j, r])
             for d in range(wp.static(dim)):
-                rj[d] = linear(f[d])
-                Waa[d, d] = Waa[d, d] + linear(c * m_j)
-            moment = real(0.0)
-            away_angle = real(0.0)
-            inertia = real(0.0)
+                Waa[d, d] = Waa[d, d] + inertia
             if wp.static(twist):
-                inertia = c * rotary[j, r]
-                away_angle = theta[j, r] - target_angle[j, r]
-                moment = outer_moment - own_angle - inertia * away_angle
-                rj[wp.static(angle)] = linear(moment)
-                Waa[wp.static(angle), wp.static(angle)] = Waa[wp.static(angle), wp.static(angle)] + linear(inertia)
-
-            noise += wp.max(wp.abs(total)) * wp.max(wp.abs(x[j, r]))
-            for d in range(wp.static(dim)):
-                if ((int(mask) >> d) & 1) == 0:
-                    worst = wp.max(worst, wp.abs(f[d]))
-            if wp.static(twist):
-                if ((int(mask) >> wp.static(dim)) & 1) == 0:
-                    worst = wp.max(worst, wp.abs(moment) * over_length)
-            before = total
-
-            # change of inertia's and loads' energy along the last step, exact products of small numbers
+                Waa[wp.static(angle), wp.static(angle)] = Waa[wp.static(angle), wp.static(angle)] + linear(
+                    c * rotary[j, r]
+                )
+            rj = with_angle(right, wp.static(angle), j, r, part(right, 0, j, r))
+            worst = wp.max(worst, wp.max(wp.abs(rj)))
             if not first:
-                work = real(0.0)
-                u = V()
-                if placed[r] != 0:
-                    u = x[j, r] - base[j, r]
-                else:
-                    for d in range(wp.static(dim)):
-                        u[d] = taken * real(direction[d, j, r])
-                work += wp.dot(u, (away - u * real(0.5)) * (c * m_j) - outer_force)
-                if wp.static(twist):
-                    du = taken * real(direction[wp.static(angle), j, r])
-                    work += du * (inertia * (away_angle - real(0.5) * du) - outer_moment)
-                change += work
-                noise += wp.abs(work)
-
+                change += energy_change[j, r]
+                noise += real(energy_noise[j, r])
+            mask = fixed[j, r]
             if mask != wp.uint8(0):
                 free = H()
                 for d in range(wp.static(nb)):
@@ -249,7 +194,6 @@ def sweep_kernel(kind: ChainKind, real, linear):
                 Waa = wp.cw_mul(Waa, wp.outer(free, free)) + wp.diag(H(linear(1.0)) - free)
                 Wab = wp.cw_mul(Wab, rows)
                 Wac = wp.cw_mul(Wac, rows)
-                rj = wp.cw_mul(rj, free)
                 ra = wp.cw_mul(ra, free)
             # columns of held dofs ahead stay: their solution is zero, and what they gather is masked with their rows
 
@@ -278,10 +222,10 @@ def sweep_kernel(kind: ChainKind, real, linear):
             Wbc = M()
             Wcc = M()
 
-        residual[r] = worst
+        residual[r] = real(worst)
         if first:
             if load_scale[r] == real(0.0):
-                load_scale[r] = worst
+                load_scale[r] = real(worst)
             lost[r] = 0
             change = real(0.0)
         finite = wp.isfinite(worst) and wp.isfinite(newton) and wp.isfinite(change)

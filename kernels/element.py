@@ -394,7 +394,14 @@ def evaluate_kernel(kind: ChainKind, real, linear):
     spans = tuple(term.measure.span for term in kind.terms)
     terms, size, twist, closed = len(kind.terms), kind.window, kind.twist, kind.closed
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+    # three blocks a multiprocessor: 168 registers instead of 170 are worth 30 % at 100,000 rods on an H200
+    @wp.kernel(
+        module="unique",
+        enable_backward=False,
+        grid_stride=False,
+        launch_bounds=(128, 3),
+        module_options=CPU_OPTIONS,
+    )
     def evaluate(
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),

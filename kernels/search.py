@@ -174,7 +174,7 @@ def adjust_kernel(kind: ChainKind, real, linear):
     V = wp.types.vector(dim, real)
     place, turn_angles, relag, _ = search_functions(kind, real, linear)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def adjust(
         count: wp.array(dtype=int),
         fixed: wp.array2d(dtype=wp.uint8),

@@ -28,7 +28,7 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def begin(
         x0: wp.array2d(dtype=V),
         v0: wp.array2d(dtype=V),
@@ -120,7 +120,7 @@ def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
     V = wp.types.vector(dim, real)
     place, _, relag, _ = search_functions(kind, real, linear)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def predict(
         x0: wp.array2d(dtype=V),
         v0: wp.array2d(dtype=V),
@@ -155,7 +155,7 @@ def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
 def start_kernel(real):
     """Starts a step: every rod that has not been given up has all of it to do."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def start(
         status: wp.array(dtype=int),
         progress_out: wp.array(dtype=real),
@@ -177,7 +177,7 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
     """Positions, angles and their velocities at the end of the step, of the rods that converged."""
     V, twist = wp.types.vector(kind.dim, real), kind.twist
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def finish(
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
@@ -248,7 +248,7 @@ def finish_frames_kernel(kind: ChainKind, real):
         )
         return wp.normalize(u - t * wp.dot(u, t)), t
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def finish(
         x: wp.array2d(dtype=V),
         frame: wp.array3d(dtype=real),
@@ -277,7 +277,7 @@ def advance_kernel(real):
     `tally` counts outcomes by their code; `work` holds Newton iterations (sum, largest), solves, retries, lost pivots.
     """
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def advance(
         iteration: wp.array(dtype=int),
         lost: wp.array(dtype=int),
@@ -363,7 +363,7 @@ def motion_kernels(kind: ChainKind, real, midpoint: bool):
         shift = row(pose, m, 15) * (real(1.0) - s) + row(pose, m, 18) * s
         return turned(pose, m, s, rest - pivot) + pivot + shift
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def nodes(
         where: wp.array2d(dtype=int),
         rest: wp.array2d(dtype=real),
@@ -412,7 +412,7 @@ def motion_kernels(kind: ChainKind, real, midpoint: bool):
         expected = angle0 + wp.dot(row(pose, m, 0), t) * (s1 - s0)
         return angle - turn * wp.round((angle - expected) / turn)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def angles(
         where: wp.array2d(dtype=int),
         rest: wp.array2d(dtype=real),
@@ -460,7 +460,7 @@ def load_kernels(kind: ChainKind, real):
         def across(couple: X, e: V):
             return wp.cross(couple, e)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def add(
         where: wp.array2d(dtype=int),
         values: wp.array2d(dtype=real),
@@ -487,7 +487,7 @@ def load_kernels(kind: ChainKind, real):
             if wp.static(twist):
                 wp.atomic_add(load_angle_out, k, r, wp.dot(couple, e) / wp.length(e))
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def reset(
         where: wp.array2d(dtype=int),
         values: wp.array2d(dtype=real),

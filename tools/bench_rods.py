@@ -165,6 +165,7 @@ def largest_residual(integrator: ddg.Integrator, state) -> float:
         newton.status.zero_()
         newton.iteration.zero_()
         newton.evaluate(state.groups[chain.index].last)
+        newton.check()
         newton.unbalanced.fill_(1)
         newton.sweep()
         worst.append(float(newton.residual.numpy().max()))

@@ -29,7 +29,7 @@ class PcgNewton(ChainNewton):
 
         self.blocks = vectors(3 * kind.block**2)
         self.factors = vectors(3 * kind.block**2 + kind.block) if preconditioner == "chain" else self.blocks
-        self.right, self.rest, self.z, self.p, self.q = (vectors() for _ in range(5))
+        self.rest, self.z, self.p, self.q = (vectors() for _ in range(4))
         self.change, self.noise = (arrays.allocate(nodes, self.real, device) for _ in range(2))
         self.without_compression = wp.full(columns, 1, dtype=int, device=device)  # PCG needs a definite matrix
         self.merit = wp.zeros(columns, dtype=self.real, device=device)
