@@ -14,11 +14,13 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
+from ddg_warp.io.colors import SCALE
+
 DPI = 160
 FLAT = 1e-3  # thickness over size below which rods are drawn in their plane
 MARGIN = 0.06  # of the size, around the rods
 GREY = "0.35"
-TIME_COLORS = LinearSegmentedColormap.from_list("time", ["#c9d6e8", "#6f9bd1", "#3b5fa8", "#7a2f79", "#d1495b"])
+TIME_COLORS = LinearSegmentedColormap.from_list("time", SCALE)
 MARKERS = "osD^vP"
 
 

@@ -17,9 +17,8 @@ from ddg_warp.surface import AFTER, BEFORE, Surface
 
 
 def face_normals(surface: Surface, points: np.ndarray | None = None) -> np.ndarray:
-    """Unit normals (T, 3)."""
-    vectors = _double_area_vectors(_corners(surface, points))
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    """Unit normals (T, 3); 0 for a triangle that has collapsed."""
+    return _unit_or_zero(_double_area_vectors(_corners(surface, points)))
 
 
 def face_areas(surface: Surface, points: np.ndarray | None = None) -> np.ndarray:
@@ -47,8 +46,7 @@ def vertex_normals(surface: Surface, points: np.ndarray | None = None) -> np.nda
     points = surface.points if points is None else points
     weighted = face_normals(surface, points)[:, None] * corner_angles(surface, points)[..., None]
     normals = np.stack([_at_vertices(surface, weighted[..., k], len(points)) for k in range(3)], axis=1)
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
+    return _unit_or_zero(normals)
 
 
 def barycentric_areas(surface: Surface, points: np.ndarray | None = None) -> np.ndarray:
@@ -227,6 +225,11 @@ def _sines_cosines(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     to_after, to_before = corners[:, AFTER] - corners, corners[:, BEFORE] - corners
     double_areas = np.linalg.norm(_double_area_vectors(corners), axis=-1)
     return np.repeat(double_areas[:, None], 3, axis=1), np.einsum("tij,tij->ti", to_after, to_before)
+
+
+def _unit_or_zero(vectors: np.ndarray) -> np.ndarray:
+    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0.0)
 
 
 def _hat_gradients(corners: np.ndarray) -> np.ndarray:
