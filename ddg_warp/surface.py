@@ -120,7 +120,11 @@ class Surface:
                 indices of vertices.
         """
         chosen = np.zeros(len(self.points), bool)
-        chosen[where(self.points) if callable(where) else where] = True
+        where = where(self.points) if callable(where) else where
+        try:
+            chosen[where] = True
+        except IndexError as error:
+            raise SceneError(f"{self._name}: no edges on these vertices ({error}); give (P,) bool or indices") from None
         return np.flatnonzero(chosen[self.edges].all(axis=1))
 
     @property
@@ -128,7 +132,10 @@ class Surface:
         return f"surface '{self.name}'"
 
     def _checked_points(self, points) -> np.ndarray:
-        points = np.array(points, dtype=np.float64)
+        try:
+            points = np.array(points, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise SceneError(f"{self._name}: the points are no array of numbers; give (P, 3)") from None
         if points.ndim != 2 or points.shape[1] != 3:
             raise SceneError(f"{self._name}: points have shape {points.shape}; give (P, 3)")
         for vertex in np.flatnonzero(~np.isfinite(points).all(axis=1))[:1]:
@@ -136,7 +143,10 @@ class Surface:
         return points
 
     def _checked_triangles(self, triangles) -> np.ndarray:
-        triangles = np.asarray(triangles)
+        try:
+            triangles = np.asarray(triangles)
+        except ValueError:
+            raise SceneError(f"{self._name}: the triangles are not of three vertices each; give (T, 3)") from None
         if triangles.ndim != 2 or triangles.shape[1] != 3 or not len(triangles):
             raise SceneError(f"{self._name}: triangles have shape {triangles.shape}; give (T, 3), one at least")
         if triangles.dtype.kind not in "iu":

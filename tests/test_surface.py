@@ -95,6 +95,9 @@ def test_edges_are_found():
     assert np.array_equal(surface.edges_on(np.array([0, 4, 8])), left)
     assert np.array_equal(surface.edges_on(surface.points[:, 0] == 0.0), left)
     assert set(left) < set(surface.boundary_edges)
+    for wrong in ([0, 12], [True, False], [0.5]):
+        with pytest.raises(SceneError, match=r"no edges on these vertices .* give \(P,\) bool or indices"):
+            surface.edges_on(wrong)
     found = surface.edge_between([0, 8, 5], [4, 4, 0])
     assert surface.edges[found].tolist() == [[0, 4], [4, 8], [0, 5]]
     assert surface.boundary[found].tolist() == [True, True, False]
@@ -159,6 +162,8 @@ REFUSED = {
     "index negative": (SQUARE, [[0, 1, 2], [0, 2, -1]], "triangle 1", "-1"),
     "no whole number": (SQUARE, [[0.0, 1.0, 2.0]], "float64", "whole numbers"),
     "quads": (SQUARE, [[0, 1, 2, 3]], "(1, 4)", "(T, 3)"),
+    "polygons": (SQUARE, [[0, 1, 2], [0, 1, 2, 3]], "not of three", "(T, 3)"),
+    "no points": ([[0, 0, "a"]], [[0, 1, 2]], "no array of numbers", "(P, 3)"),
     "nothing": (SQUARE, np.zeros((0, 3), int), "one at least"),
     "points in the plane": (np.array(SQUARE)[:, :2], [[0, 1, 2]], "(4, 2)", "(P, 3)"),
     "not finite": ([*SQUARE[:3], [0, np.nan, 0]], [[0, 1, 2], [0, 2, 3]], "vertex 3", "non-finite"),

@@ -1,12 +1,14 @@
 """Meshes: OBJ and USD files are read in metres, seen from outside; surfaces are recorded beside rods and read back."""
 
 import h5py
+import matplotlib.image
 import numpy as np
 import pytest
 from pxr import Gf, Usd, UsdGeom, Vt
 from stand_in import Model, State, curves, rest_points, step, surfaces
 
 from ddg_warp import meshes
+from ddg_warp.figure import rods_picture
 from ddg_warp.io import Curves, MeshError, MissingFileError, Shapes, Surfaces
 from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader, TrajectoryWriter, read_rods
 from ddg_warp.io.mesh_read import read_mesh
@@ -15,6 +17,7 @@ from ddg_warp.operators import face_areas, vertex_normals
 from ddg_warp.record import SCENE, TRAJECTORY, Recorder, export_usd
 from ddg_warp.surface import Surface
 
+NO_RODS = Curves(np.zeros(0, int), np.zeros(0, bool), np.zeros(0), np.zeros(0, object), np.zeros(0, int))
 PYRAMID = """
 # a pyramid over a square
 o tent
@@ -359,8 +362,7 @@ def test_surfaces_alone(tmp_path):
     """A model without rods."""
     points, triangles = meshes.sphere(1)
     ball = Surfaces(triangles, np.array([0]), np.array(["ball"]), np.full(len(triangles), 1e-3))
-    none = Curves(np.zeros(0, int), np.zeros(0, bool), np.zeros(0), np.zeros(0, object), np.zeros(0, int))
-    model = Model(curves=none, surfaces=ball)
+    model = Model(curves=NO_RODS, surfaces=ball)
     with Recorder(model, tmp_path, block=1) as recorder:
         for time in (0.0, 0.1):
             recorder.record(State(time, points + time))
@@ -382,3 +384,24 @@ def test_resume_refuses_other_surfaces(tmp_path):
     for other in (None, Surfaces(**{**vars(surfaces()), "triangles": surfaces().triangles[:, ::-1]})):
         with pytest.raises(TrajectoryError, match="other surfaces than the model"):
             TrajectoryWriter.resume(tmp_path / "t.h5", Model(surfaces=other))
+
+
+def colored(path):
+    """RGB of the pixels that are not grey, and how much of the rectangle around them they fill."""
+    image = matplotlib.image.imread(path)[..., :3]
+    mask = np.ptp(image, axis=2) > 0.05
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return image[mask], mask.sum() / (np.ptp(rows) + 1) / (np.ptp(columns) + 1)
+
+
+def test_pictures_show_surfaces(tmp_path):
+    """A disc in its plane fills pi/4 of the square around it; a ball has as many shades as it has directions."""
+    points, triangles = meshes.disc(12)
+    part = Surfaces(triangles, np.array([0]), np.array(["disc"]), np.full(len(triangles), 1e-3))
+    rods_picture(Model(curves=NO_RODS, surfaces=part), {0.0: points}, tmp_path / "disc.png")
+    _, filled = colored(tmp_path / "disc.png")
+    assert filled == pytest.approx(np.pi / 4.0, rel=0.01)
+    model = shell_model(worlds=2)
+    rods_picture(model, {0.0: model.state().points()}, tmp_path / "both.png")
+    shades, _ = colored(tmp_path / "both.png")
+    assert len(np.unique(shades, axis=0)) > 10
