@@ -1,8 +1,8 @@
 """USD: recorded rods and surfaces out. `read_curves` and `validate` are here too, for one import.
 
 All rods of a batch stand in one prim below /World: a linear BasisCurves, or a Mesh of tubes for programs that draw no
-curves or drop their materials. Every surface is a Mesh of its own. z is up,
-lengths are in metres, times in seconds times timeCodesPerSecond.
+curves or drop their materials. Every surface is a Mesh of its own. z is up, lengths are in metres, times in seconds
+times timeCodesPerSecond.
 USD saves a file in place, over its old table of contents, so that a process killed meanwhile leaves it unreadable.
 The stage therefore lives in a file `NAME.partial.usdc`; after each save a copy of it takes the final name in one step.
 """
