@@ -172,7 +172,7 @@ def say(result, content: dict, checks: list, directory: Path) -> None:
 
 
 def draw(directory: Path, title: str, shapes: int = 6) -> None:
-    """Draw the rods of the first world at a few times into DIR/picture.png, where matplotlib is installed."""
+    """Draw the rods and surfaces of the first world at a few times into DIR/picture.png, where matplotlib is installed."""
     try:
         from ddg_warp.figure import rods_picture
     except ModuleNotFoundError as error:
@@ -182,9 +182,9 @@ def draw(directory: Path, title: str, shapes: int = 6) -> None:
 
     with TrajectoryReader(directory / "trajectory.h5") as reader:
         frames = {round((len(reader) - 1) * k / (shapes - 1)) for k in range(shapes)}
-        count = sum(reader.counts)
+        count = reader.points.shape[-2]
         points = {float(reader.time[frame]): reader.points[frame].reshape(-1, 3)[:count] for frame in frames}
-        rods_picture(reader.curves, points, directory / "picture.png", title)
+        rods_picture(reader, points, directory / "picture.png", title)
 
 
 def list_all(chosen: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""Pictures with matplotlib: rods at a few times, and errors in a double logarithmic diagram."""
+"""Pictures with matplotlib: rods and surfaces at a few times, and errors in a double logarithmic diagram."""
 
 from __future__ import annotations
 
@@ -9,26 +9,31 @@ from pathlib import Path
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection
+from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
-from mpl_toolkits.mplot3d.art3d import Line3DCollection
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+
+from ddg_warp.io import Shapes
+from ddg_warp.io.colors import SCALE
 
 DPI = 160
 FLAT = 1e-3  # thickness over size below which rods are drawn in their plane
 MARGIN = 0.06  # of the size, around the rods
 GREY = "0.35"
-TIME_COLORS = LinearSegmentedColormap.from_list("time", ["#c9d6e8", "#6f9bd1", "#3b5fa8", "#7a2f79", "#d1495b"])
+LIGHT = np.array([-0.37, -0.56, 0.74])  # unit vector from the surfaces to the light
+DARKEST = 0.55  # brightness of what the light grazes
+TIME_COLORS = LinearSegmentedColormap.from_list("time", SCALE)
 MARKERS = "osD^vP"
 
 
 def rods_picture(
     rods, points_by_time: Mapping[float, np.ndarray] | Iterable[tuple[float, np.ndarray]], path, title: str = ""
 ) -> None:
-    """Draws rods at a few times, the latest on top; flat where the rods stay in a coordinate plane.
+    """Draws rods and surfaces at a few times, the latest on top; flat where they stay in a coordinate plane.
 
     Args:
-        rods: A model, its curves, or a `CurveSet`.
+        rods: A model, a `TrajectoryReader`, the curves of either, or a `CurveSet`.
         points_by_time: Time [s] and positions [m], (P, 3) or (worlds, P, 3), of each shape to draw.
         path: The picture to write; its suffix is the format.
         title: A line above.
@@ -39,23 +44,22 @@ def rods_picture(
         raise ValueError("there is no shape to draw: give the points of at least one time")
     times = np.array([time for time, _ in frames])
     points = np.array([np.reshape(shape, (-1, 3)) for _, shape in frames], dtype=np.float64)
-    worlds = points.shape[1] // int(np.sum(curves.counts))
-    counts, closed = np.tile(curves.counts, worlds), np.tile(curves.closed, worlds)
+    surfaces = getattr(rods, "surfaces", None)
+    worlds = points.shape[1] // Shapes.of(curves, surfaces).point_count
+    shapes = Shapes.of(curves, surfaces, worlds)
     low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
     flat = np.flatnonzero(high - low <= FLAT * np.max(high - low))
     axes = [k for k in range(3) if k != (flat[0] if len(flat) else None)]
     norm = Normalize(times[0], times[-1] if len(times) > 1 else times[0] + 1.0)
     figure = Figure(figsize=(7.0, 5.2), layout="constrained")
     plot = _flat_axes(figure, axes, low, high) if len(flat) else _solid_axes(figure, low, high)
-    kind = LineCollection if len(flat) else Line3DCollection
     for time, shape in zip(times, points, strict=True):
         latest = time == times[-1]
         color = TIME_COLORS(norm(time)) if len(times) > 1 else TIME_COLORS(0.5)
-        lines = kind(
-            _polylines(shape[:, axes], counts, closed), colors=[color], linewidths=_line_width(len(counts), latest)
-        )
-        lines.set(capstyle="round", joinstyle="round")
-        plot.add_collection(lines)
+        if surfaces is not None:
+            _draw_triangles(plot, shape[shapes.surfaces.triangles][..., axes], color)
+        if len(curves.counts):
+            _draw_rods(plot, shape[shapes.rows][:, axes], shapes.curves, color, latest)
     _explain_times(figure, plot, times, norm)
     plot.set_title(textwrap.fill(title, 80), loc="left", fontsize=11)
     _save(figure, path)
@@ -89,6 +93,27 @@ def error_plot(path, rows: Iterable[Mapping], x: str, y: str, series: str, title
     if names:
         plot.legend(frameon=False, fontsize=9, title=series, title_fontsize=9)
     _save(figure, path)
+
+
+def _draw_rods(plot, points: np.ndarray, curves, color, latest: bool) -> None:
+    """Adds polylines, in two or three dimensions."""
+    kind = LineCollection if points.shape[-1] == 2 else Line3DCollection
+    polylines = _polylines(points, curves.counts, curves.closed)
+    lines = kind(polylines, colors=[color], linewidths=_line_width(len(curves.counts), latest))
+    lines.set(capstyle="round", joinstyle="round")
+    plot.add_collection(lines)
+
+
+def _draw_triangles(plot, corners: np.ndarray, color) -> None:
+    """Adds triangles, corners (T, 3, 2), or shaded ones, corners (T, 3, 3); thin lines close the gaps between them."""
+    if corners.shape[-1] == 2:
+        plot.add_collection(PolyCollection(corners, facecolors=[color], edgecolors=[color], linewidths=0.2))
+        return
+    vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    facing = np.abs(vectors @ LIGHT) / np.maximum(np.linalg.norm(vectors, axis=1), np.finfo(float).tiny)
+    shaded = np.tile(color, (len(corners), 1))
+    shaded[:, :3] *= (DARKEST + (1.0 - DARKEST) * facing)[:, None]  # both sides alike
+    plot.add_collection(Poly3DCollection(corners, facecolors=shaded, edgecolors=shaded, linewidths=0.2))
 
 
 def _polylines(points: np.ndarray, counts: np.ndarray, closed: np.ndarray) -> list[np.ndarray]:

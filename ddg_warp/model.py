@@ -115,11 +115,14 @@ class Model:
     Attributes:
         scene: what it was built from.
         curves: rods in the user's order.
+        surfaces: None: a scene has rods only.
         groups: rods of one kind and similar length each.
         held: what each support of the scene holds.
         precision: scalar types.
         worlds: number of independent copies.
     """
+
+    surfaces = None
 
     def __init__(self, scene, *, device=None, precision: str | None = None, worlds: int = 1):
         if worlds < 1:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ddg_warp.io import Curves
+from ddg_warp.io import Shapes
 
 TRAJECTORY, SCENE = "trajectory.h5", "scene.usdc"
 DEFAULT_FPS = 24.0
@@ -72,9 +72,9 @@ class Recorder:
         if usd:
             from ddg_warp.io.usd import CurvesWriter
 
-            curves = Curves.tiled(model.curves, model.worlds)
+            shapes = Shapes.of(model.curves, model.surfaces, model.worlds)
             fps = fps or _fps_of(model, every)
-            self._scene = CurvesWriter(self.directory / SCENE, curves, fps=fps, tube=tube, block=block)
+            self._scene = CurvesWriter(self.directory / SCENE, shapes, fps=fps, tube=tube, block=block)
         if resume:
             self._replay()
 
@@ -144,8 +144,8 @@ def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False
     with TrajectoryReader(trajectory) as reader:
         worlds = int(np.prod(reader.points.shape[1:-2]))
         spacing = np.median(np.diff(reader.time)) if len(reader) > 1 else 1.0 / DEFAULT_FPS
-        curves = Curves.tiled(reader.curves, worlds)
-        with CurvesWriter(path, curves, fps=fps or round(1.0 / spacing, 6), tube=tube) as writer:
+        shapes = Shapes.of(reader.curves, reader.surfaces, worlds)
+        with CurvesWriter(path, shapes, fps=fps or round(1.0 / spacing, 6), tube=tube) as writer:
             for time, points in zip(reader.time, reader.points, strict=True):
                 writer.write(time, points.reshape(-1, 3))
 

@@ -1,6 +1,7 @@
-"""Reading and writing curves and trajectories; every format's library is loaded only by its own module.
+"""Reading and writing curves, meshes and trajectories; every format's library is loaded only by its own module.
 
-`usd` (BasisCurves in, curves or tubes out), `hdf5` (trajectory.h5 in and out), `dismech` (text in).
+`usd` (BasisCurves in; curves or tubes, and meshes out), `mesh_read` (meshes in), `hdf5` (trajectory.h5 in and out), `dismech`
+(text in).
 """
 
 from __future__ import annotations
@@ -15,7 +16,11 @@ class CurveError(ValueError):
     """A file holds no usable curves; the message names the file, the object, the index and the remedy."""
 
 
-class MissingFileError(CurveError, FileNotFoundError):
+class MeshError(ValueError):
+    """A file holds no usable mesh; the message names the file, the place in it and the remedy."""
+
+
+class MissingFileError(CurveError, MeshError, FileNotFoundError):
     """The file to read does not exist."""
 
     def __str__(self) -> str:
@@ -44,6 +49,68 @@ class Curves:
     def tiled(cls, curves, worlds: int) -> Curves:
         """`worlds` copies of a model's curves, one after the other."""
         return cls(**{field.name: np.tile(getattr(curves, field.name), worlds) for field in fields(cls)})
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """Triangles among the points of a trajectory; the attributes of `model.surfaces`, which is None where there are none.
+
+    Attributes:
+        triangles: Rows of `state.points()` at the corners of each triangle, shape (T, 3), int; surface after surface.
+        first: First triangle of each surface, shape (S,), int, increasing from 0.
+        names: Name of each surface, shape (S,), str.
+        thickness: Thickness of each triangle [m], shape (T,), float64.
+    """
+
+    triangles: np.ndarray
+    first: np.ndarray
+    names: np.ndarray
+    thickness: np.ndarray
+
+    def parts(self) -> list[slice]:
+        """The triangles of each surface."""
+        return [slice(a, b) for a, b in zip(self.first, [*self.first[1:], len(self.triangles)], strict=True)]
+
+    @classmethod
+    def tiled(cls, surfaces: Surfaces, worlds: int, point_count: int) -> Surfaces:
+        """`worlds` copies of a model's surfaces, one after the other, each among `point_count` points of its own."""
+        world = np.arange(worlds)[:, None]
+        return cls(
+            triangles=(surfaces.triangles + point_count * world[..., None]).reshape(-1, 3),
+            first=(surfaces.first + len(surfaces.triangles) * world).ravel(),
+            names=np.tile(surfaces.names, worlds),
+            thickness=np.tile(surfaces.thickness, worlds),
+        )
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """The rods and surfaces of all worlds, and where they stand among the points of a frame, world after world.
+
+    In each world the points of the rods come first, then those that only surfaces have.
+
+    Attributes:
+        curves: The rods of all worlds.
+        rows: Row of each of their points in a frame, shape (n,), int.
+        surfaces: The surfaces of all worlds, or None.
+        point_count: Points of one world.
+        worlds: Number of worlds.
+    """
+
+    curves: Curves
+    rows: np.ndarray
+    surfaces: Surfaces | None
+    point_count: int
+    worlds: int
+
+    @classmethod
+    def of(cls, curves, surfaces: Surfaces | None = None, worlds: int = 1) -> Shapes:
+        """Those of a model's `curves` and `surfaces`, which are of one world."""
+        rod_points = int(np.sum(curves.counts))
+        point_count = rod_points if surfaces is None else max(rod_points, int(surfaces.triangles.max()) + 1)
+        rows = np.arange(rod_points) + point_count * np.arange(worlds)[:, None]
+        tiled = None if surfaces is None else Surfaces.tiled(surfaces, worlds, point_count)
+        return cls(Curves.tiled(curves, worlds), rows.ravel(), tiled, point_count, worlds)
 
 
 @dataclass(frozen=True)

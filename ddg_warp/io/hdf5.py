@@ -2,7 +2,8 @@
 
     /trajectory   time (F,) [s], points (F, P, 3) [m], velocities (F, P, 3) [m/s] and directors (F, E, 3) if wanted,
                   series/NAME (F,); with several worlds (F, B, P, 3) and (F, B, E, 3)
-    /model        curves/{counts, closed, radius, names, batch}, parameters/NAME
+    /model        curves/{counts, closed, radius, names, batch}, surfaces/{triangles, first, names, thickness} if there are
+                  any, parameters/NAME
     /control      how the run was driven
     /checkpoint   a and b, in turn the state at the last frame, at full precision; the attribute current says which
     /VTKHDF       the same points for ParaView, see `vtkhdf`
@@ -25,8 +26,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from ddg_warp.io import Curves, existing
-from ddg_warp.io.hdf5_read import CURVE_FIELDS, TrajectoryError, TrajectoryReader, read_rods
+from ddg_warp.io import Shapes, existing
+from ddg_warp.io.hdf5_read import CURVE_FIELDS, SURFACE_FIELDS, TrajectoryError, TrajectoryReader, read_rods
 from ddg_warp.io.journal import recover, transaction
 from ddg_warp.io.vtkhdf import write_view
 
@@ -85,6 +86,10 @@ class TrajectoryWriter:
             same = np.array_equal(reader.curves.counts, model.curves.counts)
             if not (same and np.array_equal(reader.curves.closed, model.curves.closed)):
                 raise TrajectoryError(f"{path}: the file holds other rods than the model; resume with its own scene")
+            if not np.array_equal(_triangles(reader.surfaces), _triangles(model.surfaces)):
+                raise TrajectoryError(
+                    f"{path}: the file holds other surfaces than the model; resume with its own scene"
+                )
         writer = cls.__new__(cls)
         writer._prepare(path, model, block, names)
         writer._slot = OTHER_SLOT[slot]
@@ -126,7 +131,7 @@ class TrajectoryWriter:
             for name in ("time", *self._names):
                 _extend(trajectory, name, np.stack([frame[name] for frame in self._frames]), self._block)
             self._extend_series(trajectory)
-            write_view(file, self._curves)
+            write_view(file, self._shapes)
             checkpoint = file.require_group(f"checkpoint/{slot}")
             checkpoint.attrs["frame"] = len(trajectory["time"])
             for name, value in self._snapshot.items():
@@ -144,7 +149,7 @@ class TrajectoryWriter:
         self._model = model
         self._names = names
         self._slot = "a"
-        self._curves = Curves.tiled(model.curves, model.worlds)
+        self._shapes = Shapes.of(model.curves, model.surfaces, model.worlds)
         self._frames: list[dict] = []
         self._snapshot: dict[str, np.ndarray] = {}
         frame_bytes = sum(8 * int(np.prod(self._shape(name))) for name in names)
@@ -152,9 +157,9 @@ class TrajectoryWriter:
 
     def _shape(self, name: str) -> tuple[int, ...]:
         """Shape of one frame of a field."""
-        curves, worlds = self._model.curves, self._model.worlds
-        points = int(np.sum(curves.counts))
-        rows = points - np.count_nonzero(~np.asarray(curves.closed)) if name == "directors" else points
+        curves, worlds, rows = self._model.curves, self._model.worlds, self._shapes.point_count
+        if name == "directors":
+            rows = int(np.sum(curves.counts)) - np.count_nonzero(~np.asarray(curves.closed))
         return (rows, 3) if worlds == 1 else (worlds, rows, 3)
 
     def _extend_series(self, trajectory: h5py.Group) -> None:
@@ -171,7 +176,7 @@ class TrajectoryWriter:
             trajectory = file["trajectory"]
             for name in ("time", *self._names, *(f"series/{name}" for name in trajectory.get("series", ()))):
                 trajectory[name].resize(frame, axis=0)
-            write_view(file, self._curves)
+            write_view(file, self._shapes)
 
 
 def _origin() -> dict[str, str]:
@@ -189,10 +194,16 @@ def _write_attributes(group: h5py.Group, values: Mapping) -> None:
         group.attrs[name] = value if isinstance(value, str | int | float) else json.dumps(value, default=str)
 
 
+def _triangles(surfaces) -> np.ndarray:
+    return np.zeros((0, 3), int) if surfaces is None else surfaces.triangles
+
+
 def _write_model(group: h5py.Group, model) -> None:
     curves, parameters = group.create_group("curves"), group.create_group("parameters")
     for name in CURVE_FIELDS:
         _overwrite(curves, name, np.asarray(getattr(model.curves, name)))
+    for name in SURFACE_FIELDS if model.surfaces is not None else ():
+        _overwrite(group.require_group("surfaces"), name, np.asarray(getattr(model.surfaces, name)))
     for name, value in model.parameters().items():
         _overwrite(parameters, name, np.asarray(value))
 

@@ -8,10 +8,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from ddg_warp.io import CurveError, Curves, CurveSet, checked_curves, existing
+from ddg_warp.io import CurveError, Curves, CurveSet, Surfaces, checked_curves, existing
 from ddg_warp.io.journal import open_to_read
 
 CURVE_FIELDS = ("counts", "closed", "radius", "names", "batch")
+SURFACE_FIELDS = ("triangles", "first", "names", "thickness")
 
 
 class TrajectoryError(ValueError):
@@ -28,6 +29,7 @@ class TrajectoryReader:
         directors: First material directors, shape (F, E, 3) or (F, B, E, 3), read when indexed, or None.
         series: Observed values by name, each of shape (F,).
         curves: How the points are joined to rods.
+        surfaces: How the points are joined to triangles, or None.
         parameters: The model's parameters by name.
         provenance: The attributes of the file.
         recorded: Names of the recorded fields.
@@ -47,6 +49,9 @@ class TrajectoryReader:
         self.recorded = [name for name in ("points", "velocities", "directors") if name in trajectory]
         self.series = {name: values[:] for name, values in trajectory.get("series", {}).items()}
         self.curves = Curves(**{name: _array(model["curves"][name]) for name in CURVE_FIELDS})
+        self.surfaces = None
+        if "surfaces" in model:
+            self.surfaces = Surfaces(**{name: _array(model["surfaces"][name]) for name in SURFACE_FIELDS})
         self.parameters = _all_arrays(model["parameters"])
         self.provenance = {name: _plain(value) for name, value in self._file.attrs.items()}
 
@@ -133,7 +138,7 @@ def _by_batch(curves: Curves, points: np.ndarray, path: Path) -> list[CurveSet]:
     sets = []
     for batch in np.unique(curves.batch):
         rods = curves.batch == batch
-        mine = np.repeat(rods, curves.counts)
+        mine = np.flatnonzero(np.repeat(rods, curves.counts))
         name = str(curves.names[rods][0])
         radius = curves.radius[mine]
         sets.append(checked_curves(points[mine], curves.counts[rods], curves.closed[rods], radius, name, str(path)))

@@ -1,7 +1,8 @@
-"""USD: recorded rods out, as curves or as tubes. `read_curves` and `validate` are here too, for one import.
+"""USD: recorded rods and surfaces out. `read_curves` and `validate` are here too, for one import.
 
 All rods of a batch stand in one prim below /World: a linear BasisCurves, or a Mesh of tubes for programs that draw no
-curves or drop their materials. z is up, lengths are in metres, times in seconds times timeCodesPerSecond.
+curves or drop their materials. Every surface is a Mesh of its own. z is up, lengths are in metres, times in seconds
+times timeCodesPerSecond.
 USD saves a file in place, over its old table of contents, so that a process killed meanwhile leaves it unreadable.
 The stage therefore lives in a file `NAME.partial.usdc`; after each save a copy of it takes the final name in one step.
 """
@@ -14,32 +15,43 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from pxr import Sdf, Tf, Usd, UsdGeom, Vt
+from pxr import Tf, Usd, UsdGeom
 
-from ddg_warp.io import CurveError, Curves
-from ddg_warp.io.tube import SIDES, tube_faces, tube_points
+from ddg_warp.io import CurveError, Curves, Shapes
+from ddg_warp.io.colors import PALETTE
 from ddg_warp.io.usd_check import validate
+from ddg_warp.io.usd_prims import ColorBy, CurvesPrim, Frame, PointsPrim, SurfacePrim, TubesPrim
 from ddg_warp.io.usd_read import read_curves
 
 __all__ = ["CurvesWriter", "read_curves", "validate"]
 
-PALETTE = ((0.12, 0.47, 0.71), (0.89, 0.47, 0.20), (0.17, 0.63, 0.42), (0.74, 0.27, 0.35), (0.55, 0.42, 0.70))
 GROWTH = 8  # saves are at least an eighth of the recording apart, which bounds what their copies cost
 
 
 class CurvesWriter:
-    """Writes frames of rods to a USD file.
+    """Writes frames of rods and surfaces to a USD file.
 
     Args:
         path: The file, .usdc or .usda; an existing one is replaced.
-        curves: Rods without points, such as `model.curves`, or a `CurveSet`.
+        curves: Rods without points, such as `model.curves`, or a `CurveSet`; or `Shapes` of rods and surfaces.
         fps: Time codes per second.
-        colors: RGB of each rod, shape (R, 3), or of each point, shape (P, 3); by default one color a batch.
+        colors: RGB of each rod, shape (R, 3), or of each of their points; by default one color a batch.
+        color_by: Name of a scalar that gives the color instead, and its values at the two ends of the scale.
         tube: Whether to write tubes instead of curves.
         block: Frames between two saves, at least; a killed process leaves the frames saved last.
     """
 
-    def __init__(self, path, curves, *, fps: float = 24.0, colors=None, tube: bool = False, block: int = 32):
+    def __init__(
+        self,
+        path,
+        curves,
+        *,
+        fps: float = 24.0,
+        colors=None,
+        color_by: tuple[str, float, float] | None = None,
+        tube: bool = False,
+        block: int = 32,
+    ):
         self.path = Path(path)
         self._partial = self.path.with_name(f"{self.path.stem}.partial{self.path.suffix}")
         self._partial.unlink(missing_ok=True)
@@ -47,7 +59,13 @@ class CurvesWriter:
         self._frames = self._saved = 0
         self._stage = Usd.Stage.CreateNew(str(self._partial))
         self._describe_stage()
-        self._prims = _define_prims(self._stage, curves, colors, _TubesPrim if tube else _CurvesPrim)
+        shapes = curves if isinstance(curves, Shapes) else _drawable(curves)
+        color_by = ColorBy(*color_by) if color_by else None
+        self._prims: list[PointsPrim] = []
+        if len(shapes.curves.counts):
+            self._prims += _define_rods(self._stage, shapes, colors, color_by, TubesPrim if tube else CurvesPrim)
+        if shapes.surfaces is not None:
+            self._prims += _define_surfaces(self._stage, shapes, color_by)
 
     def __enter__(self) -> CurvesWriter:
         return self
@@ -55,7 +73,15 @@ class CurvesWriter:
     def __exit__(self, *_) -> None:
         self.close()
 
-    def write(self, time: float, points, *, velocities=None, scalars: Mapping[str, np.ndarray] | None = None) -> None:
+    def write(
+        self,
+        time: float,
+        points,
+        *,
+        velocities=None,
+        scalars: Mapping[str, np.ndarray] | None = None,
+        triangle_scalars: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
         """Adds a frame.
 
         Args:
@@ -63,10 +89,11 @@ class CurvesWriter:
             points: Positions [m], shape (P, 3).
             velocities: Velocities [m/s], shape (P, 3).
             scalars: Values at the points by name, each of shape (P,), written unchanged as primvars.
+            triangle_scalars: Values of the triangles of all surfaces by name, each of shape (T,), likewise.
         """
         code = Usd.TimeCode(round(time * self._fps, 6))
         for prim in self._prims:
-            prim.write(code, points, velocities, scalars or {})
+            prim.write(code, Frame(points, velocities, scalars or {}, triangle_scalars or {}))
         if self._frames == 0:
             self._stage.SetStartTimeCode(code.GetValue())
         self._stage.SetEndTimeCode(code.GetValue())
@@ -97,90 +124,15 @@ class CurvesWriter:
         self._stage.SetDefaultPrim(UsdGeom.Xform.Define(self._stage, "/World").GetPrim())
 
 
-class _CurvesPrim:
-    """The rods of one batch as one BasisCurves prim.
-
-    Args:
-        stage: Where to define it.
-        path: Path of the new prim.
-        curves: The rods of the batch, all closed or all open.
-        nodes: Index of each of their points among all points, shape (p,).
-        color: One RGB, or one for each point, shape (p, 3).
-    """
-
-    def __init__(self, stage: Usd.Stage, path: str, curves: Curves, nodes: np.ndarray, color: np.ndarray):
-        self._curves, self._nodes = curves, nodes
-        self._prim = self._define(stage, path)
-        primvars = UsdGeom.PrimvarsAPI(self._prim)
-        uniform = color.ndim == 1
-        kind = UsdGeom.Tokens.constant if uniform else UsdGeom.Tokens.vertex
-        shown = _vectors([color] if uniform else self._at_vertices(color))
-        primvars.CreatePrimvar("displayColor", Sdf.ValueTypeNames.Color3fArray, kind).Set(shown)
-        radius = _floats(self._at_vertices(curves.radius))
-        primvars.CreatePrimvar("radius", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex).Set(radius)
-        self._primvars = primvars
-
-    def write(self, code: Usd.TimeCode, points, velocities, scalars: Mapping[str, np.ndarray]) -> None:
-        """Sets the samples of one frame; the arrays hold all rods' points."""
-        shown = _vectors(self._vertices(np.asarray(points, dtype=np.float64)[self._nodes]))
-        self._prim.GetPointsAttr().Set(shown, code)
-        self._prim.GetExtentAttr().Set(self._extent(shown), code)
-        if velocities is not None:
-            self._prim.GetVelocitiesAttr().Set(_vectors(self._at_vertices(np.asarray(velocities)[self._nodes])), code)
-        for name, values in scalars.items():
-            primvar = self._primvars.CreatePrimvar(name, Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex)
-            primvar.Set(_floats(self._at_vertices(np.asarray(values)[self._nodes])), code)
-
-    def _define(self, stage: Usd.Stage, path: str) -> UsdGeom.PointBased:
-        curves = UsdGeom.BasisCurves.Define(stage, path)
-        curves.CreateTypeAttr(UsdGeom.Tokens.linear)
-        curves.CreateWrapAttr(UsdGeom.Tokens.periodic if self._curves.closed[0] else UsdGeom.Tokens.nonperiodic)
-        curves.CreateCurveVertexCountsAttr(_ints(self._curves.counts))
-        widths = 2.0 * self._curves.radius
-        uniform = np.ptp(widths) == 0.0
-        self._widths = _floats(widths[:1] if uniform else widths)
-        curves.CreateWidthsAttr(self._widths)
-        curves.SetWidthsInterpolation(UsdGeom.Tokens.constant if uniform else UsdGeom.Tokens.vertex)
-        return curves
-
-    def _vertices(self, points: np.ndarray) -> np.ndarray:
-        return points
-
-    def _at_vertices(self, values: np.ndarray) -> np.ndarray:
-        """Values at the points, as values at the vertices."""
-        return values
-
-    def _extent(self, vertices: Vt.Vec3fArray) -> Vt.Vec3fArray:
-        return UsdGeom.Curves.ComputeExtent(vertices, self._widths)
-
-
-class _TubesPrim(_CurvesPrim):
-    """The rods of one batch as one Mesh; a velocity is that of the centreline."""
-
-    def _define(self, stage: Usd.Stage, path: str) -> UsdGeom.PointBased:
-        mesh = UsdGeom.Mesh.Define(stage, path)
-        sizes, indices = tube_faces(self._curves.counts, self._curves.closed)
-        mesh.CreateFaceVertexCountsAttr(_ints(sizes))
-        mesh.CreateFaceVertexIndicesAttr(_ints(indices))
-        mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-        mesh.CreateDoubleSidedAttr(False)
-        return mesh
-
-    def _vertices(self, points: np.ndarray) -> np.ndarray:
-        return tube_points(points, self._curves.counts, self._curves.closed, self._curves.radius)
-
-    def _at_vertices(self, values: np.ndarray) -> np.ndarray:
-        return np.repeat(values, SIDES, axis=0)
-
-    def _extent(self, vertices: Vt.Vec3fArray) -> Vt.Vec3fArray:
-        return UsdGeom.PointBased.ComputeExtent(vertices)
-
-
-def _define_prims(stage: Usd.Stage, curves, colors, kind: type[_CurvesPrim]) -> list[_CurvesPrim]:
-    """One prim for each batch; two where it has open and closed rods, because USD wraps all curves of a prim alike."""
+def _drawable(curves) -> Shapes:
     if curves.radius is None:
         raise CurveError("the rods have no radius, so they cannot be drawn: give each point one [m]")
-    curves = Curves.tiled(curves, 1)
+    return Shapes.of(curves)
+
+
+def _define_rods(stage: Usd.Stage, shapes: Shapes, colors, color_by, kind: type[CurvesPrim]) -> list[PointsPrim]:
+    """One prim for each batch; two where it has open and closed rods, because USD wraps all curves of a prim alike."""
+    curves = shapes.curves
     if colors is not None and len(colors) == len(curves.counts):
         colors = np.repeat(colors, curves.counts, axis=0)
     prims = []
@@ -192,7 +144,19 @@ def _define_prims(stage: Usd.Stage, curves, colors, kind: type[_CurvesPrim]) -> 
                 names, radius = curves.names[rods], curves.radius[mine]
                 part = Curves(curves.counts[rods], curves.closed[rods], radius, names, curves.batch[rods])
                 color = np.array(PALETTE[batch % len(PALETTE)]) if colors is None else np.asarray(colors)[mine]
-                prims.append(kind(stage, _free_path(stage, str(names[0])), part, np.flatnonzero(mine), color))
+                path = _free_path(stage, str(names[0]))
+                prims.append(kind(stage, path, part, shapes.rows[mine], color, color_by))
+    return prims
+
+
+def _define_surfaces(stage: Usd.Stage, shapes: Shapes, color_by) -> list[PointsPrim]:
+    """One prim for each surface, in the colors that follow those of the rods."""
+    surfaces, batches = shapes.surfaces, len(np.unique(shapes.curves.batch))
+    of_a_world = len(surfaces.names) // shapes.worlds
+    prims = []
+    for k, (part, name) in enumerate(zip(surfaces.parts(), surfaces.names, strict=True)):
+        color = np.array(PALETTE[(batches + k % of_a_world) % len(PALETTE)])
+        prims.append(SurfacePrim(stage, _free_path(stage, str(name)), surfaces, part, color, color_by))
     return prims
 
 
@@ -204,15 +168,3 @@ def _free_path(stage: Usd.Stage, name: str) -> str:
         number += 1
         path = f"{base}_{number}"
     return path
-
-
-def _vectors(values) -> Vt.Vec3fArray:
-    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32))
-
-
-def _floats(values) -> Vt.FloatArray:
-    return Vt.FloatArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32))
-
-
-def _ints(values) -> Vt.IntArray:
-    return Vt.IntArray.FromNumpy(np.ascontiguousarray(values, dtype=np.int32))

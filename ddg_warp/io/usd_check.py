@@ -14,7 +14,8 @@ def validate(path) -> list[str]:
     """What is wrong with a USD file, a sentence each; empty where all is well.
 
     USD's own validators run where the installed USD has them. Beside them, for every BasisCurves and Mesh at every
-    time sample: counts match the points, all is finite, widths are positive and the extent contains the points.
+    time sample: counts match the points, all is finite, widths are positive, normals are unit vectors or 0 where there are
+    any, and the extent contains the points.
     """
     path = existing(path)
     try:
@@ -59,8 +60,10 @@ def _check_faces(mesh: UsdGeom.Mesh) -> tuple[int, list[str]]:
     """(points that the faces use, problems)."""
     counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [0])
     indices = np.array(mesh.GetFaceVertexIndicesAttr().Get() or [-1])
-    matches = counts.sum() == len(indices)
-    return indices.max() + 1, [] if matches else [f"faces have {counts.sum()} corners, but {len(indices)} are listed"]
+    problems = [] if indices.min() >= 0 else [f"corner {np.argmin(indices)} has the index {indices.min()}"]
+    if counts.sum() != len(indices):
+        problems.append(f"faces have {counts.sum()} corners, but {len(indices)} are listed")
+    return indices.max() + 1, problems
 
 
 def _check_frame(shape: UsdGeom.PointBased, time, count: int, margin: float) -> list[str]:
@@ -74,6 +77,11 @@ def _check_frame(shape: UsdGeom.PointBased, time, count: int, margin: float) -> 
     velocities = shape.GetVelocitiesAttr().Get(time)
     if velocities is not None and (len(velocities) != count or not np.isfinite(np.array(velocities)).all()):
         problems.append("the velocities do not match the points or are not finite")
+    normals = shape.GetNormalsAttr().Get(time)
+    if normals is not None and shape.GetNormalsInterpolation() == UsdGeom.Tokens.vertex:
+        lengths = np.linalg.norm(np.array(normals, dtype=np.float64).reshape(-1, 3), axis=1)
+        if len(lengths) != count or not (np.isclose(lengths, 1.0, atol=1e-4) | (lengths == 0.0)).all():
+            problems.append("the normals do not match the points or are not of length 1")
     extent = np.array(shape.GetExtentAttr().Get(time) or [], dtype=np.float64)
     if extent.shape != (2, 3):
         return [*problems, "there is no extent"]

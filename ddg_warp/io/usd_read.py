@@ -1,5 +1,6 @@
-"""Curves from USD files: every BasisCurves prim becomes a `CurveSet`; transforms, metersPerUnit and upAxis are applied.
+"""Curves and meshes from USD files, in metres with z up: transforms, metersPerUnit and upAxis are applied.
 
+Every BasisCurves prim becomes a `CurveSet`; of a file with several meshes one is chosen by its path.
 Attributes are taken at the default time, or at their first sample where they have no default. Widths are diameters;
 under a transform that scales, they scale by the cube root of its volume change. A cubic curve is replaced by the
 polyline through its knots: its vertices (Catmull-Rom), every third vertex (Bezier), or (p0 + 4 p1 + p2)/6 (B-spline);
@@ -13,10 +14,12 @@ from pathlib import Path
 import numpy as np
 from pxr import Tf, Usd, UsdGeom
 
-from ddg_warp.io import CurveError, CurveSet, checked_curves, existing
+from ddg_warp.io import CurveError, CurveSet, MeshError, checked_curves, existing
+from ddg_warp.io.mesh_read import triangulated
 
 Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 BEZIER_STEP = 3
+MESHES_LISTED = 5
 
 
 def read_curves(path, prim: str | None = None) -> list[CurveSet]:
@@ -27,15 +30,8 @@ def read_curves(path, prim: str | None = None) -> list[CurveSet]:
         prim: Path of the prim to read, with all below it; by default the whole file.
     """
     path = existing(path)
-    try:
-        stage = Usd.Stage.Open(str(path))
-    except Tf.ErrorException as error:
-        raise CurveError(f"{path}: this is not a USD file that can be read ({error}); export it again") from error
-    root = stage.GetPrimAtPath(prim) if prim else stage.GetPseudoRoot()
-    if not root:
-        raise CurveError(f"{path}: there is no prim {prim}; `usdtree {path}` lists them")
-    within = Usd.PrimRange(root, Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate))
-    curves = [UsdGeom.BasisCurves(each) for each in within if each.IsA(UsdGeom.BasisCurves)]
+    stage = _opened(path, CurveError)
+    curves = _shapes(stage, path, prim, UsdGeom.BasisCurves, CurveError)
     if not curves:
         raise CurveError(
             f"{path}: there are no BasisCurves{f' below {prim}' if prim else ''}; export curves, not meshes"
@@ -43,15 +39,67 @@ def read_curves(path, prim: str | None = None) -> list[CurveSet]:
     return [_read_prim(each, path) for each in curves]
 
 
-def _read_prim(curves: UsdGeom.BasisCurves, path: Path) -> CurveSet:
-    name = str(curves.GetPath())
-    attribute = curves.GetPointsAttr()
+def read_mesh_prim(path, prim: str | None = None) -> tuple[np.ndarray, np.ndarray, str]:
+    """The mesh of a USD file, in metres with z up: (points (P, 3), triangles (T, 3), name of the prim).
+
+    Polygons are cut into fans; holes are left out. A subdivision surface is taken as its control mesh. Triangles run
+    counter-clockwise as seen from outside, also where the file says leftHanded or a transform mirrors.
+
+    Args:
+        path: A .usd, .usda, .usdc or .usdz file.
+        prim: Path of the Mesh prim, or of one above it; needed where the file has several meshes.
+    """
+    path = existing(path)
+    stage = _opened(path, MeshError)
+    meshes = _shapes(stage, path, prim, UsdGeom.Mesh, MeshError)
+    if len(meshes) != 1:
+        listed = ", ".join(str(mesh.GetPath()) for mesh in meshes[:MESHES_LISTED]) or "none"
+        raise MeshError(f"{path}: there are {len(meshes)} meshes to read ({listed}); give prim= the path of one")
+    (mesh,) = meshes
+    where = f"{path}, {mesh.GetPath()}"
+    points, time = _points(mesh, where, MeshError)
+    counts = np.array(_value(mesh.GetFaceVertexCountsAttr(), time) or [], dtype=int)
+    indices = np.array(_value(mesh.GetFaceVertexIndicesAttr(), time) or [], dtype=int)
+    holes = np.array(_value(mesh.GetHoleIndicesAttr(), time) or [], dtype=int)
+    triangles, face = triangulated(points, counts, indices, where)
+    triangles = triangles[~np.isin(face, holes)]
+    to_world, _ = _placement(mesh, time)
+    left_handed = mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
+    if left_handed != (np.linalg.det(to_world[:3, :3]) < 0.0):
+        triangles = triangles[:, [0, 2, 1]]
+    return points @ to_world[:3, :3] + to_world[3, :3], triangles, mesh.GetPrim().GetName()
+
+
+def _opened(path: Path, error: type[ValueError]) -> Usd.Stage:
+    """The stage of a file; its prims live no longer than it."""
+    try:
+        return Usd.Stage.Open(str(path))
+    except Tf.ErrorException as reason:
+        raise error(f"{path}: this is not a USD file that can be read ({reason}); export it again") from reason
+
+
+def _shapes(stage: Usd.Stage, path: Path, prim: str | None, kind: type, error: type[ValueError]) -> list:
+    """All prims of a kind in a file, or below the prim at a path."""
+    root = stage.GetPrimAtPath(prim) if prim else stage.GetPseudoRoot()
+    if not root:
+        raise error(f"{path}: there is no prim {prim}; `usdtree {path}` lists them")
+    within = Usd.PrimRange(root, Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate))
+    return [kind(each) for each in within if each.IsA(kind)]
+
+
+def _points(shape: UsdGeom.PointBased, where: str, error: type[ValueError]) -> tuple[np.ndarray, Usd.TimeCode]:
+    """(points in the prim's units, shape (P, 3); the time at which other attributes are taken)."""
+    attribute = shape.GetPointsAttr()
     if not attribute.HasValue():
-        raise CurveError(f"{path}, {name}: the curves have no points; export them with their points")
+        raise error(f"{where}: there are no points; export the prim with its points")
     # EarliestTime means the first sample of an attribute, and its default where it has no samples.
     time = Usd.TimeCode.EarliestTime() if attribute.Get() is not None else Usd.TimeCode(attribute.GetTimeSamples()[0])
-    points = np.array(attribute.Get() if attribute.Get() is not None else attribute.Get(time), dtype=np.float64)
-    points = points.reshape(-1, 3)
+    return np.array(_value(attribute, time), dtype=np.float64).reshape(-1, 3), time
+
+
+def _read_prim(curves: UsdGeom.BasisCurves, path: Path) -> CurveSet:
+    name = str(curves.GetPath())
+    points, time = _points(curves, f"{path}, {name}", CurveError)
     counts = np.array(_value(curves.GetCurveVertexCountsAttr(), time) or [], dtype=int)
     closed = curves.GetWrapAttr().Get() == UsdGeom.Tokens.periodic
     checked_curves(points, counts, closed, None, name, str(path))
@@ -70,10 +118,10 @@ def _value(attribute: Usd.Attribute, time: Usd.TimeCode):
     return attribute.Get(time) if default is None else default
 
 
-def _placement(curves: UsdGeom.BasisCurves, time: Usd.TimeCode) -> tuple[np.ndarray, float]:
+def _placement(shape: UsdGeom.PointBased, time: Usd.TimeCode) -> tuple[np.ndarray, float]:
     """(matrix for row vectors to metres with z up, shape (4, 4); its mean scale)."""
-    stage = curves.GetPrim().GetStage()
-    matrix = np.array(curves.ComputeLocalToWorldTransform(time)) * UsdGeom.GetStageMetersPerUnit(stage)
+    stage = shape.GetPrim().GetStage()
+    matrix = np.array(shape.ComputeLocalToWorldTransform(time)) * UsdGeom.GetStageMetersPerUnit(stage)
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
         matrix[:, :3] = matrix[:, :3] @ Y_UP_TO_Z_UP.T
     return matrix, abs(np.linalg.det(matrix[:3, :3])) ** (1.0 / 3.0)

@@ -1,4 +1,5 @@
-"""A view of a trajectory that ParaView opens: the group /VTKHDF, a transient PolyData (VTKHDF 2.0) of polylines.
+"""A view of a trajectory that ParaView opens: the group /VTKHDF, a transient PolyData (VTKHDF 2.0): rods as polylines, surfaces
+as triangles.
 
 Points and velocities are virtual datasets over /trajectory, and the times a link to it, so that nothing is stored
 twice. The topology is stored once: every step points to the same part, which begins at offset 0.
@@ -14,7 +15,7 @@ import numpy as np
 if TYPE_CHECKING:
     import h5py
 
-    from ddg_warp.io import Curves
+    from ddg_warp.io import Shapes
 
 VERSION = (2, 0)
 CELL_KINDS = ("Vertices", "Lines", "Polygons", "Strips")
@@ -22,31 +23,36 @@ STEP_CHUNK = 64
 STATIC_OFFSETS = {"PartOffsets": (), "CellOffsets": (len(CELL_KINDS),), "ConnectivityIdOffsets": (len(CELL_KINDS),)}
 
 
-def write_view(file: h5py.File, curves: Curves) -> None:
+def write_view(file: h5py.File, shapes: Shapes) -> None:
     """Makes /VTKHDF show all frames of /trajectory.
 
     Args:
         file: Open for writing.
-        curves: The rods of one frame, all worlds one after the other.
+        shapes: The rods and surfaces of one frame.
     """
     if "VTKHDF" not in file:
-        _write_topology(file.create_group("VTKHDF"), curves)
+        _write_topology(file.create_group("VTKHDF"), shapes)
     view, trajectory = file["VTKHDF"], file["trajectory"]
-    _write_steps(view, trajectory, int(curves.counts.sum()))
+    _write_steps(view, trajectory, shapes.worlds * shapes.point_count)
     _flatten(view, "Points", trajectory["points"])
     if "velocities" in trajectory:
         _flatten(view["PointData"], "velocity", trajectory["velocities"])
 
 
-def _write_topology(view: h5py.Group, curves: Curves) -> None:
+def _write_topology(view: h5py.Group, shapes: Shapes) -> None:
     """What does not change from step to step."""
     view.attrs["Version"] = np.array(VERSION)
     view.attrs.create("Type", np.bytes_("PolyData"))  # VTK reads fixed-length ASCII only
-    view["NumberOfPoints"] = [int(curves.counts.sum())]
-    connectivity, offsets = _polylines(curves)
+    view["NumberOfPoints"] = [shapes.worlds * shapes.point_count]
+    cells = {"Lines": _polylines(shapes)}
+    if shapes.surfaces is not None:
+        triangles = shapes.surfaces.triangles
+        cells["Polygons"] = (triangles.ravel(), 3 * np.arange(len(triangles) + 1))
     for kind in CELL_KINDS:
-        _write_cells(view.create_group(kind), *((connectivity, offsets) if kind == "Lines" else ([], [0])))
-    view.create_group("PointData")["radius"] = curves.radius
+        _write_cells(view.create_group(kind), *cells.get(kind, ([], [0])))
+    radius = np.zeros(shapes.worlds * shapes.point_count)  # points of surfaces have none
+    radius[shapes.rows] = shapes.curves.radius
+    view.create_group("PointData")["radius"] = radius
     steps = view.create_group("Steps")
     steps["Values"] = view.file["trajectory/time"]
     steps.create_group("PointDataOffsets")
@@ -59,11 +65,12 @@ def _write_cells(group: h5py.Group, connectivity, offsets) -> None:
     group["NumberOfCells"] = [len(offsets) - 1]
 
 
-def _polylines(curves: Curves) -> tuple[np.ndarray, np.ndarray]:
+def _polylines(shapes: Shapes) -> tuple[np.ndarray, np.ndarray]:
     """(connectivity, offsets) of one polyline a rod; a closed one returns to its first point."""
+    curves = shapes.curves
     ends = np.cumsum(curves.counts)
     starts = ends - curves.counts
-    connectivity = np.insert(np.arange(ends[-1]), ends[curves.closed], starts[curves.closed])
+    connectivity = np.insert(shapes.rows, ends[curves.closed], shapes.rows[starts[curves.closed]])
     return connectivity, np.concatenate([[0], np.cumsum(curves.counts + curves.closed)])
 
 

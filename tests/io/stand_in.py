@@ -6,7 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ddg_warp.io import Curves
+from ddg_warp import meshes
+from ddg_warp.io import Curves, Surfaces
+
+SAIL, BALL = meshes.rectangle(4, 2), meshes.sphere(0)
 
 
 def curves() -> Curves:
@@ -27,6 +30,22 @@ def rest_points() -> np.ndarray:
     angle = 2.0 * np.pi * np.arange(6) / 6
     rods = [np.stack([line, np.full(5, y), np.zeros(5)], axis=1) for y in (0.0, 0.5)]
     return np.concatenate([*rods, np.stack([np.cos(angle), np.sin(angle), np.ones(6)], axis=1)])
+
+
+def surfaces() -> Surfaces:
+    """A sail of 4 x 2 cells, held by the ring at its first vertex, and a ball; their other points follow those of the rods."""
+    (_, sail), (_, ball) = SAIL, BALL
+    return Surfaces(
+        triangles=np.concatenate([np.where(sail == 0, 15, 15 + sail), 30 + ball]),
+        first=np.array([0, len(sail)]),
+        names=np.array(["sail", "ball"], dtype=object),
+        thickness=np.repeat([1e-3, 2e-3], [len(sail), len(ball)]),
+    )
+
+
+def surface_points() -> np.ndarray:
+    """Positions of the points that only the surfaces have [m], shape (26, 3)."""
+    return np.concatenate([SAIL[0][1:] + [0.5, -1.0, 1.0], BALL[0] + [0.0, 0.0, 3.0]])
 
 
 @dataclass
@@ -54,6 +73,7 @@ class Model:
     """A model of `worlds` copies."""
 
     curves: Curves = field(default_factory=curves)
+    surfaces: Surfaces | None = None
     worlds: int = 1
     scene: object = None
 
@@ -62,6 +82,8 @@ class Model:
 
     def state(self) -> State:
         points = rest_points()
+        if self.surfaces is not None:
+            points = np.concatenate([points, surface_points()])
         return State(0.0, points if self.worlds == 1 else np.stack([points + k for k in range(self.worlds)]))
 
     def restore(self, snapshot: dict[str, np.ndarray]) -> State:

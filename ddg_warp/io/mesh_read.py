@@ -1,0 +1,125 @@
+"""Triangle meshes from OBJ and USD files.
+
+OBJ files know neither units nor which way is up: their numbers are taken as metres with z up. All objects and groups of an
+OBJ file are taken together; texture coordinates and normals are not read.
+Source: B1. Object Files, Advanced Visualizer manual, Wavefront Technologies (statements v, f, o, g; line continuation).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from ddg_warp.io import MeshError, existing
+
+USD_SUFFIXES = {".usd", ".usda", ".usdc", ".usdz"}
+
+
+def read_mesh(path, prim: str | None = None) -> tuple[np.ndarray, np.ndarray, str]:
+    """The mesh of an OBJ or USD file: (points (P, 3) [m], triangles (T, 3), name).
+
+    Polygons are cut into fans from their first corner, which suits convex ones. `Surface` checks what comes back.
+
+    Args:
+        path: A .obj, .usd, .usda, .usdc or .usdz file.
+        prim: For USD, path of the Mesh prim, or of one above it; needed where the file has several meshes.
+
+    Raises:
+        MeshError: the file cannot be read; names the file, the line or prim, and the remedy.
+    """
+    path = existing(path)
+    if path.suffix.lower() in USD_SUFFIXES:
+        from ddg_warp.io.usd_read import read_mesh_prim
+
+        return read_mesh_prim(path, prim)
+    if path.suffix.lower() == ".obj":
+        if prim is not None:
+            raise MeshError(f"{path}: prim = {prim!r}, but an OBJ file has no prims; leave it out")
+        return _read_obj(path)
+    raise MeshError(f"{path}: meshes are read from .obj, .usd, .usda, .usdc and .usdz files")
+
+
+def triangulated(
+    points: np.ndarray, counts: np.ndarray, indices: np.ndarray, where: str, lines: list[int] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """(triangles (T, 3), face of each triangle (T,)): every face as a fan from its first corner.
+
+    Args:
+        points: (P, 3), only to be checked.
+        counts: Corners of each face, shape (F,).
+        indices: Points of the corners, face after face.
+        where: What messages begin with.
+        lines: Line in which each face stands, for messages that name lines instead of faces.
+    """
+
+    def place(face: int) -> str:
+        return f"{where}: face {face}" if lines is None else f"{where}:{lines[face]}: the face"
+
+    if not len(counts):
+        raise MeshError(f"{where}: there is not a single face; export the mesh with its faces")
+    for face in np.flatnonzero(counts < 3)[:1]:
+        raise MeshError(f"{place(face)} has {counts[face]} corners; a face has at least 3, so delete it")
+    if counts.sum() != len(indices):
+        raise MeshError(
+            f"{where}: the faces have {counts.sum()} corners, but {len(indices)} are listed; export it again"
+        )
+    for corner in np.flatnonzero((indices < 0) | (indices >= len(points)))[:1]:
+        face = np.searchsorted(np.cumsum(counts), corner, side="right")
+        raise MeshError(
+            f"{place(face)} has a corner at a vertex that does not exist, there are {len(points)}; correct it"
+        )
+    for vertex in np.flatnonzero(~np.isfinite(points).all(axis=1))[:1]:
+        raise MeshError(f"{where}: vertex {vertex} is not finite; re-export it or delete it")
+    face = np.repeat(np.arange(len(counts)), counts - 2)
+    step = np.arange(len(face)) - np.repeat(np.cumsum(counts - 2) - (counts - 2), counts - 2)
+    first = (np.cumsum(counts) - counts)[face]
+    return indices[np.stack([first, first + step + 1, first + step + 2], axis=1)], face
+
+
+def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
+    points: list[list[float]] = []
+    indices: list[int] = []
+    counts, lines, name = [], [], ""
+    for number, (keyword, *words) in _statements(path):
+        try:
+            if keyword == "v":
+                x, y, z = map(float, words[:3])
+                points.append([x, y, z])
+            elif keyword == "f":
+                corners = [int(word.partition("/")[0]) for word in words]
+                if 0 in corners:
+                    raise MeshError(f"{path}:{number}: the face names vertex 0; an OBJ file counts from 1, correct it")
+                # what is negative counts back from the last vertex so far
+                indices += [k - 1 if k > 0 else max(len(points) + k, -1) for k in corners]
+                counts.append(len(corners))
+                lines.append(number)
+            elif keyword in {"o", "g"} and not name:
+                name = " ".join(words)
+        except MeshError:
+            raise
+        except ValueError:
+            wanted = "three numbers" if keyword == "v" else "vertices as v, v/vt, v//vn or v/vt/vn"
+            text = " ".join([keyword, *words])
+            raise MeshError(f"{path}:{number}: '{text}' cannot be read; write {wanted} after {keyword}") from None
+    vertices = np.array(points, dtype=np.float64).reshape(-1, 3)
+    triangles, _ = triangulated(vertices, np.array(counts, int), np.array(indices, int), str(path), lines)
+    return vertices, triangles, name or path.stem
+
+
+def _statements(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """(number of the first line, words) of every statement; comments are gone, lines that end with \\ are joined."""
+    pending: list[str] = []
+    start = 0
+    with open(path, encoding="utf-8-sig", errors="replace") as file:
+        for number, line in enumerate(file, start=1):
+            text = line.partition("#")[0].rstrip()
+            start = start if pending else number
+            continued = text.endswith("\\")
+            pending += text.removesuffix("\\").split()
+            if pending and not continued:
+                yield start, pending
+                pending = []
+    if pending:
+        yield start, pending

@@ -1,0 +1,182 @@
+"""USD prims with sampled points: rods as BasisCurves or as a Mesh of tubes, surfaces as a Mesh of triangles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom, Vt
+
+from ddg_warp.io import Curves, Surfaces
+from ddg_warp.io.colors import on_scale
+from ddg_warp.io.tube import SIDES, tube_faces, tube_points
+from ddg_warp.operators import vertex_normals
+
+
+@dataclass(frozen=True)
+class ColorBy:
+    """A scalar that decides the color, and its values at the two ends of the scale."""
+
+    name: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What prims write at one time; points (P, 3) [m], velocities (P, 3) [m/s] or None, scalars by name."""
+
+    points: np.ndarray
+    velocities: np.ndarray | None
+    at_points: Mapping[str, np.ndarray]
+    at_triangles: Mapping[str, np.ndarray]
+
+
+class PointsPrim:
+    """Some of the points of a frame as a prim.
+
+    Args:
+        prim: The prim, without samples.
+        rows: Rows of its points among those of a frame, shape (p,).
+        color: One RGB, or one for each point, shape (p, 3).
+        color_by: What the color is taken from where a frame has it.
+    """
+
+    def __init__(self, prim: UsdGeom.PointBased, rows: np.ndarray, color: np.ndarray, color_by: ColorBy | None):
+        self._prim, self._rows, self._color_by = prim, rows, color_by
+        self._primvars = UsdGeom.PrimvarsAPI(prim)
+        uniform = color.ndim == 1
+        kind = UsdGeom.Tokens.constant if uniform else UsdGeom.Tokens.vertex
+        self._color = self._primvars.CreatePrimvar("displayColor", Sdf.ValueTypeNames.Color3fArray, kind)
+        self._color.Set(_vectors([color] if uniform else self._at_vertices(color)))
+
+    def write(self, code: Usd.TimeCode, frame: Frame) -> None:
+        """Sets the samples of one frame."""
+        shown = _vectors(self._vertices(np.asarray(frame.points, dtype=np.float64)[self._rows]))
+        self._prim.GetPointsAttr().Set(shown, code)
+        self._prim.GetExtentAttr().Set(self._extent(shown), code)
+        if frame.velocities is not None:
+            velocities = self._at_vertices(np.asarray(frame.velocities)[self._rows])
+            self._prim.GetVelocitiesAttr().Set(_vectors(velocities), code)
+        for name, values in frame.at_points.items():
+            self._write_scalar(code, name, self._at_vertices(np.asarray(values)[self._rows]), UsdGeom.Tokens.vertex)
+
+    def _write_scalar(self, code: Usd.TimeCode, name: str, values: np.ndarray, kind: str) -> None:
+        self._primvars.CreatePrimvar(name, Sdf.ValueTypeNames.FloatArray, kind).Set(_floats(values), code)
+        if self._color_by is not None and name == self._color_by.name:
+            self._color.GetAttr().ClearDefault()  # the samples are at other places than the one color was
+            self._color.SetInterpolation(kind)
+            self._color.Set(_vectors(on_scale(values, self._color_by.low, self._color_by.high)), code)
+
+    def _vertices(self, points: np.ndarray) -> np.ndarray:
+        return points
+
+    def _at_vertices(self, values: np.ndarray) -> np.ndarray:
+        """Values at the points, as values at the vertices."""
+        return values
+
+    def _extent(self, vertices: Vt.Vec3fArray) -> Vt.Vec3fArray:
+        return UsdGeom.PointBased.ComputeExtent(vertices)
+
+
+class CurvesPrim(PointsPrim):
+    """Rods as one BasisCurves prim.
+
+    Args:
+        stage: Where to define it.
+        path: Path of the new prim.
+        curves: The rods, all closed or all open.
+        rows, color, color_by: See `PointsPrim`.
+    """
+
+    def __init__(self, stage: Usd.Stage, path: str, curves: Curves, rows, color, color_by):
+        self._curves = curves
+        super().__init__(self._define(stage, path), rows, color, color_by)
+        radius = _floats(self._at_vertices(curves.radius))
+        self._primvars.CreatePrimvar("radius", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex).Set(radius)
+
+    def _define(self, stage: Usd.Stage, path: str) -> UsdGeom.PointBased:
+        curves = UsdGeom.BasisCurves.Define(stage, path)
+        curves.CreateTypeAttr(UsdGeom.Tokens.linear)
+        curves.CreateWrapAttr(UsdGeom.Tokens.periodic if self._curves.closed[0] else UsdGeom.Tokens.nonperiodic)
+        curves.CreateCurveVertexCountsAttr(_ints(self._curves.counts))
+        widths = 2.0 * self._curves.radius
+        uniform = np.ptp(widths) == 0.0
+        self._widths = _floats(widths[:1] if uniform else widths)
+        curves.CreateWidthsAttr(self._widths)
+        curves.SetWidthsInterpolation(UsdGeom.Tokens.constant if uniform else UsdGeom.Tokens.vertex)
+        return curves
+
+    def _extent(self, vertices: Vt.Vec3fArray) -> Vt.Vec3fArray:
+        return UsdGeom.Curves.ComputeExtent(vertices, self._widths)
+
+
+class TubesPrim(CurvesPrim):
+    """Rods as one Mesh; a velocity is that of the centreline."""
+
+    def _define(self, stage: Usd.Stage, path: str) -> UsdGeom.PointBased:
+        sizes, indices = tube_faces(self._curves.counts, self._curves.closed)
+        return _define_mesh(stage, path, sizes, indices, double_sided=False)
+
+    def _vertices(self, points: np.ndarray) -> np.ndarray:
+        return tube_points(points, self._curves.counts, self._curves.closed, self._curves.radius)
+
+    def _at_vertices(self, values: np.ndarray) -> np.ndarray:
+        return np.repeat(values, SIDES, axis=0)
+
+    def _extent(self, vertices: Vt.Vec3fArray) -> Vt.Vec3fArray:
+        return UsdGeom.PointBased.ComputeExtent(vertices)
+
+
+class SurfacePrim(PointsPrim):
+    """One surface as a Mesh of triangles, seen from both sides, with a normal at each vertex.
+
+    Args:
+        stage: Where to define it.
+        path: Path of the new prim.
+        surfaces: All surfaces.
+        part: The triangles of this one.
+        color, color_by: See `PointsPrim`.
+    """
+
+    def __init__(self, stage: Usd.Stage, path: str, surfaces: Surfaces, part: slice, color, color_by):
+        rows, local = np.unique(surfaces.triangles[part], return_inverse=True)
+        self.triangles = local.reshape(-1, 3)  # what `vertex_normals` asks of a surface
+        self._part = part
+        mesh = _define_mesh(stage, path, np.full(len(self.triangles), 3), self.triangles.ravel(), double_sided=True)
+        super().__init__(mesh, rows, color, color_by)
+        mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+        thickness = surfaces.thickness[part]
+        uniform = np.ptp(thickness) == 0.0
+        kind = UsdGeom.Tokens.constant if uniform else UsdGeom.Tokens.uniform
+        primvar = self._primvars.CreatePrimvar("thickness", Sdf.ValueTypeNames.FloatArray, kind)
+        primvar.Set(_floats(thickness[:1] if uniform else thickness))
+
+    def write(self, code: Usd.TimeCode, frame: Frame) -> None:
+        super().write(code, frame)
+        points = np.asarray(frame.points, dtype=np.float64)[self._rows]
+        self._prim.GetNormalsAttr().Set(_vectors(vertex_normals(self, points)), code)
+        for name, values in frame.at_triangles.items():
+            self._write_scalar(code, name, np.asarray(values)[self._part], UsdGeom.Tokens.uniform)
+
+
+def _define_mesh(stage: Usd.Stage, path: str, sizes: np.ndarray, indices: np.ndarray, double_sided: bool):
+    mesh = UsdGeom.Mesh.Define(stage, path)
+    mesh.CreateFaceVertexCountsAttr(_ints(sizes))
+    mesh.CreateFaceVertexIndicesAttr(_ints(indices))
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    mesh.CreateDoubleSidedAttr(double_sided)
+    return mesh
+
+
+def _vectors(values) -> Vt.Vec3fArray:
+    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32))
+
+
+def _floats(values) -> Vt.FloatArray:
+    return Vt.FloatArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32))
+
+
+def _ints(values) -> Vt.IntArray:
+    return Vt.IntArray.FromNumpy(np.ascontiguousarray(values, dtype=np.int32))
