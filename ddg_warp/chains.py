@@ -115,13 +115,12 @@ def compile_chains(scene: Scene) -> tuple[list[ChainGroup], list[list[Held]]]:
     Raises:
         SceneError: the scene is no simulation; the message names the object and its index.
     """
-    if not scene.batches:
-        raise SceneError("the scene has no rods; add some with scene.add_rods(points, section=..., material=...)")
-    ghosts = np.zeros((scene.rod_count, 2), int)
-    for support in scene.supports:
-        if support.end:
-            ghosts[support.rods, 0 if support.end == "first" else 1] = 1
-    pieces = [piece for batch in scene.batches for piece in _pieces(scene, batch, ghosts)]
+    if not scene.batches and not scene.shells:
+        raise SceneError(
+            "the scene has no rods and no shells; add some with scene.add_rods(points, section=..., material=...)"
+        )
+    ghosts, joined = ghost_nodes(scene), net_rods(scene)
+    pieces = [piece for batch in scene.batches for piece in pieces_of(scene, batch, ghosts, ~joined)]
     pieces.sort(key=lambda piece: (repr(piece.kind), piece.x.shape[1]))
     groups: list[list[Piece]] = []
     for piece in pieces:
@@ -131,7 +130,7 @@ def compile_chains(scene: Scene) -> tuple[list[ChainGroup], list[list[Held]]]:
         else:
             groups.append([piece])
     chains = [_join(group) for group in groups]
-    place = np.zeros((scene.rod_count, 2), int)
+    place = np.full((scene.rod_count, 2), -1)  # rods of the net have none
     for g, chain in enumerate(chains):
         place[chain.rods] = np.column_stack([np.full(len(chain.rods), g), np.arange(len(chain.rods))])
     motions = scene_motions(scene)
@@ -140,19 +139,41 @@ def compile_chains(scene: Scene) -> tuple[list[ChainGroup], list[list[Held]]]:
     return chains, held
 
 
+def ghost_nodes(scene: Scene) -> np.ndarray:
+    """Ghost nodes of every rod at its first and last node (R, 2), 0 or 1."""
+    ghosts = np.zeros((scene.rod_count, 2), int)
+    for support in scene.supports:
+        if support.end:
+            ghosts[support.rods, 0 if support.end == "first" else 1] = 1
+    return ghosts
+
+
+def net_rods(scene: Scene) -> np.ndarray:
+    """Which rods belong to the scene's net: those that are joined or attached to something (R,) bool."""
+    chosen = np.zeros(scene.rod_count, bool)
+    for joint in scene.joints:
+        chosen[[rod for rod, _ in joint.members]] = True
+    for attachment in scene.attachments:
+        chosen[attachment.rod] = True
+    return chosen
+
+
 def scene_motions(scene: Scene) -> list:
     """The different motions of a scene's supports, in order of appearance."""
-    return list({id(s.motion): s.motion for s in scene.supports if s.motion is not None}.values())
+    supports = [*scene.supports, *scene.shell_supports]
+    return list({id(s.motion): s.motion for s in supports if s.motion is not None}.values())
 
 
-def _pieces(scene: Scene, batch: RodBatch, ghosts: np.ndarray) -> list[Piece]:
+def pieces_of(scene: Scene, batch: RodBatch, ghosts: np.ndarray, chosen: np.ndarray) -> list[Piece]:
+    """The chosen rods (R,) of a batch, those with the same ghosts together."""
     check_batch(batch, scene.dimension)
+    chosen = chosen[batch.first : batch.first + batch.rods]
     flags = ghosts[batch.first : batch.first + batch.rods]
     if batch.closed and flags.any():
         raise SceneError(f"rod {batch.first + int(np.argmax(flags.any(1)))} is closed: it has no end to clamp")
     result = []
-    for pattern in np.unique(flags, axis=0):
-        rows = np.flatnonzero((flags == pattern).all(1))
+    for pattern in np.unique(flags[chosen], axis=0):
+        rows = np.flatnonzero((flags == pattern).all(1) & chosen)
         result.append(_piece(scene.dimension, batch, rows, (int(pattern[0]), int(pattern[1]))))
     return result
 
@@ -366,7 +387,7 @@ def _join_parameter(values: list[np.ndarray], pieces: list[Piece], n: int, total
     return _compress(out.T).T
 
 
-def _bits(components: str, dim: int) -> int:
+def component_bits(components: str, dim: int) -> int:
     axes = "xz" if dim == 2 else "xyz"
     unknown = set(components) - set("xyz")
     if unknown:
@@ -389,7 +410,7 @@ def _hold(chains: list[ChainGroup], place: np.ndarray, support: Support, motions
             edges += [(chain, np.minimum(k, ghost), columns)]
     held = []
     for chain, k, columns in nodes:
-        bits = _bits(support.components, chain.kind.dim)
+        bits = component_bits(support.components, chain.kind.dim)
         chain.fixed[k, columns] |= np.uint8(bits)
         chain.moving_nodes += moving(k, columns)
         held.append(Held(chains.index(chain), k, columns, bits))
@@ -420,7 +441,7 @@ def _apply_loads(scene: Scene, chains: list[ChainGroup], place: np.ndarray) -> N
 
 def _places(chains, place, rods, index, what):
     """Where node or edge `index` of rods lies: (chain, nodes, columns) of each group."""
-    for g in np.unique(place[rods, 0]):
+    for g in np.unique(place[rods, 0][place[rods, 0] >= 0]):
         chain = chains[g]
         columns = place[rods, 1][place[rods, 0] == g]
         own = chain.own[columns] - (1 if what == "edge" and not chain.kind.closed else 0)

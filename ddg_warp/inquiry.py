@@ -54,7 +54,7 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     for support in model.held:
         total, moment, about = np.zeros(3), np.zeros(3), None if point is None else np.asarray(point, float)
         for held in support:
-            part = tangent.groups[held.group]
+            part = tangent.parts[held.group]
             kind = part.group.kind
             axes = [0, 2] if kind.dim == 2 else [0, 1, 2]
             x = q[part.offset : part.offset + part.size].reshape(part.group.columns, part.group.nodes, kind.block)

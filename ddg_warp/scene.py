@@ -9,6 +9,7 @@ from ddg_warp import validate
 from ddg_warp.errors import SceneError
 from ddg_warp.material import Material, Stiffness
 from ddg_warp.motion import Motion
+from ddg_warp.structures import Structures
 
 
 @dataclass(frozen=True)
@@ -80,8 +81,8 @@ class Load:
 
 
 @dataclass
-class Scene:
-    """Rods with supports and loads, ready to be built for a device.
+class Scene(Structures):
+    """Rods and shells with supports and loads, ready to be built for a device.
 
     Args:
         gravity: acceleration (3,) [m/s^2].

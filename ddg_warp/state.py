@@ -32,27 +32,32 @@ class GroupState:
 
 
 class State:
-    """Positions, velocities, frames and time of a model's rods. A step returns another state and does not change this one.
+    """Positions, velocities, frames and time of a model's rods and shells. A step returns another state and does not change this one.
 
     The integrator writes into two states in turn: a state stays valid until the step after the next; `copy()` keeps it.
     """
 
-    def __init__(self, model, groups: list[GroupState], time: float = 0.0):
+    def __init__(self, model, groups: list[GroupState], net=None, time: float = 0.0):
         self.model = model
         self.groups = groups
+        self.net = net
         self.time = time
 
+    def parts(self) -> dict:
+        """State of every group of rods, and of the net if there is one, by name."""
+        return {str(i): group for i, group in enumerate(self.groups)} | ({"net": self.net} if self.net else {})
+
     def points(self) -> np.ndarray:
-        """Positions of nodes in the order of `model.curves` (P, 3) [m]; (worlds, P, 3) if there are several."""
-        return self.model.gather_nodes([arrays.download(group.x) for group in self.groups])
+        """Positions (P, 3) [m], or (worlds, P, 3): nodes in the order of `model.curves`, then vertices shell by shell."""
+        return self.model.gather_nodes([arrays.download(group.x) for group in self.groups], self.net and self.net.q)
 
     def velocities(self) -> np.ndarray:
         """Velocities of nodes, ordered as `points` [m/s]."""
-        return self.model.gather_nodes([arrays.download(group.v) for group in self.groups])
+        return self.model.gather_nodes([arrays.download(group.v) for group in self.groups], self.net and self.net.v)
 
     def angles(self) -> np.ndarray | None:
         """Angles theta of edges [rad] (edges,) or (worlds, edges); None if no rod has twist."""
-        return self.model.gather_edges([arrays.download(group.theta) for group in self.groups])
+        return self.model.gather_angles(self)
 
     def directors(self) -> np.ndarray | None:
         """First material director of every edge (edges, 3) or (worlds, edges, 3); None if no rod has twist."""
@@ -66,14 +71,14 @@ class State:
 
     def assign(self, other: "State") -> None:
         """Take over everything of another state of the same model."""
-        for mine, theirs in zip(self.groups, other.groups, strict=True):
-            for name, array in mine.arrays().items():
-                wp.copy(array, getattr(theirs, name))
+        for mine, theirs in zip(self.parts().values(), other.parts().values(), strict=True):
+            for array, source in zip(mine.arrays().values(), theirs.arrays().values(), strict=True):
+                wp.copy(array, source)
         self.time = other.time
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Everything a bitwise restart needs."""
         data = {"time": np.float64(self.time)}
-        for i, group in enumerate(self.groups):
-            data |= {f"{i}/{name}": arrays.download(array) for name, array in group.arrays().items()}
+        for part, values in self.parts().items():
+            data |= {f"{part}/{name}": arrays.download(array) for name, array in values.arrays().items()}
         return data

@@ -8,11 +8,9 @@ mode "follow" takes it as it is, with the residual as merit, to follow equilibri
 from dataclasses import dataclass
 
 import numpy as np
-import warp as wp
 from scipy import sparse
 
 from ddg_warp.errors import SceneError, SolverError, check_options
-from ddg_warp.integrate.prescribed import PrescribedMotion
 from ddg_warp.linear.direct import Factorisation, SingularError
 from ddg_warp.state import State
 from ddg_warp.tangent import Tangent
@@ -108,7 +106,7 @@ class Equilibrium:
         """The equilibrium at load parameter `at`, from a state that belongs to `before`."""
         tangent, options = self.tangent, self.options
         state = state.copy()
-        _move_supports(self.model, state, before, at)
+        tangent.move_supports(state, before, at)
         free = tangent.free
         energies, q = tangent.element_energies(state), tangent.dofs(state)
         outer = tangent.loads(at, q)
@@ -133,7 +131,7 @@ class Equilibrium:
             polished = excess <= 0.0  # the floor is a bound: one more iteration gives what rounding allows
             self.iterations += 1
             direction, decrease = self._direction(hessian, residual)
-            shortened = min(1.0, options.rotation_cap / max(1e-300, self._rotation(q, direction)))
+            shortened = min(1.0, options.rotation_cap / max(1e-300, tangent.rotation(q, direction)))
             direction, decrease = shortened * direction, shortened * decrease
             taken, found = 1.0, False
             merit = np.linalg.norm(self._scaled(residual)[free])
@@ -178,19 +176,6 @@ class Equilibrium:
         """Moments over an edge length, so that they compare with forces."""
         return np.where(self.tangent.angle, residual / self.tangent.edge_length(), residual)
 
-    def _rotation(self, q: np.ndarray, direction: np.ndarray) -> float:
-        """Largest turn of an edge, or change of an angle, that a full step would make."""
-        worst = np.abs(direction[self.tangent.angle]).max(initial=0.0)
-        for part in self.tangent.groups:
-            span = slice(part.offset, part.offset + part.size)
-            kind = part.group.kind
-            edges = (part.incidence @ q[span]).reshape(-1, kind.window)[:, : kind.dim]
-            turns = (part.incidence @ direction[span]).reshape(-1, kind.window)[:, : kind.dim]
-            length = np.linalg.norm(edges, axis=1)
-            real = length > 0.0
-            worst = max(worst, (np.linalg.norm(turns[real], axis=1) / length[real]).max(initial=0.0))
-        return worst
-
     def _direction(self, hessian, residual: np.ndarray) -> tuple[np.ndarray, float]:
         """Newton direction on the free dofs and the decrease of energy it promises."""
         free = np.flatnonzero(self.tangent.free)
@@ -227,17 +212,10 @@ class Equilibrium:
     def _where(self, outcome: str, residual: np.ndarray, at: float) -> str:
         masked = np.where(self.tangent.free, np.abs(self._scaled(residual)), -1.0)
         worst = int(np.argmax(np.where(np.isfinite(masked), masked, np.inf)))
-        for part in self.tangent.groups:
-            if part.offset <= worst < part.offset + part.size:
-                group = part.group
-                column, k = divmod((worst - part.offset) // group.kind.block, group.nodes)
-                rod = int(group.host.rods[column % group.rods])
-                node = k - int(group.host.first[column % group.rods])
-                return (
-                    f"no equilibrium at load parameter {at:g}: {outcome}, largest residual {residual[worst]:.3g} at node {node} "
-                    f"of rod {rod}; take more load steps, or hold what can still move freely"
-                )
-        return outcome
+        return (
+            f"no equilibrium at load parameter {at:g}: {outcome}, largest residual {residual[worst]:.3g} at "
+            f"{self.tangent.where(worst)}; take more load steps, or hold what can still move freely"
+        )
 
 
 def _require_supports(model) -> None:
@@ -252,16 +230,3 @@ def _require_supports(model) -> None:
                     f"rod {host.rods[loose[0]]} is not held along {axis}: a static solve needs supports; "
                     "add scene.clamp(...) or scene.fix(...)"
                 )
-
-
-def _move_supports(model, state: State, before: float, at: float) -> None:
-    """Put held dofs where their motions have them."""
-    if not model.motions:
-        return
-    for group, data in zip(model.groups, state.groups, strict=True):
-        if group.moving is not None:
-            motion = PrescribedMotion(model, group)
-            motion.upload(before, at)
-            whole = wp.full(group.columns, 1.0, dtype=model.types.real, device=model.wp_device)
-            motion.apply(group.still, whole, data.x, data.frame, data.theta)
-    model.carry_frames(state)

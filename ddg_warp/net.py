@@ -1,0 +1,524 @@
+"""From a scene to its net: shells, joined rods and what they share, as blocks of three dofs and element sets.
+
+Nodes of joined rods and attached vertices become one. Blocks are numbered nodes first, then angles (of rod edges, then of mesh
+edges), then rotations of rigid joints. In a scene of dimension 2 the net is the planar one of three-dimensional elements.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ddg_warp import shells as shell_terms
+from ddg_warp.chains import Piece, TimedLoad, component_bits, ghost_nodes, net_rods, pieces_of, scene_motions
+from ddg_warp.elements import ElementSet
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels.terms import JOINT
+from ddg_warp.surface import Surface
+from ddg_warp.validate import check_index
+
+COINCIDE = 1e-6  # how far joined nodes may lie apart, in lengths of their shortest edge
+
+
+@dataclass
+class NetRod:
+    """A rod of the net: blocks of its own nodes, angles of its own edges (indices of blocks; empty without twist)."""
+
+    rod: int
+    nodes: np.ndarray
+    edges: np.ndarray
+    first: int  # ghosts before its first node
+    piece: Piece
+    row: int  # of the piece
+    all_nodes: np.ndarray  # with ghosts
+    all_edges: np.ndarray
+
+
+@dataclass
+class NetShell:
+    """A shell of the net: blocks of its vertices, block of the angle of each mesh edge (-1 without)."""
+
+    surface: Surface
+    nodes: np.ndarray
+    edges: np.ndarray
+    kinds: shell_terms.EdgeKinds
+    plate: shell_terms.Plate
+
+
+@dataclass
+class NetSet:
+    """Elements of one term on blocks: slots (n, E), own lagged rows (m, E), data (d, E), parameters as of `ElementSet`."""
+
+    term: object
+    slots: np.ndarray
+    lag: np.ndarray
+    data: np.ndarray
+    parameters: list[np.ndarray]
+
+    def __len__(self) -> int:
+        return self.slots.shape[1]
+
+
+@dataclass(frozen=True)
+class NetHeld:
+    """Dofs that a support holds: (block, component) pairs, and whether they are positions."""
+
+    blocks: np.ndarray
+    components: np.ndarray
+
+
+@dataclass
+class NetLoad:
+    """A load that changes: forces (B, 3) [N] (or a moment in component 0 of an angle's block) on blocks."""
+
+    blocks: np.ndarray
+    force: np.ndarray
+    amplitude: object
+
+    at = TimedLoad.at
+
+
+@dataclass
+class NetPressure:
+    """Pressure [Pa] on triangles of nodes (T, 3) that follows them; amplitude or None."""
+
+    triangles: np.ndarray
+    pressure: np.ndarray
+    amplitude: object
+
+    at = TimedLoad.at
+
+
+@dataclass(eq=False)
+class Net:
+    """A scene's net on the host: N blocks of three dofs.
+
+    Attributes:
+        rest: blocks at rest (N, 3): positions, then zeros.
+        nodes, angles, spins: how many blocks of each kind; rod_edges: how many of the angles belong to rods.
+        rods, shells: what the net was made from.
+        sets: elements by term.
+        ends: nodes of every rod edge (rod_edges, 2); frame: director and tangent of it (6, rod_edges).
+        mass: of every dof (N, 3) [kg, kg m^2]; fixed: held dofs (N, 3).
+        load: dead forces (N, 3); timed, pressures: loads that change.
+        held: what each support of `scene.supports`, then of `scene.shell_supports`, holds here.
+        moving: (block, motion) of nodes with a motion, with rest positions; turning: (angle block, motion, sign) of rod edges.
+    """
+
+    rest: np.ndarray
+    nodes: int
+    angles: int
+    spins: int
+    rods: list[NetRod]
+    shells: list[NetShell]
+    sets: list[NetSet]
+    ends: np.ndarray
+    frame: np.ndarray
+    mass: np.ndarray
+    fixed: np.ndarray
+    load: np.ndarray
+    timed: list[NetLoad] = field(default_factory=list)
+    pressures: list[NetPressure] = field(default_factory=list)
+    held: list[NetHeld] = field(default_factory=list)
+    moving: list[tuple[np.ndarray, int]] = field(default_factory=list)
+    turning: list[tuple[np.ndarray, int]] = field(default_factory=list)
+
+    @property
+    def blocks(self) -> int:
+        """Number of blocks."""
+        return len(self.rest)
+
+    @property
+    def rod_edges(self) -> int:
+        """Angles that belong to rod edges; they come first."""
+        return len(self.ends)
+
+
+def compile_net(scene) -> Net | None:
+    """The net of a scene, None if it has none.
+
+    Raises:
+        SceneError: something cannot be joined, held or loaded as described; the message names it.
+    """
+    chosen = net_rods(scene)
+    if not chosen.any() and not scene.shells:
+        return None
+    if scene.shells and scene.dimension == 2:
+        raise SceneError("a scene with shells has dimension 3; leave dimension=2 to rods")
+    builder, ghosts, spatial = _Builder(scene), ghost_nodes(scene), spatial_scene(scene)
+    for batch in scene.batches:
+        if chosen[batch.first : batch.first + batch.rods].any():
+            if scene.dimension == 2:
+                batch = _spatial(batch)
+            for piece in pieces_of(spatial, batch, ghosts, chosen):
+                for row, rod in enumerate(piece.rods):
+                    builder.add_rod(piece, row, int(rod))
+    for index, shell in enumerate(scene.shells):
+        builder.add_shell(index, shell)
+    return builder.finish()
+
+
+def spatial_scene(scene):
+    """The scene as one of dimension 3, for what is compiled as in space."""
+    return replace(scene, dimension=3) if scene.dimension == 2 else scene
+
+
+def _spatial(batch):
+    """A planar batch as rods in space with twist, which the net holds in the plane."""
+    section = batch.section
+    natural = batch.natural
+    if not isinstance(natural, str):
+        zero = np.zeros(1)
+        natural = (zero, np.asarray(natural[0]), zero)
+    points = batch.points * [1.0, 0.0, 1.0]
+    section = replace(section, EI2=section.EI1, GJ=section.EI1)
+    return replace(
+        batch, points=points, section=section, twist=batch.bend, natural=natural, director=np.array([0.0, 1.0, 0.0])
+    )
+
+
+class _Builder:
+    """Collects raw nodes and elements, then merges what is shared."""
+
+    def __init__(self, scene):
+        self.scene = scene
+        self.points: list[np.ndarray] = []
+        self.count = 0
+        self.rods: dict[int, NetRod] = {}
+        self.shells: list[tuple] = []
+        self.rod_edges = 0
+        self.frames: list[np.ndarray] = []
+        self.ends: list[np.ndarray] = []
+
+    def add_rod(self, piece: Piece, row: int, rod: int) -> None:
+        """Number a rod's nodes and angles."""
+        x = piece.x[row]
+        nodes = self._number(x)
+        closed = piece.kind.closed
+        edges = len(x) - (0 if closed else 1)
+        angles = np.zeros(0, int)
+        if piece.kind.twist:
+            angles = self.rod_edges + np.arange(edges)
+            self.rod_edges += edges
+            self.frames.append(np.concatenate([piece.director[row].T, piece.tangent[row].T]))
+            self.ends.append(np.column_stack([nodes[:edges], np.roll(nodes, -1)[:edges]]))
+        before, after = piece.ghosts
+        own = slice(before, len(x) - after)
+        own_edges = angles[before : edges - after] if angles.size else angles
+        self.rods[rod] = NetRod(rod, nodes[own], own_edges, before, piece, row, nodes, angles)
+
+    def add_shell(self, index: int, shell) -> None:
+        """Number a shell's vertices."""
+        surface = Surface(shell.points, shell.triangles)
+        self.shells.append((surface, self._number(shell.points)))
+
+    def _number(self, points: np.ndarray) -> np.ndarray:
+        self.points.append(points)
+        self.count += len(points)
+        return np.arange(self.count - len(points), self.count)
+
+    def finish(self) -> Net:
+        """Everything joined and numbered for good."""
+        scene, points = self.scene, np.concatenate(self.points)
+        merged = self._merge(points)
+        rest_nodes = np.zeros((merged.max() + 1, 3))
+        rest_nodes[merged[::-1]] = points[::-1]  # the first of the merged nodes says where
+        for rod in self.rods.values():
+            rod.nodes, rod.all_nodes = merged[rod.nodes], merged[rod.all_nodes]
+        nodes = len(rest_nodes)
+        ends = merged[np.concatenate(self.ends)] if self.ends else np.zeros((0, 2), int)
+        shells, mesh_edges = [], 0
+        for (surface, numbers), shell in zip(self.shells, scene.shells, strict=True):
+            kinds = self._kinds(surface, len(shells))
+            turning = shell.bending == "midedge_dof"
+            first = nodes + self.rod_edges + mesh_edges
+            angle = first + np.arange(len(surface.edges)) if turning else np.full(len(surface.edges), -1)
+            mesh_edges += len(surface.edges) if turning else 0
+            material = shell.material
+            plate = shell_terms.plate(
+                surface,
+                shell.points,
+                shell.thickness,
+                material.young,
+                material.poisson,
+                kinds,
+                rest=shell.rest,
+                viscosity=material.viscosity if material.viscosity > 0.0 else None,
+            )
+            shells.append(NetShell(surface, merged[numbers], angle, kinds, plate))
+        angles = self.rod_edges + mesh_edges
+        rigid = [joint for joint in scene.joints if joint.rigid]
+        rods = sorted(self.rods.values(), key=lambda rod: rod.rod)
+        for rod in rods:
+            rod.edges, rod.all_edges = rod.edges + nodes, rod.all_edges + nodes
+        blocks = nodes + angles + len(rigid)
+        net = Net(
+            rest=np.concatenate([rest_nodes, np.zeros((blocks - nodes, 3))]),
+            nodes=nodes,
+            angles=angles,
+            spins=len(rigid),
+            rods=rods,
+            shells=shells,
+            sets=[],
+            ends=ends,
+            frame=np.concatenate(self.frames, axis=1) if self.frames else np.zeros((6, 0)),
+            mass=np.zeros((blocks, 3)),
+            fixed=np.zeros((blocks, 3), bool),
+            load=np.zeros((blocks, 3)),
+        )
+        net.fixed[nodes : nodes + angles, 1:] = True
+        joints = _joint_places(scene, net, rigid)
+        net.sets = _gather_sets([*_rod_sets(net, joints), *_joint_sets(net, joints), *_shell_sets(net, scene)])
+        _add_masses(scene, net)
+        _hold(scene, net)
+        _load(scene, net)
+        if scene.dimension == 2:
+            net.fixed[:nodes, 1] = True
+            net.fixed[nodes : nodes + angles] = True
+            net.fixed[nodes + angles :, [0, 2]] = True
+        return net
+
+    def _merge(self, points: np.ndarray) -> np.ndarray:
+        """New number of every node; joined ones share theirs."""
+        root = np.arange(len(points))
+
+        def find(i):
+            while root[i] != i:
+                i = root[i]
+            return i
+
+        def unite(i, j, what):
+            gap = np.linalg.norm(points[i] - points[j])
+            if gap > COINCIDE * max(1e-300, np.abs(points[[i, j]]).max()):
+                raise SceneError(f"{what} lie {gap:.3g} m apart at rest; what is joined starts at one point")
+            a, b = find(i), find(j)
+            root[max(a, b)] = min(a, b)
+
+        for number, joint in enumerate(self.scene.joints):
+            places = []
+            for rod, node in joint.members:
+                nodes = self.rods[rod].nodes
+                check_index("node", node, np.array([len(nodes)]), np.array([rod]))
+                places.append(nodes[node])
+            for place in places[1:]:
+                unite(places[0], place, f"joint {number}: its members")
+        for link in self.scene.attachments:
+            nodes, vertices = self.rods[link.rod].nodes, self.shells[link.shell][1]
+            for node, vertex in zip(link.nodes, link.vertices, strict=True):
+                check_index("node", int(node), np.array([len(nodes)]), np.array([link.rod]))
+                unite(nodes[node], vertices[vertex], f"node {node} of rod {link.rod} and vertex {vertex}")
+        flat = np.array([find(i) for i in range(len(points))]) if self.scene.joints or self.scene.attachments else root
+        return np.unique(flat, return_inverse=True)[1]
+
+    def _kinds(self, surface: Surface, index: int) -> shell_terms.EdgeKinds:
+        """What holds the normals at mesh edges: those whose two vertices a support names."""
+        clamped, symmetry = {}, {}
+        corners = surface.points[surface.triangles]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        for support in self.scene.shell_supports:
+            if support.shell != index or not support.edges:
+                continue
+            inside = np.isin(surface.edges, support.vertices).all(1)
+            if support.edges == "symmetry":
+                for edge in np.flatnonzero(inside & surface.boundary):
+                    symmetry[int(edge)] = support.normal
+            else:
+                for edge in np.flatnonzero(inside):
+                    sides = surface.edge_triangles[edge]
+                    total = normals[sides[sides >= 0]].sum(0)
+                    clamped[int(edge)] = total / np.linalg.norm(total)
+        for edge in set(clamped) & set(symmetry):
+            del symmetry[edge]
+        return shell_terms.edge_kinds(surface, clamped, symmetry)
+
+
+def _joint_places(scene, net: Net, rigid) -> list[tuple[int, int, list]]:
+    """Of each rigid joint: node, block of its rotation, and its edges as (rod, edge with ghosts, sign)."""
+    by_rod = {rod.rod: rod for rod in net.rods}
+    result = []
+    for number, joint in enumerate(rigid):
+        members, node = [], -1
+        for index, at in joint.members:
+            rod = by_rod[index]
+            if not rod.edges.size:
+                raise SceneError(f"rigid joint {number}: rod {index} has no twist; join it with rigid=False")
+            k = rod.first + (at if at >= 0 else len(rod.nodes) + at)
+            node = rod.all_nodes[k]
+            count, closed = len(rod.all_nodes), rod.piece.kind.closed
+            if closed or k < count - 1:
+                members.append((rod, k, 1.0))
+            if closed or k > 0:
+                members.append((rod, (k - 1) % count, -1.0))
+        result.append((node, net.nodes + net.angles + number, members))
+    return result
+
+
+def _rod_sets(net: Net, joints) -> list[NetSet]:
+    """Stretch and bending of the rods; vertices at rigid joints are left to these."""
+    skipped = {(member.rod, node) for node, _, members in joints for member, _, _ in members}
+    sets = []
+    for rod in net.rods:
+        piece, row = rod.piece, rod.row
+        kind, nodes, n = piece.kind, rod.all_nodes, len(rod.all_nodes)
+        at = 0
+        for term in kind.terms:
+            span, size = term.measure.span, len(term.parameter_names)
+            count = n if kind.closed else n - span
+            k = np.arange(count)
+            values = [_row(p, row, count) for p in piece.parameters[at : at + size]]
+            at += size
+            if span == 2:
+                keep = np.array([(rod.rod, nodes[(i + 1) % n]) not in skipped for i in k], bool)
+                k, values = k[keep], [value[keep] for value in values]
+            slots = [nodes[(k + i) % n] for i in range(span + 1)]
+            lag = np.zeros((0, len(k)))
+            if term.measure.angles:
+                slots += [rod.all_edges[k], rod.all_edges[(k + 1) % n]]
+                lag = piece.reference_twist[row][k][None]
+            sets.append(NetSet(term, np.array(slots), lag, np.zeros((0, len(k))), values))
+    return sets
+
+
+def _row(values: np.ndarray, row: int, count: int) -> np.ndarray:
+    values = values[row if len(values) > 1 else 0]
+    return np.broadcast_to(values if len(values) == 1 else values[:count], (count,))
+
+
+def _joint_sets(net: Net, joints) -> list[NetSet]:
+    """Bending and twist of the half cells between rigid joints and the edges that meet them."""
+    sets = []
+    for node, spin, members in joints:
+        for rod, k, sign in members:
+            piece, row = rod.piece, rod.row
+            n = len(rod.all_nodes)
+            other = rod.all_nodes[(k + 1) % n if sign > 0 else k]
+            edge = net.rest[other] - net.rest[node]
+            length = np.linalg.norm(edge)
+            frame = net.frame[:, rod.all_edges[k] - net.nodes]
+            section = piece.batch.section
+            stiffness = [_edge_value(value, piece, row, k) for value in (section.EI1, section.EI2, section.GJ)]
+            lag = np.concatenate([frame[:3], edge / length, [0.0]])[:, None]
+            parameters = [np.array([0.5 * length])] + [np.array([v]) for v in (*stiffness, 0.0, 0.0, 0.0)]
+            slots = np.array([[node], [other], [rod.all_edges[k]], [spin]])
+            sets.append(NetSet(JOINT, slots, lag, np.array([[sign]]), parameters))
+    return sets
+
+
+def _edge_value(value, piece: Piece, row: int, edge: int) -> float:
+    """A stiffness of the section on an edge with ghosts."""
+    batch, (before, _) = piece.batch, piece.ghosts
+    full = np.broadcast_to(np.asarray(value, float), (batch.rods, batch.edges))
+    return float(full[piece.rods[row] - batch.first, np.clip(edge - before, 0, batch.edges - 1)])
+
+
+def _shell_sets(net: Net, scene) -> list[NetSet]:
+    sets = []
+    for shell, description in zip(net.shells, scene.shells, strict=True):
+        for elements in shell_terms.shell_elements(shell.surface, shell.plate, shell.kinds, description.bending):
+            sets.append(_bound(elements, shell))
+        if description.bending == "midedge_dof":
+            net.fixed[shell.edges[~shell.kinds.turning], 0] = True
+    return sets
+
+
+def _bound(elements: ElementSet, shell: NetShell) -> NetSet:
+    count = len(elements.nodes)
+    slots = np.concatenate([shell.nodes[elements.nodes], shell.edges[elements.angles]], axis=1).T
+    parameters = [np.broadcast_to(np.asarray(p, float), (count,)) for p in elements.parameters]
+    return NetSet(elements.term, slots, np.zeros((0, count)), elements.data.T, parameters)
+
+
+def _gather_sets(sets: list[NetSet]) -> list[NetSet]:
+    """One set a term."""
+    result = []
+    for name in dict.fromkeys(s.term.name for s in sets if len(s)):
+        same = [s for s in sets if s.term.name == name and len(s)]
+        join = [np.concatenate([getattr(s, what) for s in same], axis=1) for what in ("slots", "lag", "data")]
+        parameters = [np.concatenate(values) for values in zip(*(s.parameters for s in same), strict=True)]
+        result.append(NetSet(same[0].term, *join, parameters))
+    return result
+
+
+def _add_masses(scene, net: Net) -> None:
+    for rod in net.rods:
+        np.add.at(net.mass, rod.all_nodes, rod.piece.mass[rod.row][:, None])
+        if rod.all_edges.size:
+            net.mass[rod.all_edges, 0] += np.broadcast_to(rod.piece.rotary[rod.row], rod.all_edges.shape)
+    for shell, description in zip(net.shells, scene.shells, strict=True):
+        weight = shell.plate.area * shell.plate.thickness * description.material.density / 3.0
+        np.add.at(net.mass, shell.nodes[shell.surface.triangles], np.repeat(weight[:, None, None], 3, 1))
+    members = {rod.rod: rod for rod in net.rods}
+    for rods, node, mass in scene.masses:
+        for rod in rods:
+            if rod in members:
+                net.mass[members[rod].nodes[node]] += mass
+
+
+def _hold(scene, net: Net) -> None:
+    """Mark held dofs; remember what each support holds and what moves."""
+    members = {rod.rod: rod for rod in net.rods}
+    motions = scene_motions(scene)
+    for support in scene.supports:
+        bits = component_bits(support.components, 3)
+        nodes, edges = [], []
+        for index in support.rods:
+            rod = members.get(int(index))
+            if rod is None:
+                continue
+            for node in support.nodes:
+                check_index("node", node, np.array([len(rod.nodes)]), np.array([rod.rod]))
+                nodes.append(rod.nodes[node])
+            for edge in support.edges:
+                if rod.edges.size:
+                    edges.append(rod.edges[edge])
+            if support.end:
+                last = support.end == "last"
+                nodes += [rod.all_nodes[-1 if last else 0], rod.nodes[-1 if last else 0]]
+                edges += [rod.all_edges[-1 if last else 0]] if rod.all_edges.size else []
+        _mark(net, np.array(nodes, int), bits, np.array(edges, int), support.motion, motions)
+    for support in scene.shell_supports:
+        nodes = net.shells[support.shell].nodes[support.vertices]
+        _mark(net, nodes, component_bits(support.components, 3), np.zeros(0, int), support.motion, motions)
+
+
+def _mark(net: Net, nodes, bits: int, edges, motion, motions) -> None:
+    components = np.array([d for d in range(3) if (bits >> d) & 1])
+    pairs = np.array([(n, d) for n in nodes for d in components] + [(e, 0) for e in edges], int).reshape(-1, 2)
+    net.fixed[pairs[:, 0], pairs[:, 1]] = True
+    net.held.append(NetHeld(pairs[:, 0], pairs[:, 1]))
+    if motion is not None:
+        index = next(i for i, m in enumerate(motions) if m is motion)
+        net.moving.append((nodes, index))
+        if len(edges):
+            net.turning.append((edges, index))
+
+
+def _load(scene, net: Net) -> None:
+    members = {rod.rod: rod for rod in net.rods}
+    for load in scene.loads:
+        for index in load.rods:
+            rod = members.get(int(index))
+            if rod is None:
+                continue
+            if np.any(load.couple):
+                raise SceneError(f"add_couple: rod {index} is part of a net; give a pair of forces or a twisting moment")
+            place = rod.nodes[load.node] if load.edge is None else rod.edges[load.edge]
+            force = np.asarray(load.force, float) if load.edge is None else np.array([load.moment, 0.0, 0.0])
+            _put(net, np.array([place]), force[None], load.amplitude)
+    for load in scene.shell_loads:
+        _put(net, net.shells[load.shell].nodes[load.vertices], load.force, load.amplitude)
+    for pressure in scene.pressures:
+        shell = net.shells[pressure.shell]
+        triangles = shell.nodes[shell.surface.triangles[pressure.triangles]]
+        if pressure.dead:
+            x = net.rest[triangles]
+            area = np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]) / 6.0 * pressure.pressure[:, None]
+            _put(net, triangles.ravel(), np.repeat(area, 3, axis=0), pressure.amplitude)
+        else:
+            net.pressures.append(NetPressure(triangles, pressure.pressure, pressure.amplitude))
+
+
+def _put(net: Net, blocks: np.ndarray, force: np.ndarray, amplitude) -> None:
+    if amplitude is None:
+        np.add.at(net.load, blocks, force)
+    else:
+        net.timed.append(NetLoad(blocks, force, amplitude))

@@ -1,0 +1,194 @@
+"""A net on a device: constant arrays, its states, and what can be launched on them."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import warp as wp
+
+from ddg_warp.kernels.net import elements, frames
+from ddg_warp.net import Net
+
+
+@dataclass
+class NetState:
+    """Device arrays of a net with N blocks, W worlds.
+
+    Attributes:
+        q, v: blocks (W N,) of positions [m], angles and rotation vectors since the last step [rad], and their rates.
+        frame: director and tangent of rod edges (6, W edges).
+        lag: own lagged rows of each element set (rows, W E); last: strains of each damped set at this state.
+    """
+
+    q: wp.array
+    v: wp.array
+    frame: wp.array
+    lag: list[wp.array] = field(default_factory=list)
+    last: list[wp.array] = field(default_factory=list)
+
+    def arrays(self) -> dict[str, wp.array]:
+        """All arrays by name."""
+        named = {"q": self.q, "v": self.v, "frame": self.frame}
+        for i, (lag, last) in enumerate(zip(self.lag, self.last, strict=True)):
+            named |= {f"lag_{i}": lag, f"last_{i}": last}
+        return named
+
+
+class DeviceSet:
+    """Elements of one term on the device; parameters as in `Group`: one buffer, and rows (offset, along, across worlds)."""
+
+    def __init__(self, host, worlds: int, device, real):
+        self.host, self.term, self.worlds, self.device = host, host.term, worlds, device
+        self.elements = len(host)
+        self.slots = wp.array(np.ascontiguousarray(host.slots, np.int32), dtype=int, device=device)
+        data = host.data if host.data.size else np.zeros((1, 1))
+        self.data = wp.array(np.ascontiguousarray(data), dtype=real, device=device)
+        self.parameters = [_short(np.asarray(p, float))[None] for p in host.parameters]
+        self.upload(real)
+
+    def upload(self, real) -> None:
+        """Parameters (1 or worlds, 1 or elements) to one buffer with its table."""
+        offset, table = 0, []
+        for values in self.parameters:
+            across, along = values.shape
+            table.append((offset, 1 if along > 1 else 0, along if across > 1 else 0))
+            offset += values.size
+        self.buffer = wp.array(np.concatenate([p.ravel() for p in self.parameters]), dtype=real, device=self.device)
+        self.table = wp.array(np.array(table, np.int32), dtype=int, device=self.device)
+
+    def set_parameter(self, row: int, values: np.ndarray, name: str) -> None:
+        """Replace a row by values of shape (), (worlds,), (elements,) or (worlds, elements)."""
+        if values.ndim == 0:
+            new = values.reshape(1, 1)
+        elif values.shape == (self.worlds,) and self.worlds > 1:
+            new = values[:, None]
+        elif values.shape in ((self.elements,), (self.worlds, self.elements)):
+            new = np.atleast_2d(values)
+        else:
+            raise ValueError(
+                f"{name} has shape {values.shape}; give one number, ({self.worlds},), ({self.elements},) or "
+                f"({self.worlds}, {self.elements})"
+            )
+        self.parameters[row] = np.ascontiguousarray(new)
+        self.upload(self.buffer.dtype)
+
+
+class DeviceNet:
+    """A `Net` with all its worlds on a device."""
+
+    def __init__(self, host: Net, worlds: int, device, real):
+        self.host, self.worlds, self.device, self.real = host, worlds, device, real
+        self.vector = wp.types.vector(3, real)
+        self.blocks, self.angle_start = host.blocks, host.nodes
+        self.edges = host.rod_edges
+        self.sets = [DeviceSet(s, worlds, device, real) for s in host.sets]
+        self.ends = wp.array(np.ascontiguousarray(host.ends, np.int32).reshape(-1, 2), dtype=int, device=device)
+        self.still = wp.zeros(worlds, dtype=real, device=device)
+
+    def empty(self) -> NetState:
+        """Arrays of a state, not yet filled."""
+
+        def zeros(rows, columns):
+            return wp.zeros((max(1, rows), max(1, columns)), dtype=self.real, device=self.device)
+
+        blocks = self.worlds * self.blocks
+        q, v = (wp.zeros(blocks, dtype=self.vector, device=self.device) for _ in range(2))
+        state = NetState(q, v, zeros(6, self.worlds * self.edges))
+        for part in self.sets:
+            count = self.worlds * part.elements
+            rows = len(part.host.lag)
+            state.lag.append(zeros(rows, count if rows else 1))
+            strains = len(part.term.measure.strains) if part.term.density.lagged else 0
+            state.last.append(zeros(strains, count if strains else 1))
+        return state
+
+    def rest(self) -> NetState:
+        """The rest state."""
+        state = self.empty()
+        state.q.assign(np.tile(self.host.rest, (self.worlds, 1)))
+        if self.edges:
+            state.frame.assign(np.tile(self.host.frame, (1, self.worlds)))
+        for part, lag in zip(self.sets, state.lag, strict=True):
+            if len(part.host.lag):
+                lag.assign(np.tile(part.host.lag, (1, self.worlds)))
+        return state
+
+    def inputs(self, part: DeviceSet, state: NetState, index: int, q=None, rate=None) -> list:
+        """What every kernel of a term reads."""
+        return [
+            state.q if q is None else q,
+            state.frame,
+            state.lag[index],
+            state.last[index],
+            self.still if rate is None else rate,
+            part.buffer,
+            part.table,
+            part.slots,
+            part.data,
+            self.blocks,
+            self.angle_start,
+            part.elements,
+        ]
+
+    def strains(self, state: NetState, index: int, strain: wp.array, stress: wp.array | None = None) -> None:
+        """Strains of a set (strains, W E), and stresses if asked for."""
+        part = self.sets[index]
+        wp.launch(
+            elements.term_kernels(part.term, self.real)[3],
+            self.worlds * part.elements,
+            self.inputs(part, state, index) + [int(stress is not None)],
+            [strain, strain if stress is None else stress],
+            device=self.device,
+        )
+
+    def update_strains(self, state: NetState) -> None:
+        """Store the strains of a state where strain-rate damping looks for them."""
+        for index, part in enumerate(self.sets):
+            if part.term.density.lagged:
+                self.strains(state, index, state.last[index])
+
+    def carry(self, before: NetState, after: NetState) -> None:
+        """Lagged data of `after` from those of `before` and the positions of `after`, whose joints then start from zero.
+
+        The two may be the same state. Launches alone, so that it can be captured.
+        """
+        real, device = self.real, self.device
+        if not self.edges:
+            return
+        wp.launch(
+            frames.edge_kernel(real),
+            self.worlds * self.edges,
+            [after.q, self.ends, self.blocks, before.frame],
+            [after.frame],
+            device=device,
+        )
+        for part, old, new in zip(self.sets, before.lag, after.lag, strict=True):
+            measure = part.term.measure
+            if measure.spins:
+                wp.launch(
+                    frames.joint_kernel(real),
+                    self.worlds * part.elements,
+                    [after.q, after.frame, part.slots, part.data, self.blocks, self.angle_start, self.edges, old],
+                    [new],
+                    device=device,
+                )
+            elif measure.frames:
+                wp.launch(
+                    frames.vertex_kernel(real),
+                    self.worlds * part.elements,
+                    [after.frame, part.slots, measure.nodes, self.angle_start, self.edges, old],
+                    [new],
+                    device=device,
+                )
+        if self.host.spins:
+            wp.launch(
+                frames.reset_kernel(real),
+                self.worlds * self.host.spins,
+                [self.blocks - self.host.spins, self.host.spins, self.blocks],
+                [after.q],
+                device=device,
+            )
+
+
+def _short(values: np.ndarray) -> np.ndarray:
+    """One value where all are alike."""
+    return values[:1] if values.size and np.all(values == values.flat[0]) else values

@@ -1,0 +1,201 @@
+"""What a net contributes to a model's energy and tangent on the host; dofs are its blocks, three each, world by world."""
+
+import numpy as np
+import warp as wp
+from scipy import sparse
+
+from ddg_warp.kernels.net import elements
+
+
+class NetTangent:
+    """The part of the net. See `Tangent` for the methods."""
+
+    def __init__(self, model, offset: int):
+        self.model, self.net, self.host, self.offset = model, model.net, model.net.host, offset
+        worlds, host = self.net.worlds, self.host
+        self.size = 3 * host.blocks * worlds
+        kind = np.zeros((host.blocks, 3), bool)
+        kind[host.nodes :] = True
+        self.free, self.angle, self.mass = (
+            np.tile(values.ravel(), worlds) for values in (~host.fixed, kind, host.mass)
+        )
+        self.incidence = [_incidence(part.host, host.blocks, worlds) for part in self.net.sets]
+        self._ends = np.concatenate([host.ends, *(s.nodes[s.surface.edges] for s in host.shells)])
+        if not len(self._ends):
+            self._ends = np.concatenate([s.slots[:2].T for s in host.sets])
+        length = np.linalg.norm(np.diff(host.rest[self._ends], axis=1)[:, 0], axis=1)
+        self._edge_length = float(length.mean())
+
+    def energies(self, state):
+        """(term's name, energies of its elements)."""
+        for i, part in enumerate(self.net.sets):
+            out = wp.zeros(part.elements * self.net.worlds, dtype=self.net.real, device=self.net.device)
+            self._launch(state, i, 0, out, ())
+            yield part.term.name.removesuffix("_damped"), out.numpy().astype(np.float64)
+
+    def gradient(self, state) -> np.ndarray:
+        result = np.zeros((self.size // 3, 3))
+        for i, part in enumerate(self.net.sets):
+            count, slots = part.elements * self.net.worlds, part.host.slots
+            out = wp.zeros((len(slots), count), dtype=self.net.vector, device=self.net.device)
+            self._launch(state, i, 1, out, ())
+            forces = out.numpy().astype(np.float64)
+            index = _tiled(slots, self.host.blocks, self.net.worlds).ravel()
+            for d in range(3):
+                result[:, d] += np.bincount(index, forces[..., d].ravel(), len(result))
+        return result.ravel()
+
+    def hessian(self, state) -> sparse.csc_matrix:
+        total = sparse.csr_matrix((self.size, self.size))
+        for i, part in enumerate(self.net.sets):
+            size, count = part.term.measure.size, part.elements * self.net.worlds
+            out = wp.zeros((count, size, size), dtype=self.net.real, device=self.net.device)
+            self._launch(state, i, 2, out, (size,))
+            values = out.numpy().astype(np.float64)
+            values = 0.5 * (values + values.transpose(0, 2, 1))
+            diagonal = sparse.bsr_matrix((values, np.arange(count), np.arange(count + 1)))
+            total = total + self.incidence[i].T @ (diagonal @ self.incidence[i])
+        return total.tocsc()
+
+    def loads(self, factor: float, q: np.ndarray) -> np.ndarray:
+        host, x = self.host, q.reshape(self.net.worlds, -1, 3)
+        force = host.load * factor
+        force[: host.nodes] += factor * host.mass[: host.nodes] * np.asarray(self.model.scene.gravity, float)
+        for load in host.timed:
+            np.add.at(force, load.blocks, load.at(factor, factor) * load.force)
+        result = np.tile(force, (self.net.worlds, 1, 1))
+        for pressure in host.pressures:
+            scale = pressure.at(factor, factor) * pressure.pressure / 6.0
+            for world in range(self.net.worlds):
+                corners = x[world][pressure.triangles]
+                area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+                np.add.at(result[world], pressure.triangles, (scale[:, None] * area)[:, None])
+        return result.ravel()
+
+    def load_stiffness(self, factor: float, q: np.ndarray) -> sparse.csc_matrix | None:
+        if not self.host.pressures:
+            return None
+        rows, cols, values = [], [], []
+        x, N = q.reshape(self.net.worlds, -1, 3), self.host.blocks
+        for pressure in self.host.pressures:
+            scale = pressure.at(factor, factor) * pressure.pressure / 6.0
+            for world in range(self.net.worlds):
+                triangles = pressure.triangles
+                corners = x[world][triangles]
+                for j in range(3):
+                    # d/dx_j of (x1 - x0) x (x2 - x0): the edge opposite to corner j, crossed
+                    e = corners[:, (j + 2) % 3] - corners[:, (j + 1) % 3]
+                    block = -scale[:, None, None] * _cross(e)
+                    for i in range(3):
+                        r, c = np.broadcast_arrays(np.arange(3)[:, None], np.arange(3))
+                        rows.append((3 * (triangles[:, i] + world * N))[:, None, None] + r)
+                        cols.append((3 * (triangles[:, j] + world * N))[:, None, None] + c)
+                        values.append(block)
+        data = (np.concatenate(values).ravel(), (np.concatenate(rows).ravel(), np.concatenate(cols).ravel()))
+        return sparse.csc_matrix(data, shape=(self.size, self.size))
+
+    def dofs(self, state) -> np.ndarray:
+        return state.net.q.numpy().astype(np.float64).ravel()
+
+    def assign(self, state, q: np.ndarray) -> None:
+        state.net.q.assign(q.reshape(-1, 3))
+
+    def retract(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
+        return q + step
+
+    def move_supports(self, state, before: float, at: float) -> None:
+        """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""
+        host = self.host
+        q = state.net.q.numpy().astype(np.float64).reshape(self.net.worlds, -1, 3)
+        for blocks, motion in host.moving:
+            target = self.model.motions[motion].place(at, host.rest[blocks])
+            q[:, blocks] = np.where(host.fixed[blocks], target, q[:, blocks])
+        if host.turning:
+            frame = state.net.frame.numpy().astype(np.float64).reshape(6, self.net.worlds, -1)
+            for blocks, index in host.turning:
+                motion = self.model.motions[index]
+                for block in blocks:
+                    f = block - host.nodes
+                    for world in range(self.net.worlds):
+                        x = q[world][host.ends[f]]
+                        q[world, block, 0] = motion.director_angle(
+                            before, at, host.frame[:3, f], frame[:, world, f], x[1] - x[0], q[world, block, 0]
+                        )
+        state.net.q.assign(q.reshape(-1, 3))
+
+    def edges(self, q: np.ndarray) -> np.ndarray:
+        """Edge vectors (E, 3)."""
+        x = q.reshape(self.net.worlds, -1, 3)
+        return (x[:, self._ends[:, 1]] - x[:, self._ends[:, 0]]).reshape(-1, 3)
+
+    def edge_length(self) -> float:
+        """Mean rest length of edges [m]."""
+        return self._edge_length
+
+    def where(self, dof: int) -> str:
+        """Name of a dof's place."""
+        block = dof // 3 % self.host.blocks
+        for rod in self.host.rods:
+            for what, blocks in (("node", rod.nodes), ("edge", rod.edges)):
+                if block in blocks:
+                    return f"{what} {int(np.flatnonzero(blocks == block)[0])} of rod {rod.rod}"
+        for i, shell in enumerate(self.host.shells):
+            for what, blocks in (("vertex", shell.nodes), ("mesh edge", shell.edges)):
+                if block in blocks:
+                    return f"{what} {int(np.flatnonzero(blocks == block)[0])} of shell {i}"
+        return f"joint {block - self.host.nodes - self.host.angles}"
+
+    def _launch(self, state, index: int, which: int, out: wp.array, columns: tuple) -> None:
+        part = self.net.sets[index]
+        wp.launch(
+            elements.term_kernels(part.term, self.net.real)[which],
+            (part.elements * self.net.worlds, *columns),
+            self.net.inputs(part, state.net, index),
+            [out],
+            device=self.net.device,
+        )
+
+
+def _tiled(slots: np.ndarray, blocks: int, worlds: int) -> np.ndarray:
+    """Slots (n, W E) of all worlds."""
+    return np.concatenate([slots + world * blocks for world in range(worlds)], axis=1)
+
+
+def _incidence(part, blocks: int, worlds: int) -> sparse.csr_matrix:
+    """B of one set: (local dofs of all elements, dofs)."""
+    measure = part.term.measure
+    slots = _tiled(part.slots, blocks, worlds)
+    count = slots.shape[1]
+    first = np.arange(count) * measure.size
+    rows, cols, values = [], [], []
+
+    def put(local, block, component, sign):
+        rows.append(first + local)
+        cols.append(3 * block + component)
+        values.append(np.full(count, sign))
+
+    for i, (a, b) in enumerate(measure.edges):
+        for d in range(3):
+            put(3 * i + d, slots[b], d, 1.0)
+            put(3 * i + d, slots[a], d, -1.0)
+    at = 3 * len(measure.edges)
+    for i in range(measure.angles):
+        put(at + i, slots[measure.nodes + i], 0, 1.0)
+    for i in range(measure.spins):
+        for d in range(3):
+            put(at + measure.angles + 3 * i + d, slots[measure.nodes + measure.angles + i], d, 1.0)
+    shape = (count * measure.size, 3 * blocks * worlds)
+    return sparse.csr_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(cols))), shape=shape)
+
+
+def _cross(e: np.ndarray) -> np.ndarray:
+    """Matrices of e x (T, 3, 3)."""
+    zero = np.zeros(len(e))
+    return np.stack(
+        [
+            np.stack([zero, -e[:, 2], e[:, 1]], -1),
+            np.stack([e[:, 2], zero, -e[:, 0]], -1),
+            np.stack([-e[:, 1], e[:, 0], zero], -1),
+        ],
+        axis=1,
+    )

@@ -1,0 +1,332 @@
+"""The element path of nets: gather by index -> strains and Jacobian -> energy | gradient | factor | Hessian, per element.
+
+All dofs lie in blocks of three reals: positions of nodes, then an angle each (in component 0), then rotation vectors of rigid
+joints. An element has *slots*: its nodes, its angles, its rotation vectors, each with the index of a block. Derivatives are
+written a slot, so that whoever gathers them knows blocks only. Worlds lie behind each other: block i of world w is
+w * blocks + i, element i of world w is w * elements + i; topology and constant data are stored once.
+
+The lagged data of an element are, in this order: (u, t) of the rod edges its angles belong to, its own lagged rows, its data.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.element import CPU_OPTIONS
+from ddg_warp.kernels.terms import Term
+
+FRAME = 6  # reals of the reference frame of an edge: first director and tangent
+
+
+@cache
+def functions(term: Term, real):
+    """gather(...) -> (q, s, w, p) of an element; spread(f, slot) -> derivative with respect to the block of a slot."""
+    measure, density = term.measure, term.density
+    V = wp.types.vector(3, real)
+    Q, S, _, _ = measure.types(real)
+    n = len(measure.strains)
+    P = wp.types.vector(density.parameter_size(n), real)
+    static_size, size = len(term.parameter_names) - 1, density.parameter_size(n)
+    nodes, angles, spins, edges = measure.nodes, measure.angles, measure.spins, measure.edges
+    frames, own, data_size = measure.frames, measure.lag_size - FRAME * measure.frames, measure.data_size
+    angle_row, spin_row = 3 * len(edges), 3 * len(edges) + angles
+    first = tuple(edge[0] for edge in edges)
+    second = tuple(edge[1] for edge in edges)
+    edge_count = len(edges)
+    lagged = density.lagged
+
+    @wp.func
+    def gather(
+        q: wp.array(dtype=V),
+        frame: wp.array2d(dtype=real),
+        lag: wp.array2d(dtype=real),
+        last: wp.array2d(dtype=real),
+        rate: wp.array(dtype=real),
+        buffer: wp.array(dtype=real),
+        table: wp.array2d(dtype=int),
+        slots: wp.array2d(dtype=int),
+        data: wp.array2d(dtype=real),
+        blocks: int,
+        angle_start: int,
+        elements: int,
+        tid: int,
+    ):
+        world = tid / elements
+        e = tid - world * elements
+        shift = world * blocks
+        local = Q()
+        for i in range(wp.static(edge_count)):
+            edge = q[slots[wp.static(second[i]), e] + shift] - q[slots[wp.static(first[i]), e] + shift]
+            for d in range(3):
+                local[wp.static(3 * i) + d] = edge[d]
+        for i in range(wp.static(angles)):
+            angle = q[slots[wp.static(nodes + i), e] + shift]
+            local[wp.static(angle_row + i)] = angle[0]
+        for i in range(wp.static(spins)):
+            spin = q[slots[wp.static(nodes + angles + i), e] + shift]
+            for d in range(3):
+                local[wp.static(spin_row + 3 * i) + d] = spin[d]
+        s = S()
+        for i in range(wp.static(frames)):
+            # frames of a world lie behind each other, too
+            f = slots[wp.static(nodes + i), e] - angle_start + world * (frame.shape[1] / rate.shape[0])
+            for c in range(wp.static(FRAME)):
+                s[wp.static(FRAME * i) + c] = frame[c, f]
+        for c in range(wp.static(own)):
+            s[wp.static(FRAME * frames) + c] = lag[c, tid]
+        for c in range(wp.static(data_size)):
+            s[wp.static(FRAME * frames + own) + c] = data[c, e]
+        p = P()
+        for i in range(wp.static(static_size)):
+            row = i + 1
+            p[i] = buffer[table[row, 0] + e * table[row, 1] + world * table[row, 2]]
+        if wp.static(lagged):
+            for i in range(wp.static(n)):
+                p[wp.static(static_size) + i] = last[i, tid]
+            p[wp.static(size - 1)] = rate[world]
+        return local, s, buffer[table[0, 0] + e * table[0, 1] + world * table[0, 2]], p
+
+    @wp.func
+    def spread(f: Q, slot: int):
+        """The three reals of a slot; `slot` is a constant where this is unrolled."""
+        v = V()
+        for i in range(wp.static(edge_count)):
+            if slot == wp.static(first[i]):
+                v -= V(f[wp.static(3 * i)], f[wp.static(3 * i + 1)], f[wp.static(3 * i + 2)])
+            if slot == wp.static(second[i]):
+                v += V(f[wp.static(3 * i)], f[wp.static(3 * i + 1)], f[wp.static(3 * i + 2)])
+        for i in range(wp.static(angles)):
+            if slot == wp.static(nodes + i):
+                v[0] = f[wp.static(angle_row + i)]
+        for i in range(wp.static(spins)):
+            if slot == wp.static(nodes + angles + i):
+                for d in range(3):
+                    v[d] = f[wp.static(spin_row + 3 * i) + d]
+        return v
+
+    return gather, spread
+
+
+@cache
+def term_kernels(term: Term, real):
+    """Kernels of one term: energy, gradient (slots, elements), Hessian (size * size, elements), strains and stresses."""
+    measure, density = term.measure, term.density
+    V = wp.types.vector(3, real)
+    Q, S, _, _ = measure.types(real)
+    n = len(measure.strains)
+    P = wp.types.vector(density.parameter_size(n), real)
+    strains_of, jacobian_of, _ = measure.functions(real)
+    energy_of, slope_of, _ = density.functions(real, n)
+    gather, spread = functions(term, real)
+    slots_count, size = measure.slots, measure.size
+
+    @wp.func
+    def gradient_at(q: Q, s: S, w: real, p: P):
+        e, jacobian = jacobian_of(q, s, w)
+        return (slope_of(e, p) * w) * jacobian
+
+    @wp.func
+    def along(q: Q, s: S, w: real, p: P, v: Q):
+        return wp.dot(gradient_at(q, s, w, p), v)
+
+    @wp.kernel(module="unique", enable_backward=True)
+    def energy(
+        q: wp.array(dtype=V),
+        frame: wp.array2d(dtype=real),
+        lag: wp.array2d(dtype=real),
+        last: wp.array2d(dtype=real),
+        rate: wp.array(dtype=real),
+        buffer: wp.array(dtype=real),
+        table: wp.array2d(dtype=int),
+        slots: wp.array2d(dtype=int),
+        data: wp.array2d(dtype=real),
+        blocks: int,
+        angle_start: int,
+        elements: int,
+        energy_out: wp.array(dtype=real),
+    ):
+        e = wp.tid()
+        x, s, w, p = gather(
+            q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, e
+        )
+        energy_out[e] = w * energy_of(strains_of(x, s, w), p)
+
+    @wp.kernel(module="unique", enable_backward=True)
+    def gradient(
+        q: wp.array(dtype=V),
+        frame: wp.array2d(dtype=real),
+        lag: wp.array2d(dtype=real),
+        last: wp.array2d(dtype=real),
+        rate: wp.array(dtype=real),
+        buffer: wp.array(dtype=real),
+        table: wp.array2d(dtype=int),
+        slots: wp.array2d(dtype=int),
+        data: wp.array2d(dtype=real),
+        blocks: int,
+        angle_start: int,
+        elements: int,
+        gradient_out: wp.array2d(dtype=V),
+    ):
+        e = wp.tid()
+        x, s, w, p = gather(
+            q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, e
+        )
+        f = gradient_at(x, s, w, p)
+        for i in range(wp.static(slots_count)):
+            gradient_out[i, e] = spread(f, i)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def hessian(
+        q: wp.array(dtype=V),
+        frame: wp.array2d(dtype=real),
+        lag: wp.array2d(dtype=real),
+        last: wp.array2d(dtype=real),
+        rate: wp.array(dtype=real),
+        buffer: wp.array(dtype=real),
+        table: wp.array2d(dtype=int),
+        slots: wp.array2d(dtype=int),
+        data: wp.array2d(dtype=real),
+        blocks: int,
+        angle_start: int,
+        elements: int,
+        hessian_out: wp.array3d(dtype=real),
+    ):
+        """Exact Hessian in the local dofs, a column a thread: the reverse of the gradient, seeded with unit vectors."""
+        e, column = wp.tid()
+        x, s, w, p = gather(
+            q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, e
+        )
+        v = Q()
+        v[column] = real(1.0)
+        dq, _ds, _dw, _dp, _dv = wp.grad(along)(x, s, w, p, v)
+        for i in range(wp.static(size)):
+            hessian_out[e, i, column] = dq[i]
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def strains(
+        q: wp.array(dtype=V),
+        frame: wp.array2d(dtype=real),
+        lag: wp.array2d(dtype=real),
+        last: wp.array2d(dtype=real),
+        rate: wp.array(dtype=real),
+        buffer: wp.array(dtype=real),
+        table: wp.array2d(dtype=int),
+        slots: wp.array2d(dtype=int),
+        data: wp.array2d(dtype=real),
+        blocks: int,
+        angle_start: int,
+        elements: int,
+        stressed: int,
+        strain_out: wp.array2d(dtype=real),
+        stress_out: wp.array2d(dtype=real),
+    ):
+        e = wp.tid()
+        x, s, w, p = gather(
+            q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, e
+        )
+        strain = strains_of(x, s, w)
+        for i in range(wp.static(n)):
+            strain_out[i, e] = strain[i]
+        if stressed != 0:
+            stress = slope_of(strain, p)
+            for i in range(wp.static(n)):
+                stress_out[i, e] = stress[i]
+
+    return energy, gradient, hessian, strains
+
+
+@cache
+def evaluate_kernel(term: Term, real, linear):
+    """The kernel of a Newton iteration: energy, gradient and Gauss-Newton factor of one term, written a slot.
+
+    Factor rows are vectors [strain * slots + slot][element]; `tension_out` holds the scalars of the geometric stiffness, made
+    positive semi-definite (an edge under compression, a triangle by the eigenvalues of its two-by-two stress, leaves out the
+    negative part). Energies go to the half of `energy_out` that the line search does not hold.
+    """
+    measure, density = term.measure, term.density
+    V, F = wp.types.vector(3, real), wp.types.vector(3, linear)
+    Q, S, E, _ = measure.types(real)
+    n, tensions = len(measure.strains), measure.tensions
+    _, jacobian_of, tension_of = measure.functions(real)
+    energy_of, slope_of, root_of = density.functions(real, n)
+    gather, spread = functions(term, real)
+    slots_count, coupled = measure.slots, density.coupled
+    C = wp.types.vector(3, real)
+
+    @wp.func
+    def definite(c: C):
+        """The nearest positive semi-definite (c11, c12, c22)."""
+        mean = real(0.5) * (c[0] + c[2])
+        half = real(0.5) * (c[0] - c[2])
+        radius = wp.sqrt(half * half + c[1] * c[1])
+        low = mean - radius
+        high = mean + radius
+        if low >= real(0.0):
+            return c
+        if high <= real(0.0):
+            return C()
+        # high * v v^T with v the eigenvector of the larger eigenvalue: (c - low I) high / (high - low)
+        scale = high / (high - low)
+        return C((c[0] - low) * scale, c[1] * scale, (c[2] - low) * scale)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def evaluate(
+        q: wp.array(dtype=V),
+        frame: wp.array2d(dtype=real),
+        lag: wp.array2d(dtype=real),
+        last: wp.array2d(dtype=real),
+        rate: wp.array(dtype=real),
+        buffer: wp.array(dtype=real),
+        table: wp.array2d(dtype=int),
+        slots: wp.array2d(dtype=int),
+        data: wp.array2d(dtype=real),
+        blocks: int,
+        angle_start: int,
+        elements: int,
+        status: wp.array(dtype=int),
+        slot: wp.array(dtype=int),
+        factor_out: wp.array2d(dtype=F),
+        tension_out: wp.array2d(dtype=linear),
+        gradient_out: wp.array2d(dtype=V),
+        energy_out: wp.array2d(dtype=real),
+    ):
+        tid = wp.tid()
+        world = tid / elements
+        if status[world] != 0:
+            return
+        x, s, w, p = gather(
+            q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid
+        )
+        e, jacobian = jacobian_of(x, s, w)
+        slope = slope_of(e, p)
+        energy_out[1 - slot[world], tid] = w * energy_of(e, p)
+        f = (slope * w) * jacobian
+        for i in range(wp.static(slots_count)):
+            gradient_out[i, tid] = spread(f, i)
+        shift = E()
+        if wp.static(tensions == 1):
+            c, shift = tension_of(x, w, slope)
+            if c < real(0.0):
+                c = real(0.0)
+                shift = E()
+            tension_out[0, tid] = linear(c)
+        if wp.static(tensions == 3):
+            c3, _shift = tension_of(x, w, slope)
+            c3 = definite(c3)
+            for i in range(3):
+                tension_out[i, tid] = linear(c3[i])
+        root = root_of(e, p, shift)
+        weight = wp.sqrt(w)
+        if wp.static(coupled):
+            rows = root * jacobian
+            for m in range(wp.static(n)):
+                for i in range(wp.static(slots_count)):
+                    v = spread(rows[m] * weight, i)
+                    factor_out[wp.static(m * slots_count) + i, tid] = F(linear(v[0]), linear(v[1]), linear(v[2]))
+        else:
+            for m in range(wp.static(n)):
+                for i in range(wp.static(slots_count)):
+                    u = spread(jacobian[m] * (root[m] * weight), i)
+                    factor_out[wp.static(m * slots_count) + i, tid] = F(linear(u[0]), linear(u[1]), linear(u[2]))
+
+    return evaluate

@@ -1,0 +1,130 @@
+"""Lagged data of a net: frames of rod edges, reference twist of their vertices, ghosts and rotation of rigid joints."""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels import frames
+from ddg_warp.kernels.measures.joint_curvature_twist import rotations
+
+
+@cache
+def functions(real):
+    """row(a, i, k) -> vector from three rows of an array; put(a, i, k, v)."""
+    V = wp.types.vector(3, real)
+
+    @wp.func
+    def row(a: wp.array2d(dtype=real), i: int, k: int):
+        return V(a[i, k], a[i + 1, k], a[i + 2, k])
+
+    @wp.func
+    def put(a: wp.array2d(dtype=real), i: int, k: int, v: V):
+        for d in range(3):
+            a[i + d, k] = v[d]
+
+    return row, put
+
+
+@cache
+def edge_kernel(real):
+    """Frames of rod edges, transported to the tangents of positions q and orthonormalised."""
+    V = wp.types.vector(3, real)
+    row, put = functions(real)
+    transport, *_ = frames.functions(real)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def edges(
+        q: wp.array(dtype=V),
+        ends: wp.array2d(dtype=int),
+        blocks: int,
+        frame: wp.array2d(dtype=real),
+        frame_out: wp.array2d(dtype=real),
+    ):
+        f = wp.tid()
+        count = ends.shape[0]
+        world = f / count
+        i = f - world * count
+        t = wp.normalize(q[ends[i, 1] + world * blocks] - q[ends[i, 0] + world * blocks])
+        u = transport(row(frame, 0, f), row(frame, 3, f), t)
+        put(frame_out, 0, f, wp.normalize(u - t * wp.dot(u, t)))
+        put(frame_out, 3, f, t)
+
+    return edges
+
+
+@cache
+def vertex_kernel(real):
+    """Reference twist of rod vertices between frames that are up to date; `angles` are the blocks of both edges' angles."""
+    row, _ = functions(real)
+    _, reference_twist, _ = frames.functions(real)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def vertices(
+        frame: wp.array2d(dtype=real),
+        slots: wp.array2d(dtype=int),
+        first_angle: int,
+        angle_start: int,
+        edges: int,
+        lag: wp.array2d(dtype=real),
+        lag_out: wp.array2d(dtype=real),
+    ):
+        tid = wp.tid()
+        count = slots.shape[1]
+        world = tid / count
+        e = tid - world * count
+        a = slots[first_angle, e] - angle_start + world * edges
+        b = slots[first_angle + 1, e] - angle_start + world * edges
+        lag_out[0, tid] = reference_twist(
+            row(frame, 0, a), row(frame, 0, b), row(frame, 3, a), row(frame, 3, b), lag[0, tid]
+        )
+
+    return vertices
+
+
+@cache
+def joint_kernel(real):
+    """Ghost edges of rigid joints, turned by the joint's rotation, and the reference twist to the edges that meet it."""
+    V = wp.types.vector(3, real)
+    row, put = functions(real)
+    _, reference_twist, _ = frames.functions(real)
+    turned, _ = rotations(real)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def joints(
+        q: wp.array(dtype=V),
+        frame: wp.array2d(dtype=real),
+        slots: wp.array2d(dtype=int),
+        data: wp.array2d(dtype=real),
+        blocks: int,
+        angle_start: int,
+        edges: int,
+        lag: wp.array2d(dtype=real),
+        lag_out: wp.array2d(dtype=real),
+    ):
+        tid = wp.tid()
+        count = slots.shape[1]
+        world = tid / count
+        e = tid - world * count
+        omega = q[slots[3, e] + world * blocks]
+        t = wp.normalize(turned(omega, row(lag, 3, tid)))
+        u = turned(omega, row(lag, 0, tid))
+        u = wp.normalize(u - t * wp.dot(u, t))
+        f = slots[2, e] - angle_start + world * edges
+        put(lag_out, 0, tid, u)
+        put(lag_out, 3, tid, t)
+        lag_out[6, tid] = reference_twist(u, row(frame, 0, f), t, row(frame, 3, f) * data[0, e], lag[6, tid])
+
+    return joints
+
+
+@cache
+def reset_kernel(real):
+    """Rotations of joints start from zero once their frames have taken them over."""
+    V = wp.types.vector(3, real)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def reset(first: int, spins: int, blocks: int, q: wp.array(dtype=V)):
+        tid = wp.tid()
+        q[first + tid % spins + tid / spins * blocks] = V()
+
+    return reset
