@@ -1,7 +1,6 @@
 """From a surface, its material and its supports to the element sets of a shell: membrane and bending.
 
-The bending models, and what they are good for (measured in tests/test_shells.py):
-MODELS
+MODELDOC
 """
 
 from dataclasses import dataclass
@@ -11,107 +10,9 @@ import numpy as np
 from ddg_warp.elements import ElementSet
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.terms import SHELLS
+from ddg_warp.shell_geometry import CLAMPED, NEIGHBOUR, EdgeKinds, edge_angles, metric, mid_edge_nodes, second_form
 
-MODELS = ("midedge", "midedge_dof", "hinge", "isometric")
-FREE, NEIGHBOUR, CLAMPED, SYMMETRY = range(4)  # kinds of an edge, as kernels/measures/midedge_curvature.py numbers them
-
-
-@dataclass(frozen=True)
-class EdgeKinds:
-    """What the normal at each mesh edge is taken from.
-
-    Attributes:
-        kind: FREE, NEIGHBOUR, CLAMPED or SYMMETRY (E,).
-        vector: prescribed unit normal of a clamped edge, unit normal of a symmetry plane, else zero (E, 3).
-    """
-
-    kind: np.ndarray
-    vector: np.ndarray
-
-    @property
-    def turning(self) -> np.ndarray:
-        """Edges whose rotation is a dof of the bending model "midedge_dof" (E,); those of the others must be fixed."""
-        return self.kind <= NEIGHBOUR
-
-    def of_triangles(self, surface) -> tuple[np.ndarray, np.ndarray]:
-        """Kinds (T, 3) and vectors (T, 3, 3) of the edges opposite to the corners."""
-        return self.kind[surface.triangle_edges], self.vector[surface.triangle_edges]
-
-
-def edge_kinds(surface, clamped: dict | None = None, symmetry: dict | None = None) -> EdgeKinds:
-    """Kinds of the edges of a surface.
-
-    Args:
-        surface: topology.
-        clamped: edge index -> normal of the surface there (3), on the side that the triangles' normals point to.
-        symmetry: edge index -> normal of the symmetry plane (3), either way.
-
-    Raises:
-        SceneError: no such edge, a normal that is zero or not finite, a symmetry plane at an edge inside the surface, or
-            an edge with both supports.
-    """
-    kind = np.where(surface.boundary, FREE, NEIGHBOUR)
-    vector = np.zeros((len(kind), 3))
-    for support, name, edges in ((CLAMPED, "clamped", clamped or {}), (SYMMETRY, "symmetry", symmetry or {})):
-        for edge, normal in edges.items():
-            normal = np.asarray(normal, float)
-            if not 0 <= edge < len(kind):
-                raise SceneError(f"{name} edge {edge}: the surface has edges 0 to {len(kind) - 1}")
-            if normal.shape != (3,) or not np.isfinite(normal).all() or not normal.any():
-                raise SceneError(f"{name} edge {edge}: normal {normal}; it is a finite vector that is not zero")
-            if kind[edge] >= CLAMPED:
-                raise SceneError(f"edge {edge} is clamped and on a symmetry plane; choose one")
-            if support == SYMMETRY and not surface.boundary[edge]:
-                raise SceneError(f"symmetry edge {edge} is inside the surface; a symmetry plane ends it")
-            kind[edge], vector[edge] = support, normal / np.linalg.norm(normal)
-    return EdgeKinds(kind, vector)
-
-
-def metric(surface, positions: np.ndarray) -> np.ndarray:
-    """First fundamental form (a11, a12, a22) of the triangles in the basis x1 - x0, x2 - x0 (T, 3) [m^2]."""
-    x0, x1, x2 = np.moveaxis(positions[surface.triangles], 1, 0)
-    a1, a2 = x1 - x0, x2 - x0
-    return np.stack([_dot(a1, a1), _dot(a1, a2), _dot(a2, a2)], -1)
-
-
-def second_form(surface, positions: np.ndarray, kinds: EdgeKinds, rotations: np.ndarray | None = None) -> np.ndarray:
-    """Second fundamental form (b11, b12, b22) of the triangles from mid-edge normals (T, 3) [m].
-
-    Args:
-        surface: topology.
-        positions: (P, 3) [m].
-        kinds: of the edges.
-        rotations: angle of the mid-edge normal of each edge about it, from the averaged one (E,) [rad]; zero by default.
-    """
-    corners = positions[surface.triangles]
-    behind = positions[mid_edge_nodes(surface)[:, 3:]]
-    kind, vector = kinds.of_triangles(surface)
-    xi = np.zeros(len(kinds.kind)) if rotations is None else rotations
-    c = np.empty((len(corners), 3))
-    for i in range(3):
-        first = corners[:, (i + 1) % 3]
-        e, a, b = corners[:, (i + 2) % 3] - first, corners[:, i] - first, behind[:, i] - first
-        N, k = vector[:, i], kind[:, i]
-        b = np.where((k == SYMMETRY)[:, None], a - 2.0 * _dot(a, N)[:, None] * N, b)
-        phi = np.where(k == FREE, 0.0, 0.5 * dihedral(e, a, b))
-        phi += np.where(k <= NEIGHBOUR, surface.triangle_signs[:, i] * xi[surface.triangle_edges[:, i]], 0.0)
-        d = a - e * (_dot(a, e) / _dot(e, e))[:, None]
-        c[:, i] = np.where(k == CLAMPED, 2.0 * _dot(N, d), -2.0 * np.sqrt(_dot(d, d)) * np.sin(phi))
-    return np.stack([c[:, 0] + c[:, 1], c[:, 0], c[:, 0] + c[:, 2]], -1)
-
-
-def dihedral(e: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle between the triangles (e, a) and (b, e) about e, positive where convex on the side of their normals [rad]."""
-    n, m = np.cross(e, a), np.cross(b, e)
-    return np.arctan2(_dot(np.cross(n, m), e), _dot(n, m) * np.sqrt(_dot(e, e)))
-
-
-def mid_edge_nodes(surface) -> np.ndarray:
-    """Corners of the triangles and the corners behind their edges (T, 6); the triangle's own where there is none."""
-    edges = surface.triangle_edges
-    side = np.where(surface.triangle_signs > 0, 1, 0)  # the neighbour is the one that runs the edge the other way
-    behind = surface.edge_opposite[edges, side]
-    return np.concatenate([surface.triangles, np.where(behind < 0, surface.triangles, behind)], axis=1)
+MODELS = ("midedge_dof", "midedge", "hinge", "isometric")
 
 
 @dataclass(frozen=True)
@@ -121,7 +22,8 @@ class Plate:
     Attributes:
         abar: rest metric (T, 3) [m^2].
         bbar: rest second fundamental form (T, 3) [m].
-        angle: rest angle of every edge, dihedral or tilt (E,) [rad]; None if the rest shape is explicit and curved.
+        angle: rest angle of every edge for the triangle on either side, dihedral or tilt (E, 2) [rad]; None if the rest shape
+            is explicit and curved.
         thickness: (T,) [m].
         young: Young's modulus (T,) [Pa].
         poisson: Poisson's ratio (T,).
@@ -176,7 +78,7 @@ def plate(surface, positions, thickness, young, poisson, kinds: EdgeKinds, rest=
     """
     positions = np.asarray(positions, float)
     count = len(surface.triangles)
-    angle = np.zeros(len(surface.edges))
+    angle = np.zeros((len(surface.edges), 2))
     if isinstance(rest, str):
         if rest not in ("shape", "flat"):
             raise SceneError(f"rest = {rest!r}; it is 'shape', 'flat' or two arrays (abar, bbar)")
@@ -230,7 +132,7 @@ def hinge_bending(surface, plate: Plate, kinds: EdgeKinds) -> list[ElementSet]:
     edges, nodes = _hinges(surface, kinds)
     sides = surface.edge_triangles[edges]
     lengths = 0.5 * sum(_length_squared(surface, plate, edges, sides[:, i]) for i in range(2))
-    law = [lengths / (plate.area[sides].sum(1) / 3.0), *_quadratic(plate, sides, plate.angle[edges], 1)]
+    law = [lengths / (plate.area[sides].sum(1) / 3.0), *_quadratic(plate, sides, plate.angle[edges, 0], 1)]
     none = np.zeros((len(edges), 0))
     hinges = ElementSet(_term("shell_hinge", plate), nodes, none.astype(int), none, law)
     supported = np.flatnonzero(kinds.kind >= CLAMPED)
@@ -242,7 +144,7 @@ def hinge_bending(surface, plate: Plate, kinds: EdgeKinds) -> list[ElementSet]:
         ends = np.where(side[:, None] == 0, surface.edges[edges], surface.edges[edges, ::-1])
         nodes = np.concatenate([ends, surface.edge_opposite[edges, side][:, None]], axis=1)
         weight = _length_squared(surface, plate, edges, triangles) / (plate.area[triangles] / 3.0)
-        law = [weight, *_quadratic(plate, triangles[:, None], plate.angle[edges], 1)]
+        law = [weight, *_quadratic(plate, triangles[:, None], plate.angle[edges, side], 1)]
         data = np.concatenate([kinds.kind[edges, None], kinds.vector[edges]], axis=1)
         sets.append(ElementSet(_term("shell_tilt", plate), nodes, np.zeros((len(edges), 0), int), data, law))
     return sets
@@ -278,22 +180,6 @@ def shell_elements(surface, plate: Plate, kinds: EdgeKinds, bending: str = "mide
     if bending == "isometric":
         return [membrane(surface, plate), isometric_bending(surface, plate, kinds)]
     return [membrane(surface, plate), mid_edge_bending(surface, plate, kinds, bending == "midedge_dof")]
-
-
-def edge_angles(surface, positions: np.ndarray, kinds: EdgeKinds) -> np.ndarray:
-    """Angle of every edge (E,) [rad]: dihedral inside, zero at free edges, tilt of the triangle at a support."""
-    edges, opposite = surface.edges, surface.edge_opposite
-    forwards = opposite[:, :1] >= 0  # a boundary edge is taken as its triangle runs it
-    ends = np.where(forwards, edges, edges[:, ::-1])
-    corner = np.where(forwards[:, 0], opposite[:, 0], opposite[:, 1])
-    behind = np.where(surface.boundary, corner, opposite[:, 1])
-    first = positions[ends[:, 0]]
-    e, a, b = positions[ends[:, 1]] - first, positions[corner] - first, positions[behind] - first
-    N = kinds.vector
-    mirrored = a - 2.0 * _dot(a, N)[:, None] * N
-    n = np.cross(e, a)
-    tilt = np.arctan2(_dot(np.cross(n, N), e), _dot(n, N) * np.sqrt(_dot(e, e)))
-    return np.choose(kinds.kind, [np.zeros(len(edges)), dihedral(e, a, b), tilt, 0.5 * dihedral(e, a, mirrored)])
 
 
 def _hinges(surface, kinds: EdgeKinds) -> tuple[np.ndarray, np.ndarray]:
@@ -338,8 +224,3 @@ def _by_triangle(name: str, values, count: int, valid, text: str) -> np.ndarray:
     for t in np.flatnonzero(~(np.isfinite(values) & valid(values)))[:1]:
         raise SceneError(f"triangle {t}: {name} = {values[t]}; it is finite and {text}")
     return values
-
-
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Scalar products along the last axis."""
-    return np.sum(a * b, -1)
