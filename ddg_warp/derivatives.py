@@ -436,7 +436,7 @@ def factor(case: Case) -> float:
         rows = slice(row, row + len(term.measure.strains))
         w = sample.data["buffer"][first]
         expected += w * np.einsum("minr,mjnr->ijnr", strain_rate[rows], stress_rate[rows])
-        if term.measure.has_tension:
+        if term.measure.tensions:
             edge = np.moveaxis(sample.edges(), -1, 0)
             length = np.linalg.norm(edge, axis=0)
             across = np.eye(kind.dim)[..., None, None] - edge * edge[:, None] / length**2

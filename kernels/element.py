@@ -60,7 +60,7 @@ class ChainKind:
     @property
     def tensions(self) -> int:
         """Scalars c of the geometric stiffness c I of an edge."""
-        return sum(term.measure.has_tension for term in self.terms)
+        return sum(term.measure.tensions for term in self.terms)
 
     @property
     def factor_rows(self) -> int:
@@ -95,7 +95,7 @@ class ChainKind:
             else:
                 result.append((parameter, edge, tension, strain))
                 edge += rows * self.dim
-            tension += term.measure.has_tension
+            tension += term.measure.tensions
             parameter += len(term.parameter_names)
             strain += rows
         return result
@@ -332,7 +332,7 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear):
     load, local, short, spread = term_functions(kind, index, real)
     _, row, tension_row, _ = kind.places()[index]
     E = wp.types.vector(n, real)
-    has_tension, dim = term.measure.has_tension, kind.dim
+    has_tension, dim = term.measure.tensions > 0, kind.dim
 
     @wp.func
     def evaluate_at(

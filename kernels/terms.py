@@ -1,14 +1,20 @@
-"""The registry: a term is a measure times a density, one line each."""
+"""The registries: a term is a measure times a density, one line each. Rods run along chains, shells on any elements."""
 
 from dataclasses import dataclass
 
 from ddg_warp.kernels.densities import Density
 from ddg_warp.kernels.densities.quadratic import kelvin_voigt, quadratic
+from ddg_warp.kernels.densities.st_venant_kirchhoff import st_venant_kirchhoff, st_venant_kirchhoff_damped
 from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.measures.curvature_binormal import curvature_binormal
 from ddg_warp.kernels.measures.edge_stretch import edge_stretch, edge_stretch_2d
+from ddg_warp.kernels.measures.edge_tilt import edge_tilt
+from ddg_warp.kernels.measures.hinge_angle import hinge_angle
+from ddg_warp.kernels.measures.isometric_bending import isometric_bending
+from ddg_warp.kernels.measures.midedge_curvature import midedge_curvature, midedge_curvature_dof
 from ddg_warp.kernels.measures.planar_curvature import planar_curvature
 from ddg_warp.kernels.measures.rod_curvature_twist import rod_curvature_twist
+from ddg_warp.kernels.measures.triangle_metric import triangle_metric
 
 
 @dataclass(frozen=True)
@@ -39,5 +45,25 @@ REGISTRY = {
         Term("planar_stretch_damped", edge_stretch_2d, kelvin_voigt, "planar stretch with strain-rate damping"),
         Term("planar_bend", planar_curvature, quadratic, "bending in the plane, EI"),
         Term("planar_bend_damped", planar_curvature, kelvin_voigt, "planar bending with strain-rate damping"),
+    )
+}
+
+SHELLS = {
+    term.name: term
+    for term in (
+        Term("shell_stretch", triangle_metric, st_venant_kirchhoff, "membrane of a triangle, E h"),
+        Term("shell_stretch_damped", triangle_metric, st_venant_kirchhoff_damped, "membrane with strain-rate damping"),
+        Term("shell_bend", midedge_curvature, st_venant_kirchhoff, "bending by mid-edge normals, E h^3"),
+        Term("shell_bend_damped", midedge_curvature, st_venant_kirchhoff_damped, "the same with strain-rate damping"),
+        Term(
+            "shell_bend_dof", midedge_curvature_dof, st_venant_kirchhoff, "bending by mid-edge normals that turn, E h^3"
+        ),
+        Term("shell_bend_dof_damped", midedge_curvature_dof, st_venant_kirchhoff_damped, "the same, damped"),
+        Term("shell_hinge", hinge_angle, quadratic, "bending by dihedral angles"),
+        Term("shell_hinge_damped", hinge_angle, kelvin_voigt, "dihedral angles with strain-rate damping"),
+        Term("shell_tilt", edge_tilt, quadratic, "hinge at a clamped edge or a symmetry plane"),
+        Term("shell_tilt_damped", edge_tilt, kelvin_voigt, "the same with strain-rate damping"),
+        Term("shell_isometric", isometric_bending, quadratic, "quadratic bending of flat, inextensible sheets"),
+        Term("shell_isometric_damped", isometric_bending, kelvin_voigt, "the same with strain-rate damping"),
     )
 }

@@ -12,14 +12,17 @@ class Density:
         name: field's name of the law.
         parameters: n -> names of the parameters, in the order of p.
         lagged: whether p ends with the strains of the last step (n) and the reciprocal of the time step (1).
+        coupled: whether psi'' is a full matrix.
         functions: (real, n) -> (energy(e, p), slope(e, p), root(e, p, shift)), where root is the square root of the diagonal
-            of psi'' + diag(shift), made positive semi-definite.
+            of psi'' + diag(shift), made positive semi-definite, as a vector. Of a coupled law it is the matrix R (n x n) with
+            R^T R = psi'', and shift is ignored.
     """
 
     name: str
     parameters: Callable
     functions: Callable
     lagged: bool = False
+    coupled: bool = False
 
     def parameter_size(self, strains: int) -> int:
         """Reals in p, those of the last step included."""

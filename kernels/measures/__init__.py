@@ -1,9 +1,10 @@
 """Measures: the geometry. A measure maps the local dofs of an element to a few strains.
 
 The local dofs are q = [edge vectors of the stencil..., angles of its edges...], so that translation invariance holds by
-construction and forces on nodes are differences of edge forces. Where a measure needs frames it reads s, the lagged data of
-the stencil, which stay constant during a step. w is the rest measure of the element (rest length, Voronoi length, area):
-strains are pointwise quantities, so a density and its parameters do not depend on the mesh.
+construction and forces on nodes are differences of edge forces. Where a measure needs more it reads s, which stays constant
+during a step: lagged frames of a rod, or data of the element such as the normal of a clamp. w is the rest measure of the
+element (rest length, Voronoi length, area): strains are pointwise quantities, so a density and its parameters do not depend
+on the mesh.
 """
 
 from collections.abc import Callable
@@ -20,12 +21,15 @@ class Measure:
         name: field's name of the measure.
         dim: dimension of space, 2 or 3.
         edges: pairs of local nodes; edge i of the stencil is x[j] - x[i].
-        angles: how many of the edges (the first ones) bring their angle theta as a dof.
+        angles: how many edges bring their angle as a dof; of a rod the first of the stencil, of a triangle its sides.
         lag_size: reals of lagged data of the stencil; 0 for a measure without frames.
+        data_size: reals of constant data of the element; 0 for a measure without.
+        tensions: scalars of the geometric stiffness; 0 where it is left to the exact Hessian.
         strains: names and units of the strains.
         functions: real -> (strains, jacobian, tension). `strains(q, s, w) -> E`; `jacobian(q, s, w) -> (E, J)`; `tension` is
-            None, or `tension(q, w, slope) -> (c, shift)` with the second derivative of a strain of one edge,
-            w slope : d2e = c I + w J^T diag(shift) J; its other terms are left to the exact Hessian.
+            None, or `tension(q, w, slope) -> (c, shift)` with the second derivative of the strains,
+            w slope : d2e = C + w J^T diag(shift) J. One edge has one tension, a scalar c with C = c I. A triangle has
+            three, the vector c = (c11, c12, c22), and C has the blocks c_ij I between its edge vectors i and j.
     """
 
     name: str
@@ -35,7 +39,8 @@ class Measure:
     functions: Callable
     angles: int = 0
     lag_size: int = 0
-    has_tension: bool = False
+    data_size: int = 0
+    tensions: int = 0
 
     @property
     def size(self) -> int:
@@ -48,10 +53,10 @@ class Measure:
         return len(self.edges)
 
     def types(self, real):
-        """Vector of dofs, of lagged data, of strains, and matrix of the Jacobian."""
+        """Vector of dofs, of lagged and constant data, of strains, and matrix of the Jacobian."""
         return (
             wp.types.vector(self.size, real),
-            wp.types.vector(max(1, self.lag_size), real),
+            wp.types.vector(max(1, self.lag_size + self.data_size), real),
             wp.types.vector(len(self.strains), real),
             wp.types.matrix((len(self.strains), self.size), real),
         )

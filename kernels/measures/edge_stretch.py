@@ -34,9 +34,7 @@ def _functions(measure_of):
     return functions
 
 
-edge_stretch = Measure(
-    "edge_stretch", 3, ((0, 1),), ("stretch [1]",), _functions(lambda: edge_stretch), has_tension=True
-)
+edge_stretch = Measure("edge_stretch", 3, ((0, 1),), ("stretch [1]",), _functions(lambda: edge_stretch), tensions=1)
 edge_stretch_2d = Measure(
-    "edge_stretch_2d", 2, ((0, 1),), ("stretch [1]",), _functions(lambda: edge_stretch_2d), has_tension=True
+    "edge_stretch_2d", 2, ((0, 1),), ("stretch [1]",), _functions(lambda: edge_stretch_2d), tensions=1
 )

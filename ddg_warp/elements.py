@@ -1,0 +1,45 @@
+"""Elements of one term on any nodes: what a net gathers by index."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ddg_warp.kernels.terms import Term
+
+
+@dataclass(frozen=True)
+class ElementSet:
+    """Elements of one term, on the host.
+
+    Attributes:
+        term: measure and density.
+        nodes: node of each place in the stencil (E, n) int.
+        angles: angle of each place (E, a) int, counted by whoever makes the elements; of a surface, its edges.
+        data: constant data as the measure's s (E, d) float.
+        parameters: rest measure first, then those of the density in its order, each broadcastable to (E,).
+    """
+
+    term: Term
+    nodes: np.ndarray
+    angles: np.ndarray
+    data: np.ndarray
+    parameters: list[np.ndarray]
+
+    def __post_init__(self):
+        measure = self.term.measure
+        count = len(self.nodes)
+        stencil = 1 + max(max(pair) for pair in measure.edges)
+        expected = {"nodes": stencil, "angles": measure.angles, "data": measure.data_size}
+        for name, size in expected.items():
+            if getattr(self, name).shape != (count, size):
+                raise ValueError(f"{self.term.name}: {name} {getattr(self, name).shape}; it takes {(count, size)}")
+        if len(self.parameters) != len(self.term.parameter_names):
+            raise ValueError(
+                f"{self.term.name}: {len(self.parameters)} parameters; it takes {self.term.parameter_names}"
+            )
+        for name, values in zip(self.term.parameter_names, self.parameters, strict=True):
+            if np.shape(values) not in ((), (1,), (count,)):
+                raise ValueError(f"{self.term.name}: {name} has shape {np.shape(values)}; one number or {count}")
+
+    def __len__(self) -> int:
+        return len(self.nodes)

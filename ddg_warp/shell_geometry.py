@@ -1,0 +1,131 @@
+"""Geometry of a surface as shells read it, in NumPy: fundamental forms and angles, with free, clamped and symmetry edges."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ddg_warp.errors import SceneError
+
+FREE, NEIGHBOUR, CLAMPED, SYMMETRY = range(4)  # kinds of an edge, as kernels/measures/midedge_curvature.py numbers them
+
+
+@dataclass(frozen=True)
+class EdgeKinds:
+    """What the normal at each mesh edge is taken from.
+
+    Attributes:
+        kind: FREE, NEIGHBOUR, CLAMPED or SYMMETRY (E,).
+        vector: prescribed unit normal of a clamped edge, unit normal of a symmetry plane, else zero (E, 3).
+    """
+
+    kind: np.ndarray
+    vector: np.ndarray
+
+    @property
+    def turning(self) -> np.ndarray:
+        """Edges whose rotation is a dof of the bending model "midedge_dof" (E,); those of the others must be fixed."""
+        return self.kind <= NEIGHBOUR
+
+    def of_triangles(self, surface) -> tuple[np.ndarray, np.ndarray]:
+        """Kinds (T, 3) and vectors (T, 3, 3) of the edges opposite to the corners."""
+        return self.kind[surface.triangle_edges], self.vector[surface.triangle_edges]
+
+
+def edge_kinds(surface, clamped: dict | None = None, symmetry: dict | None = None) -> EdgeKinds:
+    """Kinds of the edges of a surface.
+
+    Args:
+        surface: topology.
+        clamped: edge index -> normal of the surface there (3), on the side that the triangles' normals point to.
+        symmetry: edge index -> normal of the symmetry plane (3), either way.
+
+    Raises:
+        SceneError: no such edge, a normal that is zero or not finite, a symmetry plane at an edge inside the surface, or
+            an edge with both supports.
+    """
+    kind = np.where(surface.boundary, FREE, NEIGHBOUR)
+    vector = np.zeros((len(kind), 3))
+    for support, name, edges in ((CLAMPED, "clamped", clamped or {}), (SYMMETRY, "symmetry", symmetry or {})):
+        for edge, normal in edges.items():
+            normal = np.asarray(normal, float)
+            if not 0 <= edge < len(kind):
+                raise SceneError(f"{name} edge {edge}: the surface has edges 0 to {len(kind) - 1}")
+            if normal.shape != (3,) or not np.isfinite(normal).all() or not normal.any():
+                raise SceneError(f"{name} edge {edge}: normal {normal}; it is a finite vector that is not zero")
+            if kind[edge] >= CLAMPED:
+                raise SceneError(f"edge {edge} is clamped and on a symmetry plane; choose one")
+            if support == SYMMETRY and not surface.boundary[edge]:
+                raise SceneError(f"symmetry edge {edge} is inside the surface; a symmetry plane ends it")
+            kind[edge], vector[edge] = support, normal / np.linalg.norm(normal)
+    return EdgeKinds(kind, vector)
+
+
+def metric(surface, positions: np.ndarray) -> np.ndarray:
+    """First fundamental form (a11, a12, a22) of the triangles in the basis x1 - x0, x2 - x0 (T, 3) [m^2]."""
+    x0, x1, x2 = np.moveaxis(positions[surface.triangles], 1, 0)
+    a1, a2 = x1 - x0, x2 - x0
+    return np.stack([_dot(a1, a1), _dot(a1, a2), _dot(a2, a2)], -1)
+
+
+def second_form(surface, positions: np.ndarray, kinds: EdgeKinds, rotations: np.ndarray | None = None) -> np.ndarray:
+    """Second fundamental form (b11, b12, b22) of the triangles from mid-edge normals (T, 3) [m].
+
+    Args:
+        surface: topology.
+        positions: (P, 3) [m].
+        kinds: of the edges.
+        rotations: angle of the mid-edge normal of each edge about it, from the averaged one (E,) [rad]; zero by default.
+    """
+    corners = positions[surface.triangles]
+    behind = positions[mid_edge_nodes(surface)[:, 3:]]
+    kind, vector = kinds.of_triangles(surface)
+    xi = np.zeros(len(kinds.kind)) if rotations is None else rotations
+    c = np.empty((len(corners), 3))
+    for i in range(3):
+        first = corners[:, (i + 1) % 3]
+        e, a, b = corners[:, (i + 2) % 3] - first, corners[:, i] - first, behind[:, i] - first
+        N, k = vector[:, i], kind[:, i]
+        b = np.where((k == SYMMETRY)[:, None], a - 2.0 * _dot(a, N)[:, None] * N, b)
+        phi = np.where(k == FREE, 0.0, 0.5 * dihedral(e, a, b))
+        phi += np.where(k <= NEIGHBOUR, surface.triangle_signs[:, i] * xi[surface.triangle_edges[:, i]], 0.0)
+        d = a - e * (_dot(a, e) / _dot(e, e))[:, None]
+        c[:, i] = np.where(k == CLAMPED, 2.0 * _dot(N, d), -2.0 * np.sqrt(_dot(d, d)) * np.sin(phi))
+    return np.stack([c[:, 0] + c[:, 1], c[:, 0], c[:, 0] + c[:, 2]], -1)
+
+
+def dihedral(e: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angle between the triangles (e, a) and (b, e) about e, positive where convex on the side of their normals [rad]."""
+    n, m = np.cross(e, a), np.cross(b, e)
+    return np.arctan2(_dot(np.cross(n, m), e), _dot(n, m) * np.sqrt(_dot(e, e)))
+
+
+def mid_edge_nodes(surface) -> np.ndarray:
+    """Corners of the triangles and the corners behind their edges (T, 6); the triangle's own where there is none."""
+    edges = surface.triangle_edges
+    side = np.where(surface.triangle_signs > 0, 1, 0)  # the neighbour is the one that runs the edge the other way
+    behind = surface.edge_opposite[edges, side]
+    return np.concatenate([surface.triangles, np.where(behind < 0, surface.triangles, behind)], axis=1)
+
+
+def edge_angles(surface, positions: np.ndarray, kinds: EdgeKinds) -> np.ndarray:
+    """Angle of every edge for the triangle on either side, as columns of `edge_triangles` (E, 2) [rad].
+
+    Dihedral where there is a neighbour, tilt of the triangle at a support, zero at free edges and where there is no triangle.
+    """
+    result, N = np.zeros((len(surface.edges), 2)), kinds.vector
+    for side in range(2):
+        ends = surface.edges if side == 0 else surface.edges[:, ::-1]
+        first = positions[ends[:, 0]]
+        corner, behind = surface.edge_opposite[:, side], surface.edge_opposite[:, 1 - side]
+        e, a, b = positions[ends[:, 1]] - first, positions[corner] - first, positions[behind] - first
+        n = np.cross(e, a)
+        clamped = np.arctan2(_dot(np.cross(n, N), e), _dot(n, N) * np.sqrt(_dot(e, e)))
+        mirrored = 0.5 * dihedral(e, a, a - 2.0 * _dot(a, N)[:, None] * N)
+        angle = np.choose(kinds.kind, [np.zeros(len(e)), dihedral(e, a, b), clamped, mirrored])
+        result[:, side] = np.where(corner < 0, 0.0, angle)
+    return result
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Scalar products along the last axis."""
+    return np.sum(a * b, -1)

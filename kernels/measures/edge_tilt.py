@@ -1,0 +1,79 @@
+"""Angle between a triangle's normal and its target about an edge [rad]: half a hinge, at a clamped edge or a symmetry plane.
+
+Nodes 0, 1 on the edge (the way the triangle runs it), 2 opposite. With e = x1 - x0, a = x2 - x0, n = e x a:
+
+    clamped:  alpha = atan2((n x N) . e / |e|, n . N), N the prescribed unit normal;
+    symmetry: alpha = theta / 2, theta the angle of the hinge with the mirrored triangle, whose corner is a - 2 (a . N) N with N the
+              unit normal of the plane, in which the edge lies: the normal on the edge stays in the plane.
+
+Data: kind (2 clamped, 3 symmetry), N (3). Signs as in `hinge_angle`. Half of the mirrored hinge, whose angle is 2 alpha, has the
+energy k w alpha^2 / 2 with w = |e|^2 / A_e, A_e a third of the one triangle's rest area.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.measures import Measure
+from ddg_warp.kernels.measures.hinge_angle import dihedral
+
+
+@cache
+def mirror(real):
+    """Device function: a vector mirrored at the plane with the unit normal N."""
+    V = wp.types.vector(3, real)
+
+    @wp.func
+    def mirrored(a: V, N: V):
+        return a - N * (real(2.0) * wp.dot(a, N))
+
+    return mirrored
+
+
+@cache
+def _functions(real):
+    Q, S, E, M = edge_tilt.types(real)
+    V = wp.types.vector(3, real)
+    angle, derivative = dihedral(real)
+    mirrored = mirror(real)
+
+    @wp.func
+    def derivatives(q: Q, s: S):
+        e = V(q[0], q[1], q[2])
+        a = V(q[3], q[4], q[5])
+        N = V(s[1], s[2], s[3])
+        half = real(0.5)
+        if s[0] > real(2.5):
+            theta, de, da, db = derivative(e, a, mirrored(a, N))
+            return half * theta, half * de, half * (da + mirrored(db, N))
+        # y = (n x N) . t and x = n . N with t = e / |e|; n x N . e = (a . e) (N . e) - (N . a) |e|^2
+        length = wp.length(e)
+        t = e / length
+        Nt = wp.dot(N, t)
+        at = wp.dot(a, t)
+        Na = wp.dot(N, a)
+        y = at * Nt * length - Na * length
+        x = wp.dot(wp.cross(e, a), N)
+        y_e = N * at + a * Nt - t * (at * Nt + Na)
+        y_a = (t * Nt - N) * length
+        scale = real(1.0) / wp.max(x * x + y * y, real(1.0e-30))
+        return (
+            wp.atan2(y, x),
+            (y_e * x - wp.cross(a, N) * y) * scale,
+            (y_a * x - wp.cross(N, e) * y) * scale,
+        )
+
+    @wp.func
+    def strains(q: Q, s: S, w: real):
+        alpha, _e, _a = derivatives(q, s)
+        return E(alpha)
+
+    @wp.func
+    def jacobian(q: Q, s: S, w: real):
+        alpha, e, a = derivatives(q, s)
+        return E(alpha), wp.matrix_from_rows(Q(e[0], e[1], e[2], a[0], a[1], a[2]))
+
+    return strains, jacobian, None
+
+
+edge_tilt = Measure("edge_tilt", 3, ((0, 1), (0, 2)), ("angle [rad]",), _functions, data_size=4)

@@ -1,0 +1,74 @@
+"""Dihedral angle of an interior edge [rad]: four nodes, 0 and 1 on the edge, 2 and 3 opposite (Grinspun et al. 2003).
+
+With e = x1 - x0, a = x2 - x0, b = x3 - x0 the area normals are n = e x a and m = b x e, and
+
+    theta = atan2((n x m) . e / |e|, n . m),   positive where the surface is convex seen from the side that the normals point to.
+
+Derivatives (Wardetzky et al. 2007; Tamstorf and Grinspun 2013), with the heights h = |n| / |e|, k = |m| / |e|:
+d theta / da = -n / (|n| h), d theta / db = -m / (|m| k), and that of e follows from the invariance under rotations. A triangle
+without area has zero derivatives; theta jumps by 2 pi where the surface folds onto itself.
+
+The quadratic density with stiffness k [J] and w = |e|^2 / A_e, A_e a third of the two triangles' rest area (Grinspun et al.
+2003), makes the energy k w theta^2 / 2. On a mesh of equilateral triangles this is the plate of bending stiffness D = 3 k with
+Gaussian modulus -4 k = -(4/3) D (Seung and Nelson 1988): it has the Poisson's ratio -1/3 whatever the material's. So k = D / 3
+bends that mesh right into cylinders, and spheres with the energy of nu = -1/3. On right triangles with the diagonal at 45 degrees
+cylinders bent along 0, 90 and 135 degrees still have D = 3 k, but 9 k along 45 degrees, and refining does not change it.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.measures import Measure
+
+
+@cache
+def dihedral(real):
+    """Device functions of an edge e with the corners a and b beside it, all from the first node of the edge.
+
+    Returns:
+        angle(e, a, b) -> theta; derivative(e, a, b) -> (theta, dtheta/de, dtheta/da, dtheta/db).
+    """
+    V = wp.types.vector(3, real)
+
+    @wp.func
+    def angle(e: V, a: V, b: V):
+        n = wp.cross(e, a)
+        m = wp.cross(b, e)
+        return wp.atan2(wp.dot(wp.cross(n, m), e), wp.dot(n, m) * wp.length(e))
+
+    @wp.func
+    def by_height(n: V, length: real):
+        """Unit normal over the height of its triangle on an edge of that length; zero where the triangle has no area."""
+        return n * (length / wp.max(wp.dot(n, n), real(1.0e-30)))
+
+    @wp.func
+    def derivative(e: V, a: V, b: V):
+        length = wp.length(e)
+        da = -by_height(wp.cross(e, a), length)
+        db = -by_height(wp.cross(b, e), length)
+        de = -(da * wp.dot(a, e) + db * wp.dot(b, e)) / (length * length)
+        return angle(e, a, b), de, da, db
+
+    return angle, derivative
+
+
+@cache
+def _functions(real):
+    Q, S, E, M = hinge_angle.types(real)
+    V = wp.types.vector(3, real)
+    angle, derivative = dihedral(real)
+
+    @wp.func
+    def strains(q: Q, s: S, w: real):
+        return E(angle(V(q[0], q[1], q[2]), V(q[3], q[4], q[5]), V(q[6], q[7], q[8])))
+
+    @wp.func
+    def jacobian(q: Q, s: S, w: real):
+        theta, e, a, b = derivative(V(q[0], q[1], q[2]), V(q[3], q[4], q[5]), V(q[6], q[7], q[8]))
+        return E(theta), wp.matrix_from_rows(Q(e[0], e[1], e[2], a[0], a[1], a[2], b[0], b[1], b[2]))
+
+    return strains, jacobian, None
+
+
+hinge_angle = Measure("hinge_angle", 3, ((0, 1), (0, 2), (0, 3)), ("angle [rad]",), _functions)

@@ -1,0 +1,196 @@
+"""Second fundamental form of a triangle, (b11, b12, b22) [m], from normals at the middles of its edges.
+
+b_ij = -dn(a_i) . a_j in the basis a1 = x1 - x0, a2 = x2 - x0, n interpolated linearly between the mid-edge normals N_i (edge i is
+opposite to corner i). With c_i = 2 N_i . d_i, d_i from edge i square to it to corner i,
+
+    b11 = c0 + c1,   b12 = c0,   b22 = c0 + c2
+
+(Grinspun, Gingold, Reisman, Zorin 2006; Weischedel 2012; Chen, Sastry, van Rees, Vouga 2018). N_i is the triangle's normal turned
+about edge i by the angle phi_i, so that c_i = -2 h_i sin(phi_i), h_i the height over edge i. By the kind of the edge:
+
+    0 free:        phi = 0, the normal of the triangle
+    1 neighbour:   phi = theta / 2, the mean of the two triangles' unit normals, theta the dihedral angle
+    2 clamped:     c = 2 N . d with the prescribed unit normal N
+    3 symmetry:    as 1, with the mirrored triangle as neighbour; that is the normal projected into the plane and normalised
+
+`midedge_curvature_dof` adds to phi of kinds 0 and 1 the sign of the edge times an angle xi of the edge, a dof: the normal turns
+about the edge as the mesh stores it, and is the same for both triangles (the mid-edge directors of Chen et al. 2018; the rotations
+of Morley's plate). At kinds 2 and 3 xi has no effect and must be fixed.
+
+Nodes: corners 0, 1, 2 and the corners 3, 4, 5 behind edges 0, 1, 2; a missing one may be any node. Data: the three kinds, the three
+vectors (prescribed normal or unit normal of the plane), and, with angles, the three signs. w is the rest area [m^2].
+
+Accuracy, measured on exact shapes (energy per area of cylinder, sphere, saddle; rest flat), see tests/kernels/test_shell_orders.py:
+ACCURACY
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.measures import Measure
+from ddg_warp.kernels.measures.edge_tilt import mirror
+from ddg_warp.kernels.measures.hinge_angle import dihedral
+
+
+@cache
+def _edge(real):
+    """Device functions c(e, a, b, kind, N, xi) of one edge and its derivatives (c, dc/de, dc/da, dc/db, dc/dxi).
+
+    e runs along the edge as the triangle does, a to the triangle's corner, b to the corner behind it, all from the edge's first node.
+    """
+    V = wp.types.vector(3, real)
+    angle, derivative = dihedral(real)
+    mirrored = mirror(real)
+
+    @wp.func
+    def value(e: V, a: V, b: V, kind: real, N: V, xi: real):
+        t = wp.normalize(e)
+        d = a - t * wp.dot(a, t)
+        c = real(2.0) * wp.dot(N, d)
+        if kind < real(1.5) or kind > real(2.5):
+            phi = xi
+            if kind > real(2.5):
+                phi = real(0.5) * angle(e, a, mirrored(a, N))
+            elif kind > real(0.5):
+                phi = xi + real(0.5) * angle(e, a, b)
+            c = real(-2.0) * wp.length(d) * wp.sin(phi)
+        return c
+
+    @wp.func
+    def turned(e: V, a: V, phi: real):
+        """c = -2 h sin(phi) at constant phi: (c, dc/de, dc/da, dc/dphi)."""
+        length = wp.length(e)
+        n = wp.cross(e, a)
+        unit = wp.normalize(n)
+        h = wp.length(n) / length
+        s = real(-2.0) * wp.sin(phi)
+        along = s / length
+        return (
+            s * h,
+            (wp.cross(a, unit) - e * (h / length)) * along,
+            wp.cross(unit, e) * along,
+            real(-2.0) * h * wp.cos(phi),
+        )
+
+    @wp.func
+    def derivatives(e: V, a: V, b: V, kind: real, N: V, xi: real):
+        half = real(0.5)
+        if kind < real(0.5):
+            c, de, da, dphi = turned(e, a, xi)
+            return c, de, da, V(), dphi
+        elif kind < real(1.5):
+            theta, theta_e, theta_a, theta_b = derivative(e, a, b)
+            c, de, da, dphi = turned(e, a, xi + half * theta)
+            g = half * dphi
+            return c, de + g * theta_e, da + g * theta_a, g * theta_b, dphi
+        elif kind < real(2.5):
+            length = wp.length(e)
+            t = e / length
+            Nt = wp.dot(N, t)
+            at = wp.dot(a, t)
+            two = real(2.0)
+            de = (N * at + (a - t * (two * at)) * Nt) * (-two / length)
+            return two * (wp.dot(N, a) - Nt * at), de, two * (N - t * Nt), V(), real(0.0)
+        else:
+            theta, theta_e, theta_a, theta_b = derivative(e, a, mirrored(a, N))
+            c, de, da, dphi = turned(e, a, half * theta)
+            g = half * dphi
+            return c, de + g * theta_e, da + g * (theta_a + mirrored(theta_b, N)), V(), real(0.0)
+
+    return value, derivatives
+
+
+def _functions(measure_of):
+    @cache
+    def functions(real):
+        Q, S, E, M = measure_of().types(real)
+        V = wp.types.vector(3, real)
+        value, derivatives = _edge(real)
+        rotated = measure_of().angles > 0
+
+        @wp.func
+        def local(q: Q, i: int):
+            return V(q[3 * i], q[3 * i + 1], q[3 * i + 2])
+
+        @wp.func
+        def target(s: S, i: int):
+            return V(s[3 + 3 * i], s[4 + 3 * i], s[5 + 3 * i])
+
+        @wp.func
+        def sign(s: S, i: int):
+            if wp.static(rotated):
+                return s[12 + i]
+            else:
+                return real(0.0)
+
+        @wp.func
+        def rotation(q: Q, s: S, i: int):
+            if wp.static(rotated):
+                return sign(s, i) * q[15 + i]
+            else:
+                return real(0.0)
+
+        @wp.func
+        def strains(q: Q, s: S, w: real):
+            a1 = local(q, 0)
+            a2 = local(q, 1)
+            c0 = value(a2 - a1, -a1, local(q, 2), s[0], target(s, 0), rotation(q, s, 0))
+            c1 = value(-a2, a1 - a2, local(q, 3), s[1], target(s, 1), rotation(q, s, 1))
+            c2 = value(a1, a2, local(q, 4), s[2], target(s, 2), rotation(q, s, 2))
+            return E(c0 + c1, c0, c0 + c2)
+
+        @wp.func
+        def row(a1: V, a2: V, b0: V, b1: V, b2: V, xi: V):
+            if wp.static(rotated):
+                # fmt: off
+                return Q(a1[0], a1[1], a1[2], a2[0], a2[1], a2[2], b0[0], b0[1], b0[2],
+                         b1[0], b1[1], b1[2], b2[0], b2[1], b2[2], xi[0], xi[1], xi[2])
+            else:
+                return Q(
+                    a1[0],
+                    a1[1],
+                    a1[2],
+                    a2[0],
+                    a2[1],
+                    a2[2],
+                    b0[0],
+                    b0[1],
+                    b0[2],
+                    b1[0],
+                    b1[1],
+                    b1[2],
+                    b2[0],
+                    b2[1],
+                    b2[2],
+                )
+                # fmt: on
+
+        @wp.func
+        def jacobian(q: Q, s: S, w: real):
+            a1 = local(q, 0)
+            a2 = local(q, 1)
+            c0, e0, d0, b0, x0 = derivatives(a2 - a1, -a1, local(q, 2), s[0], target(s, 0), rotation(q, s, 0))
+            c1, e1, d1, b1, x1 = derivatives(-a2, a1 - a2, local(q, 3), s[1], target(s, 1), rotation(q, s, 1))
+            c2, e2, d2, b2, x2 = derivatives(a1, a2, local(q, 4), s[2], target(s, 2), rotation(q, s, 2))
+            zero = real(0.0)
+            none = V()
+            row0 = row(-e0 - d0, e0, b0, none, none, V(x0 * sign(s, 0), zero, zero))
+            row1 = row(d1, -e1 - d1, none, b1, none, V(zero, x1 * sign(s, 1), zero))
+            row2 = row(e2, d2, none, none, b2, V(zero, zero, x2 * sign(s, 2)))
+            return E(c0 + c1, c0, c0 + c2), wp.matrix_from_rows(row0 + row1, row0, row0 + row2)
+
+        return strains, jacobian, None
+
+    return functions
+
+
+_EDGES = ((0, 1), (0, 2), (1, 3), (2, 4), (0, 5))
+_STRAINS = ("b11 [m]", "b12 [m]", "b22 [m]")
+
+midedge_curvature = Measure(
+    "midedge_curvature", 3, _EDGES, _STRAINS, _functions(lambda: midedge_curvature), data_size=12
+)
+midedge_curvature_dof = Measure(
+    "midedge_curvature_dof", 3, _EDGES, _STRAINS, _functions(lambda: midedge_curvature_dof), angles=3, data_size=15
+)

@@ -1,0 +1,272 @@
+"""What the tests of shells share: a launch of any term on local dofs, meshes of the unit square, and exact shapes."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import warp as wp
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
+from scipy.spatial import Delaunay
+
+from ddg_warp.kernels.terms import SHELLS
+
+
+@dataclass
+class Elements:
+    """Local dofs q (N, size), constant data s, rest measure w (N,) and parameters p (N, .) of N elements of a term."""
+
+    name: str
+    q: np.ndarray
+    s: np.ndarray
+    w: np.ndarray
+    p: np.ndarray
+
+    def evaluate(self, precision="float64", device="cpu") -> dict[str, np.ndarray]:
+        """energy (N, 1), gradient, strain, stress, jacobian, root and tension of the elements."""
+        real = wp.float32 if precision == "float32" else wp.float64
+        run, shapes = _kernels(self.name, real)[0], _shapes(self.name)
+        out = [wp.zeros((len(self.q), *shape), dtype=real, device=device) for shape in shapes.values()]
+        wp.launch(run, len(self.q), self._inputs(real, device), out, device=device)
+        return {name: array.numpy().astype(float) for name, array in zip(shapes, out, strict=True)}
+
+    def hessian(self, precision="float64", device="cpu") -> np.ndarray:
+        """Reverse mode of the gradient (N, size, size)."""
+        return self._reverse(1, (SHELLS[self.name].measure.size,) * 2, precision, device)
+
+    def reverse(self, precision="float64", device="cpu") -> np.ndarray:
+        """Reverse mode of the energy (N, size)."""
+        return self._reverse(2, (SHELLS[self.name].measure.size,), precision, device)
+
+    def _reverse(self, which, shape, precision, device):
+        real = wp.float32 if precision == "float32" else wp.float64
+        out = wp.zeros((len(self.q), *shape), dtype=real, device=device)
+        launch = (len(self.q), *shape[1:])
+        wp.launch(_kernels(self.name, real)[which], launch, self._inputs(real, device), [out], device=device)
+        return out.numpy().astype(float)
+
+    def changed(self, **changes) -> "Elements":
+        """The same elements with other arrays."""
+        return Elements(**{**vars(self), **changes})
+
+    def _inputs(self, real, device):
+        Q, S, P = _types(self.name, real)
+        values = [(self.q, Q), (self.s, S), (self.w, real), (self.p, P)]
+        return [wp.array(np.ascontiguousarray(value), dtype=dtype, device=device) for value, dtype in values]
+
+
+def _types(name, real):
+    term = SHELLS[name]
+    Q, S, _, _ = term.measure.types(real)
+    return Q, S, wp.types.vector(term.density.parameter_size(len(term.measure.strains)), real)
+
+
+def _shapes(name):
+    n, size = len(SHELLS[name].measure.strains), SHELLS[name].measure.size
+    vectors = {"energy": (1,), "gradient": (size,), "strain": (n,), "stress": (n,)}
+    return {**vectors, "jacobian": (n, size), "root": (n, n), "tension": (3,)}
+
+
+@cache
+def _kernels(name, real):
+    """Kernels of a term on arrays of local dofs: everything of first order, and the columns of the Hessian."""
+    term = SHELLS[name]
+    n, size, coupled, tensions = (
+        len(term.measure.strains),
+        term.measure.size,
+        term.density.coupled,
+        term.measure.tensions,
+    )
+    Q, S, P = _types(name, real)
+    E = wp.types.vector(n, real)
+    strains_of, jacobian_of, tension_of = term.measure.functions(real)
+    energy_of, slope_of, root_of = term.density.functions(real, n)
+
+    @wp.func
+    def energy_at(q: Q, s: S, w: real, p: P):
+        return w * energy_of(strains_of(q, s, w), p)
+
+    @wp.func
+    def gradient_at(q: Q, s: S, w: real, p: P):
+        e, jacobian = jacobian_of(q, s, w)
+        return (slope_of(e, p) * w) * jacobian
+
+    @wp.func
+    def along(q: Q, s: S, w: real, p: P, v: Q):
+        return wp.dot(gradient_at(q, s, w, p), v)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def first(
+        q: wp.array(dtype=Q),
+        s: wp.array(dtype=S),
+        w: wp.array(dtype=real),
+        p: wp.array(dtype=P),
+        energy_out: wp.array2d(dtype=real),
+        gradient_out: wp.array2d(dtype=real),
+        strain_out: wp.array2d(dtype=real),
+        stress_out: wp.array2d(dtype=real),
+        jacobian_out: wp.array3d(dtype=real),
+        root_out: wp.array3d(dtype=real),
+        tension_out: wp.array2d(dtype=real),
+    ):
+        k = wp.tid()
+        energy_out[k, 0] = energy_at(q[k], s[k], w[k], p[k])
+        g = gradient_at(q[k], s[k], w[k], p[k])
+        strain = strains_of(q[k], s[k], w[k])
+        e, jacobian = jacobian_of(q[k], s[k], w[k])
+        slope = slope_of(e, p[k])
+        root = root_of(e, p[k], E())
+        for i in range(wp.static(size)):
+            gradient_out[k, i] = g[i]
+        for m in range(wp.static(n)):
+            strain_out[k, m] = strain[m]
+            stress_out[k, m] = slope[m]
+            for i in range(wp.static(size)):
+                jacobian_out[k, m, i] = jacobian[m, i]
+            if wp.static(coupled):
+                for c in range(wp.static(n)):
+                    root_out[k, m, c] = root[m, c]
+            else:
+                root_out[k, m, m] = root[m]
+        if wp.static(tensions == 3):
+            blocks, _shift = tension_of(q[k], w[k], slope)
+            for m in range(3):
+                tension_out[k, m] = blocks[m]
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def second(
+        q: wp.array(dtype=Q),
+        s: wp.array(dtype=S),
+        w: wp.array(dtype=real),
+        p: wp.array(dtype=P),
+        hessian_out: wp.array3d(dtype=real),
+    ):
+        k, column = wp.tid()
+        v = Q()
+        v[column] = real(1.0)
+        dq, _ds, _dw, _dp, _dv = wp.grad(along)(q[k], s[k], w[k], p[k], v)
+        for i in range(wp.static(size)):
+            hessian_out[k, i, column] = dq[i]
+
+    # by itself: a function called forwards in a kernel before wp.grad takes it there has no reverse in Warp 1.19, it is zero
+    @wp.kernel(module="unique", enable_backward=False)
+    def reverse(
+        q: wp.array(dtype=Q),
+        s: wp.array(dtype=S),
+        w: wp.array(dtype=real),
+        p: wp.array(dtype=P),
+        reverse_out: wp.array2d(dtype=real),
+    ):
+        k = wp.tid()
+        dq, _ds, _dw, _dp = wp.grad(energy_at)(q[k], s[k], w[k], p[k])
+        for i in range(wp.static(size)):
+            reverse_out[k, i] = dq[i]
+
+    return first, second, reverse
+
+
+def gather(elements, positions, angles=None) -> Elements:
+    """The elements of a set at given positions (P, 3) and angles, all zero by default."""
+    measure = elements.term.measure
+    count = len(elements)
+    x = positions[elements.nodes]
+    q = [x[:, j] - x[:, i] for i, j in measure.edges]
+    if measure.angles:
+        q.append(np.zeros((count, measure.angles)) if angles is None else angles[elements.angles])
+    s = elements.data if measure.data_size else np.zeros((count, 1))
+    w, *p = (np.broadcast_to(values, (count,)) for values in elements.parameters)
+    return Elements(elements.term.name, np.concatenate(q, axis=1), s, w, np.stack(p, axis=1))
+
+
+def relaxed_angles(elements, positions, active, device) -> np.ndarray:
+    """Angles that minimise the energy at fixed positions, by Gauss and Newton; those not `active` stay zero."""
+    angles, chosen, size = np.zeros(len(active)), np.flatnonzero(active), 3 * len(elements)
+    for _ in range(6):
+        local = gather(elements, positions, angles)
+        at = local.evaluate(device=device)
+        factor = np.einsum("tij,tjk->tik", at["root"], at["jacobian"][:, :, 15:]) * np.sqrt(local.w)[:, None, None]
+        columns = np.repeat(elements.angles[:, None], 3, axis=1).ravel()
+        matrix = sparse.csr_matrix((factor.ravel(), (np.repeat(np.arange(size), 3), columns)), (size, len(active)))
+        gradient = np.zeros(len(active))
+        np.add.at(gradient, elements.angles, at["gradient"][:, 15:])
+        angles[chosen] -= spsolve((matrix.T @ matrix)[chosen][:, chosen].tocsc(), gradient[chosen])
+    return angles
+
+
+def square(kind: str, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (P, 2) and triangles of a mesh of the unit square with n edges a side.
+
+    Kinds: "right" (diagonals along 45 degrees), "crossed" (diagonals alternate), "equilateral" (rows sheared to and fro, no
+    square), "jittered" ("right" with random inner points), "delaunay" (random inner points).
+    """
+    if kind == "delaunay":
+        return _delaunay(n)
+    i, j = (a.ravel() for a in np.meshgrid(np.arange(n + 1), np.arange(n + 1), indexing="ij"))
+    points = np.stack([i, j], -1) / n
+    if kind == "equilateral":
+        points = np.stack([i + 0.5 * (j % 2), j * np.sqrt(0.75)], -1) / n
+    if kind == "jittered":
+        inside = (i > 0) & (i < n) & (j > 0) & (j < n)
+        points[inside] += np.random.default_rng(0).uniform(-0.2, 0.2, (inside.sum(), 2)) / n
+    a, b = (a.ravel() for a in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
+    p, q, r, s = (c * (n + 1) + d for c, d in ((a, b), (a + 1, b), (a + 1, b + 1), (a, b + 1)))
+    rising = {"crossed": (a + b) % 2 == 0, "equilateral": b % 2 == 1}.get(kind, np.ones(len(a), bool))[:, None]
+    first = np.where(rising, np.stack([p, q, r], -1), np.stack([p, q, s], -1))
+    second = np.where(rising, np.stack([p, r, s], -1), np.stack([q, r, s], -1))
+    return points, np.concatenate([first, second])
+
+
+def _delaunay(n):
+    side = np.arange(n) / n
+    corners = [(side, 0 * side), (1 + 0 * side, side), (1 - side, 1 + 0 * side), (0 * side, 1 - side)]
+    points = np.concatenate([np.stack(pair, -1) for pair in corners])
+    for candidate in np.random.default_rng(0).uniform(0.3 / n, 1.0 - 0.3 / n, (40 * n * n, 2)):
+        if ((points - candidate) ** 2).sum(1).min() > (0.7 / n) ** 2:
+            points = np.concatenate([points, [candidate]])
+    triangles = Delaunay(points).simplices
+    a, b, c = np.moveaxis(points[triangles], 1, 0)
+    area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    triangles = np.where(area[:, None] > 0.0, triangles, triangles[:, [0, 2, 1]])
+    return points, triangles[np.abs(area) > 1e-9]
+
+
+def cylinder(points, angle, radius=2.0):
+    """Isometric image of a plane, bent along a direction in degrees, and its outward normals (P, 3) each."""
+    c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    u, v = points @ [c, s] / radius, points @ [-s, c]
+    x, z = radius * np.sin(u), radius * (np.cos(u) - 1.0)
+    return np.stack([c * x - s * v, s * x + c * v, z], -1), np.stack([c * np.sin(u), s * np.sin(u), np.cos(u)], -1)
+
+
+def sphere(points, radius=2.0):
+    """Cap over the unit square, and its outward normals."""
+    x, y = (points - 0.5).T
+    place = np.stack([x, y, np.sqrt(radius**2 - x**2 - y**2)], -1)
+    return place, place / radius
+
+
+def saddle(points, k=0.02, angle=0.0):
+    """Shallow graph of curvatures k, -k along a direction in degrees, and its normals."""
+    c, s = np.cos(2.0 * np.radians(angle)), np.sin(2.0 * np.radians(angle))
+    x, y = (points - 0.5).T
+    normal = np.stack([-k * (c * x + s * y), -k * (s * x - c * y), np.ones(len(x))], -1)
+    place = np.stack([x, y, k * (0.5 * c * (x**2 - y**2) + s * x * y)], -1)
+    return place, normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+
+
+class Surface:
+    """Topology of an oriented triangle mesh, with the arrays that shells.py reads."""
+
+    def __init__(self, triangles):
+        self.triangles = np.asarray(triangles)
+        starts, ends = np.roll(self.triangles, -1, 1).ravel(), np.roll(self.triangles, -2, 1).ravel()
+        sides = np.stack([np.minimum(starts, ends), np.maximum(starts, ends)], 1)
+        self.edges, inverse = np.unique(sides, axis=0, return_inverse=True)
+        self.triangle_edges = inverse.reshape(self.triangles.shape)
+        self.triangle_signs = np.where(starts < ends, 1, -1).reshape(self.triangles.shape)
+        side = np.where(self.triangle_signs > 0, 0, 1)
+        self.edge_triangles = np.full((len(self.edges), 2), -1)
+        self.edge_opposite = self.edge_triangles.copy()
+        self.edge_triangles[self.triangle_edges, side] = np.arange(len(self.triangles))[:, None]
+        self.edge_opposite[self.triangle_edges, side] = self.triangles
+        self.boundary = (self.edge_triangles < 0).any(1)
