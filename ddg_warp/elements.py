@@ -28,8 +28,7 @@ class ElementSet:
     def __post_init__(self):
         measure = self.term.measure
         count = len(self.nodes)
-        stencil = 1 + max(max(pair) for pair in measure.edges)
-        expected = {"nodes": stencil, "angles": measure.angles, "data": measure.data_size}
+        expected = {"nodes": measure.nodes, "angles": measure.angles, "data": measure.data_size}
         for name, size in expected.items():
             if getattr(self, name).shape != (count, size):
                 raise ValueError(f"{self.term.name}: {name} {getattr(self, name).shape}; it takes {(count, size)}")

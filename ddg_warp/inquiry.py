@@ -34,6 +34,11 @@ def energies(model, state) -> dict[str, float]:
         if group.kind.twist:
             rotary = np.tile(group.host.rotary, (1, group.worlds))
             kinetic += 0.5 * float((rotary * arrays.download(data.omega) ** 2).sum())
+    if model.net is not None:
+        host = model.net.host
+        q, v = (array.numpy().astype(float).reshape(model.worlds, -1, 3) for array in (state.net.q, state.net.v))
+        kinetic += 0.5 * float((host.mass * v * v).sum())
+        potential -= float((host.mass[: host.nodes] * q[:, : host.nodes] * np.asarray(model.scene.gravity)).sum())
     return result | {"kinetic": kinetic, "gravity": potential}
 
 

@@ -8,7 +8,7 @@ import warp as wp
 from ddg_warp import arrays, precision
 from ddg_warp.chains import ChainGroup, compile_chains, scene_motions
 from ddg_warp.errors import SceneError
-from ddg_warp.io import Curves
+from ddg_warp.io import Curves, Surfaces
 from ddg_warp.kernels import element, step
 from ddg_warp.state import GroupState, State
 
@@ -115,14 +115,12 @@ class Model:
     Attributes:
         scene: what it was built from.
         curves: rods in the user's order.
-        surfaces: None: a scene has rods only.
-        groups: rods of one kind and similar length each.
-        held: what each support of the scene holds.
+        groups: rods of one kind and similar length each; those that are part of the net are not among them.
+        net: shells and what is joined, or None.
+        held: what each support of the scene's rods holds in the groups.
         precision: scalar types.
         worlds: number of independent copies.
     """
-
-    surfaces = None
 
     def __init__(self, scene, *, device=None, precision: str | None = None, worlds: int = 1):
         if worlds < 1:
@@ -135,6 +133,13 @@ class Model:
         self.chains, self.held = compile_chains(scene)
         self.motions = scene_motions(scene)
         self.groups = [Group(chain, scene, worlds, self.wp_device, self.types.real) for chain in self.chains]
+        self.net = self._build_net() if scene.shells or scene.joints or scene.attachments else None
+
+    def _build_net(self):
+        from ddg_warp.net import compile_net
+        from ddg_warp.net_model import DeviceNet
+
+        return DeviceNet(compile_net(self.scene), self.worlds, self.wp_device, self.types.real)
 
     @property
     def device(self) -> str:
@@ -149,6 +154,9 @@ class Model:
     @cached_property
     def curves(self) -> Curves:
         batches = self.scene.batches
+        if not batches:
+            none = np.zeros(0, int)
+            return Curves(none, none.astype(bool), np.zeros(0), np.zeros(0, object), none)
         counts = np.concatenate([np.full(b.rods, b.nodes) for b in batches])
         radius = [np.broadcast_to(_node_radius(b), (b.rods, b.nodes)).ravel() for b in batches]
         return Curves(
@@ -158,6 +166,38 @@ class Model:
             names=np.concatenate([np.full(b.rods, b.name, dtype=object) for b in batches]),
             batch=np.concatenate([np.full(b.rods, i) for i, b in enumerate(batches)]),
         )
+
+    @cached_property
+    def surfaces(self) -> Surfaces | None:
+        """Shells as triangles among the rows of `State.points`; None without."""
+        if not self.scene.shells:
+            return None
+        shells, rods = self.net.host.shells, int(self.curves.counts.sum())
+        points = np.cumsum([0] + [len(shell.nodes) for shell in shells])
+        triangles = np.cumsum([0] + [len(shell.surface.triangles) for shell in shells])
+        return Surfaces(
+            triangles=np.concatenate([s.surface.triangles + rods + at for s, at in zip(shells, points, strict=False)]),
+            first=triangles[:-1],
+            names=np.array([shell.name for shell in self.scene.shells], dtype=object),
+            thickness=np.concatenate([shell.plate.thickness for shell in shells]),
+        )
+
+    @cached_property
+    def _net_rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of `State.points` that the net fills, and the blocks that fill them."""
+        if self.net is None:
+            return np.zeros(0, int), np.zeros(0, int)
+        start = np.concatenate([[0], np.cumsum(self.curves.counts)])
+        rows = [start[rod.rod] + np.arange(len(rod.nodes)) for rod in self.net.host.rods]
+        blocks = [rod.nodes for rod in self.net.host.rods] + [shell.nodes for shell in self.net.host.shells]
+        vertices = sum(len(shell.nodes) for shell in self.net.host.shells)
+        return np.concatenate([*rows, start[-1] + np.arange(vertices)]).astype(int), np.concatenate(blocks)
+
+    @property
+    def points_count(self) -> int:
+        """Rows of `State.points` in one world."""
+        vertices = 0 if self.net is None else sum(len(shell.nodes) for shell in self.net.host.shells)
+        return int(self.curves.counts.sum()) + vertices
 
     def report(self) -> str:
         """What is in the model, what it costs, and what is left out."""
@@ -208,12 +248,17 @@ class Model:
                     row = place[0] + candidate.parameter_names.index(parameter)
                     group.set_parameter(row, values, f"{term}.{parameter}")
                     found = True
+        for part in self.net.sets if self.net is not None else ():
+            if part.term.name == term and parameter in part.term.parameter_names:
+                part.set_parameter(part.term.parameter_names.index(parameter), values, f"{term}.{parameter}")
+                found = True
         if not found:
             raise ValueError(f"no rod has the term {term!r}; this model has {', '.join(self._term_names())}")
         self.version += 1
 
     def _term_names(self) -> list[str]:
-        return sorted({term.name for group in self.groups for term in group.kind.terms})
+        nets = [part.term.name for part in self.net.sets] if self.net is not None else []
+        return sorted({term.name for group in self.groups for term in group.kind.terms} | set(nets))
 
     def parameters(self) -> dict[str, np.ndarray]:
         """Parameters of all terms by name, `group/term/parameter`, broadcastable to (node, column of the group)."""
@@ -223,6 +268,9 @@ class Model:
                 for j, name in enumerate(term.parameter_names):
                     result[f"{i}/{term.name}/{name}"] = group.parameter(place[0] + j)
             result |= {f"{i}/mass": group.host.mass, f"{i}/rotary_inertia": group.host.rotary}
+        for part in self.net.sets if self.net is not None else ():
+            for name, values in zip(part.term.parameter_names, part.parameters, strict=True):
+                result[f"net/{part.term.name}/{name}"] = values
         return result
 
     def state(self, points=None, velocities=None, spins=None) -> State:
@@ -253,6 +301,13 @@ class Model:
                     omega = np.zeros((group.nodes, group.columns))
                     self._scatter_edges(group, spins, omega)
                     arrays.assign(data.omega, omega)
+        if self.net is not None:
+            state.net = self.net.rest()
+            if spins is not None:
+                raise ValueError("spins are of rods on their own; this model has a net")
+            for values, array, what in ((points, state.net.q, "points"), (velocities, state.net.v, "velocities")):
+                if values is not None:
+                    array.assign(self._scatter_net(values, array.numpy(), what))
         if points is not None:
             self.carry_frames(state)
         self.update_strains(state)
@@ -260,20 +315,29 @@ class Model:
 
     def _scatter_nodes(self, group: Group, values, out: np.ndarray, what: str) -> None:
         """Put values in the user's order (P, 3) into (node, column, dim) of a group."""
-        counts = self.curves.counts
-        values = np.asarray(values, float)
-        if values.shape not in ((counts.sum(), 3), (self.worlds, counts.sum(), 3)):
-            raise ValueError(
-                f"{what} have shape {values.shape}; they are ({counts.sum()}, 3), or one such array a world"
-            )
-        if not np.isfinite(values).all():
-            raise ValueError(f"{what}: node {int(np.argwhere(~np.isfinite(values))[0][-2])} is not finite")
-        start = np.concatenate([[0], np.cumsum(counts)])
+        values = self._point_values(values, what)
+        start = np.concatenate([[0], np.cumsum(self.curves.counts)])
         axes = [0, 2] if group.kind.dim == 2 else [0, 1, 2]
         k, column, index = _user_index(group, group.host.own, start)
         for world in range(self.worlds):
             own = values if values.ndim == 2 else values[world]
             out[k, column + world * group.rods] = own[index][:, axes]
+
+    def _scatter_net(self, values, blocks: np.ndarray, what: str) -> np.ndarray:
+        """Blocks (worlds N, 3) with values in the user's order (P, 3) put in."""
+        values = self._point_values(values, what)
+        out = blocks.astype(float).reshape(self.worlds, -1, 3)
+        rows, places = self._net_rows
+        out[:, places] = (values if values.ndim == 3 else values[None])[:, rows]
+        return out.reshape(-1, 3)
+
+    def _point_values(self, values, what: str) -> np.ndarray:
+        values, count = np.asarray(values, float), self.points_count
+        if values.shape not in ((count, 3), (self.worlds, count, 3)):
+            raise ValueError(f"{what} have shape {values.shape}; they are ({count}, 3), or one such array a world")
+        if not np.isfinite(values).all():
+            raise ValueError(f"{what}: node {int(np.argwhere(~np.isfinite(values))[0][-2])} is not finite")
+        return values
 
     def _scatter_edges(self, group: Group, values, out: np.ndarray) -> None:
         counts = self.curves.counts - np.where(self.curves.closed, 0, 1)
@@ -290,7 +354,8 @@ class Model:
 
     def empty_state(self) -> State:
         """Arrays of a state, not yet filled."""
-        return State(self, [self._group_state(group) for group in self.groups])
+        net = self.net.empty() if self.net is not None else None
+        return State(self, [self._group_state(group) for group in self.groups], net)
 
     def restore(self, snapshot: dict[str, np.ndarray]) -> State:
         """The state that `State.snapshot` saved, bit by bit.
@@ -299,12 +364,12 @@ class Model:
             ValueError: the snapshot is of another model.
         """
         state = self.empty_state()
-        names = {"time"} | {f"{i}/{name}" for i, group in enumerate(state.groups) for name in group.arrays()}
+        names = {"time"} | {f"{part}/{name}" for part, data in state.parts().items() for name in data.arrays()}
         if names ^ set(snapshot):
             raise ValueError(f"snapshot is of another model: it differs by {', '.join(sorted(names ^ set(snapshot)))}")
-        for i, group in enumerate(state.groups):
-            for name, array in group.arrays().items():
-                values = np.asarray(snapshot[f"{i}/{name}"])
+        for part, data in state.parts().items():
+            for name, array in data.arrays().items():
+                values = np.asarray(snapshot[f"{part}/{name}"])
                 if values.shape[: array.ndim] != array.shape:
                     raise ValueError(
                         f"snapshot is of another model: {name} has shape {values.shape}, not {array.shape}"
@@ -343,12 +408,16 @@ class Model:
                     device=self.wp_device,
                 )
                 wp.copy(data.frame, new)
+        if self.net is not None:
+            self.net.carry(state.net, state.net)
 
     def update_strains(self, state: State) -> None:
         """Store the strains of a state where strain-rate damping looks for them."""
         for group, data in zip(self.groups, state.groups, strict=True):
             if group.kind.viscous:
                 self.strains(group, data, data.last)
+        if self.net is not None:
+            self.net.update_strains(state.net)
 
     def strains(self, group: Group, data: GroupState, out: wp.array, stress: wp.array | None = None) -> None:
         """Launch the strain kernel of a group; stresses go to `stress`, if given (viscous parts at rest). Can be captured."""
@@ -361,11 +430,13 @@ class Model:
             device=self.wp_device,
         )
 
-    def gather_nodes(self, values: list[np.ndarray]) -> np.ndarray:
-        """From arrays (node, column, dim) of every group to the user's order, in three dimensions."""
-        counts = self.curves.counts
-        start = np.concatenate([[0], np.cumsum(counts)])
-        out = np.zeros((self.worlds, start[-1], 3))
+    def gather_nodes(self, values: list[np.ndarray], blocks: wp.array | None = None) -> np.ndarray:
+        """From arrays (node, column, dim) of every group and blocks of the net to the user's order, in three dimensions."""
+        start = np.concatenate([[0], np.cumsum(self.curves.counts)])
+        out = np.zeros((self.worlds, self.points_count, 3))
+        if blocks is not None:
+            rows, places = self._net_rows
+            out[:, rows] = blocks.numpy().reshape(self.worlds, -1, 3)[:, places]
         for group, value in zip(self.groups, values, strict=True):
             axes = [0, 2] if group.kind.dim == 2 else [0, 1, 2]
             k, column, index = _user_index(group, group.host.own, start)
@@ -373,9 +444,16 @@ class Model:
                 out[world][index[:, None], axes] = value[k, column + world * group.rods]
         return out[0] if self.worlds == 1 else out
 
-    def gather_edges(self, values: list[np.ndarray], width: int = 0) -> np.ndarray | None:
-        """The same for edges; None without twist."""
-        if not any(group.kind.twist for group in self.groups):
+    def gather_angles(self, state: State) -> np.ndarray | None:
+        """Angles of all edges of rods; see `State.angles`."""
+        net = None
+        if self.net is not None and self.net.edges:
+            net = state.net.q.numpy().reshape(self.worlds, -1, 3)[:, self.net.angle_start :, 0]
+        return self._gather_edges([arrays.download(data.theta) for data in state.groups], net)
+
+    def _gather_edges(self, values: list[np.ndarray], net: np.ndarray | None = None, width: int = 0):
+        """From arrays (node, column) of every group and values of the net's rod edges (worlds, edges) to the user's order."""
+        if not any(group.kind.twist for group in self.groups) and net is None:
             return None
         counts = self.curves.counts - np.where(self.curves.closed, 0, 1)
         start = np.concatenate([[0], np.cumsum(counts)])
@@ -386,18 +464,27 @@ class Model:
                 k, column, index = _user_index(group, own, start)
                 for world in range(self.worlds):
                     out[world][index] = value[k, column + world * group.rods]
+        for rod in self.net.host.rods if net is not None else ():
+            rows = start[rod.rod] + np.arange(len(rod.edges))
+            out[:, rows] = net[:, rod.edges - self.net.angle_start]
         return out[0] if self.worlds == 1 else out
 
     def gather_directors(self, state: State) -> np.ndarray | None:
         """First material directors of a state; see `State.directors`."""
-        if not any(group.kind.twist for group in self.groups):
-            return None
-        values = []
-        for data in state.groups:
+        values, net = [], None
+        if self.net is not None and self.net.edges:
+            frame = np.moveaxis(state.net.frame.numpy().reshape(6, self.worlds, -1), 0, -1)
+            angle = state.net.q.numpy().reshape(self.worlds, -1, 3)[:, self.net.angle_start :][:, : self.net.edges, 0]
+            u, t = frame[..., :3], frame[..., 3:]
+            net = u * np.cos(angle)[..., None] + np.cross(t, u) * np.sin(angle)[..., None]
+        for group, data in zip(self.groups, state.groups, strict=True):
+            if not group.kind.twist:
+                values.append(np.zeros(0))
+                continue
             frame, theta = arrays.download(data.frame), arrays.download(data.theta)
             u, t = np.moveaxis(frame[0:3], 0, -1), np.moveaxis(frame[3:6], 0, -1)
             values.append(u * np.cos(theta)[..., None] + np.cross(t, u) * np.sin(theta)[..., None])
-        return self.gather_edges(values, 3)
+        return self._gather_edges(values, net, 3)
 
 
 _precision = precision.choose

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ddg_warp import shell_geometry
 from ddg_warp import shells as shell_terms
 from ddg_warp.chains import Piece, TimedLoad, component_bits, ghost_nodes, net_rods, pieces_of, scene_motions
 from ddg_warp.elements import ElementSet
@@ -40,7 +41,7 @@ class NetShell:
     surface: Surface
     nodes: np.ndarray
     edges: np.ndarray
-    kinds: shell_terms.EdgeKinds
+    kinds: shell_geometry.EdgeKinds
     plate: shell_terms.Plate
 
 
@@ -309,7 +310,7 @@ class _Builder:
         flat = np.array([find(i) for i in range(len(points))]) if self.scene.joints or self.scene.attachments else root
         return np.unique(flat, return_inverse=True)[1]
 
-    def _kinds(self, surface: Surface, index: int) -> shell_terms.EdgeKinds:
+    def _kinds(self, surface: Surface, index: int) -> shell_geometry.EdgeKinds:
         """What holds the normals at mesh edges: those whose two vertices a support names."""
         clamped, symmetry = {}, {}
         corners = surface.points[surface.triangles]
@@ -328,7 +329,7 @@ class _Builder:
                     clamped[int(edge)] = total / np.linalg.norm(total)
         for edge in set(clamped) & set(symmetry):
             del symmetry[edge]
-        return shell_terms.edge_kinds(surface, clamped, symmetry)
+        return shell_geometry.edge_kinds(surface, clamped, symmetry)
 
 
 def _joint_places(scene, net: Net, rigid) -> list[tuple[int, int, list]]:
@@ -500,7 +501,9 @@ def _load(scene, net: Net) -> None:
             if rod is None:
                 continue
             if np.any(load.couple):
-                raise SceneError(f"add_couple: rod {index} is part of a net; give a pair of forces or a twisting moment")
+                raise SceneError(
+                    f"add_couple: rod {index} is part of a net; give a pair of forces or a twisting moment"
+                )
             place = rod.nodes[load.node] if load.edge is None else rod.edges[load.edge]
             force = np.asarray(load.force, float) if load.edge is None else np.array([load.moment, 0.0, 0.0])
             _put(net, np.array([place]), force[None], load.amplitude)

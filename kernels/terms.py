@@ -11,6 +11,7 @@ from ddg_warp.kernels.measures.edge_stretch import edge_stretch, edge_stretch_2d
 from ddg_warp.kernels.measures.edge_tilt import edge_tilt
 from ddg_warp.kernels.measures.hinge_angle import hinge_angle
 from ddg_warp.kernels.measures.isometric_bending import isometric_bending
+from ddg_warp.kernels.measures.joint_curvature_twist import joint_curvature_twist
 from ddg_warp.kernels.measures.midedge_curvature import midedge_curvature, midedge_curvature_dof
 from ddg_warp.kernels.measures.planar_curvature import planar_curvature
 from ddg_warp.kernels.measures.rod_curvature_twist import rod_curvature_twist
@@ -67,3 +68,5 @@ SHELLS = {
         Term("shell_isometric_damped", isometric_bending, kelvin_voigt, "the same with strain-rate damping"),
     )
 }
+
+JOINT = Term("rigid_joint", joint_curvature_twist, quadratic, "bending and twist of half cells at rigid joints")

@@ -230,3 +230,10 @@ def _require_supports(model) -> None:
                     f"rod {host.rods[loose[0]]} is not held along {axis}: a static solve needs supports; "
                     "add scene.clamp(...) or scene.fix(...)"
                 )
+    if model.net is not None:
+        loose = np.flatnonzero(~model.net.host.fixed[: model.net.host.nodes].any(0))
+        if loose.size:
+            raise SceneError(
+                f"no node of the shells and joined rods is held along {'xyz'[loose[0]]}: a static solve needs supports; "
+                "add scene.hold(...), scene.clamp_boundary(...) or scene.fix(...)"
+            )

@@ -1,7 +1,7 @@
 """Measures: the geometry. A measure maps the local dofs of an element to a few strains.
 
-The local dofs are q = [edge vectors of the stencil..., angles of its edges...], so that translation invariance holds by
-construction and forces on nodes are differences of edge forces. Where a measure needs more it reads s, which stays constant
+The local dofs are q = [edge vectors of the stencil..., angles of its edges..., rotation vectors of joints...], so that
+translation invariance holds by construction and forces on nodes are differences of edge forces. Where a measure needs more it reads s, which stays constant
 during a step: lagged frames of a rod, or data of the element such as the normal of a clamp. w is the rest measure of the
 element (rest length, Voronoi length, area): strains are pointwise quantities, so a density and its parameters do not depend
 on the mesh.
@@ -25,6 +25,8 @@ class Measure:
         lag_size: reals of lagged data of the stencil; 0 for a measure without frames.
         data_size: reals of constant data of the element; 0 for a measure without.
         tensions: scalars of the geometric stiffness; 0 where it is left to the exact Hessian.
+        spins: rotation vectors of rigid joints among the dofs, after the angles.
+        frames: how many of the angles belong to edges with a reference frame, which the lagged data begin with.
         strains: names and units of the strains.
         functions: real -> (strains, jacobian, tension). `strains(q, s, w) -> E`; `jacobian(q, s, w) -> (E, J)`; `tension` is
             None, or `tension(q, w, slope) -> (c, shift)` with the second derivative of the strains,
@@ -41,11 +43,23 @@ class Measure:
     lag_size: int = 0
     data_size: int = 0
     tensions: int = 0
+    spins: int = 0
+    frames: int = 0
 
     @property
     def size(self) -> int:
         """Number of local dofs."""
-        return self.dim * len(self.edges) + self.angles
+        return self.dim * len(self.edges) + self.angles + 3 * self.spins
+
+    @property
+    def nodes(self) -> int:
+        """Nodes of the stencil."""
+        return 1 + max(max(pair) for pair in self.edges)
+
+    @property
+    def slots(self) -> int:
+        """Nodes, angles and rotation vectors of the stencil."""
+        return self.nodes + self.angles + self.spins
 
     @property
     def span(self) -> int:

@@ -69,9 +69,7 @@ def _functions(real):
         t = turned(omega, V(s[9], s[10], s[11]))
         sign = s[13]
         r = R(t[0], t[1], t[2], q[0], q[1], q[2], real(0.0), sign * q[3])
-        lag = T(
-            u[0], u[1], u[2], t[0], t[1], t[2], s[0], s[1], s[2], sign * s[3], sign * s[4], sign * s[5], s[12]
-        )
+        lag = T(u[0], u[1], u[2], t[0], t[1], t[2], s[0], s[1], s[2], sign * s[3], sign * s[4], sign * s[5], s[12])
         return r, lag, t, omega, sign
 
     @wp.func
@@ -89,9 +87,7 @@ def _functions(real):
     def jacobian(q: Q, s: S, w: real):
         r, lag, t, omega, sign = vertex(q, s)
         e, j = rod_jacobian(r, lag, w)
-        return e, wp.matrix_from_rows(
-            row(j[0], t, omega, sign), row(j[1], t, omega, sign), row(j[2], t, omega, sign)
-        )
+        return e, wp.matrix_from_rows(row(j[0], t, omega, sign), row(j[1], t, omega, sign), row(j[2], t, omega, sign))
 
     return strains, jacobian, None
 

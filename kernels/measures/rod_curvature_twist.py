@@ -93,5 +93,6 @@ rod_curvature_twist = Measure(
     ("curvature_1 [1/m]", "curvature_2 [1/m]", "twist [1/m]"),
     _functions,
     angles=2,
+    frames=2,
     lag_size=13,
 )

@@ -146,9 +146,7 @@ def term_kernels(term: Term, real):
         energy_out: wp.array(dtype=real),
     ):
         e = wp.tid()
-        x, s, w, p = gather(
-            q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, e
-        )
+        x, s, w, p = gather(q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, e)
         energy_out[e] = w * energy_of(strains_of(x, s, w), p)
 
     @wp.kernel(module="unique", enable_backward=True)
@@ -168,9 +166,7 @@ def term_kernels(term: Term, real):
         gradient_out: wp.array2d(dtype=V),
     ):
         e = wp.tid()
-        x, s, w, p = gather(
-            q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, e
-        )
+        x, s, w, p = gather(q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, e)
         f = gradient_at(x, s, w, p)
         for i in range(wp.static(slots_count)):
             gradient_out[i, e] = spread(f, i)
@@ -193,9 +189,7 @@ def term_kernels(term: Term, real):
     ):
         """Exact Hessian in the local dofs, a column a thread: the reverse of the gradient, seeded with unit vectors."""
         e, column = wp.tid()
-        x, s, w, p = gather(
-            q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, e
-        )
+        x, s, w, p = gather(q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, e)
         v = Q()
         v[column] = real(1.0)
         dq, _ds, _dw, _dp, _dv = wp.grad(along)(x, s, w, p, v)
@@ -221,9 +215,7 @@ def term_kernels(term: Term, real):
         stress_out: wp.array2d(dtype=real),
     ):
         e = wp.tid()
-        x, s, w, p = gather(
-            q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, e
-        )
+        x, s, w, p = gather(q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, e)
         strain = strains_of(x, s, w)
         for i in range(wp.static(n)):
             strain_out[i, e] = strain[i]
@@ -294,9 +286,7 @@ def evaluate_kernel(term: Term, real, linear):
         world = tid / elements
         if status[world] != 0:
             return
-        x, s, w, p = gather(
-            q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid
-        )
+        x, s, w, p = gather(q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid)
         e, jacobian = jacobian_of(x, s, w)
         slope = slope_of(e, p)
         energy_out[1 - slot[world], tid] = w * energy_of(e, p)
