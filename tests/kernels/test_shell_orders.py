@@ -41,7 +41,7 @@ def relative_error(mesh, n, shape, bending, device, supported):
     kinds = edge_kinds(surface, clamped)
     plate = flat_plate(surface, place, kinds)
     _, bend = shells.shell_elements(surface, plate, kinds, bending)
-    angles = relaxed_angles(bend, place, kinds.turning, device) if bending == "midedge_dof" else None
+    angles = relaxed_angles(bend, place, shells.turning(kinds, bending), device) if bend.angles.size else None
     energy = gather(bend, place, angles).evaluate(device=device)["energy"][:, 0]
     span = points.max(0)
     middle = points[triangles].mean(1) / span
@@ -88,6 +88,15 @@ def test_averaged_normals_do_not_converge_where_diagonals_alternate(device, mesh
     """The error of the energy depends on mesh and direction, 65 % and 186 % at the worst, and stays when h is halved."""
     for n in (16, 32):
         assert abs(relative_error(mesh, n, shape, "midedge", device, supported=False) - error) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("bending", "turn"), [("midedge_dof", (1, 1, 0, 0)), ("midedge_boundary", (1, 0, 0, 0)), ("midedge", (0, 0, 0, 0))]
+)
+def test_edges_that_turn(bending, turn):
+    """By kind of the edge: free, with a neighbour, clamped, symmetry."""
+    *_, kinds = patch()
+    assert np.array_equal(shells.turning(kinds, bending), np.array(turn, bool)[kinds.kind])
 
 
 def conversion(mesh, place, bending, device):
