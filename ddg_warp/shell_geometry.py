@@ -21,11 +21,6 @@ class EdgeKinds:
     kind: np.ndarray
     vector: np.ndarray
 
-    @property
-    def turning(self) -> np.ndarray:
-        """Edges whose rotation is a dof of the bending model "midedge_dof" (E,); those of the others must be fixed."""
-        return self.kind <= NEIGHBOUR
-
     def of_triangles(self, surface) -> tuple[np.ndarray, np.ndarray]:
         """Kinds (T, 3) and vectors (T, 3, 3) of the edges opposite to the corners."""
         return self.kind[surface.triangle_edges], self.vector[surface.triangle_edges]

@@ -20,8 +20,10 @@ of Morley's plate). At kinds 2 and 3 xi has no effect and must be fixed.
 Nodes: corners 0, 1, 2 and the corners 3, 4, 5 behind edges 0, 1, 2; a missing one may be any node. Data: the three kinds, the three
 vectors (prescribed normal or unit normal of the plane), and, with angles, the three signs. w is the rest area [m^2].
 
-Accuracy, measured on exact shapes (energy per area of cylinder, sphere, saddle; rest flat), see tests/kernels/test_shell_orders.py:
-ACCURACY
+Accuracy (tests/kernels/test_shell_orders.py). Averaged normals are consistent where the mesh is alike everywhere (right or
+equilateral triangles): order 2 in the energy of exact shapes. Elsewhere their energy does not converge: where diagonals alternate it
+is 65 % too high for a cylinder across them and 186 % for twist, on irregular meshes 5 to 35 %. With angles, relaxed, the order is
+2 on every mesh. A free edge without angle takes no moment of its triangle's normal, an error of order 1; an angle there mends it.
 """
 
 from functools import cache

@@ -178,18 +178,34 @@ def gather(elements, positions, angles=None) -> Elements:
     return Elements(elements.term.name, np.concatenate(q, axis=1), s, w, np.stack(p, axis=1))
 
 
+def factor(elements, local: Elements, points: int, edges: int, device) -> sparse.csr_matrix:
+    """F with F^T F the Gauss-Newton Hessian of a set: columns 3 a node, then one an edge."""
+    at, measure = local.evaluate(device=device), elements.term.measure
+    rows = at["root"] @ at["jacobian"] * np.sqrt(local.w)[:, None, None]
+    axes = np.arange(3)
+    columns, values = [], []
+    for k, pair in enumerate(measure.edges):
+        for node, sign in zip(pair, (-1.0, 1.0), strict=True):
+            columns.append(3 * elements.nodes[:, node, None] + axes)
+            values.append(sign * rows[:, :, 3 * k : 3 * k + 3])
+    columns.append(3 * points + elements.angles)
+    values.append(rows[:, :, 3 * len(measure.edges) :])
+    values, columns = np.concatenate(values, axis=2), np.concatenate(columns, axis=1)
+    columns = np.broadcast_to(columns[:, None], values.shape)
+    places = np.broadcast_to(np.arange(rows.shape[0] * rows.shape[1]).reshape(*rows.shape[:2], 1), values.shape)
+    shape = (rows.shape[0] * rows.shape[1], 3 * points + edges)
+    return sparse.csr_matrix((values.ravel(), (places.ravel(), columns.ravel())), shape)
+
+
 def relaxed_angles(elements, positions, active, device) -> np.ndarray:
     """Angles that minimise the energy at fixed positions, by Gauss and Newton; those not `active` stay zero."""
-    angles, chosen, size = np.zeros(len(active)), np.flatnonzero(active), 3 * len(elements)
-    for _ in range(6):
+    angles, chosen = np.zeros(len(active)), np.flatnonzero(active)
+    for _ in range(3):
         local = gather(elements, positions, angles)
-        at = local.evaluate(device=device)
-        factor = np.einsum("tij,tjk->tik", at["root"], at["jacobian"][:, :, 15:]) * np.sqrt(local.w)[:, None, None]
-        columns = np.repeat(elements.angles[:, None], 3, axis=1).ravel()
-        matrix = sparse.csr_matrix((factor.ravel(), (np.repeat(np.arange(size), 3), columns)), (size, len(active)))
+        matrix = factor(elements, local, len(positions), len(active), device)[:, 3 * len(positions) + chosen]
         gradient = np.zeros(len(active))
-        np.add.at(gradient, elements.angles, at["gradient"][:, 15:])
-        angles[chosen] -= spsolve((matrix.T @ matrix)[chosen][:, chosen].tocsc(), gradient[chosen])
+        np.add.at(gradient, elements.angles, local.evaluate(device=device)["gradient"][:, 15:])
+        angles[chosen] -= spsolve((matrix.T @ matrix).tocsc(), gradient[chosen])
     return angles
 
 
