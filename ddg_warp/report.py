@@ -1,6 +1,13 @@
 """The report of a model: terms, elements, dofs, solver, kernels, memory, and what the scene does without."""
 
 from ddg_warp.kernels.terms import REGISTRY
+from ddg_warp.linear.choice import automatic
+
+SOLVERS = {
+    "chain": "PCG (closed chains)",
+    "sweep": "chain sweep, one Newton loop a rod",
+    "partitioned": "cyclic reduction (few long rods), one Newton loop a rod",
+}
 
 
 def report(model) -> str:
@@ -19,8 +26,7 @@ def report(model) -> str:
             present.add(term.name)
             elements = int((host.count - (0 if kind.closed else term.measure.span)).sum()) * model.worlds
             lines.append(f"  {term.name}: {elements} elements, {term.measure.name} x {term.density.name}")
-        solver = "PCG (closed chains)" if kind.closed else "chain sweep, one Newton loop a rod"
-        lines.append(f"  solver: {solver}, linear algebra in {model.types.linear.__name__}")
+        lines.append(f"  solver: {SOLVERS[automatic(group)]}, linear algebra in {model.types.linear.__name__}")
         lines.append(f"  memory: {bytes_per_node(model, kind)} bytes a node")
     absent = sorted(name for name in REGISTRY if name not in present)
     lines.append("not in this scene: " + ", ".join(absent))

@@ -188,7 +188,9 @@ def assemble_kernel(kind: ChainKind, real, linear):
                 )
             D = wp.cw_mul(D, wp.outer(free, free)) + wp.diag(H(linear(1.0)) - free)
             store(blocks_out, 0, k, r, D)
-            store(blocks_out, wp.static(nb2), k, r, wp.cw_mul(E, wp.outer(free, free_of(fixed, along(k + 1, n), r))))
+            if wp.static(closed) or k < n - 1:
+                E = wp.cw_mul(E, wp.outer(free, free_of(fixed, along(k + 1, n), r)))
+            store(blocks_out, wp.static(nb2), k, r, E)
             if wp.static(span == 2):
                 ahead = along(k + 2, n)
                 if wp.static(closed) or k < n - 2:
