@@ -8,8 +8,7 @@ A_i and couplings B_i to block i + 1. A level eliminates every odd block and lea
     x_u = A_u^-1 r_u - (A_u^-1 B_j^T) x_j - (A_u^-1 B_u) x_j+2 .
 
 It is an elimination in another order than the sweep's, so that the pivots of a definite matrix are positive here too, and lost
-ones mean the same. Nodes past the end of a rod are rows of the identity. Columns of the right-hand sides are dealt to `lanes`
-threads, each of which factors for itself: on a GPU that is cheaper than to wait for one another.
+ones mean the same. Nodes past the end of a rod are rows of the identity.
 """
 
 from functools import cache
@@ -27,7 +26,10 @@ def level_rows(kind: ChainKind) -> tuple[int, int, int]:
 
 @cache
 def _block_functions(kind: ChainKind, linear, first: bool):
-    """factor(...) and solve(...) of a diagonal block; columns, rows and products of blocks, from nodes (`first`) or a level."""
+    """factor, solve, own_column, right_side of diagonal blocks, and column, product of a coupling X, from nodes or a level.
+
+    X is the coupling B_i, or its transpose where it is `turned`, so that one code serves both neighbours of a block.
+    """
     nb, nb2 = kind.block, kind.block**2
     H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     factor_block, lower, _, lower_vector, upper_vector, congruence = pivot.functions(nb, linear)
@@ -47,34 +49,29 @@ def _block_functions(kind: ChainKind, linear, first: bool):
 
     @wp.func
     def coupling_row(p: int, q: int):
-        """Row of B_pq; of nodes, that is F for p = q, E for p > q, and nothing for p < q."""
+        """Row of B_pq; of nodes, that is F for p = q, E for p > q, and none for p < q."""
         if wp.static(first):
-            return wp.where(p == q, wp.static(2 * nb2), wp.static(nb2))
+            if p == q:
+                return wp.static(2 * nb2)
+            return wp.where(p > q, wp.static(nb2), -1)
         return (3 + 2 * p + q) * wp.static(nb2)
 
     @wp.func
-    def block(A: wp.array3d(dtype=linear), row: int, k: int, n: int, r: int):
+    def block(A: wp.array3d(dtype=linear), row: int, down: int, across: int, k: int, n: int, r: int):
+        """Entries of a block by their strides."""
         m = M()
-        if k >= 0 and k < n:
+        if row >= 0 and k >= 0 and k < n:
             for i in range(wp.static(nb)):
                 for j in range(wp.static(nb)):
-                    m[i, j] = A[row + i * wp.static(nb) + j, k, r]
+                    m[i, j] = A[row + i * down + j * across, k, r]
         return m
 
     @wp.func
-    def column(A: wp.array3d(dtype=linear), row: int, k: int, c: int, n: int, r: int):
+    def line(A: wp.array3d(dtype=linear), row: int, stride: int, k: int, n: int, r: int):
         v = H()
-        if k >= 0 and k < n:
+        if row >= 0 and k >= 0 and k < n:
             for i in range(wp.static(nb)):
-                v[i] = A[row + i * wp.static(nb) + c, k, r]
-        return v
-
-    @wp.func
-    def line(A: wp.array3d(dtype=linear), row: int, k: int, c: int, n: int, r: int):
-        v = H()
-        if k >= 0 and k < n:
-            for i in range(wp.static(nb)):
-                v[i] = A[row + c * wp.static(nb) + i, k, r]
+                v[i] = A[row + i * stride, k, r]
         return v
 
     @wp.func
@@ -88,9 +85,9 @@ def _block_functions(kind: ChainKind, linear, first: bool):
         """L D L^T of diagonal block i, itself in two by two blocks: (L0, D0^-1, Z, L1, D1^-1, lost pivots)."""
         k0 = place(i, 0)
         k1 = place(i, 1)
-        L0, d0, bad0 = factor_block(or_identity(block(A, 0, k0, n, r), k0, n))
-        Z = lower(L0, block(A, wp.static(nb2), k0, n, r))
-        A11 = or_identity(block(A, diagonal_row(1), k1, n, r), k1, n)
+        L0, d0, bad0 = factor_block(or_identity(block(A, 0, wp.static(nb), 1, k0, n, r), k0, n))
+        Z = lower(L0, block(A, wp.static(nb2), wp.static(nb), 1, k0, n, r))
+        A11 = or_identity(block(A, diagonal_row(1), wp.static(nb), 1, k1, n, r), k1, n)
         L1, d1, bad1 = factor_block(A11 - congruence(Z, d0, Z))
         return L0, d0, Z, L1, d1, bad0 + bad1
 
@@ -105,10 +102,10 @@ def _block_functions(kind: ChainKind, linear, first: bool):
     def own_column(A: wp.array3d(dtype=linear), i: int, q: int, c: int, n: int, r: int):
         """Column c of half q of A_i; the lower half of the first columns, which nobody reads, is left out."""
         k = place(i, q)
-        top = column(A, q * wp.static(nb2), place(i, 0), c, n, r)
+        top = line(A, q * wp.static(nb2) + c, wp.static(nb), place(i, 0), n, r)
         bottom = H()
         if q == 1:
-            bottom = column(A, diagonal_row(1), k, c, n, r)
+            bottom = line(A, diagonal_row(1) + c, wp.static(nb), k, n, r)
         if k >= n:
             unit = H()
             for d in range(wp.static(nb)):
@@ -120,65 +117,57 @@ def _block_functions(kind: ChainKind, linear, first: bool):
         return top, bottom
 
     @wp.func
-    def coupling_column(A: wp.array3d(dtype=linear), i: int, q: int, c: int, n: int, r: int):
-        """Column c of half q of B_i."""
-        top = H()
-        if not wp.static(first) or q == 0:
-            top = column(A, coupling_row(0, q), place(i, 0), c, n, r)
-        return top, column(A, coupling_row(1, q), place(i, 1), c, n, r)
+    def right_side(b: wp.array3d(dtype=linear), i: int, n: int, r: int):
+        top = line(b, 0, 1, place(i, 0), n, r)
+        return top, line(b, wp.static(0 if first else nb), 1, place(i, 1), n, r)
 
     @wp.func
-    def coupling_line(A: wp.array3d(dtype=linear), i: int, p: int, c: int, n: int, r: int):
-        """Row c of half p of B_i."""
-        k = place(i, p)
-        right = H()
-        if not wp.static(first) or p == 1:
-            right = line(A, coupling_row(p, 1), k, c, n, r)
-        return line(A, coupling_row(p, 0), k, c, n, r), right
-
-    @wp.func
-    def couple(A: wp.array3d(dtype=linear), i: int, u0: H, u1: H, n: int, r: int):
-        """B_i u."""
-        k = place(i, 1)
-        top = block(A, coupling_row(0, 0), place(i, 0), n, r) * u0
-        bottom = block(A, coupling_row(1, 0), k, n, r) * u0 + block(A, coupling_row(1, 1), k, n, r) * u1
-        if not wp.static(first):
-            top += block(A, coupling_row(0, 1), k, n, r) * u1
+    def column(A: wp.array3d(dtype=linear), i: int, turned: bool, q: int, c: int, n: int, r: int):
+        """Column c of half q of X."""
+        if turned:
+            k = place(i, q)
+            top = line(A, coupling_row(q, 0) + c * wp.static(nb), 1, k, n, r)
+            bottom = H()
+            if coupling_row(q, 1) >= 0:
+                bottom = line(A, coupling_row(q, 1) + c * wp.static(nb), 1, k, n, r)
+        else:
+            top = H()
+            if coupling_row(0, q) >= 0:
+                top = line(A, coupling_row(0, q) + c, wp.static(nb), place(i, 0), n, r)
+            bottom = line(A, coupling_row(1, q) + c, wp.static(nb), place(i, 1), n, r)
         return top, bottom
 
     @wp.func
-    def couple_back(A: wp.array3d(dtype=linear), i: int, u0: H, u1: H, n: int, r: int):
-        """B_i^T u."""
-        k = place(i, 1)
-        top = u0 * block(A, coupling_row(0, 0), place(i, 0), n, r) + u1 * block(A, coupling_row(1, 0), k, n, r)
-        bottom = u1 * block(A, coupling_row(1, 1), k, n, r)
-        if not wp.static(first):
-            bottom += u0 * block(A, coupling_row(0, 1), k, n, r)
-        return top, bottom
+    def product(A: wp.array3d(dtype=linear), i: int, turned: bool, u0: H, u1: H, n: int, r: int):
+        """X^T u."""
+        down = wp.where(turned, wp.static(nb), 1)
+        across = wp.where(turned, 1, wp.static(nb))
+        k0 = place(i, 0)
+        k1 = place(i, 1)
+        top = block(A, coupling_row(0, 0), down, across, k0, n, r) * u0
+        bottom = block(A, coupling_row(1, 1), down, across, k1, n, r) * u1
+        low = block(A, coupling_row(1, 0), down, across, k1, n, r)
+        high = block(A, coupling_row(0, 1), down, across, k0, n, r)
+        if turned:
+            return top + high * u1, bottom + low * u0
+        return top + low * u1, bottom + high * u0
 
-    @wp.func
-    def right_side(b: wp.array3d(dtype=linear), i: int, p: int, n: int, r: int):
-        v = H()
-        k = place(i, p)
-        row = p * wp.static(0 if first else nb)
-        if k >= 0 and k < n:
-            for d in range(wp.static(nb)):
-                v[d] = b[row + d, k, r]
-        return v
-
-    return factor, solve, own_column, coupling_column, coupling_line, couple, couple_back, right_side
+    return factor, solve, own_column, right_side, column, product
 
 
 @cache
 def reduce_kernel(kind: ChainKind, linear, first: bool):
-    """One level: the even blocks take what the odd ones leave, and keep what the odd ones' solution needs."""
+    """One level: the even blocks take what the odd ones leave, and keep what the odd ones' solution needs.
+
+    Thread c of a block has column c of its matrix, then the right-hand side, then the columns of its coupling. Each factors both
+    neighbours for itself, one after the other in a loop that is not unrolled: that keeps them in registers.
+    """
     nb, nb2 = kind.block, kind.block**2
     H = wp.types.vector(nb, linear)
-    functions = _block_functions(kind, linear, first)
-    factor, solve, own_column, coupling_column, coupling_line, couple, couple_back, right_side = functions
+    factor, solve, own_column, right_side, column, product = _block_functions(kind, linear, first)
 
     @wp.func
-    def put_column(A: wp.array3d(dtype=linear), row: int, stride: int, k: int, r: int, v: H):
+    def put(A: wp.array3d(dtype=linear), row: int, stride: int, k: int, r: int, v: H):
         for d in range(wp.static(nb)):
             A[row + d * stride, k, r] = v[d]
 
@@ -189,70 +178,70 @@ def reduce_kernel(kind: ChainKind, linear, first: bool):
         count: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
         blocks: int,
-        lanes: int,
+        neighbours: int,
         matrix_out: wp.array3d(dtype=linear),
         right_out: wp.array3d(dtype=linear),
         kept_out: wp.array3d(dtype=linear),
         bad: wp.array(dtype=int),
     ):
-        lane, j, r = wp.tid()
+        c, j, r = wp.tid()
         if wanted[r] == 0:
             return
         n = blocks
         if wp.static(first):
             n = count[r]
         i = 2 * j
-        odd = i + 1 < blocks
-        Ll, dl, Zl, Ml, el, _bad = factor(matrix, i - 1, n, r)
-        Lu, du, Zu, Mu, eu, lost = factor(matrix, i + 1, n, r)
-        if odd and lane == 0 and lost > 0:
-            wp.atomic_add(bad, r, lost)
-        for c in range(lane, wp.static(2 * nb + 1), lanes):
-            q = c // wp.static(nb)
-            at = c - q * wp.static(nb)
-            a0 = H()
-            a1 = H()
-            b0 = H()
-            b1 = H()
-            o0 = H()
-            o1 = H()
-            if q < 2:
-                a0, a1 = coupling_column(matrix, i - 1, q, at, n, r)
-                b0, b1 = coupling_line(matrix, i, q, at, n, r)
-                o0, o1 = own_column(matrix, i, q, at, n, r)
+        own = c < wp.static(2 * nb)
+        outer = c == wp.static(2 * nb)
+        at = c
+        if c > wp.static(2 * nb):
+            at = c - wp.static(2 * nb + 1)
+        q = at // wp.static(nb)
+        at -= q * wp.static(nb)
+        o0 = H()
+        o1 = H()
+        start = int(0)
+        if own:
+            o0, o1 = own_column(matrix, i, q, at, n, r)
+        elif outer:
+            o0, o1 = right_side(right, i, n, r)
+        else:
+            start = 1
+        for side in range(start, neighbours):
+            away = i - 1 + 2 * side
+            L0, d0, Z, L1, d1, lost = factor(matrix, away, n, r)
+            v0 = H()
+            v1 = H()
+            if outer:
+                v0, v1 = right_side(right, away, n, r)
             else:
-                a0 = right_side(right, i - 1, 0, n, r)
-                a1 = right_side(right, i - 1, 1, n, r)
-                b0 = right_side(right, i + 1, 0, n, r)
-                b1 = right_side(right, i + 1, 1, n, r)
-                o0 = right_side(right, i, 0, n, r)
-                o1 = right_side(right, i, 1, n, r)
-            y0, y1 = solve(Ll, dl, Zl, Ml, el, a0, a1)
-            s0, s1 = couple_back(matrix, i - 1, y0, y1, n, r)
-            w0, w1 = solve(Lu, du, Zu, Mu, eu, b0, b1)
-            t0, t1 = couple(matrix, i, w0, w1, n, r)
-            o0 = o0 - s0 - t0
-            o1 = o1 - s1 - t1
-            if q == 2:
-                put_column(right_out, 0, 1, j, r, o0)
-                put_column(right_out, wp.static(nb), 1, j, r, o1)
-                if odd:
-                    put_column(kept_out, wp.static(8 * nb2), 1, j, r, w0)
-                    put_column(kept_out, wp.static(8 * nb2 + nb), 1, j, r, w1)
-            else:
-                v0, v1 = coupling_column(matrix, i + 1, q, at, n, r)
-                y0, y1 = solve(Lu, du, Zu, Mu, eu, v0, v1)
-                t0, t1 = couple(matrix, i, y0, y1, n, r)
-                put_column(matrix_out, q * wp.static(nb2) + at, wp.static(nb), j, r, o0)
-                if q == 1:
-                    put_column(matrix_out, wp.static(2 * nb2) + at, wp.static(nb), j, r, o1)
-                put_column(matrix_out, (3 + q) * wp.static(nb2) + at, wp.static(nb), j, r, -t0)
-                put_column(matrix_out, (5 + q) * wp.static(nb2) + at, wp.static(nb), j, r, -t1)
-                if odd:
-                    put_column(kept_out, c, wp.static(2 * nb), j, r, w0)
-                    put_column(kept_out, wp.static(2 * nb2) + c, wp.static(2 * nb), j, r, w1)
-                    put_column(kept_out, wp.static(4 * nb2) + c, wp.static(2 * nb), j, r, y0)
-                    put_column(kept_out, wp.static(6 * nb2) + c, wp.static(2 * nb), j, r, y1)
+                v0, v1 = column(matrix, wp.where(own, i - 1 + side, i + 1), own and side == 1, q, at, n, r)
+            y0, y1 = solve(L0, d0, Z, L1, d1, v0, v1)
+            t0, t1 = product(matrix, i - 1 + side, side == 1, y0, y1, n, r)
+            o0 = o0 - t0
+            o1 = o1 - t1
+            if side == 1 and away < blocks:
+                if c == 0 and lost > 0:
+                    wp.atomic_add(bad, r, lost)
+                row = wp.static(8 * nb2)
+                stride = int(1)
+                if not outer:
+                    row = q * wp.static(nb) + at
+                    stride = wp.static(2 * nb)
+                    if not own:
+                        row += wp.static(4 * nb2)
+                put(kept_out, row, stride, j, r, y0)
+                put(kept_out, row + wp.static(nb) * stride, stride, j, r, y1)
+        if own:
+            put(matrix_out, q * wp.static(nb2) + at, wp.static(nb), j, r, o0)
+            if q == 1:
+                put(matrix_out, wp.static(2 * nb2) + at, wp.static(nb), j, r, o1)
+        elif outer:
+            put(right_out, 0, 1, j, r, o0)
+            put(right_out, wp.static(nb), 1, j, r, o1)
+        else:
+            put(matrix_out, (3 + q) * wp.static(nb2) + at, wp.static(nb), j, r, o0)
+            put(matrix_out, (5 + q) * wp.static(nb2) + at, wp.static(nb), j, r, o1)
 
     return reduce
 
@@ -261,7 +250,7 @@ def reduce_kernel(kind: ChainKind, linear, first: bool):
 def last_kernel(kind: ChainKind, linear, first: bool):
     """Solution of the one block that is left: the first two nodes of a rod."""
     nb = kind.block
-    factor, solve, *_, right_side = _block_functions(kind, linear, first)
+    factor, solve, _, right_side, *_ = _block_functions(kind, linear, first)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
     def last(
@@ -279,7 +268,8 @@ def last_kernel(kind: ChainKind, linear, first: bool):
         if wp.static(first):
             n = count[r]
         L, d, Z, M, e, lost = factor(matrix, 0, n, r)
-        u0, u1 = solve(L, d, Z, M, e, right_side(right, 0, 0, n, r), right_side(right, 0, 1, n, r))
+        b0, b1 = right_side(right, 0, n, r)
+        u0, u1 = solve(L, d, Z, M, e, b0, b1)
         for c in range(wp.static(nb)):
             solution_out[c, 0, r] = u0[c]
             if count[r] > 1:

@@ -140,7 +140,6 @@ class CyclicReduction:
 
     def __init__(self, kind, nodes: int, columns: int, linear, device):
         self.columns, self.device, self.dofs = columns, device, 2 * kind.block
-        self.lanes = self.dofs + 1 if wp.get_device(device).is_cuda else 1
         self.blocks = [-(-nodes // 2)]  # of every level
         while self.blocks[-1] > 1:
             self.blocks.append(-(-self.blocks[-1] // 2))
@@ -168,8 +167,8 @@ class CyclicReduction:
             outputs = [self.matrices[level], self.rights[level], self.kept[level]]
             wp.launch(
                 kernel,
-                (self.lanes, self.blocks[level + 1], self.columns),
-                [matrix, right, count, wanted, self.blocks[level], self.lanes],
+                (2 * self.dofs + 1, self.blocks[level + 1], self.columns),
+                [matrix, right, count, wanted, self.blocks[level], 2],
                 [*outputs, bad],
                 device=self.device,
                 block_dim=64,

@@ -115,8 +115,10 @@ def test_pivots_are_lost_where_the_matrix_is_indefinite(device):
             seen.add(bool(indefinite))
             assert clamped[column] == indefinite
             assert (moved[column] == 0.0) == indefinite
+        assert (newton.iteration.numpy() == 1 - clamped).all()
         newton.iterate(state.last)
-        assert (newton.iteration.numpy() == np.where(clamped, 1, 2) - newton.halvings.numpy().clip(max=1) * (1 - clamped)).all()
+        assert (newton.iteration.numpy() >= 1).all()
+        assert (newton.step_length.numpy() > 0.0).all()
         assert (newton.lost.numpy() == 0).all()
     assert seen == {True, False}
 
@@ -213,7 +215,7 @@ def spanning() -> ddg.Scene:
     scene = ddg.Scene()
     rod = scene.add_rod(straight(80), section=ddg.Circle(0.005), material=RUBBER)
     scene.fix(rod, [20])
-    scene.fix(rod, [55], motion=ddg.Motion(translation=lambda t: (-0.5 * t, 0.2 * t, 0.0)))
+    scene.fix(rod, [55], motion=ddg.Motion(translation=lambda t: (0.05 * t, 0.3 * t, 0.0)))
     scene.fix(rod, [70], components="z")
     scene.add_force(rod, 79, (0.0, 0.02, 0.1))
     return scene
@@ -248,8 +250,7 @@ def test_steps_are_those_of_the_sweep(device, name, scheme):
     state, found = moved(build(), device, "partitioned", **given)
     start = build().build(device).state().points()
     assert np.abs(swept.points() - start).max() > 0.005
-    stiffness = 1e8 if name == "stiff" else 1.0
-    np.testing.assert_allclose(state.points(), swept.points(), rtol=0, atol=1e-12 + 1e-17 * stiffness)
+    np.testing.assert_allclose(state.points(), swept.points(), rtol=0, atol=1e-12)
     np.testing.assert_allclose(state.velocities(), swept.velocities(), rtol=0, atol=1e-9)
     assert found["retries"] == exact["retries"] == found["pcg_iterations"] == 0
 
