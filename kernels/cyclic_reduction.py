@@ -286,9 +286,7 @@ def expand_kernel(kind: ChainKind, linear):
     nb, nb2 = kind.block, kind.block**2
 
     @wp.func
-    def product(
-        kept: wp.array3d(dtype=linear), row: int, j: int, x: wp.array3d(dtype=linear), k: int, n: int, r: int
-    ):
+    def product(kept: wp.array3d(dtype=linear), row: int, j: int, x: wp.array3d(dtype=linear), k: int, n: int, r: int):
         """Row of a kept block times the solution at the nodes k and k + 1."""
         total = linear(0.0)
         for p in range(2):

@@ -183,7 +183,9 @@ def _newton(model, group, integrator: Integrator, precision) -> ChainNewton:
     if integrator.solver == "projective":
         return ProjectiveNewton(*given, *last)
     if linear in DIRECT and group.kind.closed:
-        raise SceneError(f"linear {linear!r}: rod {group.host.rods[0]} is closed; use 'auto' or a preconditioner of PCG")
+        raise SceneError(
+            f"linear {linear!r}: rod {group.host.rods[0]} is closed; use 'auto' or a preconditioner of PCG"
+        )
     if linear in DIRECT:
         return DIRECT[linear](*given, *last)
     return PcgNewton(*given, linear, *last)

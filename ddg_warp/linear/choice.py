@@ -1,7 +1,7 @@
 """Which linear solver suits a group of rods."""
 
-# A sweep costs about 2 us a node of the longest rod, however many rods run side by side; cyclic reduction about 40 launches
-# and, for all rods together, some ns a node.
+# An iteration by the sweep takes about 2 us a node of the longest rod, however many rods run side by side; one by cyclic reduction
+# takes about 40 launches, and some ns a node of all rods together.
 LONG = 512  # nodes of a rod from which on cyclic reduction pays on a GPU ...
 FEW = 256  # ... if there are no more rods than this
 

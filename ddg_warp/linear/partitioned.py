@@ -14,7 +14,7 @@ from ddg_warp.newton import NewtonOptions
 class PartitionedNewton(AssembledNewton):
     """As `ChainNewton`, without a loop of one thread over the nodes of a rod, for open rods.
 
-    An iteration is about 2 log2(n) + 13 launches. Loops of one thread run over sqrt(n) nodes or ranges of nodes.
+    An iteration is about 2 log2(n) + 10 launches. Loops of one thread run over sqrt(n) nodes or ranges of nodes.
     """
 
     def __init__(self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False):

@@ -17,7 +17,9 @@ class PcgNewton(AssembledNewton):
             a few iterations for a closed one).
     """
 
-    def __init__(self, model, group, options: NewtonOptions, preconditioner: str = "chain", linear=None, midpoint: bool = False):
+    def __init__(
+        self, model, group, options: NewtonOptions, preconditioner: str = "chain", linear=None, midpoint: bool = False
+    ):
         if preconditioner not in pcg.PRECONDITIONERS:
             raise SceneError(f"preconditioner {preconditioner!r}: it is one of {', '.join(pcg.PRECONDITIONERS)}")
         super().__init__(model, group, options, linear, midpoint)

@@ -81,6 +81,7 @@ def test_direction_is_a_dense_solve(device, name, precision, tolerance):
     """And the decrement is r . d, and a rod that wants nothing is left alone."""
     found = 0
     for newton, state in solvers(name, device, clamped=True, precision=precision):
+        found += newton.group.columns
         newton.iterate(state.last)
         arrays.assign(newton.direction, np.full(newton.direction.shape, 7.0))
         wanted = newton.wanted.numpy()
@@ -98,8 +99,7 @@ def test_direction_is_a_dense_solve(device, name, precision, tolerance):
                 direction[:, :n, column].T.ravel(), expected, rtol=0, atol=tolerance * np.abs(expected).max()
             )
             np.testing.assert_allclose(decrement[column], r @ expected, rtol=tolerance)
-            found += 1
-    assert found == 2 * len(COUNTS) - len({newton.group for newton, _ in solvers(name, device, clamped=True)})
+    assert found == 2 * len(COUNTS)
 
 
 def test_pivots_are_lost_where_the_matrix_is_indefinite(device):
@@ -222,7 +222,7 @@ def spanning() -> ddg.Scene:
 
 
 def free() -> ddg.Scene:
-    """Free fall of a rod that two opposite couples wind up and bend."""
+    """A rod that falls freely, pushed at one end and wound up at both."""
     scene = ddg.Scene()
     rod = scene.add_rod(straight(60), section=ddg.Circle(0.01), material=RUBBER)
     scene.add_force(rod, 0, (0.0, 0.0, 3.0))
@@ -270,8 +270,8 @@ def test_repeats_bit_by_bit(device, precision):
     np.testing.assert_array_equal(first.velocities(), second.velocities())
 
 
-def test_free_rod_falls_and_turns_by_its_forces(device):
-    """Implicit Euler: momentum grows by F h a step, angular momentum about the origin by nearly the torque of the forces."""
+def test_momentum_of_a_free_rod(device):
+    """It grows by the sum of the outer forces times h a step."""
     dt, steps = 1e-3, 20
     state, _ = moved(free(), device, "partitioned", dt=dt, steps=steps, rtol=1e-12)
     host = state.model.groups[0].host
@@ -285,7 +285,7 @@ def test_failure_is_named(device):
         moved(stiff(), device, "partitioned", max_iterations=1, retry_limit=1)
     folded = straight(21)
     folded[11:, 0] = 1.0 - folded[11:, 0]
-    with pytest.raises(ddg.SolverError, match="non_finite.*fold back by 180 degrees"):
+    with pytest.raises(ddg.SolverError, match=r"non_finite.*fold back by 180 degrees"):
         moved(cantilever(21), device, "partitioned", start=folded)
 
 
@@ -301,7 +301,7 @@ def test_a_rod_that_fails_leaves_the_others_alone(device):
     integrator, state = ddg.Integrator(model, linear="partitioned", check_every=100), model.state(start.reshape(-1, 3))
     for _ in range(5):
         state = integrator.step(state, 0.01)
-    with pytest.raises(ddg.SolverError, match="rod 1 .*non_finite"):
+    with pytest.raises(ddg.SolverError, match=r"rod 1 .*non_finite"):
         integrator.check(state)
     alone = ddg.Scene()
     alone.clamp(alone.add_rod(points[0], section=ddg.Circle(0.02), material=RUBBER), edges=[0])
@@ -329,7 +329,10 @@ def test_closed_rods_are_refused(device):
     angle = 2.0 * np.pi * np.arange(12) / 12
     scene = ddg.Scene()
     scene.add_rod(
-        np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], -1), section=ddg.Circle(0.02), material=RUBBER, closed=True
+        np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], -1),
+        section=ddg.Circle(0.02),
+        material=RUBBER,
+        closed=True,
     )
     with pytest.raises(ddg.SceneError, match="'partitioned': rod 0 is closed"):
         ddg.Integrator(scene.build(device), linear="partitioned")
