@@ -184,6 +184,7 @@ def reduce_kernel(kind: ChainKind, linear, first: bool):
         kept_out: wp.array3d(dtype=linear),
         bad: wp.array(dtype=int),
     ):
+        """`blocks` of the level; `neighbours` is 2, which the compiler must not know."""
         c, j, r = wp.tid()
         if wanted[r] == 0:
             return

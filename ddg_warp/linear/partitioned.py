@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels import cyclic_reduction, parallel_search
+from ddg_warp.kernels import cyclic_reduction, parallel_moves, parallel_search
 from ddg_warp.linear.assembled import AssembledNewton
 from ddg_warp.newton import NewtonOptions
 
@@ -34,8 +34,8 @@ class PartitionedNewton(AssembledNewton):
         self.reduction = CyclicReduction(kind, group.nodes, columns, self.linear, device)
         self._weigh, self._gauge = parallel_search.sum_kernels(kind, real, self.linear)
         self._judge, self._take = parallel_search.decide_kernels(kind, real, self.linear)
-        self._moves = parallel_search.move_kernels(kind, real, self.linear)
-        self._aim, self._renew = parallel_search.predict_kernels(kind, real, self.linear)
+        self._moves = parallel_moves.move_kernels(kind, real, self.linear)
+        self._aim, self._renew = parallel_moves.predict_kernels(kind, real, self.linear)
 
     @property
     def kernels(self) -> list:
