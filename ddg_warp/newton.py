@@ -6,7 +6,7 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import check_options
-from ddg_warp.kernels import balance, chain, element, search
+from ddg_warp.kernels import balance, chain, element, search, step
 
 MANY = 50_000  # rods from which full blocks of the sweep pay on a GPU; below, small ones reach more multiprocessors
 
@@ -39,6 +39,11 @@ class NewtonOptions:
 class ChainNewton:
     """Newton on one group of uncoupled open rods by the chain sweep. Owns what is needed while a solve runs.
 
+    Args:
+        model, group, options: what to solve, and how.
+        linear: scalar type of the linear algebra; that of the model by default.
+        midpoint: whether predicted iterates are midpoints, to which the lagged frames are carried.
+
     Attributes:
         x, theta, frame: the iterate and its lagged frames; base: the accepted positions it was reached from.
         target, target_angle, coefficient: the quadratic of inertia, coefficient * m |x - target|^2 / 2.
@@ -47,7 +52,7 @@ class ChainNewton:
 
     reuse = False  # whether the matrix of a step's first iterate serves the whole step
 
-    def __init__(self, model, group, options: NewtonOptions, linear=None):
+    def __init__(self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False):
         self.group, self.options = group, options
         self.real, self.linear = model.types.real, linear or model.types.linear
         self.eps = model.types.eps
@@ -85,17 +90,33 @@ class ChainNewton:
         self.device = device
         self._evaluate = element.evaluate_kernel(kind, self.real, self.linear)
         self._check = balance.check_kernel(kind, self.real, self.linear)
+        self._predict = step.predict_kernel(kind, self.real, self.linear, midpoint)
         self._sweep = None if kind.closed else chain.sweep_kernel(kind, self.real, self.linear)
         self._adjust = None if kind.closed else search.adjust_kernel(kind, self.real, self.linear)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [self._evaluate, self._check, self._sweep, self._adjust]
+        return [*self.kernels_around, self._sweep, self._adjust]
+
+    @property
+    def kernels_around(self) -> list:
+        """Those that do not depend on how the system is solved."""
+        return [self._predict, self._evaluate, self._check]
 
     def pcg_iterations(self) -> int:
         """None: the sweep is direct."""
         return 0
+
+    def predict(self, before, progress: wp.array, bent: wp.array) -> None:
+        """Redo the predictor of `bent` rods from the state `before`, with edges turned; carry frames to midpoints."""
+        wp.launch(
+            self._predict,
+            self.group.columns,
+            [before.x, before.v, self.group.fixed, self.group.count, self.rate, progress, bent],
+            [self.base, self.direction, self.x, self.frame],
+            device=self.device,
+        )
 
     def solve(self, last: wp.array) -> None:
         """Iterate until no rod is active; can be captured. `last` holds the strains of the last step."""

@@ -1,6 +1,14 @@
 """The report of a model: terms, elements, dofs, solver, kernels, memory, and what the scene does without."""
 
+from ddg_warp.kernels import cyclic_reduction
 from ddg_warp.kernels.terms import REGISTRY
+from ddg_warp.linear.choice import automatic
+
+SOLVERS = {
+    "chain": "PCG (closed chains)",
+    "sweep": "chain sweep, one Newton loop a rod",
+    "partitioned": "cyclic reduction (few long rods), one Newton loop a rod",
+}
 
 
 def report(model) -> str:
@@ -19,9 +27,8 @@ def report(model) -> str:
             present.add(term.name)
             elements = int((host.count - (0 if kind.closed else term.measure.span)).sum()) * model.worlds
             lines.append(f"  {term.name}: {elements} elements, {term.measure.name} x {term.density.name}")
-        solver = "PCG (closed chains)" if kind.closed else "chain sweep, one Newton loop a rod"
-        lines.append(f"  solver: {solver}, linear algebra in {model.types.linear.__name__}")
-        lines.append(f"  memory: {bytes_per_node(model, kind)} bytes a node")
+        lines.append(f"  solver: {SOLVERS[automatic(group)]}, linear algebra in {model.types.linear.__name__}")
+        lines.append(f"  memory: {bytes_per_node(model, group)} bytes a node")
     absent = sorted(name for name in REGISTRY if name not in present)
     lines.append("not in this scene: " + ", ".join(absent))
     if not any(group.kind.twist for group in model.groups):
@@ -29,11 +36,16 @@ def report(model) -> str:
     return "\n".join(lines)
 
 
-def bytes_per_node(model, kind) -> int:
+def bytes_per_node(model, group) -> int:
     """Device memory of states, iterate and solver for one node of a chain."""
+    kind, nb = group.kind, group.kind.block
     real, linear = (4 if t.__name__ == "float32" else 8 for t in (model.types.real, model.types.linear))
     state = 2 * kind.dim + (9 if kind.twist else 0) + (kind.strain_rows if kind.viscous else 0)
     iterate = 2 * kind.dim + (9 if kind.twist else 0) + kind.window + 2
-    solver = kind.factor_rows + 2 * kind.block**2 + 2 * kind.block + 1
+    solver = kind.factor_rows + 2 * nb**2 + 2 * nb + 1
     constant = 2 * real + 1
+    if automatic(group) == "partitioned":
+        iterate += kind.dim + (7 if kind.twist else 0) + 2
+        solver += 3 * nb**2 + nb + sum(cyclic_reduction.level_rows(kind)) // 2
+        constant += 8
     return 2 * state * real + iterate * real + solver * linear + constant

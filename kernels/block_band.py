@@ -51,13 +51,13 @@ def block_functions(kind: ChainKind, linear):
 
 @cache
 def assemble_kernel(kind: ChainKind, real, linear):
-    """Blocks of H and the residual of every active rod; per node its share of the energy's change and of the rounding in it."""
+    """Blocks of H of every rod that is not in balance."""
     dim, nb, nb2, twist, span, closed = kind.dim, kind.block, kind.block**2, kind.twist, kind.span, kind.closed
     window, vertex_rows, edge_rows, tensions = kind.window, kind.vertex_strains, kind.edge_strains, kind.tensions
-    V, H, M = wp.types.vector(dim, real), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
+    H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     edge_row, tension_row = vertex_rows * window, vertex_rows * window + edge_rows * dim
-    _, store, _, put = block_functions(kind, linear)
-    _, behind, balance = node_functions(kind, real)
+    _, store, _, _ = block_functions(kind, linear)
+    _, behind, _ = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
 
     @wp.func
@@ -100,37 +100,20 @@ def assemble_kernel(kind: ChainKind, real, linear):
             free[d] = linear(1 - ((int(fixed[k, r]) >> d) & 1))
         return free
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def assemble(
         F: wp.array3d(dtype=linear),
-        g: wp.array3d(dtype=real),
-        energy: wp.array3d(dtype=real),
         count: wp.array(dtype=int),
         mass: wp.array2d(dtype=real),
         rotary: wp.array2d(dtype=real),
         coefficient: wp.array(dtype=real),
-        x: wp.array2d(dtype=V),
-        theta: wp.array2d(dtype=real),
-        target: wp.array2d(dtype=V),
-        target_angle: wp.array2d(dtype=real),
-        gravity: wp.array(dtype=V),
-        load: wp.array2d(dtype=V),
-        load_angle: wp.array2d(dtype=real),
-        loaded: int,
         fixed: wp.array2d(dtype=wp.uint8),
-        direction: wp.array3d(dtype=linear),
-        base: wp.array2d(dtype=V),
         status: wp.array(dtype=int),
         unbalanced: wp.array(dtype=int),
         drowned: wp.array(dtype=int),
-        slot: wp.array(dtype=int),
         iteration: wp.array(dtype=int),
         reuse: int,
-        step_length: wp.array(dtype=real),
         blocks_out: wp.array3d(dtype=linear),
-        residual_out: wp.array3d(dtype=linear),
-        change_out: wp.array2d(dtype=real),
-        noise_out: wp.array2d(dtype=real),
     ):
         k, r = wp.tid()
         n = count[r]
@@ -138,89 +121,52 @@ def assemble_kernel(kind: ChainKind, real, linear):
             return
         if unbalanced[r] == 0 and (drowned[r] == 0 or iteration[r] > 0):
             return
+        if reuse != 0 and iteration[r] > 0:
+            return
         c = coefficient[r]
         b = behind(k, n)
         free = free_of(fixed, k, r)
-        m_k = mass[k, r]
-        f, moment, size, _elastic = balance(
-            g, mass, rotary, c, x, theta, target, target_angle, gravity, load, load_angle, loaded, k, n, r
-        )
-        rhs = H()
-        for d in range(wp.static(dim)):
-            rhs[d] = linear(f[d])
-        if wp.static(twist):
-            rhs[wp.static(nb - 1)] = linear(moment)
-        put(residual_out, 0, k, r, wp.cw_mul(rhs, free))
-
-        if reuse == 0 or iteration[r] == 0:
-            D = M()
-            E = M()
-            G = M()
-            if wp.static(span == 2):
-                bb = int(-1)
-                if b >= 0:
-                    bb = behind(b, n)
-                for m in range(wp.static(vertex_rows)):
-                    row = m * wp.static(window)
-                    if wp.static(closed) or k < n - 2:
-                        A = own(F, row, k, r, 0)
-                        D += wp.outer(A, A)
-                        E += wp.outer(A, own(F, row, k, r, 1))
-                        G += wp.outer(A, own(F, row, k, r, 2))
-                    if b >= 0 and (wp.static(closed) or k < n - 1):
-                        B = own(F, row, b, r, 1)
-                        D += wp.outer(B, B)
-                        E += wp.outer(B, own(F, row, b, r, 2))
-                    if bb >= 0:
-                        C = own(F, row, bb, r, 2)
-                        D += wp.outer(C, C)
-            if wp.static(closed) or k < n - 1:
-                S = edge_block(F, k, r)
-                D += S
-                E -= S
+        D = M()
+        E = M()
+        G = M()
+        if wp.static(span == 2):
+            bb = int(-1)
             if b >= 0:
-                D += edge_block(F, b, r)
-            for d in range(wp.static(dim)):
-                D[d, d] = D[d, d] + linear(c * m_k)
-            if wp.static(twist):
-                D[wp.static(nb - 1), wp.static(nb - 1)] = D[wp.static(nb - 1), wp.static(nb - 1)] + linear(
-                    c * rotary[k, r]
-                )
-            D = wp.cw_mul(D, wp.outer(free, free)) + wp.diag(H(linear(1.0)) - free)
-            store(blocks_out, 0, k, r, D)
-            store(blocks_out, wp.static(nb2), k, r, wp.cw_mul(E, wp.outer(free, free_of(fixed, along(k + 1, n), r))))
-            if wp.static(span == 2):
-                ahead = along(k + 2, n)
+                bb = behind(b, n)
+            for m in range(wp.static(vertex_rows)):
+                row = m * wp.static(window)
                 if wp.static(closed) or k < n - 2:
-                    G = wp.cw_mul(G, wp.outer(free, free_of(fixed, ahead, r)))
-                store(blocks_out, wp.static(2 * nb2), k, r, G)
-
-        # change of the energy since the accepted iterate: elements, then inertia and loads along the last step
-        change = real(0.0)
-        noise = size * wp.max(wp.abs(x[k, r]))
+                    A = own(F, row, k, r, 0)
+                    D += wp.outer(A, A)
+                    E += wp.outer(A, own(F, row, k, r, 1))
+                    G += wp.outer(A, own(F, row, k, r, 2))
+                if b >= 0 and (wp.static(closed) or k < n - 1):
+                    B = own(F, row, b, r, 1)
+                    D += wp.outer(B, B)
+                    E += wp.outer(B, own(F, row, b, r, 2))
+                if bb >= 0:
+                    C = own(F, row, bb, r, 2)
+                    D += wp.outer(C, C)
         if wp.static(closed) or k < n - 1:
-            e_new = energy[1 - slot[r], k, r]
-            noise += wp.abs(e_new)
-            change = e_new - energy[slot[r], k, r]
-        if iteration[r] > 0:
-            work = real(0.0)
-            taken = step_length[r]
-            away = x[k, r] - target[k, r]
-            outer = gravity[0] * m_k
-            if loaded != 0:
-                outer += load[k, r]
-            u = x[k, r] - base[k, r]
-            work += wp.dot(u, (away - u * real(0.5)) * (c * m_k) - outer)
-            if wp.static(twist):
-                du = taken * real(direction[wp.static(nb - 1), k, r])
-                away_angle = theta[k, r] - target_angle[k, r]
-                work += du * c * rotary[k, r] * (away_angle - real(0.5) * du)
-                if loaded != 0:
-                    work -= du * load_angle[k, r]
-            change += work
-            noise += wp.abs(work)
-        change_out[k, r] = change
-        noise_out[k, r] = noise
+            S = edge_block(F, k, r)
+            D += S
+            E -= S
+        if b >= 0:
+            D += edge_block(F, b, r)
+        for d in range(wp.static(dim)):
+            D[d, d] = D[d, d] + linear(c * mass[k, r])
+        if wp.static(twist):
+            D[wp.static(nb - 1), wp.static(nb - 1)] = D[wp.static(nb - 1), wp.static(nb - 1)] + linear(c * rotary[k, r])
+        D = wp.cw_mul(D, wp.outer(free, free)) + wp.diag(H(linear(1.0)) - free)
+        store(blocks_out, 0, k, r, D)
+        if wp.static(closed) or k < n - 1:
+            E = wp.cw_mul(E, wp.outer(free, free_of(fixed, along(k + 1, n), r)))
+        store(blocks_out, wp.static(nb2), k, r, E)
+        if wp.static(span == 2):
+            ahead = along(k + 2, n)
+            if wp.static(closed) or k < n - 2:
+                G = wp.cw_mul(G, wp.outer(free, free_of(fixed, ahead, r)))
+            store(blocks_out, wp.static(2 * nb2), k, r, G)
 
     return assemble
 
@@ -261,7 +207,7 @@ def factor_kernel(kind: ChainKind, linear):
     load, store, _, put = block_functions(kind, linear)
     factor, lower, upper, _, _, congruence = pivot.functions(nb, linear)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def factorise(
         blocks: wp.array3d(dtype=linear),
         count: wp.array(dtype=int),
@@ -348,7 +294,7 @@ def direct_kernel(kind: ChainKind, linear):
     """Direction of every rod that wants one, straight from the factors."""
     substitute = substitute_function(kind, linear)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def direct(
         factor: wp.array3d(dtype=linear),
         right: wp.array3d(dtype=linear),

@@ -290,7 +290,7 @@ def term_kernels(kind: ChainKind, index: int, real):
             for i in range(wp.static(size)):
                 gradient_out[i, k, r] = f[i]
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def hessian(
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
@@ -479,7 +479,7 @@ def strain_kernel(kind: ChainKind, real):
     each = tuple(_strain_functions(kind, i, real) for i in range(len(kind.terms)))
     spans, closed = tuple(term.measure.span for term in kind.terms), kind.closed
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def strains(
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),

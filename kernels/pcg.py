@@ -9,127 +9,12 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels import outcome, pivot
+from ddg_warp.kernels import pivot
 from ddg_warp.kernels.block_band import block_functions, product_function, substitute_function
 from ddg_warp.kernels.element import ChainKind
 from ddg_warp.kernels.search import TURNED, search_functions
 
 PRECONDITIONERS = ("jacobi", "block_jacobi", "chain")
-
-
-@cache
-def judge_kernel(kind: ChainKind, real, linear):
-    """Line search of a rod: stop it where it balances, accept the iterate (and ask for a direction), or shorten the step."""
-    V = wp.types.vector(kind.dim, real)
-    place, turn_angles, relag, shorter = search_functions(kind, real, linear)
-    twist, nb = kind.twist, kind.block
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def judge(
-        residual: wp.array3d(dtype=linear),
-        change: wp.array2d(dtype=real),
-        noise: wp.array2d(dtype=real),
-        count: wp.array(dtype=int),
-        floor: real,
-        max_iterations: int,
-        max_halvings: int,
-        direction: wp.array3d(dtype=linear),
-        fixed: wp.array2d(dtype=wp.uint8),
-        base: wp.array2d(dtype=V),
-        x: wp.array2d(dtype=V),
-        theta: wp.array2d(dtype=real),
-        frame: wp.array3d(dtype=real),
-        status: wp.array(dtype=int),
-        unbalanced: wp.array(dtype=int),
-        drowned: wp.array(dtype=int),
-        slot: wp.array(dtype=int),
-        iteration: wp.array(dtype=int),
-        halvings: wp.array(dtype=int),
-        step_length: wp.array(dtype=real),
-        decrement: wp.array(dtype=real),
-        merit: wp.array(dtype=real),
-        load_scale: wp.array(dtype=real),
-        largest: wp.array(dtype=real),
-        turned: wp.array(dtype=int),
-        wanted: wp.array(dtype=int),
-        active: wp.array(dtype=int),
-    ):
-        r = wp.tid()
-        wanted[r] = 0
-        if status[r] != 0:
-            return
-        # rounding excuses a residual only after an iteration: the predictor's may be all of a coarse precision's load
-        if unbalanced[r] == 0 and (drowned[r] == 0 or iteration[r] > 0):
-            status[r] = wp.where(
-                drowned[r] == 0, int(wp.static(outcome.CONVERGED)), int(wp.static(outcome.CONVERGED_TO_ROUNDING))
-            )
-            return
-        unbalanced[r] = 0
-        drowned[r] = 0
-        n = count[r]
-        total = real(0.0)
-        rounding = real(0.0)
-        square = real(0.0)
-        worst = real(0.0)
-        for k in range(n):
-            total += change[k, r]
-            rounding += noise[k, r]
-            for d in range(wp.static(nb)):
-                size = wp.abs(real(residual[d, k, r]))
-                worst = wp.max(worst, size)
-                square += size * size
-        rounding *= floor
-        first = iteration[r] == 0
-        largest[r] = worst
-        if first:
-            total = real(0.0)
-            if load_scale[r] == real(0.0):
-                load_scale[r] = worst
-        finite = wp.isfinite(square) and wp.isfinite(total)
-        if first and not finite:
-            status[r] = wp.static(outcome.NON_FINITE)
-            return
-        taken = step_length[r]
-        expected = taken * decrement[r]
-        accept = first
-        if not first and finite:
-            if expected > real(10.0) * rounding:
-                accept = total <= real(-1.0e-4) * expected + rounding
-            else:
-                accept = square <= real(4.0) * merit[r] or taken == real(0.0)
-        if not accept:
-            halvings[r] = halvings[r] + 1
-            if halvings[r] > max_halvings:
-                status[r] = wp.static(outcome.LINE_SEARCH_FAILED)
-                return
-            less = shorter(taken, expected, total, finite)
-            place(x, base, direction, fixed, less, n, r)
-            turn_angles(theta, direction, less - taken, n, r)
-            step_length[r] = less
-            active[0] = 1
-            return
-        iteration[r] = iteration[r] + 1
-        if iteration[r] > max_iterations:
-            status[r] = wp.static(outcome.MAX_ITERATIONS)
-            return
-        merit[r] = square
-        slot[r] = 1 - slot[r]
-        halvings[r] = 0
-        if wp.static(twist):
-            if turned[r] != 0:
-                # angles mean something else now: take no step, and ask for a direction in the new frames
-                relag(x, frame, n, r)
-                turned[r] = 0
-                decrement[r] = real(1.0e30)
-                step_length[r] = real(0.0)
-                for k in range(n):
-                    base[k, r] = x[k, r]
-                active[0] = 1
-                return
-        wanted[r] = 1
-        active[0] = 1
-
-    return judge
 
 
 @cache
@@ -180,7 +65,7 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
             total += wp.dot(here, u)
         return total
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def start(
         blocks: wp.array3d(dtype=linear),
         factors: wp.array3d(dtype=linear),
@@ -214,7 +99,7 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
         else:
             wanted[r] = 2
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def product(
         blocks: wp.array3d(dtype=linear),
         p: wp.array3d(dtype=linear),
@@ -230,7 +115,7 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
         if wanted[r] == 1 and k < count[r]:
             put(q_out, 0, k, r, times(blocks, p, k, count[r], r))
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def advance(
         blocks: wp.array3d(dtype=linear),
         factors: wp.array3d(dtype=linear),
@@ -289,7 +174,7 @@ def take_kernel(kind: ChainKind, real, linear):
     place, turn_angles, _, _ = search_functions(kind, real, linear)
     nb = kind.block
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def take(
         first_residual: wp.array3d(dtype=linear),
         iterations: wp.array(dtype=int),

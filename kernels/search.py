@@ -12,13 +12,12 @@ TURNED = 0.1  # largest turn of an edge in a step that is still taken straight [
 
 
 @cache
-def search_functions(kind: ChainKind, real, linear):
-    """What every solver's line search does to a rod: place(...), turn_angles(...), relag(...), shorter(...)."""
-    dim, twist, angle, every = kind.dim, kind.twist, kind.block - 1, (1 << kind.dim) - 1
+def move_functions(kind: ChainKind, real, linear):
+    """What happens to one node or edge: excess(...) of a turned edge, put(...) a node, carry(...) a frame to the iterate."""
+    dim = kind.dim
     V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
-    transport, reference_twist, _ = frames.functions(real)
+    transport, *_ = frames.functions(real)
     along, *_ = gather_functions(kind, real)
-    closed = kind.closed
 
     @wp.func
     def step_of(direction: wp.array3d(dtype=linear), j: int, r: int):
@@ -59,6 +58,28 @@ def search_functions(kind: ChainKind, real, linear):
             if ((int(fixed[j, r]) >> d) & 1) == 0:
                 moved[d] = moved[d] + shift[d]
         x[j, r] = moved
+
+    @wp.func
+    def carry(x: wp.array2d(dtype=V), frame: wp.array3d(dtype=real), j: int, n: int, r: int):
+        """Director of edge j carried to its tangent in the iterate, and this tangent."""
+        t = wp.normalize(x[along(j + 1, n), r] - x[j, r])
+        u = transport(
+            X(frame[0, j, r], frame[1, j, r], frame[2, j, r]), X(frame[3, j, r], frame[4, j, r], frame[5, j, r]), t
+        )
+        return u, t
+
+    return step_of, excess, put, carry
+
+
+@cache
+def search_functions(kind: ChainKind, real, linear):
+    """What every solver's line search does to a rod: place(...), turn_angles(...), relag(...), shorter(...)."""
+    dim, twist, angle, every = kind.dim, kind.twist, kind.block - 1, (1 << kind.dim) - 1
+    V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
+    _, reference_twist, _ = frames.functions(real)
+    step_of, excess, put, carry = move_functions(kind, real, linear)
+    along, *_ = gather_functions(kind, real)
+    closed = kind.closed
 
     @wp.func
     def place(
@@ -138,10 +159,7 @@ def search_functions(kind: ChainKind, real, linear):
         u_first = X()
         t_first = X()
         for j in range(n - wp.static(0 if closed else 1)):
-            t = wp.normalize(x[along(j + 1, n), r] - x[j, r])
-            u = transport(
-                X(frame[0, j, r], frame[1, j, r], frame[2, j, r]), X(frame[3, j, r], frame[4, j, r], frame[5, j, r]), t
-            )
+            u, t = carry(x, frame, j, n, r)
             if j > 0:
                 frame[6, j - 1, r] = reference_twist(u0, u, t0, t, frame[6, j - 1, r])
             for c in range(3):

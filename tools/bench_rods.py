@@ -29,7 +29,7 @@ EXACT_RTOL = 1e-12  # of the reference, which rounding ends
 DEVIATION = 1e-5  # largest error of a node [m per m of rod]
 NEVER = 10**9  # steps between readings of the outcomes
 SHOWN = (
-    "study rods nodes precision linear rtol ms_per_step ns_per_node_iteration newton_mean newton_max outcomes retries "
+    "study rods nodes solver precision linear rtol ms_per_step ns_per_node_iteration newton_mean newton_max outcomes retries "
     "lost_pivots residual error failure"
 ).split()
 
@@ -41,6 +41,7 @@ class Case:
     Attributes:
         study: What the case belongs to.
         rods, nodes: Number of rods, nodes of each.
+        solver: The integrator's `linear`.
         precision, rtol, dt: Of the integrator; dt [s].
         radius, length: Of a rod [m].
         gravity: Acceleration [m/s^2].
@@ -52,6 +53,7 @@ class Case:
     study: str
     rods: int
     nodes: int
+    solver: str = "auto"
     precision: str = "float64"
     rtol: float = 1e-8
     dt: float = 1.0 / 240.0
@@ -195,7 +197,7 @@ def run(case: Case, device) -> tuple[dict, np.ndarray]:
     memory = used_memory(device)
     began = time.perf_counter()
     model = case.scene().build(device=device.alias, precision=case.precision)
-    integrator = ddg.Integrator(model, rtol=case.rtol, check_every=NEVER)
+    integrator = ddg.Integrator(model, linear=case.solver, rtol=case.rtol, check_every=NEVER)
     state = model.state()
     wp.synchronize_device(device)
     built = time.perf_counter()
@@ -227,6 +229,7 @@ def run(case: Case, device) -> tuple[dict, np.ndarray]:
         "study": case.study,
         "rods": case.rods,
         "nodes": case.nodes,
+        "solver": case.solver,
         "precision": case.precision,
         "linear": ", ".join(statistics.get("linear", [])),
         "rtol": case.rtol,
@@ -242,7 +245,7 @@ def run(case: Case, device) -> tuple[dict, np.ndarray]:
         "lost_pivots": statistics["lost_pivots"],
         "build_s": built - began,
         "first_two_steps_s": first,
-        "bytes_per_node": bytes_per_node(model, model.groups[0].kind),
+        "bytes_per_node": bytes_per_node(model, model.groups[0]),
         "measured_bytes_per_node": memory / nodes,
         "failure": failure,
     }
@@ -256,8 +259,8 @@ def measure(case: Case, device, exact: dict) -> dict:
     if case.tip is not None:
         error = np.abs(found[:, -1, [0, 2]] - case.tip).max()
     else:
-        # The rods are alike and apart, so that one of them, in float64 and solved to rounding, stands for all.
-        alone = replace(case, study="", rods=1, precision="float64", rtol=EXACT_RTOL)
+        # The rods are alike and apart, so that one of them, in float64 and swept to rounding, stands for all.
+        alone = replace(case, study="", rods=1, solver="sweep", precision="float64", rtol=EXACT_RTOL)
         if alone not in exact:
             exact[alone] = run(alone, device)[1]
         error = np.linalg.norm(found - exact[alone], axis=2).max()
@@ -328,6 +331,7 @@ def main() -> int:
     parser.add_argument("--cuda", action="store_true", help="many rods on a GPU")
     parser.add_argument("--long", action="store_true", help="one long rod; on the CPU with --cpu")
     parser.add_argument("--quick", action="store_true", help="small sizes: does it run?")
+    parser.add_argument("--linear", default="auto", help="linear solver: auto, sweep, partitioned, ... (default: auto)")
     parser.add_argument("--device", help="Warp device (default: cpu with --cpu, else cuda:0)")
     parser.add_argument("--commit", default="", help="commit, where there is no git checkout")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results", help="default: tools/results")
@@ -341,6 +345,7 @@ def main() -> int:
     cases = cpu_cases(chosen.quick) if chosen.cpu else cuda_cases(chosen.quick) if chosen.cuda else []
     if chosen.long:
         cases += long_cases(chosen.quick, device.is_cuda)
+    cases = [replace(case, solver=chosen.linear) for case in cases]
     stem = chosen.out / ("rods_cpu" if chosen.cpu else "rods_cuda" if chosen.cuda else "rods_long")
     rows, exact = [], {}
     for case in cases:

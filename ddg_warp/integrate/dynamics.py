@@ -9,6 +9,8 @@ from ddg_warp import arrays, geometry
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.integrate.prescribed import PrescribedMotion, TimedLoads
 from ddg_warp.kernels import element, outcome, step
+from ddg_warp.linear.choice import automatic
+from ddg_warp.linear.partitioned import PartitionedNewton
 from ddg_warp.linear.pcg import PcgNewton, ProjectiveNewton
 from ddg_warp.newton import ChainNewton, NewtonOptions
 from ddg_warp.precision import FLOAT32_LIMIT, float32_error
@@ -16,6 +18,7 @@ from ddg_warp.state import State
 
 SOLVERS = ("newton", "projective")
 SCHEMES = ("implicit_euler", "implicit_midpoint")
+DIRECT = {"sweep": ChainNewton, "partitioned": PartitionedNewton}  # solvers of open rods by their name
 FOLDED = 1e-5  # how close to opposite [rad] edges that meet are called folded, in messages
 
 
@@ -38,8 +41,9 @@ class Integrator:
         scheme: "implicit_euler" (first order, damps what the step does not resolve) or "implicit_midpoint" (second order,
             A-stable, keeps the energy of linear oscillations).
         solver: "newton", or "projective": the matrix of a step's first iterate serves all of its iterations.
-        linear: of Newton: "auto" (the chain sweep for open rods, PCG with the chain preconditioner for closed ones), "sweep", or
-            PCG with "jacobi", "block_jacobi" or "chain" as preconditioner.
+        linear: of Newton: "auto" (the chain sweep for open rods, on CUDA cyclic reduction where they are few and long; PCG with
+            the chain preconditioner for closed ones), "sweep", "partitioned" (cyclic reduction), or PCG with "jacobi",
+            "block_jacobi" or "chain" as preconditioner.
         rtol, max_iterations, ...: see `NewtonOptions`.
         retry_limit: how often in a row a rod's failed step is tried again: first from the last state instead of the predictor,
             then in halves, and so on, down to 2^-(retry_limit / 2) of the step.
@@ -173,14 +177,18 @@ class Integrator:
 
 def _newton(model, group, integrator: Integrator, precision) -> ChainNewton:
     """The solver of a group that the integrator's `linear` asks for."""
-    linear = integrator.linear
+    linear = integrator.linear if integrator.linear != "auto" else automatic(group)
+    given = (model, group, integrator.options)
+    last = (precision, integrator.scheme == "implicit_midpoint")
     if integrator.solver == "projective":
-        return ProjectiveNewton(model, group, integrator.options, precision)
-    if linear == "sweep" and group.kind.closed:
-        raise SceneError(f"linear 'sweep': rod {group.host.rods[0]} is closed; use 'auto' or a preconditioner of PCG")
-    if linear == "sweep" or (linear == "auto" and not group.kind.closed):
-        return ChainNewton(model, group, integrator.options, precision)
-    return PcgNewton(model, group, integrator.options, "chain" if linear == "auto" else linear, precision)
+        return ProjectiveNewton(*given, *last)
+    if linear in DIRECT and group.kind.closed:
+        raise SceneError(
+            f"linear {linear!r}: rod {group.host.rods[0]} is closed; use 'auto' or a preconditioner of PCG"
+        )
+    if linear in DIRECT:
+        return DIRECT[linear](*given, *last)
+    return PcgNewton(*given, linear, *last)
 
 
 def _require_mass(model) -> None:
@@ -210,7 +218,6 @@ class _ChainStep:
         self.kernels = {
             "start": step.start_kernel(real),
             "begin": step.begin_kernel(kind, real, midpoint),
-            "predict": step.predict_kernel(kind, real, self.newton.linear, midpoint),
             "nodes": step.finish_nodes_kernel(kind, real, midpoint),
             "advance": step.advance_kernel(real),
         }
@@ -263,12 +270,7 @@ class _ChainStep:
             + [newton.unbalanced, newton.drowned]
             + [newton.load_scale, self.bent, newton.active],
         )
-        self._launch(
-            "predict",
-            group.columns,
-            [before.x, before.v, group.fixed, group.count, newton.rate, self.progress, self.bent],
-            [newton.base, newton.direction, newton.x, newton.frame],
-        )
+        newton.predict(before, self.progress, self.bent)
         self.bent.zero_()
         if self.moving:
             self.moving.apply(self.progress, self.portion, newton.x, newton.frame, newton.theta)

@@ -3,13 +3,13 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import block_band, pcg
-from ddg_warp.newton import ChainNewton, NewtonOptions
+from ddg_warp.kernels import block_band, judge, pcg
+from ddg_warp.linear.assembled import AssembledNewton
+from ddg_warp.newton import NewtonOptions
 
 
-class PcgNewton(ChainNewton):
+class PcgNewton(AssembledNewton):
     """As `ChainNewton`, with the system assembled in blocks and solved by conjugate gradients.
 
     Args:
@@ -17,29 +17,23 @@ class PcgNewton(ChainNewton):
             a few iterations for a closed one).
     """
 
-    def __init__(self, model, group, options: NewtonOptions, preconditioner: str = "chain", linear=None):
+    def __init__(
+        self, model, group, options: NewtonOptions, preconditioner: str = "chain", linear=None, midpoint: bool = False
+    ):
         if preconditioner not in pcg.PRECONDITIONERS:
             raise SceneError(f"preconditioner {preconditioner!r}: it is one of {', '.join(pcg.PRECONDITIONERS)}")
-        super().__init__(model, group, options, linear)
-        kind, device = group.kind, model.wp_device
-        nodes, columns = (group.nodes, group.columns), group.columns
-
-        def vectors(rows=kind.block):
-            return arrays.allocate((rows, *nodes), self.linear, device)
-
-        self.blocks = vectors(3 * kind.block**2)
-        self.factors = vectors(3 * kind.block**2 + kind.block) if preconditioner == "chain" else self.blocks
-        self.rest, self.z, self.p, self.q = (vectors() for _ in range(4))
-        self.change, self.noise = (arrays.allocate(nodes, self.real, device) for _ in range(2))
+        super().__init__(model, group, options, linear, midpoint)
+        kind, device, columns = group.kind, model.wp_device, group.columns
+        by_chain = preconditioner == "chain"
+        self.factors = self.vectors(3 * kind.block**2 + kind.block) if by_chain else self.blocks
+        self.rest, self.z, self.p, self.q = (self.vectors() for _ in range(4))
         self.without_compression = wp.full(columns, 1, dtype=int, device=device)  # PCG needs a definite matrix
-        self.merit = wp.zeros(columns, dtype=self.real, device=device)
         self.rho, self.rho_first = (wp.zeros(columns, dtype=self.linear, device=device) for _ in range(2))
-        self.wanted, self.iterations = (wp.zeros(columns, dtype=int, device=device) for _ in range(2))
+        self.iterations = wp.zeros(columns, dtype=int, device=device)
         self.busy = wp.zeros(1, dtype=int, device=device)
         self.pcg_work = wp.zeros(1, dtype=wp.int64, device=device)
-        self._assemble = block_band.assemble_kernel(kind, self.real, self.linear)
-        self._judge = pcg.judge_kernel(kind, self.real, self.linear)
-        self._factor = block_band.factor_kernel(kind, self.linear) if preconditioner == "chain" else None
+        self._judge = judge.judge_kernel(kind, self.real, self.linear)
+        self._factor = block_band.factor_kernel(kind, self.linear) if by_chain else None
         self._start, self._product, self._advance = pcg.solver_kernels(kind, self.linear, preconditioner)
         self._take = pcg.take_kernel(kind, self.real, self.linear)
         self._limit = 10 * kind.block * group.nodes
@@ -48,7 +42,7 @@ class PcgNewton(ChainNewton):
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         own = [self._assemble, self._judge, self._start, self._product, self._advance, self._take]
-        return [self._evaluate, self._check, *own, *([self._factor] if self._factor else [])]
+        return [*self.kernels_around, *own, *([self._factor] if self._factor else [])]
 
     def sweep(self) -> None:
         """Assemble, decide, solve for a direction and take it."""
@@ -67,28 +61,11 @@ class PcgNewton(ChainNewton):
     def assemble(self) -> None:
         """Blocks and residual of active rods; accept or shorten the last step; factors where a direction is wanted."""
         group, options, device = self.group, self.options, self.device
-        wp.launch(
-            self._assemble,
-            (group.nodes, group.columns),
-            [self.factor, self.gradient, self.energy, group.count, group.mass, group.rotary, self.coefficient]
-            + [self.x, self.theta, self.target, self.target_angle, group.gravity, group.load, group.load_angle]
-            + [
-                int(group.host.loaded),
-                group.fixed,
-                self.direction,
-                self.base,
-                self.status,
-                self.unbalanced,
-                self.drowned,
-            ]
-            + [self.slot, self.iteration, int(self.reuse), self.step_length],
-            [self.blocks, self.right, self.change, self.noise],
-            device=device,
-        )
+        self.assemble_blocks()
         wp.launch(
             self._judge,
             group.columns,
-            [self.right, self.change, self.noise, group.count, options.floor_factor * self.eps]
+            [self.right, self.energy_change, self.energy_noise, group.count, options.floor_factor * self.eps]
             + [options.max_iterations, options.max_halvings, self.direction, group.fixed, self.base]
             + [self.x, self.theta, self.frame, self.status, self.unbalanced, self.drowned, self.slot]
             + [self.iteration, self.halvings, self.step_length, self.decrement, self.merit, self.load_scale]
@@ -149,14 +126,14 @@ class ProjectiveNewton(PcgNewton):
 
     reuse = True
 
-    def __init__(self, model, group, options: NewtonOptions, linear=None):
-        super().__init__(model, group, options, "chain", linear)
+    def __init__(self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False):
+        super().__init__(model, group, options, "chain", linear, midpoint)
         self._direct = block_band.direct_kernel(group.kind, self.linear)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [self._evaluate, self._check, self._assemble, self._judge, self._factor, self._direct, self._take]
+        return [*self.kernels_around, self._assemble, self._judge, self._factor, self._direct, self._take]
 
     def direct(self) -> None:
         """Directions by the factors of the first iterate."""

@@ -171,7 +171,7 @@ def term_kernels(term: Term, real):
         for i in range(wp.static(slots_count)):
             gradient_out[i, e] = spread(f, i)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def hessian(
         q: wp.array(dtype=V),
         frame: wp.array2d(dtype=real),
@@ -196,7 +196,7 @@ def term_kernels(term: Term, real):
         for i in range(wp.static(size)):
             hessian_out[e, i, column] = dq[i]
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def strains(
         q: wp.array(dtype=V),
         frame: wp.array2d(dtype=real),

@@ -32,7 +32,7 @@ def edge_kernel(real):
     row, put = functions(real)
     transport, *_ = frames.functions(real)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def edges(
         q: wp.array(dtype=V),
         ends: wp.array2d(dtype=int),
@@ -58,7 +58,7 @@ def vertex_kernel(real):
     row, _ = functions(real)
     _, reference_twist, _ = frames.functions(real)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def vertices(
         frame: wp.array2d(dtype=real),
         slots: wp.array2d(dtype=int),
@@ -89,7 +89,7 @@ def joint_kernel(real):
     _, reference_twist, _ = frames.functions(real)
     turned, _ = rotations(real)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def joints(
         q: wp.array(dtype=V),
         frame: wp.array2d(dtype=real),
@@ -122,7 +122,7 @@ def reset_kernel(real):
     """Rotations of joints start from zero once their frames have taken them over."""
     V = wp.types.vector(3, real)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def reset(first: int, spins: int, blocks: int, q: wp.array(dtype=V)):
         tid = wp.tid()
         q[first + tid % spins + tid / spins * blocks] = V()

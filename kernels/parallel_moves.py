@@ -1,0 +1,208 @@
+"""Moves of few, long rods, a thread a node: what `search.adjust` and `step.predict` do with one thread a rod.
+
+Turned edges are summed to positions by a prefix sum: within ranges of about the root of a rod's nodes, a thread a range, then over
+the ranges, a thread a rod.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels import frames
+from ddg_warp.kernels.element import ChainKind
+from ddg_warp.kernels.search import PLACE, RELAG, move_functions
+
+
+@cache
+def move_kernels(kind: ChainKind, real, linear):
+    """`turn`, `scan` and `offset`, the prefix sum of turned edges, then `move`, which puts nodes or frames; see `search.place`.
+
+    `turn` also carries frames, into a second array, as neighbours still read those of before.
+    """
+    dim, twist = kind.dim, kind.twist
+    V = wp.types.vector(dim, real)
+    step_of, excess, put, carry = move_functions(kind, real, linear)
+    _, reference_twist, _ = frames.functions(real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def turn(
+        count: wp.array(dtype=int),
+        todo: wp.array(dtype=int),
+        direction: wp.array3d(dtype=linear),
+        step_length: wp.array(dtype=real),
+        base: wp.array2d(dtype=V),
+        x: wp.array2d(dtype=V),
+        frame: wp.array3d(dtype=real),
+        excess_out: wp.array2d(dtype=V),
+        frame_out: wp.array3d(dtype=real),
+    ):
+        """Of every edge: excess of turning it over shearing it, or its frame in the iterate."""
+        k, r = wp.tid()
+        n = count[r]
+        if k >= n - 1:
+            return
+        if todo[r] == wp.static(PLACE):
+            excess_out[k, r] = excess(base, direction, step_length[r], k, n, r)
+        if wp.static(twist):
+            if todo[r] == wp.static(RELAG):
+                u, t = carry(x, frame, k, n, r)
+                for c in range(3):
+                    frame_out[c, k, r] = u[c]
+                    frame_out[3 + c, k, r] = t[c]
+                twisted = frame[6, k, r]
+                if k < n - 2:
+                    u1, t1 = carry(x, frame, k + 1, n, r)
+                    twisted = reference_twist(u, u1, t, t1, twisted)
+                frame_out[6, k, r] = twisted
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def scan(
+        count: wp.array(dtype=int),
+        todo: wp.array(dtype=int),
+        width: int,
+        excess_to_sum: wp.array2d(dtype=V),
+        sum_out: wp.array3d(dtype=V),
+    ):
+        """Sums of the edges before every node within its range of `width` nodes; of a range, its sum and that of these sums."""
+        i, r = wp.tid()
+        if todo[r] != wp.static(PLACE):
+            return
+        n = count[r]
+        running = V()
+        area = V()
+        for k in range(i * width, wp.min(n, (i + 1) * width)):
+            here = V()
+            if k < n - 1:
+                here = excess_to_sum[k, r]
+            excess_to_sum[k, r] = running
+            area += running
+            running += here
+        sum_out[0, i, r] = running
+        sum_out[1, i, r] = area
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def offset(
+        count: wp.array(dtype=int),
+        todo: wp.array(dtype=int),
+        width: int,
+        ranges: int,
+        sums: wp.array3d(dtype=V),
+        mean_out: wp.array(dtype=V),
+    ):
+        """Replaces a range's sum by that of all ranges before it; mean over the nodes of what the edges before them sum to."""
+        r = wp.tid()
+        if todo[r] != wp.static(PLACE):
+            return
+        n = count[r]
+        running = V()
+        mean = V()
+        for i in range(ranges):
+            here = sums[0, i, r]
+            sums[0, i, r] = running
+            nodes = wp.min(n, (i + 1) * width) - i * width
+            if nodes > 0:
+                mean += sums[1, i, r] + running * real(nodes)
+                running += here
+        mean_out[r] = mean / real(n)
+
+    @wp.func
+    def before(prefix: wp.array2d(dtype=V), sums: wp.array3d(dtype=V), width: int, k: int, r: int):
+        """Sum over all edges before node k."""
+        return prefix[k, r] + sums[0, k // width, r]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def move(
+        count: wp.array(dtype=int),
+        fixed: wp.array2d(dtype=wp.uint8),
+        held: wp.array3d(dtype=int),
+        todo: wp.array(dtype=int),
+        direction: wp.array3d(dtype=linear),
+        step_length: wp.array(dtype=real),
+        angle_change: wp.array(dtype=real),
+        prefix: wp.array2d(dtype=V),
+        sums: wp.array3d(dtype=V),
+        mean: wp.array(dtype=V),
+        width: int,
+        new_frame: wp.array3d(dtype=real),
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        frame: wp.array3d(dtype=real),
+        base: wp.array2d(dtype=V),
+    ):
+        """Puts a node where its step ends: of turned edges the sum from the held node before it, closing at the next."""
+        k, r = wp.tid()
+        what = todo[r]
+        if what == 0 or k >= count[r]:
+            return
+        if what == wp.static(RELAG):
+            base[k, r] = x[k, r]
+            if wp.static(twist):
+                if k < count[r] - 1:
+                    for c in range(7):
+                        frame[c, k, r] = new_frame[c, k, r]
+            return
+        shift = V()
+        if what == wp.static(PLACE):
+            shift = before(prefix, sums, width, k, r)
+            p = held[0, k, r]
+            q = held[1, k, r]
+            if p < 0 and q < 0:
+                shift -= mean[r]
+            elif p < 0:
+                shift -= before(prefix, sums, width, q, r)
+            else:
+                start = before(prefix, sums, width, p, r)
+                shift -= start
+                if q > p:
+                    shift -= (before(prefix, sums, width, q, r) - start) * (real(k - p) / real(q - p))
+        put(x, base, direction, fixed, step_length[r], shift, k, r)
+        if wp.static(twist):
+            theta[k, r] = theta[k, r] + angle_change[r] * real(direction[wp.static(dim), k, r])
+
+    return turn, scan, offset, move
+
+
+@cache
+def predict_kernels(kind: ChainKind, real, linear):
+    """`aim`: bent rods step along their velocity, with edges turned; `renew`: every rod that moves takes new frames."""
+    dim, nb = kind.dim, kind.block
+    V = wp.types.vector(dim, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def aim(
+        x0: wp.array2d(dtype=V),
+        v0: wp.array2d(dtype=V),
+        fixed: wp.array2d(dtype=wp.uint8),
+        count: wp.array(dtype=int),
+        rate: wp.array(dtype=real),
+        progress: wp.array(dtype=real),
+        bent: wp.array(dtype=int),
+        base_out: wp.array2d(dtype=V),
+        direction_out: wp.array3d(dtype=linear),
+        step_length_out: wp.array(dtype=real),
+        angle_change_out: wp.array(dtype=real),
+        todo_out: wp.array(dtype=int),
+    ):
+        k, r = wp.tid()
+        if k >= count[r]:
+            return
+        moving = progress[r] < real(1.0) and bent[r] != 0
+        if k == 0:
+            step_length_out[r] = real(1.0)
+            angle_change_out[r] = real(0.0)
+            todo_out[r] = wp.where(moving, wp.static(PLACE), 0)
+        if moving:
+            base_out[k, r] = x0[k, r]
+            v = v0[k, r] / rate[r]
+            for d in range(wp.static(nb)):
+                direction_out[d, k, r] = linear(0.0)
+            for d in range(wp.static(dim)):
+                if ((int(fixed[k, r]) >> d) & 1) == 0:
+                    direction_out[d, k, r] = linear(v[d])
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def renew(progress: wp.array(dtype=real), todo_out: wp.array(dtype=int)):
+        r = wp.tid()
+        todo_out[r] = wp.where(progress[r] < real(1.0), wp.static(RELAG), 0)
+
+    return aim, renew

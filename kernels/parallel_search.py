@@ -1,0 +1,210 @@
+"""The line search of few, long rods: what `judge` and `pcg.take` do with one thread a rod, spread over its nodes.
+
+Sums over a rod run over fixed ranges of about the root of its nodes, a thread a range, then a thread a rod over the ranges: always
+in one order.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels import outcome
+from ddg_warp.kernels.element import ChainKind
+from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
+from ddg_warp.kernels.search import PLACE, TURNED
+
+STRAIGHT = 4  # beside PLACE and RELAG, what is to be done with a rod: move its nodes along the direction
+
+
+@cache
+def sum_kernels(kind: ChainKind, real, linear):
+    """Partial sums of a range: `weigh` of energy changes, rounding and residuals, `gauge` of a direction.
+
+    Range i of a rod holds its nodes i, i + ranges, ..., so that neighbouring threads read neighbouring nodes.
+    """
+    dim, nb = kind.dim, kind.block
+    V = wp.types.vector(dim, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def weigh(
+        residual: wp.array3d(dtype=linear),
+        change: wp.array2d(dtype=real),
+        noise: wp.array2d(dtype=linear),
+        count: wp.array(dtype=int),
+        status: wp.array(dtype=int),
+        ranges: int,
+        partial_out: wp.array3d(dtype=real),
+    ):
+        """Sums of energy changes, of their rounding and of squares of the residual, and its largest component."""
+        i, r = wp.tid()
+        if status[r] != 0:
+            return
+        total = real(0.0)
+        rounding = real(0.0)
+        square = real(0.0)
+        worst = real(0.0)
+        for k in range(i, count[r], ranges):
+            total += change[k, r]
+            rounding += real(noise[k, r])
+            for d in range(wp.static(nb)):
+                size = wp.abs(real(residual[d, k, r]))
+                worst = wp.max(worst, size)
+                square += size * size
+        partial_out[0, i, r] = total
+        partial_out[1, i, r] = rounding
+        partial_out[2, i, r] = square
+        partial_out[3, i, r] = worst
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def gauge(
+        residual: wp.array3d(dtype=linear),
+        direction: wp.array3d(dtype=linear),
+        x: wp.array2d(dtype=V),
+        count: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        ranges: int,
+        base_out: wp.array2d(dtype=V),
+        partial_out: wp.array3d(dtype=real),
+    ):
+        """Share of r . d, and the largest squared turn of an edge; takes the iterate as the positions a step comes from."""
+        i, r = wp.tid()
+        if wanted[r] == 0:
+            return
+        total = real(0.0)
+        rotation = real(0.0)
+        for k in range(i, count[r], ranges):
+            here = x[k, r]
+            base_out[k, r] = here
+            for d in range(wp.static(nb)):
+                total += real(residual[d, k, r]) * real(direction[d, k, r])
+            if k > 0:
+                bent = V()
+                for d in range(wp.static(dim)):
+                    bent[d] = real(direction[d, k, r] - direction[d, k - 1, r])
+                rotation = wp.max(rotation, wp.length_sq(bent) / wp.length_sq(here - x[k - 1, r]))
+        partial_out[0, i, r] = total
+        partial_out[1, i, r] = rotation
+
+    return weigh, gauge
+
+
+@cache
+def decide_kernels(kind: ChainKind, real, linear):
+    """Decisions of a rod from its partial sums: `judge` of an iterate, `take` of a direction."""
+    balanced, decide = judge_functions(kind, real, linear)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def judge(
+        partial: wp.array3d(dtype=real),
+        ranges: int,
+        floor: real,
+        max_iterations: int,
+        max_halvings: int,
+        status: wp.array(dtype=int),
+        unbalanced: wp.array(dtype=int),
+        drowned: wp.array(dtype=int),
+        slot: wp.array(dtype=int),
+        iteration: wp.array(dtype=int),
+        halvings: wp.array(dtype=int),
+        step_length: wp.array(dtype=real),
+        decrement: wp.array(dtype=real),
+        merit: wp.array(dtype=real),
+        load_scale: wp.array(dtype=real),
+        largest: wp.array(dtype=real),
+        turned: wp.array(dtype=int),
+        lost: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        bad: wp.array(dtype=int),
+        todo: wp.array(dtype=int),
+        angle_change: wp.array(dtype=real),
+        active: wp.array(dtype=int),
+    ):
+        r = wp.tid()
+        wanted[r] = 0
+        todo[r] = 0
+        bad[r] = 0
+        if balanced(status, unbalanced, drowned, iteration, r):
+            return
+        total = real(0.0)
+        rounding = real(0.0)
+        square = real(0.0)
+        worst = real(0.0)
+        for i in range(ranges):
+            total += partial[0, i, r]
+            rounding += partial[1, i, r]
+            square += partial[2, i, r]
+            worst = wp.max(worst, partial[3, i, r])
+        if iteration[r] == 0:
+            lost[r] = 0
+        taken = step_length[r]
+        what = decide(
+            total,
+            rounding * floor,
+            square,
+            worst,
+            max_iterations,
+            max_halvings,
+            status,
+            slot,
+            iteration,
+            halvings,
+            step_length,
+            decrement,
+            merit,
+            load_scale,
+            largest,
+            turned,
+            r,
+        )
+        if what == wp.static(STOP):
+            return
+        active[0] = 1
+        if what == wp.static(DIRECT):
+            wanted[r] = 1
+        else:
+            todo[r] = what
+            angle_change[r] = step_length[r] - taken
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def take(
+        partial: wp.array3d(dtype=real),
+        ranges: int,
+        rotation_cap: real,
+        wanted: wp.array(dtype=int),
+        bad: wp.array(dtype=int),
+        status: wp.array(dtype=int),
+        iteration: wp.array(dtype=int),
+        step_length: wp.array(dtype=real),
+        decrement: wp.array(dtype=real),
+        lost: wp.array(dtype=int),
+        clamped: wp.array(dtype=int),
+        todo: wp.array(dtype=int),
+        angle_change: wp.array(dtype=real),
+    ):
+        r = wp.tid()
+        if wanted[r] == 0:
+            return
+        if bad[r] > 0 and clamped[r] == 0:
+            # compression has made the matrix indefinite: the same iterate again, without what compression takes away
+            clamped[r] = 1
+            iteration[r] = iteration[r] - 1
+            step_length[r] = real(0.0)
+            return
+        lost[r] = lost[r] + bad[r]
+        total = real(0.0)
+        rotation = real(0.0)
+        for i in range(ranges):
+            total += partial[0, i, r]
+            rotation = wp.max(rotation, partial[1, i, r])
+        if not wp.isfinite(total):
+            status[r] = wp.static(outcome.NON_FINITE)
+            return
+        whole = real(1.0)
+        if rotation > rotation_cap * rotation_cap:
+            whole = rotation_cap / wp.sqrt(rotation)
+        step_length[r] = whole
+        angle_change[r] = whole
+        decrement[r] = total
+        todo[r] = wp.where(rotation > real(wp.static(TURNED**2)), wp.static(PLACE), wp.static(STRAIGHT))
+
+    return judge, take

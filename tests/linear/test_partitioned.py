@@ -1,0 +1,338 @@
+"""Cyclic reduction against dense matrices, moves against those by one thread a rod, and steps against the chain sweep."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import warp as wp
+
+import ddg_warp as ddg
+from ddg_warp import arrays
+from ddg_warp.kernels import search
+from ddg_warp.linear import choice
+from ddg_warp.linear.partitioned import PartitionedNewton
+from ddg_warp.newton import NewtonOptions
+
+KINDS = {"twist": {}, "untwisted": {"twist": False}, "planar": {"dimension": 2}, "stretch": {"bend": False}}
+EVERY_KIND = pytest.mark.parametrize("name", KINDS)
+COUNTS = (2, 3, 4, 5, 17, 20, 64, 79, 100, 123)  # groups of one rod or of two of different lengths
+RUBBER = ddg.Material(young=1e7, poisson=0.5, density=1000.0)
+STEEL = ddg.Material(young=2e11, poisson=0.3, density=7800.0)
+
+
+def scene_of(name, counts=COUNTS, held=True) -> ddg.Scene:
+    """Rough rods of these numbers of nodes, with loads, and with supports anywhere."""
+    given = {"dimension": 3} | KINDS[name]
+    random, scene = np.random.default_rng(5), ddg.Scene(gravity=(0.3, -0.5, -2.0), dimension=given.pop("dimension"))
+    extra = {"EI2": 0.9, "rotary_inertia": 0.2} if name == "twist" else {}
+    section = ddg.Stiffness(EA=9.0, EI1=0.6, GJ=0.5, mass_per_length=0.7, **extra)
+    for nodes in counts:
+        points = np.cumsum(np.array([1.0, 0.0, 0.2]) + 0.2 * random.normal(size=(nodes, 3)), axis=0)
+        points[:, 1] *= scene.dimension == 3
+        bend = {} if nodes > 2 else {"bend": False, "twist": False}
+        rod = scene.add_rod(points, section=section, natural="straight", **(given | bend))
+        scene.add_force(rod, nodes // 2, (0.4, 0.2, -0.6))
+        if held and nodes > 3:
+            scene.fix(rod, [nodes // 3])
+            scene.fix(rod, [nodes - 2], components="z")
+            if nodes > 16:
+                scene.fix(rod, [11, 15])
+            if name == "twist":
+                scene.fix_twist(rod, [0, nodes // 2])
+    return scene
+
+
+def solvers(name, device, clamped, precision="float64", noise=0.15, **options):
+    """A solver of every group of the rods above in two worlds, at random iterates; clamped: without compression."""
+    random = np.random.default_rng(11)
+    model = scene_of(name, **options).build(device, precision, worlds=2)
+    for group, state in zip(model.groups, model.state().groups, strict=True):
+        newton = PartitionedNewton(model, group, NewtonOptions())
+        x = arrays.download(state.x)
+        for array in (newton.x, newton.target):
+            arrays.assign(array, x + noise * random.normal(size=x.shape))
+        if group.kind.twist:
+            wp.copy(newton.frame, state.frame)
+            for array in (newton.theta, newton.target_angle):
+                arrays.assign(array, 2.0 * noise * random.normal(size=array.shape))
+        newton.coefficient.assign(random.uniform(1.0, 3.0, size=group.columns))
+        newton.rate.fill_(1.0)
+        newton.clamped.fill_(int(clamped))
+        yield newton, state
+
+
+def dense(newton, column: int) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix and residual of a rod from the blocks of its nodes."""
+    kind, n = newton.group.kind, int(newton.group.count.numpy()[column])
+    nb = kind.block
+    stored = arrays.download(newton.blocks)[:, :, column].reshape(3, nb, nb, -1)
+    H = np.zeros((n, nb, n, nb))
+    for k in range(n):
+        H[k, :, k] = stored[0, ..., k]
+        for ahead in range(1, min(kind.span, n - 1 - k) + 1):
+            H[k, :, k + ahead] = stored[ahead, ..., k]
+            H[k + ahead, :, k] = stored[ahead, ..., k].T
+    return H.reshape(n * nb, n * nb), arrays.download(newton.right)[:, :n, column].T.ravel()
+
+
+@EVERY_KIND
+@pytest.mark.parametrize(("precision", "tolerance"), [("float64", 1e-11), ("mixed", 1e-3)])
+def test_direction_is_a_dense_solve(device, name, precision, tolerance):
+    """And the decrement is r . d, and a rod that wants nothing is left alone."""
+    found = 0
+    for newton, state in solvers(name, device, clamped=True, precision=precision):
+        found += newton.group.columns
+        newton.iterate(state.last)
+        arrays.assign(newton.direction, np.full(newton.direction.shape, 7.0))
+        wanted = newton.wanted.numpy()
+        assert wanted.all()
+        wanted[-1] = 0
+        newton.wanted.assign(wanted)
+        newton.direct()
+        direction, decrement = arrays.download(newton.direction), newton.decrement.numpy()
+        assert (direction[..., -1] == 7.0).all()
+        assert (newton.lost.numpy() == 0).all()
+        for column in range(newton.group.columns - 1):
+            H, r = dense(newton, column)
+            expected, n = np.linalg.solve(H, r), len(r) // newton.group.kind.block
+            np.testing.assert_allclose(
+                direction[:, :n, column].T.ravel(), expected, rtol=0, atol=tolerance * np.abs(expected).max()
+            )
+            np.testing.assert_allclose(decrement[column], r @ expected, rtol=tolerance)
+    assert found == 2 * len(COUNTS)
+
+
+def test_pivots_are_lost_where_the_matrix_is_indefinite(device):
+    """Compression makes some of the matrices so; those rods stay, to be tried without it, and the others move."""
+    seen = set()
+    for newton, state in solvers("untwisted", device, clamped=False, noise=0.25):
+        newton.coefficient.fill_(0.3)
+        before = arrays.download(newton.x)
+        newton.iterate(state.last)
+        clamped, moved = newton.clamped.numpy(), np.abs(arrays.download(newton.x) - before).max(axis=(0, 2))
+        for column in range(newton.group.columns):
+            indefinite = np.linalg.eigvalsh(dense(newton, column)[0])[0] < 0.0
+            seen.add(bool(indefinite))
+            assert clamped[column] == indefinite
+            assert (moved[column] == 0.0) == indefinite
+        assert (newton.iteration.numpy() == 1 - clamped).all()
+        newton.iterate(state.last)
+        assert (newton.iteration.numpy() >= 1).all()
+        assert (newton.step_length.numpy() > 0.0).all()
+        assert (newton.lost.numpy() == 0).all()
+    assert seen == {True, False}
+
+
+def adjusted(newton, todo: int):
+    """What one thread a rod makes of the same task, as `x`, `theta` and `frame`."""
+    group = newton.group
+    copies = [wp.clone(array) for array in (newton.x, newton.theta, newton.frame, newton.base)]
+    wp.launch(
+        search.adjust_kernel(group.kind, newton.real, newton.linear),
+        group.columns,
+        [group.count, group.fixed, newton.direction, newton.step_length, newton.angle_change, *copies]
+        + [wp.full(group.columns, todo, dtype=int, device=newton.device)]
+        + [wp.full(group.columns, 1, dtype=int, device=newton.device)],
+        device=newton.device,
+    )
+    return [arrays.download(array) for array in copies[:3]]
+
+
+@EVERY_KIND
+@pytest.mark.parametrize("held", [True, False])
+def test_edges_are_turned_as_by_one_thread(device, name, held):
+    """From held nodes anywhere or from none, along steps that turn edges by about a radian."""
+    random = np.random.default_rng(3)
+    for newton, state in solvers(name, device, clamped=True, held=held):
+        newton.iterate(state.last)
+        group = newton.group
+        mask = (arrays.download(group.fixed) >> np.arange(group.kind.block)[:, None, None]) & 1
+        step = 0.5 * random.normal(size=newton.direction.shape) * (mask == 0)
+        arrays.assign(newton.direction, step)
+        newton.step_length.fill_(0.7)
+        newton.angle_change.fill_(-0.3)
+        newton.todo.fill_(search.PLACE)
+        expected = adjusted(newton, search.PLACE)
+        straight = arrays.download(newton.base) + 0.7 * np.moveaxis(step[: group.kind.dim], 0, -1)
+        newton.move()
+        inside = np.arange(group.nodes)[:, None] < np.tile(group.host.count, 2)
+        x, theta = arrays.download(newton.x), arrays.download(newton.theta)
+        np.testing.assert_allclose(x[inside], expected[0][inside], rtol=0, atol=1e-12)
+        assert np.abs(x - straight)[inside].max() > 0.05
+        if group.kind.twist:
+            np.testing.assert_array_equal(theta, expected[1])
+
+
+def test_frames_are_carried_as_by_one_thread(device):
+    for newton, state in solvers("twist", device, clamped=True, noise=0.3):
+        if newton.group.kind.twist:
+            newton.evaluate(state.last)
+            newton.todo.fill_(search.RELAG)
+            before, (x, _, expected) = arrays.download(newton.frame), adjusted(newton, search.RELAG)
+            newton.move()
+            found = arrays.download(newton.frame)
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
+            assert np.abs(found - before).max() > 0.1
+            np.testing.assert_array_equal(arrays.download(newton.x), x)
+
+
+def moved(scene, device, linear, *, dt=0.01, steps=10, precision="float64", start=None, **options):
+    """State and statistics after some steps."""
+    model = scene.build(device, precision)
+    integrator, state = ddg.Integrator(model, linear=linear, **options), model.state(points=start)
+    for _ in range(steps):
+        state = integrator.step(state, dt)
+    integrator.check(state)
+    return state, integrator.statistics()
+
+
+def straight(nodes: int, axis=(1.0, 0.0, 0.0), length: float = 1.0) -> np.ndarray:
+    return np.linspace(0.0, length, nodes)[:, None] * np.array(axis)
+
+
+def cantilever(nodes=50, section=None, material=RUBBER, **options) -> ddg.Scene:
+    scene = ddg.Scene(**options)
+    scene.clamp_end(scene.add_rod(straight(nodes), section=section or ddg.Circle(0.02), material=material))
+    return scene
+
+
+def hanging() -> ddg.Scene:
+    """A rod of 1,000 nodes and 10 m hangs from its clamp and is pulled aside."""
+    scene = ddg.Scene(gravity=(0.0, -2.943, -9.81))
+    rod = scene.add_rod(straight(1000, (0.0, 0.0, -1.0), 10.0), section=ddg.Circle(2e-3), material=RUBBER)
+    scene.clamp(rod, edges=[0])
+    return scene
+
+
+def stiff() -> ddg.Scene:
+    """EA L^2 / EI = 1e8, and it turns by a radian within ten steps: edges must be turned, not sheared."""
+    section = ddg.Stiffness(EA=1e8, EI1=1.0, GJ=0.7, mass_per_length=1.0, rotary_inertia=1e-6)
+    return cantilever(64, section, None, gravity=(0.0, 5.0, -300.0))
+
+
+def spanning() -> ddg.Scene:
+    """Held at nodes within, with free ends, one component held elsewhere, and a support that moves."""
+    scene = ddg.Scene()
+    rod = scene.add_rod(straight(80), section=ddg.Circle(0.005), material=RUBBER)
+    scene.fix(rod, [20])
+    scene.fix(rod, [55], motion=ddg.Motion(translation=lambda t: (0.05 * t, 0.3 * t, 0.0)))
+    scene.fix(rod, [70], components="z")
+    scene.add_force(rod, 79, (0.0, 0.02, 0.1))
+    return scene
+
+
+def free() -> ddg.Scene:
+    """A rod that falls freely, pushed at one end and wound up at both."""
+    scene = ddg.Scene()
+    rod = scene.add_rod(straight(60), section=ddg.Circle(0.01), material=RUBBER)
+    scene.add_force(rod, 0, (0.0, 0.0, 3.0))
+    scene.add_twisting_moment(rod, 0, 0.02)
+    scene.add_twisting_moment(rod, -1, -0.02)
+    return scene
+
+
+SCENES = {
+    "cantilever": (cantilever, {}),
+    "hanging": (hanging, {"dt": 1.0 / 240.0}),
+    "stiff": (stiff, {}),
+    "spanning": (spanning, {}),
+    "free": (free, {}),
+}
+
+
+@pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
+@pytest.mark.parametrize("name", SCENES)
+def test_steps_are_those_of_the_sweep(device, name, scheme):
+    """Asked for all digits, the solvers agree to rounding; neither retries."""
+    build, given = SCENES[name]
+    given = {"rtol": 1e-13, "scheme": scheme} | given
+    swept, exact = moved(build(), device, "sweep", **given)
+    state, found = moved(build(), device, "partitioned", **given)
+    start = build().build(device).state().points()
+    assert np.abs(swept.points() - start).max() > 0.005
+    np.testing.assert_allclose(state.points(), swept.points(), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(state.velocities(), swept.velocities(), rtol=0, atol=1e-9)
+    assert found["retries"] == exact["retries"] == found["pcg_iterations"] == 0
+
+
+@pytest.mark.parametrize("name", ["cantilever", "hanging"])
+def test_as_many_iterations_as_the_sweep(device, name):
+    build, given = SCENES[name]
+    (_, swept), (_, found) = (moved(build(), device, linear, **given) for linear in ("sweep", "partitioned"))
+    assert found["newton_iterations"] == swept["newton_iterations"]
+    assert found["outcomes"] == swept["outcomes"]
+
+
+@pytest.mark.parametrize("precision", ["float64", "mixed"])
+def test_repeats_bit_by_bit(device, precision):
+    first, second = (moved(stiff(), device, "partitioned", precision=precision, steps=6)[0] for _ in range(2))
+    np.testing.assert_array_equal(first.points(), second.points())
+    np.testing.assert_array_equal(first.velocities(), second.velocities())
+
+
+def test_momentum_of_a_free_rod(device):
+    """It grows by the sum of the outer forces times h a step."""
+    dt, steps = 1e-3, 20
+    state, _ = moved(free(), device, "partitioned", dt=dt, steps=steps, rtol=1e-12)
+    host = state.model.groups[0].host
+    mass = host.mass[:, 0]
+    momentum = mass @ state.velocities()
+    np.testing.assert_allclose(momentum, [0.0, 0.0, (3.0 - 9.81 * mass.sum()) * dt * steps], rtol=1e-9, atol=1e-9)
+
+
+def test_failure_is_named(device):
+    with pytest.raises(ddg.SolverError, match="max_iterations"):
+        moved(stiff(), device, "partitioned", max_iterations=1, retry_limit=1)
+    folded = straight(21)
+    folded[11:, 0] = 1.0 - folded[11:, 0]
+    with pytest.raises(ddg.SolverError, match=r"non_finite.*fold back by 180 degrees"):
+        moved(cantilever(21), device, "partitioned", start=folded)
+
+
+def test_a_rod_that_fails_leaves_the_others_alone(device):
+    """Beside a folded one, of which the model says what it is, a rod falls as it does alone."""
+    scene = ddg.Scene()
+    points = np.stack([straight(21), straight(21) + [0.0, 1.0, 0.0]])
+    rods = scene.add_rods(points, section=ddg.Circle(0.02), material=RUBBER)
+    scene.clamp(rods, edges=[0])
+    start = points.copy()
+    start[1, 11:, 0] = 1.0 - start[1, 11:, 0]
+    model = scene.build(device, "float64")
+    integrator, state = ddg.Integrator(model, linear="partitioned", check_every=100), model.state(start.reshape(-1, 3))
+    for _ in range(5):
+        state = integrator.step(state, 0.01)
+    with pytest.raises(ddg.SolverError, match=r"rod 1 .*non_finite"):
+        integrator.check(state)
+    alone = ddg.Scene()
+    alone.clamp(alone.add_rod(points[0], section=ddg.Circle(0.02), material=RUBBER), edges=[0])
+    np.testing.assert_array_equal(state.points()[:21], moved(alone, device, "partitioned", steps=5)[0].points())
+
+
+def test_what_auto_chooses(device):
+    """Cyclic reduction where rods are few, long, open and on a GPU; the report says so."""
+
+    def chosen(nodes, columns, closed=False, cuda=True):
+        kind, where = SimpleNamespace(closed=closed), SimpleNamespace(is_cuda=cuda)
+        return choice.automatic(SimpleNamespace(kind=kind, device=where, nodes=nodes, columns=columns))
+
+    assert chosen(10_000, 1) == chosen(choice.LONG, choice.FEW) == "partitioned"
+    assert chosen(choice.LONG - 1, 1) == chosen(10_000, choice.FEW + 1) == chosen(10_000, 1, cuda=False) == "sweep"
+    assert chosen(10_000, 1, closed=True) == "chain"
+    model = hanging().build(device)
+    expected = "cyclic reduction" if model.wp_device.is_cuda else "chain sweep"
+    assert expected in model.report()
+    solver = ddg.Integrator(model)._chains[0].newton
+    assert isinstance(solver, PartitionedNewton) == model.wp_device.is_cuda
+
+
+def test_closed_rods_are_refused(device):
+    angle = 2.0 * np.pi * np.arange(12) / 12
+    scene = ddg.Scene()
+    scene.add_rod(
+        np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], -1),
+        section=ddg.Circle(0.02),
+        material=RUBBER,
+        closed=True,
+    )
+    with pytest.raises(ddg.SceneError, match="'partitioned': rod 0 is closed"):
+        ddg.Integrator(scene.build(device), linear="partitioned")
