@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.errors import check_options
-from ddg_warp.kernels import balance, chain, element, search
+from ddg_warp.errors import SceneError, check_options
+from ddg_warp.kernels import balance, chain, element, geometric, search
 
+PSD_MODES = ("gauss_newton", "project", "progressive", "none")
 MANY = 50_000  # rods from which full blocks of the sweep pay on a GPU; below, small ones reach more multiprocessors
 
 
@@ -23,6 +24,11 @@ class NewtonOptions:
         max_halvings: shortenings of one step by the line search.
         rotation_cap: largest turn of an edge in one update [rad].
         linear_rtol: reduction of the residual by PCG, in the norm of the preconditioner.
+        psd: the matrix. "gauss_newton": without second derivatives of bending and twist, never indefinite but for compression,
+            which is left out where a pivot is lost. "progressive": the exact Hessian, and in iterations where it is not
+            positive definite Gauss-Newton without compression. "project": the exact one with every element made positive
+            semi-definite by its eigenvalues. "none": the exact one; where it is indefinite the solve ends with the outcome
+            `indefinite`, and a time step is tried again with a shorter one.
     """
 
     rtol: float = 1e-8
@@ -31,9 +37,12 @@ class NewtonOptions:
     max_halvings: int = 20
     rotation_cap: float = 1.0
     linear_rtol: float = 1e-8
+    psd: str = "gauss_newton"
 
     def __post_init__(self):
         check_options(self, ("rtol", "floor_factor", "rotation_cap", "linear_rtol"), ("max_iterations", "max_halvings"))
+        if self.psd not in PSD_MODES:
+            raise SceneError(f"psd {self.psd!r}: it is one of {', '.join(PSD_MODES)}")
 
 
 class ChainNewton:
@@ -77,6 +86,11 @@ class ChainNewton:
         self.status, self.slot, self.iteration, self.halvings = flags(), flags(), flags(), flags()
         self.lost, self.turned, self.clamped, self.unbalanced, self.drowned = (flags() for _ in range(5))
         self.without_compression = self.clamped  # rods whose matrix leaves the stiffness that compression takes away
+        self.exact = options.psd != "gauss_newton"
+        self.geometric = make(geometric.entries(kind) if self.exact else 1, *(nodes if self.exact else (1, 1)), dtype=self.linear)
+        if self.exact:  # compression is part of the geometric stiffness
+            self.without_compression = wp.full(columns, 1, dtype=int, device=device)
+            self._geometric = geometric.geometric_kernel(kind, self.real, self.linear, options.psd == "project")
         self.coefficient, self.rate = scalars(), scalars()
         self.step_length, self.decrement, self.load_scale, self.residual = scalars(), scalars(), scalars(), scalars()
         self.todo, self.placed, self.angle_change = flags(), flags(), scalars()
@@ -84,13 +98,13 @@ class ChainNewton:
         self.device = device
         self._evaluate = element.evaluate_kernel(kind, self.real, self.linear)
         self._check = balance.check_kernel(kind, self.real, self.linear)
-        self._sweep = None if kind.closed else chain.sweep_kernel(kind, self.real, self.linear)
+        self._sweep = None if kind.closed else chain.sweep_kernel(kind, self.real, self.linear, options.psd)
         self._adjust = None if kind.closed else search.adjust_kernel(kind, self.real, self.linear)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [self._evaluate, self._check, self._sweep, self._adjust]
+        return [self._evaluate, self._check, self._sweep, self._adjust, *([self._geometric] if self.exact else [])]
 
     def pcg_iterations(self) -> int:
         """None: the sweep is direct."""
@@ -118,6 +132,16 @@ class ChainNewton:
             device=self.device,
             block_dim=128,
         )
+        if self.exact:
+            wp.launch(
+                self._geometric,
+                (group.elements, group.columns),
+                [self.x, self.theta, self.frame, last, self.rate, group.buffer, group.table, group.count]
+                + [self.status, self.clamped, self.factor, group.kind.window],
+                [self.geometric],
+                device=self.device,
+                block_dim=128,
+            )
 
     def check(self) -> None:
         """Find the rods that are out of equilibrium."""
@@ -139,7 +163,7 @@ class ChainNewton:
         wp.launch(
             self._sweep,
             group.columns,
-            [self.factor, self.gradient, self.energy, group.count]
+            [self.factor, self.geometric, self.gradient, self.energy, group.count]
             + [group.mass, group.rotary, self.coefficient, self.target, self.target_angle, group.gravity]
             + [group.load, group.load_angle, int(group.host.loaded), group.fixed, group.length]
             + [options.floor_factor * self.eps, options.rotation_cap]

@@ -1,7 +1,7 @@
 """The chain sweep: one thread a rod takes a Newton iteration from element factors and forces to new dofs.
 
-The Gauss-Newton matrix of an open rod is block-pentadiagonal (block: position of a node and angle of the edge that starts
-there): H = sum F^T F + c I (edges) + inertia. The sweep forms its blocks in registers, adds inertia and loads, eliminates node by
+The matrix of an open rod is block-pentadiagonal (block: position of a node and angle of the edge that starts
+there): H = sum F^T F + c I (edges) + inertia, and the geometric stiffness if asked for. The sweep forms its blocks in registers, adds inertia and loads, eliminates node by
 node, and at the end of the rod knows the change of the energy and the Newton decrement r^T H^-1 r. It then either rejects the
 iterate and shortens the step, or substitutes back and takes the next step. No physics here: strains are rows.
 
@@ -13,15 +13,19 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels import outcome, pivot
+from ddg_warp.kernels import geometric, outcome, pivot
 from ddg_warp.kernels.balance import node_functions
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind
 from ddg_warp.kernels.search import PLACE, RELAG, TURNED, search_functions
 
 
 @cache
-def sweep_kernel(kind: ChainKind, real, linear):
-    """The sweep for one kind of chain; see the module's text."""
+def sweep_kernel(kind: ChainKind, real, linear, psd: str = "gauss_newton"):
+    """The sweep for one kind of chain; see the module's text.
+
+    Where a pivot is lost, the same iterate comes again with `clamped[r]` raised: without what compression takes away, and, in
+    the modes of `psd` with the geometric stiffness G, without that for one iteration. Mode "none" ends there.
+    """
     dim, nb, twist, span = kind.dim, kind.block, kind.twist, kind.span
     window, nb2 = kind.window, kind.block**2
     V, H, M = wp.types.vector(dim, real), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
@@ -30,6 +34,8 @@ def sweep_kernel(kind: ChainKind, real, linear):
     force, *_ = node_functions(kind, real)
     angle = nb - 1
     vertex_rows, edge_rows, tensions = kind.vertex_strains, kind.edge_strains, kind.tensions
+    exact, fails = psd != "gauss_newton", psd == "none"
+    aa, ab, ac, bb, bc, cc = geometric.block_functions(kind, linear)
 
     @wp.func
     def part(F: wp.array3d(dtype=linear), row: int, k: int, r: int):
@@ -70,6 +76,7 @@ def sweep_kernel(kind: ChainKind, real, linear):
     def sweep(
         # element path
         F: wp.array3d(dtype=linear),
+        G: wp.array3d(dtype=linear),
         g: wp.array3d(dtype=real),
         energy: wp.array3d(dtype=real),
         count: wp.array(dtype=int),
@@ -188,6 +195,16 @@ def sweep_kernel(kind: ChainKind, real, linear):
                     Waa += T
                     Wab -= T
                     Wbb += T
+                if wp.static(exact):
+                    if clamped[r] == 0:
+                        Waa += aa(G, j, r)
+                        Wab += ab(G, j, r)
+                        Wbb += bb(G, j, r)
+                        if wp.static(span == 2):
+                            if j < n - 2:
+                                Wac += ac(G, j, r)
+                                Wbc += bc(G, j, r)
+                                Wcc += cc(G, j, r)
             total += ahead
             ahead = ahead_next
 
@@ -286,7 +303,10 @@ def sweep_kernel(kind: ChainKind, real, linear):
             change = real(0.0)
         finite = wp.isfinite(worst) and wp.isfinite(newton) and wp.isfinite(change)
         if lost_here > 0 and clamped[r] == 0:
-            # compression has made the matrix indefinite: the same iterate again, without what compression takes away
+            if wp.static(fails):
+                status[r] = wp.static(outcome.INDEFINITE)
+                return
+            # the matrix is indefinite: the same iterate again, without what compression (or curvature) takes away
             clamped[r] = 1
             active[0] = 1
             return
@@ -323,6 +343,8 @@ def sweep_kernel(kind: ChainKind, real, linear):
         halvings[r] = 0
         placed[r] = 0
         lost[r] = lost[r] + lost_here
+        if wp.static(exact):
+            clamped[r] = 0
         if wp.static(twist):
             if turned[r] != 0:
                 # angles mean something else in new frames: take no step, and ask for a direction there

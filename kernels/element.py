@@ -233,7 +233,7 @@ def term_kernels(kind: ChainKind, index: int, real):
     V, W = wp.types.vector(kind.dim, real), wp.types.vector(kind.window, real)
     S13 = wp.types.vector(13, real)
     P = wp.types.vector(term.density.parameter_size(len(term.measure.strains)), real)
-    strains_of, jacobian_of, _ = term.measure.functions(real)
+    strains_of, jacobian_of, *_ = term.measure.functions(real)
     energy_of, slope_of, _ = term.density.functions(real, len(term.measure.strains))
     _, window, lagged, _ = gather_functions(kind, real)
     load, local, short, spread = term_functions(kind, index, real)
@@ -327,7 +327,7 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear):
     term = kind.terms[index]
     W, S13 = wp.types.vector(kind.window, real), wp.types.vector(13, real)
     n, size = len(term.measure.strains), term.measure.size
-    _, jacobian_of, tension_of = term.measure.functions(real)
+    _, jacobian_of, tension_of, _ = term.measure.functions(real)
     energy_of, slope_of, root_of = term.density.functions(real, n)
     load, local, short, spread = term_functions(kind, index, real)
     _, row, tension_row, _ = kind.places()[index]

@@ -23,9 +23,10 @@ class Measure:
         angles: how many of the edges (the first ones) bring their angle theta as a dof.
         lag_size: reals of lagged data of the stencil; 0 for a measure without frames.
         strains: names and units of the strains.
-        functions: real -> (strains, jacobian, tension). `strains(q, s, w) -> E`; `jacobian(q, s, w) -> (E, J)`; `tension` is
-            None, or `tension(q, w, slope) -> (c, shift)` with the second derivative of a strain of one edge,
-            w slope : d2e = c I + w J^T diag(shift) J; its other terms are left to the exact Hessian.
+        functions: real -> (strains, jacobian, tension, curvature). `strains(q, s, w) -> E`; `jacobian(q, s, w) -> (E, J)`;
+            `tension` is None, or `tension(q, w, slope) -> (c, shift)` with the second derivative of a strain of one edge,
+            w slope : d2e = c I + w J^T diag(shift) J; `curvature(q, s, w, slope)` of measures of two edges is w slope : d2e as
+            the upper triangle of a symmetric matrix, row by row.
     """
 
     name: str
