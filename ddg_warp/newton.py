@@ -86,17 +86,21 @@ class ChainNewton:
         self.status, self.slot, self.iteration, self.halvings = flags(), flags(), flags(), flags()
         self.lost, self.turned, self.clamped, self.unbalanced, self.drowned = (flags() for _ in range(5))
         self.without_compression = self.clamped  # rods whose matrix leaves the stiffness that compression takes away
-        self.exact = options.psd != "gauss_newton"
-        self.geometric = make(geometric.entries(kind) if self.exact else 1, *(nodes if self.exact else (1, 1)), dtype=self.linear)
-        if self.exact:  # compression is part of the geometric stiffness
+        self.exact = (
+            options.psd != "gauss_newton" and kind.span == 2
+        )  # a rod that only stretches has its Hessian anyway
+        rows = kind.geometric_rows if self.exact else 1
+        self.geometric = make(rows, *(nodes if self.exact else (1, 1)), dtype=self.linear)
+        self._project = None
+        if options.psd == "project" and self.exact:
             self.without_compression = wp.full(columns, 1, dtype=int, device=device)
-            self._geometric = geometric.geometric_kernel(kind, self.real, self.linear, options.psd == "project")
+            self._project = geometric.project_kernel(kind, self.real, self.linear)
         self.coefficient, self.rate = scalars(), scalars()
         self.step_length, self.decrement, self.load_scale, self.residual = scalars(), scalars(), scalars(), scalars()
         self.todo, self.placed, self.angle_change = flags(), flags(), scalars()
         self.active = wp.zeros(1, dtype=int, device=device)
         self.device = device
-        self._evaluate = element.evaluate_kernel(kind, self.real, self.linear)
+        self._evaluate = element.evaluate_kernel(kind, self.real, self.linear, self.exact)
         self._check = balance.check_kernel(kind, self.real, self.linear)
         self._sweep = None if kind.closed else chain.sweep_kernel(kind, self.real, self.linear, options.psd)
         self._adjust = None if kind.closed else search.adjust_kernel(kind, self.real, self.linear)
@@ -104,7 +108,7 @@ class ChainNewton:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [self._evaluate, self._check, self._sweep, self._adjust, *([self._geometric] if self.exact else [])]
+        return [self._evaluate, self._check, self._sweep, self._adjust, *([self._project] if self._project else [])]
 
     def pcg_iterations(self) -> int:
         """None: the sweep is direct."""
@@ -128,19 +132,17 @@ class ChainNewton:
             (group.elements, group.columns),
             [self.x, self.theta, self.frame, last, self.rate, group.buffer, group.table, group.count]
             + [self.status, self.slot, self.without_compression, self.iteration, int(self.reuse)],
-            [self.factor, self.gradient, self.energy, self.stiffness, self.turned, self.active],
+            [self.factor, self.geometric, self.gradient, self.energy, self.stiffness, self.turned, self.active],
             device=self.device,
             block_dim=128,
         )
-        if self.exact:
+        if self._project:
             wp.launch(
-                self._geometric,
+                self._project,
                 (group.elements, group.columns),
-                [self.x, self.theta, self.frame, last, self.rate, group.buffer, group.table, group.count]
-                + [self.status, self.clamped, self.factor, group.kind.window],
+                [self.x, group.count, self.status, group.kind.window, self.factor],
                 [self.geometric],
                 device=self.device,
-                block_dim=128,
             )
 
     def check(self) -> None:

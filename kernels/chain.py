@@ -183,6 +183,14 @@ def sweep_kernel(kind: ChainKind, real, linear, psd: str = "gauss_newton"):
                             Wbb += wp.outer(B, B)
                             Wbc += wp.outer(B, C)
                             Wcc += wp.outer(C, C)
+                        if wp.static(exact):
+                            if clamped[r] == 0:
+                                Waa += aa(G, j, r)
+                                Wab += ab(G, j, r)
+                                Wac += ac(G, j, r)
+                                Wbb += bb(G, j, r)
+                                Wbc += bc(G, j, r)
+                                Wcc += cc(G, j, r)
                 edge_row = wp.static(vertex_rows * window)
                 for m in range(wp.static(edge_rows)):
                     t = part(F, edge_row + m * wp.static(dim), j, r)
@@ -195,16 +203,6 @@ def sweep_kernel(kind: ChainKind, real, linear, psd: str = "gauss_newton"):
                     Waa += T
                     Wab -= T
                     Wbb += T
-                if wp.static(exact):
-                    if clamped[r] == 0:
-                        Waa += aa(G, j, r)
-                        Wab += ab(G, j, r)
-                        Wbb += bb(G, j, r)
-                        if wp.static(span == 2):
-                            if j < n - 2:
-                                Wac += ac(G, j, r)
-                                Wbc += bc(G, j, r)
-                                Wcc += cc(G, j, r)
             total += ahead
             ahead = ahead_next
 

@@ -14,6 +14,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import frames
+from ddg_warp.kernels.measures.turning import packed_index
 from ddg_warp.kernels.terms import Term
 
 # Fused multiply-adds are what a CUDA build uses too. They and inlining halve the CPU's time for a sweep (1.9 to 0.9 of it each).
@@ -66,6 +67,11 @@ class ChainKind:
     def factor_rows(self) -> int:
         """Reals of the factor of one element: vertex rows, edge rows, tensions, in this order."""
         return self.vertex_strains * self.window + self.edge_strains * self.dim + self.tensions
+
+    @property
+    def geometric_rows(self) -> int:
+        """Reals of the geometric stiffness of a window: the upper triangle of its matrix, row by row."""
+        return self.window * (self.window + 1) // 2
 
     @property
     def strain_rows(self) -> int:
@@ -322,17 +328,23 @@ def term_kernels(kind: ChainKind, index: int, real):
 
 
 @cache
-def evaluate_functions(kind: ChainKind, index: int, real, linear):
-    """evaluate_at of one term: writes its factor rows; returns its energy, derivative with respect to the window, stiffness."""
+def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool):
+    """evaluate_at of one term: writes its factor rows; returns its energy, derivative with respect to the window, stiffness.
+
+    With `curved`, a term that spans two edges (a rod has one) also writes its geometric stiffness.
+    """
     term = kind.terms[index]
     W, S13 = wp.types.vector(kind.window, real), wp.types.vector(13, real)
     n, size = len(term.measure.strains), term.measure.size
-    _, jacobian_of, tension_of, _ = term.measure.functions(real)
+    _, jacobian_of, tension_of, curvature_of = term.measure.functions(real)
     energy_of, slope_of, root_of = term.density.functions(real, n)
     load, local, short, spread = term_functions(kind, index, real)
     _, row, tension_row, _ = kind.places()[index]
     E = wp.types.vector(n, real)
     has_tension, dim = term.measure.has_tension, kind.dim
+    bends = curved and term.measure.span == 2
+    dofs = [*range(dim * term.measure.span), *(dim * kind.span + i for i in range(term.measure.angles))]
+    places = tuple(packed_index(kind.window, dofs[i], dofs[j]) for i in range(size) for j in range(i, size))
 
     @wp.func
     def evaluate_at(
@@ -345,6 +357,7 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear):
         clamped: int,
         frozen: bool,
         factor: wp.array3d(dtype=linear),
+        geometric: wp.array3d(dtype=linear),
         k: int,
         r: int,
     ):
@@ -365,6 +378,10 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear):
             for m in range(wp.static(n)):
                 for i in range(wp.static(size)):
                     factor[wp.static(row) + m * wp.static(size) + i, k, r] = linear(root[m] * jacobian[m, i])
+        if wp.static(bends):
+            second = curvature_of(q, short(s), w, slope)
+            for i in range(wp.static(len(places))):
+                geometric[wp.static(places[i]), k, r] = linear(second[i])
         stiffness = real(0.0)
         for m in range(wp.static(n)):
             edge = real(0.0)
@@ -377,8 +394,11 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear):
 
 
 @cache
-def evaluate_kernel(kind: ChainKind, real, linear):
+def evaluate_kernel(kind: ChainKind, real, linear, curved: bool = False):
     """The fused kernel of a Newton iteration: energy, gradient on the window and Gauss-Newton factor of all terms.
+
+    With `curved` also the geometric stiffness of terms that span two edges: the factor, compression included, and this make the
+    exact Hessian.
 
     Compression lowers the stiffness across an edge, which can make the matrix indefinite: `clamped` rods do without that.
     With `reuse` the factor is written once a step, at the first iterate. Energies go to the slot that the line search does not
@@ -388,13 +408,14 @@ def evaluate_kernel(kind: ChainKind, real, linear):
     """
     V, W = wp.types.vector(kind.dim, real), wp.types.vector(kind.window, real)
     _, window, lagged, _ = gather_functions(kind, real)
-    each = tuple(evaluate_functions(kind, i, real, linear) for i in range(len(kind.terms)))
+    each = tuple(evaluate_functions(kind, i, real, linear, curved) for i in range(len(kind.terms)))
+    options = CPU_OPTIONS | {"max_unroll": kind.geometric_rows} if curved else CPU_OPTIONS
     X = wp.types.vector(3, real)
     transport, reference_twist, _ = frames.functions(real)
     spans = tuple(term.measure.span for term in kind.terms)
     terms, size, twist, closed = len(kind.terms), kind.window, kind.twist, kind.closed
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+    @wp.kernel(module="unique", enable_backward=False, module_options=options)
     def evaluate(
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
@@ -410,6 +431,7 @@ def evaluate_kernel(kind: ChainKind, real, linear):
         iteration: wp.array(dtype=int),
         reuse: int,
         factor_out: wp.array3d(dtype=linear),
+        geometric_out: wp.array3d(dtype=linear),
         gradient_out: wp.array3d(dtype=real),
         energy_out: wp.array3d(dtype=real),
         stiffness_out: wp.array2d(dtype=linear),
@@ -432,7 +454,7 @@ def evaluate_kernel(kind: ChainKind, real, linear):
         for i in range(wp.static(terms)):
             if whole or wp.static(spans[i]) == 1:
                 energy, part, stiff = wp.static(each[i])(
-                    q, s, buffer, table, last, rate[r], clamped[r], frozen, factor_out, k, r
+                    q, s, buffer, table, last, rate[r], clamped[r], frozen, factor_out, geometric_out, k, r
                 )
                 total += energy
                 f += part

@@ -20,6 +20,10 @@ class PcgNewton(ChainNewton):
     def __init__(self, model, group, options: NewtonOptions, preconditioner: str = "chain", linear=None):
         if preconditioner not in pcg.PRECONDITIONERS:
             raise SceneError(f"preconditioner {preconditioner!r}: it is one of {', '.join(pcg.PRECONDITIONERS)}")
+        if preconditioner != "chain" and options.psd in ("progressive", "none"):
+            raise SceneError(
+                f"psd {options.psd!r}: preconditioner {preconditioner!r} cannot tell an indefinite matrix; use 'chain'"
+            )
         super().__init__(model, group, options, linear)
         kind, device = group.kind, model.wp_device
         nodes, columns = (group.nodes, group.columns), group.columns
@@ -31,16 +35,19 @@ class PcgNewton(ChainNewton):
         self.factors = vectors(3 * kind.block**2 + kind.block) if preconditioner == "chain" else self.blocks
         self.right, self.rest, self.z, self.p, self.q = (vectors() for _ in range(5))
         self.change, self.noise = (arrays.allocate(nodes, self.real, device) for _ in range(2))
-        self.without_compression = wp.full(columns, 1, dtype=int, device=device)  # PCG needs a definite matrix
+        self._repeats = options.psd in ("progressive", "none")
+        if not self._repeats:
+            self.without_compression = wp.full(columns, 1, dtype=int, device=device)  # PCG needs a definite matrix
         self.merit = wp.zeros(columns, dtype=self.real, device=device)
         self.rho, self.rho_first = (wp.zeros(columns, dtype=self.linear, device=device) for _ in range(2))
-        self.wanted, self.iterations = (wp.zeros(columns, dtype=int, device=device) for _ in range(2))
+        self.wanted, self.iterations, self.negative = (wp.zeros(columns, dtype=int, device=device) for _ in range(3))
         self.busy = wp.zeros(1, dtype=int, device=device)
         self.pcg_work = wp.zeros(1, dtype=wp.int64, device=device)
-        self._assemble = block_band.assemble_kernel(kind, self.real, self.linear)
+        self._assemble = block_band.assemble_kernel(kind, self.real, self.linear, self.exact)
         self._judge = pcg.judge_kernel(kind, self.real, self.linear)
         self._factor = block_band.factor_kernel(kind, self.linear) if preconditioner == "chain" else None
         self._start, self._product, self._advance = pcg.solver_kernels(kind, self.linear, preconditioner)
+        self._repeat = pcg.repeat_kernel(options.psd == "none") if self._repeats else None
         self._take = pcg.take_kernel(kind, self.real, self.linear)
         self._limit = 10 * kind.block * group.nodes
 
@@ -48,12 +55,14 @@ class PcgNewton(ChainNewton):
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         own = [self._assemble, self._judge, self._start, self._product, self._advance, self._take]
-        return [self._evaluate, self._check, *own, *([self._factor] if self._factor else [])]
+        return [self._evaluate, self._check, *own, *filter(None, (self._factor, self._repeat, self._project))]
 
     def sweep(self) -> None:
         """Assemble, decide, solve for a direction and take it."""
         self.assemble()
+        self._repeat_indefinite(0)
         self.direct()
+        self._repeat_indefinite(1)
         group, device = self.group, self.device
         wp.launch(
             self._take,
@@ -64,13 +73,24 @@ class PcgNewton(ChainNewton):
             device=device,
         )
 
+    def _repeat_indefinite(self, done: int) -> None:
+        """Let rods whose exact Hessian turned out to be indefinite come again, before or after directions are found."""
+        if self._repeat:
+            wp.launch(
+                self._repeat,
+                self.group.columns,
+                [done, self.wanted, self.negative, self.clamped, self.status, self.iteration, self.slot, self.lost],
+                device=self.device,
+            )
+
     def assemble(self) -> None:
         """Blocks and residual of active rods; accept or shorten the last step; factors where a direction is wanted."""
         group, options, device = self.group, self.options, self.device
         wp.launch(
             self._assemble,
             (group.nodes, group.columns),
-            [self.factor, self.gradient, self.energy, group.count, group.mass, group.rotary, self.coefficient]
+            [self.factor, self.geometric, self.clamped, self.gradient, self.energy]
+            + [group.count, group.mass, group.rotary, self.coefficient]
             + [self.x, self.theta, self.target, self.target_angle, group.gravity, group.load, group.load_angle]
             + [
                 int(group.host.loaded),
@@ -100,7 +120,7 @@ class PcgNewton(ChainNewton):
                 self._factor,
                 group.columns,
                 [self.blocks, group.count, self.wanted, self.iteration, int(self.reuse)],
-                [self.factors, self.lost],
+                [self.factors, self.negative if self._repeat else self.lost],
                 device=device,
             )
 
@@ -131,7 +151,7 @@ class PcgNewton(ChainNewton):
             group.columns,
             [self.blocks, self.factors, group.count, self.options.linear_rtol, self._limit],
             [self.q, self.rest, self.direction, self.z, self.p, self.rho, self.rho_first]
-            + [self.iterations, self.wanted, self.busy],
+            + [self.iterations, self.wanted, self.busy, self.negative],
             device=device,
         )
 
@@ -150,6 +170,8 @@ class ProjectiveNewton(PcgNewton):
     reuse = True
 
     def __init__(self, model, group, options: NewtonOptions, linear=None):
+        if options.psd != "gauss_newton":
+            raise SceneError(f"psd {options.psd!r}: the solver 'projective' freezes the matrix of 'gauss_newton'")
         super().__init__(model, group, options, "chain", linear)
         self._direct = block_band.direct_kernel(group.kind, self.linear)
 
