@@ -1,9 +1,10 @@
 """The chain sweep: one thread a rod takes a Newton iteration from element factors and forces to new dofs.
 
-The matrix of an open rod is block-pentadiagonal (block: position of a node and angle of the edge that starts
-there): H = sum F^T F + c I (edges) + inertia, and the geometric stiffness if asked for. The sweep forms its blocks in registers, adds inertia and loads, eliminates node by
-node, and at the end of the rod knows the change of the energy and the Newton decrement r^T H^-1 r. It then either rejects the
-iterate and shortens the step, or substitutes back and takes the next step. No physics here: strains are rows.
+The matrix of an open rod is block-pentadiagonal (block: position of a node and angle of the edge that starts there):
+H = sum F^T F + c I (edges) + inertia, and the geometric stiffness if asked for. The sweep forms its blocks in registers, adds
+inertia and loads, eliminates node by node, and at the end of the rod knows the change of the energy and the Newton decrement
+r^T H^-1 r. It then either rejects the iterate and shortens the step, or substitutes back and takes the next step. No physics
+here: strains are rows.
 
 Line search (Armijo, c = 1e-4) on the energy, summed as differences element by element. Where the expected decrease drowns in
 rounding, the decrement decides instead (natural monotonicity test; Deuflhard, Newton Methods for Nonlinear Problems, 2004).
