@@ -105,7 +105,7 @@ class Sample:
         flags = [wp.zeros(2, dtype=int, device=self.device) for _ in range(4)]
         clamped = wp.full(2, 0 if curved else 1, dtype=int, device=self.device)
         out = self._launch(
-            element.evaluate_kernel(kind, real, real, curved),
+            element.evaluate_kernel(kind, real, real, 0 if curved else None),
             real,
             [
                 (kind.factor_rows, *self.shape),

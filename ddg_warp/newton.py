@@ -8,6 +8,9 @@ from ddg_warp import arrays
 from ddg_warp.errors import SceneError, check_options
 from ddg_warp.kernels import balance, chain, element, geometric, search
 
+EARLY = (
+    2  # iterations of "progressive" that Gauss-Newton makes first: far from a solution the exact matrix is no better
+)
 PSD_MODES = ("gauss_newton", "project", "progressive", "none")
 MANY = 50_000  # rods from which full blocks of the sweep pay on a GPU; below, small ones reach more multiprocessors
 
@@ -25,10 +28,11 @@ class NewtonOptions:
         rotation_cap: largest turn of an edge in one update [rad].
         linear_rtol: reduction of the residual by PCG, in the norm of the preconditioner.
         psd: the matrix. "gauss_newton": without second derivatives of bending and twist, never indefinite but for compression,
-            which is left out where a pivot is lost. "progressive": the exact Hessian, and in iterations where it is not
-            positive definite Gauss-Newton without compression. "project": the exact one with every element made positive
-            semi-definite by its eigenvalues. "none": the exact one; where it is indefinite the solve ends with the outcome
-            `indefinite`, and a time step is tried again with a shorter one.
+            which is left out where a pivot is lost. "progressive": from the third iteration on the exact Hessian, and in iterations
+            where it is not positive definite Gauss-Newton without compression: for curved, twisted or compressed rods and long
+            steps, where Gauss-Newton takes many iterations. "project": the exact one with every element made positive
+            semi-definite by its eigenvalues, which costs ten times as much. "none": the exact one; where it is indefinite the
+            solve ends with the outcome `indefinite`, and a time step is tried again with a shorter one.
     """
 
     rtol: float = 1e-8
@@ -90,6 +94,7 @@ class ChainNewton:
             options.psd != "gauss_newton" and kind.span == 2
         )  # a rod that only stretches has its Hessian anyway
         rows = kind.geometric_rows if self.exact else 1
+        self.exact_from = (EARLY if options.psd == "progressive" else 0) if self.exact else None
         self.geometric = make(rows, *(nodes if self.exact else (1, 1)), dtype=self.linear)
         self._project = None
         if options.psd == "project" and self.exact:
@@ -100,9 +105,11 @@ class ChainNewton:
         self.todo, self.placed, self.angle_change = flags(), flags(), scalars()
         self.active = wp.zeros(1, dtype=int, device=device)
         self.device = device
-        self._evaluate = element.evaluate_kernel(kind, self.real, self.linear, self.exact)
+        self._evaluate = element.evaluate_kernel(kind, self.real, self.linear, self.exact_from)
         self._check = balance.check_kernel(kind, self.real, self.linear)
-        self._sweep = None if kind.closed else chain.sweep_kernel(kind, self.real, self.linear, options.psd)
+        self._sweep = None
+        if not kind.closed:
+            self._sweep = chain.sweep_kernel(kind, self.real, self.linear, self.exact_from, options.psd == "none")
         self._adjust = None if kind.closed else search.adjust_kernel(kind, self.real, self.linear)
 
     @property

@@ -50,10 +50,10 @@ def block_functions(kind: ChainKind, linear):
 
 
 @cache
-def assemble_kernel(kind: ChainKind, real, linear, curved: bool = False):
+def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None):
     """Blocks of H and the residual of every active rod; per node its share of the energy's change and of the rounding in it.
 
-    With `curved`, H has the geometric stiffness of rods that are not `clamped`.
+    From iteration `exact_from` on, H has the geometric stiffness of rods that are not `clamped`.
     """
     dim, nb, nb2, twist, span, closed = kind.dim, kind.block, kind.block**2, kind.twist, kind.span, kind.closed
     window, vertex_rows, edge_rows, tensions = kind.window, kind.vertex_strains, kind.edge_strains, kind.tensions
@@ -62,6 +62,7 @@ def assemble_kernel(kind: ChainKind, real, linear, curved: bool = False):
     _, store, _, put = block_functions(kind, linear)
     _, behind, balance = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
+    curved, begin = exact_from is not None, exact_from or 0
     first_first, first_mid, first_last, mid_mid, mid_last, last_last = geometric.block_functions(kind, linear)
 
     @wp.func
@@ -181,7 +182,7 @@ def assemble_kernel(kind: ChainKind, real, linear, curved: bool = False):
                         C = own(F, row, bb, r, 2)
                         D += wp.outer(C, C)
                 if wp.static(curved):
-                    if clamped[r] == 0:
+                    if clamped[r] == 0 and iteration[r] >= wp.static(begin):
                         if wp.static(closed) or k < n - 2:
                             D += first_first(second, k, r)
                             E += first_mid(second, k, r)

@@ -21,11 +21,11 @@ from ddg_warp.kernels.search import PLACE, RELAG, TURNED, search_functions
 
 
 @cache
-def sweep_kernel(kind: ChainKind, real, linear, psd: str = "gauss_newton"):
+def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, fails: bool = False):
     """The sweep for one kind of chain; see the module's text.
 
-    Where a pivot is lost, the same iterate comes again with `clamped[r]` raised: without what compression takes away, and, in
-    the modes of `psd` with the geometric stiffness G, without that for one iteration. Mode "none" ends there.
+    From iteration `exact_from` on, the matrix has the geometric stiffness G. Where a pivot is lost, the same iterate comes again
+    with `clamped[r]` raised: without what compression takes away, and, for this iteration, without G; or the solve `fails`.
     """
     dim, nb, twist, span = kind.dim, kind.block, kind.twist, kind.span
     window, nb2 = kind.window, kind.block**2
@@ -35,7 +35,7 @@ def sweep_kernel(kind: ChainKind, real, linear, psd: str = "gauss_newton"):
     force, *_ = node_functions(kind, real)
     angle = nb - 1
     vertex_rows, edge_rows, tensions = kind.vertex_strains, kind.edge_strains, kind.tensions
-    exact, fails = psd != "gauss_newton", psd == "none"
+    exact, begin = exact_from is not None, exact_from or 0
     aa, ab, ac, bb, bc, cc = geometric.block_functions(kind, linear)
 
     @wp.func
@@ -185,7 +185,7 @@ def sweep_kernel(kind: ChainKind, real, linear, psd: str = "gauss_newton"):
                             Wbc += wp.outer(B, C)
                             Wcc += wp.outer(C, C)
                         if wp.static(exact):
-                            if clamped[r] == 0:
+                            if clamped[r] == 0 and iteration[r] >= wp.static(begin):
                                 Waa += aa(G, j, r)
                                 Wab += ab(G, j, r)
                                 Wac += ac(G, j, r)

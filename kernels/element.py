@@ -356,6 +356,7 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool):
         rate: real,
         clamped: int,
         frozen: bool,
+        exact: bool,
         factor: wp.array3d(dtype=linear),
         geometric: wp.array3d(dtype=linear),
         k: int,
@@ -379,9 +380,10 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool):
                 for i in range(wp.static(size)):
                     factor[wp.static(row) + m * wp.static(size) + i, k, r] = linear(root[m] * jacobian[m, i])
         if wp.static(bends):
-            second = curvature_of(q, short(s), w, slope)
-            for i in range(wp.static(len(places))):
-                geometric[wp.static(places[i]), k, r] = linear(second[i])
+            if exact:
+                second = curvature_of(q, short(s), w, slope)
+                for i in range(wp.static(len(places))):
+                    geometric[wp.static(places[i]), k, r] = linear(second[i])
         stiffness = real(0.0)
         for m in range(wp.static(n)):
             edge = real(0.0)
@@ -394,11 +396,11 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool):
 
 
 @cache
-def evaluate_kernel(kind: ChainKind, real, linear, curved: bool = False):
+def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None):
     """The fused kernel of a Newton iteration: energy, gradient on the window and Gauss-Newton factor of all terms.
 
-    With `curved` also the geometric stiffness of terms that span two edges: the factor, compression included, and this make the
-    exact Hessian.
+    From iteration `exact_from` on also the geometric stiffness of terms that span two edges: the factor, compression included,
+    and this make the exact Hessian.
 
     Compression lowers the stiffness across an edge, which can make the matrix indefinite: `clamped` rods do without that.
     With `reuse` the factor is written once a step, at the first iterate. Energies go to the slot that the line search does not
@@ -408,6 +410,7 @@ def evaluate_kernel(kind: ChainKind, real, linear, curved: bool = False):
     """
     V, W = wp.types.vector(kind.dim, real), wp.types.vector(kind.window, real)
     _, window, lagged, _ = gather_functions(kind, real)
+    curved, begin = exact_from is not None, exact_from or 0
     each = tuple(evaluate_functions(kind, i, real, linear, curved) for i in range(len(kind.terms)))
     options = CPU_OPTIONS | {"max_unroll": kind.geometric_rows} if curved else CPU_OPTIONS
     X = wp.types.vector(3, real)
@@ -448,13 +451,14 @@ def evaluate_kernel(kind: ChainKind, real, linear, curved: bool = False):
         q = window(x, theta, k, n, whole, r)
         s = lagged(frame, k, n, whole, r)
         frozen = reuse != 0 and iteration[r] > 0
+        exact = iteration[r] >= wp.static(begin)
         total = real(0.0)
         stiffest = real(0.0)
         f = W()
         for i in range(wp.static(terms)):
             if whole or wp.static(spans[i]) == 1:
                 energy, part, stiff = wp.static(each[i])(
-                    q, s, buffer, table, last, rate[r], clamped[r], frozen, factor_out, geometric_out, k, r
+                    q, s, buffer, table, last, rate[r], clamped[r], frozen, exact, factor_out, geometric_out, k, r
                 )
                 total += energy
                 f += part

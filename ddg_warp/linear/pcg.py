@@ -43,7 +43,7 @@ class PcgNewton(ChainNewton):
         self.wanted, self.iterations, self.negative = (wp.zeros(columns, dtype=int, device=device) for _ in range(3))
         self.busy = wp.zeros(1, dtype=int, device=device)
         self.pcg_work = wp.zeros(1, dtype=wp.int64, device=device)
-        self._assemble = block_band.assemble_kernel(kind, self.real, self.linear, self.exact)
+        self._assemble = block_band.assemble_kernel(kind, self.real, self.linear, self.exact_from)
         self._judge = pcg.judge_kernel(kind, self.real, self.linear)
         self._factor = block_band.factor_kernel(kind, self.linear) if preconditioner == "chain" else None
         self._start, self._product, self._advance = pcg.solver_kernels(kind, self.linear, preconditioner)
