@@ -9,7 +9,7 @@ from ddg_warp.errors import SceneError, check_options
 from ddg_warp.kernels import balance, chain, element, geometric, search
 
 EARLY = (
-    2  # iterations of "progressive" that Gauss-Newton makes first: far from a solution the exact matrix is no better
+    2  # iterations of "progressive" by Gauss-Newton: far from a solution the exact matrix is no better, and costs more
 )
 PSD_MODES = ("gauss_newton", "project", "progressive", "none")
 MANY = 50_000  # rods from which full blocks of the sweep pay on a GPU; below, small ones reach more multiprocessors
@@ -27,12 +27,13 @@ class NewtonOptions:
         max_halvings: shortenings of one step by the line search.
         rotation_cap: largest turn of an edge in one update [rad].
         linear_rtol: reduction of the residual by PCG, in the norm of the preconditioner.
-        psd: the matrix. "gauss_newton": without second derivatives of bending and twist, never indefinite but for compression,
-            which is left out where a pivot is lost. "progressive": from the third iteration on the exact Hessian, and in iterations
-            where it is not positive definite Gauss-Newton without compression: for curved, twisted or compressed rods and long
-            steps, where Gauss-Newton takes many iterations. "project": the exact one with every element made positive
-            semi-definite by its eigenvalues, which costs ten times as much. "none": the exact one; where it is indefinite the
-            solve ends with the outcome `indefinite`, and a time step is tried again with a shorter one.
+        psd: the matrix. "gauss_newton": without second derivatives of bending and twist, never indefinite but for
+            compression, which is left out where a pivot is lost. "progressive": from the third iteration on the exact Hessian,
+            and in iterations where it is not positive definite Gauss-Newton without compression: for curved, twisted or
+            compressed rods and long steps, where Gauss-Newton takes many iterations. "project": the exact one with every
+            element made positive semi-definite by its eigenvalues, at twenty times the cost of an iteration. "none": the
+            exact one; where it is indefinite the solve ends with the outcome `indefinite`, and a time step is tried again
+            with a shorter one.
     """
 
     rtol: float = 1e-8

@@ -19,7 +19,7 @@ def packed_index(size: int, i: int, j: int) -> int:
 
 @cache
 def functions(real):
-    """turning(...) -> S_vv, S_uu, S_vu of K'' without its last two terms; window_block(...) -> second derivative in edges."""
+    """turning(...) -> S_vv, S_uu, S_vu of K'' without its last two terms; across(...) and lengthening(...) take it to edges."""
     V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
 
     @wp.func
