@@ -8,9 +8,7 @@ from ddg_warp import arrays
 from ddg_warp.errors import SceneError, check_options
 from ddg_warp.kernels import balance, chain, element, geometric, search
 
-EARLY = (
-    2  # iterations of "progressive" by Gauss-Newton: far from a solution the exact matrix is no better, and costs more
-)
+EARLY = 2  # iterations that "progressive" makes by Gauss-Newton: far from a solution the exact matrix is no better
 PSD_MODES = ("gauss_newton", "project", "progressive", "none")
 MANY = 50_000  # rods from which full blocks of the sweep pay on a GPU; below, small ones reach more multiprocessors
 
