@@ -13,6 +13,7 @@ strains, w the rest measure and q the window of an element:
     evaluate     energy and gradient of the fused kernel = sum over the terms' own kernels
     factor       F^T F + c of the chain = w J^T (d stress / dq) + max(N, 0)/|e| (I - t t^T), derivatives by differences
     definite     F^T F + c has no negative eigenvalue
+    exact        F^T F + c, compression included, and the geometric stiffness = Hessian kernels of all terms
     rest         no force in the rest shape
     invariance   a rigid motion keeps the energy when the lagged data turn too, or when angles make up for the frames
     rigid        the gradient is orthogonal to translations and infinitesimal rotations
@@ -95,19 +96,28 @@ class Sample:
             element.strain_kernel(self.kind, real), real, [(self.kind.strain_rows, *self.shape)] * 2, [1], **changed
         )
 
-    def evaluate(self, real) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Factor rows, window gradient and energy of the fused kernel."""
+    def evaluate(self, real, curved: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Factor rows, window gradient, energy and packed geometric stiffness of the fused kernel.
+
+        `curved` asks for the latter, with compression in the factor.
+        """
         kind = self.kind
         flags = [wp.zeros(2, dtype=int, device=self.device) for _ in range(4)]
-        clamped = wp.full(2, 1, dtype=int, device=self.device)
+        clamped = wp.full(2, 0 if curved else 1, dtype=int, device=self.device)
         out = self._launch(
-            element.evaluate_kernel(kind, real, real),
+            element.evaluate_kernel(kind, real, real, 0 if curved else None),
             real,
-            [(kind.factor_rows, *self.shape), (kind.window, *self.shape), (2, *self.shape), self.shape],
+            [
+                (kind.factor_rows, *self.shape),
+                (kind.geometric_rows, *self.shape),
+                (kind.window, *self.shape),
+                (2, *self.shape),
+                self.shape,
+            ],
             before=[*flags[:2], clamped, flags[0], 0],
             after=flags[2:],
         )
-        return out[0], out[1], out[2][1]
+        return out[0], out[2], out[3][1], out[1]
 
     def reverse(self, index: int, which: int, seed: np.ndarray, real) -> dict[str, np.ndarray]:
         """Reverse mode of the energy (which = 0) or gradient (1) kernel of a term, by input."""
@@ -419,7 +429,7 @@ def symmetry(case: Case) -> float:
 
 def evaluate(case: Case) -> float:
     sample, terms = case.sample, range(len(case.kind.terms))
-    _, force, energy = sample.evaluate(case.real)
+    _, force, energy, _ = sample.evaluate(case.real)
     return max(
         relative(force, sum(sample.gradient(i) for i in terms)), relative(energy, sum(sample.energy(i) for i in terms))
     )
@@ -447,6 +457,11 @@ def factor(case: Case) -> float:
 def definite(case: Case) -> float:
     values = np.linalg.eigvalsh(np.moveaxis(_gauss_newton(case), (0, 1), (-2, -1)))
     return float(max(0.0, -values.min()) / values.max())
+
+
+def exact(case: Case) -> float:
+    expected = sum(case.sample.hessian(i, wp.float64) for i in range(len(case.kind.terms)))
+    return relative(_gauss_newton(case, exact=True), expected)
 
 
 def rest(case: Case) -> float:
@@ -528,6 +543,7 @@ CHECKS = {
     "evaluate": (evaluate, 1e-13, 1e-5),
     "factor": (factor, 1e-8, 1e-5),
     "definite": (definite, 1e-14, 1e-6),
+    "exact": (exact, 1e-14, 1e-5),
     "rest": (rest, 1e-13, 1e-5),
     "invariance": (invariance, 1e-13, 1e-5),
     "rigid": (rigid, 1e-13, 1e-5),
@@ -575,14 +591,18 @@ def table(term: str | None = None, precision: str = "float64", device: str = "cp
     return rows
 
 
-def _gauss_newton(case: Case) -> np.ndarray:
-    """F^T F + c on the windows (window, window, n, R), from what the evaluate kernel writes."""
+def _gauss_newton(case: Case, exact: bool = False) -> np.ndarray:
+    """F^T F + c, or the exact matrix, on the windows (window, window, n, R), from what the evaluate kernel writes."""
     kind = case.kind
-    rows = case.sample.evaluate(case.real)[0]
+    rows, _, _, geometric = case.sample.evaluate(case.real, exact)
     edge_row, tension_row = kind.vertex_strains * kind.window, kind.factor_rows - kind.tensions
     vertex = rows[:edge_row].reshape(kind.vertex_strains, kind.window, *case.sample.shape)
     edge = rows[edge_row:tension_row].reshape(kind.edge_strains, kind.dim, *case.sample.shape)
     result = np.einsum("minr,mjnr->ijnr", vertex, vertex)
     result[: kind.dim, : kind.dim] += np.einsum("minr,mjnr->ijnr", edge, edge)
     result[: kind.dim, : kind.dim] += np.eye(kind.dim)[..., None, None] * rows[tension_row:].sum(0)
+    if exact:
+        i, j = np.triu_indices(kind.window)
+        result[i, j] += geometric
+        result[j[i != j], i[i != j]] += geometric[i != j]
     return result

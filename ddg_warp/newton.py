@@ -5,9 +5,11 @@ from dataclasses import dataclass
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.errors import check_options
-from ddg_warp.kernels import balance, chain, element, search, step
+from ddg_warp.errors import SceneError, check_options
+from ddg_warp.kernels import balance, chain, element, geometric, search, step
 
+EARLY = 2  # iterations that "progressive" makes by Gauss-Newton: far from a solution the exact matrix is no better
+PSD_MODES = ("auto", "gauss_newton", "project", "progressive", "none")
 MANY = 50_000  # rods from which full blocks of the sweep pay on a GPU; below, small ones reach more multiprocessors
 
 
@@ -23,6 +25,13 @@ class NewtonOptions:
         max_halvings: shortenings of one step by the line search.
         rotation_cap: largest turn of an edge in one update [rad].
         linear_rtol: reduction of the residual by PCG, in the norm of the preconditioner.
+        psd: the matrix. "gauss_newton": without second derivatives of bending and twist, never indefinite but for
+            compression, which is left out where a pivot is lost. "progressive": from the third iteration on the exact Hessian,
+            and in iterations where it is not positive definite Gauss-Newton without compression: for curved, twisted or
+            compressed rods and long steps, where Gauss-Newton takes many iterations. "project": the exact one with every
+            element made positive semi-definite by its eigenvalues, at twenty times the cost of an iteration. "none": the
+            exact one; where it is indefinite the solve ends with the outcome `indefinite`, and a time step is tried again
+            with a shorter one. "auto": "progressive" for rods that are curved or twisted at rest, else "gauss_newton".
     """
 
     rtol: float = 1e-8
@@ -31,9 +40,12 @@ class NewtonOptions:
     max_halvings: int = 20
     rotation_cap: float = 1.0
     linear_rtol: float = 1e-8
+    psd: str = "auto"
 
     def __post_init__(self):
         check_options(self, ("rtol", "floor_factor", "rotation_cap", "linear_rtol"), ("max_iterations", "max_halvings"))
+        if self.psd not in PSD_MODES:
+            raise SceneError(f"psd {self.psd!r}: it is one of {', '.join(PSD_MODES)}")
 
 
 class ChainNewton:
@@ -83,16 +95,34 @@ class ChainNewton:
         self.status, self.slot, self.iteration, self.halvings = flags(), flags(), flags(), flags()
         self.lost, self.turned, self.clamped, self.unbalanced, self.drowned = (flags() for _ in range(5))
         self.without_compression = self.clamped  # rods whose matrix leaves the stiffness that compression takes away
+        self.psd = self.automatic_psd() if options.psd == "auto" else options.psd
+        self.exact = self.psd != "gauss_newton" and kind.span == 2  # a rod that only stretches has its Hessian anyway
+        rows = kind.geometric_rows if self.exact else 1
+        self.exact_from = (EARLY if self.psd == "progressive" else 0) if self.exact else None
+        self.geometric = make(rows, *(nodes if self.exact else (1, 1)), dtype=self.linear)
+        self._project = None
+        if self.psd == "project" and self.exact:
+            self.without_compression = wp.full(columns, 1, dtype=int, device=device)
+            self._project = geometric.project_kernel(kind, self.real, self.linear)
         self.coefficient, self.rate = scalars(), scalars()
         self.step_length, self.decrement, self.load_scale, self.residual = scalars(), scalars(), scalars(), scalars()
         self.todo, self.placed, self.angle_change = flags(), flags(), scalars()
         self.active = wp.zeros(1, dtype=int, device=device)
         self.device = device
-        self._evaluate = element.evaluate_kernel(kind, self.real, self.linear)
+        self._evaluate = element.evaluate_kernel(kind, self.real, self.linear, self.exact_from)
         self._check = balance.check_kernel(kind, self.real, self.linear)
         self._predict = step.predict_kernel(kind, self.real, self.linear, midpoint)
-        self._sweep = None if kind.closed else chain.sweep_kernel(kind, self.real, self.linear)
+        self._sweep = None
+        if not kind.closed:
+            self._sweep = chain.sweep_kernel(kind, self.real, self.linear, self.exact_from, self.psd == "none")
         self._adjust = None if kind.closed else search.adjust_kernel(kind, self.real, self.linear)
+
+    def automatic_psd(self) -> str:
+        """The mode of `NewtonOptions.psd` that suits the rods: Gauss-Newton lacks what a natural curvature does to their roll."""
+        places = zip(self.group.kind.terms, self.group.kind.places(), strict=True)
+        bending = [(term, at[0]) for term, at in places if term.measure.span == 2]
+        names = [(at + i) for term, at in bending for i, name in enumerate(term.parameter_names) if "rest" in name]
+        return "progressive" if any(self.group.parameter(row).any() for row in names) else "gauss_newton"
 
     @property
     def kernels(self) -> list:
@@ -102,7 +132,7 @@ class ChainNewton:
     @property
     def kernels_around(self) -> list:
         """Those that do not depend on how the system is solved."""
-        return [self._predict, self._evaluate, self._check]
+        return [self._predict, self._evaluate, self._check, *([self._project] if self._project else [])]
 
     def pcg_iterations(self) -> int:
         """None: the sweep is direct."""
@@ -136,10 +166,18 @@ class ChainNewton:
             (group.elements, group.columns),
             [self.x, self.theta, self.frame, last, self.rate, group.buffer, group.table, group.count]
             + [self.status, self.slot, self.without_compression, self.iteration, int(self.reuse)],
-            [self.factor, self.gradient, self.energy, self.stiffness, self.turned, self.active],
+            [self.factor, self.geometric, self.gradient, self.energy, self.stiffness, self.turned, self.active],
             device=self.device,
             block_dim=128,
         )
+        if self._project:
+            wp.launch(
+                self._project,
+                (group.elements, group.columns),
+                [self.x, group.count, self.status, group.kind.window, self.factor],
+                [self.geometric],
+                device=self.device,
+            )
 
     def check(self) -> None:
         """Residuals, the change of the energy, and the rods that are out of equilibrium."""
@@ -162,7 +200,7 @@ class ChainNewton:
         wp.launch(
             self._sweep,
             group.columns,
-            [self.factor, self.right, self.energy_change, self.energy_noise, group.count]
+            [self.factor, self.geometric, self.right, self.energy_change, self.energy_noise, group.count]
             + [group.mass, group.rotary, self.coefficient, group.fixed]
             + [options.floor_factor * self.eps, options.rotation_cap]
             + [options.max_iterations, options.max_halvings]

@@ -9,7 +9,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels import pivot
+from ddg_warp.kernels import geometric, pivot
 from ddg_warp.kernels.balance import node_functions
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions
 
@@ -50,8 +50,11 @@ def block_functions(kind: ChainKind, linear):
 
 
 @cache
-def assemble_kernel(kind: ChainKind, real, linear):
-    """Blocks of H of every rod that is not in balance."""
+def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None):
+    """Blocks of H of every rod that is not in balance.
+
+    From iteration `exact_from` on, H has the geometric stiffness of rods that are not `clamped`.
+    """
     dim, nb, nb2, twist, span, closed = kind.dim, kind.block, kind.block**2, kind.twist, kind.span, kind.closed
     window, vertex_rows, edge_rows, tensions = kind.window, kind.vertex_strains, kind.edge_strains, kind.tensions
     H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
@@ -59,6 +62,8 @@ def assemble_kernel(kind: ChainKind, real, linear):
     _, store, _, _ = block_functions(kind, linear)
     _, behind, _ = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
+    curved, begin = exact_from is not None, exact_from or 0
+    first_first, first_mid, first_last, mid_mid, mid_last, last_last = geometric.block_functions(kind, linear)
 
     @wp.func
     def part(F: wp.array3d(dtype=linear), row: int, k: int, r: int):
@@ -103,6 +108,8 @@ def assemble_kernel(kind: ChainKind, real, linear):
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def assemble(
         F: wp.array3d(dtype=linear),
+        second: wp.array3d(dtype=linear),
+        clamped: wp.array(dtype=int),
         count: wp.array(dtype=int),
         mass: wp.array2d(dtype=real),
         rotary: wp.array2d(dtype=real),
@@ -147,6 +154,17 @@ def assemble_kernel(kind: ChainKind, real, linear):
                 if bb >= 0:
                     C = own(F, row, bb, r, 2)
                     D += wp.outer(C, C)
+            if wp.static(curved):
+                if clamped[r] == 0 and iteration[r] >= wp.static(begin):
+                    if wp.static(closed) or k < n - 2:
+                        D += first_first(second, k, r)
+                        E += first_mid(second, k, r)
+                        G += first_last(second, k, r)
+                    if b >= 0 and (wp.static(closed) or k < n - 1):
+                        D += mid_mid(second, b, r)
+                        E += mid_last(second, b, r)
+                    if bb >= 0:
+                        D += last_last(second, bb, r)
         if wp.static(closed) or k < n - 1:
             S = edge_block(F, k, r)
             D += S

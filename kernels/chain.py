@@ -1,10 +1,10 @@
 """The chain sweep: one thread a rod takes a Newton iteration from element factors and forces to new dofs.
 
-The Gauss-Newton matrix of an open rod is block-pentadiagonal (block: position of a node and angle of the edge that starts
-there): H = sum F^T F + c I (edges) + inertia. The sweep forms its blocks in registers, takes the residual of `balance`,
-eliminates node by node, and at the end of the rod knows the change of the energy and the Newton decrement r^T H^-1 r. It then
-either rejects the iterate and shortens the step, or substitutes back and takes the next step. No physics here: strains are
-rows.
+The matrix of an open rod is block-pentadiagonal (block: position of a node and angle of the edge that starts there):
+H = sum F^T F + c I (edges) + inertia, and the geometric stiffness if asked for. The sweep forms its blocks in registers, takes the
+residual of `balance`, eliminates node by node, and at the end of the rod knows the change of the energy and the Newton decrement
+r^T H^-1 r. It then either rejects the iterate and shortens the step, or substitutes back and takes the next step. No physics
+here: strains are rows.
 
 Line search (Armijo, c = 1e-4) on the energy, summed as differences element by element. Where the expected decrease drowns in
 rounding, the decrement decides instead (natural monotonicity test; Deuflhard, Newton Methods for Nonlinear Problems, 2004).
@@ -14,14 +14,18 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels import outcome, pivot
+from ddg_warp.kernels import geometric, outcome, pivot
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind
 from ddg_warp.kernels.search import PLACE, RELAG, TURNED, search_functions
 
 
 @cache
-def sweep_kernel(kind: ChainKind, real, linear):
-    """The sweep for one kind of chain; see the module's text."""
+def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, fails: bool = False):
+    """The sweep for one kind of chain; see the module's text.
+
+    From iteration `exact_from` on, the matrix has the geometric stiffness G. Where a pivot is lost, the same iterate comes again
+    with `clamped[r]` raised: without what compression takes away, and, for this iteration, without G; or the solve `fails`.
+    """
     dim, nb, twist, span = kind.dim, kind.block, kind.twist, kind.span
     window, nb2 = kind.window, kind.block**2
     V, H, M = wp.types.vector(dim, real), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
@@ -29,6 +33,8 @@ def sweep_kernel(kind: ChainKind, real, linear):
     *_, shorter = search_functions(kind, real, linear)
     angle = nb - 1
     vertex_rows, edge_rows, tensions = kind.vertex_strains, kind.edge_strains, kind.tensions
+    exact, begin = exact_from is not None, exact_from or 0
+    aa, ab, ac, bb, bc, cc = geometric.block_functions(kind, linear)
 
     @wp.func
     def part(F: wp.array3d(dtype=linear), row: int, k: int, r: int):
@@ -76,6 +82,7 @@ def sweep_kernel(kind: ChainKind, real, linear):
     )
     def sweep(
         F: wp.array3d(dtype=linear),
+        G: wp.array3d(dtype=linear),
         # balance
         right: wp.array3d(dtype=linear),
         energy_change: wp.array2d(dtype=real),
@@ -160,6 +167,14 @@ def sweep_kernel(kind: ChainKind, real, linear):
                         Wbb += wp.outer(B, B)
                         Wbc += wp.outer(B, C)
                         Wcc += wp.outer(C, C)
+                    if wp.static(exact):
+                        if clamped[r] == 0 and iteration[r] >= wp.static(begin):
+                            Waa += aa(G, j, r)
+                            Wab += ab(G, j, r)
+                            Wac += ac(G, j, r)
+                            Wbb += bb(G, j, r)
+                            Wbc += bc(G, j, r)
+                            Wcc += cc(G, j, r)
             if j < n - 1:
                 edge_row = wp.static(vertex_rows * window)
                 for m in range(wp.static(edge_rows)):
@@ -230,7 +245,10 @@ def sweep_kernel(kind: ChainKind, real, linear):
             change = real(0.0)
         finite = wp.isfinite(worst) and wp.isfinite(newton) and wp.isfinite(change)
         if lost_here > 0 and clamped[r] == 0:
-            # compression has made the matrix indefinite: the same iterate again, without what compression takes away
+            if wp.static(fails):
+                status[r] = wp.static(outcome.INDEFINITE)
+                return
+            # the matrix is indefinite: the same iterate again, without what compression (or curvature) takes away
             clamped[r] = 1
             active[0] = 1
             return
@@ -267,6 +285,8 @@ def sweep_kernel(kind: ChainKind, real, linear):
         halvings[r] = 0
         placed[r] = 0
         lost[r] = lost[r] + lost_here
+        if wp.static(exact):
+            clamped[r] = 0
         if wp.static(twist):
             if turned[r] != 0:
                 # angles mean something else in new frames: take no step, and ask for a direction there

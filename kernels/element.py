@@ -14,6 +14,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import frames
+from ddg_warp.kernels.measures.turning import packed_index
 from ddg_warp.kernels.terms import Term
 
 # Fused multiply-adds are what a CUDA build uses too. They and inlining halve the CPU's time for a sweep (1.9 to 0.9 of it each).
@@ -66,6 +67,11 @@ class ChainKind:
     def factor_rows(self) -> int:
         """Reals of the factor of one element: vertex rows, edge rows, tensions, in this order."""
         return self.vertex_strains * self.window + self.edge_strains * self.dim + self.tensions
+
+    @property
+    def geometric_rows(self) -> int:
+        """Reals of the geometric stiffness of a window: the upper triangle of its matrix, row by row."""
+        return self.window * (self.window + 1) // 2
 
     @property
     def strain_rows(self) -> int:
@@ -233,7 +239,7 @@ def term_kernels(kind: ChainKind, index: int, real):
     V, W = wp.types.vector(kind.dim, real), wp.types.vector(kind.window, real)
     S13 = wp.types.vector(13, real)
     P = wp.types.vector(term.density.parameter_size(len(term.measure.strains)), real)
-    strains_of, jacobian_of, _ = term.measure.functions(real)
+    strains_of, jacobian_of, *_ = term.measure.functions(real)
     energy_of, slope_of, _ = term.density.functions(real, len(term.measure.strains))
     _, window, lagged, _ = gather_functions(kind, real)
     load, local, short, spread = term_functions(kind, index, real)
@@ -322,17 +328,23 @@ def term_kernels(kind: ChainKind, index: int, real):
 
 
 @cache
-def evaluate_functions(kind: ChainKind, index: int, real, linear):
-    """evaluate_at of one term: writes its factor rows; returns its energy, derivative with respect to the window, stiffness."""
+def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool):
+    """evaluate_at of one term: writes its factor rows; returns its energy, derivative with respect to the window, stiffness.
+
+    With `curved`, a term that spans two edges (a rod has one) also writes its geometric stiffness.
+    """
     term = kind.terms[index]
     W, S13 = wp.types.vector(kind.window, real), wp.types.vector(13, real)
     n, size = len(term.measure.strains), term.measure.size
-    _, jacobian_of, tension_of = term.measure.functions(real)
+    _, jacobian_of, tension_of, curvature_of = term.measure.functions(real)
     energy_of, slope_of, root_of = term.density.functions(real, n)
     load, local, short, spread = term_functions(kind, index, real)
     _, row, tension_row, _ = kind.places()[index]
     E = wp.types.vector(n, real)
     has_tension, dim = term.measure.tensions > 0, kind.dim
+    bends = curved and term.measure.span == 2
+    dofs = [*range(dim * term.measure.span), *(dim * kind.span + i for i in range(term.measure.angles))]
+    places = tuple(packed_index(kind.window, dofs[i], dofs[j]) for i in range(size) for j in range(i, size))
 
     @wp.func
     def evaluate_at(
@@ -344,7 +356,9 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear):
         rate: real,
         clamped: int,
         frozen: bool,
+        exact: bool,
         factor: wp.array3d(dtype=linear),
+        geometric: wp.array3d(dtype=linear),
         k: int,
         r: int,
     ):
@@ -365,6 +379,11 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear):
             for m in range(wp.static(n)):
                 for i in range(wp.static(size)):
                     factor[wp.static(row) + m * wp.static(size) + i, k, r] = linear(root[m] * jacobian[m, i])
+        if wp.static(bends):
+            if exact:
+                second = curvature_of(q, short(s), w, slope)
+                for i in range(wp.static(len(places))):
+                    geometric[wp.static(places[i]), k, r] = linear(second[i])
         stiffness = real(0.0)
         for m in range(wp.static(n)):
             edge = real(0.0)
@@ -377,8 +396,11 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear):
 
 
 @cache
-def evaluate_kernel(kind: ChainKind, real, linear):
+def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None):
     """The fused kernel of a Newton iteration: energy, gradient on the window and Gauss-Newton factor of all terms.
+
+    From iteration `exact_from` on also the geometric stiffness of terms that span two edges: the factor, compression included,
+    and this make the exact Hessian.
 
     Compression lowers the stiffness across an edge, which can make the matrix indefinite: `clamped` rods do without that.
     With `reuse` the factor is written once a step, at the first iterate. Energies go to the slot that the line search does not
@@ -388,7 +410,9 @@ def evaluate_kernel(kind: ChainKind, real, linear):
     """
     V, W = wp.types.vector(kind.dim, real), wp.types.vector(kind.window, real)
     _, window, lagged, _ = gather_functions(kind, real)
-    each = tuple(evaluate_functions(kind, i, real, linear) for i in range(len(kind.terms)))
+    curved, begin = exact_from is not None, exact_from or 0
+    each = tuple(evaluate_functions(kind, i, real, linear, curved) for i in range(len(kind.terms)))
+    options = CPU_OPTIONS | {"max_unroll": kind.geometric_rows} if curved else CPU_OPTIONS
     X = wp.types.vector(3, real)
     transport, reference_twist, _ = frames.functions(real)
     spans = tuple(term.measure.span for term in kind.terms)
@@ -396,11 +420,7 @@ def evaluate_kernel(kind: ChainKind, real, linear):
 
     # three blocks a multiprocessor: 168 registers instead of 170 are worth 30 % at 100,000 rods on an H200
     @wp.kernel(
-        module="unique",
-        enable_backward=False,
-        grid_stride=False,
-        launch_bounds=(128, 3),
-        module_options=CPU_OPTIONS,
+        module="unique", enable_backward=False, grid_stride=False, launch_bounds=(128, 3), module_options=options
     )
     def evaluate(
         x: wp.array2d(dtype=V),
@@ -417,6 +437,7 @@ def evaluate_kernel(kind: ChainKind, real, linear):
         iteration: wp.array(dtype=int),
         reuse: int,
         factor_out: wp.array3d(dtype=linear),
+        geometric_out: wp.array3d(dtype=linear),
         gradient_out: wp.array3d(dtype=real),
         energy_out: wp.array3d(dtype=real),
         stiffness_out: wp.array2d(dtype=linear),
@@ -433,13 +454,14 @@ def evaluate_kernel(kind: ChainKind, real, linear):
         q = window(x, theta, k, n, whole, r)
         s = lagged(frame, k, n, whole, r)
         frozen = reuse != 0 and iteration[r] > 0
+        exact = iteration[r] >= wp.static(begin)
         total = real(0.0)
         stiffest = real(0.0)
         f = W()
         for i in range(wp.static(terms)):
             if whole or wp.static(spans[i]) == 1:
                 energy, part, stiff = wp.static(each[i])(
-                    q, s, buffer, table, last, rate[r], clamped[r], frozen, factor_out, k, r
+                    q, s, buffer, table, last, rate[r], clamped[r], frozen, exact, factor_out, geometric_out, k, r
                 )
                 total += energy
                 f += part

@@ -6,7 +6,8 @@ CONVERGED_TO_ROUNDING = 2
 MAX_ITERATIONS = 3
 LINE_SEARCH_FAILED = 4
 NON_FINITE = 5
-GIVEN_UP = 6  # an earlier step failed for good; the rod rests at its last good state
+INDEFINITE = 6  # the exact Hessian has a negative pivot, and nothing was to be put in its place
+GIVEN_UP = 7  # an earlier step failed for good; the rod rests at its last good state
 
 NAMES = {
     CONVERGED: "converged",
@@ -14,5 +15,6 @@ NAMES = {
     MAX_ITERATIONS: "max_iterations",
     LINE_SEARCH_FAILED: "line_search_failed",
     NON_FINITE: "non_finite",
+    INDEFINITE: "indefinite",
     GIVEN_UP: "given_up",
 }

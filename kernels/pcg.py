@@ -9,7 +9,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels import pivot
+from ddg_warp.kernels import outcome, pivot
 from ddg_warp.kernels.block_band import block_functions, product_function, substitute_function
 from ddg_warp.kernels.element import ChainKind
 from ddg_warp.kernels.search import TURNED, search_functions
@@ -132,6 +132,7 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
         iterations: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
         busy: wp.array(dtype=int),
+        negative: wp.array(dtype=int),
     ):
         """Step length, new residual, preconditioning, test, new direction; `wanted` becomes 2 where a rod is done."""
         r = wp.tid()
@@ -146,6 +147,8 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
             curvature += wp.dot(pk, qk)
             size += wp.length(pk) * wp.length(qk)
         if not curvature > eps * size:
+            if curvature < -linear(10.0) * eps * size:
+                negative[r] = negative[r] + 1
             wanted[r] = 2
             return
         alpha = rho[r] / curvature
@@ -164,6 +167,46 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
         busy[0] = 1
 
     return start, product, advance
+
+
+@cache
+def repeat_kernel(fails: bool):
+    """Where the exact Hessian is indefinite: end the solve (`fails`), or undo the acceptance and ask for the iterate again.
+
+    `negative` counts lost pivots and negative curvatures of this iteration; `clamped` then leaves the geometric stiffness and
+    what compression takes away out of the next matrix, and the line search, which has the same numbers, accepts again.
+    `done` says that the direction has been found.
+    """
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def repeat(
+        done: int,
+        wanted: wp.array(dtype=int),
+        negative: wp.array(dtype=int),
+        clamped: wp.array(dtype=int),
+        status: wp.array(dtype=int),
+        iteration: wp.array(dtype=int),
+        slot: wp.array(dtype=int),
+        lost: wp.array(dtype=int),
+    ):
+        r = wp.tid()
+        if wanted[r] == 0:
+            return
+        if negative[r] > 0 and clamped[r] == 0:
+            wanted[r] = 0
+            negative[r] = 0
+            if wp.static(fails):
+                status[r] = wp.static(outcome.INDEFINITE)
+                return
+            clamped[r] = 1
+            iteration[r] = iteration[r] - 1
+            slot[r] = 1 - slot[r]
+        elif done != 0:
+            lost[r] = lost[r] + negative[r]
+            negative[r] = 0
+            clamped[r] = 0
+
+    return repeat
 
 
 @cache

@@ -369,6 +369,9 @@ def test_statics_without_supports(device, held, axis):
         ({"max_iterations": 0}, ("max_iterations", "at least 1")),
         ({"max_halvings": 2.5}, ("max_halvings", "whole number")),
         ({"retry_limit": -1}, ("retry_limit", "0 for no retry")),
+        ({"psd": "exact"}, ("psd", "exact", "gauss_newton", "project", "progressive", "none")),
+        ({"psd": "none", "linear": "jacobi"}, ("psd", "jacobi", "chain")),
+        ({"psd": "project", "solver": "projective"}, ("psd", "projective", "gauss_newton")),
     ],
 )
 def test_newton_options(device, options, words):

@@ -22,7 +22,7 @@ class AssembledNewton(ChainNewton):
         self.placed = wp.full(group.columns, 1, dtype=int, device=device)  # `base` holds where every step comes from
         self.merit = wp.zeros(group.columns, dtype=self.real, device=device)
         self.wanted = wp.zeros(group.columns, dtype=int, device=device)
-        self._assemble = block_band.assemble_kernel(kind, self.real, self.linear)
+        self._assemble = block_band.assemble_kernel(kind, self.real, self.linear, self.exact_from)
 
     def vectors(self, rows: int | None = None) -> wp.array:
         """Zeros of the linear algebra for every node, as many as a node has dofs unless told otherwise."""
@@ -35,7 +35,16 @@ class AssembledNewton(ChainNewton):
         wp.launch(
             self._assemble,
             (group.nodes, group.columns),
-            [self.factor, group.count, group.mass, group.rotary, self.coefficient, group.fixed]
+            [
+                self.factor,
+                self.geometric,
+                self.clamped,
+                group.count,
+                group.mass,
+                group.rotary,
+                self.coefficient,
+                group.fixed,
+            ]
             + [self.status, self.unbalanced, self.drowned, self.iteration, int(self.reuse)],
             [self.blocks],
             device=self.device,

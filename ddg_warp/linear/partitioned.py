@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
+from ddg_warp.errors import SceneError
 from ddg_warp.kernels import cyclic_reduction, parallel_moves, parallel_search
 from ddg_warp.linear.assembled import AssembledNewton
 from ddg_warp.newton import NewtonOptions
@@ -18,6 +19,8 @@ class PartitionedNewton(AssembledNewton):
     """
 
     def __init__(self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False):
+        if options.psd == "none":
+            raise SceneError("psd 'none': linear 'partitioned' cannot stop at an indefinite matrix; use 'sweep'")
         super().__init__(model, group, options, linear, midpoint)
         kind, device, real = group.kind, model.wp_device, self.real
         vector, columns = wp.types.vector(kind.dim, real), group.columns

@@ -22,32 +22,45 @@ class PcgNewton(AssembledNewton):
     ):
         if preconditioner not in pcg.PRECONDITIONERS:
             raise SceneError(f"preconditioner {preconditioner!r}: it is one of {', '.join(pcg.PRECONDITIONERS)}")
+        if preconditioner != "chain" and options.psd in ("progressive", "none"):
+            raise SceneError(
+                f"psd {options.psd!r}: preconditioner {preconditioner!r} cannot tell an indefinite matrix; use 'chain'"
+            )
+        by_chain = self._by_chain = preconditioner == "chain"
         super().__init__(model, group, options, linear, midpoint)
         kind, device, columns = group.kind, model.wp_device, group.columns
-        by_chain = preconditioner == "chain"
         self.factors = self.vectors(3 * kind.block**2 + kind.block) if by_chain else self.blocks
         self.rest, self.z, self.p, self.q = (self.vectors() for _ in range(4))
-        self.without_compression = wp.full(columns, 1, dtype=int, device=device)  # PCG needs a definite matrix
+        self._repeats = self.psd in ("progressive", "none")
+        if not self._repeats:
+            self.without_compression = wp.full(columns, 1, dtype=int, device=device)  # PCG needs a definite matrix
         self.rho, self.rho_first = (wp.zeros(columns, dtype=self.linear, device=device) for _ in range(2))
-        self.iterations = wp.zeros(columns, dtype=int, device=device)
+        self.iterations, self.negative = (wp.zeros(columns, dtype=int, device=device) for _ in range(2))
         self.busy = wp.zeros(1, dtype=int, device=device)
         self.pcg_work = wp.zeros(1, dtype=wp.int64, device=device)
         self._judge = judge.judge_kernel(kind, self.real, self.linear)
         self._factor = block_band.factor_kernel(kind, self.linear) if by_chain else None
         self._start, self._product, self._advance = pcg.solver_kernels(kind, self.linear, preconditioner)
+        self._repeat = pcg.repeat_kernel(self.psd == "none") if self._repeats else None
         self._take = pcg.take_kernel(kind, self.real, self.linear)
         self._limit = 10 * kind.block * group.nodes
+
+    def automatic_psd(self) -> str:
+        """Gauss-Newton where an indefinite matrix would not be noticed."""
+        return super().automatic_psd() if self._by_chain and not self.reuse else "gauss_newton"
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         own = [self._assemble, self._judge, self._start, self._product, self._advance, self._take]
-        return [*self.kernels_around, *own, *([self._factor] if self._factor else [])]
+        return [*self.kernels_around, *own, *filter(None, (self._factor, self._repeat))]
 
     def sweep(self) -> None:
         """Assemble, decide, solve for a direction and take it."""
         self.assemble()
+        self._repeat_indefinite(0)
         self.direct()
+        self._repeat_indefinite(1)
         group, device = self.group, self.device
         wp.launch(
             self._take,
@@ -57,6 +70,16 @@ class PcgNewton(AssembledNewton):
             + [self.pcg_work],
             device=device,
         )
+
+    def _repeat_indefinite(self, done: int) -> None:
+        """Let rods whose exact Hessian turned out to be indefinite come again, before or after directions are found."""
+        if self._repeat:
+            wp.launch(
+                self._repeat,
+                self.group.columns,
+                [done, self.wanted, self.negative, self.clamped, self.status, self.iteration, self.slot, self.lost],
+                device=self.device,
+            )
 
     def assemble(self) -> None:
         """Blocks and residual of active rods; accept or shorten the last step; factors where a direction is wanted."""
@@ -77,7 +100,7 @@ class PcgNewton(AssembledNewton):
                 self._factor,
                 group.columns,
                 [self.blocks, group.count, self.wanted, self.iteration, int(self.reuse)],
-                [self.factors, self.lost],
+                [self.factors, self.negative if self._repeat else self.lost],
                 device=device,
             )
 
@@ -108,7 +131,7 @@ class PcgNewton(AssembledNewton):
             group.columns,
             [self.blocks, self.factors, group.count, self.options.linear_rtol, self._limit],
             [self.q, self.rest, self.direction, self.z, self.p, self.rho, self.rho_first]
-            + [self.iterations, self.wanted, self.busy],
+            + [self.iterations, self.wanted, self.busy, self.negative],
             device=device,
         )
 
@@ -127,6 +150,8 @@ class ProjectiveNewton(PcgNewton):
     reuse = True
 
     def __init__(self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False):
+        if options.psd not in ("auto", "gauss_newton"):
+            raise SceneError(f"psd {options.psd!r}: the solver 'projective' freezes the matrix of 'gauss_newton'")
         super().__init__(model, group, options, "chain", linear, midpoint)
         self._direct = block_band.direct_kernel(group.kind, self.linear)
 

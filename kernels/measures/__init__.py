@@ -28,10 +28,12 @@ class Measure:
         spins: rotation vectors of rigid joints among the dofs, after the angles.
         frames: how many of the angles belong to edges with a reference frame, which the lagged data begin with.
         strains: names and units of the strains.
-        functions: real -> (strains, jacobian, tension). `strains(q, s, w) -> E`; `jacobian(q, s, w) -> (E, J)`; `tension` is
-            None, or `tension(q, w, slope) -> (c, shift)` with the second derivative of the strains,
+        functions: real -> (strains, jacobian, tension, curvature). `strains(q, s, w) -> E`; `jacobian(q, s, w) -> (E, J)`;
+            `tension` is None, or `tension(q, w, slope) -> (c, shift)` with the second derivative of the strains,
             w slope : d2e = C + w J^T diag(shift) J. One edge has one tension, a scalar c with C = c I. A triangle has
             three, the vector c = (c11, c12, c22), and C has the blocks c_ij I between its edge vectors i and j.
+            `curvature` is None, or `curvature(q, s, w, slope)`, of rod vertices: w slope : d2e as the upper triangle of a
+            symmetric matrix, row by row.
     """
 
     name: str

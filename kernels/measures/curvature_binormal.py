@@ -9,13 +9,14 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.measures import Measure
+from ddg_warp.kernels.measures import Measure, turning
 
 
 @cache
 def _functions(real):
     Q, S, E, M = curvature_binormal.types(real)
-    V = wp.types.vector(3, real)
+    V, H, M3 = wp.types.vector(3, real), wp.types.vector(21, real), wp.types.matrix((3, 3), real)
+    turning_of, across, lengthening = turning.functions(real)
 
     @wp.func
     def strains(q: Q, s: S, w: real):
@@ -51,7 +52,40 @@ def _functions(real):
             row(V(zero, zero, one), kb[2], te, tf, ie, i_f),
         )
 
-    return strains, jacobian, None
+    @wp.func
+    def packed(ee: M3, ef: M3, ff: M3):
+        """Upper triangle of the matrix, row by row."""
+        h = H()
+        for i in range(3):
+            for j in range(3):
+                if j >= i:
+                    h[i * 6 - i * (i - 1) // 2 + j - i] = ee[i, j]
+                    h[(i + 3) * 6 - (i + 3) * (i + 2) // 2 + j - i] = ff[i, j]
+                h[i * 6 - i * (i - 1) // 2 + 3 + j - i] = ef[i, j]
+        return h
+
+    @wp.func
+    def curvature(q: Q, s: S, w: real, slope: E):
+        e = V(q[0], q[1], q[2])
+        f = V(q[3], q[4], q[5])
+        ie = real(1.0) / wp.length(e)
+        i_f = real(1.0) / wp.length(f)
+        te = e * ie
+        tf = f * i_f
+        i = real(1.0) / (real(1.0) + wp.dot(te, tf))
+        g = V(slope[0], slope[1], slope[2]) * real(2.0)
+        tt = (te + tf) * i
+        k = wp.dot(wp.cross(te, tf), g) * i
+        a = wp.cross(tf, g) * i - tt * k
+        b = -wp.cross(te, g) * i - tt * k
+        vv, uu, vu = turning_of(a, b, tt, g, i, k)
+        return packed(
+            across(vv, te, te, ie * ie) + lengthening(te, a, ie),
+            across(vu, te, tf, ie * i_f),
+            across(uu, tf, tf, i_f * i_f) + lengthening(tf, b, i_f),
+        )
+
+    return strains, jacobian, None, curvature
 
 
 curvature_binormal = Measure(

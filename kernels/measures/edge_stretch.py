@@ -29,7 +29,7 @@ def _functions(measure_of):
             c = slope[0] / wp.length(q)
             return c, E(-c * w)
 
-        return strains, jacobian, tension
+        return strains, jacobian, tension, None
 
     return functions
 

@@ -73,7 +73,7 @@ def _functions(real):
         alpha, e, a = derivatives(q, s)
         return E(alpha), wp.matrix_from_rows(Q(e[0], e[1], e[2], a[0], a[1], a[2]))
 
-    return strains, jacobian, None
+    return strains, jacobian, None, None
 
 
 edge_tilt = Measure("edge_tilt", 3, ((0, 1), (0, 2)), ("angle [rad]",), _functions, data_size=4)

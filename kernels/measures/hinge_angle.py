@@ -68,7 +68,7 @@ def _functions(real):
         theta, e, a, b = derivative(V(q[0], q[1], q[2]), V(q[3], q[4], q[5]), V(q[6], q[7], q[8]))
         return E(theta), wp.matrix_from_rows(Q(e[0], e[1], e[2], a[0], a[1], a[2], b[0], b[1], b[2]))
 
-    return strains, jacobian, None
+    return strains, jacobian, None, None
 
 
 hinge_angle = Measure("hinge_angle", 3, ((0, 1), (0, 2), (0, 3)), ("angle [rad]",), _functions)

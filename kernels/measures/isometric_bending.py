@@ -40,7 +40,7 @@ def _functions(real):
             Q(zero, zero, s[0], zero, zero, s[1], zero, zero, s[2]),
         )
 
-    return strains, jacobian, None
+    return strains, jacobian, None, None
 
 
 isometric_bending = Measure(

@@ -58,7 +58,7 @@ def _functions(real):
     Q, S, E, _ = joint_curvature_twist.types(real)
     R, T, _, _ = rod_curvature_twist.types(real)
     V = wp.types.vector(3, real)
-    rod_strains, rod_jacobian, _ = rod_curvature_twist.functions(real)
+    rod_strains, rod_jacobian, *_ = rod_curvature_twist.functions(real)
     turned, transposed = rotations(real)
 
     @wp.func
@@ -89,7 +89,7 @@ def _functions(real):
         e, j = rod_jacobian(r, lag, w)
         return e, wp.matrix_from_rows(row(j[0], t, omega, sign), row(j[1], t, omega, sign), row(j[2], t, omega, sign))
 
-    return strains, jacobian, None
+    return strains, jacobian, None, None
 
 
 joint_curvature_twist = Measure(

@@ -182,7 +182,7 @@ def _functions(measure_of):
             row2 = row(e2, d2, none, none, b2, V(zero, zero, x2 * sign(s, 2)))
             return E(c0 + c1, c0, c0 + c2), wp.matrix_from_rows(row0 + row1, row0, row0 + row2)
 
-        return strains, jacobian, None
+        return strains, jacobian, None, None
 
     return functions
 

@@ -10,6 +10,17 @@ The published gradients hold the reference frame still; a frame transported in t
 z . de / |e| with z = (t0 x te) / (1 + t0 . te), which subtracts (d/dtheta_e) z / |e| from every strain's derivative.
 Singular where the rod folds back by 180 degrees, or an edge turns by 180 degrees from its lagged tangent.
 
+Second derivatives, contracted with moments M: a frame that spins by s_e = dtheta_e - z . de / |e| turns m1 by s_e m2, and
+m2 by -s_e m1, and te by v (see `turning`). With h = M1 m1 + M2 m2 and g = M1 m2 - M2 m1 of each edge, b half of the curvature
+binormal, i and tt as in `turning`, the derivative of w M . strains along a line is
+
+    A . v + B . u - (b . h_e + M3) s_e - (b . h_f - M3) s_f,   A, B those of g = g_e + g_f, plus M3 b,
+
+and its derivative adds to that of `turning`: 2 (tt . (v + u)) (b . h_e s_e + b . h_f s_f) + (g_e . v) (b . v) + (g_f . u) (b . u)
+- 2 i s_e (v . tf x h_e - u . te x h_e) - 2 i s_f (v . tf x h_f - u . te x h_f) - b . g_e s_e^2 - b . g_f s_f^2
++ M3 (tt . (u x v) - (tt . (v + u)) (b . (v + u))), and with the spin's own ds_e = (z . v) (t0 . v) / (1 + t0 . te) + 2 (te . de)
+(z . v) / |e| the factors of s_e and s_f times it. (Bergou et al. 2010 give these for frames that do not spin.)
+
 Lagged data: u_e (3), t_e (3), u_f (3), t_f (3), m_ref (1).
 """
 
@@ -18,14 +29,16 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import frames
-from ddg_warp.kernels.measures import Measure
+from ddg_warp.kernels.measures import Measure, turning
 
 
 @cache
 def _functions(real):
     Q, S, E, M = rod_curvature_twist.types(real)
     V = wp.types.vector(3, real)
+    H, M3 = wp.types.vector(36, real), wp.types.matrix((3, 3), real)
     transport, reference_twist, rotate = frames.functions(real)
+    turning_of, across, lengthening = turning.functions(real)
 
     @wp.func
     def material_frames(q: Q, s: S):
@@ -83,7 +96,81 @@ def _functions(real):
             row((kb + ze) * ie, (kb - zf) * i_f, -iw, iw),
         )
 
-    return strains, jacobian, None
+    @wp.func
+    def symmetric(a: V, b: V):
+        m = wp.outer(a, b)
+        return (m + wp.transpose(m)) * real(0.5)
+
+    @wp.func
+    def packed(ee: M3, ef: M3, ff: M3, ea: V, eb: V, fa: V, fb: V, aa: real, bb: real):
+        """Upper triangle of the matrix, row by row; angles do not couple to each other."""
+        h = H()
+        for i in range(3):
+            for j in range(3):
+                if j >= i:
+                    h[i * 8 - i * (i - 1) // 2 + j - i] = ee[i, j]
+                    h[(i + 3) * 8 - (i + 3) * (i + 2) // 2 + j - i] = ff[i, j]
+                h[i * 8 - i * (i - 1) // 2 + 3 + j - i] = ef[i, j]
+            h[i * 8 - i * (i - 1) // 2 + 6 - i] = ea[i]
+            h[i * 8 - i * (i - 1) // 2 + 7 - i] = eb[i]
+            h[(i + 3) * 8 - (i + 3) * (i + 2) // 2 + 3 - i] = fa[i]
+            h[(i + 3) * 8 - (i + 3) * (i + 2) // 2 + 4 - i] = fb[i]
+        h[33] = aa
+        h[35] = bb
+        return h
+
+    @wp.func
+    def curvature(q: Q, s: S, w: real, slope: E):
+        te, tf, m1e, m2e, m1f, m2f, _twist, inverse_e, inverse_f = material_frames(q, s)
+        i = real(1.0) / (real(1.0) + wp.dot(te, tf))
+        b = wp.cross(te, tf) * i
+        tt = (te + tf) * i
+        m3 = slope[2]
+        ge = m2e * slope[0] - m1e * slope[1]
+        gf = m2f * slope[0] - m1f * slope[1]
+        he = m1e * slope[0] + m2e * slope[1]
+        hf = m1f * slope[0] + m2f * slope[1]
+        g = ge + gf
+        k = wp.dot(b, g)
+        turn_e = wp.cross(tf, g) * i - tt * k
+        turn_f = -wp.cross(te, g) * i - tt * k
+        vv, uu, vu = turning_of(turn_e, turn_f, tt, g, i, k)
+        twisting = symmetric(tt, b) * m3
+        vu += wp.skew(tt) * (real(0.5) * m3) - twisting
+        # spins: of the frame of e with v and u, then of that of f
+        be = wp.dot(b, he)
+        bf = wp.dot(b, hf)
+        ve = tt * be - wp.cross(tf, he) * i
+        ue = tt * be + wp.cross(te, he) * i
+        vf = tt * bf - wp.cross(tf, hf) * i
+        uf = tt * bf + wp.cross(te, hf) * i
+        ee = -wp.dot(b, ge)
+        ff = -wp.dot(b, gf)
+        # the spin of frames transported in time
+        t0e = V(s[3], s[4], s[5])
+        t0f = V(s[9], s[10], s[11])
+        ye = t0e / (real(1.0) + wp.dot(t0e, te))
+        yf = t0f / (real(1.0) + wp.dot(t0f, tf))
+        ze = wp.cross(ye, te)
+        zf = wp.cross(yf, tf)
+        moment_e = -be - m3
+        moment_f = -bf + m3
+        vv += symmetric(ge, b) - twisting + symmetric(ze, ye * moment_e - ve * real(2.0) + ze * ee)
+        uu += symmetric(gf, b) - twisting + symmetric(zf, yf * moment_f - uf * real(2.0) + zf * ff)
+        vu -= wp.outer(ze, ue) + wp.outer(vf, zf)
+        return packed(
+            across(vv, te, te, inverse_e * inverse_e) + lengthening(te, turn_e + b * m3 - ze * moment_e, inverse_e),
+            across(vu, te, tf, inverse_e * inverse_f),
+            across(uu, tf, tf, inverse_f * inverse_f) + lengthening(tf, turn_f + b * m3 - zf * moment_f, inverse_f),
+            (ve - te * wp.dot(te, ve) - ze * ee) * inverse_e,
+            (vf - te * wp.dot(te, vf)) * inverse_e,
+            (ue - tf * wp.dot(tf, ue)) * inverse_f,
+            (uf - tf * wp.dot(tf, uf) - zf * ff) * inverse_f,
+            ee,
+            ff,
+        )
+
+    return strains, jacobian, None, curvature
 
 
 rod_curvature_twist = Measure(

@@ -40,7 +40,7 @@ def _functions(real):
     def tension(q: Q, w: real, slope: E):
         return V(w * slope[0], real(0.5) * w * slope[1], w * slope[2]), E()
 
-    return strains, jacobian, tension
+    return strains, jacobian, tension, None
 
 
 triangle_metric = Measure(

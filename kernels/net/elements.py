@@ -115,7 +115,7 @@ def term_kernels(term: Term, real):
     Q, S, _, _ = measure.types(real)
     n = len(measure.strains)
     P = wp.types.vector(density.parameter_size(n), real)
-    strains_of, jacobian_of, _ = measure.functions(real)
+    strains_of, jacobian_of, *_ = measure.functions(real)
     energy_of, slope_of, _ = density.functions(real, n)
     gather, spread = functions(term, real)
     slots_count, size = measure.slots, measure.size
@@ -239,7 +239,7 @@ def evaluate_kernel(term: Term, real, linear):
     V, F = wp.types.vector(3, real), wp.types.vector(3, linear)
     Q, S, E, _ = measure.types(real)
     n, tensions = len(measure.strains), measure.tensions
-    _, jacobian_of, tension_of = measure.functions(real)
+    _, jacobian_of, tension_of, _ = measure.functions(real)
     energy_of, slope_of, root_of = density.functions(real, n)
     gather, spread = functions(term, real)
     slots_count, coupled = measure.slots, density.coupled

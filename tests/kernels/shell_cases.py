@@ -79,7 +79,7 @@ def _kernels(name, real):
     )
     Q, S, P = _types(name, real)
     E = wp.types.vector(n, real)
-    strains_of, jacobian_of, tension_of = term.measure.functions(real)
+    strains_of, jacobian_of, tension_of, _ = term.measure.functions(real)
     energy_of, slope_of, root_of = term.density.functions(real, n)
 
     @wp.func

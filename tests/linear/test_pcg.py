@@ -44,15 +44,17 @@ def scene_of(name, closed, counts=(7, 6)) -> ddg.Scene:
 class Problem:
     """A Newton iteration of two rods in two worlds at a random state: dense matrices, and what the kernels made of them."""
 
-    def __init__(self, name, closed, device, preconditioner="chain", precision="float64"):
+    def __init__(self, name, closed, device, preconditioner="chain", precision="float64", scale=1.0, **options):
         random = np.random.default_rng(11)
         self.model = scene_of(name, closed).build(device, precision, worlds=2)
         (self.group,) = self.model.groups
         self.kind, self.device, self.count = self.group.kind, device, np.tile(self.group.host.count, 2)
-        newton = self.newton = PcgNewton(self.model, self.group, NewtonOptions(linear_rtol=1e-13), preconditioner)
+        newton = self.newton = PcgNewton(
+            self.model, self.group, NewtonOptions(linear_rtol=1e-13, **options), preconditioner
+        )
         state = self.model.state().groups[0]
         x = arrays.download(state.x)
-        arrays.assign(newton.x, x + 0.1 * random.normal(size=x.shape))
+        arrays.assign(newton.x, scale * x + 0.1 * random.normal(size=x.shape))
         arrays.assign(newton.target, x + 0.1 * random.normal(size=x.shape))
         if self.kind.twist:
             wp.copy(newton.frame, state.frame)

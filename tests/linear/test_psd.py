@@ -1,0 +1,200 @@
+"""Modes of the Newton matrix: the exact Hessian, made positive semi-definite or not, against Gauss-Newton."""
+
+import numpy as np
+import pytest
+import warp as wp
+from test_pcg import EVERY_CHAIN, Problem
+
+import ddg_warp as ddg
+from ddg_warp import arrays
+from ddg_warp.kernels import outcome
+from ddg_warp.linear.pcg import PcgNewton
+from ddg_warp.newton import ChainNewton, NewtonOptions
+from ddg_warp.tangent import Tangent
+
+CONVERGED = {"converged", "converged_to_rounding"}
+
+
+def elastic(problem: Problem, column: int) -> np.ndarray:
+    """The matrix of a Newton iteration on free dofs, without inertia."""
+    host, kind, n, rod = problem.group.host, problem.kind, int(problem.count[column]), column % 2
+    c = float(arrays.download(problem.newton.coefficient)[column])
+    inertia = np.repeat(c * host.mass[:n, rod, None], kind.block, 1)
+    if kind.twist:
+        inertia[:, kind.dim] = c * host.rotary[:n, rod]
+    free = free_dofs(problem, column)
+    return (problem.blocks(column) - np.diag(inertia.ravel()))[np.ix_(free, free)]
+
+
+def free_dofs(problem: Problem, column: int) -> np.ndarray:
+    bits = problem.group.host.fixed[: problem.count[column], column % 2, None] >> np.arange(problem.kind.block)
+    return (bits & 1 == 0).ravel()
+
+
+def exact(problem: Problem) -> list[np.ndarray]:
+    """The same from the reverse mode of the gradient, of every rod."""
+    kind, state = problem.kind, problem.model.state()
+    data = state.groups[0]
+    arrays.assign(data.x, np.ascontiguousarray(np.moveaxis(problem.before[..., : kind.dim], 0, 1)))
+    if kind.twist:
+        arrays.assign(data.theta, np.ascontiguousarray(problem.before[..., kind.dim].T))
+    full, size = Tangent(problem.model).hessian(state).toarray(), problem.group.nodes * kind.block
+    result = []
+    for column in range(len(problem.count)):
+        own = column * size + np.flatnonzero(free_dofs(problem, column))
+        result.append(full[np.ix_(own, own)])
+    return result
+
+
+@EVERY_CHAIN
+def test_none_is_the_exact_hessian(device, name, closed):
+    """Assembled with analytic second derivatives; frames lag behind, edges are bent, twisted, stretched and compressed."""
+    problem = Problem(name, closed, device, psd="none")
+    gauss_newton = Problem(name, closed, device)
+    for column, expected in enumerate(exact(problem)):
+        np.testing.assert_allclose(elastic(problem, column), expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+        assert np.abs(elastic(gauss_newton, column) - expected).max() > 0.01 * np.abs(expected).max()
+
+
+@EVERY_CHAIN
+def test_project_is_positive_semi_definite(device, name, closed):
+    """At 0.6 of the rest length, bent, where the exact Hessian is not; the projected one lies above it, element by element."""
+    problem = Problem(name, closed, device, psd="project", scale=0.6)
+    for column, hessian in enumerate(exact(problem)):
+        size, projected = np.abs(hessian).max(), elastic(problem, column)
+        assert np.linalg.eigvalsh(hessian)[0] < -1e-2 * size
+        assert np.linalg.eigvalsh(projected)[0] > -1e-14 * size
+        assert np.linalg.eigvalsh(projected - hessian)[0] > -1e-14 * size
+
+
+def helix(nodes=48, turns=6, closed=False, young=1e7) -> ddg.Scene:
+    """A rod that is curled at rest, on a clamp; closed, a wavy ring that would be straight."""
+    s = np.arange(nodes) / (nodes - 1 + closed)
+    a = 2.0 * np.pi * s
+    if closed:
+        points = 0.3 * np.stack([np.cos(a), np.sin(a), 0.3 * np.sin(3.0 * a)], -1)
+    else:
+        points = np.stack([0.03 * np.cos(turns * a), 0.03 * np.sin(turns * a), -0.3 * s], -1)
+    scene, natural = ddg.Scene(), "straight" if closed else "shape"
+    material = ddg.Material(young=young, poisson=0.4, density=1300.0)
+    rod = scene.add_rod(points, section=ddg.Circle(2e-3), material=material, natural=natural, closed=closed)
+    scene.clamp(rod, [0])
+    return scene
+
+
+def bent(solver, device, psd: str):
+    """A solver on a helix whose inertia pulls it away by 0.2 of its length, and twists it by up to 1 rad."""
+    s = np.linspace(0.0, 1.0, 16)
+    points = np.stack([0.3 * np.cos(2.0 * np.pi * s), 0.3 * np.sin(2.0 * np.pi * s), -0.5 * s], -1)
+    scene = ddg.Scene()
+    section = ddg.Stiffness(EA=5.0, EI1=0.05, EI2=0.03, GJ=0.04, mass_per_length=0.1, rotary_inertia=1e-3)
+    scene.clamp(scene.add_rod(points, section=section, natural="shape"), [0])
+    model = scene.build(device, "float64")
+    (group,) = model.groups
+    newton = solver(model, group, NewtonOptions(psd=psd, rtol=1e-13, linear_rtol=1e-14))
+    data = model.state().groups[0]
+    x = arrays.download(data.x)
+    wp.copy(newton.frame, data.frame)
+    arrays.assign(newton.x, x)
+    arrays.assign(newton.target, x + 0.2 * s[:, None, None] ** 2 * np.array([1.0, 0.5, 0.7]))
+    arrays.assign(newton.target_angle, np.ascontiguousarray(s[:, None]))
+    newton.coefficient.fill_(500.0)
+    newton.active.fill_(1)
+    return newton, data.last
+
+
+def errors(newton, last) -> list[float]:
+    """sqrt(r . H^-1 r), the distance to the solution in the energy norm as Newton sees it, of every iterate."""
+    found = []
+    while not newton.status.numpy()[0]:
+        newton.iterate(last)
+        found.append(float(newton.decrement.numpy()[0]) ** 0.5)
+    assert newton.status.numpy()[0] in (outcome.CONVERGED, outcome.CONVERGED_TO_ROUNDING)
+    return found[:-1]
+
+
+def order(sizes: list[float]) -> float:
+    """p of e_k+1 = C e_k^p, from the last three errors above rounding."""
+    a, b, c = np.log([e for e in sizes if e > 1e-12][-3:])
+    return (c - b) / (b - a)
+
+
+@pytest.mark.parametrize("solver", [ChainNewton, PcgNewton])
+@pytest.mark.parametrize("psd", ["progressive", "none"])
+def test_exact_newton_converges_quadratically(device, solver, psd):
+    sizes, plain = errors(*bent(solver, device, psd)), errors(*bent(solver, device, "gauss_newton"))
+    print(psd, order(sizes), sizes, order(plain), plain)
+    assert order(sizes) > 1.8
+    assert order(plain) < 1.3
+    assert len(sizes) < 0.5 * len(plain)
+
+
+def run(scene, device, steps, dt, precision="float64", start=None, **options):
+    """Points after some steps, and the statistics."""
+    model = scene.build(device, precision)
+    integrator, state = ddg.Integrator(model, **options), model.state(points=start)
+    for _ in range(steps):
+        state = integrator.step(state, dt)
+    integrator.check(state)
+    return state.points(), integrator.statistics()
+
+
+@pytest.mark.parametrize("precision", ["float64", "mixed"])
+def test_fewer_iterations_on_a_curl(device, precision):
+    """A tenth, where Gauss-Newton runs into its limit of 100 and needs shorter steps."""
+    _, plain = run(helix(64, 10), device, 60, 1.0 / 120.0, precision, psd="gauss_newton")
+    assert plain["outcomes"]["max_iterations"] > 0
+    for linear in ("sweep", "chain"):
+        _, found = run(helix(64, 10), device, 60, 1.0 / 120.0, precision, psd="progressive", linear=linear)
+        assert found["newton_iterations"]["mean"] < 0.2 * plain["newton_iterations"]["mean"]
+        assert found["newton_iterations"]["max"] < 10
+        assert set(found["outcomes"]) <= CONVERGED and found["retries"] == 0
+
+
+@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("psd", ["project", "progressive", "none"])
+def test_every_mode_has_the_same_solution(device, psd, closed):
+    """Residuals stop at rtol of the load, which leaves distances far below a thousandth of the radius."""
+    scene = helix(24, 1.5, closed, young=1e8)
+    linears = ("auto",) if closed else ("sweep", "chain")
+    dt = 0.003 if closed else 0.01  # a ring set free has other branches to fall to
+    expected, _ = run(scene, device, 5, dt, psd="gauss_newton", rtol=1e-12)
+    assert np.abs(expected - scene.batches[0].points).max() > 2e-3
+    for linear in linears:
+        found, statistics = run(scene, device, 5, dt, psd=psd, linear=linear, rtol=1e-12, linear_rtol=1e-12)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+        assert CONVERGED & set(statistics["outcomes"])
+
+
+def squeezed(closed: bool, share: float) -> tuple[ddg.Scene, np.ndarray]:
+    """A rod and points at a share of its length, bent a little: compression far beyond what buckles it."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    s = np.arange(24) / (23 + closed)
+    points = np.stack([s, 0.0 * s, 0.0 * s], -1)
+    if closed:
+        points = np.stack([np.cos(2.0 * np.pi * s), np.sin(2.0 * np.pi * s), 0.0 * s], -1) / (2.0 * np.pi)
+    section = ddg.Stiffness(EA=100.0, EI1=1e-3, GJ=1e-3, mass_per_length=0.1)
+    rod = scene.add_rod(points, section=section, natural="straight", closed=closed)
+    if not closed:
+        scene.fix(rod, [0, 23])
+    return scene, share * points + 1e-3 * np.random.default_rng(4).normal(size=points.shape)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("share", [0.998, 0.8])
+def test_progressive_holds_where_the_exact_hessian_is_indefinite(device, closed, share):
+    """It needs no shorter steps, not even where Gauss-Newton is too slow to be of use; `none` says why by name."""
+    (scene, start), dt = squeezed(closed, share), 0.02
+    if share == 0.998:
+        _, plain = run(scene, device, 10, dt, start=start)
+        assert set(plain["outcomes"]) <= CONVERGED
+    else:
+        with pytest.raises(ddg.SolverError, match="max_iterations"):
+            run(scene, device, 10, dt, start=start)
+    for linear in ("auto", "chain"):
+        points, found = run(scene, device, 10, dt, start=start, psd="progressive", linear=linear)
+        assert set(found["outcomes"]) <= CONVERGED and found["retries"] == 0
+        assert np.isfinite(points).all()
+        with pytest.raises(ddg.SolverError) as caught:
+            run(scene, device, 2, dt, start=start, psd="none", linear=linear, retry_limit=0)
+        assert caught.value.outcome == "indefinite"
