@@ -146,6 +146,13 @@ class ChainTangent:
         """Mean rest length of edges [m]."""
         return float((self.group.host.length / np.maximum(1, self.group.host.own - 1)).mean())
 
+    def point_dofs(self) -> tuple[np.ndarray, list[int], np.ndarray]:
+        """Rows of `State.points`, axes, and the dofs (rows, axes) of the first world."""
+        group, kind = self.group, self.group.kind
+        k, column, rows = self.model.places(group)
+        dofs = ((column * group.nodes + k) * kind.block)[:, None] + np.arange(kind.dim)
+        return rows, [0, 2] if kind.dim == 2 else [0, 1, 2], dofs
+
     def where(self, dof: int) -> str:
         """Name of a dof's place."""
         column, k = divmod(dof // self.group.kind.block, self.group.nodes)

@@ -132,6 +132,11 @@ class NetTangent:
         """Mean rest length of edges [m]."""
         return self._edge_length
 
+    def point_dofs(self) -> tuple[np.ndarray, list[int], np.ndarray]:
+        """Rows of `State.points`, axes, and the dofs (rows, axes) of the first world."""
+        rows, blocks = self.model.net_rows
+        return rows, [0, 1, 2], 3 * blocks[:, None] + np.arange(3)
+
     def where(self, dof: int) -> str:
         """Name of a dof's place."""
         block = dof // 3 % self.host.blocks
