@@ -173,7 +173,7 @@ class ChainTangent:
         out = self._blocks(moved)
         for column in range(group.columns):
             n = group.host.count[column % group.rods]
-            bend = _turn_excess(x[column, :n], dx[column, :n], kind.closed)
+            bend = turn_excess(x[column, :n], dx[column, :n], kind.closed)
             for d in range(kind.dim):
                 anchors = np.flatnonzero(held[column, :n, d])
                 if not anchors.size:
@@ -243,7 +243,7 @@ def _couple_stiffness(e: np.ndarray, couple: np.ndarray) -> tuple[np.ndarray, np
     return (2.0 * np.outer(cross @ e, e) / square - cross) / square, about
 
 
-def _turn_excess(x: np.ndarray, dx: np.ndarray, closed: bool) -> np.ndarray:
+def turn_excess(x: np.ndarray, dx: np.ndarray, closed: bool) -> np.ndarray:
     """Positions of nodes by turned edges minus those by straight steps (n, dim), zero at the first node."""
     e, de = (np.roll(v, -1, axis=0) - v if closed else np.diff(v, axis=0) for v in (x, dx))
     length = np.linalg.norm(e, axis=1, keepdims=True)

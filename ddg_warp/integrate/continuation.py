@@ -46,8 +46,8 @@ class ContinuationOptions:
     max_step: float = 0.1
     min_step: float = 1e-7
     load_scale: float = 1.0
-    iterations: int = 4
-    max_iterations: int = 12
+    iterations: int = 6
+    max_iterations: int = 15
     rotation_cap: float = 0.3
     tolerance: float = 1e-9
     rtol: float = 1e-10
@@ -371,6 +371,7 @@ class Continuation:
         try:
             if here.direction[-1] * there.direction[-1] < 0.0:
                 limit = self._limit_point(here, length)
+                limit.negative = min(here.negative, there.negative)
                 fold = limit.arclength - here.arclength
                 _, _, rate, *_ = self._system(limit.state, self.tangent.dofs(limit.state), limit.load)
                 sense = np.sign(rate @ limit.direction[:-1])
@@ -416,6 +417,7 @@ class Continuation:
         root = low + (high - low) * (a / (a - b) if a * b < 0.0 else 0.5)
         point = self._at(here, root)
         point.kind = BIFURCATION
+        point.negative = min(count, after) + (jump if root > fold else 0)
         point.mode = self._critical(point)[1]
         return point, high, after
 

@@ -1,11 +1,11 @@
 """Paths of equilibria: what a continuation leaves behind, and what it may be told to watch."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from ddg_warp.errors import SceneError
-from ddg_warp.state import State
 
 REGULAR, LIMIT_POINT, BIFURCATION = "regular", "limit point", "bifurcation"
 
@@ -51,14 +51,15 @@ class Point:
         load: load parameter.
         arclength: along the path from its start, in the metric of the continuation.
         values: watched displacements by name [m].
-        negative: number of negative eigenvalues of the tangent stiffness: 0 where the equilibrium is stable.
+        negative: number of negative eigenvalues of the tangent stiffness: 0 where the equilibrium is stable. At
+            a limit point or bifurcation without the one that vanishes.
         kind: "regular", "limit point" (the load is stationary) or "bifurcation" (another path crosses).
         direction: unit tangent of the path: dofs (size,) and load parameter at the end.
         mode: of a bifurcation, the critical eigenvector (size,) of unit length in the metric; None elsewhere.
         iterations: Newton iterations it took.
     """
 
-    state: State
+    state: Any
     load: float
     arclength: float
     values: dict[str, float]
