@@ -65,7 +65,7 @@ class ChainTangent:
         force[..., : kind.dim] = np.tile(dead.transpose(1, 0, 2), (group.worlds, 1, 1)) * factor
         if kind.twist:
             force[..., kind.dim] = np.tile(host.load_angle.T, (group.worlds, 1)) * factor
-        x = self._blocks(q)
+        x = self.blocks(q)
         for load, columns in self._timed():
             scale = load.at(factor, factor)
             np.add.at(force, (columns, load.k, slice(0, kind.dim)), scale * load.force)
@@ -88,7 +88,7 @@ class ChainTangent:
             values.append(block.ravel())
 
         group, kind = self.group, self.group.kind
-        x = self._blocks(q)
+        x = self.blocks(q)
         for load, columns in self._timed():
             for column, k in zip(columns, load.k, strict=True) if load.couple.any() else ():
                 scale = load.at(factor, factor)
@@ -105,7 +105,8 @@ class ChainTangent:
         data = (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols)))
         return sparse.csc_matrix(data, shape=(self.size, self.size))
 
-    def _blocks(self, q: np.ndarray) -> np.ndarray:
+    def blocks(self, q: np.ndarray) -> np.ndarray:
+        """Dofs (size,) as (column, node, dofs of a node)."""
         return q.reshape(self.group.columns, self.group.nodes, self.group.kind.block)
 
     def _timed(self):
@@ -124,7 +125,7 @@ class ChainTangent:
 
     def assign(self, state, q: np.ndarray) -> None:
         kind, data = self.group.kind, self.data(state)
-        values = self._blocks(q)
+        values = self.blocks(q)
         arrays.assign(data.x, np.ascontiguousarray(values[..., : kind.dim].transpose(1, 0, 2)))
         if kind.twist:
             arrays.assign(data.theta, np.ascontiguousarray(values[..., kind.dim].T))
@@ -168,9 +169,9 @@ class ChainTangent:
         """
         moved = q + step
         kind, group = self.group.kind, self.group
-        x, dx = (self._blocks(v)[..., : kind.dim] for v in (q, step))
-        held = ~self._blocks(self.free)[..., : kind.dim]
-        out = self._blocks(moved)
+        x, dx = (self.blocks(v)[..., : kind.dim] for v in (q, step))
+        held = ~self.blocks(self.free)[..., : kind.dim]
+        out = self.blocks(moved)
         for column in range(group.columns):
             n = group.host.count[column % group.rods]
             bend = turn_excess(x[column, :n], dx[column, :n], kind.closed)
