@@ -17,17 +17,18 @@ SOURCE = "second variation of Kirchhoff rods, spectral Ritz; 1.088 (Argyris 1979
 CRITICAL = {1: 1.086757492, -1: -0.6802353021}
 
 
-def build(n: int = 20, sense: int = 1) -> ddg.Scene:
+def build(n: int = 20, sense: int = 1, in_plane: float = 1.0) -> ddg.Scene:
     """The frame in the plane of x and z: one leg along x from the clamp, the other down along z.
 
     Args:
         n: edges of each leg
         sense: 1 pulls the clamped leg, -1 presses it
+        in_plane: bending stiffness in the plane over that of the strip; the reference is rigid there
     """
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     t = np.linspace(0.0, LEG, n + 1)[:, None]
     # The first director stands across the plane, and EI2 is of curvature about it.
-    weak, strong = E * WIDTH * THICKNESS**3 / 12.0, E * WIDTH**3 * THICKNESS / 12.0
+    weak, strong = E * WIDTH * THICKNESS**3 / 12.0, in_plane * E * WIDTH**3 * THICKNESS / 12.0
     torsion = E / (2.0 * (1.0 + NU)) * WIDTH * THICKNESS**3 / 3.0
     section = ddg.Stiffness(EA=E * WIDTH * THICKNESS, EI1=weak, EI2=strong, GJ=torsion, radius=2.0)
     across = (0.0, 1.0, 0.0)
