@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 from scipy import sparse
 
+from ddg_warp.chain_tangent import turn_excess
 from ddg_warp.kernels.net import elements
 
 
@@ -25,6 +26,10 @@ class NetTangent:
             self._ends = np.concatenate([s.slots[:2].T for s in host.sets])
         length = np.linalg.norm(np.diff(host.rest[self._ends], axis=1)[:, 0], axis=1)
         self._edge_length = float(length.mean())
+        self._anchored = host.fixed[: host.nodes].copy()
+        for shell in host.shells:
+            self._anchored[shell.nodes] = True
+        self._order = _outwards(host.rods, self._anchored.any(1))
 
     def energies(self, state):
         """(term's name, energies of its elements)."""
@@ -101,7 +106,27 @@ class NetTangent:
         state.net.q.assign(q.reshape(-1, 3))
 
     def retract(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
-        return q + step
+        """q moved along `step`, with edges of rods turned instead of sheared; see `ChainTangent.retract`.
+
+        Rods are taken from held nodes outwards: where one meets others that are placed already, or a shell, it is anchored there.
+        """
+        moved = q + step
+        x, dx, out = (v.reshape(self.net.worlds, -1, 3) for v in (q, step, moved))
+        for world in range(self.net.worlds):
+            excess = np.zeros((self.host.nodes, 3))
+            placed = self._anchored.copy()
+            for rod in self._order:
+                nodes = rod.all_nodes
+                bend = turn_excess(x[world][nodes], dx[world][nodes], rod.piece.kind.closed)
+                for d in range(3):
+                    anchors = np.flatnonzero(placed[nodes, d])
+                    if not anchors.size:
+                        anchors = np.array([0])
+                    miss = np.interp(np.arange(len(nodes)), anchors, bend[anchors, d] - excess[nodes[anchors], d])
+                    excess[nodes, d] = bend[:, d] - miss
+                placed[nodes] = True
+            out[world][: self.host.nodes] += np.where(self.host.fixed[: self.host.nodes], 0.0, excess)
+        return moved
 
     def move_supports(self, state, before: float, at: float) -> None:
         """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""
@@ -132,6 +157,11 @@ class NetTangent:
         """Mean rest length of edges [m]."""
         return self._edge_length
 
+    def point_dofs(self) -> tuple[np.ndarray, list[int], np.ndarray]:
+        """Rows of `State.points`, axes, and the dofs (rows, axes) of the first world."""
+        rows, blocks = self.model.net_rows
+        return rows, [0, 1, 2], 3 * blocks[:, None] + np.arange(3)
+
     def where(self, dof: int) -> str:
         """Name of a dof's place."""
         block = dof // 3 % self.host.blocks
@@ -154,6 +184,17 @@ class NetTangent:
             [out],
             device=self.net.device,
         )
+
+
+def _outwards(rods, anchored: np.ndarray) -> list:
+    """Rods in an order in which each meets a held node, or one before it, if that is possible."""
+    reached, order, left = anchored.copy(), [], list(rods)
+    while left:
+        rod = next((rod for rod in left if reached[rod.all_nodes].any()), left[0])
+        left = [other for other in left if other is not rod]
+        order.append(rod)
+        reached[rod.all_nodes] = True
+    return order
 
 
 def _tiled(slots: np.ndarray, blocks: int, worlds: int) -> np.ndarray:
