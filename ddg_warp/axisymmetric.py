@@ -173,17 +173,11 @@ def _curvature(shell: NetMeridian, edges: np.ndarray) -> np.ndarray:
     result[1:-1, 0] = _turn(edges[:-1], edges[1:]) / (0.5 * (length[1:] + length[:-1]))
     result[1:-1, 1] = 0.5 * (sines[1:] + sines[:-1]) / R[1:-1]
     for end, (node, sign) in enumerate(((0, 1.0), (-1, -1.0))):
-        along = sign * _turn(shell.tangent[end], edges[node]) * 2.0 / length[node]
-        result[node, 0] = along
-        result[node, 1] = (
-            {
-                "pole": along,
-                "clamped": shell.tangent[end, 1] / R[node],
-                "free": sines[node] / R[node],
-            }[shell.kind[end]]
-            if R[node]
-            else along
-        )
+        result[node] = sign * _turn(shell.tangent[end], edges[node]) * 2.0 / length[node]
+        if shell.kind[end] == "clamped":
+            result[node, 1] = shell.tangent[end, 1] / R[node]
+        elif shell.kind[end] == "free":
+            result[node, 1] = sines[node] / shell.radius[node]
     return result
 
 
@@ -236,7 +230,7 @@ def element_sets(shell: NetMeridian) -> list[ElementSet]:
             data = [*tangent, along, 0.0, 0.0]
             rest[1] -= tangent[1] / R[node]
         else:  # the curvature along the meridian is such that there is no moment
-            data = [0.0, 0.0, 0.0, 0.0, 1.0 / R[node]]
+            data = [0.0, 0.0, 0.0, 0.0, 1.0 / shell.radius[edge]]
             rest[0], D, poisson = 0.0, D * (1.0 - nu**2), 0.0
         area = shell.halves[edge, :1] if end == 0 else shell.halves[edge, 1:]
         nodes = np.array([[edge, edge + 1]])

@@ -18,14 +18,14 @@ SOURCE = "Marguerre and Reissner's equations by collocation (Budiansky 1959, Hua
 
 # lambda: largest and, beyond it, smallest p / p_cl at nu = 0.3. With x = lambda r / a, b and f rotation and stress function,
 # x (x b')' - b = x f (b - x) - 2 x^3 p / p_cl, x (x f')' - f = x (x b - b^2 / 2); b = f = 0 at 0, b = x f' - nu f = 0 at lambda.
-LIMITS = {4: (0.5637254, 0.4244725), 5: (0.6159879, 0.2839929)}
+LIMITS = {4: (0.5637254, 0.4244725), 5: (0.6159879, 0.2839929), 6: (0.9720065, 0.2206402)}
 
 
 def build(shallowness: int = 5, n: int = 80) -> ddg.Scene:
     """The dome, its crown at height R.
 
     Args:
-        shallowness: lambda, 4 or 5
+        shallowness: lambda: 4, 5 or 6
         n: edges of the meridian
     """
     if shallowness not in LIMITS:

@@ -11,7 +11,8 @@ along the meridian is, so that a uniform stretch of the surface changes neither)
                             data: tx, tz, c1, c2, c3.
                             A pole, where the meridian goes on as its mirror image across the axis and the surface is
                             curved alike in all directions: c1 = c2 = 2 / l, (tx, tz) = (1, 0). A clamped rim: c1 = 2 / l
-                            alone. A rim that is free to turn, without moment along the meridian: c3 = 1 / R, all else zero.
+                            alone. A rim that is free to turn, without moment along the meridian: c3 = 1 / R with R in the middle of
+                            the edge, all else zero.
 
 Derivatives: K' = 1 + K^2 / 4 in phi, phi' = (-z, x) / (x^2 + z^2), sin(phi)' = cos(phi) phi'.
 """
