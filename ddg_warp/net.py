@@ -230,7 +230,7 @@ class _Builder:
         shells, mesh_edges = [], 0
         for (surface, numbers), shell in zip(self.shells, scene.shells, strict=True):
             kinds = self._kinds(surface, len(shells))
-            turning = shell.bending == "midedge_dof"
+            turning = shell.bending in shell_terms.TURNING
             first = nodes + self.rod_edges + mesh_edges
             angle = first + np.arange(len(surface.edges)) if turning else np.full(len(surface.edges), -1)
             mesh_edges += len(surface.edges) if turning else 0
@@ -416,8 +416,8 @@ def _shell_sets(net: Net, scene) -> list[NetSet]:
     for shell, description in zip(net.shells, scene.shells, strict=True):
         for elements in shell_terms.shell_elements(shell.surface, shell.plate, shell.kinds, description.bending):
             sets.append(_bound(elements, shell))
-        if description.bending == "midedge_dof":
-            net.fixed[shell.edges[~shell.kinds.turning], 0] = True
+        if description.bending in shell_terms.TURNING:
+            net.fixed[shell.edges[~shell_terms.turning(shell.kinds, description.bending)], 0] = True
     return sets
 
 

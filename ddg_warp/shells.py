@@ -35,6 +35,7 @@ from ddg_warp.shell_geometry import (
 )
 
 MODELS = ("midedge_dof", "midedge_boundary", "midedge", "hinge", "isometric")
+TURNING = ("midedge_dof", "midedge_boundary")  # models whose mesh edges have an angle
 
 
 @dataclass(frozen=True)

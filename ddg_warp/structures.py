@@ -107,7 +107,7 @@ class Structures:
             triangles: corners (T, 3), neighbours oriented alike; normals follow the right hand.
             thickness: one number or one a triangle [m].
             material: `Material`; its density gives the mass, its viscosity the strain-rate damping.
-            bending: "midedge_dof", "midedge", "hinge" or "isometric"; see `ddg_warp.shells`.
+            bending: "midedge_dof", "midedge_boundary", "midedge", "hinge" or "isometric"; see `ddg_warp.shells`.
             rest: "shape" takes metric and curvature at rest from the points, "flat" the metric alone; or two arrays
                 (abar (T, 3) [m^2], bbar (T, 3) [m]), first and second fundamental form in the basis of the first two edges.
             name: shown in reports and output.

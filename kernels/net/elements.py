@@ -233,7 +233,8 @@ def evaluate_kernel(term: Term, real, linear):
 
     Factor rows are vectors [strain * slots + slot][element]; `tension_out` holds the scalars of the geometric stiffness, made
     positive semi-definite (an edge under compression, a triangle by the eigenvalues of its two-by-two stress, leaves out the
-    negative part). Energies go to the half of `energy_out` that the line search does not hold.
+    negative part). Energies go to the half of `energy_out` that the line search does not hold. `stiffness_out` is the largest
+    that a strain has against moving the element.
     """
     measure, density = term.measure, term.density
     V, F = wp.types.vector(3, real), wp.types.vector(3, linear)
@@ -281,6 +282,7 @@ def evaluate_kernel(term: Term, real, linear):
         tension_out: wp.array2d(dtype=linear),
         gradient_out: wp.array2d(dtype=V),
         energy_out: wp.array2d(dtype=real),
+        stiffness_out: wp.array(dtype=linear),
     ):
         tid = wp.tid()
         world = tid / elements
@@ -307,16 +309,20 @@ def evaluate_kernel(term: Term, real, linear):
                 tension_out[i, tid] = linear(c3[i])
         root = root_of(e, p, shift)
         weight = wp.sqrt(w)
+        stiffest = real(0.0)
         if wp.static(coupled):
             rows = root * jacobian
             for m in range(wp.static(n)):
+                stiffest = wp.max(stiffest, w * wp.dot(rows[m], rows[m]))
                 for i in range(wp.static(slots_count)):
                     v = spread(rows[m] * weight, i)
                     factor_out[wp.static(m * slots_count) + i, tid] = F(linear(v[0]), linear(v[1]), linear(v[2]))
         else:
             for m in range(wp.static(n)):
+                stiffest = wp.max(stiffest, w * root[m] * root[m] * wp.dot(jacobian[m], jacobian[m]))
                 for i in range(wp.static(slots_count)):
                     u = spread(jacobian[m] * (root[m] * weight), i)
                     factor_out[wp.static(m * slots_count) + i, tid] = F(linear(u[0]), linear(u[1]), linear(u[2]))
+        stiffness_out[tid] = linear(stiffest)
 
     return evaluate
