@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.kernels.net import elements, krylov, newton, system
-from ddg_warp.net_system import NetSystem, Sums, assembly_kernels
+from ddg_warp.net_system import Assembly, NetSystem, Sums
 from ddg_warp.newton import NewtonOptions
 
 LOOSEST = 0.1  # largest reduction of the residual that a direction is solved to (Eisenstat and Walker's forcing term)
@@ -64,7 +64,7 @@ class NetNewton:
         self.arm = float(lengths.mean())
         self._evaluate = [elements.evaluate_kernel(part.term, self.real, self.linear) for part in net.sets]
         self._outer, self._collect, self._settle = system.balance_kernels(self.real, self.linear)
-        self._assemble = assembly_kernels(net, self.real, self.linear)
+        self._assembly = Assembly(net, self.system, self.parts, self.real, self.linear)
         self._judge, self._measure, self._rotate, self._take, self._move = newton.search_kernels(self.real, self.linear)
         self._invert, self._start, self._begin, *self._cycle = krylov.solver_kernels(self.linear)
         self._limit = max(200, 10 * int(np.sqrt(blocks)) * 10)
@@ -85,7 +85,7 @@ class NetNewton:
         """Kernels to load before a capture."""
         own = [self._outer, self._collect, self._settle, self._judge, self._measure, self._rotate, self._take]
         cycle = [self._move, self._invert, self._start, self._begin, *self._cycle]
-        return [*own, *cycle, *self._evaluate, *self._assemble]
+        return [*own, *cycle, *self._evaluate, *self._assembly.kernels]
 
     @property
     def tiled_kernels(self) -> list:
@@ -166,24 +166,7 @@ class NetNewton:
 
     def assemble(self) -> None:
         """H of the worlds that want a direction."""
-        table, all_positions = self.system, self.worlds * self.system.positions
-        wp.launch(
-            self._assemble[0],
-            all_positions,
-            [self.mass, self.coefficient, table.rows, table.columns, self.wanted, table.positions],
-            [self.matrix],
-            device=self.device,
-        )
-        for kernel, part, own, (starts, items) in zip(
-            self._assemble[1:], self.net.sets, self.parts, table.adds, strict=True
-        ):
-            wp.launch(
-                kernel,
-                all_positions,
-                [own["factor"], own["tension"], starts, items, part.elements, self.wanted, table.positions],
-                [self.matrix],
-                device=self.device,
-            )
+        self._assembly(self.mass, self.coefficient, self.wanted, self.matrix)
 
     def direct(self) -> None:
         """Directions by conjugate gradients."""

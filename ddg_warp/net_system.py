@@ -81,6 +81,37 @@ class Sums:
             wp.launch_tiled(kernel, dim=grid, inputs=inputs, block_dim=krylov.THREADS, device=self.device)
 
 
-def assembly_kernels(net, real, linear) -> list:
-    """Kernels that sum H: inertia, then every set."""
-    return [system.inertia_kernel(real, linear)] + [system.assemble_kernel(part.term, linear) for part in net.sets]
+class Assembly:
+    """Sums H from what the elements of all sets write, `system.SETS` sets a launch.
+
+    Args:
+        written: of each set, the arrays "factor" and "tension".
+    """
+
+    def __init__(self, net, table: NetSystem, written: list[dict], real, linear):
+        self.net, self.table, self.kernels, self._own = net, table, [], []
+        Contributions = system.contributions(linear)
+        for first in range(0, len(net.sets), system.SETS):
+            sets = net.sets[first : first + system.SETS]
+            terms = tuple(part.term for part in sets)
+            self.kernels.append(system.assemble_kernel(terms, real, linear, first == 0))
+            own = []
+            for i in range(first, first + len(sets)):
+                data = Contributions()
+                data.factor, data.tension = written[i]["factor"], written[i]["tension"]
+                data.starts, data.items = table.adds[i]
+                data.elements = net.sets[i].elements
+                own.append(data)
+            self._own.append(own + [own[-1]] * (system.SETS - len(own)))
+
+    def __call__(self, mass, coefficient, wanted, matrix: wp.array) -> None:
+        """Write H (9, positions of all worlds) of the worlds that want it."""
+        table = self.table
+        for kernel, own in zip(self.kernels, self._own, strict=True):
+            wp.launch(
+                kernel,
+                self.net.worlds * table.positions,
+                [mass, coefficient, table.rows, table.columns, wanted, table.positions, *own],
+                [matrix],
+                device=self.net.device,
+            )

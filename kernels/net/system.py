@@ -160,42 +160,29 @@ def balance_kernels(real, linear):
 
 
 @cache
-def inertia_kernel(real, linear):
-    """Starts the blocks of H: inertia on the diagonal, zero elsewhere."""
-    V = wp.types.vector(3, real)
+def contributions(linear):
+    """What a set adds to H: its factor rows, geometric stiffness, and the items of each position."""
+    H = wp.types.vector(3, linear)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def inertia(
-        mass: wp.array(dtype=V),
-        coefficient: wp.array(dtype=real),
-        rows: wp.array(dtype=int),
-        columns: wp.array(dtype=int),
-        wanted: wp.array(dtype=int),
-        positions: int,
-        matrix_out: wp.array2d(dtype=linear),
-    ):
-        p = wp.tid()
-        w = p / positions
-        if wanted[w] == 0:
-            return
-        at = p - w * positions
-        row = rows[at]
-        diagonal = V()
-        if row == columns[at] and row >= 0:
-            diagonal = mass[row] * coefficient[w]
-        for c in range(9):
-            matrix_out[c, p] = linear(0.0)
-        for d in range(3):
-            matrix_out[4 * d, p] = linear(diagonal[d])
+    @wp.struct
+    class Contributions:
+        factor: wp.array2d(dtype=H)
+        tension: wp.array2d(dtype=linear)
+        starts: wp.array(dtype=int)
+        items: wp.array(dtype=int)
+        elements: int
 
-    return inertia
+    return Contributions
 
 
 @cache
-def assemble_kernel(term: Term, linear):
-    """Adds F^T F and the geometric stiffness of one set; an item is (element * slots + row's slot) * slots + column's slot."""
+def sum_function(term: Term, linear):
+    """add(contributions, position, world): F^T F and geometric stiffness of one set.
+
+    An item is (element * slots + row's slot) * slots + column's slot.
+    """
     measure = term.measure
-    H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
+    M, Contributions = wp.types.matrix((3, 3), linear), contributions(linear)
     n, slots, tensions, edges = len(measure.strains), measure.slots, measure.tensions, measure.edges
 
     @wp.func
@@ -210,30 +197,62 @@ def assemble_kernel(term: Term, linear):
 
     @wp.func
     def geometric(tension: wp.array2d(dtype=linear), e: int, a: int, b: int):
-        c = linear(0.0)
-        if wp.static(tensions == 1):
-            c = (
-                tension[0, e]
-                * weight(wp.static(edges[0][0]), wp.static(edges[0][1]), a)
-                * weight(wp.static(edges[0][0]), wp.static(edges[0][1]), b)
-            )
+        a1 = weight(wp.static(edges[0][0]), wp.static(edges[0][1]), a)
+        b1 = weight(wp.static(edges[0][0]), wp.static(edges[0][1]), b)
+        c = tension[0, e] * a1 * b1
         if wp.static(tensions == 3):
-            a1 = weight(wp.static(edges[0][0]), wp.static(edges[0][1]), a)
             a2 = weight(wp.static(edges[-1][0]), wp.static(edges[-1][1]), a)
-            b1 = weight(wp.static(edges[0][0]), wp.static(edges[0][1]), b)
             b2 = weight(wp.static(edges[-1][0]), wp.static(edges[-1][1]), b)
-            c = tension[0, e] * a1 * b1 + tension[1, e] * (a1 * b2 + a2 * b1) + tension[2, e] * a2 * b2
+            c += tension[1, e] * (a1 * b2 + a2 * b1) + tension[2, e] * a2 * b2
         return c
+
+    @wp.func
+    def add(own: Contributions, at: int, w: int):
+        m = M()
+        for index in range(own.starts[at], own.starts[at + 1]):
+            item = own.items[index]
+            pair = item / wp.static(slots)
+            b = item - pair * wp.static(slots)
+            e = pair / wp.static(slots)
+            a = pair - e * wp.static(slots)
+            e += w * own.elements
+            for i in range(wp.static(n)):
+                m += wp.outer(own.factor[i * wp.static(slots) + a, e], own.factor[i * wp.static(slots) + b, e])
+            if wp.static(tensions > 0):
+                c = geometric(own.tension, e, a, b)
+                for d in range(3):
+                    m[d, d] = m[d, d] + c
+        return m
+
+    return add
+
+
+SETS = 6  # sets that one launch sums
+
+
+@cache
+def assemble_kernel(terms: tuple[Term, ...], real, linear, begins: bool):
+    """H of up to `SETS` sets, a thread a position, with inertia where it `begins`; else it adds to what is there."""
+    V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), linear)
+    Contributions = contributions(linear)
+    sums = tuple(sum_function(term, linear) for term in terms)
+    count = len(terms)
+    last = count - 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def assemble(
-        factor: wp.array2d(dtype=H),
-        tension: wp.array2d(dtype=linear),
-        starts: wp.array(dtype=int),
-        items: wp.array(dtype=int),
-        elements: int,
+        mass: wp.array(dtype=V),
+        coefficient: wp.array(dtype=real),
+        rows: wp.array(dtype=int),
+        columns: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
         positions: int,
+        own0: Contributions,
+        own1: Contributions,
+        own2: Contributions,
+        own3: Contributions,
+        own4: Contributions,
+        own5: Contributions,
         matrix: wp.array2d(dtype=linear),
     ):
         p = wp.tid()
@@ -241,27 +260,33 @@ def assemble_kernel(term: Term, linear):
         if wanted[w] == 0:
             return
         at = p - w * positions
-        first = starts[at]
-        last = starts[at + 1]
-        if first == last:
-            return
+        row = rows[at]
+        if row < 0:
+            return  # padding stays zero
         m = M()
-        for index in range(first, last):
-            item = items[index]
-            pair = item / wp.static(slots)
-            b = item - pair * wp.static(slots)
-            e = pair / wp.static(slots)
-            a = pair - e * wp.static(slots)
-            e += w * elements
-            for i in range(wp.static(n)):
-                m += wp.outer(factor[i * wp.static(slots) + a, e], factor[i * wp.static(slots) + b, e])
-            if wp.static(tensions > 0):
-                c = geometric(tension, e, a, b)
+        if wp.static(begins):
+            if row == columns[at]:
+                inertia = mass[row] * coefficient[w]
                 for d in range(3):
-                    m[d, d] = m[d, d] + c
+                    m[d, d] = linear(inertia[d])
+        else:
+            for i in range(3):
+                for j in range(3):
+                    m[i, j] = matrix[3 * i + j, p]
+        m += wp.static(sums[0])(own0, at, w)
+        if wp.static(count > 1):
+            m += wp.static(sums[min(1, last)])(own1, at, w)
+        if wp.static(count > 2):
+            m += wp.static(sums[min(2, last)])(own2, at, w)
+        if wp.static(count > 3):
+            m += wp.static(sums[min(3, last)])(own3, at, w)
+        if wp.static(count > 4):
+            m += wp.static(sums[min(4, last)])(own4, at, w)
+        if wp.static(count > 5):
+            m += wp.static(sums[min(5, last)])(own5, at, w)
         for i in range(3):
             for j in range(3):
-                matrix[3 * i + j, p] = matrix[3 * i + j, p] + m[i, j]
+                matrix[3 * i + j, p] = m[i, j]
 
     return assemble
 
