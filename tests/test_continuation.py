@@ -1,6 +1,7 @@
 """Paths of equilibria: closed forms of trusses, the elastica, limit points, bifurcations, branches, and failures by name."""
 
 import sys
+from itertools import groupby
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -32,7 +33,7 @@ def truss(device, length: float, **options):
 
 # P(z) = 2 EA z (1 / l - 1 / l0) with l^2 = 1 + z^2: two bars of force EA (l / l0 - 1) with slope z / l.
 def exact_load(z, length):
-    return -2.0 * z * (1.0 / np.sqrt(1.0 + z**2) - 1.0 / length)
+    return 2.0 * z * (1.0 / np.sqrt(1.0 + z**2) - 1.0 / length)
 
 
 def test_shallow_truss_snaps_through(device):
@@ -41,7 +42,7 @@ def test_shallow_truss_snaps_through(device):
     continuation, height = truss(device, length)
     path = continuation.trace(stop=Stop(displacement=("drop", -1.0, 2.3 * height)))
     z = height - path.values("drop")
-    np.testing.assert_allclose(path.load, -exact_load(z, length) * -1.0, atol=1e-10)
+    np.testing.assert_allclose(path.load, exact_load(z, length), atol=1e-10)
     assert path.outcome == "displacement"
     assert path.values("drop")[-1] == pytest.approx(2.3 * height, rel=1e-12)
     assert np.abs(path.values("sway")).max() < 1e-12
@@ -73,7 +74,7 @@ def test_steep_truss_bifurcates_before_it_snaps(device):
     mode = found[0].mode.reshape(-1, 2)
     assert np.abs(mode[1, 1]) < 1e-9 * np.abs(mode[1, 0])  # sideways
     counts = [point.negative for point in path.points if point.kind == "regular"]
-    assert list(dict.fromkeys(counts)) == [0, 1, 2, 1]
+    assert [count for count, _ in groupby(counts)] == [0, 1, 2, 1]
 
 
 def test_branch_of_the_truss(device):
@@ -92,8 +93,8 @@ def test_branch_of_the_truss(device):
             forces += (now / length - 1.0) * bar / now
         np.testing.assert_allclose(forces[:, 0], 0.0, atol=1e-9)
         np.testing.assert_allclose(forces[:, 1], -branch.load, atol=1e-9)
-        assert (np.diff(np.abs(x)) > 0.0).all()
-        assert np.abs(x[-1]) > 0.3
+        assert (np.diff(np.abs(x[:6])) > 0.0).all()
+        assert np.abs(x).max() > 1.0
         sides.append((x, branch.load))
     np.testing.assert_allclose(sides[0][0], -sides[1][0], atol=1e-9)
     np.testing.assert_allclose(sides[0][1], sides[1][1], atol=1e-9)
@@ -133,7 +134,7 @@ def test_pinned_column_bifurcates_at_eulers_loads(device):
     assert [point.load for point in path.bifurcations] == pytest.approx(expected, rel=1e-7)
     assert expected == pytest.approx([np.pi**2, 4.0 * np.pi**2], rel=0.03)
     counts = [point.negative for point in path.points if point.kind == "regular"]
-    assert list(dict.fromkeys(counts)) == [0, 1, 2]
+    assert [count for count, _ in groupby(counts)] == [0, 1, 2]
     for k, point in enumerate(path.bifurcations, 1):
         waves = np.sin(k * np.pi * np.linspace(0.0, 1.0, n + 1))
         mode = point.mode.reshape(-1, 2)[:, 1]
@@ -236,14 +237,14 @@ def test_failures_are_named(device):
     with pytest.raises(ddg.SolverError, match=r"no_start.*statics.solve") as caught:
         continuation.trace(start=0.3)
     assert caught.value.outcome == "no_start"
-    with pytest.raises(ddg.SolverError, match=r"step_too_small.*after 1 points") as caught:
+    with pytest.raises(ddg.SolverError, match=r"after 1 points: step_too_small.*min_step smaller") as caught:
         truss(device, 3.0, max_iterations=1, step=0.05, min_step=0.02)[0].trace()
     assert caught.value.outcome == "step_too_small"
     assert len(caught.value.path) == 1
     np.testing.assert_array_equal(caught.value.state.points(), continuation.model.state().points())
     (point,) = truss(device, 3.0)[0].trace(stop=Stop(load=(-1.0, 0.5))).bifurcations
     with pytest.raises(ddg.SolverError, match="no_branch") as caught:
-        truss(device, 3.0, max_iterations=1, rtol=1e-14)[0].switch(point)
+        truss(device, 3.0, max_iterations=1)[0].switch(point, step=1e6)
     assert caught.value.outcome == "no_branch"
 
 

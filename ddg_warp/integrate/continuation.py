@@ -49,7 +49,7 @@ class ContinuationOptions:
     iterations: int = 6
     max_iterations: int = 15
     rotation_cap: float = 0.3
-    tolerance: float = 1e-9
+    tolerance: float = 1e-7
     rtol: float = 1e-10
     floor_factor: float = 16.0
 
