@@ -14,6 +14,7 @@ __version__ = "0.1.0"
 _HOME = {
     "Check": "check",
     "Circle": "material",
+    "Displacement": "integrate.path",
     "Dynamics": "scene",
     "Ellipse": "material",
     "Integrator": "integrate.dynamics",
@@ -28,6 +29,8 @@ _HOME = {
     "State": "state",
     "Statics": "scene",
     "Stiffness": "material",
+    "Stop": "integrate.path",
+    "Trace": "scene",
 }
 __all__ = list(_HOME)
 

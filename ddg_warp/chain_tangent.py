@@ -65,7 +65,7 @@ class ChainTangent:
         force[..., : kind.dim] = np.tile(dead.transpose(1, 0, 2), (group.worlds, 1, 1)) * factor
         if kind.twist:
             force[..., kind.dim] = np.tile(host.load_angle.T, (group.worlds, 1)) * factor
-        x = self._blocks(q)
+        x = self.blocks(q)
         for load, columns in self._timed():
             scale = load.at(factor, factor)
             np.add.at(force, (columns, load.k, slice(0, kind.dim)), scale * load.force)
@@ -88,7 +88,7 @@ class ChainTangent:
             values.append(block.ravel())
 
         group, kind = self.group, self.group.kind
-        x = self._blocks(q)
+        x = self.blocks(q)
         for load, columns in self._timed():
             for column, k in zip(columns, load.k, strict=True) if load.couple.any() else ():
                 scale = load.at(factor, factor)
@@ -105,7 +105,8 @@ class ChainTangent:
         data = (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols)))
         return sparse.csc_matrix(data, shape=(self.size, self.size))
 
-    def _blocks(self, q: np.ndarray) -> np.ndarray:
+    def blocks(self, q: np.ndarray) -> np.ndarray:
+        """Dofs (size,) as (column, node, dofs of a node)."""
         return q.reshape(self.group.columns, self.group.nodes, self.group.kind.block)
 
     def _timed(self):
@@ -124,7 +125,7 @@ class ChainTangent:
 
     def assign(self, state, q: np.ndarray) -> None:
         kind, data = self.group.kind, self.data(state)
-        values = self._blocks(q)
+        values = self.blocks(q)
         arrays.assign(data.x, np.ascontiguousarray(values[..., : kind.dim].transpose(1, 0, 2)))
         if kind.twist:
             arrays.assign(data.theta, np.ascontiguousarray(values[..., kind.dim].T))
@@ -146,6 +147,13 @@ class ChainTangent:
         """Mean rest length of edges [m]."""
         return float((self.group.host.length / np.maximum(1, self.group.host.own - 1)).mean())
 
+    def point_dofs(self) -> tuple[np.ndarray, list[int], np.ndarray]:
+        """Rows of `State.points`, axes, and the dofs (rows, axes) of the first world."""
+        group, kind = self.group, self.group.kind
+        k, column, rows = self.model.places(group)
+        dofs = ((column * group.nodes + k) * kind.block)[:, None] + np.arange(kind.dim)
+        return rows, [0, 2] if kind.dim == 2 else [0, 1, 2], dofs
+
     def where(self, dof: int) -> str:
         """Name of a dof's place."""
         column, k = divmod(dof // self.group.kind.block, self.group.nodes)
@@ -161,12 +169,12 @@ class ChainTangent:
         """
         moved = q + step
         kind, group = self.group.kind, self.group
-        x, dx = (self._blocks(v)[..., : kind.dim] for v in (q, step))
-        held = ~self._blocks(self.free)[..., : kind.dim]
-        out = self._blocks(moved)
+        x, dx = (self.blocks(v)[..., : kind.dim] for v in (q, step))
+        held = ~self.blocks(self.free)[..., : kind.dim]
+        out = self.blocks(moved)
         for column in range(group.columns):
             n = group.host.count[column % group.rods]
-            bend = _turn_excess(x[column, :n], dx[column, :n], kind.closed)
+            bend = turn_excess(x[column, :n], dx[column, :n], kind.closed)
             for d in range(kind.dim):
                 anchors = np.flatnonzero(held[column, :n, d])
                 if not anchors.size:
@@ -236,7 +244,7 @@ def _couple_stiffness(e: np.ndarray, couple: np.ndarray) -> tuple[np.ndarray, np
     return (2.0 * np.outer(cross @ e, e) / square - cross) / square, about
 
 
-def _turn_excess(x: np.ndarray, dx: np.ndarray, closed: bool) -> np.ndarray:
+def turn_excess(x: np.ndarray, dx: np.ndarray, closed: bool) -> np.ndarray:
     """Positions of nodes by turned edges minus those by straight steps (n, dim), zero at the first node."""
     e, de = (np.roll(v, -1, axis=0) - v if closed else np.diff(v, axis=0) for v in (x, dx))
     length = np.linalg.norm(e, axis=1, keepdims=True)

@@ -132,7 +132,7 @@ def run_scene(chosen: argparse.Namespace) -> int:
     content = summary(name, settings, result, checks)
     for path in filter(None, (directory / "summary.json", chosen.json)):
         write_json(path, content)
-    draw(directory, one_liner(Path(module.__file__)))
+    draw(directory, one_liner(Path(module.__file__)), result.path)
     say(result, content, checks, directory)
     return DONE if not result.failure and all(check.passed for check in checks) else FAILED
 
@@ -171,10 +171,13 @@ def say(result, content: dict, checks: list, directory: Path) -> None:
         print(f"ddg-warp: the solver failed: {result.failure}", file=sys.stderr)
 
 
-def draw(directory: Path, title: str, shapes: int = 6) -> None:
-    """Draw the rods and surfaces of the first world at a few times into DIR/picture.png, where matplotlib is installed."""
+def draw(directory: Path, title: str, path=None, shapes: int = 6) -> None:
+    """Draw the rods and surfaces of the first world at a few times into DIR/picture.png, where matplotlib is installed.
+
+    A path of equilibria goes to DIR/path.png, load over displacements.
+    """
     try:
-        from ddg_warp.figure import rods_picture
+        from ddg_warp.figure import path_plot, rods_picture
     except ModuleNotFoundError as error:
         print(f"no picture without {error.name}: `pip install matplotlib`", file=sys.stderr)
         return
@@ -185,6 +188,8 @@ def draw(directory: Path, title: str, shapes: int = 6) -> None:
         count = reader.points.shape[-2]
         points = {float(reader.time[frame]): reader.points[frame].reshape(-1, 3)[:count] for frame in frames}
         rods_picture(reader, points, directory / "picture.png", title)
+    if path is not None:
+        path_plot(path, directory / "path.png", title)
 
 
 def list_all(chosen: argparse.Namespace) -> int:

@@ -95,6 +95,39 @@ def error_plot(path, rows: Iterable[Mapping], x: str, y: str, series: str, title
     _save(figure, path)
 
 
+def path_plot(path, file, title: str = "") -> None:
+    """Draws the load parameter over every watched displacement: full where stable, broken where not, special points marked.
+
+    Args:
+        path: A `ddg_warp.integrate.path.Path`.
+        file: The picture to write; its suffix is the format.
+        title: A line above.
+    """
+    figure = Figure(figsize=(6.0, 4.4), layout="constrained")
+    plot = figure.add_subplot()
+    names, load = list(path.points[0].values), path.load
+    unstable = (path.negative[:-1] > 0) & (path.negative[1:] > 0)
+    for k, name in enumerate(names):
+        color, values = TIME_COLORS(0.3 + 0.7 * k / max(1, len(names))), path.values(name)
+        for broken, style in ((False, "-"), (True, "--")):
+            kept = np.flatnonzero(unstable == broken)
+            runs = np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1) if len(kept) else []
+            segments = [np.column_stack([a[i[0] : i[-1] + 2] for a in (values, load)]) for i in runs]
+            plot.add_collection(LineCollection(segments, colors=[color], linestyles=style, linewidths=1.4))
+        plot.plot([], [], color=color, label=name)
+        for kind, marker in (("limit point", "o"), ("bifurcation", "D")):
+            special = path.of_kind(kind)
+            plot.plot([p.values[name] for p in special], [p.load for p in special], marker, color=color, markersize=5)
+    plot.autoscale()
+    plot.set(xlabel="displacement [m]", ylabel="load parameter")
+    plot.set_title(textwrap.fill(title, 80), loc="left", fontsize=11)
+    plot.grid(color="0.9", linewidth=0.6)
+    plot.spines[["top", "right"]].set_visible(False)
+    if names:
+        plot.legend(frameon=False, fontsize=9)
+    _save(figure, file)
+
+
 def _draw_rods(plot, points: np.ndarray, curves, color, latest: bool) -> None:
     """Adds polylines, in two or three dimensions."""
     kind = LineCollection if points.shape[-1] == 2 else Line3DCollection

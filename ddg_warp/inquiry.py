@@ -43,7 +43,7 @@ def energies(model, state) -> dict[str, float]:
 
 
 def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
-    """Force and moment of every support of the scene, in the order they were added, for one world.
+    """Force and moment of every support of the scene for one world: those of rods in the order they were added, then of shells.
 
     They balance the internal forces and the loads on held dofs; the inertia of a held node itself is left out, which a
     moving support would have to add.
@@ -55,30 +55,48 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     tangent = Tangent(model)
     q = tangent.dofs(state)
     force = np.where(tangent.free, 0.0, tangent.gradient(state) - tangent.loads(factor, q))
+    net = model.net.host.held if model.net is not None else []
     result = []
-    for support in model.held:
-        total, moment, about = np.zeros(3), np.zeros(3), None if point is None else np.asarray(point, float)
-        for held in support:
-            part = tangent.parts[held.group]
-            kind = part.group.kind
-            axes = [0, 2] if kind.dim == 2 else [0, 1, 2]
-            x = q[part.offset : part.offset + part.size].reshape(part.group.columns, part.group.nodes, kind.block)
-            f = force[part.offset : part.offset + part.size].reshape(x.shape)
-            for node, column in zip(held.k, held.columns, strict=True):
-                here = np.zeros(3)
-                here[axes] = x[column, node, : kind.dim]
-                if about is None:
-                    about = here
-                if not held.components and kind.twist:
-                    along = x[column, (node + 1) % part.group.nodes, : kind.dim] - x[column, node, : kind.dim]
-                    moment += f[column, node, kind.dim] * along / np.linalg.norm(along)
-                else:
-                    push = np.zeros(3)
-                    push[axes] = f[column, node, : kind.dim] * [(held.components >> d) & 1 for d in range(kind.dim)]
-                    total += push
-                    moment += np.cross(here - about, push)
+    for i in range(max(len(model.held), len(net))):
+        places = [*_chain_places(tangent, q, force, model.held[i] if i < len(model.held) else [])]
+        if net:
+            places += _net_places(tangent.parts[-1], q, force, net[i])
+        about = places[0][0] if point is None and places else np.zeros(3) if point is None else np.asarray(point, float)
+        total = sum((push for _, push, _ in places), np.zeros(3))
+        moment = sum((np.cross(here - about, push) + twist for here, push, twist in places), np.zeros(3))
         result.append(Reaction(total, moment, about))
     return result
+
+
+def _chain_places(tangent, q: np.ndarray, force: np.ndarray, support):
+    """(place, force, moment) of the nodes and edges of chains that a support holds."""
+    for held in support:
+        part = tangent.parts[held.group]
+        kind = part.group.kind
+        axes = [0, 2] if kind.dim == 2 else [0, 1, 2]
+        x, f = (part.blocks(tangent.of(part, values))[..., : kind.block] for values in (q, force))
+        for node, column in zip(held.k, held.columns, strict=True):
+            here, push, twist = np.zeros(3), np.zeros(3), np.zeros(3)
+            here[axes] = x[column, node, : kind.dim]
+            if not held.components and kind.twist:
+                along = x[column, (node + 1) % part.group.nodes, : kind.dim] - x[column, node, : kind.dim]
+                twist = f[column, node, kind.dim] * along / np.linalg.norm(along)
+            else:
+                push[axes] = f[column, node, : kind.dim] * [(held.components >> d) & 1 for d in range(kind.dim)]
+            yield here, push, twist
+
+
+def _net_places(part, q: np.ndarray, force: np.ndarray, held) -> list[tuple]:
+    """(place, force, moment) of the blocks of the net that a support holds, in the first world."""
+    host, places = part.host, []
+    x, f = (Tangent.of(part, values).reshape(-1, 3) for values in (q, force))
+    for block, component in zip(held.blocks, held.components, strict=True):
+        if block < host.nodes:
+            places.append((x[block], f[block] * np.eye(3)[component], np.zeros(3)))
+        else:
+            first, last = x[host.ends[block - host.nodes]]
+            places.append((first, np.zeros(3), f[block, 0] * (last - first) / np.linalg.norm(last - first)))
+    return places
 
 
 def stresses(model, state) -> dict[str, list[np.ndarray]]:

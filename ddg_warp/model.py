@@ -183,7 +183,7 @@ class Model:
         )
 
     @cached_property
-    def _net_rows(self) -> tuple[np.ndarray, np.ndarray]:
+    def net_rows(self) -> tuple[np.ndarray, np.ndarray]:
         """Rows of `State.points` that the net fills, and the blocks that fill them."""
         if self.net is None:
             return np.zeros(0, int), np.zeros(0, int)
@@ -192,6 +192,11 @@ class Model:
         blocks = [rod.nodes for rod in self.net.host.rods] + [shell.nodes for shell in self.net.host.shells]
         vertices = sum(len(shell.nodes) for shell in self.net.host.shells)
         return np.concatenate([*rows, start[-1] + np.arange(vertices)]).astype(int), np.concatenate(blocks)
+
+    def places(self, group: Group) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of a group's nodes: place along the rod with ghosts, column, row of `State.points`."""
+        start = np.concatenate([[0], np.cumsum(self.curves.counts)])
+        return _user_index(group, group.host.own, start)
 
     @property
     def points_count(self) -> int:
@@ -316,9 +321,8 @@ class Model:
     def _scatter_nodes(self, group: Group, values, out: np.ndarray, what: str) -> None:
         """Put values in the user's order (P, 3) into (node, column, dim) of a group."""
         values = self._point_values(values, what)
-        start = np.concatenate([[0], np.cumsum(self.curves.counts)])
         axes = [0, 2] if group.kind.dim == 2 else [0, 1, 2]
-        k, column, index = _user_index(group, group.host.own, start)
+        k, column, index = self.places(group)
         for world in range(self.worlds):
             own = values if values.ndim == 2 else values[world]
             out[k, column + world * group.rods] = own[index][:, axes]
@@ -327,7 +331,7 @@ class Model:
         """Blocks (worlds N, 3) with values in the user's order (P, 3) put in."""
         values = self._point_values(values, what)
         out = blocks.astype(float).reshape(self.worlds, -1, 3)
-        rows, places = self._net_rows
+        rows, places = self.net_rows
         out[:, places] = (values if values.ndim == 3 else values[None])[:, rows]
         return out.reshape(-1, 3)
 
@@ -435,7 +439,7 @@ class Model:
         start = np.concatenate([[0], np.cumsum(self.curves.counts)])
         out = np.zeros((self.worlds, self.points_count, 3))
         if blocks is not None:
-            rows, places = self._net_rows
+            rows, places = self.net_rows
             out[:, rows] = blocks.numpy().reshape(self.worlds, -1, 3)[:, places]
         for group, value in zip(self.groups, values, strict=True):
             axes = [0, 2] if group.kind.dim == 2 else [0, 1, 2]

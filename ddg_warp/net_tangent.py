@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 from scipy import sparse
 
+from ddg_warp.chain_tangent import turn_excess
 from ddg_warp.kernels.net import elements
 
 
@@ -19,12 +20,30 @@ class NetTangent:
         self.free, self.angle, self.mass = (
             np.tile(values.ravel(), worlds) for values in (~host.fixed, kind, host.mass)
         )
-        self.incidence = [_incidence(part.host, host.blocks, worlds) for part in self.net.sets]
+        self._prepare()
         self._ends = np.concatenate([host.ends, *(s.nodes[s.surface.edges] for s in host.shells)])
         if not len(self._ends):
             self._ends = np.concatenate([s.slots[:2].T for s in host.sets])
         length = np.linalg.norm(np.diff(host.rest[self._ends], axis=1)[:, 0], axis=1)
         self._edge_length = float(length.mean())
+        self._anchored = host.fixed[: host.nodes].copy()
+        for shell in host.shells:
+            self._anchored[shell.nodes] = True
+        self._order = _outwards(host.rods, self._anchored.any(1))
+
+    def _prepare(self) -> None:
+        """The pattern of the Hessian, and where in it the entries of every element go."""
+        entries, self._scatter = [], []
+        for part in self.net.sets:
+            to_local, slot, component = _local(part.term.measure)
+            dofs = 3 * _tiled(part.host.slots, self.host.blocks, self.net.worlds)[slot].T + component
+            entries.append((dofs[:, None, :] * self.size + dofs[:, :, None]).ravel())  # column by column
+            self._scatter.append(to_local)
+        pattern, places = np.unique(np.concatenate(entries), return_inverse=True)
+        places = np.split(places, np.cumsum([len(e) for e in entries])[:-1])
+        self._scatter = list(zip(self._scatter, places, strict=True))
+        columns, self._indices = np.divmod(pattern, self.size)
+        self._pointers = np.searchsorted(columns, np.arange(self.size + 1))
 
     def energies(self, state):
         """(term's name, energies of its elements)."""
@@ -46,16 +65,16 @@ class NetTangent:
         return result.ravel()
 
     def hessian(self, state) -> sparse.csc_matrix:
-        total = sparse.csr_matrix((self.size, self.size))
+        total = np.zeros(len(self._indices))
         for i, part in enumerate(self.net.sets):
             size, count = part.term.measure.size, part.elements * self.net.worlds
             out = wp.zeros((count, size, size), dtype=self.net.real, device=self.net.device)
             self._launch(state, i, 2, out, (size,))
             values = out.numpy().astype(np.float64)
             values = 0.5 * (values + values.transpose(0, 2, 1))
-            diagonal = sparse.bsr_matrix((values, np.arange(count), np.arange(count + 1)))
-            total = total + self.incidence[i].T @ (diagonal @ self.incidence[i])
-        return total.tocsc()
+            to_local, places = self._scatter[i]
+            total += np.bincount(places, (to_local.T @ values @ to_local).ravel(), len(total))
+        return sparse.csc_matrix((total, self._indices, self._pointers), shape=(self.size, self.size))
 
     def loads(self, factor: float, q: np.ndarray) -> np.ndarray:
         host, x = self.host, q.reshape(self.net.worlds, -1, 3)
@@ -101,7 +120,27 @@ class NetTangent:
         state.net.q.assign(q.reshape(-1, 3))
 
     def retract(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
-        return q + step
+        """q moved along `step`, with edges of rods turned instead of sheared; see `ChainTangent.retract`.
+
+        Rods are taken from held nodes outwards: where one meets others that are placed already, or a shell, it is anchored there.
+        """
+        moved = q + step
+        x, dx, out = (v.reshape(self.net.worlds, -1, 3) for v in (q, step, moved))
+        for world in range(self.net.worlds):
+            excess = np.zeros((self.host.nodes, 3))
+            placed = self._anchored.copy()
+            for rod in self._order:
+                nodes = rod.all_nodes
+                bend = turn_excess(x[world][nodes], dx[world][nodes], rod.piece.kind.closed)
+                for d in range(3):
+                    anchors = np.flatnonzero(placed[nodes, d])
+                    if not anchors.size:
+                        anchors = np.array([0])
+                    miss = np.interp(np.arange(len(nodes)), anchors, bend[anchors, d] - excess[nodes[anchors], d])
+                    excess[nodes, d] = bend[:, d] - miss
+                placed[nodes] = True
+            out[world][: self.host.nodes] += np.where(self.host.fixed[: self.host.nodes], 0.0, excess)
+        return moved
 
     def move_supports(self, state, before: float, at: float) -> None:
         """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""
@@ -132,6 +171,11 @@ class NetTangent:
         """Mean rest length of edges [m]."""
         return self._edge_length
 
+    def point_dofs(self) -> tuple[np.ndarray, list[int], np.ndarray]:
+        """Rows of `State.points`, axes, and the dofs (rows, axes) of the first world."""
+        rows, blocks = self.model.net_rows
+        return rows, [0, 1, 2], 3 * blocks[:, None] + np.arange(3)
+
     def where(self, dof: int) -> str:
         """Name of a dof's place."""
         block = dof // 3 % self.host.blocks
@@ -156,36 +200,36 @@ class NetTangent:
         )
 
 
+def _outwards(rods, anchored: np.ndarray) -> list:
+    """Rods in an order in which each meets a held node, or one before it, if that is possible."""
+    reached, order, left = anchored.copy(), [], list(rods)
+    while left:
+        rod = next((rod for rod in left if reached[rod.all_nodes].any()), left[0])
+        left = [other for other in left if other is not rod]
+        order.append(rod)
+        reached[rod.all_nodes] = True
+    return order
+
+
 def _tiled(slots: np.ndarray, blocks: int, worlds: int) -> np.ndarray:
     """Slots (n, W E) of all worlds."""
     return np.concatenate([slots + world * blocks for world in range(worlds)], axis=1)
 
 
-def _incidence(part, blocks: int, worlds: int) -> sparse.csr_matrix:
-    """B of one set: (local dofs of all elements, dofs)."""
-    measure = part.term.measure
-    slots = _tiled(part.slots, blocks, worlds)
-    count = slots.shape[1]
-    first = np.arange(count) * measure.size
-    rows, cols, values = [], [], []
-
-    def put(local, block, component, sign):
-        rows.append(first + local)
-        cols.append(3 * block + component)
-        values.append(np.full(count, sign))
-
+def _local(measure) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """B of an element: (local dofs, dofs of its slots that they depend on); and slot and component of these."""
+    full = np.zeros((measure.size, measure.slots, 3))
     for i, (a, b) in enumerate(measure.edges):
-        for d in range(3):
-            put(3 * i + d, slots[b], d, 1.0)
-            put(3 * i + d, slots[a], d, -1.0)
+        full[3 * i : 3 * i + 3, b] += np.eye(3)
+        full[3 * i : 3 * i + 3, a] -= np.eye(3)
     at = 3 * len(measure.edges)
     for i in range(measure.angles):
-        put(at + i, slots[measure.nodes + i], 0, 1.0)
+        full[at + i, measure.nodes + i, 0] = 1.0
     for i in range(measure.spins):
-        for d in range(3):
-            put(at + measure.angles + 3 * i + d, slots[measure.nodes + measure.angles + i], d, 1.0)
-    shape = (count * measure.size, 3 * blocks * worlds)
-    return sparse.csr_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(cols))), shape=shape)
+        rows = at + measure.angles + 3 * i
+        full[rows : rows + 3, measure.nodes + measure.angles + i] = np.eye(3)
+    slot, component = np.nonzero(full.any(0))
+    return full[:, slot, component], slot, component
 
 
 def _cross(e: np.ndarray) -> np.ndarray:

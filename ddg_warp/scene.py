@@ -7,6 +7,7 @@ import numpy as np
 
 from ddg_warp import validate
 from ddg_warp.errors import SceneError
+from ddg_warp.integrate.path import Displacement, Stop
 from ddg_warp.material import Material, Stiffness
 from ddg_warp.motion import Motion
 from ddg_warp.structures import Structures
@@ -26,6 +27,23 @@ class Statics:
     """Find the equilibrium: loads and motions grow with the load parameter from 0 to 1 in `load_steps` increments."""
 
     load_steps: int = 1
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Follow the path of equilibria from load parameter 0 by arc length, through limit points.
+
+    Attributes:
+        watch: displacements to record by name (`Displacement`).
+        stop: where to end.
+        step, max_step, load_scale: see `ddg_warp.integrate.continuation.ContinuationOptions`.
+    """
+
+    watch: dict[str, Displacement] = field(default_factory=dict)
+    stop: Stop = field(default_factory=Stop)
+    step: float = 0.02
+    max_step: float = 0.1
+    load_scale: float = 1.0
 
 
 @dataclass
@@ -87,7 +105,7 @@ class Scene(Structures):
     Args:
         gravity: acceleration (3,) [m/s^2].
         dimension: 3, or 2 for a scene that stays in the plane of x and z (y of every point is then ignored).
-        analysis: `Dynamics` or `Statics`: what `ddg-warp run` does with the scene.
+        analysis: `Dynamics`, `Statics` or `Trace`: what `ddg-warp run` does with the scene.
         mass_damping: mass-proportional damping alpha [1/s].
         initial: makes the first state of a run from the model; the rest state by default.
         callbacks: functions of the state, called between steps.
@@ -95,7 +113,7 @@ class Scene(Structures):
 
     gravity: tuple = (0.0, 0.0, -9.81)
     dimension: int = 3
-    analysis: Dynamics | Statics = field(default_factory=Dynamics)
+    analysis: Dynamics | Statics | Trace = field(default_factory=Dynamics)
     mass_damping: float = 0.0
     initial: Callable | None = None
     batches: list[RodBatch] = field(default_factory=list)

@@ -10,7 +10,7 @@ from typing import Any
 
 from ddg_warp.catalog import InputError
 from ddg_warp.errors import SolverError
-from ddg_warp.scene import Dynamics, Scene
+from ddg_warp.scene import Dynamics, Scene, Statics
 
 
 @dataclass
@@ -21,7 +21,8 @@ class Result:
         scene: The scene that was run.
         model: Its model.
         state: The last good state.
-        times: Time of each recorded state [s], the initial one first; in statics, the load parameter.
+        times: Time of each recorded state [s], the initial one first; in statics, the load
+            parameter; along a path, the arc length.
         series: Observed values by name, one a recorded state.
         statistics: `integrator.statistics()`, and the like of a static run.
         energies: Energies by term [J] at "start" and "end".
@@ -30,6 +31,7 @@ class Result:
         wall_time: Time from the scene to the end [s].
         compile_time: Time from the scene to the end of the first step, less a steady step [s].
         failure: Why the run ended early; empty where it did not.
+        path: The path of equilibria that was followed, if that was the analysis (`ddg_warp.integrate.path.Path`).
     """
 
     scene: Scene
@@ -44,6 +46,7 @@ class Result:
     wall_time: float = 0.0
     compile_time: float = 0.0
     failure: str = ""
+    path: Any = None
 
     @property
     def seconds_per_step(self) -> float:
@@ -123,7 +126,12 @@ def simulate(
     if dynamic:
         dt = analysis.dt if dt is None else dt
         duration = analysis.duration if duration is None else duration
-    steps = step_count(dt, duration) if dynamic else analysis.load_steps
+    if dynamic:
+        run, steps = advance, step_count(dt, duration)
+    elif isinstance(analysis, Statics):
+        run, steps = equilibrate, analysis.load_steps
+    else:
+        run, steps = follow, analysis.stop.steps
 
     model = scene.build(device=device, precision=precision, worlds=worlds)
     result = Result(scene, model, scene.initial(model) if scene.initial else model.state(), dt=dt)
@@ -142,22 +150,21 @@ def simulate(
         text = "compiling, once"
         bar = stack.enter_context(tqdm(total=steps, initial=done, desc=text, unit="step", disable=not progress))
 
-        def keep(state) -> None:
+        def keep(state, **observed) -> None:
             if len(result.step_times) == 1:
                 result.compile_time = time.perf_counter() - began
                 bar.set_description()
             result.state = state
             result.times.append(float(state.time))
-            observed = {} if observe is None else dict(observe(model, state))
+            observed |= {} if observe is None else observe(model, state)
             for name, value in observed.items():
                 result.series.setdefault(name, []).append(value)
             if recorder is not None:
                 recorder.record(state, observed=observed)
 
         try:
-            if resume is None:
+            if resume is None and run is not follow:
                 keep(result.state)
-            run = advance if dynamic else equilibrate
             run(result, steps, keep, options=options, clock=clock or wall_clock(model.device), bar=bar)
         except SolverError as error:
             result.failure = str(error)
@@ -208,6 +215,32 @@ def equilibrate(result: Result, steps: int, keep: Callable, *, options: Mapping,
         mean = sum(iterations) / max(1, len(iterations))
         newton = {"mean": mean, "max": max(iterations, default=0)}
         result.statistics = {"newton_iterations": newton, "pcg_iterations": 0, "outcomes": dict(outcomes)}
+
+
+def follow(result: Result, steps: int, keep: Callable, *, options: Mapping, clock, bar) -> None:
+    """Follow the path of equilibria and `keep` each point, with its load parameter and what is watched."""
+    from ddg_warp.integrate.continuation import Continuation
+
+    analysis, started = result.scene.analysis, clock()
+    settings = {name: getattr(analysis, name) for name in ("step", "max_step", "load_scale")}
+    try:
+        continuation = Continuation(result.model, analysis.watch, **{**settings, **options})
+        result.path = continuation.trace(result.state, stop=analysis.stop)
+    except SolverError as error:
+        result.path = getattr(error, "path", None)
+        raise
+    finally:
+        points = result.path.points if result.path is not None else []
+        for point in points:
+            state = point.state.copy()
+            state.time = point.arclength
+            keep(state, load=point.load, **point.values)
+            bar.update()
+        result.step_times = [(clock() - started) / max(1, len(points))] * len(points)
+        iterations = [point.iterations for point in points]
+        newton = {"mean": sum(iterations) / max(1, len(iterations)), "max": max(iterations, default=0)}
+        outcomes = dict(Counter(point.kind for point in points))
+        result.statistics = {"newton_iterations": newton, "pcg_iterations": 0, "outcomes": outcomes}
 
 
 def step_count(dt: float, duration: float) -> int:

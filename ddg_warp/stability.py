@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg, sparse
 from scipy.optimize import brentq
-from scipy.sparse.linalg import eigsh
+from scipy.sparse.linalg import eigsh, splu
 
-from ddg_warp.linear.direct import Factorisation
+from ddg_warp.linear.direct import Factorisation, SingularError
 from ddg_warp.tangent import Tangent
 
 DENSE = 600  # free dofs up to which a dense eigenvalue solver is the quicker and safer choice
@@ -71,6 +71,44 @@ def spectrum(model, state, count: int = 4, metric: str = "mass", tangent: Tangen
     modes = np.zeros((tangent.size, count))
     modes[free[kept]] = scaling[:, None] * vectors[:, :count]
     return Spectrum(values[:count], modes, negative)
+
+
+def negative_eigenvalues(matrix) -> int:
+    """Number of negative eigenvalues of a stiffness; of an unsymmetric one (loads that follow), of those with negative real part."""
+    symmetric = abs(matrix - matrix.T).max() <= 1e-11 * abs(matrix).max()
+    if symmetric:
+        try:
+            factor = Factorisation(sparse.csc_matrix(matrix))
+            if factor.reliable:
+                return factor.negative
+        except SingularError:
+            pass
+    scaling = sparse.diags(1.0 / np.sqrt(np.abs(matrix.diagonal()) + 1e-300))
+    scaled = (scaling @ matrix @ scaling).toarray()
+    values = linalg.eigvalsh(scaled) if symmetric else linalg.eigvals(scaled).real
+    return int((values < 0.0).sum())
+
+
+def nearest_to_zero(matrix, scaling: np.ndarray) -> tuple[float, np.ndarray]:
+    """Eigenvalue nearest to zero of S K S, S = diag(scaling), and S times its eigenvector, by inverse iteration.
+
+    The matrix may be unsymmetric. The vector's largest entry is positive, so that it is the same in every run.
+    """
+    scaled = sparse.csc_matrix(sparse.diags(scaling) @ matrix @ sparse.diags(scaling))
+    try:
+        factor = splu(scaled)
+    except RuntimeError:  # exactly singular: any tiny shift will do
+        factor = splu(scaled + 1e-14 * abs(scaled).max() * sparse.identity(len(scaling), format="csc"))
+    vector = np.random.default_rng(0).standard_normal(len(scaling))  # without any symmetry
+    value = np.inf
+    for _ in range(200):
+        vector = factor.solve(vector / np.linalg.norm(vector))
+        vector /= np.linalg.norm(vector)
+        before, value = value, float(vector @ (scaled @ vector))
+        if abs(value - before) <= 1e-12 * abs(value):
+            break
+    vector = scaling * vector
+    return value, vector * np.sign(vector[np.argmax(np.abs(vector))])
 
 
 def _condensed(matrix, massive: np.ndarray):

@@ -90,6 +90,22 @@ class Tangent:
                 part.move_supports(state, before, at)
             self.model.carry_frames(state)
 
+    def support_step(self, state, before: float, at: float) -> np.ndarray:
+        """How far the supports of a state that belongs to `before` are from where they are at `at` (size,), zero at free dofs."""
+        if not self.model.motions:
+            return np.zeros(self.size)
+        moved = state.copy()
+        self.move_supports(moved, before, at)
+        return np.where(self.free, 0.0, self.dofs(moved) - self.dofs(state))
+
+    def advance(self, state, step: np.ndarray, at: float):
+        """Another state, moved along `step` (size,); its supports are then exactly where they are at load parameter `at`."""
+        moved = state.copy()
+        self.assign(moved, self.retract(self.dofs(state), step))
+        self.move_supports(moved, at, at)
+        moved.time = at
+        return moved
+
     def rotation(self, q: np.ndarray, direction: np.ndarray) -> float:
         """Largest turn of an edge, or change of an angle, that a step along `direction` would make [rad]."""
         worst = np.abs(direction[self.angle]).max(initial=0.0)
@@ -100,9 +116,22 @@ class Tangent:
             worst = max(worst, (np.linalg.norm(turns[real], axis=1) / length[real]).max(initial=0.0))
         return float(worst)
 
+    def turned_over(self, before: np.ndarray, after: np.ndarray) -> bool:
+        """Whether an edge points backwards on dofs `after` as against `before`."""
+        pairs = ((part.edges(self.of(part, before)), part.edges(self.of(part, after))) for part in self.parts)
+        return any((np.sum(a * b, axis=1) < 0.0).any() for a, b in pairs)
+
     def edge_length(self) -> float:
         """Mean rest length of edges [m]: what makes angles and positions comparable."""
         return float(np.mean([part.edge_length() for part in self.parts]))
+
+    def point_dofs(self) -> np.ndarray:
+        """Dofs of the rows of `State.points` (P, 3), of the first world; -1 for what a planar rod has not."""
+        result = np.full((self.model.points_count, 3), -1)
+        for part in self.parts:
+            rows, axes, dofs = part.point_dofs()
+            result[rows[:, None], axes] = dofs + part.offset
+        return result
 
     def where(self, dof: int) -> str:
         """Name of a dof's place, such as "node 3 of rod 1"."""

@@ -73,7 +73,7 @@ class Equilibrium:
     def __init__(self, model, options: StaticsOptions | None = None):
         self.model, self.options = model, options or StaticsOptions()
         self.tangent = Tangent(model)
-        _require_supports(model)
+        require_supports(model)
         self.iterations = 0
         self.outcome = ""
 
@@ -105,8 +105,7 @@ class Equilibrium:
     def solve(self, state: State, before: float, at: float) -> State:
         """The equilibrium at load parameter `at`, from a state that belongs to `before`."""
         tangent, options = self.tangent, self.options
-        state = state.copy()
-        tangent.move_supports(state, before, at)
+        state = self._with_supports_moved(state, before, at)
         free = tangent.free
         energies, q = tangent.element_energies(state), tangent.dofs(state)
         outer = tangent.loads(at, q)
@@ -120,11 +119,10 @@ class Equilibrium:
                 hessian = hessian + following
             if not np.isfinite(residual).all() or not np.isfinite(hessian.data).all():
                 raise SolverError(self._where("non_finite", residual, at), state=state, outcome="non_finite")
-            outer_sum = np.abs(outer[free & ~tangent.angle]).sum()
-            scale = max(outer_sum, np.abs(gradient[~free & ~tangent.angle]).max(initial=0.0), scale or 0.0)
+            scale = max(self.load_scale(outer, gradient), scale or 0.0)
             if scale == 0.0:
                 scale = np.abs(residual[free]).max()
-            excess = self._excess(residual, gradient, hessian, q, scale)
+            excess = self.excess(residual, gradient, hessian, q, scale)
             if excess <= 0.0 and (self.outcome == "converged" or polished):
                 state.time = at
                 return state
@@ -172,6 +170,37 @@ class Equilibrium:
             )
         raise SolverError(self._where("max_iterations", outer - gradient, at), state=state, outcome="max_iterations")
 
+    def _with_supports_moved(self, state: State, before: float, at: float) -> State:
+        """A copy with its supports where they are at `at`, and the free dofs following by the tangent if that is the better guess.
+
+        A support that moves by more than an edge length on its own turns its edge over.
+        """
+        tangent = self.tangent
+        alone = state.copy()
+        step = tangent.support_step(state, before, at)
+        if not step.any():
+            tangent.move_supports(alone, before, at)
+            return alone
+        tangent.move_supports(alone, before, at)
+        q = tangent.dofs(state)
+        hessian = tangent.hessian(state)
+        if not np.isfinite(hessian.data).all():
+            return alone
+        direction, _ = self._direction(hessian, tangent.loads(at, q) - tangent.gradient(state) - hessian @ step)
+        follow = tangent.advance(state, step + direction, at)
+
+        def potential(candidate):
+            return tangent.element_energies(candidate).sum() - tangent.loads(at, q) @ (tangent.dofs(candidate) - q)
+
+        overturned = tangent.turned_over(q, tangent.dofs(alone))
+        better = overturned or not potential(alone) <= potential(follow)
+        return follow if better and np.isfinite(potential(follow)) else alone
+
+    def load_scale(self, outer: np.ndarray, gradient: np.ndarray) -> float:
+        """What residuals are compared with [N]: sum of the outer forces, or the largest support force if that is more."""
+        free, angle = self.tangent.free, self.tangent.angle
+        return max(np.abs(outer[free & ~angle]).sum(), np.abs(gradient[~free & ~angle]).max(initial=0.0))
+
     def _scaled(self, residual: np.ndarray) -> np.ndarray:
         """Moments over an edge length, so that they compare with forces."""
         return np.where(self.tangent.angle, residual / self.tangent.edge_length(), residual)
@@ -197,7 +226,7 @@ class Equilibrium:
                 break
         return factor
 
-    def _excess(self, residual, gradient, hessian, q, scale: float) -> float:
+    def excess(self, residual, gradient, hessian, q, scale: float) -> float:
         """How far the worst dof is from equilibrium; not positive when all are."""
         free, angle = self.tangent.free, self.tangent.angle
         reach = np.abs(q[free & ~angle]).max(initial=1.0)
@@ -218,7 +247,7 @@ class Equilibrium:
         )
 
 
-def _require_supports(model) -> None:
+def require_supports(model) -> None:
     """Refuse a rod that can be shifted as a whole: no node of it holds some component. It may still turn."""
     for group in model.groups:
         host, axes = group.host, "xz" if group.kind.dim == 2 else "xyz"

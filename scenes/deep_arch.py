@@ -1,0 +1,48 @@
+"""Deep arch: a circular arch of 215 degrees, one foot clamped, the other hinged, pressed down at its crown until it snaps.
+
+The arch sways towards its hinge and reaches its largest load after the crown has come down by more than the radius (DaDeppo and
+Schmidt, J. Appl. Mech. 42, 1975). Reference: inextensible elastica by collocation, checked by shooting.
+"""
+
+import numpy as np
+
+import ddg_warp as ddg
+
+RADIUS = 100.0  # m
+ANGLE = 215.0  # degrees
+EI = 1.0e6  # N m^2
+EA = 1.0e9  # N; so stiff that the arch counts as inextensible
+LOAD = 1000.0  # N, at load parameter 1
+SOURCE = "inextensible elastica, collocation; 897 (DaDeppo & Schmidt 1975)"
+
+# First maximum of the load [N], and where the crown is then, down and aside [m].
+CRITICAL, DROP, SHIFT = 897.3089968, 113.7320631, 61.14146579
+
+
+def build(n: int = 240) -> ddg.Scene:
+    """The arch in the plane of x and z, its crown at (0, 0, R).
+
+    Args:
+        n: edges of the arch, an even number
+    """
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2)
+    angle = np.radians(ANGLE) * np.linspace(-0.5, 0.5, n + 1)
+    points = RADIUS * np.stack([np.sin(angle), 0.0 * angle, np.cos(angle)], axis=1)
+    arch = scene.add_rod(points, section=ddg.Stiffness(EA=EA, EI1=EI, radius=1.0), name="arch")
+    scene.clamp_end(arch, "first")
+    scene.fix(arch, [-1])
+    scene.add_force(arch, n // 2, (0.0, 0.0, -LOAD))
+    watch = {"drop": ddg.Displacement.of(n // 2, "z", -1.0), "shift": ddg.Displacement.of(n // 2, "x")}
+    scene.analysis = ddg.Trace(watch, ddg.Stop(limit_points=1), step=0.03, max_step=0.15)
+    return scene
+
+
+def check(result) -> list[ddg.Check]:
+    """The limit load, and where the crown is there, to what edges of this length can resolve."""
+    limit = result.path.limit_points[0]
+    finer = max(1.0, (240.0 / (result.model.curves.counts[0] - 1)) ** 2)
+    return [
+        ddg.Check("critical load [N]", LOAD * limit.load, CRITICAL, 2e-3 * finer, SOURCE, relative=True),
+        ddg.Check("drop of the crown [m]", limit.values["drop"], DROP, 2e-3 * finer, SOURCE, relative=True),
+        ddg.Check("shift of the crown [m]", limit.values["shift"], SHIFT, 2e-3 * finer, SOURCE, relative=True),
+    ]
