@@ -1,6 +1,5 @@
 """Growth through rest forms: bilayers against Timoshenko and Ashwell, and the ripples of a grown edge."""
 
-import numpy as np
 import pytest
 from convergence import equilibrium, order
 
