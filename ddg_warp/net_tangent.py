@@ -45,17 +45,38 @@ class NetTangent:
                 result[:, d] += np.bincount(index, forces[..., d].ravel(), len(result))
         return result.ravel()
 
-    def hessian(self, state) -> sparse.csc_matrix:
+    def hessian(self, state, stress: list | None = None) -> sparse.csc_matrix:
         total = sparse.csr_matrix((self.size, self.size))
         for i, part in enumerate(self.net.sets):
             size, count = part.term.measure.size, part.elements * self.net.worlds
             out = wp.zeros((count, size, size), dtype=self.net.real, device=self.net.device)
-            self._launch(state, i, 2, out, (size,))
+            extra = np.zeros((len(part.term.measure.strains), count))
+            if stress is not None:
+                extra = stress[i] - self._stress(state, i)
+            self._launch(state, i, 2, out, (size,), wp.array(extra, dtype=self.net.real, device=self.net.device))
             values = out.numpy().astype(np.float64)
             values = 0.5 * (values + values.transpose(0, 2, 1))
             diagonal = sparse.bsr_matrix((values, np.arange(count), np.arange(count + 1)))
             total = total + self.incidence[i].T @ (diagonal @ self.incidence[i])
         return total.tocsc()
+
+    def linear_stress(self, state, step: np.ndarray) -> list:
+        """Stresses (strains, elements) of every set that the strains e + J step have."""
+        result = []
+        change = wp.array(step.reshape(-1, 3), dtype=self.net.vector, device=self.net.device)
+        for i, part in enumerate(self.net.sets):
+            shape = (len(part.term.measure.strains), part.elements * self.net.worlds)
+            out = wp.zeros(shape, dtype=self.net.real, device=self.net.device)
+            self._launch(state, i, 4, out, (), change)
+            result.append(out.numpy().astype(np.float64))
+        return result
+
+    def _stress(self, state, index: int) -> np.ndarray:
+        part = self.net.sets[index]
+        shape = (len(part.term.measure.strains), part.elements * self.net.worlds)
+        strain, stress = (wp.zeros(shape, dtype=self.net.real, device=self.net.device) for _ in range(2))
+        self.net.strains(state.net, index, strain, stress)
+        return stress.numpy().astype(np.float64)
 
     def loads(self, factor: float, q: np.ndarray) -> np.ndarray:
         host, x = self.host, q.reshape(self.net.worlds, -1, 3)
@@ -145,12 +166,12 @@ class NetTangent:
                     return f"{what} {int(np.flatnonzero(blocks == block)[0])} of shell {i}"
         return f"joint {block - self.host.nodes - self.host.angles}"
 
-    def _launch(self, state, index: int, which: int, out: wp.array, columns: tuple) -> None:
+    def _launch(self, state, index: int, which: int, out: wp.array, columns: tuple, *more) -> None:
         part = self.net.sets[index]
         wp.launch(
             elements.term_kernels(part.term, self.net.real)[which],
             (part.elements * self.net.worlds, *columns),
-            self.net.inputs(part, state.net, index),
+            [*self.net.inputs(part, state.net, index), *more],
             [out],
             device=self.net.device,
         )

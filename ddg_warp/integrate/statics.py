@@ -2,7 +2,8 @@
 
 Every load step holds supports where their motion has them at the load parameter t and scales loads by t. Newton uses the exact
 tangent where it is positive definite; where it is not, mode "minimise" shifts it until it is (so that only minima attract), and
-mode "follow" takes it as it is, with the residual as merit, to follow equilibria that are not stable.
+mode "follow" takes it as it is, with the residual as merit, to follow equilibria that are not stable. Shells try Newton with stresses
+of its own first (`ddg_warp.integrate.mixed`), which takes fewer iterations, and fall back on this search.
 """
 
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ import numpy as np
 from scipy import sparse
 
 from ddg_warp.errors import SceneError, SolverError, check_options
+from ddg_warp.integrate import mixed
 from ddg_warp.linear.direct import Factorisation, SingularError
 from ddg_warp.state import State
 from ddg_warp.tangent import Tangent
@@ -105,13 +107,15 @@ class Equilibrium:
     def solve(self, state: State, before: float, at: float) -> State:
         """The equilibrium at load parameter `at`, from a state that belongs to `before`."""
         tangent, options = self.tangent, self.options
+        if tangent.mixed and (found := mixed.newton(self, state, before, at)) is not None:
+            return found
         state = state.copy()
         tangent.move_supports(state, before, at)
         free = tangent.free
         energies, q = tangent.element_energies(state), tangent.dofs(state)
         outer = tangent.loads(at, q)
         gradient = tangent.gradient(state)
-        scale, polished = None, False
+        scale, polished = 0.0, False
         for _ in range(options.max_iterations):
             residual = outer - gradient
             hessian = tangent.hessian(state)
@@ -120,11 +124,8 @@ class Equilibrium:
                 hessian = hessian + following
             if not np.isfinite(residual).all() or not np.isfinite(hessian.data).all():
                 raise SolverError(self._where("non_finite", residual, at), state=state, outcome="non_finite")
-            outer_sum = np.abs(outer[free & ~tangent.angle]).sum()
-            scale = max(outer_sum, np.abs(gradient[~free & ~tangent.angle]).max(initial=0.0), scale or 0.0)
-            if scale == 0.0:
-                scale = np.abs(residual[free]).max()
-            excess = self._excess(residual, gradient, hessian, q, scale)
+            scale = max(scale, self.scale(outer, gradient, residual))
+            excess = self.excess(residual, gradient, hessian, q, scale)
             if excess <= 0.0 and (self.outcome == "converged" or polished):
                 state.time = at
                 return state
@@ -197,7 +198,13 @@ class Equilibrium:
                 break
         return factor
 
-    def _excess(self, residual, gradient, hessian, q, scale: float) -> float:
+    def scale(self, outer: np.ndarray, gradient: np.ndarray, residual: np.ndarray) -> float:
+        """Sum of the outer forces or largest support force [N]; the residual where there are none."""
+        free, angle = self.tangent.free, self.tangent.angle
+        size = max(np.abs(outer[free & ~angle]).sum(), np.abs(gradient[~free & ~angle]).max(initial=0.0))
+        return float(size) if size > 0.0 else float(np.abs(residual[free]).max())
+
+    def excess(self, residual, gradient, hessian, q, scale: float) -> float:
         """How far the worst dof is from equilibrium; not positive when all are."""
         free, angle = self.tangent.free, self.tangent.angle
         reach = np.abs(q[free & ~angle]).max(initial=1.0)
