@@ -414,7 +414,8 @@ def _edge_value(value, piece: Piece, row: int, edge: int) -> float:
 def _shell_sets(net: Net, scene) -> list[NetSet]:
     sets = []
     for shell, description in zip(net.shells, scene.shells, strict=True):
-        for elements in shell_terms.shell_elements(shell.surface, shell.plate, shell.kinds, description.bending):
+        models = description.bending, description.membrane
+        for elements in shell_terms.shell_elements(shell.surface, shell.plate, shell.kinds, *models):
             sets.append(_bound(elements, shell))
         if description.bending == "midedge_dof":
             net.fixed[shell.edges[~shell.kinds.turning], 0] = True

@@ -20,6 +20,7 @@ class Shell:
     thickness: np.ndarray
     material: Material
     bending: str
+    membrane: str
     rest: object
     name: str
 
@@ -97,6 +98,7 @@ class Structures:
         thickness,
         material: Material,
         bending: str = "midedge_dof",
+        membrane: str = "flat",
         rest="shape",
         name: str = "shell",
     ) -> int:
@@ -130,7 +132,7 @@ class Structures:
             raise SceneError(f"shell '{name}': triangles are {triangles.dtype}; give whole numbers")
         if not isinstance(material, Material):
             raise SceneError(f"shell '{name}': material is {material!r}; give material=Material(...)")
-        self.shells.append(Shell(points, triangles, np.asarray(thickness, float), material, bending, rest, name))
+        self.shells.append(Shell(points, triangles, np.asarray(thickness, float), material, bending, membrane, rest, name))
         return len(self.shells) - 1
 
     def hold(self, shell: int, vertices, components: str = "xyz", motion: Motion | None = None) -> None:
