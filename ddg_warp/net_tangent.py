@@ -1,5 +1,7 @@
 """What a net contributes to a model's energy and tangent on the host; dofs are its blocks, three each, world by world."""
 
+from functools import cached_property
+
 import numpy as np
 import warp as wp
 from scipy import sparse
@@ -20,12 +22,15 @@ class NetTangent:
             np.tile(values.ravel(), worlds) for values in (~host.fixed, kind, host.mass)
         )
         self._places = [_places(part.host, host.blocks, worlds) for part in self.net.sets]
-        self._pattern = _Pattern([dofs for _, dofs in self._places], self.size)
         self._ends = np.concatenate([host.ends, *(s.nodes[s.surface.edges] for s in host.shells)])
         if not len(self._ends):
             self._ends = np.concatenate([s.slots[:2].T for s in host.sets])
         length = np.linalg.norm(np.diff(host.rest[self._ends], axis=1)[:, 0], axis=1)
         self._edge_length = float(length.mean())
+
+    @cached_property
+    def _pattern(self) -> "_Pattern":
+        return _Pattern([dofs for _, dofs in self._places], self.size)
 
     def energies(self, state):
         """(term's name, energies of its elements)."""
