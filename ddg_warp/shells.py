@@ -13,6 +13,7 @@ from ddg_warp.kernels.terms import SHELLS
 from ddg_warp.shell_geometry import CLAMPED, NEIGHBOUR, EdgeKinds, edge_angles, metric, mid_edge_nodes, second_form
 
 MODELS = ("midedge_dof", "midedge", "hinge", "isometric")
+MEMBRANES = ("flat", "curved")
 
 
 @dataclass(frozen=True)
@@ -182,11 +183,15 @@ def shell_elements(
     """Membrane and bending of a shell. With "midedge_dof" the angles of edges that are not `kinds.turning` must be fixed.
 
     Raises:
-        SceneError: no such bending model, or one that the rest shape or the supports do not fit.
+        SceneError: no such model of bending or membrane, or one that the rest shape, the supports or the other do not fit.
     """
     if bending not in MODELS:
         raise SceneError(f"bending = {bending!r}; it is one of {', '.join(MODELS)}")
+    if membrane_model not in MEMBRANES:
+        raise SceneError(f"membrane = {membrane_model!r}; it is one of {', '.join(MEMBRANES)}")
     if membrane_model == "curved":
+        if bending != "midedge_dof":
+            raise SceneError(f"membrane 'curved' reads the mid-edge normals of bending 'midedge_dof', not {bending!r}")
         return [curved_membrane(surface, plate, kinds), mid_edge_bending(surface, plate, kinds, True)]
     if bending == "hinge":
         return [membrane(surface, plate), *hinge_bending(surface, plate, kinds)]

@@ -54,7 +54,7 @@ class Tangent:
         return np.concatenate([part.gradient(state) for part in self.parts])
 
     @property
-    def mixed(self) -> bool:
+    def shells_alone(self) -> bool:
         """Whether the model consists of shells alone, so that `linear_stress` serves it."""
         return not self.model.groups and not self.model.net.edges
 

@@ -54,9 +54,9 @@ def observe(model, state) -> dict[str, float]:
     return {"drop": -_sze.displacement(model, state, 0, 0), "force": float(force)}
 
 
-def limit(result) -> tuple[float, float]:
-    """First limit load [N] and the drop there [mm], by a parabola through the first maximum; the last state without one."""
-    drop, force = np.array(result.series["drop"]), np.array(result.series["force"])
+def limit(series) -> tuple[float, float]:
+    """First limit load [N] and the drop there [mm], by a parabola through the first maximum; NaN without one."""
+    drop, force = np.array(series["drop"]), np.array(series["force"])
     peaks = np.flatnonzero((force[1:-1] >= force[:-2]) & (force[1:-1] > force[2:])) + 1
     if not peaks.size:
         return float("nan"), float("nan")
@@ -70,4 +70,4 @@ def check(result) -> list[ddg.Check]:
     thickness = float(result.scene.shells[0].thickness)
     if thickness not in LIMIT:
         return []
-    return [ddg.Check("limit load [N]", limit(result)[0], LIMIT[thickness], 0.015, _sze.SOURCE, relative=True)]
+    return [ddg.Check("limit load [N]", limit(result.series)[0], LIMIT[thickness], 0.015, _sze.SOURCE, relative=True)]

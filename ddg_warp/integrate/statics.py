@@ -68,6 +68,7 @@ class Equilibrium:
 
     Attributes:
         tangent: energy, gradient and Hessian of the model.
+        mixed: whether Newton with stresses of its own is tried first; where it can be, by default.
         iterations: Newton iterations so far.
         outcome: of the last solve, `converged` or `converged_to_rounding`.
     """
@@ -76,6 +77,7 @@ class Equilibrium:
         self.model, self.options = model, options or StaticsOptions()
         self.tangent = Tangent(model)
         _require_supports(model)
+        self.mixed = self.tangent.shells_alone
         self.iterations = 0
         self.outcome = ""
 
@@ -107,7 +109,7 @@ class Equilibrium:
     def solve(self, state: State, before: float, at: float) -> State:
         """The equilibrium at load parameter `at`, from a state that belongs to `before`."""
         tangent, options = self.tangent, self.options
-        if tangent.mixed and (found := mixed.newton(self, state, before, at)) is not None:
+        if self.mixed and (found := mixed.newton(self, state, before, at)) is not None:
             return found
         state = state.copy()
         tangent.move_supports(state, before, at)

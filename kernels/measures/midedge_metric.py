@@ -75,8 +75,8 @@ def _functions(real):
     return strains, jacobian, tension
 
 
-curved_metric = Measure(
-    "curved_metric",
+midedge_metric = Measure(
+    "midedge_metric",
     3,
     midedge_curvature_dof.edges,
     ("a11/2 [m^2]", "a12/2 [m^2]", "a22/2 [m^2]"),
