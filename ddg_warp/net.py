@@ -416,7 +416,8 @@ def _edge_value(value, piece: Piece, row: int, edge: int) -> float:
 def _shell_sets(net: Net, scene) -> list[NetSet]:
     sets, count = [], Counter()
     for shell, description in zip(net.shells, scene.shells, strict=True):
-        for elements in shell_terms.shell_elements(shell.surface, shell.plate, shell.kinds, description.bending):
+        models = description.bending, description.membrane
+        for elements in shell_terms.shell_elements(shell.surface, shell.plate, shell.kinds, *models):
             sets.append(_bound(elements, shell))
             shell.first[elements.term.name] = count[elements.term.name]
             count[elements.term.name] += len(elements)
