@@ -252,7 +252,9 @@ def term_kernels(term: Term, real):
         """Stresses of the strains that a step gives to first order, e + J step."""
         tid = wp.tid()
         x, s, w, p = gather(q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid)
-        d, _s, _w, _p = gather(step, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid)
+        d, _s, _w, _p = gather(
+            step, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid
+        )
         e, jacobian = jacobian_of(x, s, w)
         stress = slope_of(e + jacobian * d, p)
         for i in range(wp.static(n)):
