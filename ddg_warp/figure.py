@@ -110,7 +110,9 @@ def path_plot(path, file, title: str = "") -> None:
     for k, name in enumerate(names):
         color, values = TIME_COLORS(0.3 + 0.7 * k / max(1, len(names))), path.values(name)
         for broken, style in ((False, "-"), (True, "--")):
-            segments = [np.column_stack([values[i : i + 2], load[i : i + 2]]) for i in np.flatnonzero(unstable == broken)]
+            kept = np.flatnonzero(unstable == broken)
+            runs = np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1) if len(kept) else []
+            segments = [np.column_stack([a[i[0] : i[-1] + 2] for a in (values, load)]) for i in runs]
             plot.add_collection(LineCollection(segments, colors=[color], linestyles=style, linewidths=1.4))
         plot.plot([], [], color=color, label=name)
         for kind, marker in (("limit point", "o"), ("bifurcation", "D")):

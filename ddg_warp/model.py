@@ -267,6 +267,26 @@ class Model:
             raise ValueError(f"no rod has the term {term!r}; this model has {', '.join(self._term_names())}")
         self.version += 1
 
+    def set_rest(self, shell: int, *, points=None, metric=None, curvature=None, angle=None) -> None:
+        """Change the rest shape of a shell in every world: growth, swelling, bilayers, creases, pre-stress.
+
+        What is not given stays. Masses stay too, as does the direction of clamped normals. See `ddg_warp.rest_shapes` for forms from
+        principal stretches and curvatures.
+
+        Args:
+            shell: index of the shell.
+            points: (P, 3) [m], a shape whose metric, curvature and angles are those at rest.
+            metric: first fundamental form (T, 3) [m^2], (11, 12, 22) in the basis of the first two edges of a triangle.
+            curvature: second fundamental form (T, 3) [m] in the same basis; bending "midedge_dof" and "midedge".
+            angle: of the mesh edges (E,) [rad], positive where convex on the side of the normals; bending "hinge".
+
+        Raises:
+            ValueError: no such shell, a shape that does not fit, a metric without area, or what this bending model does not have.
+        """
+        from ddg_warp.rest_shapes import set_rest
+
+        set_rest(self, shell, points=points, metric=metric, curvature=curvature, angle=angle)
+
     def _term_names(self) -> list[str]:
         nets = [part.term.name for part in self.net.sets] if self.net is not None else []
         return sorted({term.name for group in self.groups for term in group.kind.terms} | set(nets))

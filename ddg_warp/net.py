@@ -4,6 +4,7 @@ Nodes of joined rods and attached vertices become one. Blocks are numbered nodes
 edges), then rotations of rigid joints. In a scene of dimension 2 the net is the planar one of three-dimensional elements.
 """
 
+from collections import Counter
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -43,6 +44,7 @@ class NetShell:
     edges: np.ndarray
     kinds: shell_geometry.EdgeKinds
     plate: shell_terms.Plate
+    first: dict[str, int] = field(default_factory=dict)  # its first element in the set of each of its terms
 
 
 @dataclass
@@ -240,7 +242,7 @@ class _Builder:
         shells, mesh_edges = [], 0
         for (surface, numbers), shell in zip(self.shells, scene.shells, strict=True):
             kinds = self._kinds(surface, len(shells))
-            turning = shell.bending == "midedge_dof"
+            turning = shell.bending in shell_terms.TURNING
             first = nodes + self.rod_edges + mesh_edges
             angle = first + np.arange(len(surface.edges)) if turning else np.full(len(surface.edges), -1)
             mesh_edges += len(surface.edges) if turning else 0
@@ -428,12 +430,15 @@ def _edge_value(value, piece: Piece, row: int, edge: int) -> float:
 
 
 def _shell_sets(net: Net, scene) -> list[NetSet]:
-    sets = []
+    sets, count = [], Counter()
     for shell, description in zip(net.shells, scene.shells, strict=True):
-        for elements in shell_terms.shell_elements(shell.surface, shell.plate, shell.kinds, description.bending):
+        models = description.bending, description.membrane
+        for elements in shell_terms.shell_elements(shell.surface, shell.plate, shell.kinds, *models):
             sets.append(_bound(elements, shell.nodes, shell.edges))
-        if description.bending == "midedge_dof":
-            net.fixed[shell.edges[~shell.kinds.turning], 0] = True
+            shell.first[elements.term.name] = count[elements.term.name]
+            count[elements.term.name] += len(elements)
+        if description.bending in shell_terms.TURNING:
+            net.fixed[shell.edges[~shell_terms.turning(shell.kinds, description.bending)], 0] = True
     return sets
 
 

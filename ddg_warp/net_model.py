@@ -71,6 +71,22 @@ class DeviceSet:
         self.parameters[row] = np.ascontiguousarray(new)
         self.upload(self.buffer.dtype)
 
+    def set_rest(self, first: int, parameters: list) -> None:
+        """Replace the rest measure, metric and strains of the elements from `first` on, in every world; stiffness stays.
+
+        Args:
+            first: element.
+            parameters: all parameters of the term in their order, each one number or one an element.
+        """
+        count = max(np.size(values) for values in parameters)
+        for row, (name, values) in enumerate(zip(self.term.parameter_names, parameters, strict=True)):
+            if not name.startswith(("measure", "metric", "rest")):
+                continue
+            full = np.repeat(self.parameters[row], self.elements // self.parameters[row].shape[1], axis=1)
+            full[:, first : first + count] = values
+            self.parameters[row] = full if len(full) > 1 else _short(full[0])[None]
+        self.upload(self.buffer.dtype)
+
 
 class DeviceNet:
     """A `Net` with all its worlds on a device."""

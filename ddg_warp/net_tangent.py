@@ -1,5 +1,7 @@
 """What a net contributes to a model's energy and tangent on the host; dofs are its blocks, three each, world by world."""
 
+from functools import cached_property
+
 import numpy as np
 import warp as wp
 from scipy import sparse
@@ -20,7 +22,7 @@ class NetTangent:
         self.free, self.angle, self.mass = (
             np.tile(values.ravel(), worlds) for values in (~host.fixed, kind, host.mass)
         )
-        self.incidence = [_incidence(part.host, host.blocks, worlds) for part in self.net.sets]
+        self._places = [_places(part.host, host.blocks, worlds) for part in self.net.sets]
         self._ends = np.concatenate(
             [host.ends, *(s.nodes[s.surface.edges] for s in host.shells), *(m.ends for m in host.meridians)]
         )
@@ -32,6 +34,10 @@ class NetTangent:
         for shell in host.shells:
             self._anchored[shell.nodes] = True
         self._order = _outwards(host.rods, self._anchored.any(1))
+
+    @cached_property
+    def _pattern(self) -> "_Pattern":
+        return _Pattern([dofs for _, dofs in self._places], self.size)
 
     def energies(self, state):
         """(term's name, energies of its elements)."""
@@ -52,17 +58,36 @@ class NetTangent:
                 result[:, d] += np.bincount(index, forces[..., d].ravel(), len(result))
         return result.ravel()
 
-    def hessian(self, state) -> sparse.csc_matrix:
-        total = sparse.csr_matrix((self.size, self.size))
+    def hessian(self, state, stress: list | None = None) -> sparse.csc_matrix:
+        entries = []
         for i, part in enumerate(self.net.sets):
             size, count = part.term.measure.size, part.elements * self.net.worlds
             out = wp.zeros((count, size, size), dtype=self.net.real, device=self.net.device)
-            self._launch(state, i, 2, out, (size,))
+            extra = np.zeros((len(part.term.measure.strains), count))
+            if stress is not None:
+                extra = stress[i] - self._stress(state, i)
+            self._launch(state, i, 2, out, (size,), wp.array(extra, dtype=self.net.real, device=self.net.device))
             values = out.numpy().astype(np.float64)
-            values = 0.5 * (values + values.transpose(0, 2, 1))
-            diagonal = sparse.bsr_matrix((values, np.arange(count), np.arange(count + 1)))
-            total = total + self.incidence[i].T @ (diagonal @ self.incidence[i])
-        return total.tocsc()
+            entries.append(_spread(0.5 * (values + values.transpose(0, 2, 1)), self._places[i][0]).ravel())
+        return self._pattern.matrix(np.concatenate(entries))
+
+    def linear_stress(self, state, step: np.ndarray) -> list:
+        """Stresses (strains, elements) of every set that the strains e + J step have."""
+        result = []
+        change = wp.array(step.reshape(-1, 3), dtype=self.net.vector, device=self.net.device)
+        for i, part in enumerate(self.net.sets):
+            shape = (len(part.term.measure.strains), part.elements * self.net.worlds)
+            out = wp.zeros(shape, dtype=self.net.real, device=self.net.device)
+            self._launch(state, i, 4, out, (), change)
+            result.append(out.numpy().astype(np.float64))
+        return result
+
+    def _stress(self, state, index: int) -> np.ndarray:
+        part = self.net.sets[index]
+        shape = (len(part.term.measure.strains), part.elements * self.net.worlds)
+        strain, stress = (wp.zeros(shape, dtype=self.net.real, device=self.net.device) for _ in range(2))
+        self.net.strains(state.net, index, strain, stress)
+        return stress.numpy().astype(np.float64)
 
     def loads(self, factor: float, q: np.ndarray) -> np.ndarray:
         host, x = self.host, q.reshape(self.net.worlds, -1, 3)
@@ -192,12 +217,12 @@ class NetTangent:
                 return f"node {int(np.flatnonzero(meridian.nodes == block)[0])} of axisymmetric shell {i}"
         return f"joint {block - self.host.nodes - self.host.angles}"
 
-    def _launch(self, state, index: int, which: int, out: wp.array, columns: tuple) -> None:
+    def _launch(self, state, index: int, which: int, out: wp.array, columns: tuple, *more) -> None:
         part = self.net.sets[index]
         wp.launch(
             elements.term_kernels(part.term, self.net.real)[which],
             (part.elements * self.net.worlds, *columns),
-            self.net.inputs(part, state.net, index),
+            [*self.net.inputs(part, state.net, index), *more],
             [out],
             device=self.net.device,
         )
@@ -219,35 +244,50 @@ def _tiled(slots: np.ndarray, blocks: int, worlds: int) -> np.ndarray:
     return np.concatenate([slots + world * blocks for world in range(worlds)], axis=1)
 
 
-def _incidence(part, blocks: int, worlds: int) -> sparse.csr_matrix:
-    """B of one set: (local dofs of all elements, dofs)."""
+def _places(part, blocks: int, worlds: int) -> tuple[np.ndarray, np.ndarray]:
+    """B (local dofs, dofs of an element's slots), the same for all elements of a set, and these dofs (elements, .)."""
     measure = part.term.measure
     slots = _tiled(part.slots, blocks, worlds)
-    count = slots.shape[1]
-    first = np.arange(count) * measure.size
-    rows, cols, values = [], [], []
-
-    def put(local, block, component, sign):
-        rows.append(first + local)
-        cols.append(3 * block + component)
-        values.append(np.full(count, sign))
-
+    first_angle, first_spin = measure.nodes, measure.nodes + measure.angles
+    columns = [(slot, d) for slot in range(measure.slots) for d in range(1 if first_angle <= slot < first_spin else 3)]
+    number = {place: i for i, place in enumerate(columns)}
+    B = np.zeros((measure.size, len(columns)))
     for i, (a, b) in enumerate(measure.edges):
         for d in range(3):
-            put(3 * i + d, slots[b], d, 1.0)
-            put(3 * i + d, slots[a], d, -1.0)
+            B[3 * i + d, number[b, d]] += 1.0
+            B[3 * i + d, number[a, d]] -= 1.0
     at = 3 * len(measure.edges)
     for i in range(measure.angles):
-        put(at + i, slots[measure.nodes + i], 0, 1.0)
+        B[at + i, number[first_angle + i, 0]] = 1.0
     for i in range(measure.spins):
         for d in range(3):
-            put(at + measure.angles + 3 * i + d, slots[measure.nodes + measure.angles + i], d, 1.0)
+            B[at + measure.angles + 3 * i + d, number[first_spin + i, d]] = 1.0
     at += measure.angles + 3 * measure.spins
     for i in range(measure.points):
         for d in range(3):
-            put(at + 3 * i + d, slots[i], d, 1.0)
-    shape = (count * measure.size, 3 * blocks * worlds)
-    return sparse.csr_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(cols))), shape=shape)
+            B[at + 3 * i + d, number[i, d]] = 1.0
+    return B, np.stack([3 * slots[slot] + d for slot, d in columns], axis=1)
+
+
+def _spread(values: np.ndarray, B: np.ndarray) -> np.ndarray:
+    """B^T values B of all elements."""
+    return np.matmul(B.T, (values.reshape(-1, len(B)) @ B).reshape(len(values), len(B), -1))
+
+
+class _Pattern:
+    """Where the entries of element matrices go in their sparse sum; made once, so that sums are one pass over the entries."""
+
+    def __init__(self, dofs: list[np.ndarray], size: int):
+        keys = [(d[:, None, :].astype(np.int64) * size + d[:, :, None]).ravel() for d in dofs]  # column by column
+        places, self._index = np.unique(np.concatenate(keys), return_inverse=True)
+        column, self._rows = np.divmod(places, size)
+        self._starts = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=size))])
+        self._size = size
+
+    def matrix(self, entries: np.ndarray) -> sparse.csc_matrix:
+        """The sum of element matrices, whose entries are given row by row, element by element."""
+        data = np.bincount(self._index, entries, len(self._rows))
+        return sparse.csc_matrix((data, self._rows, self._starts), shape=(self._size, self._size))
 
 
 def _cross(e: np.ndarray) -> np.ndarray:

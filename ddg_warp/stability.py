@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg, sparse
 from scipy.optimize import brentq
-from scipy.sparse.linalg import eigsh, splu
+from scipy.sparse.linalg import LinearOperator, eigsh, splu
 
 from ddg_warp.linear.direct import Factorisation, SingularError
 from ddg_warp.tangent import Tangent
@@ -150,3 +150,39 @@ def critical(equilibrium_at: Callable, low: float, high: float, tolerance: float
         return float(spectrum(model, state, 1, "unit").eigenvalues[0])
 
     return float(brentq(lowest, low, high, xtol=tolerance * abs(high - low)))
+
+
+def buckling(model, free, loaded, count: int = 1) -> np.ndarray:
+    """Linearised buckling: the lowest positive factors for which K(free) + factor (K(loaded) - K(free)) is singular.
+
+    With K the exact tangents of two equilibria of which the first is stable. Where the state before buckling is in proportion to its
+    load, as of a flat plate, these are the critical loads over that of `loaded`; elsewhere take `critical`, or two states close to
+    the critical one.
+
+    Args:
+        model: what both states belong to.
+        free, loaded: two equilibria, such as the state without load and under a part of it.
+        count: how many factors.
+
+    Raises:
+        ValueError: the first equilibrium is not stable, or no positive factor is found.
+    """
+    tangent = Tangent(model)
+    dofs = np.flatnonzero(tangent.free)
+    start, end = (tangent.hessian(state)[dofs][:, dofs] for state in (free, loaded))
+    factors = Factorisation(sparse.csc_matrix(start))
+    if factors.negative:
+        raise ValueError(f"the first state is no minimum: its tangent has {factors.negative} negative eigenvalues")
+    size = len(dofs)
+    softening = sparse.csc_matrix(start - end)
+    if size <= DENSE:
+        values = linalg.eigh(softening.toarray(), start.toarray(), eigvals_only=True)
+    else:
+        inverse = LinearOperator((size, size), matvec=factors.solve, dtype=np.float64)
+        values = eigsh(
+            softening, k=count, M=start, Minv=inverse, which="LA", v0=np.ones(size), return_eigenvectors=False
+        )
+    values = np.sort(values[values > 0.0])[::-1][:count]
+    if not len(values):
+        raise ValueError("no load along this direction makes the tangent singular")
+    return 1.0 / values

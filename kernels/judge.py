@@ -10,16 +10,15 @@ import warp as wp
 
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.element import ChainKind
-from ddg_warp.kernels.search import PLACE, RELAG, search_functions
+from ddg_warp.kernels.search import PLACE, RELAG, search_functions, shorter_function
 
 STOP, DIRECT = 0, 3  # beside PLACE and RELAG: nothing more to do, and a direction is wanted
 
 
 @cache
-def judge_functions(kind: ChainKind, real, linear):
+def judge_functions(twist: bool, real):
     """balanced(...): whether a rod has stopped; decide(...): what an active rod does next (STOP, PLACE, RELAG or DIRECT)."""
-    *_, shorter = search_functions(kind, real, linear)
-    twist = kind.twist
+    shorter = shorter_function(real)
 
     @wp.func
     def balanced(
@@ -116,7 +115,7 @@ def judge_kernel(kind: ChainKind, real, linear):
     """The line search of a rod by one thread: sums over its nodes, decides, and puts a shortened step or new frames."""
     V = wp.types.vector(kind.dim, real)
     place, turn_angles, relag, _ = search_functions(kind, real, linear)
-    balanced, decide = judge_functions(kind, real, linear)
+    balanced, decide = judge_functions(kind.twist, real)
     twist, nb = kind.twist, kind.block
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)

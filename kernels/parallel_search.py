@@ -91,7 +91,7 @@ def sum_kernels(kind: ChainKind, real, linear):
 @cache
 def decide_kernels(kind: ChainKind, real, linear):
     """Decisions of a rod from its partial sums: `judge` of an iterate, `take` of a direction."""
-    balanced, decide = judge_functions(kind, real, linear)
+    balanced, decide = judge_functions(kind.twist, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def judge(

@@ -72,6 +72,23 @@ def move_functions(kind: ChainKind, real, linear):
 
 
 @cache
+def shorter_function(real):
+    """shorter(taken, expected, change, finite): length of a step after its rejection."""
+
+    @wp.func
+    def shorter(taken: real, expected: real, change: real, finite: bool):
+        """Length after a rejected step: minimum of the parabola through energy, slope and new energy, within bounds."""
+        if not finite:
+            return real(0.1) * taken
+        bowl = change + expected
+        if bowl > real(0.0):
+            return taken * wp.clamp(real(0.5) * expected / bowl, real(0.1), real(0.5))
+        return real(0.5) * taken
+
+    return shorter
+
+
+@cache
 def search_functions(kind: ChainKind, real, linear):
     """What every solver's line search does to a rod: place(...), turn_angles(...), relag(...), shorter(...)."""
     dim, twist, angle, every = kind.dim, kind.twist, kind.block - 1, (1 << kind.dim) - 1
@@ -172,17 +189,7 @@ def search_functions(kind: ChainKind, real, linear):
         if wp.static(closed):
             frame[6, n - 1, r] = reference_twist(u0, u_first, t0, t_first, frame[6, n - 1, r])
 
-    @wp.func
-    def shorter(taken: real, expected: real, change: real, finite: bool):
-        """Length after a rejected step: minimum of the parabola through energy, slope and new energy, within bounds."""
-        if not finite:
-            return real(0.1) * taken
-        bowl = change + expected
-        if bowl > real(0.0):
-            return taken * wp.clamp(real(0.5) * expected / bowl, real(0.1), real(0.5))
-        return real(0.5) * taken
-
-    return place, turn_angles, relag, shorter
+    return place, turn_angles, relag, shorter_function(real)
 
 
 @cache

@@ -15,6 +15,7 @@ from ddg_warp.kernels.measures.hinge_angle import hinge_angle
 from ddg_warp.kernels.measures.isometric_bending import isometric_bending
 from ddg_warp.kernels.measures.joint_curvature_twist import joint_curvature_twist
 from ddg_warp.kernels.measures.midedge_curvature import midedge_curvature, midedge_curvature_dof
+from ddg_warp.kernels.measures.midedge_metric import midedge_metric
 from ddg_warp.kernels.measures.planar_curvature import planar_curvature
 from ddg_warp.kernels.measures.rod_curvature_twist import rod_curvature_twist
 from ddg_warp.kernels.measures.triangle_metric import triangle_metric
@@ -56,6 +57,8 @@ SHELLS = {
     for term in (
         Term("shell_stretch", triangle_metric, st_venant_kirchhoff, "membrane of a triangle, E h"),
         Term("shell_stretch_damped", triangle_metric, st_venant_kirchhoff_damped, "membrane with strain-rate damping"),
+        Term("shell_stretch_curved", midedge_metric, st_venant_kirchhoff, "membrane of a curved triangle, E h"),
+        Term("shell_stretch_curved_damped", midedge_metric, st_venant_kirchhoff_damped, "the same, damped"),
         Term("shell_bend", midedge_curvature, st_venant_kirchhoff, "bending by mid-edge normals, E h^3"),
         Term("shell_bend_damped", midedge_curvature, st_venant_kirchhoff_damped, "the same with strain-rate damping"),
         Term(

@@ -97,6 +97,39 @@ def test_increments_are_halved(device, monkeypatch):
     np.testing.assert_allclose(state.points(), solve(model, load_steps=8).points(), atol=1e-8)
 
 
+def pushed(device, distance: float, turn: float = 0.0, dimension: int = 2):
+    """A rod bent like a bow of 40 edges, its last end moved towards the first, and turned, by the load parameter."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=dimension)
+    angle = np.linspace(-0.6, 0.6, 41)
+    points = np.stack([np.sin(angle), 0.0 * angle, np.cos(angle) - np.cos(0.6)], axis=1) / 1.2
+    rod = scene.add_rod(points, section=SECTION)
+    motion = ddg.Motion(
+        translation=lambda t: (-distance * t, 0.0, 0.0),
+        angle=lambda t: turn * t,
+        axis=(1.0, 0.3, 0.0),
+        pivot=points[-1],
+    )
+    scene.clamp_end(rod, "first")
+    scene.clamp_end(rod, "last", motion=motion) if turn else scene.fix(rod, [-1], motion=motion)
+    return scene.build(device, "float64")
+
+
+# An edge is 0.025 long: moved alone, the last node would lie twelve edges further down, and its edge point backwards.
+@pytest.mark.parametrize(("turn", "dimension"), [(0.0, 2), (0.0, 3), (0.7, 3)], ids=["plane", "space", "turned"])
+def test_supports_take_the_rest_along(device, turn, dimension):
+    """An increment that moves a support by twelve edge lengths is taken at once, to the state that small increments reach."""
+    model = pushed(device, 0.3, turn, dimension)
+    solver = Equilibrium(model)
+    whole = solver.load(model.state(), 1)
+    assert solver.iterations < 15  # 40, 337 and 42 if the supports move alone
+    small = solve(model, load_steps=40)
+    np.testing.assert_allclose(whole.points(), small.points(), atol=1e-7)
+    if dimension == 3:
+        np.testing.assert_allclose(whole.directors(), small.directors(), atol=1e-6)
+    assert whole.points()[-1, 0] == pytest.approx(np.sin(0.6) / 1.2 - 0.3, abs=1e-12)
+    assert whole.points()[20, 2] > model.state().points()[20, 2] + 0.05
+
+
 def test_failure_keeps_the_last_good_state(device):
     """A load that jumps by more than iterations and halvings allow: the error holds the state at the load before the jump."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))

@@ -7,6 +7,7 @@ import warp as wp
 
 from ddg_warp import arrays, geometry
 from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.integrate.net_step import NetStep
 from ddg_warp.integrate.prescribed import PrescribedMotion, TimedLoads
 from ddg_warp.kernels import element, outcome, step
 from ddg_warp.linear.choice import automatic
@@ -76,6 +77,7 @@ class Integrator:
         self.check_every = check_every or (32 if model.wp_device.is_cuda else 1)
         _require_mass(model)
         self._chains = [_ChainStep(self, model, group) for group in model.groups]
+        self._net = NetStep(self, model) if model.net is not None else None
         self._buffers = [model.empty_state(), model.empty_state()]
         self._graphs, self._version = {}, model.version
         self._steps_since_check = 0
@@ -98,8 +100,8 @@ class Integrator:
             self._dt_host = dt
         self._promote(dt)
         start = self._buffers[source].time
-        for chain in self._chains:
-            chain.prescribe(start, start + dt)
+        for part in self._parts:
+            part.prescribe(start, start + dt)
         self._launch(source)
         target.time = start + dt
         self._steps_since_check += 1
@@ -116,22 +118,27 @@ class Integrator:
             SolverError: a rod has been given up.
         """
         self._steps_since_check = 0
-        for chain in self._chains:
-            chain.raise_failures(state)
+        for part in self._parts:
+            part.raise_failures(state)
 
     def statistics(self) -> dict:
         """Counts since the integrator was made: Newton iterations of a solve, retries, lost pivots, outcomes."""
-        tally = sum(chain.tally.numpy() for chain in self._chains)
-        work = np.array([chain.work.numpy() for chain in self._chains])
+        tally = sum(part.tally.numpy() for part in self._parts)
+        work = np.array([part.work.numpy() for part in self._parts])
         solves = max(1, int(work[:, 2].sum()))
         return {
             "newton_iterations": {"mean": float(work[:, 0].sum() / solves), "max": int(work[:, 1].max())},
-            "pcg_iterations": sum(chain.newton.pcg_iterations() for chain in self._chains),
+            "pcg_iterations": sum(part.newton.pcg_iterations() for part in self._parts),
             "retries": int(work[:, 3].sum()),
             "lost_pivots": int(work[:, 4].sum()),
-            "linear": [chain.newton.linear.__name__ for chain in self._chains],
+            "linear": [part.newton.linear.__name__ for part in self._parts],
             "outcomes": {name: int(tally[code]) for code, name in outcome.NAMES.items() if tally[code]},
         }
+
+    @property
+    def _parts(self) -> list:
+        """Steps of the groups of rods and of the net."""
+        return self._chains if self._net is None else [*self._chains, self._net]
 
     def _promote(self, dt: float) -> None:
         """Solve in float64 where float32 factors would not be good enough for a step of dt, from now on."""
@@ -162,13 +169,15 @@ class Integrator:
             wp.capture_launch(self._graphs[source])
             return
         if not self._graphs:
-            for chain in self._chains:
-                chain.load_modules()
+            for part in self._parts:
+                part.load_modules()
         gc.disable()  # a collection while capturing would free arrays into the graph
         try:
             with wp.ScopedCapture(device=self.model.wp_device, force_module_load=False) as capture:
                 for chain in self._chains:
                     chain.step(self._buffers[source].groups[chain.index], self._buffers[1 - source].groups[chain.index])
+                if self._net is not None:
+                    self._net.step(self._buffers[source].net, self._buffers[1 - source].net)
         finally:
             gc.enable()
         self._graphs[source] = capture.graph
@@ -177,7 +186,7 @@ class Integrator:
 
 def _newton(model, group, integrator: Integrator, precision) -> ChainNewton:
     """The solver of a group that the integrator's `linear` asks for."""
-    linear = integrator.linear if integrator.linear != "auto" else automatic(group)
+    linear = automatic(group) if integrator.linear in ("auto", "multilevel") else integrator.linear
     given = (model, group, integrator.options)
     last = (precision, integrator.scheme == "implicit_midpoint")
     if integrator.solver == "projective":

@@ -2,7 +2,9 @@
 
 A rigid joint carries, for each edge that meets it, a ghost edge with the tangent and the first director that the edge had at rest.
 The ghost turns with the joint, by exp(omega) since the last step; between ghost and edge lie the strains of a rod vertex
-(`rod_curvature_twist`), with half the edge as Voronoi length, as at a clamped end. So two collinear rods joined rigidly bend as one.
+(`rod_curvature_twist`), with half the edge as Voronoi length, as at a clamped end. Two collinear rods joined rigidly are one rod: the
+half cells, in series, twist exactly as its cell and bend as it up to the square of the angle a between the edges, as
+8 B tan(a/4)^2 / l differs from 2 B tan(a/2)^2 / l.
 
 With phi the rotation of space, a row of the rod's Jacobian (a with respect to the ghost's edge t, b to its angle) turns into
 t x a + b t, and with the left Jacobian T(omega) of the exponential map (d phi = T d omega) into T^T of that.

@@ -122,10 +122,10 @@ def functions(term: Term, real):
 
 @cache
 def term_kernels(term: Term, real):
-    """Kernels of one term: energy, gradient (slots, elements), Hessian (size * size, elements), strains and stresses."""
+    """Kernels of one term: energy, gradient (slots, elements), Hessian (size * size, elements), strains and stresses, linear stresses."""
     measure, density = term.measure, term.density
     V = wp.types.vector(3, real)
-    Q, S, _, _ = measure.types(real)
+    Q, S, E, _ = measure.types(real)
     n = len(measure.strains)
     P = wp.types.vector(density.parameter_size(n), real)
     strains_of, jacobian_of, *_ = measure.functions(real)
@@ -139,8 +139,9 @@ def term_kernels(term: Term, real):
         return (slope_of(e, p) * w) * jacobian
 
     @wp.func
-    def along(q: Q, s: S, w: real, p: P, v: Q):
-        return wp.dot(gradient_at(q, s, w, p), v)
+    def along(q: Q, s: S, w: real, p: P, v: Q, extra: E):
+        e, jacobian = jacobian_of(q, s, w)
+        return wp.dot(((slope_of(e, p) + extra) * w) * jacobian, v)
 
     @wp.kernel(module="unique", enable_backward=True)
     def energy(
@@ -198,14 +199,21 @@ def term_kernels(term: Term, real):
         blocks: int,
         angle_start: int,
         elements: int,
+        extra: wp.array2d(dtype=real),
         hessian_out: wp.array3d(dtype=real),
     ):
-        """Exact Hessian in the local dofs, a column a thread: the reverse of the gradient, seeded with unit vectors."""
+        """Exact Hessian in the local dofs, a column a thread: the reverse of the gradient, seeded with unit vectors.
+
+        `extra` (strains, elements) is added to the stresses that the second derivatives of the strains are weighted with.
+        """
         e, column = wp.tid()
         x, s, w, p = gather(q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, e)
         v = Q()
         v[column] = real(1.0)
-        dq, _ds, _dw, _dp, _dv = wp.grad(along)(x, s, w, p, v)
+        more = E()
+        for i in range(wp.static(n)):
+            more[i] = extra[i, e]
+        dq, _ds, _dw, _dp, _dv, _de = wp.grad(along)(x, s, w, p, v, more)
         for i in range(wp.static(size)):
             hessian_out[e, i, column] = dq[i]
 
@@ -237,7 +245,35 @@ def term_kernels(term: Term, real):
             for i in range(wp.static(n)):
                 stress_out[i, e] = stress[i]
 
-    return energy, gradient, hessian, strains
+    @wp.kernel(module="unique", enable_backward=False)
+    def linear_stress(
+        q: wp.array(dtype=V),
+        frame: wp.array2d(dtype=real),
+        lag: wp.array2d(dtype=real),
+        last: wp.array2d(dtype=real),
+        rate: wp.array(dtype=real),
+        buffer: wp.array(dtype=real),
+        table: wp.array2d(dtype=int),
+        slots: wp.array2d(dtype=int),
+        data: wp.array2d(dtype=real),
+        blocks: int,
+        angle_start: int,
+        elements: int,
+        step: wp.array(dtype=V),
+        stress_out: wp.array2d(dtype=real),
+    ):
+        """Stresses of the strains that a step gives to first order, e + J step."""
+        tid = wp.tid()
+        x, s, w, p = gather(q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid)
+        d, _s, _w, _p = gather(
+            step, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid
+        )
+        e, jacobian = jacobian_of(x, s, w)
+        stress = slope_of(e + jacobian * d, p)
+        for i in range(wp.static(n)):
+            stress_out[i, tid] = stress[i]
+
+    return energy, gradient, hessian, strains, linear_stress
 
 
 @cache
@@ -246,7 +282,8 @@ def evaluate_kernel(term: Term, real, linear):
 
     Factor rows are vectors [strain * slots + slot][element]; `tension_out` holds the scalars of the geometric stiffness, made
     positive semi-definite (an edge under compression, a triangle by the eigenvalues of its two-by-two stress, leaves out the
-    negative part). Energies go to the half of `energy_out` that the line search does not hold.
+    negative part). Energies go to the half of `energy_out` that the line search does not hold. `stiffness_out` is the largest
+    that a strain has against moving the element.
     """
     measure, density = term.measure, term.density
     V, F = wp.types.vector(3, real), wp.types.vector(3, linear)
@@ -294,6 +331,7 @@ def evaluate_kernel(term: Term, real, linear):
         tension_out: wp.array2d(dtype=linear),
         gradient_out: wp.array2d(dtype=V),
         energy_out: wp.array2d(dtype=real),
+        stiffness_out: wp.array(dtype=linear),
     ):
         tid = wp.tid()
         world = tid / elements
@@ -320,16 +358,20 @@ def evaluate_kernel(term: Term, real, linear):
                 tension_out[i, tid] = linear(c3[i])
         root = root_of(e, p, shift)
         weight = wp.sqrt(w)
+        stiffest = real(0.0)
         if wp.static(coupled):
             rows = root * jacobian
             for m in range(wp.static(n)):
+                stiffest = wp.max(stiffest, w * wp.dot(rows[m], rows[m]))
                 for i in range(wp.static(slots_count)):
                     v = spread(rows[m] * weight, i)
                     factor_out[wp.static(m * slots_count) + i, tid] = F(linear(v[0]), linear(v[1]), linear(v[2]))
         else:
             for m in range(wp.static(n)):
+                stiffest = wp.max(stiffest, w * root[m] * root[m] * wp.dot(jacobian[m], jacobian[m]))
                 for i in range(wp.static(slots_count)):
                     u = spread(jacobian[m] * (root[m] * weight), i)
                     factor_out[wp.static(m * slots_count) + i, tid] = F(linear(u[0]), linear(u[1]), linear(u[2]))
+        stiffness_out[tid] = linear(stiffest)
 
     return evaluate

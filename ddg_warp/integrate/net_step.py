@@ -1,0 +1,184 @@
+"""A time step of a net: predictor, prescribed motion and loads, Newton, end update, retries. See `kernels.step`."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.kernels import outcome, step
+from ddg_warp.kernels.net import elements, frames, krylov, newton
+from ddg_warp.net_newton import NetNewton
+from ddg_warp.net_system import _lists
+
+
+class NetStep:
+    """Steps all worlds of a model's net; the same methods as `_ChainStep`."""
+
+    def __init__(self, integrator, model):
+        self.integrator, self.model, self.net = integrator, model, model.net
+        host, device, real = model.net.host, model.wp_device, model.types.real
+        if host.turning:
+            raise SceneError("ends of rods in a net that turn are for statics; in dynamics move their nodes alone")
+        multilevel = integrator.linear == "multilevel"
+        self.newton = NetNewton(model, integrator.options, "multilevel" if multilevel else "block_jacobi")
+        self.midpoint = integrator.scheme == "implicit_midpoint"
+        self._begin, self._hold, self._finish = newton.step_kernels(real, self.midpoint)
+        self._start, self._advance = step.start_kernel(real), step.advance_kernel(real)
+        worlds = model.worlds
+        self.progress, self.portion = (wp.zeros(worlds, dtype=real, device=device) for _ in range(2))
+        self.cautious, self.retries, self.reason = (wp.zeros(worlds, dtype=int, device=device) for _ in range(3))
+        self.remaining = wp.zeros(1, dtype=int, device=device)
+        self.tally = wp.zeros(len(outcome.NAMES) + 1, dtype=wp.int64, device=device)
+        self.work = wp.zeros(5, dtype=wp.int64, device=device)
+        self.damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
+        dead = host.mass[: host.nodes] * np.asarray(model.scene.gravity, float) + host.load[: host.nodes]
+        outer = np.abs(dead).sum() + np.abs(host.load[host.nodes :]).sum()
+        outer += sum(np.abs(load.force).sum() for load in host.timed)
+        self.outer = wp.full(worlds, float(outer), dtype=real, device=device)
+        blocks = np.concatenate([b for b, _ in host.moving]) if host.moving else np.zeros(0, int)
+        self._moving_blocks = blocks
+        self.where = wp.array(blocks.astype(np.int32), dtype=int, device=device)
+        self.place = wp.zeros((2, max(1, len(blocks))), dtype=model.net.vector, device=device)
+        self._loads(device, real)
+
+    def _loads(self, device, real) -> None:
+        """Device arrays of pressures that follow the surface, and of loads that change."""
+        host, worlds = self.net.host, self.model.worlds
+        self.constant = wp.array(np.tile(host.load, (worlds, 1)), dtype=self.net.vector, device=device)
+        self._press = self._spread = None
+        if host.pressures:
+            triangles = np.concatenate([p.triangles for p in host.pressures])
+            starts, items = _lists(triangles.ravel(), self.net.blocks)
+            self.triangles, self.starts, self.items = (
+                wp.array(np.ascontiguousarray(v, np.int32), dtype=int, device=device)
+                for v in (triangles, starts, items // 3)
+            )
+            self.pressure = wp.zeros(len(triangles), dtype=real, device=device)
+            self.force = wp.zeros(worlds * len(triangles), dtype=self.net.vector, device=device)
+            self._press, self._spread = newton.pressure_kernel(real)
+
+    def prescribe(self, t0: float, t1: float) -> None:
+        """Hand the device what supports and loads do between t0 and t1."""
+        host, model = self.net.host, self.model
+        if len(self._moving_blocks):
+            places = [
+                np.concatenate([model.motions[m].place(t, host.rest[blocks]) for blocks, m in host.moving])
+                for t in (t0, t1)
+            ]
+            self.place.assign(np.array(places))
+        at = 0.5 * (t0 + t1) if self.midpoint else t1
+        if host.timed:
+            load = host.load.copy()
+            for timed in host.timed:
+                np.add.at(load, timed.blocks, timed.at(at, 1.0) * timed.force)
+            self.constant.assign(np.tile(load, (model.worlds, 1)))
+        if host.pressures:
+            self.pressure.assign(np.concatenate([p.at(at, 1.0) * p.pressure for p in host.pressures]))
+
+    def step(self, before, after) -> None:
+        """Launch a whole step from one state to another; only launches, so that it can be captured."""
+        self._launch(
+            self._start,
+            self.model.worlds,
+            [self.newton.status],
+            [self.progress, self.portion, self.cautious, self.retries],
+        )
+        self._attempt(before, after)
+        wp.capture_while(self.remaining, lambda: self._attempt(after, after))
+
+    def _attempt(self, before, after) -> None:
+        """One solve of every world that has not finished the step."""
+        solver, blocks = self.newton, self.net.blocks
+        self._launch(
+            self._begin,
+            solver.all,
+            [before.q, before.v, solver.fixed, self.integrator._dt, self.damping, self.outer, self.progress]
+            + [self.portion, self.cautious, blocks],
+            [solver.q, solver.base, solver.target, solver.coefficient, solver.rate, solver.status, solver.iteration]
+            + [solver.halvings, solver.unbalanced, solver.drowned, solver.load_scale, solver.active],
+        )
+        if len(self._moving_blocks):
+            self._launch(
+                self._hold,
+                (len(self._moving_blocks), self.model.worlds),
+                [self.where, self.place, solver.fixed, self.progress, self.portion, blocks],
+                [solver.q],
+            )
+        self._apply_loads()
+        solver.solve(before)
+        self._launch(
+            self._finish,
+            solver.all,
+            [solver.q, before.q, before.v, solver.status, self.progress, solver.rate, blocks],
+            [after.q, after.v],
+        )
+        self.net.carry(before, after)
+        self.net.update_strains(after)
+        self.remaining.zero_()
+        self._launch(
+            self._advance,
+            self.model.worlds,
+            [solver.iteration, solver.lost, self.integrator.retry_limit, 0.5 ** (self.integrator.retry_limit // 2)],
+            [solver.status, self.progress, self.portion, self.cautious, self.retries, self.reason]
+            + [self.tally, self.work, self.remaining],
+        )
+
+    def _apply_loads(self) -> None:
+        """Constant and timed loads, and pressures on the predicted surface."""
+        solver = self.newton
+        if self._press is None:
+            if self.net.host.timed:
+                wp.copy(solver.load, self.constant)
+            return
+        count = len(self.triangles)
+        self._launch(
+            self._press,
+            self.model.worlds * count,
+            [solver.q, self.triangles, self.pressure, self.net.blocks],
+            [self.force],
+        )
+        self._launch(
+            self._spread,
+            solver.all,
+            [self.constant, self.force, self.starts, self.items, self.net.blocks, count],
+            [solver.load],
+        )
+
+    def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)
+
+    def load_modules(self) -> None:
+        """Compile and load every kernel before a capture."""
+        real, device = self.model.types.real, self.model.wp_device
+        kernels = [self._begin, self._hold, self._finish, self._start, self._advance, *self.newton.kernels]
+        kernels += [frames.edge_kernel(real), frames.vertex_kernel(real), frames.joint_kernel(real)]
+        kernels += [frames.reset_kernel(real)] if self.net.host.spins else []
+        kernels += [self._press, self._spread] if self._press else []
+        for part in self.net.sets:
+            if part.term.density.lagged:
+                kernels.append(elements.term_kernels(part.term, real)[3])
+        for kernel in kernels:
+            kernel.module.load(device)
+        for kernel in self.newton.tiled_kernels:
+            kernel.module.load(device, block_dim=krylov.THREADS if device.is_cuda else 1)
+
+    def raise_failures(self, state) -> None:
+        """Raise for worlds that were given up."""
+        if not int(self.tally.numpy()[outcome.MAX_ITERATIONS :].sum()):
+            return
+        failed = np.flatnonzero(self.newton.status.numpy() == outcome.GIVEN_UP)
+        if not failed.size:
+            return
+        from ddg_warp.tangent import Tangent
+
+        world = int(failed[0])
+        name = outcome.NAMES[int(self.reason.numpy()[world])]
+        sizes = np.abs(self.newton.right.numpy().reshape(self.model.worlds, -1))[world]
+        part = Tangent(self.model).parts[-1]
+        worst = int(np.argmax(np.where(np.isfinite(sizes), sizes, np.inf)))
+        raise SolverError(
+            f"the net (world {world}) could not be stepped to t = {state.time:g} s: {name} after "
+            f"{self.integrator.retry_limit} retries, largest residual {sizes[worst]:.3g} N at {part.where(worst)}; "
+            "take a smaller dt, a looser rtol, or check its loads and supports",
+            state=state,
+            outcome=name,
+        )

@@ -1,0 +1,273 @@
+"""Newton on a net by preconditioned conjugate gradients; every world has its own loop, all on the device."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels.net import elements, krylov, newton, system
+from ddg_warp.linear.multilevel import Multilevel
+from ddg_warp.net_system import Assembly, NetSystem, Sums
+from ddg_warp.newton import NewtonOptions
+
+PRECONDITIONERS = ("block_jacobi", "multilevel")
+LOOSEST = 0.1  # largest reduction of the residual that a direction is solved to (Eisenstat and Walker's forcing term)
+
+
+class NetNewton:
+    """Newton's method on all worlds of a net. Owns what is needed while a solve runs; attributes as of `ChainNewton`.
+
+    Args:
+        preconditioner: of conjugate gradients, "block_jacobi" or "multilevel" (see `kernels.net.levels`).
+    """
+
+    def __init__(self, model, options: NewtonOptions, preconditioner: str = "block_jacobi"):
+        if preconditioner not in PRECONDITIONERS:
+            raise SceneError(f"preconditioner {preconditioner!r}: of a net it is one of {', '.join(PRECONDITIONERS)}")
+        net = model.net
+        self.net, self.options, self.device = net, options, net.device
+        self.real, self.linear = model.types.real, model.types.linear
+        self.eps = model.types.eps
+        worlds, blocks, host, device = net.worlds, net.blocks, net.host, net.device
+        self.worlds, self.all = worlds, worlds * blocks
+        V, H = net.vector, wp.types.vector(3, self.linear)
+        M = wp.types.matrix((3, 3), self.linear)
+        self.system = NetSystem(net)
+
+        def make(shape, dtype):
+            return wp.zeros(shape, dtype=dtype, device=device)
+
+        def flags(count=1):
+            return [make(worlds, int) for _ in range(count)]
+
+        def scalars(count=1, dtype=None):
+            return [make(worlds, dtype or self.real) for _ in range(count)]
+
+        self.q, self.base, self.target, self.force = (make(self.all, V) for _ in range(4))
+        self.load = wp.array(np.tile(host.load, (worlds, 1)), dtype=V, device=device)
+        self.size, self.stiffness = make(self.all, self.real), make(self.all, self.linear)
+        self.change, self.noise, self.square, self.dots = (make((worlds, blocks), self.real) for _ in range(4))
+        self.mass = wp.array(host.mass, dtype=V, device=device)
+        bits = (host.fixed * [1, 2, 4]).sum(1).astype(np.uint8)
+        self.fixed = wp.array(bits, dtype=wp.uint8, device=device)
+        gravity = np.asarray(model.scene.gravity, float)
+        self.gravity = wp.array(gravity[None], dtype=V, device=device)
+        self.right, self.rest, self.z, self.p, self.product, self.direction = (make(self.all, H) for _ in range(6))
+        self.inverse = make(self.all, M)
+        self.matrix = make((9, worlds * self.system.positions), self.linear)
+        self.krylov_dots = make((worlds, blocks), self.linear)
+        self.status, self.slot, self.iteration, self.halvings, self.unbalanced = flags(5)
+        self.drowned, self.turned, self.wanted, self.todo, self.iterations, self.lost = flags(6)
+        self.coefficient, self.rate, self.step_length, self.decrement, self.merit = scalars(5)
+        self.load_scale, self.residual, self.sum_change, self.sum_noise, self.sum_square = scalars(5)
+        self.decrease, self.turn = scalars(2)
+        self.forcing, self.rho, self.rho_first, self.total, self.curvature = scalars(5, self.linear)
+        self.active, self.busy = make(1, int), make(1, int)
+        self.pcg_work = make(1, wp.int64)
+        self.parts = [self._part(part, make, H) for part in net.sets]
+        ends = _edges(host)
+        self.ends = wp.array(np.ascontiguousarray(ends, np.int32), dtype=int, device=device)
+        self.turns = make((worlds, len(ends)), self.real)
+        self._sum, self._sum_linear = (Sums(worlds, blocks, dtype, device) for dtype in (self.real, self.linear))
+        self._largest = Sums(worlds, len(ends), self.real, device, largest=True)
+        lengths = np.linalg.norm(np.diff(host.rest[ends], axis=1)[:, 0], axis=1)
+        self.arm = float(lengths.mean())
+        self._evaluate = [elements.evaluate_kernel(part.term, self.real, self.linear) for part in net.sets]
+        self._outer, self._collect, self._settle = system.balance_kernels(self.real, self.linear)
+        self._assembly = Assembly(net, self.system, self.parts, self.real, self.linear)
+        self._judge, self._measure, self._rotate, self._take, self._move = newton.search_kernels(self.real, self.linear)
+        self._invert, self._start, self._begin, *self._cycle = krylov.solver_kernels(self.linear)
+        self.levels = Multilevel(net, self.system, self.linear) if preconditioner == "multilevel" else None
+        self._limit = max(200, 10 * int(np.sqrt(blocks)) * 10)
+
+    def _part(self, part, make, H) -> dict:
+        """What the elements of a set write."""
+        measure, count = part.term.measure, self.worlds * part.elements
+        return {
+            "factor": make((len(measure.strains) * measure.slots, count), H),
+            "tension": make((max(1, measure.tensions), count), self.linear),
+            "gradient": make((measure.slots, count), self.net.vector),
+            "energy": make((2, count), self.real),
+            "stiffness": make(count, self.linear),
+        }
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        own = [self._outer, self._collect, self._settle, self._judge, self._measure, self._rotate, self._take]
+        cycle = [self._move, self._invert, self._start, self._begin, *self._cycle]
+        levels = self.levels.kernels if self.levels else []
+        return [*own, *cycle, *self._evaluate, *self._assembly.kernels, *levels]
+
+    @property
+    def tiled_kernels(self) -> list:
+        """Those that are launched in tiles."""
+        return [kernel for sums in (self._sum, self._sum_linear, self._largest) for kernel in sums.kernels]
+
+    def pcg_iterations(self) -> int:
+        """Iterations of all solves so far."""
+        return int(self.pcg_work.numpy()[0])
+
+    def solve(self, state) -> None:
+        """Iterate until no world is active, with the lagged data of `state`; can be captured."""
+        wp.capture_while(self.active, lambda: self.iterate(state))
+
+    def iterate(self, state) -> None:
+        """One iteration of every active world."""
+        self.active.zero_()
+        self.evaluate(state)
+        self.balance()
+        self.judge()
+        self.move()  # where a step has been shortened
+        self.assemble()
+        self.direct()
+        self.take()
+        self.move()
+
+    def evaluate(self, state) -> None:
+        """Energies, gradients and factors of all elements at the iterate."""
+        for index, (part, own, kernel) in enumerate(zip(self.net.sets, self.parts, self._evaluate, strict=True)):
+            wp.launch(
+                kernel,
+                self.worlds * part.elements,
+                self.net.inputs(part, state, index, q=self.q, rate=self.rate) + [self.status, self.slot],
+                [own["factor"], own["tension"], own["gradient"], own["energy"], own["stiffness"]],
+                device=self.device,
+                block_dim=128,
+            )
+
+    def balance(self) -> None:
+        """Residuals, the change of the energy, and the worlds that are out of equilibrium."""
+        net, options, blocks = self.net, self.options, self.net.blocks
+        self._launch(
+            self._outer,
+            [self.q, self.base, self.target, self.mass, self.gravity, self.load, self.coefficient, self.status]
+            + [blocks, net.host.nodes],
+            [self.force, self.size, self.stiffness, self.change, self.noise],
+        )
+        for part, own, (starts, items) in zip(net.sets, self.parts, self.system.meets, strict=True):
+            self._launch(
+                self._collect,
+                [own["gradient"], own["energy"], own["stiffness"], starts, items, part.term.measure.slots]
+                + [part.elements, self.status, self.slot, blocks],
+                [self.force, self.size, self.stiffness, self.change, self.noise],
+            )
+        self._launch(
+            self._settle,
+            [self.q, self.force, self.size, self.stiffness, self.fixed, self.status, self.load_scale]
+            + [blocks, net.host.nodes, self.arm, options.rtol, options.floor_factor * self.eps],
+            [self.right, self.square, self.noise, self.unbalanced, self.drowned],
+        )
+
+    def judge(self) -> None:
+        """Stop worlds, reject their iterates, or ask for a direction."""
+        options = self.options
+        self._sum(self.change, self.sum_change)
+        self._sum(self.noise, self.sum_noise)
+        self._sum(self.square, self.sum_square)
+        wp.launch(
+            self._judge,
+            self.worlds,
+            [self.sum_change, self.sum_noise, self.sum_square, options.floor_factor * self.eps]
+            + [options.max_iterations, options.max_halvings, LOOSEST, options.linear_rtol]
+            + [self.status, self.unbalanced, self.drowned, self.slot, self.iteration, self.halvings]
+            + [self.step_length, self.decrement, self.merit, self.load_scale, self.residual, self.turned]
+            + [self.forcing, self.wanted, self.todo, self.active],
+            device=self.device,
+        )
+
+    def assemble(self) -> None:
+        """H of the worlds that want a direction."""
+        self._assembly(self.mass, self.coefficient, self.wanted, self.matrix)
+
+    def direct(self) -> None:
+        """Directions by conjugate gradients."""
+        table, blocks = self.system, self.net.blocks
+        self._launch(
+            self._invert,
+            [self.matrix, table.diagonal, self.fixed, self.wanted, blocks, table.positions],
+            [self.inverse],
+        )
+        self._launch(
+            self._start,
+            [self.right, self.inverse, self.wanted, blocks],
+            [self.rest, self.direction, self.p, self.krylov_dots],
+        )
+        if self.levels:
+            self.levels.prepare(self.matrix, self.fixed, self.wanted)
+            self.levels.apply(self.rest, self.inverse, self.fixed, self.wanted, self.p, self.krylov_dots)
+        self._sum_linear(self.krylov_dots, self.total)
+        self.busy.zero_()
+        wp.launch(
+            self._begin,
+            self.worlds,
+            [self.total],
+            [self.wanted, self.rho, self.rho_first, self.iterations, self.busy],
+            device=self.device,
+        )
+        wp.capture_while(self.busy, self.cycle)
+
+    def cycle(self) -> None:
+        """One iteration of conjugate gradients."""
+        table, blocks = self.system, self.net.blocks
+        product, advance, turn, test = self._cycle
+        self.busy.zero_()
+        self._launch(
+            product,
+            [self.matrix, table.columns, table.slices, self.fixed, self.p, self.wanted, blocks, table.positions],
+            [self.product, self.krylov_dots],
+        )
+        self._sum_linear(self.krylov_dots, self.curvature)
+        self._launch(
+            advance,
+            [self.p, self.product, self.inverse, self.rho, self.curvature, self.wanted, blocks],
+            [self.direction, self.rest, self.z, self.krylov_dots],
+        )
+        if self.levels:
+            self.levels.apply(self.rest, self.inverse, self.fixed, self.wanted, self.z, self.krylov_dots)
+        self._sum_linear(self.krylov_dots, self.total)
+        self._launch(turn, [self.z, self.total, self.rho, self.wanted, blocks], [self.p])
+        wp.launch(
+            test,
+            self.worlds,
+            [self.total, self.rho_first, self.forcing, self._limit],
+            [self.rho, self.iterations, self.wanted, self.busy],
+            device=self.device,
+        )
+
+    def take(self) -> None:
+        """Lengths of the steps along the directions."""
+        blocks = self.net.blocks
+        self._launch(self._measure, [self.right, self.direction, self.wanted, blocks], [self.dots])
+        self._sum(self.dots, self.decrease)
+        wp.launch(
+            self._rotate,
+            self.worlds * len(self.ends),
+            [self.q, self.direction, self.ends, self.wanted, blocks],
+            [self.turns],
+            device=self.device,
+        )
+        self._largest(self.turns, self.turn)
+        wp.launch(
+            self._take,
+            self.worlds,
+            [self.decrease, self.turn, self.options.rotation_cap, self.iterations],
+            [self.wanted, self.status, self.step_length, self.decrement, self.todo, self.pcg_work],
+            device=self.device,
+        )
+
+    def move(self) -> None:
+        """Take the step that is to be taken."""
+        self._launch(self._move, [self.direction, self.step_length, self.todo, self.net.blocks], [self.base, self.q])
+
+    def _launch(self, kernel, inputs: list, outputs: list) -> None:
+        """One thread for each block of every world."""
+        wp.launch(kernel, self.all, inputs, outputs, device=self.device)
+
+
+def _edges(host) -> np.ndarray:
+    """Edges whose turns limit a step (E, 2): of rods and of meshes."""
+    parts = [host.ends, *(shell.nodes[shell.surface.edges] for shell in host.shells)]
+    edges = np.concatenate(parts)
+    if not len(edges):
+        edges = np.concatenate([part.slots[:2].T for part in host.sets])
+    return edges

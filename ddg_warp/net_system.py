@@ -1,0 +1,117 @@
+"""The sparse system of a net on a device: what meets at each block, and H in slices; see `kernels.net.system`."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels.net import krylov, system
+from ddg_warp.kernels.net.system import SLICE
+
+
+class NetSystem:
+    """Sparsity and lists of a net, once for all worlds.
+
+    Attributes:
+        positions: entries of H in a world, padding included.
+        rows, columns: block of each position, -1 in the padding; slices: start of each slice; diagonal: position of each H_ii.
+        meets: of each set, (starts, items) of the blocks; adds: (starts, items) of the positions.
+    """
+
+    def __init__(self, net):
+        blocks, device = net.blocks, net.device
+        slots = [part.host.slots for part in net.sets]
+        keys = [(s[:, None].astype(np.int64) * blocks + s[None]).transpose(2, 0, 1).ravel() for s in slots]
+        diagonal = np.arange(blocks, dtype=np.int64) * (blocks + 1)
+        pairs, inverse = np.unique(np.concatenate([*keys, diagonal]), return_inverse=True)
+        row, column = pairs // blocks, pairs % blocks
+        counts = np.bincount(row, minlength=blocks)
+        padded = np.zeros(-(-blocks // SLICE) * SLICE, int)
+        padded[:blocks] = counts
+        slices = np.concatenate([[0], np.cumsum(padded.reshape(-1, SLICE).max(1) * SLICE)])
+        rank = np.arange(len(pairs)) - (np.cumsum(counts) - counts)[row]
+        place = slices[row // SLICE] + rank * SLICE + row % SLICE
+        self.positions = int(slices[-1])
+        if self.positions * net.worlds >= 2**31:
+            raise SceneError("the net is too large: its matrix has more than 2^31 entries; build fewer worlds at once")
+        rows, columns = np.full(self.positions, -1), np.full(self.positions, -1)
+        rows[place], columns[place] = row, column
+
+        def put(values):
+            return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
+
+        self.rows, self.columns, self.slices = put(rows), put(columns), put(slices)
+        self.diagonal = put(place[inverse[len(inverse) - blocks :]])
+        self.entries = len(pairs)
+        at, self.adds, self.meets = 0, [], []
+        for s, key in zip(slots, keys, strict=True):
+            self.adds.append(tuple(map(put, _lists(place[inverse[at : at + len(key)]], self.positions))))
+            self.meets.append(tuple(map(put, _lists(s.T.ravel(), blocks))))
+            at += len(key)
+
+
+def _lists(target: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Items (indices into `target`) of each of `count` targets, in order: starts (count + 1,) and items."""
+    starts = np.concatenate([[0], np.cumsum(np.bincount(target, minlength=count))])
+    return starts, np.argsort(target, kind="stable")
+
+
+class Sums:
+    """Sums (or largest entries) of values (worlds, n) over each world."""
+
+    def __init__(self, worlds: int, n: int, real, device, largest: bool = False):
+        tiles = -(-n // krylov.TILE)
+        if tiles > krylov.TILES:
+            raise SceneError(f"the net has {n} blocks or edges; there may be {krylov.TILE * krylov.TILES}")
+        self.worlds, self.tiles, self.device = worlds, tiles, wp.get_device(device)
+        if self.device.is_cuda:
+            self.kernels = krylov.sum_kernels(real, largest)
+        else:
+            self.kernels = (krylov.serial_sum_kernel(real, largest),)
+        self._partial = wp.zeros((worlds, tiles), dtype=real, device=device)
+
+    def __call__(self, values: wp.array, out: wp.array) -> None:
+        """Write the sums to `out` (worlds,)."""
+        if not self.device.is_cuda:
+            wp.launch(self.kernels[0], self.worlds, [values, out], device=self.device)
+            return
+        for kernel, grid, inputs in (
+            (self.kernels[0], (self.worlds, self.tiles), [values, self._partial]),
+            (self.kernels[1], (self.worlds,), [self._partial, out]),
+        ):
+            wp.launch_tiled(kernel, dim=grid, inputs=inputs, block_dim=krylov.THREADS, device=self.device)
+
+
+class Assembly:
+    """Sums H from what the elements of all sets write, `system.SETS` sets a launch.
+
+    Args:
+        written: of each set, the arrays "factor" and "tension".
+    """
+
+    def __init__(self, net, table: NetSystem, written: list[dict], real, linear):
+        self.net, self.table, self.kernels, self._own = net, table, [], []
+        Contributions = system.contributions(linear)
+        for first in range(0, len(net.sets), system.SETS):
+            sets = net.sets[first : first + system.SETS]
+            terms = tuple(part.term for part in sets)
+            self.kernels.append(system.assemble_kernel(terms, real, linear, first == 0))
+            own = []
+            for i in range(first, first + len(sets)):
+                data = Contributions()
+                data.factor, data.tension = written[i]["factor"], written[i]["tension"]
+                data.starts, data.items = table.adds[i]
+                data.elements = net.sets[i].elements
+                own.append(data)
+            self._own.append(own + [own[-1]] * (system.SETS - len(own)))
+
+    def __call__(self, mass, coefficient, wanted, matrix: wp.array) -> None:
+        """Write H (9, positions of all worlds) of the worlds that want it."""
+        table = self.table
+        for kernel, own in zip(self.kernels, self._own, strict=True):
+            wp.launch(
+                kernel,
+                self.net.worlds * table.positions,
+                [mass, coefficient, table.rows, table.columns, wanted, table.positions, *own],
+                [matrix],
+                device=self.net.device,
+            )

@@ -1,0 +1,235 @@
+"""Preconditioned conjugate gradients on a net, every world for itself: block Jacobi, scalars on the device.
+
+`wanted` is 1 while a world iterates, 2 once it is done; sums over blocks come in one order (tiles, then a tile of tiles).
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.net.system import product_functions
+
+TILE = 4096  # entries that one block of threads sums
+TILES = 1024  # largest number of such blocks in a world
+THREADS = 256
+
+
+@cache
+def sum_kernels(real, largest: bool = False):
+    """partial(values (worlds, n), (worlds, tiles)) and total(tiles, (worlds,)): sums of rows, or their largest entries."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def partial(values: wp.array2d(dtype=real), tiles_out: wp.array2d(dtype=real)):
+        w, b = wp.tid()
+        tile = wp.tile_load(values, shape=(1, wp.static(TILE)), offset=(w, b * wp.static(TILE)))
+        if wp.static(largest):
+            wp.tile_store(tiles_out[w], wp.tile_max(tile), offset=b)
+        else:
+            wp.tile_store(tiles_out[w], wp.tile_sum(tile), offset=b)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def total(tiles: wp.array2d(dtype=real), sum_out: wp.array(dtype=real)):
+        w = wp.tid()
+        tile = wp.tile_load(tiles, shape=(1, wp.static(TILES)), offset=(w, 0))
+        if wp.static(largest):
+            wp.tile_store(sum_out, wp.tile_max(tile), offset=w)
+        else:
+            wp.tile_store(sum_out, wp.tile_sum(tile), offset=w)
+
+    return partial, total
+
+
+@cache
+def serial_sum_kernel(real, largest: bool = False):
+    """The same by one thread a world, for the CPU, which has one."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def total(values: wp.array2d(dtype=real), sum_out: wp.array(dtype=real)):
+        w = wp.tid()
+        s = real(0.0)
+        for i in range(values.shape[1]):
+            if wp.static(largest):
+                s = wp.max(s, values[w, i])
+            else:
+                s += values[w, i]
+        sum_out[w] = s
+
+    return total
+
+
+@cache
+def solver_kernels(linear):
+    """Kernels of a solve, in the order of their use; see the module's text."""
+    H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
+    times, free = product_functions(linear)
+    eps = wp.constant(linear(2.3e-16 if linear == wp.float64 else 1.2e-7))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def invert(
+        matrix: wp.array2d(dtype=linear),
+        diagonal: wp.array(dtype=int),
+        fixed: wp.array(dtype=wp.uint8),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        positions: int,
+        inverse_out: wp.array(dtype=M),
+    ):
+        """Inverse of the diagonal blocks of H on free dofs; `diagonal` holds their positions."""
+        i = wp.tid()
+        w = i / blocks
+        if wanted[w] == 0:
+            return
+        k = i - w * blocks
+        p = diagonal[k] + w * positions
+        f = free(fixed[k])
+        m = M()
+        for r in range(3):
+            for c in range(3):
+                m[r, c] = matrix[3 * r + c, p]
+        rows = wp.outer(f, f)
+        m = wp.cw_mul(m, rows) + wp.diag(H(linear(1.0)) - f)
+        # scaled to a unit diagonal: a block of a rod's end holds stretching and bending stiffness
+        s = H()
+        for d in range(3):
+            s[d] = linear(1.0) / wp.sqrt(wp.max(m[d, d], linear(1.0e-30)))
+        scale = wp.outer(s, s)
+        inverse = wp.cw_mul(wp.inverse(wp.cw_mul(m, scale)), scale)
+        if not wp.isfinite(wp.trace(inverse)):
+            inverse = wp.diag(wp.cw_mul(s, s))
+        inverse_out[i] = wp.cw_mul(inverse, rows)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def start(
+        right: wp.array(dtype=H),
+        inverse: wp.array(dtype=M),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        residual_out: wp.array(dtype=H),
+        solution_out: wp.array(dtype=H),
+        p_out: wp.array(dtype=H),
+        dots_out: wp.array2d(dtype=linear),
+    ):
+        i = wp.tid()
+        w = i / blocks
+        if wanted[w] == 0:
+            return
+        r = right[i]
+        z = inverse[i] * r
+        residual_out[i] = r
+        solution_out[i] = H()
+        p_out[i] = z
+        dots_out[w, i - w * blocks] = wp.dot(r, z)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def begin(
+        total: wp.array(dtype=linear),
+        wanted: wp.array(dtype=int),
+        rho_out: wp.array(dtype=linear),
+        first_out: wp.array(dtype=linear),
+        iterations_out: wp.array(dtype=int),
+        busy_out: wp.array(dtype=int),
+    ):
+        w = wp.tid()
+        if wanted[w] == 0:
+            return
+        rho_out[w] = total[w]
+        first_out[w] = total[w]
+        iterations_out[w] = 0
+        if total[w] > linear(0.0):
+            busy_out[0] = 1
+        else:
+            wanted[w] = 2
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def product(
+        matrix: wp.array2d(dtype=linear),
+        columns: wp.array(dtype=int),
+        slices: wp.array(dtype=int),
+        fixed: wp.array(dtype=wp.uint8),
+        p: wp.array(dtype=H),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        positions: int,
+        product_out: wp.array(dtype=H),
+        dots_out: wp.array2d(dtype=linear),
+    ):
+        """H p on free dofs, and p . H p block by block."""
+        i = wp.tid()
+        w = i / blocks
+        if wanted[w] != 1:
+            return
+        k = i - w * blocks
+        y = wp.cw_mul(times(matrix, columns, slices, p, k, w * positions, w * blocks), free(fixed[k]))
+        product_out[i] = y
+        dots_out[w, k] = wp.dot(p[i], y)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def advance(
+        p: wp.array(dtype=H),
+        product: wp.array(dtype=H),
+        inverse: wp.array(dtype=M),
+        rho: wp.array(dtype=linear),
+        curvature: wp.array(dtype=linear),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        solution: wp.array(dtype=H),
+        residual: wp.array(dtype=H),
+        z_out: wp.array(dtype=H),
+        dots_out: wp.array2d(dtype=linear),
+    ):
+        """Step along p, new residual and its preconditioned form z, and r . z block by block."""
+        i = wp.tid()
+        w = i / blocks
+        if wanted[w] != 1:
+            return
+        k = i - w * blocks
+        # curvature lost to rounding ends the solve with what it has
+        if not curvature[w] > eps * rho[w] * linear(1.0e-6):
+            dots_out[w, k] = linear(0.0)
+            return
+        alpha = rho[w] / curvature[w]
+        solution[i] = solution[i] + alpha * p[i]
+        r = residual[i] - alpha * product[i]
+        residual[i] = r
+        z = inverse[i] * r
+        z_out[i] = z
+        dots_out[w, k] = wp.dot(r, z)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def turn(
+        z: wp.array(dtype=H),
+        total: wp.array(dtype=linear),
+        rho: wp.array(dtype=linear),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        p: wp.array(dtype=H),
+    ):
+        """The next direction."""
+        i = wp.tid()
+        w = i / blocks
+        if wanted[w] == 1:
+            p[i] = z[i] + (total[w] / rho[w]) * p[i]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def test(
+        total: wp.array(dtype=linear),
+        first: wp.array(dtype=linear),
+        forcing: wp.array(dtype=linear),
+        limit: int,
+        rho: wp.array(dtype=linear),
+        iterations: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        busy_out: wp.array(dtype=int),
+    ):
+        """Whether a world goes on, by the residual in the norm of the preconditioner."""
+        w = wp.tid()
+        if wanted[w] != 1:
+            return
+        iterations[w] = iterations[w] + 1
+        rho[w] = total[w]
+        if total[w] > forcing[w] * forcing[w] * first[w] and iterations[w] < limit:
+            busy_out[0] = 1
+        else:
+            wanted[w] = 2
+
+    return invert, start, begin, product, advance, turn, test

@@ -1,0 +1,329 @@
+"""Newton's method on a net: what becomes of an iterate and of a direction, a thread a world, and the moves, a thread a block."""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels import outcome
+from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
+
+
+@cache
+def search_kernels(real, linear):
+    """judge(...) of an iterate, measure(...) and take(...) of a direction, move(...) of the blocks."""
+    V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
+    balanced, decide = judge_functions(False, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def judge(
+        change: wp.array(dtype=real),
+        noise: wp.array(dtype=real),
+        square: wp.array(dtype=real),
+        floor: real,
+        max_iterations: int,
+        max_halvings: int,
+        loosest: real,
+        tightest: real,
+        status: wp.array(dtype=int),
+        unbalanced: wp.array(dtype=int),
+        drowned: wp.array(dtype=int),
+        slot: wp.array(dtype=int),
+        iteration: wp.array(dtype=int),
+        halvings: wp.array(dtype=int),
+        step_length: wp.array(dtype=real),
+        decrement: wp.array(dtype=real),
+        merit: wp.array(dtype=real),
+        load_scale: wp.array(dtype=real),
+        largest: wp.array(dtype=real),
+        turned: wp.array(dtype=int),
+        forcing: wp.array(dtype=linear),
+        wanted: wp.array(dtype=int),
+        todo: wp.array(dtype=int),
+        active: wp.array(dtype=int),
+    ):
+        """Decides by the sums over all blocks; how exactly the next direction is solved follows Eisenstat and Walker (1996)."""
+        w = wp.tid()
+        wanted[w] = 0
+        todo[w] = 0
+        if balanced(status, unbalanced, drowned, iteration, w):
+            return
+        before = merit[w]
+        first = iteration[w] == 0
+        what = decide(
+            change[w],
+            noise[w] * floor,
+            square[w],
+            wp.sqrt(square[w]),
+            max_iterations,
+            max_halvings,
+            status,
+            slot,
+            iteration,
+            halvings,
+            step_length,
+            decrement,
+            merit,
+            load_scale,
+            largest,
+            turned,
+            w,
+        )
+        if what == wp.static(STOP):
+            return
+        active[0] = 1
+        if what == wp.static(DIRECT):
+            eta = loosest
+            if not first and before > real(0.0):
+                eta = wp.clamp(real(0.9) * square[w] / before, tightest, loosest)
+            forcing[w] = linear(eta)
+            wanted[w] = 1
+        else:
+            todo[w] = 1
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def measure(
+        right: wp.array(dtype=H),
+        direction: wp.array(dtype=H),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        dots_out: wp.array2d(dtype=real),
+    ):
+        """r . d block by block."""
+        i = wp.tid()
+        w = i / blocks
+        if wanted[w] != 0:
+            dots_out[w, i - w * blocks] = real(wp.dot(right[i], direction[i]))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def rotate(
+        q: wp.array(dtype=V),
+        direction: wp.array(dtype=H),
+        ends: wp.array2d(dtype=int),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        turn_out: wp.array2d(dtype=real),
+    ):
+        """Squared turn of every edge by a whole step."""
+        i = wp.tid()
+        count = ends.shape[0]
+        w = i / count
+        if wanted[w] == 0:
+            return
+        k = i - w * count
+        a = ends[k, 0] + w * blocks
+        b = ends[k, 1] + w * blocks
+        e = q[b] - q[a]
+        d = direction[b] - direction[a]
+        turn_out[w, k] = real(wp.dot(d, d)) / wp.length_sq(e)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def take(
+        decrease: wp.array(dtype=real),
+        turn: wp.array(dtype=real),
+        rotation_cap: real,
+        iterations: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        status: wp.array(dtype=int),
+        step_length: wp.array(dtype=real),
+        decrement: wp.array(dtype=real),
+        todo: wp.array(dtype=int),
+        work: wp.array(dtype=wp.int64),
+    ):
+        """Length of the step: whole, or so that no edge turns by more than the cap."""
+        w = wp.tid()
+        if wanted[w] == 0:
+            return
+        if not wp.isfinite(decrease[w]):
+            status[w] = wp.static(outcome.NON_FINITE)
+            return
+        whole = real(1.0)
+        if turn[w] > rotation_cap * rotation_cap:
+            whole = rotation_cap / wp.sqrt(turn[w])
+        step_length[w] = whole
+        decrement[w] = decrease[w]
+        todo[w] = 2
+        wp.atomic_add(work, 0, wp.int64(iterations[w]))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def move(
+        direction: wp.array(dtype=H),
+        step_length: wp.array(dtype=real),
+        todo: wp.array(dtype=int),
+        blocks: int,
+        base: wp.array(dtype=V),
+        q: wp.array(dtype=V),
+    ):
+        """A first step (2) goes from the iterate, which becomes the base; a shortened one (1) from the base."""
+        i = wp.tid()
+        w = i / blocks
+        what = todo[w]
+        if what == 0:
+            return
+        if what == 2:
+            base[i] = q[i]
+        d = direction[i]
+        q[i] = base[i] + V(real(d[0]), real(d[1]), real(d[2])) * step_length[w]
+
+    return judge, measure, rotate, take, move
+
+
+@cache
+def step_kernels(real, midpoint: bool):
+    """begin(...), hold(...) and finish(...) of a time step; see `kernels.step` for the schemes."""
+    V = wp.types.vector(3, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def begin(
+        q0: wp.array(dtype=V),
+        v0: wp.array(dtype=V),
+        fixed: wp.array(dtype=wp.uint8),
+        dt: wp.array(dtype=real),
+        damping: wp.array(dtype=real),
+        outer: wp.array(dtype=real),
+        progress: wp.array(dtype=real),
+        portion: wp.array(dtype=real),
+        cautious: wp.array(dtype=int),
+        blocks: int,
+        q_out: wp.array(dtype=V),
+        base_out: wp.array(dtype=V),
+        target_out: wp.array(dtype=V),
+        coefficient_out: wp.array(dtype=real),
+        rate_out: wp.array(dtype=real),
+        status_out: wp.array(dtype=int),
+        iteration_out: wp.array(dtype=int),
+        halvings_out: wp.array(dtype=int),
+        unbalanced_out: wp.array(dtype=int),
+        drowned_out: wp.array(dtype=int),
+        load_scale_out: wp.array(dtype=real),
+        active_out: wp.array(dtype=int),
+    ):
+        i = wp.tid()
+        w = i / blocks
+        if progress[w] >= real(1.0):
+            return
+        k = i - w * blocks
+        s = dt[w] * portion[w]
+        if wp.static(midpoint):
+            s *= real(0.5)
+        rate = real(1.0) / s
+        coefficient = rate * (rate + damping[0])
+        if k == 0:
+            coefficient_out[w] = coefficient
+            rate_out[w] = rate
+            status_out[w] = 0
+            iteration_out[w] = 0
+            halvings_out[w] = 0
+            unbalanced_out[w] = 0
+            drowned_out[w] = 0
+            load_scale_out[w] = outer[w]
+            active_out[0] = 1
+        mask = int(fixed[k])
+        here = q0[i]
+        v = v0[i]
+        target_out[i] = here + v * (rate / coefficient)
+        if cautious[w] == 0:
+            for d in range(3):
+                if ((mask >> d) & 1) == 0:
+                    here[d] = here[d] + s * v[d]
+        q_out[i] = here
+        base_out[i] = here
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def hold(
+        where: wp.array(dtype=int),
+        place: wp.array2d(dtype=V),
+        fixed: wp.array(dtype=wp.uint8),
+        progress: wp.array(dtype=real),
+        portion: wp.array(dtype=real),
+        blocks: int,
+        q: wp.array(dtype=V),
+    ):
+        """Puts held dofs of moving supports where they are at the end (middle) of the part of the step that is taken."""
+        i, w = wp.tid()
+        if progress[w] >= real(1.0):
+            return
+        s = progress[w] + portion[w]
+        if wp.static(midpoint):
+            s = progress[w] + real(0.5) * portion[w]
+        k = where[i]
+        at = place[0, i] * (real(1.0) - s) + place[1, i] * s
+        here = q[k + w * blocks]
+        for d in range(3):
+            if ((int(fixed[k]) >> d) & 1) == 1:
+                here[d] = at[d]
+        q[k + w * blocks] = here
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def finish(
+        q: wp.array(dtype=V),
+        q0: wp.array(dtype=V),
+        v0: wp.array(dtype=V),
+        status: wp.array(dtype=int),
+        progress: wp.array(dtype=real),
+        rate: wp.array(dtype=real),
+        blocks: int,
+        q_out: wp.array(dtype=V),
+        v_out: wp.array(dtype=V),
+    ):
+        """Blocks and their velocities at the end of the step, of the worlds that converged."""
+        i = wp.tid()
+        w = i / blocks
+        start = q0[i]
+        v = v0[i]
+        end = start
+        if progress[w] < real(1.0) and status[w] <= wp.static(outcome.CONVERGED_TO_ROUNDING):
+            end = q[i]
+            change = (end - start) * rate[w]
+            if wp.static(midpoint):
+                end = real(2.0) * end - start
+                v = real(2.0) * change - v
+            else:
+                v = change
+        q_out[i] = end
+        v_out[i] = v
+
+    return begin, hold, finish
+
+
+@cache
+def pressure_kernel(real):
+    """Force of a pressure on each corner of a triangle, p A n / 3, on the surface q."""
+    V = wp.types.vector(3, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def press(
+        q: wp.array(dtype=V),
+        triangles: wp.array2d(dtype=int),
+        pressure: wp.array(dtype=real),
+        blocks: int,
+        force_out: wp.array(dtype=V),
+    ):
+        i = wp.tid()
+        count = triangles.shape[0]
+        w = i / count
+        k = i - w * count
+        x0 = q[triangles[k, 0] + w * blocks]
+        x1 = q[triangles[k, 1] + w * blocks]
+        x2 = q[triangles[k, 2] + w * blocks]
+        force_out[i] = wp.cross(x1 - x0, x2 - x0) * (pressure[k] / real(6.0))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def spread(
+        constant: wp.array(dtype=V),
+        force: wp.array(dtype=V),
+        starts: wp.array(dtype=int),
+        items: wp.array(dtype=int),
+        blocks: int,
+        triangles: int,
+        load_out: wp.array(dtype=V),
+    ):
+        """Constant loads and the pressures of the triangles around a block."""
+        i = wp.tid()
+        w = i / blocks
+        k = i - w * blocks
+        f = constant[i]
+        for at in range(starts[k], starts[k + 1]):
+            f += force[items[at] + w * triangles]
+        load_out[i] = f
+
+    return press, spread

@@ -1,0 +1,330 @@
+"""The sparse system of a net: balance of forces at blocks, blocks of H, their product with a vector.
+
+H lies in slices of 32 rows (sliced ELLPACK, Kreutzer et al. 2014): position p = start of the slice + 32 * place in the row + row of
+the slice, so that neighbouring threads, on neighbouring rows, touch neighbouring memory; [component][position]. Both lists, of what
+meets at a block and of what adds to a position, are made once, so sums come in one order, without atomics.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.element import CPU_OPTIONS
+from ddg_warp.kernels.terms import Term
+
+SLICE = 32  # rows of a slice of H
+
+
+@cache
+def balance_kernels(real, linear):
+    """outer(...): loads and inertia at every block; collect(...): forces of a set; settle(...): residual, and whether it balances."""
+    V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def outer(
+        q: wp.array(dtype=V),
+        base: wp.array(dtype=V),
+        target: wp.array(dtype=V),
+        mass: wp.array(dtype=V),
+        gravity: wp.array(dtype=V),
+        load: wp.array(dtype=V),
+        coefficient: wp.array(dtype=real),
+        status: wp.array(dtype=int),
+        blocks: int,
+        nodes: int,
+        force_out: wp.array(dtype=V),
+        size_out: wp.array(dtype=real),
+        stiffness_out: wp.array(dtype=linear),
+        change_out: wp.array2d(dtype=real),
+        noise_out: wp.array2d(dtype=real),
+    ):
+        """Starts the sums of a block: loads, gravity and inertia, and their work along the step from `base`."""
+        i = wp.tid()
+        w = i / blocks
+        if status[w] != 0:
+            return
+        k = i - w * blocks
+        f = load[i]
+        m = mass[k]
+        if k < nodes:
+            f += wp.cw_mul(m, gravity[0])
+        c = coefficient[w]
+        away = q[i] - target[i]
+        inertia = wp.cw_mul(m, away) * c
+        u = q[i] - base[i]
+        work = wp.dot(u, inertia - wp.cw_mul(m, u) * (real(0.5) * c) - f)
+        force_out[i] = f - inertia
+        size_out[i] = wp.max(wp.abs(f))
+        stiffness_out[i] = linear(c * wp.max(m))
+        change_out[w, k] = work
+        noise_out[w, k] = wp.abs(work)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def collect(
+        gradient: wp.array2d(dtype=V),
+        energy: wp.array2d(dtype=real),
+        element_stiffness: wp.array(dtype=linear),
+        starts: wp.array(dtype=int),
+        items: wp.array(dtype=int),
+        slots: int,
+        elements: int,
+        status: wp.array(dtype=int),
+        slot: wp.array(dtype=int),
+        blocks: int,
+        force: wp.array(dtype=V),
+        size: wp.array(dtype=real),
+        stiffness: wp.array(dtype=linear),
+        change: wp.array2d(dtype=real),
+        noise: wp.array2d(dtype=real),
+    ):
+        """Adds the forces of a set; an item is element * slots + slot. The first slot of an element brings its energy."""
+        i = wp.tid()
+        w = i / blocks
+        if status[w] != 0:
+            return
+        k = i - w * blocks
+        f = V()
+        large = real(0.0)
+        stiff = linear(0.0)
+        more = real(0.0)
+        rounding = real(0.0)
+        accepted = slot[w]
+        for at in range(starts[k], starts[k + 1]):
+            item = items[at]
+            e = item / slots
+            s = item - e * slots
+            e += w * elements
+            g = gradient[s, e]
+            f += g
+            large += wp.max(wp.abs(g))
+            stiff += element_stiffness[e]
+            if s == 0:
+                new = energy[1 - accepted, e]
+                more += new - energy[accepted, e]
+                rounding += wp.abs(new)
+        force[i] = force[i] - f
+        size[i] = size[i] + large
+        stiffness[i] = stiffness[i] + stiff
+        change[w, k] = change[w, k] + more
+        noise[w, k] = noise[w, k] + rounding
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def settle(
+        q: wp.array(dtype=V),
+        force: wp.array(dtype=V),
+        size: wp.array(dtype=real),
+        stiffness: wp.array(dtype=linear),
+        fixed: wp.array(dtype=wp.uint8),
+        status: wp.array(dtype=int),
+        load_scale: wp.array(dtype=real),
+        blocks: int,
+        nodes: int,
+        arm: real,
+        rtol: real,
+        floor: real,
+        right_out: wp.array(dtype=H),
+        square_out: wp.array2d(dtype=real),
+        noise: wp.array2d(dtype=real),
+        unbalanced_out: wp.array(dtype=int),
+        drowned_out: wp.array(dtype=int),
+    ):
+        """Residual of free dofs, and its squares with moments over the length `arm`; see `kernels.balance` for the criterion."""
+        i = wp.tid()
+        w = i / blocks
+        if status[w] != 0:
+            return
+        k = i - w * blocks
+        f = force[i]
+        mask = int(fixed[k])
+        length = wp.where(k < nodes, real(1.0), arm)
+        reach = wp.max(wp.abs(q[i]))
+        if k >= nodes:
+            reach += real(1.0)
+        limit = rtol * load_scale[w] * length
+        least = floor * (real(stiffness[i]) * reach + size[i])
+        r = H()
+        square = real(0.0)
+        for d in range(3):
+            if ((mask >> d) & 1) == 0:
+                r[d] = linear(f[d])
+                square += f[d] * f[d] / (length * length)
+                if not wp.abs(f[d]) <= limit:
+                    drowned_out[w] = 1
+                    if not wp.abs(f[d]) <= least:
+                        unbalanced_out[w] = 1
+        right_out[i] = r
+        square_out[w, k] = square
+        noise[w, k] = noise[w, k] + real(0.5) * size[i] * reach
+
+    return outer, collect, settle
+
+
+@cache
+def contributions(linear):
+    """What a set adds to H: its factor rows, geometric stiffness, and the items of each position."""
+    H = wp.types.vector(3, linear)
+
+    @wp.struct
+    class Contributions:
+        factor: wp.array2d(dtype=H)
+        tension: wp.array2d(dtype=linear)
+        starts: wp.array(dtype=int)
+        items: wp.array(dtype=int)
+        elements: int
+
+    return Contributions
+
+
+@cache
+def sum_function(term: Term, linear):
+    """add(contributions, position, world): F^T F and geometric stiffness of one set.
+
+    An item is (element * slots + row's slot) * slots + column's slot.
+    """
+    measure = term.measure
+    M, Contributions = wp.types.matrix((3, 3), linear), contributions(linear)
+    n, slots, tensions, edges = len(measure.strains), measure.slots, measure.tensions, measure.edges
+
+    @wp.func
+    def weight(edge_first: int, edge_second: int, slot: int):
+        """How an edge vector depends on the node of a slot."""
+        c = linear(0.0)
+        if slot == edge_first:
+            c -= linear(1.0)
+        if slot == edge_second:
+            c += linear(1.0)
+        return c
+
+    @wp.func
+    def geometric(tension: wp.array2d(dtype=linear), e: int, a: int, b: int):
+        a1 = weight(wp.static(edges[0][0]), wp.static(edges[0][1]), a)
+        b1 = weight(wp.static(edges[0][0]), wp.static(edges[0][1]), b)
+        c = tension[0, e] * a1 * b1
+        if wp.static(tensions == 3):
+            a2 = weight(wp.static(edges[-1][0]), wp.static(edges[-1][1]), a)
+            b2 = weight(wp.static(edges[-1][0]), wp.static(edges[-1][1]), b)
+            c += tension[1, e] * (a1 * b2 + a2 * b1) + tension[2, e] * a2 * b2
+        return c
+
+    @wp.func
+    def add(own: Contributions, at: int, w: int):
+        m = M()
+        for index in range(own.starts[at], own.starts[at + 1]):
+            item = own.items[index]
+            pair = item / wp.static(slots)
+            b = item - pair * wp.static(slots)
+            e = pair / wp.static(slots)
+            a = pair - e * wp.static(slots)
+            e += w * own.elements
+            for i in range(wp.static(n)):
+                m += wp.outer(own.factor[i * wp.static(slots) + a, e], own.factor[i * wp.static(slots) + b, e])
+            if wp.static(tensions > 0):
+                c = geometric(own.tension, e, a, b)
+                for d in range(3):
+                    m[d, d] = m[d, d] + c
+        return m
+
+    return add
+
+
+SETS = 6  # sets that one launch sums
+
+
+@cache
+def assemble_kernel(terms: tuple[Term, ...], real, linear, begins: bool):
+    """H of up to `SETS` sets, a thread a position, with inertia where it `begins`; else it adds to what is there."""
+    V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), linear)
+    Contributions = contributions(linear)
+    sums = tuple(sum_function(term, linear) for term in terms)
+    count = len(terms)
+    last = count - 1
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def assemble(
+        mass: wp.array(dtype=V),
+        coefficient: wp.array(dtype=real),
+        rows: wp.array(dtype=int),
+        columns: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        positions: int,
+        own0: Contributions,
+        own1: Contributions,
+        own2: Contributions,
+        own3: Contributions,
+        own4: Contributions,
+        own5: Contributions,
+        matrix: wp.array2d(dtype=linear),
+    ):
+        p = wp.tid()
+        w = p / positions
+        if wanted[w] == 0:
+            return
+        at = p - w * positions
+        row = rows[at]
+        if row < 0:
+            return  # padding stays zero
+        m = M()
+        if wp.static(begins):
+            if row == columns[at]:
+                inertia = mass[row] * coefficient[w]
+                for d in range(3):
+                    m[d, d] = linear(inertia[d])
+        else:
+            for i in range(3):
+                for j in range(3):
+                    m[i, j] = matrix[3 * i + j, p]
+        m += wp.static(sums[0])(own0, at, w)
+        if wp.static(count > 1):
+            m += wp.static(sums[min(1, last)])(own1, at, w)
+        if wp.static(count > 2):
+            m += wp.static(sums[min(2, last)])(own2, at, w)
+        if wp.static(count > 3):
+            m += wp.static(sums[min(3, last)])(own3, at, w)
+        if wp.static(count > 4):
+            m += wp.static(sums[min(4, last)])(own4, at, w)
+        if wp.static(count > 5):
+            m += wp.static(sums[min(5, last)])(own5, at, w)
+        for i in range(3):
+            for j in range(3):
+                matrix[3 * i + j, p] = m[i, j]
+
+    return assemble
+
+
+@cache
+def product_functions(linear):
+    """times(...): row of H v; free(mask): 1 at free dofs and 0 at held ones."""
+    H = wp.types.vector(3, linear)
+
+    @wp.func
+    def free(mask: wp.uint8):
+        v = H()
+        for d in range(3):
+            v[d] = linear(1 - ((int(mask) >> d) & 1))
+        return v
+
+    @wp.func
+    def times(
+        matrix: wp.array2d(dtype=linear),
+        columns: wp.array(dtype=int),
+        slices: wp.array(dtype=int),
+        v: wp.array(dtype=H),
+        row: int,
+        first: int,
+        shift: int,
+    ):
+        """Row `row` of H of a world whose positions begin at `first` and blocks at `shift`."""
+        y = H()
+        slice = row / wp.static(SLICE)
+        start = slices[slice] + row - slice * wp.static(SLICE)
+        for p in range(start, slices[slice + 1], wp.static(SLICE)):
+            j = columns[p]
+            if j >= 0:
+                at = p + first
+                x = v[j + shift]
+                y[0] = y[0] + matrix[0, at] * x[0] + matrix[1, at] * x[1] + matrix[2, at] * x[2]
+                y[1] = y[1] + matrix[3, at] * x[0] + matrix[4, at] * x[1] + matrix[5, at] * x[2]
+                y[2] = y[2] + matrix[6, at] * x[0] + matrix[7, at] * x[1] + matrix[8, at] * x[2]
+        return y
+
+    return times, free

@@ -1,0 +1,102 @@
+"""Bilayer: a strip of two bonded layers, one of which would be longer when free, curls.
+
+Both layers grow by different amounts in all directions of the plane, so that a piece of the strip would like to be part of a sphere of
+curvature kappa (Timoshenko, J. Opt. Soc. Am. 11, 1925). A narrow strip bends along its length by kappa; a wide one cannot without
+stretching, and rolls up with (1 + nu) kappa. In between the curvature k minimises, per length and D W / 2,
+
+    (1 - nu^2) (k - kappa)^2 + ((1 + nu) kappa - nu k)^2 (1 - phi) ,
+    phi = (cosh 2b - cos 2b) / (b (sinh 2b + sin 2b)) ,  b = (W / 2) (E h k^2 / 4 D)^(1/4) ,
+
+as its cross-section bends like a beam on the elastic foundation of the strip's hoop stiffness (Ashwell, J. R. Aeronaut. Soc. 54,
+1950).
+"""
+
+import numpy as np
+
+import ddg_warp as ddg
+from ddg_warp import meshes
+from ddg_warp.rest_shapes import bilayer_curvature, grown_metric, principal_form
+
+LENGTH = 1.0  # m
+THICKNESS = 0.004  # of both layers [m]
+YOUNG = 1.0e9  # Pa
+POISSON = 0.3
+SOURCE = "Timoshenko 1925 and Ashwell 1950"
+
+
+def build(mismatch: float = 4e-3, width: float = 0.1, cells: int = 8, mesh: str = "right") -> ddg.Scene:
+    """The strip along x, drawn as it would roll up if it were narrow, and let go.
+
+    Args:
+        mismatch: difference of the free strains of the two layers, which are alike otherwise
+        width: of the strip [m]
+        cells: cells over the width, an even number; they are about square
+        mesh: right, crossed, alternating, equilateral or jittered
+    """
+    kappa = bilayer_curvature(mismatch, 0.5 * THICKNESS, 0.5 * THICKNESS)
+    along = 2 * max(1, round(0.5 * cells * LENGTH / width))
+    size = (LENGTH, width)
+    flat, triangles = (
+        meshes.jittered_rectangle(along, cells, size, jitter=0.2)
+        if mesh == "jittered"
+        else meshes.rectangle(along, cells, size, mesh)
+    )
+    flat = flat - [0.5 * LENGTH, 0.5 * width, 0.0]
+    rest = grown_metric(flat, triangles, 1.0), principal_form(flat, triangles, kappa, kappa)
+    angle = kappa * flat[:, 0]
+    points = np.stack([np.sin(angle) / kappa, flat[:, 1], (1.0 - np.cos(angle)) / kappa], -1)
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), analysis=ddg.Statics(load_steps=1))
+    strip = scene.add_shell(
+        points, triangles, thickness=THICKNESS, material=ddg.Material(YOUNG, POISSON), rest=rest, name="strip"
+    )
+    # Six components keep it from moving as a rigid body and strain nothing.
+    for place, held in (((0.0, 0.0), "xyz"), ((0.25 * LENGTH, 0.0), "yz"), ((0.0, 0.5 * width), "z")):
+        scene.hold(strip, [int(np.argmin(np.hypot(*(flat[:, :2] - place).T)))], held)
+    return scene
+
+
+def exact(mismatch: float, width: float) -> float:
+    """Curvature along the strip [1/m]."""
+    from scipy.optimize import minimize_scalar
+
+    kappa = bilayer_curvature(mismatch, 0.5 * THICKNESS, 0.5 * THICKNESS)
+
+    def energy(k):
+        b = 0.5 * width * (3.0 * (1.0 - POISSON**2) * (k / THICKNESS) ** 2) ** 0.25
+        phi = (np.cosh(2.0 * b) - np.cos(2.0 * b)) / (b * (np.sinh(2.0 * b) + np.sin(2.0 * b)))
+        return (1.0 - POISSON**2) * (k / kappa - 1.0) ** 2 + (1.0 + POISSON - POISSON * k / kappa) ** 2 * (1.0 - phi)
+
+    bounds = (0.9 * kappa, 1.1 * (1.0 + POISSON) * kappa)
+    return minimize_scalar(energy, bounds=bounds, method="bounded", options={"xatol": 1e-10 * kappa}).x
+
+
+def rest_curvature(model) -> float:
+    """kappa [1/m], from the forms of the strip at rest."""
+    metric, second = model.scene.shells[0].rest
+    return float(second[0, 0] / metric[0, 0])
+
+
+def curvature(model, state) -> float:
+    """Mean curvature [1/m] of the middle half along the strip: the turn of its cross-sections over the distance between them."""
+    drawn, points, kappa = model.scene.shells[0].points, state.points(), rest_curvature(model)
+    along = np.arctan2(kappa * drawn[:, 0], 1.0 - kappa * drawn[:, 2]) / kappa
+    across = drawn[:, 1]
+    tangents, places = [], []
+    for side in (-0.25, 0.25):
+        near = np.abs(along - side * LENGTH) < 0.05 * LENGTH
+        near &= np.abs(across) < 0.25 * np.ptp(across) + 1e-9
+        plane = np.column_stack([np.ones(near.sum()), along[near], across[near]])
+        slope = np.linalg.lstsq(plane, points[near], rcond=None)[0][1]
+        tangents.append(slope / np.linalg.norm(slope))
+        places.append(along[near].mean())
+    return float(np.arccos(np.clip(tangents[0] @ tangents[1], -1.0, 1.0)) / (places[1] - places[0]))
+
+
+def check(result) -> list[ddg.Check]:
+    """Curvature against Ashwell's strip, to what its free ends and cells of this size allow."""
+    kappa, drawn = rest_curvature(result.model), result.model.scene.shells[0].points
+    width = np.ptp(drawn[:, 1])
+    cells = np.sqrt(0.5 * len(result.model.scene.shells[0].triangles) * width / LENGTH)
+    reference = exact(kappa * THICKNESS / 1.5, width)
+    measured = curvature(result.model, result.state)
+    return [ddg.Check("curvature [1/m]", measured, reference, 0.01 + 1.0 / cells**2, SOURCE, relative=True)]

@@ -1,0 +1,197 @@
+"""Rest shapes: forms from principal values, growth, curvature, creases and pre-stress of one shell among others, and named mistakes."""
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp import meshes
+from ddg_warp.integrate.statics import solve
+from ddg_warp.rest_shapes import bilayer_curvature, grown_metric, principal_form
+from ddg_warp.shell_geometry import edge_kinds, metric, second_form
+from ddg_warp.surface import Surface
+from ddg_warp.tangent import Tangent
+
+MATERIAL = ddg.Material(1e6, 0.3, density=1000.0)
+THICKNESS = 0.02
+
+
+def patch(bending="midedge_dof", shells=1, fold=None):
+    """Jittered squares, a metre apart, held as little as statics allows."""
+    points, triangles = meshes.jittered_rectangle(4, 4, jitter=0.2)
+    if fold is not None:
+        points = fold(points)
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    for i in range(shells):
+        shell = scene.add_shell(
+            points + [0.0, 0.0, float(i)], triangles, thickness=THICKNESS, material=MATERIAL, bending=bending
+        )
+        scene.hold(shell, [0], "xyz")
+        scene.hold(shell, [4], "yz")
+        scene.hold(shell, [20], "z")
+    return scene, points, triangles
+
+
+def bowl(points):
+    """A surface with every kind of curvature."""
+    x, y = points[:, 0], points[:, 1]
+    return np.stack([x, y, 0.3 * x * y + 0.2 * x**2 - 0.1 * y**2], -1)
+
+
+def test_principal_form_of_the_plane():
+    """Stretches one give the metric; principal values and directions are those of the form, in every basis."""
+    points, triangles = meshes.jittered_rectangle(4, 4)
+    np.testing.assert_allclose(
+        grown_metric(points, triangles, 1.0), metric(Surface(points, triangles), points), atol=1e-15
+    )
+    direction = np.array([0.6, 0.8, 0.0])
+    form = principal_form(points, triangles, 3.0, -2.0, direction)
+    corners = points[triangles]
+    a = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], 1)[..., :2]
+    plane = 3.0 * np.outer(direction, direction) - 2.0 * np.outer([-0.8, 0.6, 0.0], [-0.8, 0.6, 0.0])
+    expected = np.einsum("tim,mn,tjn->tij", a, plane[:2, :2], a)
+    np.testing.assert_allclose(form, expected[:, [0, 0, 1], [0, 1, 1]], atol=1e-15)
+
+
+def test_curvature_is_positive_towards_the_normal():
+    """A cylinder that faces outwards bends away from its normal: -1 / R around it, 0 along it."""
+    points, triangles = meshes.cylinder(64, 12, 2.0, 1.0)
+    surface = Surface(points, triangles)
+    kinds = edge_kinds(surface)
+    around = np.cross([0.0, 0.0, 1.0], points[triangles].mean(1))
+    inside = (kinds.of_triangles(surface)[0] == 1).all(1)
+    expected = principal_form(points, triangles, -0.5, 0.0, around)[inside]
+    measured = second_form(surface, points, kinds)[inside]
+    np.testing.assert_allclose(measured, expected, atol=2e-3 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("bending", ["midedge_dof", "midedge", "hinge"])
+@pytest.mark.parametrize("size", [0.9, 1.1])
+def test_growth_alone_changes_the_size(device, bending, size):
+    """A metric size^2 times as large is met by a surface `size` times as large, and no other shell notices."""
+    scene, points, _ = patch(bending, shells=2)
+    model = scene.build(device, "float64")
+    before = model.version
+    model.set_rest(1, metric=size**2 * metric(Surface(points, scene.shells[1].triangles), points))
+    assert model.version > before
+    first, second = np.split(solve(model, mode="follow").points(), 2)
+    np.testing.assert_allclose(first, points, atol=1e-12)
+    np.testing.assert_allclose(second, size * points + [0.0, 0.0, 1.0], atol=1e-9)
+
+
+@pytest.mark.parametrize("bending", ["midedge_dof", "midedge", "hinge"])
+def test_points_of_a_rest_shape_bear_no_force(device, bending):
+    """The second of two shells gets another shape: it is free of force there, not where it was; the first is as before."""
+    scene, points, _ = patch(bending, shells=2)
+    model = scene.build(device, "float64")
+    tangent = Tangent(model)
+    shape = bowl(points)
+    model.set_rest(1, points=shape)
+    states = [np.concatenate([points, second + [0.0, 0.0, 1.0]]) for second in (shape, points)]
+    bent, flat = (np.abs(tangent.gradient(model.state(points=x))) for x in states)
+    assert bent.max() < 1e-12 * flat.max()
+    assert flat.max() > 1.0
+    alone = patch(bending, shells=1)[0].build(device, "float64")
+    moved = bowl(points)
+    both = tangent.gradient(model.state(points=np.concatenate([moved, states[0][len(points) :]]))).reshape(-1, 3)
+    single = Tangent(alone).gradient(alone.state(points=moved)).reshape(-1, 3)
+    np.testing.assert_allclose(both[: len(points)], single[: len(points)], atol=1e-12 * np.abs(single).max())
+
+
+def test_rest_at_start_is_rest_set_later(device):
+    """`add_shell(rest=(abar, bbar))` and `set_rest` give the same energies and forces, bit for bit."""
+    scene, points, triangles = patch()
+    forms = grown_metric(points, triangles, 1.05, 0.98), principal_form(points, triangles, 0.7, 0.2, (1.0, 1.0, 0.0))
+    model = scene.build(device, "float64")
+    model.set_rest(0, metric=forms[0], curvature=forms[1])
+    scene.shells[0].rest = forms
+    other = scene.build(device, "float64")
+    state = model.state(points=bowl(points)), other.state(points=bowl(points))
+    one, two = Tangent(model), Tangent(other)
+    np.testing.assert_array_equal(one.gradient(state[0]), two.gradient(state[1]))
+    assert one.energy(state[0]) == two.energy(state[1])
+
+
+def test_one_after_the_other_keeps_what_is_not_given(device):
+    scene, points, triangles = patch()
+    forms = {"metric": grown_metric(points, triangles, 1.05), "curvature": principal_form(points, triangles, 0.7)}
+    gradients = []
+    for steps in (["metric", "curvature"], ["curvature", "metric"]):
+        model = scene.build(device, "float64")
+        for name in steps:
+            model.set_rest(0, **{name: forms[name]})
+        gradients.append(Tangent(model).gradient(model.state(points=bowl(points))))
+    np.testing.assert_array_equal(*gradients)
+    assert np.abs(gradients[0]).max() > 1.0
+
+
+def test_crease(device):
+    """Two triangles with a rest angle between them fold by it."""
+    points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.5, -1.0, 0.0]])
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    shell = scene.add_shell(
+        points, [[0, 1, 2], [1, 0, 3]], thickness=THICKNESS, material=MATERIAL, bending="hinge", name="fold"
+    )
+    scene.hold(shell, [0, 1, 2])
+    model = scene.build(device, "float64")
+    surface = Surface(points, scene.shells[0].triangles)
+    angle = np.zeros(len(surface.edges))
+    angle[surface.edge_between(0, 1)] = 0.8
+    model.set_rest(shell, angle=angle)
+    end = solve(model, rtol=1e-12).points()[3]
+    # convex on the side of the normal +z: the free triangle goes down
+    np.testing.assert_allclose(end, [0.5, -np.cos(0.8), -np.sin(0.8)], atol=1e-9)
+
+
+def test_pre_stress(device):
+    """A membrane shrunk by 2 % and held has the energy A K (1 + nu) E^2 with E = (1 / 0.98^2 - 1) / 2 and A its rest area."""
+    scene, points, triangles = patch()
+    model = scene.build(device, "float64")
+    model.set_rest(0, metric=grown_metric(points, triangles, 0.98))
+    strain = 0.5 * (1.0 / 0.98**2 - 1.0)
+    exact = 0.98**2 * 1e6 * THICKNESS / (1.0 - 0.3) * strain**2
+    assert Tangent(model).energy(model.state())["shell_stretch"] == pytest.approx(exact, rel=1e-12)
+
+
+def test_every_world_gets_it(device):
+    scene, points, triangles = patch()
+    model = scene.build(device, "float64", worlds=2)
+    model.set_parameter("shell_bend_dof", "stiffness", np.array([1.0, 2.0]))
+    model.set_rest(0, curvature=principal_form(points, triangles, 0.5))
+    one, two = np.split(Tangent(model).gradient(model.state()), 2)
+    assert np.abs(one).max() > 0.0
+    np.testing.assert_allclose(two, 2.0 * one, rtol=1e-14)  # the stiffness of each world stays
+
+
+# kappa h / mismatch (Timoshenko 1925): 3/2 for equal layers, also where h1 / h2 = 1/2 or E1 / E2 = 10.
+@pytest.mark.parametrize(
+    ("h1", "young1", "value"), [(1.0, 1.0, 1.5), (0.5, 1.0, 1.333333333), (1.0, 10.0, 0.9958506224)]
+)
+def test_bilayer_curvature(h1, young1, value):
+    assert bilayer_curvature(1e-3, h1, 1.0, young1) * (h1 + 1.0) / 1e-3 == pytest.approx(value, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("bending", "arguments", "message"),
+    [
+        ("midedge_dof", {"shell": 1, "metric": 0}, "shell 1 does not exist; the model has 1 shells"),
+        ("midedge_dof", {}, "give points, metric, curvature or angle"),
+        ("midedge_dof", {"metric": np.ones((3, 3))}, "metric has shape (3, 3)"),
+        ("midedge_dof", {"metric": np.ones((32, 3))}, "metric of triangle 0"),
+        ("midedge_dof", {"curvature": np.full((32, 3), np.nan)}, "curvature has shape (32, 3); give finite"),
+        ("midedge_dof", {"angle": np.zeros(56)}, "has no rest angles"),
+        ("hinge", {"curvature": np.zeros((32, 3))}, "no rest curvature of a triangle"),
+        ("isometric", {"metric": np.ones((32, 3))}, "keeps its flat rest shape"),
+        ("hinge", {"points": np.zeros((2, 3))}, "points has shape (2, 3)"),
+    ],
+)
+def test_mistakes_are_named(device, bending, arguments, message):
+    model = patch(bending)[0].build(device, "float64")
+    with pytest.raises(ValueError) as error:
+        model.set_rest(**{"shell": 0, **arguments})
+    assert message in str(error.value)
+
+
+def test_direction_across_the_surface_is_refused():
+    points, triangles = meshes.rectangle(2, 2)
+    with pytest.raises(ValueError, match="triangle 0: direction"):
+        principal_form(points, triangles, 1.0, 0.0, (0.0, 0.0, 1.0))

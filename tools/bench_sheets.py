@@ -1,0 +1,156 @@
+"""Times a hanging sheet: elements, assembly, an iteration of conjugate gradients, a step; each with its floor by memory traffic.
+
+    python tools/bench_sheets.py [--device cuda:0] [--quick] [--out DIR]
+
+Prints a table; writes sheets_DEVICE.csv and .json. On CUDA the parts are captured graphs, timed by events over many launches; on
+the CPU the clock is that of this process. The floor counts what a part must read and write once, at 4.8 TB/s of an H200.
+"""
+
+import argparse
+import csv
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+import ddg_warp as ddg
+from ddg_warp import meshes
+from ddg_warp.summary import machine, plain, table, write_json
+
+BANDWIDTH = 4.8e12  # of an H200 [bytes/s]
+SIZES = {"hinge": (32, 70, 223, 707), "midedge": (32, 70, 223, 707), "midedge_dof": (32, 70, 223, 707)}
+
+
+def sheet(cells: int, bending: str) -> ddg.Scene:
+    """A square of 1 m and 1 mm, of rubber, held at two corners and released flat."""
+    points, triangles = meshes.rectangle(cells, cells, (1.0, 1.0), "alternating")
+    scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
+    material = ddg.Material(young=1e6, poisson=0.3, density=1000.0)
+    shell = scene.add_shell(points, triangles, thickness=1e-3, material=material, bending=bending)
+    corners = np.flatnonzero(
+        (points[:, 0] == points[:, 0].min())
+        & np.isin(points[:, 1], np.ptp(points[:, 1]) * np.array([-0.5, 0.5]) + points[:, 1].mean())
+    )
+    scene.hold(shell, corners)
+    return scene
+
+
+def floors(newton) -> dict[str, float]:
+    """Bytes that elements with assembly, and an iteration of conjugate gradients, must move at least."""
+    net, linear = newton.net, 4 if newton.linear is wp.float32 else 8
+    blocks, real = newton.all, 8 if newton.real is wp.float64 else 4
+    matrix = 9 * linear * newton.system.entries * newton.worlds
+    geometry = blocks * 3 * real
+    data = sum(4 * part.slots.size + real * part.buffer.size for part in net.sets)
+    vectors = blocks * 3 * linear
+    return {"assembly": matrix + geometry + data, "iteration": matrix + 9 * vectors + 9 * linear * blocks}
+
+
+def clocked(device, part, repeats: int) -> float:
+    """Seconds of one run of `part`."""
+    part()
+    if not device.is_cuda:
+        began = time.process_time()
+        for _ in range(repeats):
+            part()
+        return (time.process_time() - began) / repeats
+    with wp.ScopedCapture(device=device) as capture:
+        part()
+    wp.capture_launch(capture.graph)
+    first, last = wp.Event(device, enable_timing=True), wp.Event(device, enable_timing=True)
+    wp.record_event(first)
+    for _ in range(repeats):
+        wp.capture_launch(capture.graph)
+    wp.record_event(last)
+    wp.synchronize_device(device)
+    return 1e-3 * wp.get_event_elapsed_time(first, last) / repeats
+
+
+def measure(bending: str, cells: int, device, quick: bool) -> dict:
+    """A row of the table."""
+    began = time.perf_counter()
+    model = sheet(cells, bending).build(device.alias, "mixed" if device.is_cuda else "float64")
+    integrator = ddg.Integrator(model, check_every=1)
+    built = time.perf_counter() - began
+    state, steps, dt = model.state(), 3 if quick else 10, 1.0 / 240.0
+    for _ in range(2):
+        state = integrator.step(state, dt)
+    before = integrator.statistics()
+    wp.synchronize_device(device)
+    began = time.perf_counter() if device.is_cuda else time.process_time()
+    for _ in range(steps):
+        state = integrator.step(state, dt)
+    wp.synchronize_device(device)
+    step = ((time.perf_counter() if device.is_cuda else time.process_time()) - began) / steps
+    statistics = integrator.statistics()
+    newton, net = integrator._net.newton, state.net
+    triangles = len(model.surfaces.triangles)
+    newton.status.zero_()
+    newton.wanted.fill_(1)
+    repeats = 3 if quick else 30
+
+    def assembly():
+        newton.evaluate(net)
+        newton.assemble()
+
+    newton.forcing.zero_()
+    newton.rho_first.fill_(1.0)
+    parts = {
+        "evaluate": clocked(device, lambda: newton.evaluate(net), repeats),
+        "assembly": clocked(device, assembly, repeats),
+        "balance": clocked(device, newton.balance, repeats),
+        "iteration": clocked(device, newton.cycle, repeats),
+    }
+    floor = floors(newton)
+    solves = sum(statistics["outcomes"].values()) - sum(before["outcomes"].values())
+    return {
+        "bending": bending,
+        "triangles": triangles,
+        "precision": model.precision,
+        "ms_per_step": 1e3 * step,
+        **{f"{name}_ns_a_triangle": 1e9 * seconds / triangles for name, seconds in parts.items()},
+        **{f"{name}_floor_ns": 1e9 * size / BANDWIDTH / triangles for name, size in floor.items()},
+        "pcg_a_step": (statistics["pcg_iterations"] - before["pcg_iterations"]) / steps,
+        "newton_mean": statistics["newton_iterations"]["mean"],
+        "solves": solves,
+        "outcomes": ", ".join(f"{count} {name}" for name, count in statistics["outcomes"].items()),
+        "residual": float(np.sqrt(newton.sum_square.numpy().max())),
+        "build_s": built,
+    }
+
+
+def main() -> int:
+    """Run what the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", help="Warp device (default: CUDA if there is one)")
+    parser.add_argument("--quick", action="store_true", help="small sizes: does it run?")
+    parser.add_argument("--bending", nargs="*", default=list(SIZES), choices=list(SIZES))
+    parser.add_argument("--largest", type=int, default=10**6, help="largest number of triangles")
+    parser.add_argument("--commit", default="", help="commit, where there is no git checkout")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    chosen = parser.parse_args()
+    wp.config.quiet = True
+    device = wp.get_device(chosen.device)
+    rows = []
+    for bending in chosen.bending:
+        for cells in SIZES[bending][:1] if chosen.quick else SIZES[bending]:
+            if 2 * cells * cells <= chosen.largest:
+                rows.append(measure(bending, cells, device, chosen.quick))
+                print(table(rows[-1:]), file=sys.stderr, flush=True)
+    origin = machine()
+    origin["commit"] = chosen.commit or origin["commit"]
+    stem = chosen.out / f"sheets_{'cuda' if device.is_cuda else 'cpu'}"
+    command = " ".join(["python", "tools/bench_sheets.py", *sys.argv[1:]])
+    write_json(stem.with_suffix(".json"), {"command": command, "device": str(device), "machine": origin, "rows": rows})
+    with open(stem.with_suffix(".csv"), "w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(plain(rows))
+    print(table(rows))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
