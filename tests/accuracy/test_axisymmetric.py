@@ -10,10 +10,12 @@ import pytest
 from convergence import equilibrium, order
 
 import ddg_warp as ddg
+from ddg_warp import stability
 from ddg_warp.integrate.continuation import Continuation
 from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
 from ddg_warp.meshes import spherical_cap
 from ddg_warp.scenes import axisymmetric_dome
+from ddg_warp.tangent import Tangent
 
 E, NU = 1.0e9, 0.3
 MATERIAL = ddg.Material(young=E, poisson=NU, density=1.0)
@@ -83,7 +85,7 @@ def test_cylinder_under_pressure_at_large_strain(device):
 
 def test_edge_of_a_cylinder(device):
     """Radial force Q per length on a free edge: u = Q exp(-b z) cos(b z) / (2 b^3 D), b^4 = 3 (1 - nu^2) / (R h)^2 (Timoshenko)."""
-    R, h, Q = 1.0, 1e-3, 1e-9
+    R, h, Q = 1.0, 1e-3, 1e-4
     b = (3.0 * (1.0 - NU**2)) ** 0.25 / np.sqrt(R * h)
     errors = []
     for n in (40, 80, 160):
@@ -99,41 +101,59 @@ def test_edge_of_a_cylinder(device):
     assert order((40, 80, 160), errors) == pytest.approx(2.0, abs=0.1)
 
 
-def test_point_load_on_a_sphere(device):
-    """F / w = 4 E h^2 / (R sqrt(3 (1 - nu^2))) (Reissner 1946), on a cap of 12 sqrt(R h), edges finer towards the pole."""
-    R, h = 1.0, 1e-5
+def test_point_loads_on_a_sphere(device):
+    """F / w = 4 E h^2 / (R sqrt(3 (1 - nu^2))) (Reissner 1946) under opposite forces on both poles; edges finer towards these."""
+    R, h, load = 1.0, 1e-5, 1e-4
     stiffness = 4.0 * E * h**2 / (R * np.sqrt(3.0 * (1.0 - NU**2)))
     edges, errors = (40, 80, 160), []
     for n in edges:
         scene = still()
-        angle = 12.0 * np.sqrt(h / R) * np.linspace(0.0, 1.0, n + 1) ** 2
-        points = R * np.column_stack([np.sin(angle), np.cos(angle)])
-        shell = scene.add_axisymmetric_shell(points, thickness=h, material=MATERIAL)
-        scene.clamp_ring(shell, "last")
-        scene.add_pole_force(shell, -1e-5 * stiffness * h)
+        shell = scene.add_axisymmetric_shell(hemisphere(n, R, 4), thickness=h, material=MATERIAL)
+        scene.symmetry_ring(shell, "last")
+        scene.add_pole_force(shell, -load * stiffness * h)
         drop = R - equilibrium(scene, device)[1].points()[0, 2]
-        errors.append(1e-5 * h / drop - 1.0)
+        errors.append(load * h / drop - 1.0)
     assert abs(errors[-1]) < 5e-3
     assert order(edges, errors) == pytest.approx(2.0, abs=0.1)
 
 
+def hemisphere(n, R, grading=1):
+    angle = 0.5 * np.pi * np.linspace(0.0, 1.0, n + 1) ** grading
+    return R * np.column_stack([np.sin(angle), np.cos(angle)])
+
+
 def test_sphere_buckles(device):
-    """Half a sphere on its plane of symmetry leaves the spherical path at p = 2 E h^2 / (R^2 sqrt(3 (1 - nu^2))) (Zoelly 1915)."""
+    """The uniformly shrunk sphere is first singular at p = 2 E h^2 / (R^2 sqrt(3 (1 - nu^2))) (Zoelly 1915).
+
+    Shrunk by l it is under the pressure 2 E h (1 - l^2) / (2 (1 - nu) R l). It counts as given: on the way there by
+    equilibria, errors of the mesh act as imperfections do.
+    """
     R, h = 1.0, 2e-3
     classical = 2.0 * E * h**2 / (R**2 * np.sqrt(3.0 * (1.0 - NU**2)))
-    edges, loads = (200, 400, 800), []
+    edges, loads = (100, 200, 400), []
     for n in edges:
         scene = still()
-        angle = 0.5 * np.pi * np.linspace(0.0, 1.0, n + 1)
-        points = R * np.column_stack([np.sin(angle), np.cos(angle)])
-        shell = scene.add_axisymmetric_shell(points, thickness=h, material=MATERIAL)
+        shell = scene.add_axisymmetric_shell(hemisphere(n, R), thickness=h, material=MATERIAL)
         scene.symmetry_ring(shell, "last")
         scene.add_axisymmetric_pressure(shell, -classical)
-        path = Continuation(scene.build(device, "float64"), step=1e-3, max_step=0.1, load_scale=1.0).trace(
-            stop=ddg.Stop(load=(0.0, 1.05))
-        )
-        loads.append(path.bifurcations[0].load if path.bifurcations else np.nan)
-    print(loads)
+        model = scene.build(device, "float64")
+        tangent, rest = Tangent(model), model.state().points()
+        free = np.flatnonzero(tangent.free)
+
+        def pressure(strain):
+            return E * h * (1.0 - (1.0 - strain) ** 2) / ((1.0 - NU) * R * (1.0 - strain)) / classical
+
+        def unstable(strain):
+            state = model.state(points=(1.0 - strain) * rest)  # noqa: B023
+            following = tangent.load_stiffness(pressure(strain), tangent.dofs(state))  # noqa: B023
+            matrix = tangent.hessian(state) + following  # noqa: B023
+            return stability.negative_eigenvalues(matrix[free][:, free])  # noqa: B023
+
+        low, high = 0.0, 2.0 * h
+        for _ in range(30):
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if unstable(middle) else (middle, high)
+        loads.append(pressure(low))
     assert loads[-1] == pytest.approx(1.0, abs=5e-3)
     assert differences_order(edges, loads) == pytest.approx(2.0, abs=0.1)
 
@@ -163,8 +183,8 @@ def test_clamped_cap_snaps(device, shallowness):
 def test_everted_cap(device, shallowness, drop):
     R, h = 1.0, 2e-5
     unit = np.sqrt(R * h) / (12.0 * (1.0 - NU**2)) ** 0.25
-    errors = []
-    for n in REGULAR:
+    errors, edges = [], (40, 80, 160)
+    for n in edges:
         scene = still()
         r = shallowness * unit * np.linspace(0.0, 1.0, n + 1)
         z = np.sqrt(R**2 - r**2) - R
@@ -174,10 +194,11 @@ def test_everted_cap(device, shallowness, drop):
         mirrored = model.state(points=np.column_stack([r, 0.0 * r, -z]))
         end = Equilibrium(model, StaticsOptions(floor_factor=1.0)).load(mirrored, 1).points()[-1, 2]
         errors.append((end - z[-1]) * R / unit**2 / drop - 1.0)
-    assert abs(errors[-1]) < 1e-3
-    assert order(REGULAR, errors) == pytest.approx(2.0, abs=0.1)
+    assert abs(errors[-1]) < 3e-4
+    assert differences_order(edges, errors) == pytest.approx(2.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_agrees_with_the_triangle_shell(device):
     """A clamped cap of 0.5 rad, R / h = 50, under a pressure past linear: the crown's drop by triangles tends to that of the meridian."""
     R, h, angle = 1.0, 0.02, 0.5
@@ -200,8 +221,8 @@ def test_agrees_with_the_triangle_shell(device):
         scene.add_pressure(shell, -pressure)
         state = equilibrium(scene, device)[1]
         errors.append((points[0, 2] - state.points()[0, 2]) / exact - 1.0)
-    print(errors)
     assert abs(errors[-1]) < 0.01
+    assert abs(errors[2]) < 0.5 * abs(errors[1]) < 0.25 * abs(errors[0])
 
 
 def test_swelling_and_curling_are_free_of_stress(device):
