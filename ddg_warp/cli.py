@@ -86,6 +86,9 @@ def parser(arguments: list[str]) -> Parser:
     export.add_argument("directory", type=Path, metavar="DIR", help="directory of a run")
     export.add_argument("--to", type=Path, metavar="FILE", help="a .usdc or .usda file (default: DIR/export.usdc)")
     export.add_argument("--tube", action="store_true", help="write tube meshes, not curves")
+    export.add_argument(
+        "--revolve", type=int, default=0, metavar="N", help="turn meridians into surfaces of revolution of N sides"
+    )
 
     info = commands.add_parser("info", help="show versions, devices and machine")
     info.set_defaults(command=show_info)
@@ -246,7 +249,9 @@ def export_run(chosen: argparse.Namespace) -> int:
     if target.suffix not in (".usda", ".usdc"):
         raise InputError(f"--to {target}: the file must end in .usdc or .usda")
     target.parent.mkdir(parents=True, exist_ok=True)
-    export_usd(source, target, tube=chosen.tube)
+    if chosen.revolve and chosen.revolve < 3:
+        raise InputError(f"--revolve {chosen.revolve}: a surface of revolution has 3 sides at least")
+    export_usd(source, target, tube=chosen.tube, revolve=chosen.revolve)
     print(f"wrote {target}")
     return DONE
 

@@ -5,13 +5,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ddg_warp import motion as motions
 from ddg_warp import validate
 from ddg_warp.errors import SceneError
 from ddg_warp.material import Material
 from ddg_warp.motion import Motion
 
-FORCES = {"first": 0, "last": -1}
+ENDS = {"first": 0, "last": -1}
 
 
 @dataclass
@@ -167,15 +166,15 @@ class Meridians:
         if not support.components or set(support.components) - set("xz"):
             raise SceneError(f"ring support: components {support.components!r}; they are 'x' (radius), 'z' or both")
         motion = support.motion
-        if motion is not None and (not isinstance(motion, Motion) or motion.angle is not motions._unturned):
+        if motion is not None and (not isinstance(motion, Motion) or motion.angle is not Motion.angle):
             raise SceneError(f"ring support: motion is {motion!r}; a ring moves by Motion(translation=...) alone")
         self.ring_supports.append(support)
 
     def _end(self, shell, end: str) -> int:
         self._check_axisymmetric(shell)
-        if end not in FORCES:
+        if end not in ENDS:
             raise SceneError(f"end is {end!r}; it is 'first' or 'last'")
-        return FORCES[end]
+        return ENDS[end]
 
     def _check_axisymmetric(self, shell) -> None:
         count = len(self.axisymmetric_shells)

@@ -18,6 +18,8 @@ class NetStep:
         host, device, real = model.net.host, model.wp_device, model.types.real
         if host.turning:
             raise SceneError("ends of rods in a net that turn are for statics; in dynamics move their nodes alone")
+        if host.bands:
+            raise SceneError("pressure that follows axisymmetric shells is for statics; in dynamics give dead=True")
         multilevel = integrator.linear == "multilevel"
         self.newton = NetNewton(model, integrator.options, "multilevel" if multilevel else "block_jacobi")
         self.midpoint = integrator.scheme == "implicit_midpoint"

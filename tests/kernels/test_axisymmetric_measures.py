@@ -19,14 +19,18 @@ def sample(name: str) -> Elements:
     term, random = AXISYMMETRIC[name], np.random.default_rng(7)
     measure = term.measure
     edges = [1.0, 0.3, -0.7, 0.8, 0.2, 0.9][: 3 * len(measure.edges)]
-    q = np.concatenate([edges, [2.0, 0.1, 0.5][: 3 * measure.points]]) + 0.15 * random.normal(size=(COUNT, measure.size))
+    q = np.concatenate([edges, [2.0, 0.1, 0.5][: 3 * measure.points]]) + 0.15 * random.normal(
+        size=(COUNT, measure.size)
+    )
     s = random.uniform(0.6, 1.4, size=(COUNT, max(1, measure.data_size)))
     if measure.name == "axisymmetric_rim":
         angle = random.uniform(0.0, 0.3, COUNT)
         s[:, 0], s[:, 1] = np.cos(angle), np.sin(angle)
     p = random.uniform(0.6, 1.4, size=(COUNT, term.density.parameter_size(3)))
     for i, parameter in enumerate(term.density.parameters(3)):
-        p[:, i] *= {"poisson": 0.3, "metric_12": 0.3, "rest_11": 0.4, "rest_12": 0.4, "rest_22": 0.4}.get(parameter, 1.0)
+        p[:, i] *= {"poisson": 0.3, "metric_12": 0.3, "rest_11": 0.4, "rest_12": 0.4, "rest_22": 0.4}.get(
+            parameter, 1.0
+        )
     w = random.uniform(0.6, 1.4, size=COUNT)
     q, s, w, p = (values.astype(np.float32).astype(float) for values in (q, s, w, p))
     if measure.name == "axisymmetric_rim":
