@@ -106,7 +106,9 @@ def test_derivatives(device, name, turn):
 
     h = 1e-6
     for dof in free:
-        (above, gradient_above), (below, gradient_below) = (at(sign * h * np.eye(1, len(q), dof)[0]) for sign in (1, -1))
+        (above, gradient_above), (below, gradient_below) = (
+            at(sign * h * np.eye(1, len(q), dof)[0]) for sign in (1, -1)
+        )
         slope = (above - below).sum() / (2.0 * h)
         assert slope == pytest.approx(gradient[dof], rel=1e-6, abs=1e-6 * np.abs(gradient[free]).max())
         column = ((gradient_above - gradient_below) / (2.0 * h))[free]
@@ -204,7 +206,7 @@ def test_energy_of_a_bent_joint(device):
 
 def test_moments_balance_at_the_joint(device):
     """The clamp carries the force and its moment about the clamp; the second leg passes its bending on as twist of the first."""
-    scene, first, second = angle_frame(8)
+    scene, _, second = angle_frame(8)
     force = np.array([0.2, 0.5, -0.3])
     scene.add_force(second, -1, force)
     model, state = equilibrium(scene, device)
@@ -238,7 +240,7 @@ def test_planar_frame_equals_the_spatial_one(device):
     for dimension in (2, 3):
         scene, _, second = angle_frame(6, ROUND, dimension, end=(1.4, 0.0, -0.9))
         scene.add_force(second, -1, (-0.7, 0.0, -0.6))
-        model, state = equilibrium(scene, device)
+        _, state = equilibrium(scene, device)
         tips.append(state.points())
         assert not state.points()[:, 1].any()
     assert np.abs(tips[0][-1] - [1.4, 0.0, -0.9]).max() > 0.2
