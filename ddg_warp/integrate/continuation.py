@@ -55,8 +55,8 @@ class Continuation:
             stop: where to end.
 
         Raises:
-            SolverError: `no_start`, `singular_start`, `step_too_small`, `bound_lost` or `event_lost`; carries the last good state,
-                and the path so far as its `path`.
+            SolverError: `no_start`, `singular_start` or `step_too_small`; carries the last good state, and the path so far as its
+                `path`.
         """
         first = self.corrector.start(state or self.model.state(), start)
         if direction * first.direction[-1] < 0.0:
@@ -152,22 +152,19 @@ class Continuation:
             while True:
                 try:
                     there = self.corrector.at(here, step)
+                    outcome, row, value = self._bound(here, there, stop) or ("", None, 0.0)
+                    there = self.corrector.to(here, row, value) if outcome else there
+                    events = self._events(here, there)
                     break
-                except Failed:
+                except Failed as failed:
                     step *= 0.5
                     if step < options.min_step:
                         raise self._error(
                             "step_too_small",
                             path,
-                            "the path may end or branch here; begin elsewhere, or take min_step smaller",
+                            f"{failed}: the path may end or branch here; begin elsewhere, or take min_step smaller",
                         ) from None
-            outcome, row, value = self._bound(here, there, stop) or ("", None, 0.0)
-            if outcome:
-                try:
-                    there = self.corrector.to(here, row, value)
-                except Failed:
-                    raise self._error("bound_lost", path, "take smaller steps, or move the bound") from None
-            for event in self._events(here, there):
+            for event in events:
                 path.points.append(event)
                 if event.kind == LIMIT_POINT and len(path.limit_points) == stop.limit_points:
                     path.outcome = "limit_points"
@@ -198,22 +195,19 @@ class Continuation:
     def _events(self, here: Point, there: Point) -> list[Point]:
         """Limit points and bifurcations between two neighbours on a path, in order."""
         length, found, jump, fold = there.arclength - here.arclength, [], 0, np.inf
-        try:
-            if here.direction[-1] * there.direction[-1] < 0.0:
-                limit = self._limit_point(here, length)
-                limit.negative = min(here.negative, there.negative)
-                fold = limit.arclength - here.arclength
-                _, _, rate, *_ = self.corrector.system(limit.state, self.tangent.dofs(limit.state), limit.load)
-                sense = np.sign(rate @ limit.direction[:-1])
-                jump = int(sense * there.direction[-1] < 0.0) - int(sense * here.direction[-1] < 0.0)
-                found.append(limit)
-            low, count = 0.0, here.negative
-            ends = there.negative - jump if fold < np.inf else there.negative
-            while count != ends:
-                point, low, count = self._bifurcation(here, low, length, count, jump, fold)
-                found.append(point)
-        except Failed as failed:
-            raise self._error("event_lost", Path([here]), f"{failed}; take smaller steps") from None
+        if here.direction[-1] * there.direction[-1] < 0.0:
+            limit = self._limit_point(here, length)
+            limit.negative = min(here.negative, there.negative)
+            fold = limit.arclength - here.arclength
+            _, _, rate, *_ = self.corrector.system(limit.state, self.tangent.dofs(limit.state), limit.load)
+            sense = np.sign(rate @ limit.direction[:-1])
+            jump = int(sense * there.direction[-1] < 0.0) - int(sense * here.direction[-1] < 0.0)
+            found.append(limit)
+        low, count = 0.0, here.negative
+        ends = there.negative - jump if fold < np.inf else there.negative
+        while count != ends:
+            point, low, count = self._bifurcation(here, low, length, count, jump, fold)
+            found.append(point)
         return sorted(found, key=lambda point: point.arclength)
 
     def _limit_point(self, here: Point, length: float) -> Point:
