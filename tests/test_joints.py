@@ -266,3 +266,22 @@ def test_planar_net_keeps_natural_curvature(device, natural):
     alone = results[0]
     assert np.abs(alone[-1] - arc[-1]).max() > 0.02
     np.testing.assert_allclose(results[1], alone, atol=1e-8)
+
+
+@pytest.mark.parametrize("stretch", [1e4, 1e8], ids=["soft", "nearly inextensible"])
+def test_one_increment_is_enough(device, stretch):
+    """Three rods from one joint, bent and twisted far by forces on their ends: steps that shear edges take 786 and 5543 iterations."""
+    scene = weightless()
+    section = ddg.Stiffness(EA=stretch, EI1=1.0, EI2=1.5, GJ=0.8)
+    rods = [scene.add_rod(line(start, end, 20), section=section) for start, end in ((0 * X, X), (X, X - Z), (X, X + Y))]
+    scene.join([(rods[0], -1), (rods[1], 0), (rods[2], 0)])
+    scene.clamp_end(rods[0], "first")
+    scene.add_force(rods[1], -1, (0.5, 2.0, -1.0))
+    scene.add_force(rods[2], -1, (0.5, 1.0, 3.0))
+    model = scene.build(device, "float64")
+    solver = Equilibrium(model)
+    state = solver.load(model.state(), 1)
+    assert solver.iterations < 20
+    assert np.linalg.norm(state.points()[-1] - [1.0, 1.0, 0.0]) > 0.5
+    (reaction,) = model.reactions(state)
+    np.testing.assert_allclose(reaction.force, (-1.0, -3.0, -2.0), atol=1e-6)
