@@ -206,7 +206,7 @@ class Continuation:
         low, count = 0.0, here.negative
         ends = there.negative - jump if fold < np.inf else there.negative
         while count != ends:
-            point, low, count = self._bifurcation(here, low, length, count, jump, fold)
+            point, low, count = self._bifurcation(here, there, low, count, jump, fold)
             found.append(point)
         return sorted(found, key=lambda point: point.arclength)
 
@@ -221,28 +221,30 @@ class Continuation:
         point.kind = LIMIT_POINT
         return point
 
-    def _bifurcation(self, here: Point, low: float, high: float, count: int, jump: int, fold: float):
+    def _bifurcation(self, here: Point, there: Point, low: float, count: int, jump: int, fold: float):
         """The first change of the number of negative eigenvalues that is not a limit point's; where it is passed, and the count."""
+        length = high = there.arclength - here.arclength
 
-        def counted(step):
-            return self.corrector.at(here, step).negative - (jump if step > fold else 0)
+        def point_at(step):
+            return self.corrector.at(here, step, smooth=False) if step > 0.0 else here
 
-        after = None
+        after = there.negative - (jump if length > fold else 0)
         for _ in range(BISECTIONS):
             middle = 0.5 * (low + high)
-            there = counted(middle)
-            if there == count:
+            found = point_at(middle).negative - (jump if middle > fold else 0)
+            if found == count:
                 low = middle
             else:
-                high, after = middle, there
-        after = counted(high) if after is None else after
-        ends = [self.corrector.critical(self.corrector.at(here, step) if step > 0.0 else here) for step in (low, high)]
-        (a, _), (b, _) = ends
+                high, after = middle, found
+        a, b = (self.corrector.critical(point_at(step))[0] for step in (low, high))
         root = low + (high - low) * (a / (a - b) if a * b < 0.0 else 0.5)
-        point = self.corrector.at(here, root)
+        point = point_at(root)
         point.kind = BIFURCATION
         point.negative = min(count, after) + (jump if root > fold else 0)
         point.mode = self.corrector.critical(point)[1]
+        # the tangent of the path itself, between those beside it
+        along = here.direction + root / length * (there.direction - here.direction)
+        point.direction = along / self.corrector.norm(along)
         return point, high, after
 
     def _error(self, outcome: str, path: Path, remedy: str) -> SolverError:

@@ -77,12 +77,15 @@ class Corrector:
         weights = np.append(lengths**2 / len(position), self.options.load_scale**-2)
         self.metric = np.where(np.append(tangent.free, True), weights, 0.0)
 
-    def at(self, here: Point, step: float) -> Point:
-        """The equilibrium at an arc length `step` along the tangent."""
+    def at(self, here: Point, step: float, smooth: bool = True) -> Point:
+        """The equilibrium at an arc length `step` along the tangent; `smooth` refuses a path that turns sharply on the way.
+
+        Next to a bifurcation the tangent is lost in rounding: there it cannot be asked to be smooth.
+        """
         there = self.correct(here, step * here.direction, self.metric * here.direction)
         if self.dot(there.direction, here.direction) < 0.0:
             there.direction = -there.direction
-        if self.dot(there.direction, here.direction) < 0.7:
+        if smooth and self.dot(there.direction, here.direction) < 0.7:
             raise Failed("sharp_turn")
         there.arclength = here.arclength + step
         return there
