@@ -6,8 +6,8 @@ import numpy as np
 import warp as wp
 from scipy import sparse
 
-from ddg_warp.chain_tangent import turn_excess
 from ddg_warp.kernels.net import elements
+from ddg_warp.turning import turned
 
 
 class NetTangent:
@@ -131,7 +131,7 @@ class NetTangent:
         state.net.q.assign(q.reshape(-1, 3))
 
     def retract(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """q moved along `step`, with edges of rods turned instead of sheared; see `ChainTangent.retract`.
+        """q moved along `step`, with edges of rods turned instead of sheared; see `ddg_warp.turning`.
 
         Rods are taken from held nodes outwards: where one meets others that are placed already, or a shell, it is anchored there.
         """
@@ -141,16 +141,10 @@ class NetTangent:
             excess = np.zeros((self.host.nodes, 3))
             placed = self._anchored.copy()
             for rod in self._order:
-                nodes = rod.all_nodes
-                bend = turn_excess(x[world][nodes], dx[world][nodes], rod.piece.kind.closed)
-                for d in range(3):
-                    anchors = np.flatnonzero(placed[nodes, d])
-                    if not anchors.size:
-                        anchors = np.array([0])
-                    miss = np.interp(np.arange(len(nodes)), anchors, bend[anchors, d] - excess[nodes[anchors], d])
-                    excess[nodes, d] = bend[:, d] - miss
-                placed[nodes] = True
-            out[world][: self.host.nodes] += np.where(self.host.fixed[: self.host.nodes], 0.0, excess)
+                at, closed = rod.all_nodes, rod.piece.kind.closed
+                excess[at] = turned(x[world][at], dx[world][at], placed[at], excess[at], closed)
+                placed[at] = True
+            out[world][: self.host.nodes] += excess
         return moved
 
     def move_supports(self, state, before: float, at: float) -> None:
