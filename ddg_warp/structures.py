@@ -134,7 +134,9 @@ class Structures:
             raise SceneError(f"shell '{name}': triangles are {triangles.dtype}; give whole numbers")
         if not isinstance(material, Material):
             raise SceneError(f"shell '{name}': material is {material!r}; give material=Material(...)")
-        self.shells.append(Shell(points, triangles, np.asarray(thickness, float), material, bending, membrane, rest, name))
+        self.shells.append(
+            Shell(points, triangles, np.asarray(thickness, float), material, bending, membrane, rest, name)
+        )
         return len(self.shells) - 1
 
     def hold(self, shell: int, vertices, components: str = "xyz", motion: Motion | None = None) -> None:

@@ -12,7 +12,13 @@ INNER, OUTER, THICKNESS = 6.0, 10.0, 0.03  # m
 YOUNG = 21.0e6  # Pa
 FORCE = 0.8  # N/m
 # Load factor -> vertical displacement of the inner and the outer corner of the loaded lip [m].
-TABLE = {0.1: (4.277, 5.876), 0.25: (7.602, 10.288), 0.5: (10.468, 13.768), 0.75: (12.31, 15.842), 1.0: (13.891, 17.528)}
+TABLE = {
+    0.1: (4.277, 5.876),
+    0.25: (7.602, 10.288),
+    0.5: (10.468, 13.768),
+    0.75: (12.31, 15.842),
+    1.0: (13.891, 17.528),
+}
 
 
 def build(

@@ -109,7 +109,7 @@ def functions(term: Term, real):
 
 @cache
 def term_kernels(term: Term, real):
-    """Kernels of one term: energy, gradient (slots, elements), Hessian (size * size, elements), strains and stresses, linear stresses."""
+    """Kernels of one term: energy, gradient (slots, elements), Hessian (elements, size, size), strains, linear stresses."""
     measure, density = term.measure, term.density
     V = wp.types.vector(3, real)
     Q, S, E, _ = measure.types(real)
@@ -252,7 +252,9 @@ def term_kernels(term: Term, real):
         """Stresses of the strains that a step gives to first order, e + J step."""
         tid = wp.tid()
         x, s, w, p = gather(q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid)
-        d, _s, _w, _p = gather(step, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid)
+        d, _s, _w, _p = gather(
+            step, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid
+        )
         e, jacobian = jacobian_of(x, s, w)
         stress = slope_of(e + jacobian * d, p)
         for i in range(wp.static(n)):

@@ -53,6 +53,31 @@ def order(counts, errors):
     return -np.polyfit(np.log(counts), np.log(np.abs(errors)), 1)[0]
 
 
+@pytest.mark.parametrize("shape", ["cylinder 20", "cylinder 45"])
+@pytest.mark.parametrize("mesh", ["right", "jittered"])
+def test_curved_membrane_bends_without_stretch(device, mesh, shape):
+    """A sheet rolled up isometrically: facets have strains of order 2 in their size, arcs over their sides of order 3 or more.
+
+    Energies go with the squares. Free sheets, whose mid-edge normals are those of least bending energy; triangles in the middle.
+    """
+    counts, energies = (8, 16, 32), {"flat": [], "curved": []}
+    for n in counts:
+        points, triangles = square(mesh, n)
+        surface = Surface(triangles)
+        kinds = edge_kinds(surface)
+        plate = flat_plate(surface, np.column_stack([points, np.zeros(len(points))]), kinds)
+        place, _ = SHAPES[shape][0](points)
+        inside = (np.abs(points[triangles].mean(1) - 0.5) < 0.3).all(1)
+        for membrane, results in energies.items():
+            stretch, bend = shells.shell_elements(surface, plate, kinds, "midedge_dof", membrane)
+            angles = relaxed_angles(bend, place, kinds.turning, device)
+            energy = gather(stretch, place, angles).evaluate(device=device)["energy"][:, 0]
+            results.append(energy[inside].sum() / plate.area[inside].sum())
+    assert order(counts, energies["flat"]) == pytest.approx(4.0, abs=0.2)
+    assert order(counts, energies["curved"]) > 5.8
+    assert energies["curved"][-1] < 0.01 * energies["flat"][-1]
+
+
 @pytest.mark.parametrize("shape", ["cylinder 20", "cylinder 45", "sphere"])
 @pytest.mark.parametrize("mesh", ["crossed", "equilateral"])
 def test_turning_normals_have_order_two(device, mesh, shape):
@@ -174,13 +199,16 @@ def test_second_form_is_the_measure(device):
 
 
 @pytest.mark.parametrize("viscosity", [None, 0.1])
-@pytest.mark.parametrize("bending", ["midedge", "midedge_dof", "hinge"])
-def test_no_force_at_rest(device, bending, viscosity):
+@pytest.mark.parametrize(
+    ("bending", "membrane"),
+    [("midedge", "flat"), ("midedge_dof", "flat"), ("midedge_dof", "curved"), ("hinge", "flat")],
+)
+def test_no_force_at_rest(device, bending, membrane, viscosity):
     """With rest="shape", supports included, the shape itself bears no force; elsewhere it does."""
     surface, place, kinds = patch()
     plate = shells.plate(surface, place, 0.3, UNIT_D, NU, kinds, "shape", viscosity)
     moved = place + 0.1 * np.random.default_rng(6).normal(size=place.shape)
-    for elements in shells.shell_elements(surface, plate, kinds, bending):
+    for elements in shells.shell_elements(surface, plate, kinds, bending, membrane):
         sizes = [np.abs(at_rest(elements, x).evaluate(device=device)["gradient"]).max() for x in (place, moved)]
         assert sizes[0] < 1e-14 and sizes[1] > 1e-3, elements.term.name
 
@@ -297,10 +325,12 @@ def test_bad_supports_and_models_are_refused():
             edge_kinds(surface, clamped, symmetry)
     curved = shells.plate(surface, place, 0.1, 1.0, NU, kinds, "shape")
     explicit = shells.plate(surface, place, 0.1, 1.0, NU, kinds, (curved.abar, curved.bbar))
-    for plate, bending, message in (
-        (curved, "isometric", "needs a flat rest shape"),
-        (explicit, "hinge", "no rest angle"),
-        (curved, "koiter", "bending = 'koiter'"),
+    for plate, bending, membrane, message in (
+        (curved, "isometric", "flat", "needs a flat rest shape"),
+        (explicit, "hinge", "flat", "no rest angle"),
+        (curved, "koiter", "flat", "bending = 'koiter'"),
+        (curved, "hinge", "round", "membrane = 'round'"),
+        (curved, "hinge", "curved", "reads the mid-edge normals"),
     ):
         with pytest.raises(SceneError, match=message):
-            shells.shell_elements(surface, plate, kinds, bending)
+            shells.shell_elements(surface, plate, kinds, bending, membrane)
