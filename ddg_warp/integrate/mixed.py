@@ -43,7 +43,7 @@ def newton(solver, state: State, before: float, at: float) -> State | None:
         if not np.isfinite(residual).all() or not np.isfinite(hessian.data).all():
             return None
         if iteration:
-            scale = max(scale, solver.scale(outer, gradient, residual))
+            scale = max(scale, solver.load_scale(outer, gradient)) or np.abs(residual[free]).max()
             excess = solver.excess(residual, gradient, hessian, q, scale)
             if excess <= 0.0 and (solver.outcome == "converged" or polished):
                 stable = factor.reliable and not factor.negative

@@ -117,7 +117,7 @@ class Equilibrium:
         energies, q = tangent.element_energies(state), tangent.dofs(state)
         outer = tangent.loads(at, q)
         gradient = tangent.gradient(state)
-        scale, polished = 0.0, False
+        scale, polished = None, False
         for _ in range(options.max_iterations):
             residual = outer - gradient
             hessian = tangent.hessian(state)
@@ -126,7 +126,9 @@ class Equilibrium:
                 hessian = hessian + following
             if not np.isfinite(residual).all() or not np.isfinite(hessian.data).all():
                 raise SolverError(self._where("non_finite", residual, at), state=state, outcome="non_finite")
-            scale = max(scale, self.scale(outer, gradient, residual))
+            scale = max(self.load_scale(outer, gradient), scale or 0.0)
+            if scale == 0.0:
+                scale = np.abs(residual[free]).max()
             excess = self.excess(residual, gradient, hessian, q, scale)
             if excess <= 0.0 and (self.outcome == "converged" or polished):
                 state.time = at
@@ -175,6 +177,11 @@ class Equilibrium:
             )
         raise SolverError(self._where("max_iterations", outer - gradient, at), state=state, outcome="max_iterations")
 
+    def load_scale(self, outer: np.ndarray, gradient: np.ndarray) -> float:
+        """What residuals are compared with [N]: sum of the outer forces, or the largest support force if that is more."""
+        free, angle = self.tangent.free, self.tangent.angle
+        return max(np.abs(outer[free & ~angle]).sum(), np.abs(gradient[~free & ~angle]).max(initial=0.0))
+
     def _scaled(self, residual: np.ndarray) -> np.ndarray:
         """Moments over an edge length, so that they compare with forces."""
         return np.where(self.tangent.angle, residual / self.tangent.edge_length(), residual)
@@ -199,12 +206,6 @@ class Equilibrium:
             if self.options.mode == "follow" or (factor.reliable and not factor.negative):
                 break
         return factor
-
-    def scale(self, outer: np.ndarray, gradient: np.ndarray, residual: np.ndarray) -> float:
-        """Sum of the outer forces or largest support force [N]; the residual where there are none."""
-        free, angle = self.tangent.free, self.tangent.angle
-        size = max(np.abs(outer[free & ~angle]).sum(), np.abs(gradient[~free & ~angle]).max(initial=0.0))
-        return float(size) if size > 0.0 else float(np.abs(residual[free]).max())
 
     def excess(self, residual, gradient, hessian, q, scale: float) -> float:
         """How far the worst dof is from equilibrium; not positive when all are."""

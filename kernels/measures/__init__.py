@@ -1,10 +1,10 @@
 """Measures: the geometry. A measure maps the local dofs of an element to a few strains.
 
 The local dofs are q = [edge vectors of the stencil..., angles of its edges..., rotation vectors of joints...], so that
-translation invariance holds by construction and forces on nodes are differences of edge forces. Where a measure needs more it reads s, which stays constant
-during a step: lagged frames of a rod, or data of the element such as the normal of a clamp. w is the rest measure of the
-element (rest length, Voronoi length, area): strains are pointwise quantities, so a density and its parameters do not depend
-on the mesh.
+translation invariance holds by construction and forces on nodes are differences of edge forces. Where a measure needs more it
+reads s, which stays constant during a step: lagged frames of a rod, or data of the element such as the normal of a clamp. w is the
+rest measure of the element (rest length, Voronoi length, area): strains are pointwise quantities, so a density and its parameters
+do not depend on the mesh.
 """
 
 from collections.abc import Callable
