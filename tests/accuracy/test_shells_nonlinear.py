@@ -48,7 +48,7 @@ def test_slit_annulus_does_not_lock(device):
 
 @pytest.mark.slow
 def test_slit_annulus(device):
-    """The path at 40, 60 and 90 cells around: errors fall with order 1.3 or better, below 1.2 % of the table."""
+    """The path at 40, 60 and 90 cells around: errors up to half of the load fall, to 1.2 % at most over all of it."""
     cells, errors = (40, 60, 90), []
     for n in cells:
         values, _ = path(slit_annulus, device, 20, radial=n // 10, around=n)
