@@ -116,7 +116,7 @@ class Equilibrium:
         energies, q = tangent.element_energies(state), tangent.dofs(state)
         outer = tangent.loads(at, q)
         gradient = tangent.gradient(state)
-        scale, polished = 0.0, False
+        scale, polished = None, False
         for _ in range(options.max_iterations):
             residual = outer - gradient
             hessian = tangent.hessian(state)
