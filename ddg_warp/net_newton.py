@@ -265,8 +265,8 @@ class NetNewton:
 
 
 def _edges(host) -> np.ndarray:
-    """Edges whose turns limit a step (E, 2): of rods and of meshes."""
-    parts = [host.ends, *(shell.nodes[shell.surface.edges] for shell in host.shells)]
+    """Edges whose turns limit a step (E, 2): of rods, meshes and meridians."""
+    parts = [host.ends, *(shell.nodes[shell.surface.edges] for shell in host.shells), *(m.ends for m in host.meridians)]
     edges = np.concatenate(parts)
     if not len(edges):
         edges = np.concatenate([part.slots[:2].T for part in host.sets])

@@ -22,7 +22,9 @@ class NetTangent:
         self.free, self.angle, self.mass = (
             np.tile(values.ravel(), worlds) for values in (~host.fixed, kind, host.mass)
         )
-        self._ends = np.concatenate([host.ends, *(s.nodes[s.surface.edges] for s in host.shells)])
+        self._ends = np.concatenate(
+            [host.ends, *(s.nodes[s.surface.edges] for s in host.shells), *(m.ends for m in host.meridians)]
+        )
         if not len(self._ends):
             self._ends = np.concatenate([s.slots[:2].T for s in host.sets])
         length = np.linalg.norm(np.diff(host.rest[self._ends], axis=1)[:, 0], axis=1)
@@ -107,6 +109,9 @@ class NetTangent:
         for load in host.timed:
             np.add.at(force, load.blocks, load.at(factor, factor) * load.force)
         result = np.tile(force, (self.net.worlds, 1, 1))
+        for band in host.bands:
+            for world in range(self.net.worlds):
+                np.add.at(result[world], band.ends, band.at(factor, factor) * band.forces(x[world][band.ends]))
         for pressure in host.pressures:
             scale = pressure.at(factor, factor) * pressure.pressure / 6.0
             for world in range(self.net.worlds):
@@ -116,10 +121,19 @@ class NetTangent:
         return result.ravel()
 
     def load_stiffness(self, factor: float, q: np.ndarray) -> sparse.csc_matrix | None:
-        if not self.host.pressures:
+        if not self.host.pressures and not self.host.bands:
             return None
         rows, cols, values = [], [], []
         x, N = q.reshape(self.net.worlds, -1, 3), self.host.blocks
+        axes = np.arange(3)
+        for band in self.host.bands:
+            for world in range(self.net.worlds):
+                block = -band.at(factor, factor) * band.derivative(x[world][band.ends])
+                place = 3 * (band.ends + world * N)[:, :, None] + axes
+                row, column = np.broadcast_arrays(place[:, :, :, None, None], place[:, None, None])
+                rows.append(row)
+                cols.append(column)
+                values.append(block)
         for pressure in self.host.pressures:
             scale = pressure.at(factor, factor) * pressure.pressure / 6.0
             for world in range(self.net.worlds):
@@ -134,8 +148,8 @@ class NetTangent:
                         rows.append((3 * (triangles[:, i] + world * N))[:, None, None] + r)
                         cols.append((3 * (triangles[:, j] + world * N))[:, None, None] + c)
                         values.append(block)
-        data = (np.concatenate(values).ravel(), (np.concatenate(rows).ravel(), np.concatenate(cols).ravel()))
-        return sparse.csc_matrix(data, shape=(self.size, self.size))
+        data, *places = (np.concatenate([part.ravel() for part in parts]) for parts in (values, rows, cols))
+        return sparse.csc_matrix((data, places), shape=(self.size, self.size))
 
     def dofs(self, state) -> np.ndarray:
         return state.net.q.numpy().astype(np.float64).ravel()
@@ -205,6 +219,9 @@ class NetTangent:
             for what, blocks in (("vertex", shell.nodes), ("mesh edge", shell.edges)):
                 if block in blocks:
                     return f"{what} {int(np.flatnonzero(blocks == block)[0])} of shell {i}"
+        for i, meridian in enumerate(self.host.meridians):
+            if block in meridian.nodes:
+                return f"node {int(np.flatnonzero(meridian.nodes == block)[0])} of axisymmetric shell {i}"
         return f"joint {block - self.host.nodes - self.host.angles}"
 
     def _launch(self, state, index: int, which: int, out: wp.array, columns: tuple, *more) -> None:
@@ -246,6 +263,9 @@ def _local(measure) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     for i in range(measure.spins):
         rows = at + measure.angles + 3 * i
         full[rows : rows + 3, measure.nodes + measure.angles + i] = np.eye(3)
+    at += measure.angles + 3 * measure.spins
+    for i in range(measure.points):
+        full[at + 3 * i : at + 3 * i + 3, i] = np.eye(3)
     slot, component = np.nonzero(full.any(0))
     return full[:, slot, component], slot, component
 

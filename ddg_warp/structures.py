@@ -8,6 +8,7 @@ import numpy as np
 from ddg_warp import validate
 from ddg_warp.errors import SceneError
 from ddg_warp.material import Material
+from ddg_warp.meridians import Meridians
 from ddg_warp.motion import Motion
 
 
@@ -80,7 +81,7 @@ class Attachment:
 
 
 @dataclass
-class Structures:
+class Structures(Meridians):
     """The part of a scene that is a net: whatever is not a rod of its own."""
 
     shells: list[Shell] = field(default_factory=list)

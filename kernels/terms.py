@@ -6,6 +6,8 @@ from ddg_warp.kernels.densities import Density
 from ddg_warp.kernels.densities.quadratic import kelvin_voigt, quadratic
 from ddg_warp.kernels.densities.st_venant_kirchhoff import st_venant_kirchhoff, st_venant_kirchhoff_damped
 from ddg_warp.kernels.measures import Measure
+from ddg_warp.kernels.measures.axisymmetric_curvature import axisymmetric_curvature, axisymmetric_rim
+from ddg_warp.kernels.measures.axisymmetric_metric import axisymmetric_metric
 from ddg_warp.kernels.measures.curvature_binormal import curvature_binormal
 from ddg_warp.kernels.measures.edge_stretch import edge_stretch, edge_stretch_2d
 from ddg_warp.kernels.measures.edge_tilt import edge_tilt
@@ -69,6 +71,20 @@ SHELLS = {
         Term("shell_tilt_damped", edge_tilt, kelvin_voigt, "the same with strain-rate damping"),
         Term("shell_isometric", isometric_bending, quadratic, "quadratic bending of flat, inextensible sheets"),
         Term("shell_isometric_damped", isometric_bending, kelvin_voigt, "the same with strain-rate damping"),
+    )
+}
+
+AXISYMMETRIC = {
+    term.name: term
+    for term in (
+        Term(
+            "axisymmetric_stretch", axisymmetric_metric, st_venant_kirchhoff, "membrane of a shell of revolution, E h"
+        ),
+        Term("axisymmetric_stretch_damped", axisymmetric_metric, st_venant_kirchhoff_damped, "the same, damped"),
+        Term("axisymmetric_bend", axisymmetric_curvature, st_venant_kirchhoff, "its bending, E h^3"),
+        Term("axisymmetric_bend_damped", axisymmetric_curvature, st_venant_kirchhoff_damped, "the same, damped"),
+        Term("axisymmetric_rim", axisymmetric_rim, st_venant_kirchhoff, "its bending at poles and rims, E h^3"),
+        Term("axisymmetric_rim_damped", axisymmetric_rim, st_venant_kirchhoff_damped, "the same, damped"),
     )
 }
 

@@ -262,7 +262,15 @@ def require_supports(model) -> None:
                     "add scene.clamp(...) or scene.fix(...)"
                 )
     if model.net is not None:
-        loose = np.flatnonzero(~model.net.host.fixed[: model.net.host.nodes].any(0))
+        host = model.net.host
+        for i, shell in enumerate(host.meridians):
+            if not host.fixed[shell.nodes, 2].any():
+                raise SceneError(
+                    f"axisymmetric shell {i} is not held along z: a static solve needs scene.hold_ring(...) or "
+                    "scene.clamp_ring(...)"
+                )
+        spatial = np.setdiff1d(np.arange(host.nodes), [node for shell in host.meridians for node in shell.nodes])
+        loose = np.flatnonzero(~host.fixed[spatial].any(0)) if spatial.size else spatial
         if loose.size:
             raise SceneError(
                 f"no node of the shells and joined rods is held along {'xyz'[loose[0]]}: a static solve needs supports; "

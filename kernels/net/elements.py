@@ -29,7 +29,9 @@ def functions(term: Term, real):
     static_size, size = len(term.parameter_names) - 1, density.parameter_size(n)
     nodes, angles, spins, edges = measure.nodes, measure.angles, measure.spins, measure.edges
     frames, own, data_size = measure.frames, measure.lag_size - FRAME * measure.frames, measure.data_size
+    points = measure.points
     angle_row, spin_row = 3 * len(edges), 3 * len(edges) + angles
+    point_row = spin_row + 3 * spins
     first = tuple(edge[0] for edge in edges)
     second = tuple(edge[1] for edge in edges)
     edge_count = len(edges)
@@ -66,6 +68,10 @@ def functions(term: Term, real):
             spin = q[slots[wp.static(nodes + angles + i), e] + shift]
             for d in range(3):
                 local[wp.static(spin_row + 3 * i) + d] = spin[d]
+        for i in range(wp.static(points)):
+            position = q[slots[i, e] + shift]
+            for d in range(3):
+                local[wp.static(point_row + 3 * i) + d] = position[d]
         s = S()
         for i in range(wp.static(frames)):
             # frames of a world lie behind each other, too
@@ -102,6 +108,13 @@ def functions(term: Term, real):
             if slot == wp.static(nodes + angles + i):
                 for d in range(3):
                     v[d] = f[wp.static(spin_row + 3 * i) + d]
+        for i in range(wp.static(points)):
+            if slot == i:
+                v += V(
+                    f[wp.static(point_row + 3 * i)],
+                    f[wp.static(point_row + 3 * i + 1)],
+                    f[wp.static(point_row + 3 * i + 2)],
+                )
         return v
 
     return gather, spread
