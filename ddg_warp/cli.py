@@ -197,11 +197,11 @@ def draw(directory: Path, title: str, path=None, shapes: int = 6) -> None:
 
 def list_all(chosen: argparse.Namespace) -> int:
     """`list`: scenes and terms with what they are, in one line each."""
-    from ddg_warp.kernels.terms import REGISTRY
+    from ddg_warp.kernels.terms import ALL
 
     listed = {
         "scenes": {name: one_liner(path) for name, path in scene_files().items()},
-        "terms": {name: term.text for name, term in REGISTRY.items()},
+        "terms": {name: term.text for name, term in ALL.items()},
     }
     for title, entries in listed.items():
         width = max(map(len, entries), default=0)
@@ -213,11 +213,11 @@ def list_all(chosen: argparse.Namespace) -> int:
 
 def check_terms(chosen: argparse.Namespace) -> int:
     """`check`: the derivative table of a term, or of all."""
-    from ddg_warp.kernels.terms import REGISTRY
+    from ddg_warp.kernels.terms import ALL
     from ddg_warp.summary import table
 
-    if chosen.term is not None and chosen.term not in REGISTRY:
-        raise InputError(f"there is no term '{chosen.term}'; there are {', '.join(REGISTRY)}")
+    if chosen.term is not None and chosen.term not in ALL:
+        raise InputError(f"there is no term '{chosen.term}'; there are {', '.join(ALL)}")
 
     require_device(chosen.device)
     from ddg_warp import derivatives

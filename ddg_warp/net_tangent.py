@@ -6,8 +6,8 @@ import numpy as np
 import warp as wp
 from scipy import sparse
 
-from ddg_warp.chain_tangent import turn_excess
 from ddg_warp.kernels.net import elements
+from ddg_warp.turning import turned
 
 
 class NetTangent:
@@ -22,7 +22,6 @@ class NetTangent:
         self.free, self.angle, self.mass = (
             np.tile(values.ravel(), worlds) for values in (~host.fixed, kind, host.mass)
         )
-        self._places = [_places(part.host, host.blocks, worlds) for part in self.net.sets]
         self._ends = np.concatenate(
             [host.ends, *(s.nodes[s.surface.edges] for s in host.shells), *(m.ends for m in host.meridians)]
         )
@@ -36,8 +35,18 @@ class NetTangent:
         self._order = _outwards(host.rods, self._anchored.any(1))
 
     @cached_property
-    def _pattern(self) -> "_Pattern":
-        return _Pattern([dofs for _, dofs in self._places], self.size)
+    def _pattern(self) -> tuple[list, np.ndarray, np.ndarray]:
+        """Of each set B and where the entries of its elements go in the Hessian, column by column; rows and starts of columns."""
+        entries, local = [], []
+        for part in self.net.sets:
+            to_local, slot, component = _local(part.term.measure)
+            dofs = 3 * _tiled(part.host.slots, self.host.blocks, self.net.worlds)[slot].T + component
+            entries.append((dofs[:, None, :] * self.size + dofs[:, :, None]).ravel())
+            local.append(to_local)
+        pattern, places = np.unique(np.concatenate(entries), return_inverse=True)
+        places = np.split(places, np.cumsum([len(e) for e in entries])[:-1])
+        columns, rows = np.divmod(pattern, self.size)
+        return list(zip(local, places, strict=True)), rows, np.searchsorted(columns, np.arange(self.size + 1))
 
     def energies(self, state):
         """(term's name, energies of its elements)."""
@@ -59,7 +68,8 @@ class NetTangent:
         return result.ravel()
 
     def hessian(self, state, stress: list | None = None) -> sparse.csc_matrix:
-        entries = []
+        scatter, rows, starts = self._pattern
+        total = np.zeros(len(rows))
         for i, part in enumerate(self.net.sets):
             size, count = part.term.measure.size, part.elements * self.net.worlds
             out = wp.zeros((count, size, size), dtype=self.net.real, device=self.net.device)
@@ -68,8 +78,11 @@ class NetTangent:
                 extra = stress[i] - self._stress(state, i)
             self._launch(state, i, 2, out, (size,), wp.array(extra, dtype=self.net.real, device=self.net.device))
             values = out.numpy().astype(np.float64)
-            entries.append(_spread(0.5 * (values + values.transpose(0, 2, 1)), self._places[i][0]).ravel())
-        return self._pattern.matrix(np.concatenate(entries))
+            values = 0.5 * (values + values.transpose(0, 2, 1))
+            to_local, places = scatter[i]
+            spread = np.matmul(to_local.T, (values.reshape(-1, size) @ to_local).reshape(count, size, -1))
+            total += np.bincount(places, spread.ravel(), len(total))
+        return sparse.csc_matrix((total, rows, starts), shape=(self.size, self.size))
 
     def linear_stress(self, state, step: np.ndarray) -> list:
         """Stresses (strains, elements) of every set that the strains e + J step have."""
@@ -145,7 +158,7 @@ class NetTangent:
         state.net.q.assign(q.reshape(-1, 3))
 
     def retract(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """q moved along `step`, with edges of rods turned instead of sheared; see `ChainTangent.retract`.
+        """q moved along `step`, with edges of rods turned instead of sheared; see `ddg_warp.turning`.
 
         Rods are taken from held nodes outwards: where one meets others that are placed already, or a shell, it is anchored there.
         """
@@ -155,16 +168,10 @@ class NetTangent:
             excess = np.zeros((self.host.nodes, 3))
             placed = self._anchored.copy()
             for rod in self._order:
-                nodes = rod.all_nodes
-                bend = turn_excess(x[world][nodes], dx[world][nodes], rod.piece.kind.closed)
-                for d in range(3):
-                    anchors = np.flatnonzero(placed[nodes, d])
-                    if not anchors.size:
-                        anchors = np.array([0])
-                    miss = np.interp(np.arange(len(nodes)), anchors, bend[anchors, d] - excess[nodes[anchors], d])
-                    excess[nodes, d] = bend[:, d] - miss
-                placed[nodes] = True
-            out[world][: self.host.nodes] += np.where(self.host.fixed[: self.host.nodes], 0.0, excess)
+                at, closed = rod.all_nodes, rod.piece.kind.closed
+                excess[at] = turned(x[world][at], dx[world][at], placed[at], excess[at], closed)
+                placed[at] = True
+            out[world][: self.host.nodes] += excess
         return moved
 
     def move_supports(self, state, before: float, at: float) -> None:
@@ -244,50 +251,23 @@ def _tiled(slots: np.ndarray, blocks: int, worlds: int) -> np.ndarray:
     return np.concatenate([slots + world * blocks for world in range(worlds)], axis=1)
 
 
-def _places(part, blocks: int, worlds: int) -> tuple[np.ndarray, np.ndarray]:
-    """B (local dofs, dofs of an element's slots), the same for all elements of a set, and these dofs (elements, .)."""
-    measure = part.term.measure
-    slots = _tiled(part.slots, blocks, worlds)
-    first_angle, first_spin = measure.nodes, measure.nodes + measure.angles
-    columns = [(slot, d) for slot in range(measure.slots) for d in range(1 if first_angle <= slot < first_spin else 3)]
-    number = {place: i for i, place in enumerate(columns)}
-    B = np.zeros((measure.size, len(columns)))
+def _local(measure) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """B of an element: (local dofs, dofs of its slots that they depend on); and slot and component of these."""
+    full = np.zeros((measure.size, measure.slots, 3))
     for i, (a, b) in enumerate(measure.edges):
-        for d in range(3):
-            B[3 * i + d, number[b, d]] += 1.0
-            B[3 * i + d, number[a, d]] -= 1.0
+        full[3 * i : 3 * i + 3, b] += np.eye(3)
+        full[3 * i : 3 * i + 3, a] -= np.eye(3)
     at = 3 * len(measure.edges)
     for i in range(measure.angles):
-        B[at + i, number[first_angle + i, 0]] = 1.0
+        full[at + i, measure.nodes + i, 0] = 1.0
     for i in range(measure.spins):
-        for d in range(3):
-            B[at + measure.angles + 3 * i + d, number[first_spin + i, d]] = 1.0
+        rows = at + measure.angles + 3 * i
+        full[rows : rows + 3, measure.nodes + measure.angles + i] = np.eye(3)
     at += measure.angles + 3 * measure.spins
     for i in range(measure.points):
-        for d in range(3):
-            B[at + 3 * i + d, number[i, d]] = 1.0
-    return B, np.stack([3 * slots[slot] + d for slot, d in columns], axis=1)
-
-
-def _spread(values: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """B^T values B of all elements."""
-    return np.matmul(B.T, (values.reshape(-1, len(B)) @ B).reshape(len(values), len(B), -1))
-
-
-class _Pattern:
-    """Where the entries of element matrices go in their sparse sum; made once, so that sums are one pass over the entries."""
-
-    def __init__(self, dofs: list[np.ndarray], size: int):
-        keys = [(d[:, None, :].astype(np.int64) * size + d[:, :, None]).ravel() for d in dofs]  # column by column
-        places, self._index = np.unique(np.concatenate(keys), return_inverse=True)
-        column, self._rows = np.divmod(places, size)
-        self._starts = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=size))])
-        self._size = size
-
-    def matrix(self, entries: np.ndarray) -> sparse.csc_matrix:
-        """The sum of element matrices, whose entries are given row by row, element by element."""
-        data = np.bincount(self._index, entries, len(self._rows))
-        return sparse.csc_matrix((data, self._rows, self._starts), shape=(self._size, self._size))
+        full[at + 3 * i : at + 3 * i + 3, i] = np.eye(3)
+    slot, component = np.nonzero(full.any(0))
+    return full[:, slot, component], slot, component
 
 
 def _cross(e: np.ndarray) -> np.ndarray:

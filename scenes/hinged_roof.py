@@ -55,14 +55,16 @@ def observe(model, state) -> dict[str, float]:
 
 
 def limit(series) -> tuple[float, float]:
-    """First limit load [N] and the drop there [mm], by a parabola through the first maximum; NaN without one."""
+    """First limit load [N] and the drop there [mm], by a quartic around the first maximum; NaN without one."""
     drop, force = np.array(series["drop"]), np.array(series["force"])
     peaks = np.flatnonzero((force[1:-1] >= force[:-2]) & (force[1:-1] > force[2:])) + 1
     if not peaks.size:
         return float("nan"), float("nan")
-    near = slice(peaks[0] - 1, peaks[0] + 2)
-    a, b, c = np.polyfit(drop[near], force[near], 2)
-    return c - b * b / (4.0 * a), -b / (2.0 * a)
+    near = slice(max(0, peaks[0] - 2), peaks[0] + 3)
+    curve = np.polynomial.Polynomial.fit(drop[near], force[near], min(4, len(drop[near]) - 1))
+    roots = curve.deriv().roots()
+    place = roots[np.argmin(np.abs(roots - drop[peaks[0]]))].real
+    return float(curve(place)), float(place)
 
 
 def check(result) -> list[ddg.Check]:

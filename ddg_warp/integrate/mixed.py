@@ -31,7 +31,7 @@ def newton(solver, state: State, before: float, at: float) -> State | None:
     moved = state.copy()
     tangent.move_supports(moved, before, at)
     jump = tangent.dofs(moved) - tangent.dofs(state)
-    state, stress, scale, polished, factor = state.copy(), None, 0.0, False, None
+    state, stress, factor, scale, polished = state.copy(), None, None, 0.0, False
     for iteration in range(MAX_ITERATIONS):
         q = tangent.dofs(state)
         outer, gradient = tangent.loads(at, q), tangent.gradient(state)
@@ -43,7 +43,7 @@ def newton(solver, state: State, before: float, at: float) -> State | None:
         if not np.isfinite(residual).all() or not np.isfinite(hessian.data).all():
             return None
         if iteration:
-            scale = max(scale, solver.load_scale(outer, gradient)) or float(np.abs(residual[free]).max())
+            scale = max(scale, solver.load_scale(outer, gradient)) or np.abs(residual[free]).max()
             excess = solver.excess(residual, gradient, hessian, q, scale)
             if excess <= 0.0 and (solver.outcome == "converged" or polished):
                 stable = factor.reliable and not factor.negative

@@ -116,7 +116,7 @@ class Equilibrium:
         energies, q = tangent.element_energies(state), tangent.dofs(state)
         outer = tangent.loads(at, q)
         gradient = tangent.gradient(state)
-        scale, polished = 0.0, False
+        scale, polished = None, False
         for _ in range(options.max_iterations):
             residual = outer - gradient
             hessian = tangent.hessian(state)
@@ -184,13 +184,9 @@ class Equilibrium:
         tangent = self.tangent
         alone = state.copy()
         step = tangent.support_step(state, before, at)
-        if not step.any():
-            tangent.move_supports(alone, before, at)
-            return alone
         tangent.move_supports(alone, before, at)
-        q = tangent.dofs(state)
-        hessian = tangent.hessian(state)
-        if not np.isfinite(hessian.data).all():
+        q, hessian = tangent.dofs(state), tangent.hessian(state)
+        if not step.any() or not np.isfinite(hessian.data).all():
             return alone
         direction, _ = self._direction(hessian, tangent.loads(at, q) - tangent.gradient(state) - hessian @ step)
         follow = tangent.advance(state, step + direction, at)

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.kernels.net import levels
-from ddg_warp.kernels.net.levels import GROUP
+from ddg_warp.kernels.net.levels import GROUP, PIECE
 
 
 class Multilevel:
@@ -34,11 +34,7 @@ class Multilevel:
             here = both & (a // size == b // size)
             positions = np.flatnonzero(here)
             target = a[positions] // size
-            starts = np.concatenate([[0], np.cumsum(np.bincount(target, minlength=groups))])
-            items = positions[np.argsort(target, kind="stable")]
-            self.lists.append(
-                tuple(wp.array(v.astype(np.int32), dtype=int, device=self.device) for v in (starts, items))
-            )
+            self.lists.append(self._pieces(positions[np.argsort(target, kind="stable")], target, groups, M))
             both &= ~here
             size *= GROUP
         self.order = wp.array(order.astype(np.int32), dtype=int, device=self.device)
@@ -50,24 +46,46 @@ class Multilevel:
 
         self.blocks, self.inverses, self.sums, self.corrections = make(M), make(M), make(H), make(H)
         self._no_members = wp.zeros(1, dtype=M, device=self.device)
-        self._gather, self._restrict, self._correct, self._finish = levels.level_kernels(linear)
+        self._collect, self._gather, self._restrict, self._correct, self._finish = levels.level_kernels(linear)
+
+    def _pieces(self, items: np.ndarray, target: np.ndarray, groups: int, M) -> tuple:
+        """Items of all groups in order, starts of their pieces, first piece of each group, and sums of the pieces."""
+        counts = np.bincount(target, minlength=groups)
+        pieces = -(-counts // PIECE)
+        first = np.concatenate([[0], np.cumsum(pieces)])
+        begins = np.concatenate([[0], np.cumsum(counts)])
+        within = np.arange(first[-1]) - np.repeat(first[:-1], pieces)
+        starts = np.append(np.repeat(begins[:-1], pieces) + PIECE * within, begins[-1])
+
+        def put(values):
+            return wp.array(values.astype(np.int32), dtype=int, device=self.device)
+
+        sums = wp.zeros(self.net.worlds * max(1, int(first[-1])), dtype=M, device=self.device)
+        return put(items), put(starts), put(first), sums
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [self._gather, self._restrict, self._correct, self._finish]
+        return [self._collect, self._gather, self._restrict, self._correct, self._finish]
 
     def prepare(self, matrix: wp.array, fixed: wp.array, wanted: wp.array) -> None:
         """Diagonal blocks of all levels and their inverses, of the worlds that want a direction."""
         table, members, count = self.table, self._no_members, 0
-        for groups, (starts, items), block, inverse in zip(
-            self.counts, self.lists, self.blocks, self.inverses, strict=True
-        ):
+        worlds = self.net.worlds
+        for groups, own, block, inverse in zip(self.counts, self.lists, self.blocks, self.inverses, strict=True):
+            items, pieces, starts, sums = own
+            size = pieces.shape[0] - 1
+            wp.launch(
+                self._collect,
+                worlds * size,
+                [matrix, table.rows, table.columns, fixed, pieces, items, size, table.positions, wanted],
+                [sums],
+                device=self.device,
+            )
             wp.launch(
                 self._gather,
-                self.net.worlds * groups,
-                [matrix, table.rows, table.columns, fixed, starts, items, members, count, groups, table.positions]
-                + [wanted],
+                worlds * groups,
+                [sums, size, starts, members, count, groups, wanted],
                 [block, inverse],
                 device=self.device,
             )

@@ -122,7 +122,7 @@ def functions(term: Term, real):
 
 @cache
 def term_kernels(term: Term, real):
-    """Kernels of one term: energy, gradient (slots, elements), Hessian (size * size, elements), strains and stresses, linear stresses."""
+    """Kernels of one term: energy, gradient (slots, elements), Hessian (elements, size, size), strains, linear stresses."""
     measure, density = term.measure, term.density
     V = wp.types.vector(3, real)
     Q, S, E, _ = measure.types(real)

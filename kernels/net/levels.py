@@ -16,26 +16,53 @@ import warp as wp
 from ddg_warp.kernels.net.system import product_functions
 
 GROUP = 8  # members of a group
+PIECE = 32  # blocks of H that one thread sums
 
 
 @cache
 def level_kernels(linear):
-    """gather(...) and invert(...) of the diagonal blocks; restrict(...), correct(...) and finish(...) of an application."""
+    """collect(...) and gather(...) of the diagonal blocks; restrict(...), correct(...) and finish(...) of an application."""
     H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
     _, free = product_functions(linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def gather(
+    def collect(
         matrix: wp.array2d(dtype=linear),
         rows: wp.array(dtype=int),
         columns: wp.array(dtype=int),
         fixed: wp.array(dtype=wp.uint8),
         starts: wp.array(dtype=int),
         items: wp.array(dtype=int),
+        pieces: int,
+        positions: int,
+        wanted: wp.array(dtype=int),
+        sum_out: wp.array(dtype=M),
+    ):
+        """Sum of the blocks of H in a piece of a group's list, on free dofs."""
+        i = wp.tid()
+        w = i / pieces
+        if wanted[w] == 0:
+            return
+        k = i - w * pieces
+        m = M()
+        for at in range(starts[k], starts[k + 1]):
+            p = items[at]
+            q = p + w * positions
+            block = M()
+            for a in range(3):
+                for b in range(3):
+                    block[a, b] = matrix[3 * a + b, q]
+            m += wp.cw_mul(block, wp.outer(free(fixed[rows[p]]), free(fixed[columns[p]])))
+        sum_out[i] = m
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def gather(
+        piece_sums: wp.array(dtype=M),
+        pieces: int,
+        starts: wp.array(dtype=int),
         members: wp.array(dtype=M),
         member_count: int,
         groups: int,
-        positions: int,
         wanted: wp.array(dtype=int),
         sum_out: wp.array(dtype=M),
         inverse_out: wp.array(dtype=M),
@@ -50,13 +77,7 @@ def level_kernels(linear):
         for k in range(g * wp.static(GROUP), wp.min((g + 1) * wp.static(GROUP), member_count)):
             m += members[k + w * member_count]
         for at in range(starts[g], starts[g + 1]):
-            p = items[at]
-            q = p + w * positions
-            block = M()
-            for a in range(3):
-                for b in range(3):
-                    block[a, b] = matrix[3 * a + b, q]
-            m += wp.cw_mul(block, wp.outer(free(fixed[rows[p]]), free(fixed[columns[p]])))
+            m += piece_sums[at + w * pieces]
         sum_out[i] = m
         s = H()
         for d in range(3):
@@ -143,4 +164,4 @@ def level_kernels(linear):
         z_out[i] = z
         dots_out[w, k] = wp.dot(r, z)
 
-    return gather, restrict, correct, finish
+    return collect, gather, restrict, correct, finish

@@ -25,30 +25,30 @@ def path(module, device, steps, **parameters):
 
 @pytest.mark.parametrize("membrane", ["flat", "curved"])
 def test_cantilever_plate_shear(device, membrane):
-    """Elastica of P L^2 / EI = 4: order 2 in the length of the cells, and 0.1 % of the length at 32."""
-    cells, errors = (8, 16, 32), []
+    """Elastica of P L^2 / EI = 4: order 2 in the length of the cells, and 0.03 % of the length at 64."""
+    cells, errors = (16, 32, 64), []
     for n in cells:
-        model, state = equilibrium(cantilever_plate_shear.build(n, membrane=membrane, steps=5), device)
-        tip = cantilever_plate_shear.observe(model, state)
+        scene = cantilever_plate_shear.build(n, pattern="alternating", membrane=membrane, steps=3)
+        tip = cantilever_plate_shear.observe(*equilibrium(scene, device))
         errors.append(np.hypot(*(np.array([tip["inwards"], tip["along"]]) - cantilever_plate_shear.exact(1.0))))
-    assert errors[-1] < 1e-3 * cantilever_plate_shear.LENGTH
-    assert order(cells, errors) == pytest.approx(2.0, abs=0.25)
+    assert errors[-1] < 3e-4 * cantilever_plate_shear.LENGTH
+    assert order(cells, errors) == pytest.approx(2.0, abs=0.15)
 
 
 def test_slit_annulus_does_not_lock(device):
-    """Five cells across a turn of twelve degrees each: facets are 5 % off, arcs over their sides 2 %."""
+    """Six cells across, thirty around: with facets the lip rises 4 to 6 % too little, with the arcs over their sides 1.5 %."""
     inner, outer = slit_annulus.TABLE[1.0]
     errors = {}
     for membrane in ("flat", "curved"):
-        values, _ = path(slit_annulus, device, 10, radial=3, around=30, pattern="alternating", membrane=membrane)
+        values, _ = path(slit_annulus, device, 10, radial=6, around=30, pattern="alternating", membrane=membrane)
         errors[membrane] = np.array([values[1.0]["inner"] / inner, values[1.0]["outer"] / outer]) - 1.0
     assert np.abs(errors["curved"]).max() < 0.02
-    assert np.all(errors["flat"] < -0.035)
+    assert np.all(errors["flat"] < -0.04)
 
 
 @pytest.mark.slow
 def test_slit_annulus(device):
-    """The path at 40, 60 and 90 cells around: errors fall with order 1.3 or better, below 1.2 % of the table."""
+    """The path at 40, 60 and 90 cells around: errors up to half of the load fall, to 1.2 % at most over all of it."""
     cells, errors = (40, 60, 90), []
     for n in cells:
         values, _ = path(slit_annulus, device, 20, radial=n // 10, around=n)
@@ -66,7 +66,7 @@ def test_slit_annulus_unstructured(device):
     assert values[1.0]["outer"] == pytest.approx(outer, rel=0.02)
 
 
-@pytest.mark.parametrize(("n", "tolerance"), [(8, 0.03), pytest.param(24, 0.007, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("n", "tolerance"), [(8, 0.035), pytest.param(24, 0.01, marks=pytest.mark.slow)])
 def test_pullout_cylinder(device, n, tolerance):
     values, _ = path(pullout_cylinder, device, 20, n=n)
     for load, (radial,) in pullout_cylinder.TABLE.items():
@@ -85,22 +85,30 @@ def test_pinched_cylinder_linear(device):
 @pytest.mark.slow
 def test_pinched_cylinder_folds(device):
     """All of the load is reached, in steps that do nothing but dip further."""
-    values, solver = path(pinched_cylinder, device, 40)
+    values, _ = path(pinched_cylinder, device, 40)
     inwards = np.array([value["inwards"] for value in values.values()])
     assert np.all(np.diff(inwards) > 0.0)
     assert inwards[-1] > 0.7 * pinched_cylinder.RADIUS
 
 
-@pytest.mark.parametrize("thickness", [12.7, 6.35])
-def test_hinged_roof(device, thickness):
-    """First limit load: order 2 or nearly, and 1 % at 12 cells."""
-    cells, errors = (6, 8, 12), []
+@pytest.mark.parametrize(
+    ("thickness", "cells", "tolerance"),
+    [
+        (12.7, (3, 6, 12), 0.006),
+        pytest.param(12.7, (4, 8, 16), 0.003, marks=pytest.mark.slow),
+        pytest.param(6.35, (4, 8, 16), 0.005, marks=pytest.mark.slow),
+    ],
+)
+def test_hinged_roof(device, thickness, cells, tolerance):
+    """First limit load: order 2 in the length of the cells, 0.3 or 0.5 % at 16 of them, and 0.3 % extrapolated."""
+    loads = []
     for n in cells:
-        values, _ = path(hinged_roof, device, 16, thickness=thickness, n=n)
+        values, _ = path(hinged_roof, device, 16, thickness=thickness, n=n, membrane="flat")
         series = {name: [0.0, *(value[name] for value in values.values())] for name in ("drop", "force")}
-        errors.append(hinged_roof.limit(series)[0] / hinged_roof.LIMIT[thickness] - 1.0)
-    assert abs(errors[-1]) < 0.01
-    assert order(cells, errors) == pytest.approx(2.0, abs=0.4)
+        loads.append(hinged_roof.limit(series)[0])
+    assert loads[2] == pytest.approx(hinged_roof.LIMIT[thickness], rel=tolerance)
+    assert np.log2((loads[1] - loads[0]) / (loads[2] - loads[1])) == pytest.approx(2.0, abs=0.25)
+    assert (4.0 * loads[2] - loads[1]) / 3.0 == pytest.approx(hinged_roof.LIMIT[thickness], rel=3e-3)
 
 
 def test_stresses_of_their_own_save_iterations(device):
