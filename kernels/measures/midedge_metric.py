@@ -26,7 +26,7 @@ from ddg_warp.kernels.measures.midedge_curvature import midedge_curvature_dof
 def _functions(real):
     Q, S, E, M = midedge_curvature_dof.types(real)
     V, D = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
-    curvature, curvature_jacobian, _ = midedge_curvature_dof.functions(real)
+    curvature, curvature_jacobian, *_ = midedge_curvature_dof.functions(real)
 
     @wp.func
     def metric(q: Q, b: E):
@@ -72,7 +72,7 @@ def _functions(real):
         """That of the chords; what b adds is left out."""
         return V(w * slope[0], real(0.5) * w * slope[1], w * slope[2]), E()
 
-    return strains, jacobian, tension
+    return strains, jacobian, tension, None
 
 
 midedge_metric = Measure(
