@@ -278,6 +278,7 @@ def evaluate_kernel(term: Term, real, linear):
         elements: int,
         status: wp.array(dtype=int),
         slot: wp.array(dtype=int),
+        projected: wp.array(dtype=int),
         factor_out: wp.array2d(dtype=F),
         tension_out: wp.array2d(dtype=linear),
         gradient_out: wp.array2d(dtype=V),
@@ -298,13 +299,14 @@ def evaluate_kernel(term: Term, real, linear):
         shift = E()
         if wp.static(tensions == 1):
             c, shift = tension_of(x, w, slope)
-            if c < real(0.0):
+            if c < real(0.0) and projected[world] != 0:
                 c = real(0.0)
                 shift = E()
             tension_out[0, tid] = linear(c)
         if wp.static(tensions == 3):
             c3, _shift = tension_of(x, w, slope)
-            c3 = definite(c3)
+            if projected[world] != 0:
+                c3 = definite(c3)
             for i in range(3):
                 tension_out[i, tid] = linear(c3[i])
         root = root_of(e, p, shift)
