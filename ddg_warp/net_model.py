@@ -163,7 +163,9 @@ class DeviceNet:
             if part.term.density.lagged:
                 self.strains(state, index, state.last[index])
 
-    def carry(self, before: NetState, after: NetState, kept: NetState | None = None, moved: wp.array | None = None) -> None:
+    def carry(
+        self, before: NetState, after: NetState, kept: NetState | None = None, moved: wp.array | None = None
+    ) -> None:
         """Lagged data of `after` from those of `before` and the positions of `after`, whose joints then start from zero.
 
         Worlds that have not `moved` take over those of `kept` instead. The states may be the same. Launches alone, so that it

@@ -38,7 +38,9 @@ def build(n: int = 20, sense: int = 1, in_plane: float = 1.0) -> ddg.Scene:
     scene.clamp_end(clamped, "first")
     scene.add_force(free, -1, (float(np.sign(sense)), 0.0, 0.0))
     watch = {"deflection": ddg.Displacement.of(-1, "y")}
-    scene.analysis = ddg.Trace(watch, ddg.Stop(load=(-np.inf, 1.3 * abs(CRITICAL[int(np.sign(sense))]))), load_scale=10.0)
+    scene.analysis = ddg.Trace(
+        watch, ddg.Stop(load=(-np.inf, 1.3 * abs(CRITICAL[int(np.sign(sense))]))), load_scale=10.0
+    )
     return scene
 
 
@@ -46,4 +48,6 @@ def check(result) -> list[ddg.Check]:
     """The load at which the path in the plane branches."""
     (force,) = (load.force[0] for load in result.scene.loads)
     first = result.path.bifurcations[0]
-    return [ddg.Check("lateral buckling load [N]", force * first.load, CRITICAL[int(force)], 1e-2, SOURCE, relative=True)]
+    return [
+        ddg.Check("lateral buckling load [N]", force * first.load, CRITICAL[int(force)], 1e-2, SOURCE, relative=True)
+    ]

@@ -28,7 +28,9 @@ def truss(device, length: float, **options):
     scene.fix(bars, [0, -1])
     scene.add_force(bars, 1, (0.0, 0.0, -1.0))
     watch = {"drop": Displacement.of(1, "z", -1.0), "sway": Displacement.of(1, "x")}
-    return Continuation(scene.build(device, "float64"), watch, **{"load_scale": 0.3, "floor_factor": 1.0, **options}), height
+    return Continuation(
+        scene.build(device, "float64"), watch, **{"load_scale": 0.3, "floor_factor": 1.0, **options}
+    ), height
 
 
 # P(z) = 2 EA z (1 / l - 1 / l0) with l^2 = 1 + z^2: two bars of force EA (l / l0 - 1) with slope z / l.

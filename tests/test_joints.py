@@ -106,7 +106,9 @@ def test_derivatives(device, name, turn):
 
     h = 1e-6
     for dof in free:
-        (above, gradient_above), (below, gradient_below) = (at(sign * h * np.eye(1, len(q), dof)[0]) for sign in (1, -1))
+        (above, gradient_above), (below, gradient_below) = (
+            at(sign * h * np.eye(1, len(q), dof)[0]) for sign in (1, -1)
+        )
         slope = (above - below).sum() / (2.0 * h)
         assert slope == pytest.approx(gradient[dof], rel=1e-6, abs=1e-6 * np.abs(gradient[free]).max())
         column = ((gradient_above - gradient_below) / (2.0 * h))[free]

@@ -104,7 +104,10 @@ def pushed(device, distance: float, turn: float = 0.0, dimension: int = 2):
     points = np.stack([np.sin(angle), 0.0 * angle, np.cos(angle) - np.cos(0.6)], axis=1) / 1.2
     rod = scene.add_rod(points, section=SECTION)
     motion = ddg.Motion(
-        translation=lambda t: (-distance * t, 0.0, 0.0), angle=lambda t: turn * t, axis=(1.0, 0.3, 0.0), pivot=points[-1]
+        translation=lambda t: (-distance * t, 0.0, 0.0),
+        angle=lambda t: turn * t,
+        axis=(1.0, 0.3, 0.0),
+        pivot=points[-1],
     )
     scene.clamp_end(rod, "first")
     scene.clamp_end(rod, "last", motion=motion) if turn else scene.fix(rod, [-1], motion=motion)

@@ -169,7 +169,9 @@ class Continuation:
                 the path.
         """
         if displacement not in self.watched:
-            raise SceneError(f"no displacement {displacement!r} is watched; give watch={{{displacement!r}: Displacement...}}")
+            raise SceneError(
+                f"no displacement {displacement!r} is watched; give watch={{{displacement!r}: Displacement...}}"
+            )
         row = np.append(self.watched[displacement], 0.0)
         here, path = self._start(state or self.model.state(), start), Path()
         for value in values:
@@ -184,7 +186,9 @@ class Continuation:
                     cuts, increment = cuts + 1, 0.5 * increment
                     if cuts > max_cuts:
                         raise self._error(
-                            "displacement_turns_back", Path([*path.points, here]), "follow the path by arc length: trace()"
+                            "displacement_turns_back",
+                            Path([*path.points, here]),
+                            "follow the path by arc length: trace()",
                         ) from None
             path.points.append(here)
         path.outcome = "values"
@@ -205,7 +209,9 @@ class Continuation:
                     step *= 0.5
                     if step < options.min_step:
                         raise self._error(
-                            "step_too_small", path, "the path may end or branch here; begin elsewhere, or take min_step smaller"
+                            "step_too_small",
+                            path,
+                            "the path may end or branch here; begin elsewhere, or take min_step smaller",
                         ) from None
             bound = self._bound(here, there, stop)
             outcome = ""

@@ -9,6 +9,7 @@ from ddg_warp.kernels.net import elements, frames, krylov, newton
 from ddg_warp.net_model import NetState
 from ddg_warp.net_newton import NetNewton
 from ddg_warp.net_system import _lists
+from ddg_warp.tangent import Tangent
 
 
 class NetStep:
@@ -17,6 +18,20 @@ class NetStep:
     def __init__(self, integrator, model):
         self.integrator, self.model, self.net = integrator, model, model.net
         host, device, real = model.net.host, model.wp_device, model.types.real
+        options = integrator.options
+        for name, value, only in (
+            ("solver", integrator.solver, "newton"),
+            ("linear", integrator.linear, "auto"),
+            ("psd", options.psd, "auto"),
+        ):
+            if value != only:
+                raise SceneError(f"{name} = {value!r} is of rods on their own; with a net leave it at {only!r}")
+        bare = np.flatnonzero(((host.mass <= 0.0) & ~host.fixed)[: host.nodes].any(1))
+        if bare.size:
+            raise SceneError(
+                f"{Tangent(model).parts[-1].where(3 * int(bare[0]))} is free and has no mass; "
+                "give the material a density, or the section a mass_per_length"
+            )
         if host.turning:
             raise SceneError("ends of rods in a net that turn are for statics; in dynamics move their nodes alone")
         self.newton = NetNewton(model, integrator.options)
@@ -187,8 +202,6 @@ class NetStep:
         failed = np.flatnonzero(self.newton.status.numpy() == outcome.GIVEN_UP)
         if not failed.size:
             return
-        from ddg_warp.tangent import Tangent
-
         world = int(failed[0])
         name = outcome.NAMES[int(self.reason.numpy()[world])]
         sizes = np.abs(self.newton.right.numpy().reshape(self.model.worlds, -1))[world]

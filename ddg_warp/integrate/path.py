@@ -34,7 +34,9 @@ class Displacement:
         dofs, result = tangent.point_dofs(), np.zeros(tangent.size)
         for row, axis, weight in self.terms:
             if not -len(dofs) <= row < len(dofs) or axis not in ("x", "y", "z"):
-                raise SceneError(f"displacement of point {row} along {axis!r}: there are {len(dofs)} points, axes x, y and z")
+                raise SceneError(
+                    f"displacement of point {row} along {axis!r}: there are {len(dofs)} points, axes x, y and z"
+                )
             dof = dofs[row, "xyz".index(axis)]
             if dof < 0:
                 raise SceneError(f"displacement of point {row} along {axis!r}: the scene is planar")

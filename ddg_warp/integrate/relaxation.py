@@ -14,7 +14,6 @@ from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
 from ddg_warp.state import State
 
 
-
 def relax(
     model,
     state: State | None = None,
@@ -48,7 +47,9 @@ def relax(
         outer, gradient = tangent.loads(at, q), tangent.gradient(state)
         force = np.where(tangent.free, outer - gradient, 0.0)
         if not np.isfinite(force).all():
-            raise SolverError("relaxation: forces are not finite; begin nearer to rest", state=state, outcome="non_finite")
+            raise SolverError(
+                "relaxation: forces are not finite; begin nearer to rest", state=state, outcome="non_finite"
+            )
         scale = max(scale, equilibrium.load_scale(outer, gradient)) or np.abs(force).max()
         if np.abs(force / lever).max() <= residual * scale:
             return state

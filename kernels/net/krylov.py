@@ -97,7 +97,9 @@ def solver_kernels(linear):
         inverse = wp.cw_mul(wp.inverse(m), scale)
         minor = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
         definite = m[0, 0] > linear(0.0) and m[1, 1] > linear(0.0) and m[2, 2] > linear(0.0)
-        if not (definite and minor > linear(0.0) and wp.determinant(m) > linear(0.0) and wp.isfinite(wp.trace(inverse))):
+        if not (
+            definite and minor > linear(0.0) and wp.determinant(m) > linear(0.0) and wp.isfinite(wp.trace(inverse))
+        ):
             inverse = wp.diag(wp.cw_mul(s, s))
         inverse_out[i] = wp.cw_mul(inverse, rows)
 

@@ -124,5 +124,3 @@ def _relax_normals(model, state) -> None:
         factor = Factorisation(tangent.hessian(state)[chosen][:, chosen].tocsc())
         q[chosen] -= factor.solve(tangent.gradient(state)[chosen])
         tangent.assign(state, q)
-
-
