@@ -1,5 +1,7 @@
 """Dynamics of nets: free fall, conservation, orders in time, frequencies, joints against chains, worlds, loads, damping, failures."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy import sparse
@@ -100,7 +102,7 @@ def oscillation(device, scheme, count, period):
     frequencies, shapes = modes(model)
     q = model.state().points()
     shape = shapes[0, model.net.host.shells[0].nodes]
-    start = model.state(points=q + 0.02 * shape / np.abs(shape).max())
+    start = model.state(points=q + 1e-4 * shape / np.abs(shape).max())
     state, _ = steps(model, count, 1.0 / frequencies[0] / count, scheme, start, rtol=1e-11)
     return state.points()
 
@@ -108,8 +110,8 @@ def oscillation(device, scheme, count, period):
 @pytest.mark.parametrize(("scheme", "order"), [("implicit_euler", 1.0), ("implicit_midpoint", 2.0)])
 def test_order_in_time(device, scheme, order):
     """By three step sizes: log2 of the ratio of differences."""
-    results = [oscillation(device, scheme, count, 1.0) for count in (40, 80, 160)]
-    coarse, fine = (np.abs(a - b).max() for a, b in zip(results, results[1:], strict=False))
+    results = [oscillation(device, scheme, count, 1.0) for count in (20, 40, 80)]
+    coarse, fine = (np.abs(a - b).max() for a, b in pairwise(results))
     assert np.log2(coarse / fine) == pytest.approx(order, abs=0.1)
 
 
@@ -345,8 +347,8 @@ def test_timed_load_on_a_free_sheet(device):
 def test_balloon(device):
     """A closed sphere under pressure, a membrane of St. Venant and Kirchhoff's law with K = E h / (1 - nu^2).
 
-    Stretched by s, its Green strain is (s^2 - 1) / 2, its second Piola-Kirchhoff force per length S = K (1 + nu) (s^2 - 1) / 2, which is
-    Cauchy's force per deformed length, too; p R s = 2 S gives s^2 - a s - 1 = 0 with a = p R / (K (1 + nu)).
+    Stretched by s, its Green strain is (s^2 - 1) / 2, its second Piola-Kirchhoff force per length S = K (1 + nu) (s^2 - 1) / 2,
+    which is also the force per deformed length; p R s = 2 S gives s^2 - a s - 1 = 0 with a = p R / (K (1 + nu)).
     """
     radius, thickness, pressure = 0.5, 0.01, 2e3
     points, triangles = meshes.sphere(2, radius)

@@ -231,10 +231,10 @@ def term_kernels(term: Term, real):
 def evaluate_kernel(term: Term, real, linear):
     """The kernel of a Newton iteration: energy, gradient and Gauss-Newton factor of one term, written a slot.
 
-    Factor rows are vectors [strain * slots + slot][element]; `tension_out` holds the scalars of the geometric stiffness; in worlds
-    that are `projected` they are made positive semi-definite (an edge under compression, a triangle by the eigenvalues of its
-    two-by-two stress, leaves out the negative part). Energies go to the half of `energy_out` that the line search does not hold. `stiffness_out` is the largest
-    that a strain has against moving the element.
+    Factor rows are vectors [strain * slots + slot][element]; `tension_out` holds the scalars of the geometric stiffness; in
+    worlds that are `projected` they are made positive semi-definite (an edge under compression, a triangle by the eigenvalues of
+    its two-by-two stress, leaves out the negative part). Energies go to the half of `energy_out` that the line search does not
+    hold. `stiffness_out` is the largest that a strain has against moving the element.
     """
     measure, density = term.measure, term.density
     V, F = wp.types.vector(3, real), wp.types.vector(3, linear)
