@@ -1,8 +1,9 @@
-"""What can be asked of a model at a state: energies, support reactions, internal forces, link, writhe and twist."""
+"""What can be asked of a model at a state: energies, reactions, internal forces, fields of surfaces, link, writhe, twist."""
 
 from dataclasses import dataclass
 
 import numpy as np
+import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.tangent import Tangent
@@ -100,9 +101,13 @@ def _net_places(part, q: np.ndarray, force: np.ndarray, held) -> list[tuple]:
 
 
 def stresses(model, state) -> dict[str, list[np.ndarray]]:
-    """Conjugate stresses of every rod by term: axial force [N] of edges, moments [N m] of vertices (elements, strains).
+    """Conjugate stresses of every rod and shell by term (elements, strains), in one world.
 
-    Vertices of clamped ends are included, at the place of the end node.
+    Of rods: axial force [N] of edges, moments [N m] of vertices; those of clamped ends are included, at the place of the end
+    node, and those beside rigid joints are in "rigid_joint". Of shells: forces per length [N/m] ("shell_stretch") and moments per
+    length [N] ("shell_bend", "shell_bend_dof") of triangles, components (11, 22, 12) along the first edge at rest and across it,
+    second Piola and Kirchhoff's; a moment is positive where it raises the second fundamental form. Hinges have moments per
+    their weight. What a rod or shell has not is None.
     """
     result: dict[str, list] = {}
     for group, data in zip(model.groups, state.groups, strict=True):
@@ -116,7 +121,73 @@ def stresses(model, state) -> dict[str, list[np.ndarray]]:
             rods = result.setdefault(term.name.removesuffix("_damped"), [None] * model.scene.rod_count)
             for column, rod in enumerate(group.host.rods):
                 rods[rod] = values[rows, : group.host.count[column] - missing, column].T
+    for index in range(len(model.net.sets) if model.net is not None else 0):
+        _add_net_stresses(model, state, index, result)
     return result
+
+
+def triangle_fields(model, state) -> dict[str, np.ndarray]:
+    """Numbers to color surfaces by (worlds, triangles), in the order of `model.surfaces`.
+
+    "strain": Green's strain, its largest principal value in magnitude. "curvature" [1/m]: the same of the change of curvature, of
+    shells with mid-edge normals. "energy" [J/m^2]: elastic energy of membrane and mid-edge bending per rest area.
+    """
+    net, surfaces = model.net, model.surfaces
+    if surfaces is None:
+        raise ValueError("the model has no surfaces to color")
+    fields = {name: np.zeros((model.worlds, len(surfaces.triangles))) for name in ("strain", "curvature", "energy")}
+    for index, part in enumerate(net.sets):
+        if not (part.term.name.startswith("shell") and part.term.density.coupled):
+            continue
+        E, W = part.elements, net.worlds
+        strain, stress = (wp.zeros((3, W * E), dtype=net.real, device=net.device) for _ in range(2))
+        net.strains(state.net, index, strain, stress)
+        values, slope = (array.numpy().astype(float).reshape(3, W, E) for array in (strain, stress))
+        change = np.moveaxis(values - np.stack([np.broadcast_to(p, (W, E)) for p in part.parameters[6:9]]), 0, -1)
+        metric = [np.broadcast_to(p, (W, E)).ravel() for p in part.parameters[3:6]]
+        principal = _principal(change.reshape(-1, 3), metric).reshape(W, E)
+        row = surfaces.first[part.host.owner[0]] + part.host.owner[1]
+        fields["strain" if part.term.measure.tensions else "curvature"][:, row] = principal
+        fields["energy"][:, row] += 0.5 * np.einsum("cwe,wec->we", slope, change)  # quadratic laws
+    return fields
+
+
+def _principal(covariant: np.ndarray, metric) -> np.ndarray:
+    """Largest |eigenvalue| of symmetric tensors (n, 3) in the basis of two edges, relative to their rest metric."""
+    a11, a12, a22 = metric
+    e11, e12, e22 = covariant.T
+    area = a11 * a22 - a12**2
+    mean = 0.5 * (a22 * e11 - 2.0 * a12 * e12 + a11 * e22) / area  # half the trace of metric^-1 e
+    root = np.sqrt(np.maximum(mean**2 - (e11 * e22 - e12**2) / area, 0.0))
+    return np.abs(mean) + root
+
+
+def _add_net_stresses(model, state, index: int, result: dict[str, list]) -> None:
+    """Stresses of a set of the net, rod by rod or shell by shell."""
+    net, part = model.net, model.net.sets[index]
+    term, E = part.term, part.elements
+    shape = (len(term.measure.strains), E * net.worlds)
+    strain, stress = (wp.zeros(shape, dtype=net.real, device=net.device) for _ in range(2))
+    net.strains(state.net, index, strain, stress)
+    values = stress.numpy()[:, :E].T.astype(float)
+    if term.density.coupled:
+        values = _resultants(values, [np.broadcast_to(p[0], E) for p in part.parameters[3:6]])
+    of_shell = term.name.startswith("shell")
+    count = len(model.scene.shells) if of_shell else model.scene.rod_count
+    owners = result.setdefault(term.name.removesuffix("_damped"), [None] * count)
+    for owner in np.unique(part.host.owner[0]):
+        owners[owner] = values[part.host.owner[0] == owner]
+
+
+def _resultants(slope: np.ndarray, metric) -> np.ndarray:
+    """Components (11, 22, 12) in an orthonormal basis of slopes (s11, 2 s12, s22) in that of two edges with this rest metric."""
+    a11, a12, a22 = metric
+    basis = np.zeros((len(slope), 2, 2))
+    basis[:, 0, 0], basis[:, 0, 1] = np.sqrt(a11), a12 / np.sqrt(a11)
+    basis[:, 1, 1] = np.sqrt(a22 - a12**2 / a11)
+    s = np.stack([slope[:, 0], 0.5 * slope[:, 1], 0.5 * slope[:, 1], slope[:, 2]], -1).reshape(-1, 2, 2)
+    n = basis @ s @ basis.transpose(0, 2, 1)
+    return np.stack([n[:, 0, 0], n[:, 1, 1], n[:, 0, 1]], -1)
 
 
 def writhe(points: np.ndarray) -> float:

@@ -49,13 +49,17 @@ class NetShell:
 
 @dataclass
 class NetSet:
-    """Elements of one term on blocks: slots (n, E), own lagged rows (m, E), data (d, E), parameters as of `ElementSet`."""
+    """Elements of one term on blocks: slots (n, E), own lagged rows (m, E), data (d, E), parameters as of `ElementSet`.
+
+    `owner` (2, E) is the rod or shell of each element, and its place in it: edge, vertex, triangle or hinge.
+    """
 
     term: object
     slots: np.ndarray
     lag: np.ndarray
     data: np.ndarray
     parameters: list[np.ndarray]
+    owner: np.ndarray
 
     def __len__(self) -> int:
         return self.slots.shape[1]
@@ -393,7 +397,8 @@ def _rod_sets(net: Net, joints) -> list[NetSet]:
             if term.measure.angles:
                 slots += [rod.all_edges[k], rod.all_edges[(k + 1) % n]]
                 lag = piece.reference_twist[row][k][None]
-            sets.append(NetSet(term, np.array(slots), lag, np.zeros((0, len(k))), values))
+            owner = np.array([np.full(len(k), rod.rod), k])
+            sets.append(NetSet(term, np.array(slots), lag, np.zeros((0, len(k))), values, owner))
     return sets
 
 
@@ -418,7 +423,7 @@ def _joint_sets(net: Net, joints) -> list[NetSet]:
             lag = np.concatenate([frame[:3], edge / length, [0.0]])[:, None]
             parameters = [np.array([0.5 * length])] + [np.array([v]) for v in (*stiffness, 0.0, 0.0, 0.0)]
             slots = np.array([[node], [other], [rod.all_edges[k]], [spin]])
-            sets.append(NetSet(JOINT, slots, lag, np.array([[sign]]), parameters))
+            sets.append(NetSet(JOINT, slots, lag, np.array([[sign]]), parameters, np.array([[rod.rod], [k]])))
     return sets
 
 
@@ -431,10 +436,10 @@ def _edge_value(value, piece: Piece, row: int, edge: int) -> float:
 
 def _shell_sets(net: Net, scene) -> list[NetSet]:
     sets, count = [], Counter()
-    for shell, description in zip(net.shells, scene.shells, strict=True):
+    for index, (shell, description) in enumerate(zip(net.shells, scene.shells, strict=True)):
         models = description.bending, description.membrane
         for elements in shell_terms.shell_elements(shell.surface, shell.plate, shell.kinds, *models):
-            sets.append(_bound(elements, shell.nodes, shell.edges))
+            sets.append(_bound(elements, shell.nodes, shell.edges, index))
             shell.first[elements.term.name] = count[elements.term.name]
             count[elements.term.name] += len(elements)
         if description.bending in shell_terms.TURNING:
@@ -445,18 +450,19 @@ def _shell_sets(net: Net, scene) -> list[NetSet]:
 def _meridian_sets(net: Net) -> list[NetSet]:
     none = np.zeros(0, int)
     sets = []
-    for shell in net.meridians:
+    for index, shell in enumerate(net.meridians):
         net.fixed[shell.nodes, 1] = True
         net.fixed[shell.nodes[shell.points[:, 0] == 0.0], 0] = True
-        sets += [_bound(elements, shell.nodes, none) for elements in axisymmetric.element_sets(shell)]
+        sets += [_bound(elements, shell.nodes, none, index) for elements in axisymmetric.element_sets(shell)]
     return sets
 
 
-def _bound(elements: ElementSet, nodes: np.ndarray, edges: np.ndarray) -> NetSet:
+def _bound(elements: ElementSet, nodes: np.ndarray, edges: np.ndarray, index: int) -> NetSet:
     count = len(elements.nodes)
     slots = np.concatenate([nodes[elements.nodes], edges[elements.angles]], axis=1).T
     parameters = [np.broadcast_to(np.asarray(p, float), (count,)) for p in elements.parameters]
-    return NetSet(elements.term, slots, np.zeros((0, count)), elements.data.T, parameters)
+    owner = np.array([np.full(count, index), np.arange(count)])
+    return NetSet(elements.term, slots, np.zeros((0, count)), elements.data.T, parameters, owner)
 
 
 def _gather_sets(sets: list[NetSet]) -> list[NetSet]:
@@ -464,9 +470,9 @@ def _gather_sets(sets: list[NetSet]) -> list[NetSet]:
     result = []
     for name in dict.fromkeys(s.term.name for s in sets if len(s)):
         same = [s for s in sets if s.term.name == name and len(s)]
-        join = [np.concatenate([getattr(s, what) for s in same], axis=1) for what in ("slots", "lag", "data")]
+        join = [np.concatenate([getattr(s, what) for s in same], axis=1) for what in ("slots", "lag", "data", "owner")]
         parameters = [np.concatenate(values) for values in zip(*(s.parameters for s in same), strict=True)]
-        result.append(NetSet(same[0].term, *join, parameters))
+        result.append(NetSet(same[0].term, *join[:3], parameters, join[3]))
     return result
 
 

@@ -54,7 +54,8 @@ class NetSample:
     def hessian(self, real) -> np.ndarray:
         """Hessians in the blocks of an element (3 slots, 3 slots, E)."""
         size = self.measure.size
-        local = self._launch(2, real, [(ELEMENTS, size, size)], columns=(size,))[0]
+        none = wp.zeros((len(self.measure.strains), ELEMENTS), dtype=real, device=self.device)
+        local = self._launch(2, real, [(ELEMENTS, size, size)], extra=(none,), columns=(size,))[0]
         return np.einsum("ia,eij,jb->abe", self.incidence, local, self.incidence)
 
     def strains(self, **changed) -> tuple[np.ndarray, np.ndarray]:
@@ -75,11 +76,12 @@ class NetSample:
             zeros(max(1, self.measure.tensions), ELEMENTS),
             zeros(slots, ELEMENTS, dtype=vector),
             zeros(2, ELEMENTS),
+            zeros(ELEMENTS),
         ]
-        flags = [wp.zeros(1, dtype=int, device=self.device) for _ in range(2)]
+        flags = [wp.full(1, value, dtype=int, device=self.device) for value in (0, 0, 1)]  # the last: projected
         kernel = net_elements.evaluate_kernel(self.term, real, real)
         wp.launch(kernel, ELEMENTS, [*self._inputs(real), *flags], out, device=self.device)
-        factor, tension, gradient, energy = (array.numpy().astype(float) for array in out)
+        factor, tension, gradient, energy = (array.numpy().astype(float) for array in out[:4])
         rows = factor.reshape(n, slots, ELEMENTS, 3).transpose(0, 1, 3, 2).reshape(n, 3 * slots, ELEMENTS)
         return rows, tension[: self.measure.tensions], gradient, energy[1]
 

@@ -99,6 +99,7 @@ class DeviceNet:
         self.sets = [DeviceSet(s, worlds, device, real) for s in host.sets]
         self.ends = wp.array(np.ascontiguousarray(host.ends, np.int32).reshape(-1, 2), dtype=int, device=device)
         self.still = wp.zeros(worlds, dtype=real, device=device)
+        self.every = wp.full(worlds, 1, dtype=int, device=device)
 
     def empty(self) -> NetState:
         """Arrays of a state, not yet filled."""
@@ -162,47 +163,44 @@ class DeviceNet:
             if part.term.density.lagged:
                 self.strains(state, index, state.last[index])
 
-    def carry(self, before: NetState, after: NetState) -> None:
+    def carry(
+        self, before: NetState, after: NetState, kept: NetState | None = None, moved: wp.array | None = None
+    ) -> None:
         """Lagged data of `after` from those of `before` and the positions of `after`, whose joints then start from zero.
 
-        The two may be the same state. Launches alone, so that it can be captured.
+        Worlds that have not `moved` take over those of `kept` instead. The states may be the same. Launches alone, so that it
+        can be captured.
         """
-        real, device = self.real, self.device
+        real = self.real
         if not self.edges:
             return
-        wp.launch(
+        kept, moved = kept or before, moved or self.every
+
+        def launch(kernel, dim, inputs, outputs):
+            wp.launch(kernel, dim, inputs, outputs, device=self.device)
+
+        launch(
             frames.edge_kernel(real),
             self.worlds * self.edges,
-            [after.q, self.ends, self.blocks, before.frame],
+            [after.q, self.ends, self.blocks, moved, kept.frame, before.frame],
             [after.frame],
-            device=device,
         )
-        for part, old, new in zip(self.sets, before.lag, after.lag, strict=True):
-            measure = part.term.measure
+        for part, same, old, new in zip(self.sets, kept.lag, before.lag, after.lag, strict=True):
+            measure, dim = part.term.measure, self.worlds * part.elements
             if measure.spins:
-                wp.launch(
-                    frames.joint_kernel(real),
-                    self.worlds * part.elements,
-                    [after.q, after.frame, part.slots, part.data, self.blocks, self.angle_start, self.edges, old],
-                    [new],
-                    device=device,
-                )
+                inputs = [after.q, after.frame, part.slots, part.data, self.blocks, self.angle_start, self.edges]
+                launch(frames.joint_kernel(real), dim, [*inputs, moved, same, old], [new])
             elif measure.frames:
-                wp.launch(
-                    frames.vertex_kernel(real),
-                    self.worlds * part.elements,
-                    [after.frame, part.slots, measure.nodes, self.angle_start, self.edges, old],
-                    [new],
-                    device=device,
-                )
-        if self.host.spins:
-            wp.launch(
-                frames.reset_kernel(real),
-                self.worlds * self.host.spins,
-                [self.blocks - self.host.spins, self.host.spins, self.blocks],
-                [after.q],
-                device=device,
-            )
+                inputs = [after.frame, part.slots, measure.nodes, self.angle_start, self.edges]
+                launch(frames.vertex_kernel(real), dim, [*inputs, moved, same, old], [new])
+        self.reset_spins(after.q)
+
+    def reset_spins(self, blocks: wp.array) -> None:
+        """Zero the rotations of joints, or their rates."""
+        spins = self.host.spins
+        if spins:
+            inputs = [self.blocks - spins, spins, self.blocks]
+            wp.launch(frames.reset_kernel(self.real), self.worlds * spins, inputs, [blocks], device=self.device)
 
 
 def _short(values: np.ndarray) -> np.ndarray:

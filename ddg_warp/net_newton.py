@@ -56,7 +56,7 @@ class NetNewton:
         self.matrix = make((9, worlds * self.system.positions), self.linear)
         self.krylov_dots = make((worlds, blocks), self.linear)
         self.status, self.slot, self.iteration, self.halvings, self.unbalanced = flags(5)
-        self.drowned, self.turned, self.wanted, self.todo, self.iterations, self.lost = flags(6)
+        self.drowned, self.turned, self.wanted, self.todo, self.iterations, self.lost, self.projected = flags(7)
         self.coefficient, self.rate, self.step_length, self.decrement, self.merit = scalars(5)
         self.load_scale, self.residual, self.sum_change, self.sum_noise, self.sum_square = scalars(5)
         self.decrease, self.turn = scalars(2)
@@ -129,7 +129,8 @@ class NetNewton:
             wp.launch(
                 kernel,
                 self.worlds * part.elements,
-                self.net.inputs(part, state, index, q=self.q, rate=self.rate) + [self.status, self.slot],
+                self.net.inputs(part, state, index, q=self.q, rate=self.rate)
+                + [self.status, self.slot, self.projected],
                 [own["factor"], own["tension"], own["gradient"], own["energy"], own["stiffness"]],
                 device=self.device,
                 block_dim=128,
@@ -201,7 +202,7 @@ class NetNewton:
             self._begin,
             self.worlds,
             [self.total],
-            [self.wanted, self.rho, self.rho_first, self.iterations, self.busy],
+            [self.wanted, self.rho, self.rho_first, self.iterations, self.projected, self.busy],
             device=self.device,
         )
         wp.capture_while(self.busy, self.cycle)
@@ -219,7 +220,7 @@ class NetNewton:
         self._sum_linear(self.krylov_dots, self.curvature)
         self._launch(
             advance,
-            [self.p, self.product, self.inverse, self.rho, self.curvature, self.wanted, blocks],
+            [self.p, self.product, self.inverse, self.rho, self.curvature, self.iterations, self.wanted, blocks],
             [self.direction, self.rest, self.z, self.krylov_dots],
         )
         if self.levels:
@@ -229,8 +230,8 @@ class NetNewton:
         wp.launch(
             test,
             self.worlds,
-            [self.total, self.rho_first, self.forcing, self._limit],
-            [self.rho, self.iterations, self.wanted, self.busy],
+            [self.total, self.curvature, self.rho_first, self.forcing, self._limit],
+            [self.rho, self.iterations, self.projected, self.wanted, self.busy],
             device=self.device,
         )
 

@@ -11,6 +11,7 @@ from ddg_warp.io import Shapes
 
 TRAJECTORY, SCENE = "trajectory.h5", "scene.usdc"
 DEFAULT_FPS = 24.0
+COLORS = ("strain", "curvature", "energy")
 
 
 class Recorder:
@@ -27,6 +28,8 @@ class Recorder:
         block: Frames written together.
         fps: Time codes per second of the scene; by default one time code a recorded frame, where the scene has a dt.
         tube: Whether the scene shows tubes instead of curves.
+        color_by: What surfaces of the scene are colored by, "strain", "curvature" or "energy" (see `inquiry.triangle_fields`),
+            and its values at the two ends of the scale. Frames replayed from a trajectory, at a resume, stay plain.
         velocities: Whether to record velocities.
         directors: Whether to record the first material directors.
         provenance: Attributes of the trajectory, beside version, date and machine.
@@ -45,6 +48,7 @@ class Recorder:
         block: int = 64,
         fps: float | None = None,
         tube: bool = False,
+        color_by: tuple[str, float, float] | None = None,
         velocities: bool = False,
         directors: bool = False,
         provenance: Mapping | None = None,
@@ -57,7 +61,11 @@ class Recorder:
         self.directory.mkdir(parents=True, exist_ok=True)
         self._every = every
         self._calls, self._last = 0, None
-        self._velocities = velocities
+        self._velocities, self._color_by = velocities, color_by
+        if color_by is not None and (color_by[0] not in COLORS or model.surfaces is None):
+            raise ValueError(
+                f"color_by {color_by[0]!r}: surfaces, if there are any, are colored by {', '.join(COLORS)}"
+            )
         self._trajectory = self._scene = None
         if hdf5:
             from ddg_warp.io.hdf5 import TrajectoryWriter
@@ -74,7 +82,9 @@ class Recorder:
 
             shapes = Shapes.of(model.curves, model.surfaces, model.worlds)
             fps = fps or _fps_of(model, every)
-            self._scene = CurvesWriter(self.directory / SCENE, shapes, fps=fps, tube=tube, block=block)
+            self._scene = CurvesWriter(
+                self.directory / SCENE, shapes, fps=fps, tube=tube, block=block, color_by=color_by
+            )
         if resume:
             self._replay()
 
@@ -103,7 +113,9 @@ class Recorder:
         if self._trajectory is not None:
             self._trajectory.append(state, observed)
         if self._scene is not None:
-            self._show(state.time, state.points(), state.velocities() if self._velocities else None)
+            self._show(
+                state.time, state.points(), state.velocities() if self._velocities else None, self._fields(state)
+            )
 
     def close(self) -> None:
         """Writes what is left and closes the files."""
@@ -123,10 +135,19 @@ class Recorder:
                     reader.time[frame], reader.points[frame], reader.velocities[frame] if show_velocities else None
                 )
 
-    def _show(self, time: float, points: np.ndarray, velocities: np.ndarray | None) -> None:
+    def _fields(self, state) -> dict[str, np.ndarray] | None:
+        """What surfaces are colored by, world after world."""
+        if self._color_by is None:
+            return None
+        from ddg_warp.inquiry import triangle_fields
+
+        name = self._color_by[0]
+        return {name: triangle_fields(state.model, state)[name].ravel()}
+
+    def _show(self, time: float, points: np.ndarray, velocities: np.ndarray | None, fields=None) -> None:
         """Adds a frame of all worlds to the scene."""
         velocities = None if velocities is None else np.reshape(velocities, (-1, 3))
-        self._scene.write(time, np.reshape(points, (-1, 3)), velocities=velocities)
+        self._scene.write(time, np.reshape(points, (-1, 3)), velocities=velocities, triangle_scalars=fields)
 
 
 def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False, revolve: int = 0) -> None:

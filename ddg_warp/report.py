@@ -1,8 +1,9 @@
 """The report of a model: terms, elements, dofs, solver, kernels, memory, and what the scene does without."""
 
 from ddg_warp.kernels import cyclic_reduction
-from ddg_warp.kernels.terms import REGISTRY
+from ddg_warp.kernels.terms import JOINT, REGISTRY, SHELLS
 from ddg_warp.linear.choice import automatic
+from ddg_warp.net_system import NetSystem
 
 SOLVERS = {
     "chain": "PCG (closed chains)",
@@ -29,11 +30,35 @@ def report(model) -> str:
             lines.append(f"  {term.name}: {elements} elements, {term.measure.name} x {term.density.name}")
         lines.append(f"  solver: {SOLVERS[automatic(group)]}, linear algebra in {model.types.linear.__name__}")
         lines.append(f"  memory: {bytes_per_node(model, group)} bytes a node")
-    absent = sorted(name for name in REGISTRY if name not in present)
+    if model.net is not None:
+        lines += net_lines(model)
+        present |= {part.term.name for part in model.net.sets}
+    absent = sorted(name for name in (*REGISTRY, *SHELLS, JOINT.name) if name not in present)
     lines.append("not in this scene: " + ", ".join(absent))
-    if not any(group.kind.twist for group in model.groups):
+    if not any(group.kind.twist for group in model.groups) and (model.net is None or not model.net.edges):
         lines.append("no angles, no frames, no rotary inertia")
     return "\n".join(lines)
+
+
+def net_lines(model) -> list[str]:
+    """What the net holds: dofs, terms, the matrix."""
+    host, net = model.net.host, model.net
+    table = NetSystem(net)
+    linear = model.types.linear
+    lines = [
+        f"net: {len(host.shells)} shells of {sum(len(s.surface.triangles) for s in host.shells)} triangles, "
+        f"{len(host.rods)} rods; {host.nodes} nodes, {host.angles} angles, {host.spins} rigid joints, "
+        f"{int((~host.fixed).sum())} free dofs"
+    ]
+    for part in net.sets:
+        measure, density = part.term.measure.name, part.term.density.name
+        lines.append(f"  {part.term.name}: {part.elements * model.worlds} elements, {measure} x {density}")
+    size = 9 * table.positions * model.worlds * (4 if linear.__name__ == "float32" else 8)
+    lines.append(
+        f"  solver: PCG (block Jacobi), one Newton loop a world, linear algebra in {linear.__name__}; "
+        f"H: {table.entries} blocks of 3 x 3, {size / 1e6:.3g} MB"
+    )
+    return lines
 
 
 def bytes_per_node(model, group) -> int:

@@ -280,10 +280,10 @@ def term_kernels(term: Term, real):
 def evaluate_kernel(term: Term, real, linear):
     """The kernel of a Newton iteration: energy, gradient and Gauss-Newton factor of one term, written a slot.
 
-    Factor rows are vectors [strain * slots + slot][element]; `tension_out` holds the scalars of the geometric stiffness, made
-    positive semi-definite (an edge under compression, a triangle by the eigenvalues of its two-by-two stress, leaves out the
-    negative part). Energies go to the half of `energy_out` that the line search does not hold. `stiffness_out` is the largest
-    that a strain has against moving the element.
+    Factor rows are vectors [strain * slots + slot][element]; `tension_out` holds the scalars of the geometric stiffness; in
+    worlds that are `projected` they are made positive semi-definite (an edge under compression, a triangle by the eigenvalues of
+    its two-by-two stress, leaves out the negative part). Energies go to the half of `energy_out` that the line search does not
+    hold. `stiffness_out` is the largest that a strain has against moving the element.
     """
     measure, density = term.measure, term.density
     V, F = wp.types.vector(3, real), wp.types.vector(3, linear)
@@ -327,6 +327,7 @@ def evaluate_kernel(term: Term, real, linear):
         elements: int,
         status: wp.array(dtype=int),
         slot: wp.array(dtype=int),
+        projected: wp.array(dtype=int),
         factor_out: wp.array2d(dtype=F),
         tension_out: wp.array2d(dtype=linear),
         gradient_out: wp.array2d(dtype=V),
@@ -347,13 +348,14 @@ def evaluate_kernel(term: Term, real, linear):
         shift = E()
         if wp.static(tensions == 1):
             c, shift = tension_of(x, w, slope)
-            if c < real(0.0):
+            if c < real(0.0) and projected[world] != 0:
                 c = real(0.0)
                 shift = E()
             tension_out[0, tid] = linear(c)
         if wp.static(tensions == 3):
             c3, _shift = tension_of(x, w, slope)
-            c3 = definite(c3)
+            if projected[world] != 0:
+                c3 = definite(c3)
             for i in range(3):
                 tension_out[i, tid] = linear(c3[i])
         root = root_of(e, p, shift)

@@ -1,4 +1,7 @@
-"""Lagged data of a net: frames of rod edges, reference twist of their vertices, ghosts and rotation of rigid joints."""
+"""Lagged data of a net: frames of rod edges, reference twist of their vertices, ghosts and rotation of rigid joints.
+
+Worlds whose flag `moved` is zero take over what is `kept`, untouched.
+"""
 
 from functools import cache
 
@@ -37,12 +40,18 @@ def edge_kernel(real):
         q: wp.array(dtype=V),
         ends: wp.array2d(dtype=int),
         blocks: int,
+        moved: wp.array(dtype=int),
+        kept: wp.array2d(dtype=real),
         frame: wp.array2d(dtype=real),
         frame_out: wp.array2d(dtype=real),
     ):
         f = wp.tid()
         count = ends.shape[0]
         world = f / count
+        if moved[world] == 0:
+            for c in range(6):
+                frame_out[c, f] = kept[c, f]
+            return
         i = f - world * count
         t = wp.normalize(q[ends[i, 1] + world * blocks] - q[ends[i, 0] + world * blocks])
         u = transport(row(frame, 0, f), row(frame, 3, f), t)
@@ -65,12 +74,17 @@ def vertex_kernel(real):
         first_angle: int,
         angle_start: int,
         edges: int,
+        moved: wp.array(dtype=int),
+        kept: wp.array2d(dtype=real),
         lag: wp.array2d(dtype=real),
         lag_out: wp.array2d(dtype=real),
     ):
         tid = wp.tid()
         count = slots.shape[1]
         world = tid / count
+        if moved[world] == 0:
+            lag_out[0, tid] = kept[0, tid]
+            return
         e = tid - world * count
         a = slots[first_angle, e] - angle_start + world * edges
         b = slots[first_angle + 1, e] - angle_start + world * edges
@@ -98,12 +112,18 @@ def joint_kernel(real):
         blocks: int,
         angle_start: int,
         edges: int,
+        moved: wp.array(dtype=int),
+        kept: wp.array2d(dtype=real),
         lag: wp.array2d(dtype=real),
         lag_out: wp.array2d(dtype=real),
     ):
         tid = wp.tid()
         count = slots.shape[1]
         world = tid / count
+        if moved[world] == 0:
+            for c in range(7):
+                lag_out[c, tid] = kept[c, tid]
+            return
         e = tid - world * count
         omega = q[slots[3, e] + world * blocks]
         t = wp.normalize(turned(omega, row(lag, 3, tid)))

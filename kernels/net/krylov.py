@@ -91,10 +91,15 @@ def solver_kernels(linear):
         # scaled to a unit diagonal: a block of a rod's end holds stretching and bending stiffness
         s = H()
         for d in range(3):
-            s[d] = linear(1.0) / wp.sqrt(wp.max(m[d, d], linear(1.0e-30)))
+            s[d] = linear(1.0) / wp.sqrt(wp.max(wp.abs(m[d, d]), linear(1.0e-30)))
         scale = wp.outer(s, s)
-        inverse = wp.cw_mul(wp.inverse(wp.cw_mul(m, scale)), scale)
-        if not wp.isfinite(wp.trace(inverse)):
+        m = wp.cw_mul(m, scale)
+        inverse = wp.cw_mul(wp.inverse(m), scale)
+        minor = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
+        definite = m[0, 0] > linear(0.0) and m[1, 1] > linear(0.0) and m[2, 2] > linear(0.0)
+        if not (
+            definite and minor > linear(0.0) and wp.determinant(m) > linear(0.0) and wp.isfinite(wp.trace(inverse))
+        ):
             inverse = wp.diag(wp.cw_mul(s, s))
         inverse_out[i] = wp.cw_mul(inverse, rows)
 
@@ -127,11 +132,13 @@ def solver_kernels(linear):
         rho_out: wp.array(dtype=linear),
         first_out: wp.array(dtype=linear),
         iterations_out: wp.array(dtype=int),
+        projected_out: wp.array(dtype=int),
         busy_out: wp.array(dtype=int),
     ):
         w = wp.tid()
         if wanted[w] == 0:
             return
+        projected_out[w] = 0
         rho_out[w] = total[w]
         first_out[w] = total[w]
         iterations_out[w] = 0
@@ -170,6 +177,7 @@ def solver_kernels(linear):
         inverse: wp.array(dtype=M),
         rho: wp.array(dtype=linear),
         curvature: wp.array(dtype=linear),
+        iterations: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
         blocks: int,
         solution: wp.array(dtype=H),
@@ -183,9 +191,11 @@ def solver_kernels(linear):
         if wanted[w] != 1:
             return
         k = i - w * blocks
-        # curvature lost to rounding ends the solve with what it has
         if not curvature[w] > eps * rho[w] * linear(1.0e-6):
+            # negative, or lost to rounding: the solve ends with what it has, or with a step of steepest descent
             dots_out[w, k] = linear(0.0)
+            if iterations[w] == 0:
+                solution[i] = p[i]
             return
         alpha = rho[w] / curvature[w]
         solution[i] = solution[i] + alpha * p[i]
@@ -213,11 +223,13 @@ def solver_kernels(linear):
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def test(
         total: wp.array(dtype=linear),
+        curvature: wp.array(dtype=linear),
         first: wp.array(dtype=linear),
         forcing: wp.array(dtype=linear),
         limit: int,
         rho: wp.array(dtype=linear),
         iterations: wp.array(dtype=int),
+        projected: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
         busy_out: wp.array(dtype=int),
     ):
@@ -226,6 +238,8 @@ def solver_kernels(linear):
         if wanted[w] != 1:
             return
         iterations[w] = iterations[w] + 1
+        if not curvature[w] > linear(0.0):
+            projected[w] = 1
         rho[w] = total[w]
         if total[w] > forcing[w] * forcing[w] * first[w] and iterations[w] < limit:
             busy_out[0] = 1

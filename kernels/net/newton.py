@@ -195,13 +195,16 @@ def step_kernels(real, midpoint: bool):
         unbalanced_out: wp.array(dtype=int),
         drowned_out: wp.array(dtype=int),
         load_scale_out: wp.array(dtype=real),
+        moved_out: wp.array(dtype=int),
         active_out: wp.array(dtype=int),
     ):
         i = wp.tid()
         w = i / blocks
+        k = i - w * blocks
+        if k == 0:
+            moved_out[w] = wp.where(progress[w] < real(1.0), 1, 0)
         if progress[w] >= real(1.0):
             return
-        k = i - w * blocks
         s = dt[w] * portion[w]
         if wp.static(midpoint):
             s *= real(0.5)
@@ -264,6 +267,7 @@ def step_kernels(real, midpoint: bool):
         blocks: int,
         q_out: wp.array(dtype=V),
         v_out: wp.array(dtype=V),
+        moved_out: wp.array(dtype=int),
     ):
         """Blocks and their velocities at the end of the step, of the worlds that converged."""
         i = wp.tid()
@@ -271,7 +275,10 @@ def step_kernels(real, midpoint: bool):
         start = q0[i]
         v = v0[i]
         end = start
-        if progress[w] < real(1.0) and status[w] <= wp.static(outcome.CONVERGED_TO_ROUNDING):
+        ahead = progress[w] < real(1.0) and status[w] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
+        if i == w * blocks:
+            moved_out[w] = wp.where(ahead, 1, 0)
+        if ahead:
             end = q[i]
             change = (end - start) * rate[w]
             if wp.static(midpoint):

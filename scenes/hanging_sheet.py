@@ -1,0 +1,69 @@
+"""Hanging sheet: a square of rubber, held at two corners, let go flat and damped until it hangs; from 16 to 1024 cells a side.
+
+A sheet this thin carries its weight by tension, from the two corners, in folds. Implicit Euler only loses energy; at rest the corners
+carry half the weight each, and the lowest vertex hangs where that of a finer mesh does.
+"""
+
+import numpy as np
+
+import ddg_warp as ddg
+from ddg_warp import meshes
+from ddg_warp.inquiry import energies
+
+SIDE = 1.0  # m
+THICKNESS = 1e-3  # m
+MATERIAL = ddg.Material(young=1.0e6, poisson=0.3, density=1000.0, viscosity=0.02)
+GRAVITY = 9.81  # m/s^2
+BALANCE = "balance of forces at rest"
+LOWEST = -1.0211
+
+
+def build(
+    cells: int = 16, duration: float = 3.0, dt: float = 1.0 / 60.0, damping: float = 4.0, bending: str = "midedge_dof"
+) -> ddg.Scene:
+    """A square sheet, held at two neighbouring corners.
+
+    Args:
+        cells: cells along a side, two triangles each
+        duration: end of the run [s]
+        dt: time step [s]
+        damping: mass-proportional damping [1/s]
+        bending: midedge_dof or hinge
+    """
+    points, triangles = meshes.rectangle(cells, cells, (SIDE, SIDE), "alternating")
+    scene = ddg.Scene(
+        gravity=(0.0, 0.0, -GRAVITY), mass_damping=damping, analysis=ddg.Dynamics(dt=dt, duration=duration)
+    )
+    shell = scene.add_shell(points, triangles, thickness=THICKNESS, material=MATERIAL, bending=bending, name="sheet")
+    for corner in held(points):
+        scene.hold(shell, [corner])
+    return scene
+
+
+def held(points: np.ndarray) -> list[int]:
+    """The two corners with the smallest x."""
+    left = np.flatnonzero(points[:, 0] == points[:, 0].min())
+    return [int(left[np.argmin(points[left, 1])]), int(left[np.argmax(points[left, 1])])]
+
+
+def observe(model, state) -> dict[str, float]:
+    """Height of the lowest vertex [m], total energy and its kinetic part [J]."""
+    parts = energies(model, state)
+    lowest = float(state.points().reshape(-1, 3)[:, 2].min())
+    return {"lowest": lowest, "energy": sum(parts.values()), "kinetic": parts["kinetic"]}
+
+
+def check(result) -> list[ddg.Check]:
+    """Energy that only falls, and, once it hangs, the balance of forces and the place of the lowest vertex."""
+    model, state = result.model, result.state
+    energy = np.array(result.series["energy"])
+    gain = max(0.0, float(np.diff(energy).max())) / (energy[0] - energy[-1])
+    weight = MATERIAL.density * THICKNESS * SIDE**2 * GRAVITY
+    first, second = (reaction.force[2] for reaction in model.reactions(state))
+    lowest = result.series["lowest"][-1] / SIDE
+    return [
+        ddg.Check("largest gain of energy in a step over the whole drop", gain, 0.0, 1e-9, "implicit Euler"),
+        ddg.Check("vertical reactions over the weight", float(first + second) / weight, 1.0, 1e-3, BALANCE),
+        ddg.Check("share of the first corner", float(first / (first + second)), 0.5, 1e-3, BALANCE),
+        ddg.Check("height of the lowest vertex over the side", lowest, LOWEST, 3e-3, "this scene with 32 cells"),
+    ]
