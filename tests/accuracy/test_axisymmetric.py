@@ -243,6 +243,27 @@ def test_swelling_and_curling_are_free_of_stress(device):
         assert model.energies(state)["axisymmetric_stretch"] < 1e-12 * E * 0.01
 
 
+@pytest.mark.parametrize("angle", [1.0, np.pi])
+def test_sphere_bent_from_flat(device, angle):
+    """A clamped cap, or a sphere, flat at rest: D (1 + nu) / R^2 per area, 2 pi (1 - cos a) R^2 of it."""
+    h, errors = 0.01, []
+    for n in REGULAR:
+        scene = still()
+        a = np.linspace(0.0, angle, n + 1)
+        points = np.column_stack([np.sin(a), np.cos(a)])
+        points[-1, 0] = 0.0 if angle == np.pi else points[-1, 0]
+        shell = scene.add_axisymmetric_shell(points, thickness=h, material=MATERIAL, rest="flat")
+        if angle < np.pi:
+            scene.clamp_ring(shell, "last")
+        model = scene.build(device, "float64")
+        energies = model.energies(model.state())
+        total = energies["axisymmetric_bend"] + energies["axisymmetric_rim"]
+        errors.append(total / (2.0 * np.pi * rigidity(h) * (1.0 + NU) * (1.0 - np.cos(angle))) - 1.0)
+        assert energies["axisymmetric_stretch"] < 1e-20
+    assert abs(errors[-1]) < 1e-3
+    assert order(REGULAR, errors) == pytest.approx(2.0, abs=0.1)
+
+
 def test_prescribed_motion_and_reactions(device):
     """The force on a pole that moves it by w is the one that moves it by w; supports carry the loads; weight is rho g h A."""
     angle = np.linspace(0.0, 0.6, 31)
