@@ -342,7 +342,7 @@ def factor(case: NetCase) -> float:
         blocks = w * np.array([[stress[0], 0.5 * stress[1]], [0.5 * stress[1], stress[2]]])
         values, vectors = np.linalg.eigh(blocks.transpose(2, 0, 1))
         blocks = np.einsum("eik,ek,ejk->eij", vectors, np.maximum(values, 0.0), vectors)
-        expected += np.einsum("ia,eij,jb->abe", sample.incidence, np.kron(blocks, np.eye(3)), sample.incidence)
+        expected += _on_edges(sample, blocks)
     return _relative(_gauss_newton(case), expected)
 
 
@@ -426,9 +426,14 @@ def _gauss_newton(case: NetCase) -> np.ndarray:
     result = np.einsum("mae,mbe->abe", rows, rows)
     if len(tension) == 3:
         blocks = np.array([[tension[0], tension[1]], [tension[1], tension[2]]]).transpose(2, 0, 1)
-        incidence = case.sample.incidence
-        result += np.einsum("ia,eij,jb->abe", incidence, np.kron(blocks, np.eye(3)), incidence)
+        result += _on_edges(case.sample, blocks)
     return result
+
+
+def _on_edges(sample: NetSample, blocks: np.ndarray) -> np.ndarray:
+    """Geometric stiffness (E, 2, 2) between the first two edge vectors, in the blocks of an element."""
+    incidence = sample.incidence[:6]
+    return np.einsum("ia,eij,jb->abe", incidence, np.kron(blocks, np.eye(3)), incidence)
 
 
 def _relative(value, reference) -> float:
