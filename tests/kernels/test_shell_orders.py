@@ -69,7 +69,7 @@ def test_curved_membrane_bends_without_stretch(device, mesh, shape):
         inside = (np.abs(points[triangles].mean(1) - 0.5) < 0.3).all(1)
         for membrane, results in energies.items():
             stretch, bend = shells.shell_elements(surface, plate, kinds, "midedge_dof", membrane)
-            angles = relaxed_angles(bend, place, kinds.turning, device)
+            angles = relaxed_angles(bend, place, shells.turning(kinds, "midedge_dof"), device)
             energy = gather(stretch, place, angles).evaluate(device=device)["energy"][:, 0]
             results.append(energy[inside].sum() / plate.area[inside].sum())
     assert order(counts, energies["flat"]) == pytest.approx(4.0, abs=0.2)
