@@ -67,3 +67,30 @@ def check(result) -> list[ddg.Check]:
         ddg.Check("share of the first corner", float(first / (first + second)), 0.5, 1e-3, BALANCE),
         ddg.Check("height of the lowest vertex over the side", lowest, LOWEST, 3e-3, "this scene with 32 cells"),
     ]
+
+
+def benchmark() -> ddg.bench.Study:
+    """Free corners and the middle between them after 0.2 s, against the same sheet at a finer mesh and a shorter step.
+
+    Implicit Euler is of first order in the step, the midpoint rule of second; mesh and tolerance are lines of their own.
+    """
+    return ddg.bench.Study(
+        grid={
+            "dt": (1 / 60, 1 / 120, 1 / 240, 1 / 480),
+            "cells": (16, 32),
+            "scheme": ("implicit_euler", "implicit_midpoint"),
+            "rtol": (1e-3, 1e-8),
+        },
+        fixed={"duration": 0.2, "damping": 0.0},
+        measure=lambda result: result.state.points()[_marks(result.model)],
+        reference={"dt": 1 / 1920, "cells": 64, "scheme": "implicit_midpoint", "rtol": 1e-8},
+        series=("scheme", "cells", "rtol"),
+    )
+
+
+def _marks(model) -> list[int]:
+    """Vertices at the two free corners and in the middle between them."""
+    rest = model.state().points()
+    right = np.flatnonzero(rest[:, 0] == rest[:, 0].max())
+    across = rest[right, 1]
+    return [int(right[np.argmin(abs(across - y))]) for y in (across.min(), across.mean(), across.max())]
