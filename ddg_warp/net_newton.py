@@ -48,6 +48,7 @@ class NetNewton:
         self.krylov_dots = make((worlds, blocks), self.linear)
         self.status, self.slot, self.iteration, self.halvings, self.unbalanced = flags(5)
         self.drowned, self.turned, self.wanted, self.todo, self.iterations, self.lost, self.projected = flags(7)
+        (self.stalled,), (self.best,) = flags(), scalars()
         self.coefficient, self.rate, self.step_length, self.decrement, self.merit = scalars(5)
         self.load_scale, self.residual, self.sum_change, self.sum_noise, self.sum_square = scalars(5)
         self.decrease, self.turn = scalars(2)
@@ -61,7 +62,7 @@ class NetNewton:
         self._sum, self._sum_linear = (Sums(worlds, blocks, dtype, device) for dtype in (self.real, self.linear))
         self._largest = Sums(worlds, len(ends), self.real, device, largest=True)
         lengths = np.linalg.norm(np.diff(host.rest[ends], axis=1)[:, 0], axis=1)
-        self.arm = float(lengths.mean())
+        self.arm, self.longest = float(lengths.mean()), float(lengths.max())
         self._evaluate = [elements.evaluate_kernel(part.term, self.real, self.linear) for part in net.sets]
         self._outer, self._collect, self._settle = system.balance_kernels(self.real, self.linear)
         self._assembly = Assembly(net, self.system, self.parts, self.real, self.linear)
@@ -144,7 +145,7 @@ class NetNewton:
         self._launch(
             self._settle,
             [self.q, self.force, self.size, self.stiffness, self.fixed, self.status, self.load_scale]
-            + [blocks, net.host.nodes, self.arm, options.rtol, options.floor_factor * self.eps],
+            + [blocks, net.host.nodes, self.arm, self.longest, options.rtol, options.floor_factor * self.eps],
             [self.right, self.square, self.noise, self.unbalanced, self.drowned],
         )
 
@@ -161,7 +162,7 @@ class NetNewton:
             + [options.max_iterations, options.max_halvings, LOOSEST, options.linear_rtol]
             + [self.status, self.unbalanced, self.drowned, self.slot, self.iteration, self.halvings]
             + [self.step_length, self.decrement, self.merit, self.load_scale, self.residual, self.turned]
-            + [self.forcing, self.wanted, self.todo, self.active],
+            + [self.best, self.stalled, self.forcing, self.wanted, self.todo, self.active],
             device=self.device,
         )
 

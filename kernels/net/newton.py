@@ -7,6 +7,8 @@ import warp as wp
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
 
+STALLED = 8  # iterations without progress, where energies drown in rounding, that a world is given
+
 
 @cache
 def search_kernels(real, linear):
@@ -36,12 +38,18 @@ def search_kernels(real, linear):
         load_scale: wp.array(dtype=real),
         largest: wp.array(dtype=real),
         turned: wp.array(dtype=int),
+        best: wp.array(dtype=real),
+        stalled: wp.array(dtype=int),
         forcing: wp.array(dtype=linear),
         wanted: wp.array(dtype=int),
         todo: wp.array(dtype=int),
         active: wp.array(dtype=int),
     ):
-        """Decides by the sums over all blocks; how exactly the next direction is solved follows Eisenstat and Walker (1996)."""
+        """Decides by the sums over all blocks; how exactly the next direction is solved follows Eisenstat and Walker (1996).
+
+        A world whose expected decrease of energy drowns in rounding, and whose residual has not halved in `STALLED` iterations, has
+        converged to rounding: on bad meshes rounding leaves more than the estimate block by block.
+        """
         w = wp.tid()
         wanted[w] = 0
         todo[w] = 0
@@ -49,6 +57,7 @@ def search_kernels(real, linear):
             return
         before = merit[w]
         first = iteration[w] == 0
+        drowns = not first and step_length[w] * decrement[w] <= real(10.0) * noise[w] * floor
         what = decide(
             change[w],
             noise[w] * floor,
@@ -70,6 +79,14 @@ def search_kernels(real, linear):
         )
         if what == wp.static(STOP):
             return
+        if what == wp.static(DIRECT):
+            stalled[w] = stalled[w] + 1
+            if not drowns or square[w] < real(0.25) * best[w]:
+                best[w] = square[w]
+                stalled[w] = 0
+            if stalled[w] > wp.static(STALLED):
+                status[w] = wp.static(outcome.CONVERGED_TO_ROUNDING)
+                return
         active[0] = 1
         if what == wp.static(DIRECT):
             eta = loosest
