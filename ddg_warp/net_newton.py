@@ -58,9 +58,10 @@ class NetNewton:
         self.parts = [self._part(part, make, H) for part in net.sets]
         ends = _edges(host)
         self.ends = wp.array(np.ascontiguousarray(ends, np.int32), dtype=int, device=device)
-        self.turns = make((worlds, len(ends)), self.real)
+        turning = len(ends) + blocks - host.nodes
+        self.turns = make((worlds, turning), self.real)
         self._sum, self._sum_linear = (Sums(worlds, blocks, dtype, device) for dtype in (self.real, self.linear))
-        self._largest = Sums(worlds, len(ends), self.real, device, largest=True)
+        self._largest = Sums(worlds, turning, self.real, device, largest=True)
         lengths = np.linalg.norm(np.diff(host.rest[ends], axis=1)[:, 0], axis=1)
         self.arm, self.longest = float(lengths.mean()), float(lengths.max())
         self._evaluate = [elements.evaluate_kernel(part.term, self.real, self.linear) for part in net.sets]
@@ -227,8 +228,8 @@ class NetNewton:
         self._sum(self.dots, self.decrease)
         wp.launch(
             self._rotate,
-            self.worlds * len(self.ends),
-            [self.q, self.direction, self.ends, self.wanted, blocks],
+            self.turns.size,
+            [self.q, self.direction, self.ends, self.wanted, blocks, self.net.host.nodes],
             [self.turns],
             device=self.device,
         )

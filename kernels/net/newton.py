@@ -118,15 +118,20 @@ def search_kernels(real, linear):
         ends: wp.array2d(dtype=int),
         wanted: wp.array(dtype=int),
         blocks: int,
+        nodes: int,
         turn_out: wp.array2d(dtype=real),
     ):
-        """Squared turn of every edge by a whole step."""
+        """Squared turn of every edge, then of every angle and joint, by a whole step."""
         i = wp.tid()
-        count = ends.shape[0]
+        count = ends.shape[0] + blocks - nodes
         w = i / count
         if wanted[w] == 0:
             return
         k = i - w * count
+        if k >= ends.shape[0]:
+            angle = direction[k - ends.shape[0] + nodes + w * blocks]
+            turn_out[w, k] = real(wp.dot(angle, angle))
+            return
         a = ends[k, 0] + w * blocks
         b = ends[k, 1] + w * blocks
         e = q[b] - q[a]
@@ -146,7 +151,7 @@ def search_kernels(real, linear):
         todo: wp.array(dtype=int),
         work: wp.array(dtype=wp.int64),
     ):
-        """Length of the step: whole, or so that no edge turns by more than the cap."""
+        """Length of the step: whole, or so that nothing turns by more than the cap."""
         w = wp.tid()
         if wanted[w] == 0:
             return
@@ -194,6 +199,7 @@ def step_kernels(real, midpoint: bool):
         q0: wp.array(dtype=V),
         v0: wp.array(dtype=V),
         fixed: wp.array(dtype=wp.uint8),
+        mass: wp.array(dtype=V),
         dt: wp.array(dtype=real),
         damping: wp.array(dtype=real),
         outer: wp.array(dtype=real),
@@ -215,6 +221,7 @@ def step_kernels(real, midpoint: bool):
         moved_out: wp.array(dtype=int),
         active_out: wp.array(dtype=int),
     ):
+        """Starts a solve from the predictor; dofs without mass, whose rates mean nothing, start from where they are."""
         i = wp.tid()
         w = i / blocks
         k = i - w * blocks
@@ -243,7 +250,7 @@ def step_kernels(real, midpoint: bool):
         target_out[i] = here + v * (rate / coefficient)
         if cautious[w] == 0:
             for d in range(3):
-                if ((mask >> d) & 1) == 0:
+                if ((mask >> d) & 1) == 0 and mass[k][d] > real(0.0):
                     here[d] = here[d] + s * v[d]
         q_out[i] = here
         base_out[i] = here
