@@ -11,6 +11,7 @@ from scipy import sparse
 from ddg_warp import arrays
 from ddg_warp.integrate.prescribed import PrescribedMotion
 from ddg_warp.kernels import element
+from ddg_warp.turning import turned
 
 
 class ChainTangent:
@@ -161,12 +162,7 @@ class ChainTangent:
         return f"node {k - int(self.group.host.first[column % self.group.rods])} of rod {rod}"
 
     def retract(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """q moved along `step`, with edges turned instead of sheared.
-
-        A straight step stretches an edge that it turns, to second order, and in a nearly inextensible rod that limits steps to
-        small turns. Here an edge e becomes its rotation by t x de / |e|, lengthened by t . de; positions follow by summation
-        from the held nodes, and what misses between two held nodes is spread evenly over the edges between them.
-        """
+        """q moved along `step`, with edges turned instead of sheared; see `ddg_warp.turning`."""
         moved = q + step
         kind, group = self.group.kind, self.group
         x, dx = (self.blocks(v)[..., : kind.dim] for v in (q, step))
@@ -174,13 +170,8 @@ class ChainTangent:
         out = self.blocks(moved)
         for column in range(group.columns):
             n = group.host.count[column % group.rods]
-            bend = turn_excess(x[column, :n], dx[column, :n], kind.closed)
-            for d in range(kind.dim):
-                anchors = np.flatnonzero(held[column, :n, d])
-                if not anchors.size:
-                    anchors = np.array([0])
-                miss = np.interp(np.arange(n), anchors, bend[anchors, d])
-                out[column, :n, d] += bend[:, d] - miss
+            still = np.zeros((n, kind.dim))
+            out[column, :n, : kind.dim] += turned(x[column, :n], dx[column, :n], held[column, :n], still, kind.closed)
         return moved
 
     def _launch(self, state, index: int, which: int, out: wp.array) -> None:
@@ -242,23 +233,6 @@ def _couple_stiffness(e: np.ndarray, couple: np.ndarray) -> tuple[np.ndarray, np
         cross = np.cross(couple, np.eye(3)).T
         about = -(couple - e * (couple @ e) / square) / np.sqrt(square)
     return (2.0 * np.outer(cross @ e, e) / square - cross) / square, about
-
-
-def turn_excess(x: np.ndarray, dx: np.ndarray, closed: bool) -> np.ndarray:
-    """Positions of nodes by turned edges minus those by straight steps (n, dim), zero at the first node."""
-    e, de = (np.roll(v, -1, axis=0) - v if closed else np.diff(v, axis=0) for v in (x, dx))
-    length = np.linalg.norm(e, axis=1, keepdims=True)
-    t = e / length
-    along = np.sum(t * de, axis=1, keepdims=True)
-    across = de - t * along
-    angle = np.linalg.norm(across, axis=1, keepdims=True) / length
-    turned = (length + along) * (t * np.cos(angle) + across / length * np.sinc(angle / np.pi))
-    excess = np.cumsum(turned - e - de, axis=0)
-    if closed:
-        n = len(x)
-        excess -= excess[-1] * (np.arange(1, n + 1) / n)[:, None]
-        excess = excess[:-1]
-    return np.concatenate([np.zeros((1, x.shape[1])), excess])
 
 
 def _per_dof(group, nodes: np.ndarray, angles: np.ndarray | None) -> np.ndarray:

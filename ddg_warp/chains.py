@@ -115,7 +115,7 @@ def compile_chains(scene: Scene) -> tuple[list[ChainGroup], list[list[Held]]]:
     Raises:
         SceneError: the scene is no simulation; the message names the object and its index.
     """
-    if not scene.batches and not scene.shells:
+    if not scene.batches and not scene.shells and not scene.axisymmetric_shells:
         raise SceneError(
             "the scene has no rods and no shells; add some with scene.add_rods(points, section=..., material=...)"
         )
@@ -160,7 +160,7 @@ def net_rods(scene: Scene) -> np.ndarray:
 
 def scene_motions(scene: Scene) -> list:
     """The different motions of a scene's supports, in order of appearance."""
-    supports = [*scene.supports, *scene.shell_supports]
+    supports = [*scene.supports, *scene.shell_supports, *scene.ring_supports]
     return list({id(s.motion): s.motion for s in supports if s.motion is not None}.values())
 
 

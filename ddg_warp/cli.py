@@ -86,6 +86,9 @@ def parser(arguments: list[str]) -> Parser:
     export.add_argument("directory", type=Path, metavar="DIR", help="directory of a run")
     export.add_argument("--to", type=Path, metavar="FILE", help="a .usdc or .usda file (default: DIR/export.usdc)")
     export.add_argument("--tube", action="store_true", help="write tube meshes, not curves")
+    export.add_argument(
+        "--revolve", type=int, default=0, metavar="N", help="turn meridians into surfaces of revolution of N sides"
+    )
 
     info = commands.add_parser("info", help="show versions, devices and machine")
     info.set_defaults(command=show_info)
@@ -194,11 +197,11 @@ def draw(directory: Path, title: str, path=None, shapes: int = 6) -> None:
 
 def list_all(chosen: argparse.Namespace) -> int:
     """`list`: scenes and terms with what they are, in one line each."""
-    from ddg_warp.kernels.terms import REGISTRY
+    from ddg_warp.kernels.terms import ALL, AXISYMMETRIC
 
     listed = {
         "scenes": {name: one_liner(path) for name, path in scene_files().items()},
-        "terms": {name: term.text for name, term in REGISTRY.items()},
+        "terms": {name: term.text for name, term in (ALL | AXISYMMETRIC).items()},
     }
     for title, entries in listed.items():
         width = max(map(len, entries), default=0)
@@ -210,11 +213,11 @@ def list_all(chosen: argparse.Namespace) -> int:
 
 def check_terms(chosen: argparse.Namespace) -> int:
     """`check`: the derivative table of a term, or of all."""
-    from ddg_warp.kernels.terms import REGISTRY
+    from ddg_warp.kernels.terms import ALL
     from ddg_warp.summary import table
 
-    if chosen.term is not None and chosen.term not in REGISTRY:
-        raise InputError(f"there is no term '{chosen.term}'; there are {', '.join(REGISTRY)}")
+    if chosen.term is not None and chosen.term not in ALL:
+        raise InputError(f"there is no term '{chosen.term}'; there are {', '.join(ALL)}")
 
     require_device(chosen.device)
     from ddg_warp import derivatives
@@ -246,7 +249,9 @@ def export_run(chosen: argparse.Namespace) -> int:
     if target.suffix not in (".usda", ".usdc"):
         raise InputError(f"--to {target}: the file must end in .usdc or .usda")
     target.parent.mkdir(parents=True, exist_ok=True)
-    export_usd(source, target, tube=chosen.tube)
+    if chosen.revolve and chosen.revolve < 3:
+        raise InputError(f"--revolve {chosen.revolve}: a surface of revolution has 3 sides at least")
+    export_usd(source, target, tube=chosen.tube, revolve=chosen.revolve)
     print(f"wrote {target}")
     return DONE
 

@@ -566,29 +566,29 @@ def table(term: str | None = None, precision: str = "float64", device: str = "cp
     """Rows of the derivative table: term, chain, check, error, tolerance, passed.
 
     Args:
-        term: name of one term of the registry; all of them by default.
+        term: name of one term of chains or nets; all of them by default.
         precision: "float64" or "float32", that of the kernels under test.
         device: Warp device.
     """
+    from ddg_warp import net_derivatives
+
     rows = []
-    for one in [REGISTRY[term]] if term else REGISTRY.values():
+    for name in [term] if term else [*REGISTRY, *net_derivatives.TERMS]:
+        if name in net_derivatives.TERMS:
+            case = net_derivatives.NetCase(net_derivatives.TERMS[name], precision, device)
+            rows += [_row(name, "net", check, one(case), precision) for check, one in net_derivatives.CHECKS.items()]
+            continue
         for closed in (False, True):
-            case = Case(one, chain_of(one, closed), precision, device)
-            for name in checks_of(one, closed, precision):
-                check, double, single = CHECKS[name]
-                error, tolerance = check(case), double if precision == "float64" else single
-                chain = "closed" if closed else "open"
-                rows.append(
-                    {
-                        "term": one.name,
-                        "chain": chain,
-                        "check": name,
-                        "error": error,
-                        "tolerance": tolerance,
-                        "passed": bool(error <= tolerance),
-                    }
-                )
-    return rows
+            case = Case(REGISTRY[name], chain_of(REGISTRY[name], closed), precision, device)
+            for check in checks_of(case.term, closed, precision):
+                rows.append(_row(name, "closed" if closed else "open", check, CHECKS[check][0](case), precision))
+    return [row for row in rows if row["tolerance"] is not None]
+
+
+def _row(term: str, chain: str, check: str, error: float, precision: str) -> dict:
+    tolerance = CHECKS[check][1 if precision == "float64" else 2]
+    passed = tolerance is not None and bool(error <= tolerance)
+    return {"term": term, "chain": chain, "check": check, "error": error, "tolerance": tolerance, "passed": passed}
 
 
 def _gauss_newton(case: Case, exact: bool = False) -> np.ndarray:

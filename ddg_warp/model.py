@@ -5,7 +5,7 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays, precision
+from ddg_warp import arrays, axisymmetric, precision
 from ddg_warp.chains import ChainGroup, compile_chains, scene_motions
 from ddg_warp.errors import SceneError
 from ddg_warp.io import Curves, Surfaces
@@ -133,7 +133,7 @@ class Model:
         self.chains, self.held = compile_chains(scene)
         self.motions = scene_motions(scene)
         self.groups = [Group(chain, scene, worlds, self.wp_device, self.types.real) for chain in self.chains]
-        self.net = self._build_net() if scene.shells or scene.joints or scene.attachments else None
+        self.net = self._build_net() if needs_net(scene) else None
 
     def _build_net(self):
         from ddg_warp.net import compile_net
@@ -153,18 +153,21 @@ class Model:
 
     @cached_property
     def curves(self) -> Curves:
-        batches = self.scene.batches
-        if not batches:
+        """Rods, then meridians of axisymmetric shells, as thick as these."""
+        batches, shells = self.scene.batches, self.scene.axisymmetric_shells
+        if not batches and not shells:
             none = np.zeros(0, int)
             return Curves(none, none.astype(bool), np.zeros(0), np.zeros(0, object), none)
-        counts = np.concatenate([np.full(b.rods, b.nodes) for b in batches])
+        counts = np.concatenate([*(np.full(b.rods, b.nodes) for b in batches), *([len(s.points)] for s in shells)])
         radius = [np.broadcast_to(_node_radius(b), (b.rods, b.nodes)).ravel() for b in batches]
+        radius += [0.5 * axisymmetric.at_nodes(shell.thickness, len(shell.points)) for shell in shells]
+        single = np.ones(len(shells), int)
         return Curves(
             counts=counts,
-            closed=np.concatenate([np.full(b.rods, b.closed) for b in batches]),
+            closed=np.concatenate([*(np.full(b.rods, b.closed) for b in batches), single == 0]),
             radius=np.concatenate(radius),
-            names=np.concatenate([np.full(b.rods, b.name, dtype=object) for b in batches]),
-            batch=np.concatenate([np.full(b.rods, i) for i, b in enumerate(batches)]),
+            names=np.array([*(b.name for b in batches for _ in range(b.rods)), *(s.name for s in shells)], object),
+            batch=np.repeat(np.arange(len(batches) + len(shells)), [*(b.rods for b in batches), *single]),
         )
 
     @cached_property
@@ -188,9 +191,12 @@ class Model:
         if self.net is None:
             return np.zeros(0, int), np.zeros(0, int)
         start = np.concatenate([[0], np.cumsum(self.curves.counts)])
-        rows = [start[rod.rod] + np.arange(len(rod.nodes)) for rod in self.net.host.rods]
-        blocks = [rod.nodes for rod in self.net.host.rods] + [shell.nodes for shell in self.net.host.shells]
-        vertices = sum(len(shell.nodes) for shell in self.net.host.shells)
+        host = self.net.host
+        rows = [start[rod.rod] + np.arange(len(rod.nodes)) for rod in host.rods]
+        first = len(start) - 1 - len(host.meridians)
+        rows += [start[first + i] + np.arange(len(shell.nodes)) for i, shell in enumerate(host.meridians)]
+        blocks = [part.nodes for part in (*host.rods, *host.meridians, *host.shells)]
+        vertices = sum(len(shell.nodes) for shell in host.shells)
         return np.concatenate([*rows, start[-1] + np.arange(vertices)]).astype(int), np.concatenate(blocks)
 
     def places(self, group: Group) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -523,6 +529,11 @@ def _outer_forces(host: ChainGroup, gravity: np.ndarray) -> np.ndarray:
         size = np.abs(load.force).sum() + (abs(load.moment) + np.abs(load.couple).sum()) / host.length[load.columns]
         np.add.at(total, load.columns, size)
     return total
+
+
+def needs_net(scene) -> bool:
+    """Whether a scene has anything but rods on their own."""
+    return bool(scene.shells or scene.joints or scene.attachments or scene.axisymmetric_shells)
 
 
 def _node_radius(batch) -> np.ndarray:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ddg_warp import shell_geometry
+from ddg_warp import axisymmetric, shell_geometry
 from ddg_warp import shells as shell_terms
 from ddg_warp.chains import Piece, TimedLoad, component_bits, ghost_nodes, net_rods, pieces_of, scene_motions
 from ddg_warp.elements import ElementSet
@@ -102,12 +102,12 @@ class Net:
     Attributes:
         rest: blocks at rest (N, 3): positions, then zeros.
         nodes, angles, spins: how many blocks of each kind; rod_edges: how many of the angles belong to rods.
-        rods, shells: what the net was made from.
+        rods, shells, meridians: what the net was made from.
         sets: elements by term.
         ends: nodes of every rod edge (rod_edges, 2); frame: director and tangent of it (6, rod_edges).
         mass: of every dof (N, 3) [kg, kg m^2]; fixed: held dofs (N, 3).
-        load: dead forces (N, 3); timed, pressures: loads that change.
-        held: what each support of `scene.supports`, then of `scene.shell_supports`, holds here.
+        load: dead forces (N, 3); timed, pressures, bands: loads that change.
+        held: what each support of `scene.supports`, then of `scene.shell_supports` and `scene.ring_supports`, holds here.
         moving: (block, motion) of nodes with a motion, with rest positions; turning: (angle block, motion, sign) of rod edges.
     """
 
@@ -128,6 +128,8 @@ class Net:
     held: list[NetHeld] = field(default_factory=list)
     moving: list[tuple[np.ndarray, int]] = field(default_factory=list)
     turning: list[tuple[np.ndarray, int]] = field(default_factory=list)
+    meridians: list[axisymmetric.NetMeridian] = field(default_factory=list)
+    bands: list[axisymmetric.NetBand] = field(default_factory=list)
 
     @property
     def blocks(self) -> int:
@@ -147,7 +149,7 @@ def compile_net(scene) -> Net | None:
         SceneError: something cannot be joined, held or loaded as described; the message names it.
     """
     chosen = net_rods(scene)
-    if not chosen.any() and not scene.shells:
+    if not chosen.any() and not scene.shells and not scene.axisymmetric_shells:
         return None
     if scene.shells and scene.dimension == 2:
         raise SceneError("a scene with shells has dimension 3; leave dimension=2 to rods")
@@ -161,6 +163,8 @@ def compile_net(scene) -> Net | None:
                     builder.add_rod(piece, row, int(rod))
     for index, shell in enumerate(scene.shells):
         builder.add_shell(index, shell)
+    for shell in scene.axisymmetric_shells:
+        builder.add_meridian(shell)
     return builder.finish()
 
 
@@ -192,6 +196,7 @@ class _Builder:
         self.count = 0
         self.rods: dict[int, NetRod] = {}
         self.shells: list[tuple] = []
+        self.meridians: list[np.ndarray] = []
         self.rod_edges = 0
         self.frames: list[np.ndarray] = []
         self.ends: list[np.ndarray] = []
@@ -217,6 +222,11 @@ class _Builder:
         """Number a shell's vertices."""
         surface = Surface(shell.points, shell.triangles)
         self.shells.append((surface, self._number(shell.points)))
+
+    def add_meridian(self, shell) -> None:
+        """Number the nodes of a shell of revolution."""
+        radius, height = shell.points.T
+        self.meridians.append(self._number(np.column_stack([radius, 0.0 * radius, height])))
 
     def _number(self, points: np.ndarray) -> np.ndarray:
         self.points.append(points)
@@ -271,10 +281,16 @@ class _Builder:
             mass=np.zeros((blocks, 3)),
             fixed=np.zeros((blocks, 3), bool),
             load=np.zeros((blocks, 3)),
+            meridians=[
+                axisymmetric.meridian(shell, i, scene.ring_supports, merged[numbers])
+                for i, (shell, numbers) in enumerate(zip(scene.axisymmetric_shells, self.meridians, strict=True))
+            ],
         )
         net.fixed[nodes : nodes + angles, 1:] = True
         joints = _joint_places(scene, net, rigid)
-        net.sets = _gather_sets([*_rod_sets(net, joints), *_joint_sets(net, joints), *_shell_sets(net, scene)])
+        net.sets = _gather_sets(
+            [*_rod_sets(net, joints), *_joint_sets(net, joints), *_shell_sets(net, scene), *_meridian_sets(net)]
+        )
         _add_masses(scene, net)
         _hold(scene, net)
         _load(scene, net)
@@ -421,8 +437,9 @@ def _edge_value(value, piece: Piece, row: int, edge: int) -> float:
 def _shell_sets(net: Net, scene) -> list[NetSet]:
     sets, count = [], Counter()
     for index, (shell, description) in enumerate(zip(net.shells, scene.shells, strict=True)):
-        for elements in shell_terms.shell_elements(shell.surface, shell.plate, shell.kinds, description.bending):
-            sets.append(_bound(elements, shell, index))
+        models = description.bending, description.membrane
+        for elements in shell_terms.shell_elements(shell.surface, shell.plate, shell.kinds, *models):
+            sets.append(_bound(elements, shell.nodes, shell.edges, index))
             shell.first[elements.term.name] = count[elements.term.name]
             count[elements.term.name] += len(elements)
         if description.bending in shell_terms.TURNING:
@@ -430,9 +447,19 @@ def _shell_sets(net: Net, scene) -> list[NetSet]:
     return sets
 
 
-def _bound(elements: ElementSet, shell: NetShell, index: int) -> NetSet:
+def _meridian_sets(net: Net) -> list[NetSet]:
+    none = np.zeros(0, int)
+    sets = []
+    for index, shell in enumerate(net.meridians):
+        net.fixed[shell.nodes, 1] = True
+        net.fixed[shell.nodes[shell.points[:, 0] == 0.0], 0] = True
+        sets += [_bound(elements, shell.nodes, none, index) for elements in axisymmetric.element_sets(shell)]
+    return sets
+
+
+def _bound(elements: ElementSet, nodes: np.ndarray, edges: np.ndarray, index: int) -> NetSet:
     count = len(elements.nodes)
-    slots = np.concatenate([shell.nodes[elements.nodes], shell.edges[elements.angles]], axis=1).T
+    slots = np.concatenate([nodes[elements.nodes], edges[elements.angles]], axis=1).T
     parameters = [np.broadcast_to(np.asarray(p, float), (count,)) for p in elements.parameters]
     owner = np.array([np.full(count, index), np.arange(count)])
     return NetSet(elements.term, slots, np.zeros((0, count)), elements.data.T, parameters, owner)
@@ -457,6 +484,9 @@ def _add_masses(scene, net: Net) -> None:
     for shell, description in zip(net.shells, scene.shells, strict=True):
         weight = shell.plate.area * shell.plate.thickness * description.material.density / 3.0
         np.add.at(net.mass, shell.nodes[shell.surface.triangles], np.repeat(weight[:, None, None], 3, 1))
+    for shell in net.meridians:
+        axisymmetric.check_gravity(scene.gravity)
+        net.mass[shell.nodes] += shell.mass[:, None]
     members = {rod.rod: rod for rod in net.rods}
     for rods, node, mass in scene.masses:
         for rod in rods:
@@ -488,6 +518,9 @@ def _hold(scene, net: Net) -> None:
         _mark(net, np.array(nodes, int), bits, np.array(edges, int), support.motion, motions)
     for support in scene.shell_supports:
         nodes = net.shells[support.shell].nodes[support.vertices]
+        _mark(net, nodes, component_bits(support.components, 3), np.zeros(0, int), support.motion, motions)
+    for support in scene.ring_supports:
+        nodes = net.meridians[support.shell].nodes[support.nodes]
         _mark(net, nodes, component_bits(support.components, 3), np.zeros(0, int), support.motion, motions)
 
 
@@ -528,6 +561,16 @@ def _load(scene, net: Net) -> None:
             _put(net, triangles.ravel(), np.repeat(area, 3, axis=0), pressure.amplitude)
         else:
             net.pressures.append(NetPressure(triangles, pressure.pressure, pressure.amplitude))
+    for load in scene.ring_loads:
+        force = np.column_stack([load.force[:, 0], 0.0 * load.force[:, 0], load.force[:, 1]])
+        _put(net, net.meridians[load.shell].nodes[load.nodes], force, load.amplitude)
+    for pressure in scene.ring_pressures:
+        ends = net.meridians[pressure.shell].ends[pressure.edges]
+        band = axisymmetric.NetBand(ends, pressure.pressure, pressure.amplitude)
+        if pressure.dead:
+            _put(net, ends.ravel(), band.forces(net.rest[ends]).reshape(-1, 3), pressure.amplitude)
+        else:
+            net.bands.append(band)
 
 
 def _put(net: Net, blocks: np.ndarray, force: np.ndarray, amplitude) -> None:

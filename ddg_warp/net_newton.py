@@ -3,17 +3,26 @@
 import numpy as np
 import warp as wp
 
+from ddg_warp.errors import SceneError
 from ddg_warp.kernels.net import elements, krylov, newton, system
+from ddg_warp.linear.multilevel import Multilevel
 from ddg_warp.net_system import Assembly, NetSystem, Sums
 from ddg_warp.newton import NewtonOptions
 
+PRECONDITIONERS = ("block_jacobi", "multilevel")
 LOOSEST = 0.1  # largest reduction of the residual that a direction is solved to (Eisenstat and Walker's forcing term)
 
 
 class NetNewton:
-    """Newton's method on all worlds of a net. Owns what is needed while a solve runs; attributes as of `ChainNewton`."""
+    """Newton's method on all worlds of a net. Owns what is needed while a solve runs; attributes as of `ChainNewton`.
 
-    def __init__(self, model, options: NewtonOptions):
+    Args:
+        preconditioner: of conjugate gradients, "block_jacobi" or "multilevel" (see `kernels.net.levels`).
+    """
+
+    def __init__(self, model, options: NewtonOptions, preconditioner: str = "block_jacobi"):
+        if preconditioner not in PRECONDITIONERS:
+            raise SceneError(f"preconditioner {preconditioner!r}: of a net it is one of {', '.join(PRECONDITIONERS)}")
         net = model.net
         self.net, self.options, self.device = net, options, net.device
         self.real, self.linear = model.types.real, model.types.linear
@@ -69,6 +78,7 @@ class NetNewton:
         self._assembly = Assembly(net, self.system, self.parts, self.real, self.linear)
         self._judge, self._measure, self._rotate, self._take, self._move = newton.search_kernels(self.real, self.linear)
         self._invert, self._start, self._begin, *self._cycle = krylov.solver_kernels(self.linear)
+        self.levels = Multilevel(net, self.system, self.linear) if preconditioner == "multilevel" else None
         self._limit = max(200, 10 * int(np.sqrt(blocks)) * 10)
 
     def _part(self, part, make, H) -> dict:
@@ -87,7 +97,8 @@ class NetNewton:
         """Kernels to load before a capture."""
         own = [self._outer, self._collect, self._settle, self._judge, self._measure, self._rotate, self._take]
         cycle = [self._move, self._invert, self._start, self._begin, *self._cycle]
-        return [*own, *cycle, *self._evaluate, *self._assembly.kernels]
+        levels = self.levels.kernels if self.levels else []
+        return [*own, *cycle, *self._evaluate, *self._assembly.kernels, *levels]
 
     @property
     def tiled_kernels(self) -> list:
@@ -184,6 +195,9 @@ class NetNewton:
             [self.right, self.inverse, self.wanted, blocks],
             [self.rest, self.direction, self.p, self.krylov_dots],
         )
+        if self.levels:
+            self.levels.prepare(self.matrix, self.fixed, self.wanted)
+            self.levels.apply(self.rest, self.inverse, self.fixed, self.wanted, self.p, self.krylov_dots)
         self._sum_linear(self.krylov_dots, self.total)
         self.busy.zero_()
         wp.launch(
@@ -211,6 +225,8 @@ class NetNewton:
             [self.p, self.product, self.inverse, self.rho, self.curvature, self.iterations, self.wanted, blocks],
             [self.direction, self.rest, self.z, self.krylov_dots],
         )
+        if self.levels:
+            self.levels.apply(self.rest, self.inverse, self.fixed, self.wanted, self.z, self.krylov_dots)
         self._sum_linear(self.krylov_dots, self.total)
         self._launch(turn, [self.z, self.total, self.rho, self.wanted, blocks], [self.p])
         wp.launch(
@@ -252,8 +268,8 @@ class NetNewton:
 
 
 def _edges(host) -> np.ndarray:
-    """Edges whose turns limit a step (E, 2): of rods and of meshes."""
-    parts = [host.ends, *(shell.nodes[shell.surface.edges] for shell in host.shells)]
+    """Edges whose turns limit a step (E, 2): of rods, meshes and meridians."""
+    parts = [host.ends, *(shell.nodes[shell.surface.edges] for shell in host.shells), *(m.ends for m in host.meridians)]
     edges = np.concatenate(parts)
     if not len(edges):
         edges = np.concatenate([part.slots[:2].T for part in host.sets])

@@ -1,11 +1,13 @@
 """What a net contributes to a model's energy and tangent on the host; dofs are its blocks, three each, world by world."""
 
+from functools import cached_property
+
 import numpy as np
 import warp as wp
 from scipy import sparse
 
-from ddg_warp.chain_tangent import turn_excess
 from ddg_warp.kernels.net import elements
+from ddg_warp.turning import turned
 
 
 class NetTangent:
@@ -20,8 +22,9 @@ class NetTangent:
         self.free, self.angle, self.mass = (
             np.tile(values.ravel(), worlds) for values in (~host.fixed, kind, host.mass)
         )
-        self._prepare()
-        self._ends = np.concatenate([host.ends, *(s.nodes[s.surface.edges] for s in host.shells)])
+        self._ends = np.concatenate(
+            [host.ends, *(s.nodes[s.surface.edges] for s in host.shells), *(m.ends for m in host.meridians)]
+        )
         if not len(self._ends):
             self._ends = np.concatenate([s.slots[:2].T for s in host.sets])
         length = np.linalg.norm(np.diff(host.rest[self._ends], axis=1)[:, 0], axis=1)
@@ -31,19 +34,19 @@ class NetTangent:
             self._anchored[shell.nodes] = True
         self._order = _outwards(host.rods, self._anchored.any(1))
 
-    def _prepare(self) -> None:
-        """The pattern of the Hessian, and where in it the entries of every element go."""
-        entries, self._scatter = [], []
+    @cached_property
+    def _pattern(self) -> tuple[list, np.ndarray, np.ndarray]:
+        """Of each set B and where the entries of its elements go in the Hessian, column by column; rows and starts of columns."""
+        entries, local = [], []
         for part in self.net.sets:
             to_local, slot, component = _local(part.term.measure)
             dofs = 3 * _tiled(part.host.slots, self.host.blocks, self.net.worlds)[slot].T + component
-            entries.append((dofs[:, None, :] * self.size + dofs[:, :, None]).ravel())  # column by column
-            self._scatter.append(to_local)
+            entries.append((dofs[:, None, :] * self.size + dofs[:, :, None]).ravel())
+            local.append(to_local)
         pattern, places = np.unique(np.concatenate(entries), return_inverse=True)
         places = np.split(places, np.cumsum([len(e) for e in entries])[:-1])
-        self._scatter = list(zip(self._scatter, places, strict=True))
-        columns, self._indices = np.divmod(pattern, self.size)
-        self._pointers = np.searchsorted(columns, np.arange(self.size + 1))
+        columns, rows = np.divmod(pattern, self.size)
+        return list(zip(local, places, strict=True)), rows, np.searchsorted(columns, np.arange(self.size + 1))
 
     def energies(self, state):
         """(term's name, energies of its elements)."""
@@ -64,17 +67,40 @@ class NetTangent:
                 result[:, d] += np.bincount(index, forces[..., d].ravel(), len(result))
         return result.ravel()
 
-    def hessian(self, state) -> sparse.csc_matrix:
-        total = np.zeros(len(self._indices))
+    def hessian(self, state, stress: list | None = None) -> sparse.csc_matrix:
+        scatter, rows, starts = self._pattern
+        total = np.zeros(len(rows))
         for i, part in enumerate(self.net.sets):
             size, count = part.term.measure.size, part.elements * self.net.worlds
             out = wp.zeros((count, size, size), dtype=self.net.real, device=self.net.device)
-            self._launch(state, i, 2, out, (size,))
+            extra = np.zeros((len(part.term.measure.strains), count))
+            if stress is not None:
+                extra = stress[i] - self._stress(state, i)
+            self._launch(state, i, 2, out, (size,), wp.array(extra, dtype=self.net.real, device=self.net.device))
             values = out.numpy().astype(np.float64)
             values = 0.5 * (values + values.transpose(0, 2, 1))
-            to_local, places = self._scatter[i]
-            total += np.bincount(places, (to_local.T @ values @ to_local).ravel(), len(total))
-        return sparse.csc_matrix((total, self._indices, self._pointers), shape=(self.size, self.size))
+            to_local, places = scatter[i]
+            spread = np.matmul(to_local.T, (values.reshape(-1, size) @ to_local).reshape(count, size, -1))
+            total += np.bincount(places, spread.ravel(), len(total))
+        return sparse.csc_matrix((total, rows, starts), shape=(self.size, self.size))
+
+    def linear_stress(self, state, step: np.ndarray) -> list:
+        """Stresses (strains, elements) of every set that the strains e + J step have."""
+        result = []
+        change = wp.array(step.reshape(-1, 3), dtype=self.net.vector, device=self.net.device)
+        for i, part in enumerate(self.net.sets):
+            shape = (len(part.term.measure.strains), part.elements * self.net.worlds)
+            out = wp.zeros(shape, dtype=self.net.real, device=self.net.device)
+            self._launch(state, i, 4, out, (), change)
+            result.append(out.numpy().astype(np.float64))
+        return result
+
+    def _stress(self, state, index: int) -> np.ndarray:
+        part = self.net.sets[index]
+        shape = (len(part.term.measure.strains), part.elements * self.net.worlds)
+        strain, stress = (wp.zeros(shape, dtype=self.net.real, device=self.net.device) for _ in range(2))
+        self.net.strains(state.net, index, strain, stress)
+        return stress.numpy().astype(np.float64)
 
     def loads(self, factor: float, q: np.ndarray) -> np.ndarray:
         host, x = self.host, q.reshape(self.net.worlds, -1, 3)
@@ -83,6 +109,9 @@ class NetTangent:
         for load in host.timed:
             np.add.at(force, load.blocks, load.at(factor, factor) * load.force)
         result = np.tile(force, (self.net.worlds, 1, 1))
+        for band in host.bands:
+            for world in range(self.net.worlds):
+                np.add.at(result[world], band.ends, band.at(factor, factor) * band.forces(x[world][band.ends]))
         for pressure in host.pressures:
             scale = pressure.at(factor, factor) * pressure.pressure / 6.0
             for world in range(self.net.worlds):
@@ -92,10 +121,19 @@ class NetTangent:
         return result.ravel()
 
     def load_stiffness(self, factor: float, q: np.ndarray) -> sparse.csc_matrix | None:
-        if not self.host.pressures:
+        if not self.host.pressures and not self.host.bands:
             return None
         rows, cols, values = [], [], []
         x, N = q.reshape(self.net.worlds, -1, 3), self.host.blocks
+        axes = np.arange(3)
+        for band in self.host.bands:
+            for world in range(self.net.worlds):
+                block = -band.at(factor, factor) * band.derivative(x[world][band.ends])
+                place = 3 * (band.ends + world * N)[:, :, None] + axes
+                row, column = np.broadcast_arrays(place[:, :, :, None, None], place[:, None, None])
+                rows.append(row)
+                cols.append(column)
+                values.append(block)
         for pressure in self.host.pressures:
             scale = pressure.at(factor, factor) * pressure.pressure / 6.0
             for world in range(self.net.worlds):
@@ -110,8 +148,8 @@ class NetTangent:
                         rows.append((3 * (triangles[:, i] + world * N))[:, None, None] + r)
                         cols.append((3 * (triangles[:, j] + world * N))[:, None, None] + c)
                         values.append(block)
-        data = (np.concatenate(values).ravel(), (np.concatenate(rows).ravel(), np.concatenate(cols).ravel()))
-        return sparse.csc_matrix(data, shape=(self.size, self.size))
+        data, *places = (np.concatenate([part.ravel() for part in parts]) for parts in (values, rows, cols))
+        return sparse.csc_matrix((data, places), shape=(self.size, self.size))
 
     def dofs(self, state) -> np.ndarray:
         return state.net.q.numpy().astype(np.float64).ravel()
@@ -120,7 +158,7 @@ class NetTangent:
         state.net.q.assign(q.reshape(-1, 3))
 
     def retract(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """q moved along `step`, with edges of rods turned instead of sheared; see `ChainTangent.retract`.
+        """q moved along `step`, with edges of rods turned instead of sheared; see `ddg_warp.turning`.
 
         Rods are taken from held nodes outwards: where one meets others that are placed already, or a shell, it is anchored there.
         """
@@ -130,16 +168,10 @@ class NetTangent:
             excess = np.zeros((self.host.nodes, 3))
             placed = self._anchored.copy()
             for rod in self._order:
-                nodes = rod.all_nodes
-                bend = turn_excess(x[world][nodes], dx[world][nodes], rod.piece.kind.closed)
-                for d in range(3):
-                    anchors = np.flatnonzero(placed[nodes, d])
-                    if not anchors.size:
-                        anchors = np.array([0])
-                    miss = np.interp(np.arange(len(nodes)), anchors, bend[anchors, d] - excess[nodes[anchors], d])
-                    excess[nodes, d] = bend[:, d] - miss
-                placed[nodes] = True
-            out[world][: self.host.nodes] += np.where(self.host.fixed[: self.host.nodes], 0.0, excess)
+                at, closed = rod.all_nodes, rod.piece.kind.closed
+                excess[at] = turned(x[world][at], dx[world][at], placed[at], excess[at], closed)
+                placed[at] = True
+            out[world][: self.host.nodes] += excess
         return moved
 
     def move_supports(self, state, before: float, at: float) -> None:
@@ -187,14 +219,17 @@ class NetTangent:
             for what, blocks in (("vertex", shell.nodes), ("mesh edge", shell.edges)):
                 if block in blocks:
                     return f"{what} {int(np.flatnonzero(blocks == block)[0])} of shell {i}"
+        for i, meridian in enumerate(self.host.meridians):
+            if block in meridian.nodes:
+                return f"node {int(np.flatnonzero(meridian.nodes == block)[0])} of axisymmetric shell {i}"
         return f"joint {block - self.host.nodes - self.host.angles}"
 
-    def _launch(self, state, index: int, which: int, out: wp.array, columns: tuple) -> None:
+    def _launch(self, state, index: int, which: int, out: wp.array, columns: tuple, *more) -> None:
         part = self.net.sets[index]
         wp.launch(
             elements.term_kernels(part.term, self.net.real)[which],
             (part.elements * self.net.worlds, *columns),
-            self.net.inputs(part, state.net, index),
+            [*self.net.inputs(part, state.net, index), *more],
             [out],
             device=self.net.device,
         )
@@ -228,6 +263,9 @@ def _local(measure) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     for i in range(measure.spins):
         rows = at + measure.angles + 3 * i
         full[rows : rows + 3, measure.nodes + measure.angles + i] = np.eye(3)
+    at += measure.angles + 3 * measure.spins
+    for i in range(measure.points):
+        full[at + 3 * i : at + 3 * i + 3, i] = np.eye(3)
     slot, component = np.nonzero(full.any(0))
     return full[:, slot, component], slot, component
 

@@ -150,7 +150,7 @@ class Recorder:
         self._scene.write(time, np.reshape(points, (-1, 3)), velocities=velocities, triangle_scalars=fields)
 
 
-def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False) -> None:
+def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False, revolve: int = 0) -> None:
     """Writes the frames of a trajectory.h5 as USD.
 
     Args:
@@ -158,17 +158,24 @@ def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False
         path: The .usdc or .usda file to write.
         fps: Time codes per second; by default one time code a frame.
         tube: Whether to write tubes instead of curves.
+        revolve: Sides of the surfaces that the curves of the first world, meridians, sweep around z; 0 for none.
     """
     from ddg_warp.io.hdf5 import TrajectoryReader
+    from ddg_warp.io.revolve import Revolution
     from ddg_warp.io.usd import CurvesWriter
 
     with TrajectoryReader(trajectory) as reader:
         worlds = int(np.prod(reader.points.shape[1:-2]))
         spacing = np.median(np.diff(reader.time)) if len(reader) > 1 else 1.0 / DEFAULT_FPS
         shapes = Shapes.of(reader.curves, reader.surfaces, worlds)
+        count = int(np.sum(reader.curves.counts))
+        first = reader.points[0].reshape(-1, 3)[:count]
+        turned = Revolution(reader.curves, first, revolve) if revolve else None
+        shapes = turned.shapes if turned else shapes
         with CurvesWriter(path, shapes, fps=fps or round(1.0 / spacing, 6), tube=tube) as writer:
             for time, points in zip(reader.time, reader.points, strict=True):
-                writer.write(time, points.reshape(-1, 3))
+                points = points.reshape(-1, 3)
+                writer.write(time, turned.points(points[:count]) if turned else points)
 
 
 def _fps_of(model, every: int) -> float:

@@ -38,6 +38,7 @@ from ddg_warp.shell_geometry import (
 
 MODELS = ("midedge_dof", "midedge_boundary", "midedge", "hinge", "isometric")
 TURNING = ("midedge_dof", "midedge_boundary")  # models whose mesh edges have an angle
+MEMBRANES = ("flat", "curved")
 
 
 @dataclass(frozen=True)
@@ -137,6 +138,15 @@ def membrane(surface, plate: Plate) -> ElementSet:
     return ElementSet(_term("shell_stretch", plate), surface.triangles, none.astype(int), none, law)
 
 
+def curved_membrane(surface, plate: Plate, kinds: EdgeKinds) -> ElementSet:
+    """Membrane of all triangles with the lengths of arcs over their sides, by the mid-edge normals that turn."""
+    b11, b12, b22 = plate.bbar.T
+    squares = np.stack([b11**2, 0.5 * (b11**2 + b22**2 - (b11 + b22 - 2.0 * b12) ** 2), b22**2], -1)
+    law = _law(plate, plate.membrane_stiffness, 0.5 * (plate.abar + squares / 12.0))
+    bending = mid_edge_bending(surface, plate, kinds, True)
+    return ElementSet(_term("shell_stretch_curved", plate), bending.nodes, bending.angles, bending.data, law)
+
+
 def mid_edge_bending(surface, plate: Plate, kinds: EdgeKinds, angles: bool) -> ElementSet:
     """Bending of all triangles by mid-edge normals; with `angles` they turn, by angles numbered as the edges of the surface."""
     kind, vector = kinds.of_triangles(surface)
@@ -192,14 +202,22 @@ def isometric_bending(surface, plate: Plate, kinds: EdgeKinds) -> ElementSet:
     return ElementSet(_term("shell_isometric", plate), nodes, np.zeros((len(edges), 0), int), data, law)
 
 
-def shell_elements(surface, plate: Plate, kinds: EdgeKinds, bending: str = "midedge_dof") -> list[ElementSet]:
+def shell_elements(
+    surface, plate: Plate, kinds: EdgeKinds, bending: str = "midedge_dof", membrane_model: str = "flat"
+) -> list[ElementSet]:
     """Membrane and bending of a shell. Where there are angles, those of edges that are not `turning` must be fixed.
 
     Raises:
-        SceneError: no such bending model, or one that the rest shape or the supports do not fit.
+        SceneError: no such model of bending or membrane, or one that the rest shape, the supports or the other do not fit.
     """
     if bending not in MODELS:
         raise SceneError(f"bending = {bending!r}; it is one of {', '.join(MODELS)}")
+    if membrane_model not in MEMBRANES:
+        raise SceneError(f"membrane = {membrane_model!r}; it is one of {', '.join(MEMBRANES)}")
+    if membrane_model == "curved":
+        if bending != "midedge_dof":
+            raise SceneError(f"membrane 'curved' reads the mid-edge normals of bending 'midedge_dof', not {bending!r}")
+        return [curved_membrane(surface, plate, kinds), mid_edge_bending(surface, plate, kinds, True)]
     if bending == "hinge":
         return [membrane(surface, plate), *hinge_bending(surface, plate, kinds)]
     if bending == "isometric":

@@ -48,7 +48,7 @@ class State:
         return {str(i): group for i, group in enumerate(self.groups)} | ({"net": self.net} if self.net else {})
 
     def points(self) -> np.ndarray:
-        """Positions (P, 3) [m], or (worlds, P, 3): nodes in the order of `model.curves`, then vertices shell by shell."""
+        """Positions (P, 3) [m], or (worlds, P, 3): nodes in the order of `model.curves` (rods, meridians), then vertices."""
         return self.model.gather_nodes([arrays.download(group.x) for group in self.groups], self.net and self.net.q)
 
     def velocities(self) -> np.ndarray:

@@ -8,6 +8,7 @@ import numpy as np
 from ddg_warp import validate
 from ddg_warp.errors import SceneError
 from ddg_warp.material import Material
+from ddg_warp.meridians import Meridians
 from ddg_warp.motion import Motion
 
 
@@ -20,6 +21,7 @@ class Shell:
     thickness: np.ndarray
     material: Material
     bending: str
+    membrane: str
     rest: object
     name: str
 
@@ -79,7 +81,7 @@ class Attachment:
 
 
 @dataclass
-class Structures:
+class Structures(Meridians):
     """The part of a scene that is a net: whatever is not a rod of its own."""
 
     shells: list[Shell] = field(default_factory=list)
@@ -97,6 +99,7 @@ class Structures:
         thickness,
         material: Material,
         bending: str = "midedge_dof",
+        membrane: str = "flat",
         rest="shape",
         name: str = "shell",
     ) -> int:
@@ -108,6 +111,8 @@ class Structures:
             thickness: one number or one a triangle [m].
             material: `Material`; its density gives the mass, its viscosity the strain-rate damping.
             bending: "midedge_dof", "midedge_boundary", "midedge", "hinge" or "isometric"; see `ddg_warp.shells`.
+            membrane: "flat" (constant strain triangles) or "curved" (their sides have the length of the arcs over them, by the
+                normals of bending "midedge_dof"): thin shells that bend far do not lock. It costs about twice the time.
             rest: "shape" takes metric and curvature at rest from the points, "flat" the metric alone; or two arrays
                 (abar (T, 3) [m^2], bbar (T, 3) [m]), first and second fundamental form in the basis of the first two edges.
             name: shown in reports and output.
@@ -130,7 +135,9 @@ class Structures:
             raise SceneError(f"shell '{name}': triangles are {triangles.dtype}; give whole numbers")
         if not isinstance(material, Material):
             raise SceneError(f"shell '{name}': material is {material!r}; give material=Material(...)")
-        self.shells.append(Shell(points, triangles, np.asarray(thickness, float), material, bending, rest, name))
+        self.shells.append(
+            Shell(points, triangles, np.asarray(thickness, float), material, bending, membrane, rest, name)
+        )
         return len(self.shells) - 1
 
     def hold(self, shell: int, vertices, components: str = "xyz", motion: Motion | None = None) -> None:

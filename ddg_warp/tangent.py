@@ -53,9 +53,22 @@ class Tangent:
         """Derivative of the elastic energy (size,) [N, N m]; minus the internal force."""
         return np.concatenate([part.gradient(state) for part in self.parts])
 
-    def hessian(self, state) -> sparse.csc_matrix:
-        """Exact second derivative of the elastic energy (size, size)."""
+    @property
+    def shells_alone(self) -> bool:
+        """Whether the model consists of shells alone, so that `linear_stress` serves it."""
+        return not self.model.groups and not self.model.net.edges
+
+    def hessian(self, state, stress: list | None = None) -> sparse.csc_matrix:
+        """Exact second derivative of the elastic energy (size, size); of shells with other stresses where these are given."""
+        if stress is not None:
+            return self.parts[0].hessian(state, stress)
+        if len(self.parts) == 1:
+            return self.parts[0].hessian(state)
         return sparse.block_diag([part.hessian(state) for part in self.parts], format="csc")
+
+    def linear_stress(self, state, step: np.ndarray) -> list:
+        """Stresses (strains, elements) of every element set of the shells after a step, with strains e + J step."""
+        return self.parts[0].linear_stress(state, step)
 
     def loads(self, factor: float, q: np.ndarray) -> np.ndarray:
         """Outer forces (size,) [N, N m] on dofs q: gravity and dead loads times `factor`, timed loads at their amplitude."""

@@ -6,6 +6,8 @@ from ddg_warp.kernels.densities import Density
 from ddg_warp.kernels.densities.quadratic import kelvin_voigt, quadratic
 from ddg_warp.kernels.densities.st_venant_kirchhoff import st_venant_kirchhoff, st_venant_kirchhoff_damped
 from ddg_warp.kernels.measures import Measure
+from ddg_warp.kernels.measures.axisymmetric_curvature import axisymmetric_curvature, axisymmetric_rim
+from ddg_warp.kernels.measures.axisymmetric_metric import axisymmetric_metric
 from ddg_warp.kernels.measures.curvature_binormal import curvature_binormal
 from ddg_warp.kernels.measures.edge_stretch import edge_stretch, edge_stretch_2d
 from ddg_warp.kernels.measures.edge_tilt import edge_tilt
@@ -13,6 +15,7 @@ from ddg_warp.kernels.measures.hinge_angle import hinge_angle
 from ddg_warp.kernels.measures.isometric_bending import isometric_bending
 from ddg_warp.kernels.measures.joint_curvature_twist import joint_curvature_twist
 from ddg_warp.kernels.measures.midedge_curvature import midedge_curvature, midedge_curvature_dof
+from ddg_warp.kernels.measures.midedge_metric import midedge_metric
 from ddg_warp.kernels.measures.planar_curvature import planar_curvature
 from ddg_warp.kernels.measures.rod_curvature_twist import rod_curvature_twist
 from ddg_warp.kernels.measures.triangle_metric import triangle_metric
@@ -54,6 +57,8 @@ SHELLS = {
     for term in (
         Term("shell_stretch", triangle_metric, st_venant_kirchhoff, "membrane of a triangle, E h"),
         Term("shell_stretch_damped", triangle_metric, st_venant_kirchhoff_damped, "membrane with strain-rate damping"),
+        Term("shell_stretch_curved", midedge_metric, st_venant_kirchhoff, "membrane of a curved triangle, E h"),
+        Term("shell_stretch_curved_damped", midedge_metric, st_venant_kirchhoff_damped, "the same, damped"),
         Term("shell_bend", midedge_curvature, st_venant_kirchhoff, "bending by mid-edge normals, E h^3"),
         Term("shell_bend_damped", midedge_curvature, st_venant_kirchhoff_damped, "the same with strain-rate damping"),
         Term(
@@ -69,4 +74,20 @@ SHELLS = {
     )
 }
 
+AXISYMMETRIC = {
+    term.name: term
+    for term in (
+        Term(
+            "axisymmetric_stretch", axisymmetric_metric, st_venant_kirchhoff, "membrane of a shell of revolution, E h"
+        ),
+        Term("axisymmetric_stretch_damped", axisymmetric_metric, st_venant_kirchhoff_damped, "the same, damped"),
+        Term("axisymmetric_bend", axisymmetric_curvature, st_venant_kirchhoff, "its bending, E h^3"),
+        Term("axisymmetric_bend_damped", axisymmetric_curvature, st_venant_kirchhoff_damped, "the same, damped"),
+        Term("axisymmetric_rim", axisymmetric_rim, st_venant_kirchhoff, "its bending at poles and rims, E h^3"),
+        Term("axisymmetric_rim_damped", axisymmetric_rim, st_venant_kirchhoff_damped, "the same, damped"),
+    )
+}
+
 JOINT = Term("rigid_joint", joint_curvature_twist, quadratic, "bending and twist of half cells at rigid joints")
+
+ALL = {**REGISTRY, **SHELLS, JOINT.name: JOINT}

@@ -152,6 +152,19 @@ def test_static_scene_records_every_load_step(tmp_path, monkeypatch, device):
     assert main(["run", "sag.py", "--dt", "0.1"]) == 2
 
 
+def test_path_of_equilibria_is_recorded_and_drawn(tmp_path, device):
+    assert main(["run", "right_angle_frame", "--n", "6", "--device", device, "--out", str(tmp_path)]) == 0
+    content = summary(tmp_path)
+    assert content["outcomes"]["bifurcation"] == 1
+    assert {path.name for path in tmp_path.iterdir()} >= {"trajectory.h5", "picture.png", "path.png"}
+    with TrajectoryReader(tmp_path / "trajectory.h5") as reader:
+        load, time = reader.series["load"][:], reader.time[:]
+        assert set(reader.series) == {"load", "deflection"}
+    assert len(load) == sum(content["outcomes"].values())
+    assert (np.diff(time) > 0.0).all()  # arc length
+    assert load[-1] == pytest.approx(1.3 * 1.086757492, rel=1e-9)
+
+
 MISTAKES = {
     "parameter": (["run", "fall.py", "--m", "3"], "unrecognized arguments: --m 3"),
     "abbreviation": (["run", "fall.py", "--dura", "3"], "unrecognized arguments"),

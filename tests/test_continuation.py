@@ -268,7 +268,7 @@ def test_mistakes(device):
         continuation.control("rise", [0.1])
     with pytest.raises(ddg.SceneError, match="'rise': it is not watched"):
         continuation.trace(stop=Stop(displacement=("rise", 0.0, 1.0)))
-    with pytest.raises(ValueError, match="regular.*bifurcation"):
+    with pytest.raises(ValueError, match=r"regular.*bifurcation"):
         continuation.switch(continuation.trace(stop=Stop(steps=1)).points[0])
     for row, axis, message in ((3, "z", "there are 3 points"), (1, "w", "axes x, y and z"), (1, "y", "planar")):
         with pytest.raises(ddg.SceneError, match=message):

@@ -186,7 +186,7 @@ class Integrator:
 
 def _newton(model, group, integrator: Integrator, precision) -> ChainNewton:
     """The solver of a group that the integrator's `linear` asks for."""
-    linear = integrator.linear if integrator.linear != "auto" else automatic(group)
+    linear = automatic(group) if integrator.linear in ("auto", "multilevel") else integrator.linear
     given = (model, group, integrator.options)
     last = (precision, integrator.scheme == "implicit_midpoint")
     if integrator.solver == "projective":

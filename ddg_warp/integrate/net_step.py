@@ -34,7 +34,10 @@ class NetStep:
             )
         if host.turning:
             raise SceneError("ends of rods in a net that turn are for statics; in dynamics move their nodes alone")
-        self.newton = NetNewton(model, integrator.options)
+        if host.bands:
+            raise SceneError("pressure that follows axisymmetric shells is for statics; in dynamics give dead=True")
+        multilevel = integrator.linear == "multilevel"
+        self.newton = NetNewton(model, integrator.options, "multilevel" if multilevel else "block_jacobi")
         self.midpoint = integrator.scheme == "implicit_midpoint"
         self._begin, self._hold, self._finish = newton.step_kernels(real, self.midpoint)
         self._start, self._advance = step.start_kernel(real), step.advance_kernel(real)

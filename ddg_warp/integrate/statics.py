@@ -2,7 +2,8 @@
 
 Every load step holds supports where their motion has them at the load parameter t and scales loads by t. Newton uses the exact
 tangent where it is positive definite; where it is not, mode "minimise" shifts it until it is (so that only minima attract), and
-mode "follow" takes it as it is, with the residual as merit, to follow equilibria that are not stable.
+mode "follow" takes it as it is, with the residual as merit, to follow equilibria that are not stable. Shells try Newton with stresses
+of its own first (`ddg_warp.integrate.mixed`), which takes fewer iterations, and fall back on this search.
 """
 
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ import numpy as np
 from scipy import sparse
 
 from ddg_warp.errors import SceneError, SolverError, check_options
+from ddg_warp.integrate import mixed
 from ddg_warp.linear.direct import Factorisation, SingularError
 from ddg_warp.state import State
 from ddg_warp.tangent import Tangent
@@ -66,6 +68,7 @@ class Equilibrium:
 
     Attributes:
         tangent: energy, gradient and Hessian of the model.
+        mixed: whether Newton with stresses of its own is tried first; where it can be, by default.
         iterations: Newton iterations so far.
         outcome: of the last solve, `converged` or `converged_to_rounding`.
     """
@@ -74,6 +77,7 @@ class Equilibrium:
         self.model, self.options = model, options or StaticsOptions()
         self.tangent = Tangent(model)
         require_supports(model)
+        self.mixed = self.tangent.shells_alone
         self.iterations = 0
         self.outcome = ""
 
@@ -105,6 +109,8 @@ class Equilibrium:
     def solve(self, state: State, before: float, at: float) -> State:
         """The equilibrium at load parameter `at`, from a state that belongs to `before`."""
         tangent, options = self.tangent, self.options
+        if self.mixed and (found := mixed.newton(self, state, before, at)) is not None:
+            return found
         state = self._with_supports_moved(state, before, at)
         free = tangent.free
         energies, q = tangent.element_energies(state), tangent.dofs(state)
@@ -178,13 +184,9 @@ class Equilibrium:
         tangent = self.tangent
         alone = state.copy()
         step = tangent.support_step(state, before, at)
-        if not step.any():
-            tangent.move_supports(alone, before, at)
-            return alone
         tangent.move_supports(alone, before, at)
-        q = tangent.dofs(state)
-        hessian = tangent.hessian(state)
-        if not np.isfinite(hessian.data).all():
+        q, hessian = tangent.dofs(state), tangent.hessian(state)
+        if not step.any() or not np.isfinite(hessian.data).all():
             return alone
         direction, _ = self._direction(hessian, tangent.loads(at, q) - tangent.gradient(state) - hessian @ step)
         follow = tangent.advance(state, step + direction, at)
@@ -260,7 +262,15 @@ def require_supports(model) -> None:
                     "add scene.clamp(...) or scene.fix(...)"
                 )
     if model.net is not None:
-        loose = np.flatnonzero(~model.net.host.fixed[: model.net.host.nodes].any(0))
+        host = model.net.host
+        for i, shell in enumerate(host.meridians):
+            if not host.fixed[shell.nodes, 2].any():
+                raise SceneError(
+                    f"axisymmetric shell {i} is not held along z: a static solve needs scene.hold_ring(...) or "
+                    "scene.clamp_ring(...)"
+                )
+        spatial = np.setdiff1d(np.arange(host.nodes), [node for shell in host.meridians for node in shell.nodes])
+        loose = np.flatnonzero(~host.fixed[spatial].any(0)) if spatial.size else spatial
         if loose.size:
             raise SceneError(
                 f"no node of the shells and joined rods is held along {'xyz'[loose[0]]}: a static solve needs supports; "

@@ -1,7 +1,8 @@
 """Measures: the geometry. A measure maps the local dofs of an element to a few strains.
 
-The local dofs are q = [edge vectors of the stencil..., angles of its edges..., rotation vectors of joints...], so that
-translation invariance holds by construction and forces on nodes are differences of edge forces. Where a measure needs more it
+The local dofs are q = [edge vectors of the stencil..., angles of its edges..., rotation vectors of joints..., positions...], so
+that translation invariance holds by construction and forces on nodes are differences of edge forces; positions are there only
+where the place in space is a strain, as the radius of a surface of revolution is. Where a measure needs more it
 reads s, which stays constant during a step: lagged frames of a rod, or data of the element such as the normal of a clamp. w is
 the rest measure of the element (rest length, Voronoi length, area): strains are pointwise quantities, so a density and its
 parameters do not depend on the mesh.
@@ -26,6 +27,7 @@ class Measure:
         data_size: reals of constant data of the element; 0 for a measure without.
         tensions: scalars of the geometric stiffness; 0 where it is left to the exact Hessian.
         spins: rotation vectors of rigid joints among the dofs, after the angles.
+        points: how many nodes, the first of the stencil, are read as positions, too; after the rotation vectors.
         frames: how many of the angles belong to edges with a reference frame, which the lagged data begin with.
         strains: names and units of the strains.
         functions: real -> (strains, jacobian, tension, curvature). `strains(q, s, w) -> E`; `jacobian(q, s, w) -> (E, J)`;
@@ -46,12 +48,13 @@ class Measure:
     data_size: int = 0
     tensions: int = 0
     spins: int = 0
+    points: int = 0
     frames: int = 0
 
     @property
     def size(self) -> int:
         """Number of local dofs."""
-        return self.dim * len(self.edges) + self.angles + 3 * self.spins
+        return self.dim * (len(self.edges) + self.points) + self.angles + 3 * self.spins
 
     @property
     def nodes(self) -> int:

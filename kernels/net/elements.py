@@ -29,7 +29,9 @@ def functions(term: Term, real):
     static_size, size = len(term.parameter_names) - 1, density.parameter_size(n)
     nodes, angles, spins, edges = measure.nodes, measure.angles, measure.spins, measure.edges
     frames, own, data_size = measure.frames, measure.lag_size - FRAME * measure.frames, measure.data_size
+    points = measure.points
     angle_row, spin_row = 3 * len(edges), 3 * len(edges) + angles
+    point_row = spin_row + 3 * spins
     first = tuple(edge[0] for edge in edges)
     second = tuple(edge[1] for edge in edges)
     edge_count = len(edges)
@@ -66,6 +68,10 @@ def functions(term: Term, real):
             spin = q[slots[wp.static(nodes + angles + i), e] + shift]
             for d in range(3):
                 local[wp.static(spin_row + 3 * i) + d] = spin[d]
+        for i in range(wp.static(points)):
+            position = q[slots[i, e] + shift]
+            for d in range(3):
+                local[wp.static(point_row + 3 * i) + d] = position[d]
         s = S()
         for i in range(wp.static(frames)):
             # frames of a world lie behind each other, too
@@ -102,6 +108,13 @@ def functions(term: Term, real):
             if slot == wp.static(nodes + angles + i):
                 for d in range(3):
                     v[d] = f[wp.static(spin_row + 3 * i) + d]
+        for i in range(wp.static(points)):
+            if slot == i:
+                v += V(
+                    f[wp.static(point_row + 3 * i)],
+                    f[wp.static(point_row + 3 * i + 1)],
+                    f[wp.static(point_row + 3 * i + 2)],
+                )
         return v
 
     return gather, spread
@@ -109,10 +122,10 @@ def functions(term: Term, real):
 
 @cache
 def term_kernels(term: Term, real):
-    """Kernels of one term: energy, gradient (slots, elements), Hessian (size * size, elements), strains and stresses."""
+    """Kernels of one term: energy, gradient (slots, elements), Hessian (elements, size, size), strains, linear stresses."""
     measure, density = term.measure, term.density
     V = wp.types.vector(3, real)
-    Q, S, _, _ = measure.types(real)
+    Q, S, E, _ = measure.types(real)
     n = len(measure.strains)
     P = wp.types.vector(density.parameter_size(n), real)
     strains_of, jacobian_of, *_ = measure.functions(real)
@@ -126,8 +139,9 @@ def term_kernels(term: Term, real):
         return (slope_of(e, p) * w) * jacobian
 
     @wp.func
-    def along(q: Q, s: S, w: real, p: P, v: Q):
-        return wp.dot(gradient_at(q, s, w, p), v)
+    def along(q: Q, s: S, w: real, p: P, v: Q, extra: E):
+        e, jacobian = jacobian_of(q, s, w)
+        return wp.dot(((slope_of(e, p) + extra) * w) * jacobian, v)
 
     @wp.kernel(module="unique", enable_backward=True)
     def energy(
@@ -185,14 +199,21 @@ def term_kernels(term: Term, real):
         blocks: int,
         angle_start: int,
         elements: int,
+        extra: wp.array2d(dtype=real),
         hessian_out: wp.array3d(dtype=real),
     ):
-        """Exact Hessian in the local dofs, a column a thread: the reverse of the gradient, seeded with unit vectors."""
+        """Exact Hessian in the local dofs, a column a thread: the reverse of the gradient, seeded with unit vectors.
+
+        `extra` (strains, elements) is added to the stresses that the second derivatives of the strains are weighted with.
+        """
         e, column = wp.tid()
         x, s, w, p = gather(q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, e)
         v = Q()
         v[column] = real(1.0)
-        dq, _ds, _dw, _dp, _dv = wp.grad(along)(x, s, w, p, v)
+        more = E()
+        for i in range(wp.static(n)):
+            more[i] = extra[i, e]
+        dq, _ds, _dw, _dp, _dv, _de = wp.grad(along)(x, s, w, p, v, more)
         for i in range(wp.static(size)):
             hessian_out[e, i, column] = dq[i]
 
@@ -224,7 +245,35 @@ def term_kernels(term: Term, real):
             for i in range(wp.static(n)):
                 stress_out[i, e] = stress[i]
 
-    return energy, gradient, hessian, strains
+    @wp.kernel(module="unique", enable_backward=False)
+    def linear_stress(
+        q: wp.array(dtype=V),
+        frame: wp.array2d(dtype=real),
+        lag: wp.array2d(dtype=real),
+        last: wp.array2d(dtype=real),
+        rate: wp.array(dtype=real),
+        buffer: wp.array(dtype=real),
+        table: wp.array2d(dtype=int),
+        slots: wp.array2d(dtype=int),
+        data: wp.array2d(dtype=real),
+        blocks: int,
+        angle_start: int,
+        elements: int,
+        step: wp.array(dtype=V),
+        stress_out: wp.array2d(dtype=real),
+    ):
+        """Stresses of the strains that a step gives to first order, e + J step."""
+        tid = wp.tid()
+        x, s, w, p = gather(q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid)
+        d, _s, _w, _p = gather(
+            step, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid
+        )
+        e, jacobian = jacobian_of(x, s, w)
+        stress = slope_of(e + jacobian * d, p)
+        for i in range(wp.static(n)):
+            stress_out[i, tid] = stress[i]
+
+    return energy, gradient, hessian, strains, linear_stress
 
 
 @cache

@@ -187,7 +187,8 @@ def sum_function(term: Term, linear):
     """
     measure = term.measure
     M, Contributions = wp.types.matrix((3, 3), linear), contributions(linear)
-    n, slots, tensions, edges = len(measure.strains), measure.slots, measure.tensions, measure.edges
+    n, slots, tensions = len(measure.strains), measure.slots, measure.tensions
+    edges = measure.edges[:2]  # geometric stiffness is between the first two
 
     @wp.func
     def weight(edge_first: int, edge_second: int, slot: int):

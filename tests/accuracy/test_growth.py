@@ -1,9 +1,13 @@
 """Growth through rest forms: bilayers against Timoshenko and Ashwell, and the ripples of a grown edge."""
 
+import numpy as np
 import pytest
 from convergence import equilibrium, order
+from scipy.fft import dct
 
-from ddg_warp.scenes import bilayer_strip
+from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
+from ddg_warp.scenes import bilayer_strip, leaf
+from ddg_warp.stability import spectrum
 
 KAPPA = 1.5 * 4e-3 / bilayer_strip.THICKNESS  # of equal layers (Timoshenko 1925), mismatch 4e-3
 
@@ -41,3 +45,40 @@ def test_wide_strip_rolls_up_as_a_plate(device):
     reference = bilayer_strip.exact(4e-3, 0.4)
     assert reference > 1.2 * KAPPA
     assert curvature(device, 0.4, 16, "right") == pytest.approx(reference, rel=0.01)
+
+
+def energies(device, thickness: float) -> tuple[float, float, float, float]:
+    """Energy of the rippled leaf and of the flat one [J], strain of its edge and that at rest."""
+    model, state = equilibrium(leaf.build(0.2, thickness, 4, 24), device)
+    return *(sum(model.energies(s).values()) for s in (state, leaf.flat_state(model))), *leaf.strains(state)
+
+
+def test_leaf_ripples_and_follows_its_metric(device):
+    """Flat, the energy is that of stretching, in proportion to h; rippled, it is far below and falls faster."""
+    (thick, flat, *_), (thin, flat_thin, strain, rest) = energies(device, 0.01), energies(device, 0.005)
+    assert flat / flat_thin == pytest.approx(2.0, rel=1e-9)
+    assert thin < 0.05 * flat_thin
+    assert thick / thin > 3.0
+    assert strain == pytest.approx(rest, rel=0.05)
+
+
+def half_waves(device, thickness: float) -> int:
+    """Half waves along the edge of the fastest way out of the flat state of a little growth."""
+    model = leaf.build(0.02, thickness, 4, 48).build(device, "float64")
+    state = equilibrium_of(model)
+    lowest = spectrum(model, state, 1, "unit")
+    assert lowest.negative > 0
+    edge = model.scene.shells[0].points[:, 1] > leaf.WIDTH - 1e-9
+    ripple = lowest.modes[:, 0].reshape(-1, 3)[: len(edge)][edge, 2]
+    return int(np.argmax(np.abs(dct(ripple, type=1))))
+
+
+def equilibrium_of(model):
+    """The flat equilibrium, which is not stable."""
+    return Equilibrium(model, StaticsOptions(mode="follow")).load(leaf.flat_state(model), 1)
+
+
+def test_ripples_get_shorter_as_the_leaf_gets_thinner(device):
+    """Against D k^4 stand stresses of growth times E h: the fastest k^2 ~ E h / D, so that the wave length goes with h."""
+    counts = [half_waves(device, thickness) for thickness in (0.02, 0.01)]
+    assert counts[1] / counts[0] == pytest.approx(2.0, abs=0.3)

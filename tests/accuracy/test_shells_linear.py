@@ -18,7 +18,10 @@ def stiffness(device, *options) -> float:
 
 
 # k R / (E h^2) = 4 / sqrt(3 (1 - nu^2)) = 2.420910131 at nu = 0.3 (Reissner 1946).
-@pytest.mark.parametrize("slenderness", [100.0, 1000.0, 10000.0])
+@pytest.mark.parametrize(
+    "slenderness",
+    [pytest.param(100.0, marks=pytest.mark.slow), 1000.0, pytest.param(10000.0, marks=pytest.mark.slow)],
+)
 def test_sphere_indentation(device, slenderness):
     assert sphere_indentation.exact(0.01) / 1e5 == pytest.approx(2.420910131, rel=1e-9)
     errors = [stiffness(device, slenderness, rings, 2.0) for rings in (16, 32)]
@@ -26,6 +29,7 @@ def test_sphere_indentation(device, slenderness):
     assert abs(errors[1]) < 0.02
 
 
+@pytest.mark.slow
 def test_uniform_meshes_are_too_soft_under_a_point_force(device):
     """Edges of 0.3 sqrt(R h) all over, which is what a mesh for this shell is asked to have, and not three percent but fifteen: moments
     grow like a logarithm towards the force, and Morley's plate takes them as constant a triangle."""
@@ -124,3 +128,37 @@ def _relax_normals(model, state) -> None:
         factor = Factorisation(tangent.hessian(state)[chosen][:, chosen].tocsc())
         q[chosen] -= factor.solve(tangent.gradient(state)[chosen])
         tangent.assign(state, q)
+
+
+@pytest.mark.parametrize("angle", [0.0, 30.0, 45.0])
+@pytest.mark.parametrize("mesh", ["equilateral", "right", "crossed"])
+def test_bent_cylinder(device, mesh, angle):
+    """Turning normals have the energy D / (2 R^2) of every cylinder on every mesh, averaged ones where the mesh is symmetric to its
+    points, both with order 2; hinges on equilateral triangles, here 14 rows of them over a height of 13.9."""
+    cells = (12, 24, 48)
+    errors = [bent(device, n, "midedge_dof", mesh, angle) - 1.0 for n in cells]
+    assert abs(errors[-1]) < 3e-5
+    assert order(cells[1:], errors[1:]) == pytest.approx(2.0, abs=0.1 if mesh != "equilateral" else 0.3)
+    if mesh != "crossed":
+        assert bent(device, 24, "midedge", mesh, angle) == pytest.approx(
+            bent(device, 24, "midedge_dof", mesh, angle), abs=1e-5
+        )
+    if mesh == "equilateral":
+        assert bent(device, 24, "hinge", mesh, angle) == pytest.approx(1.0, abs=0.02)
+
+
+# Slope jumps of a quadratic patch, by direction of bending [degrees].
+@pytest.mark.parametrize(
+    ("bending", "mesh", "angle", "limit"),
+    [
+        ("hinge", "right", 0.0, 1.0),
+        ("hinge", "right", 45.0, 3.0),
+        ("hinge", "crossed", 0.0, 1.5),
+        ("hinge", "crossed", 45.0, 1.0),
+        ("midedge", "crossed", 0.0, 1.65),
+        ("midedge", "crossed", 45.0, 1.0),
+    ],
+)
+def test_bent_cylinder_of_models_that_depend_on_the_mesh(device, bending, mesh, angle, limit):
+    for cells in (12, 24):
+        assert bent(device, cells, bending, mesh, angle) == pytest.approx(limit, rel=1e-3)

@@ -9,7 +9,9 @@ from scipy import sparse
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import Delaunay
 
-from ddg_warp.kernels.terms import SHELLS
+from ddg_warp.kernels.terms import AXISYMMETRIC, SHELLS
+
+TERMS = SHELLS | AXISYMMETRIC
 
 
 @dataclass
@@ -32,11 +34,11 @@ class Elements:
 
     def hessian(self, precision="float64", device="cpu") -> np.ndarray:
         """Reverse mode of the gradient (N, size, size)."""
-        return self._reverse(1, (SHELLS[self.name].measure.size,) * 2, precision, device)
+        return self._reverse(1, (TERMS[self.name].measure.size,) * 2, precision, device)
 
     def reverse(self, precision="float64", device="cpu") -> np.ndarray:
         """Reverse mode of the energy (N, size)."""
-        return self._reverse(2, (SHELLS[self.name].measure.size,), precision, device)
+        return self._reverse(2, (TERMS[self.name].measure.size,), precision, device)
 
     def _reverse(self, which, shape, precision, device):
         real = wp.float32 if precision == "float32" else wp.float64
@@ -56,13 +58,13 @@ class Elements:
 
 
 def _types(name, real):
-    term = SHELLS[name]
+    term = TERMS[name]
     Q, S, _, _ = term.measure.types(real)
     return Q, S, wp.types.vector(term.density.parameter_size(len(term.measure.strains)), real)
 
 
 def _shapes(name):
-    n, size = len(SHELLS[name].measure.strains), SHELLS[name].measure.size
+    n, size = len(TERMS[name].measure.strains), TERMS[name].measure.size
     vectors = {"energy": (1,), "gradient": (size,), "strain": (n,), "stress": (n,)}
     return {**vectors, "jacobian": (n, size), "root": (n, n), "tension": (3,)}
 
@@ -70,7 +72,7 @@ def _shapes(name):
 @cache
 def _kernels(name, real):
     """Kernels of a term on arrays of local dofs: everything of first order, and the columns of the Hessian."""
-    term = SHELLS[name]
+    term = TERMS[name]
     n, size, coupled, tensions = (
         len(term.measure.strains),
         term.measure.size,

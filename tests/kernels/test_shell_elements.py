@@ -56,13 +56,16 @@ def test_second_form_is_the_measure(device):
 
 
 @pytest.mark.parametrize("viscosity", [None, 0.1])
-@pytest.mark.parametrize("bending", ["midedge", "midedge_dof", "hinge"])
-def test_no_force_at_rest(device, bending, viscosity):
+@pytest.mark.parametrize(
+    ("bending", "membrane"),
+    [("midedge", "flat"), ("midedge_dof", "flat"), ("midedge_dof", "curved"), ("hinge", "flat")],
+)
+def test_no_force_at_rest(device, bending, membrane, viscosity):
     """With rest="shape", supports included, the shape itself bears no force; elsewhere it does."""
     surface, place, kinds = patch()
     plate = shells.plate(surface, place, 0.3, UNIT_D, NU, kinds, "shape", viscosity)
     moved = place + 0.1 * np.random.default_rng(6).normal(size=place.shape)
-    for elements in shells.shell_elements(surface, plate, kinds, bending):
+    for elements in shells.shell_elements(surface, plate, kinds, bending, membrane):
         sizes = [np.abs(at_rest(elements, x).evaluate(device=device)["gradient"]).max() for x in (place, moved)]
         assert sizes[0] < 1e-14 and sizes[1] > 1e-3, elements.term.name
 
@@ -181,10 +184,12 @@ def test_bad_supports_and_models_are_refused():
             edge_kinds(surface, clamped, symmetry)
     curved = shells.plate(surface, place, 0.1, 1.0, NU, kinds, "shape")
     explicit = shells.plate(surface, place, 0.1, 1.0, NU, kinds, (curved.abar, curved.bbar))
-    for plate, bending, message in (
-        (curved, "isometric", "needs a flat rest shape"),
-        (explicit, "hinge", "no rest angle"),
-        (curved, "koiter", "bending = 'koiter'"),
+    for plate, bending, membrane, message in (
+        (curved, "isometric", "flat", "needs a flat rest shape"),
+        (explicit, "hinge", "flat", "no rest angle"),
+        (curved, "koiter", "flat", "bending = 'koiter'"),
+        (curved, "hinge", "round", "membrane = 'round'"),
+        (curved, "hinge", "curved", "reads the mid-edge normals"),
     ):
         with pytest.raises(SceneError, match=message):
-            shells.shell_elements(surface, plate, kinds, bending)
+            shells.shell_elements(surface, plate, kinds, bending, membrane)

@@ -60,7 +60,9 @@ def error(value, reference):
 
 def vectors_of(name, s):
     """Places of the vectors of space in the data."""
-    start = {"midedge_curvature": 3, "midedge_curvature_dof": 3, "edge_tilt": 1}.get(SHELLS[name].measure.name)
+    start = {"midedge_curvature": 3, "midedge_curvature_dof": 3, "midedge_metric": 3, "edge_tilt": 1}.get(
+        SHELLS[name].measure.name
+    )
     return [] if start is None else [slice(i, i + 3) for i in range(start, start + (9 if start == 3 else 3), 3)]
 
 

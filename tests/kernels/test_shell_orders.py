@@ -52,6 +52,31 @@ def order(counts, errors):
     return -np.polyfit(np.log(counts), np.log(np.abs(errors)), 1)[0]
 
 
+@pytest.mark.parametrize("shape", ["cylinder 20", "cylinder 45"])
+@pytest.mark.parametrize("mesh", ["right", "jittered"])
+def test_curved_membrane_bends_without_stretch(device, mesh, shape):
+    """A sheet rolled up isometrically: facets have strains of order 2 in their size, arcs over their sides of order 3 or more.
+
+    Energies go with the squares. Free sheets, whose mid-edge normals are those of least bending energy; triangles in the middle.
+    """
+    counts, energies = (8, 16, 32), {"flat": [], "curved": []}
+    for n in counts:
+        points, triangles = square(mesh, n)
+        surface = Surface(triangles)
+        kinds = edge_kinds(surface)
+        plate = flat_plate(surface, np.column_stack([points, np.zeros(len(points))]), kinds)
+        place, _ = SHAPES[shape][0](points)
+        inside = (np.abs(points[triangles].mean(1) - 0.5) < 0.3).all(1)
+        for membrane, results in energies.items():
+            stretch, bend = shells.shell_elements(surface, plate, kinds, "midedge_dof", membrane)
+            angles = relaxed_angles(bend, place, kinds.turning, device)
+            energy = gather(stretch, place, angles).evaluate(device=device)["energy"][:, 0]
+            results.append(energy[inside].sum() / plate.area[inside].sum())
+    assert order(counts, energies["flat"]) == pytest.approx(4.0, abs=0.2)
+    assert order(counts, energies["curved"]) > 5.8
+    assert energies["curved"][-1] < 0.01 * energies["flat"][-1]
+
+
 @pytest.mark.parametrize("shape", ["cylinder 20", "cylinder 45", "sphere"])
 @pytest.mark.parametrize("mesh", ["crossed", "equilateral"])
 def test_turning_normals_have_order_two(device, mesh, shape):

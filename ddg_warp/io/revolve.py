@@ -1,0 +1,50 @@
+"""Curves turned about the z axis: surfaces of revolution from the meridians of axisymmetric shells."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from ddg_warp.io import Curves, Shapes, Surfaces
+
+
+class Revolution:
+    """Surfaces that curves in the plane of x and z sweep around the z axis.
+
+    Args:
+        curves: Open curves, such as a trajectory's.
+        points: Their points at some time [m], shape (P, 3); points on the axis are poles.
+        sides: Corners of each ring.
+
+    Attributes:
+        shapes: The surfaces as what a writer of USD takes.
+    """
+
+    def __init__(self, curves: Curves, points: np.ndarray, sides: int):
+        self._angle = 2.0 * np.pi * np.arange(sides) / sides
+        starts = np.concatenate([[0], np.cumsum(curves.counts)])
+        triangles = [self._strips(np.arange(a, b), points) for a, b in pairwise(starts)]
+        radius = np.repeat(curves.radius, sides)
+        every = np.concatenate(triangles)
+        first = np.cumsum([0] + [len(part) for part in triangles[:-1]])
+        surfaces = Surfaces(every, first, np.asarray(curves.names), 2.0 * radius[every].mean(1))
+        none = np.zeros(0, int)
+        no_curves = Curves(none, none.astype(bool), np.zeros(0), np.zeros(0, object), none)
+        self.shapes = Shapes(no_curves, none, surfaces, sides * starts[-1], 1)
+
+    def points(self, points: np.ndarray) -> np.ndarray:
+        """Points of the surfaces (P sides, 3), ring after ring, from those of the curves (P, 3)."""
+        x, _, z = points[:, :, None].transpose(1, 0, 2)
+        cos, sin = np.cos(self._angle), np.sin(self._angle)
+        return np.stack([x * cos, x * sin, z + 0.0 * cos], axis=-1).reshape(-1, 3)
+
+    def _strips(self, rows: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Two triangles for each side of each edge, one at poles; normals to the left of the curve."""
+        sides = len(self._angle)
+        here = rows[:-1, None] * sides + np.arange(sides)
+        beside = rows[:-1, None] * sides + (np.arange(sides) + 1) % sides
+        lower = np.stack([here, here + sides, beside + sides], -1)
+        upper = np.stack([here, beside + sides, beside], -1)
+        off = points[rows, 0] != 0.0
+        return np.concatenate([lower[off[1:]].reshape(-1, 3), upper[off[:-1]].reshape(-1, 3)])

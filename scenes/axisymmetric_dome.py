@@ -1,0 +1,69 @@
+"""Axisymmetric dome: a shallow spherical cap under outer pressure snaps through, as a shell of revolution.
+
+The path passes a largest load, where the dome would jump, and a smallest one beyond. Under pressure the rim is clamped, and load
+parameter 1 is the buckling pressure of the whole sphere, 2 E h^2 / (R^2 sqrt(3 (1 - nu^2))). Under a force on the crown the rim may
+slide and turn, and load parameter 1 is 2 pi D / R. The limits then depend on lambda = (12 (1 - nu^2))^(1/4) a / sqrt(R h) alone
+(Budiansky 1959; Huang, J. Appl. Mech. 31, 1964), with a the radius of the rim.
+"""
+
+import numpy as np
+
+import ddg_warp as ddg
+
+RADIUS = 1.0  # m
+THICKNESS = 2e-5  # m; the cap is shallow
+YOUNG, POISSON = 1.0e9, 0.3
+CLASSICAL = 2.0 * YOUNG * THICKNESS**2 / (RADIUS**2 * np.sqrt(3.0 * (1.0 - POISSON**2)))  # Pa
+FORCE = np.pi * YOUNG * THICKNESS**3 / (6.0 * (1.0 - POISSON**2) * RADIUS)  # N
+UNIT = (RADIUS * THICKNESS) ** 0.5 / (12.0 * (1.0 - POISSON**2)) ** 0.25  # m; a / lambda
+SOURCE = "Marguerre and Reissner's equations by collocation (Budiansky 1959, Huang 1964)"
+
+# Load, lambda: largest and, beyond it, smallest load parameter t at nu = 0.3. With x = lambda r / a, b and f rotation and stress
+# function, x (x b')' - b = x f (b - x) - L and x (x f')' - f = x (x b - b^2 / 2), b = f = 0 at x = 0; under pressure L = 2 x^3 t,
+# b = x f' - nu f = 0 at lambda; under a force L = x t, x b' + nu b = f = 0 there.
+LIMITS = {
+    ("pressure", 4): (0.5637254, 0.4244706),
+    ("pressure", 5): (0.6159879, 0.2839929),
+    ("pressure", 6): (0.9720065, 0.2206402),
+    ("force", 5): (2.5781084, 0.7204937),
+    ("force", 6): (3.5459727, -1.0137903),
+}
+
+
+def build(load: str = "pressure", shallowness: int = 5, n: int = 80) -> ddg.Scene:
+    """The dome, its crown at height R.
+
+    Args:
+        load: pressure, on a dome clamped at its rim, or force, on the crown of a dome whose rim may slide and turn
+        shallowness: lambda: 4, 5 or 6 under pressure, 5 or 6 under a force
+        n: edges of the meridian
+    """
+    if (load, shallowness) not in LIMITS:
+        known = ", ".join(f"{name} {number}" for name, number in LIMITS)
+        raise ValueError(f"load = {load}, shallowness = {shallowness}; there are references for {known}")
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    angle = np.arcsin(shallowness * UNIT / RADIUS) * np.linspace(0.0, 1.0, n + 1)
+    points = RADIUS * np.column_stack([np.sin(angle), np.cos(angle)])
+    material = ddg.Material(young=YOUNG, poisson=POISSON, density=1000.0)
+    dome = scene.add_axisymmetric_shell(points, thickness=THICKNESS, material=material, name=f"dome under {load}")
+    if load == "pressure":
+        scene.clamp_ring(dome, "last")
+        scene.add_axisymmetric_pressure(dome, -CLASSICAL)
+    else:
+        scene.hold_ring(dome, -1, "z")
+        scene.add_pole_force(dome, -FORCE)
+    watch = {"drop": ddg.Displacement.of(0, "z", -1.0)}
+    scene.analysis = ddg.Trace(watch, ddg.Stop(limit_points=2), step=1e-4, max_step=4e-4, load_scale=400.0)
+    return scene
+
+
+def check(result) -> list[ddg.Check]:
+    """Both limit loads, to what edges of this length can resolve."""
+    dome = result.scene.axisymmetric_shells[0]
+    limits = LIMITS[dome.name.rpartition(" ")[2], round(float(dome.points[-1, 0]) / UNIT)]
+    tolerance = 2e-3 * max(1.0, (80.0 / (len(dome.points) - 1)) ** 2)
+    names = ("largest load", "smallest load")
+    return [
+        ddg.Check(name, point.load, limit, tolerance, SOURCE, relative=True)
+        for name, point, limit in zip(names, result.path.limit_points, limits, strict=True)
+    ]

@@ -1,0 +1,75 @@
+"""Hinged roof: a shallow cylindrical roof is pressed at its crown and snaps through.
+
+Case 3.8 of Sze, Liu and Lo (2004), thickness 12.7 or 6.35. The crown is lowered and the force that it takes observed, so that the
+first limit load is passed. Limit loads agree with a Ritz solution by Kirchhoff and Love's theory to 0.2 %.
+"""
+
+import numpy as np
+
+import ddg_warp as ddg
+from ddg_warp.motion import Motion
+from ddg_warp.scenes import _sze
+
+RADIUS, HALF_LENGTH, HALF_ANGLE = 2540.0, 254.0, 0.1  # mm, mm, rad
+YOUNG, POISSON = 3102.75, 0.3  # N/mm^2, 1
+LIMIT = {12.7: 2226.3, 6.35: 585.9}  # thickness [mm] -> first limit load [N]
+
+
+def build(
+    thickness: float = 12.7,
+    drop: float = 16.0,
+    n: int = 12,
+    pattern: str = "crossed",
+    membrane: str = "curved",
+    steps: int = 32,
+) -> ddg.Scene:
+    """A quarter of the roof; its axis is z, its crown at y = 0 faces +x.
+
+    Args:
+        thickness: 12.7 or 6.35 [mm]
+        drop: how far the crown is lowered [mm]
+        n: cells around half and along half of the roof
+        pattern: how cells become triangles: right, alternating, crossed or jittered
+        membrane: flat or curved, see Scene.add_shell
+        steps: load steps
+    """
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), analysis=ddg.Statics(load_steps=steps))
+    flat, triangles = _sze.sheet(n, n, (1.0, 1.0), pattern)
+    points = _sze.cylinder_part(flat, RADIUS, HALF_LENGTH, HALF_ANGLE)
+    material = ddg.Material(density=1.0, young=YOUNG, poisson=POISSON)
+    roof = scene.add_shell(points, triangles, thickness=thickness, material=material, membrane=membrane)
+    scene.symmetry(roof, _sze.side(flat, 0, 0.0), "y")
+    scene.symmetry(roof, _sze.side(flat, 1, 0.0), "z")
+    scene.hold(roof, _sze.side(flat, 0, 1.0))
+    scene.hold(roof, [0], "x", motion=Motion(translation=lambda t: (-drop * t, 0.0, 0.0)))
+    return scene
+
+
+def observe(model, state) -> dict[str, float]:
+    """How far the crown is lowered [mm] and the force on the whole roof that holds it there [N]."""
+    from ddg_warp.tangent import Tangent
+
+    crown = model.net.host.shells[0].nodes[0]
+    force = -4.0 * Tangent(model).gradient(state)[3 * crown]
+    return {"drop": -_sze.displacement(model, state, 0, 0), "force": float(force)}
+
+
+def limit(series) -> tuple[float, float]:
+    """First limit load [N] and the drop there [mm], by a quartic around the first maximum; NaN without one."""
+    drop, force = np.array(series["drop"]), np.array(series["force"])
+    peaks = np.flatnonzero((force[1:-1] >= force[:-2]) & (force[1:-1] > force[2:])) + 1
+    if not peaks.size:
+        return float("nan"), float("nan")
+    near = slice(max(0, peaks[0] - 2), peaks[0] + 3)
+    curve = np.polynomial.Polynomial.fit(drop[near], force[near], min(4, len(drop[near]) - 1))
+    roots = curve.deriv().roots()
+    place = roots[np.argmin(np.abs(roots - drop[peaks[0]]))].real
+    return float(curve(place)), float(place)
+
+
+def check(result) -> list[ddg.Check]:
+    """First limit load against the table, to 1.5 % at 12 cells."""
+    thickness = float(result.scene.shells[0].thickness)
+    if thickness not in LIMIT:
+        return []
+    return [ddg.Check("limit load [N]", limit(result.series)[0], LIMIT[thickness], 0.015, _sze.SOURCE, relative=True)]

@@ -1,0 +1,90 @@
+"""Leaf: a strip whose edge has grown ripples.
+
+The strip is held along its root and has grown along it by growth (y / W)^2 at the distance y from there. Flat, it would be compressed;
+it buckles and follows the metric that it has grown instead, the better the thinner it is (Sharon, Roman, Marder, Shin, Swinney, Nature
+419, 2002; Efrati, Sharon, Kupferman, J. Mech. Phys. Solids 57, 2009): what is left of the energy is bending.
+"""
+
+import numpy as np
+
+import ddg_warp as ddg
+from ddg_warp import meshes
+from ddg_warp.rest_shapes import grown_metric
+
+LENGTH, WIDTH = 1.0, 0.25  # m
+YOUNG = 1.0e6  # Pa
+POISSON = 0.3
+SOURCE = "energy and length of the grown metric"
+
+
+def build(growth: float = 0.2, thickness: float = 0.005, waves: int = 4, cells: int = 40) -> ddg.Scene:
+    """The strip in the plane of x and y, drawn with ripples whose lengths are those grown, and let go; its ends are symmetry planes.
+
+    Args:
+        growth: strain of the free edge
+        thickness: of the strip [m]
+        waves: half waves that it is drawn with; it may leave them for others
+        cells: cells along the strip
+    """
+    flat, triangles = mesh(cells)
+    # The clamp holds the normals of the drawn triangles: those of the first row are flat.
+    first = np.min(flat[flat[:, 1] > 1e-9, 1])
+    lift = np.clip((flat[:, 1] - first) / (WIDTH - first), 0.0, None) ** 2
+    points = flat.copy()
+    points[:, 2] = 2.0 * np.sqrt(growth) * lift * LENGTH / (np.pi * waves) * np.cos(np.pi * waves * flat[:, 0] / LENGTH)
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), analysis=ddg.Statics(load_steps=1))
+    strip = scene.add_shell(
+        points,
+        triangles,
+        thickness=thickness,
+        material=ddg.Material(YOUNG, POISSON),
+        rest=(grown(growth, cells), np.zeros((len(triangles), 3))),
+        name="leaf",
+    )
+    scene.clamp_boundary(strip, np.flatnonzero(flat[:, 1] < 1e-9))
+    for end in (0.0, LENGTH):
+        scene.symmetry(strip, np.flatnonzero(np.abs(flat[:, 0] - end) < 1e-9), "x")
+    return scene
+
+
+def mesh(cells: int) -> meshes.Mesh:
+    """Points and triangles of the flat strip."""
+    return meshes.rectangle(cells, max(2, round(cells * WIDTH / LENGTH)), (LENGTH, WIDTH), "alternating")
+
+
+def grown(growth: float, cells: int) -> np.ndarray:
+    """Metric at rest (T, 3) [m^2]."""
+    flat, triangles = mesh(cells)
+    return grown_metric(flat, triangles, 1.0 + growth * (flat[triangles].mean(1)[:, 1] / WIDTH) ** 2, 1.0)
+
+
+def edge(state) -> np.ndarray:
+    """Points of the free edge, in order (., 3) [m]."""
+    drawn = state.model.scene.shells[0].points
+    return state.points()[drawn[:, 1] > WIDTH - 1e-9]
+
+
+def strains(state) -> tuple[float, float]:
+    """How much longer the free edge is than at the start, over its length then: as it is, and at rest."""
+    shell = state.model.net.host.shells[0]
+    sides = np.flatnonzero((shell.surface.points[shell.surface.edges, 1] > WIDTH - 1e-9).all(1))
+    at, corner = np.nonzero(np.isin(shell.surface.triangle_edges, sides))
+    rest = np.sqrt(shell.plate.lengths_squared[at, corner]).sum()
+    length = np.linalg.norm(np.diff(edge(state), axis=0), axis=1).sum()
+    return float(length / LENGTH - 1.0), float(rest / LENGTH - 1.0)
+
+
+def flat_state(model):
+    """The state in which the strip has not left its plane."""
+    return model.state(points=model.scene.shells[0].points * [1.0, 1.0, 0.0])
+
+
+def check(result) -> list[ddg.Check]:
+    """Energy below a tenth of the flat state's; the free edge as long as it has grown, to a tenth."""
+    model = result.model
+    energies = [sum(model.energies(state).values()) for state in (result.state, flat_state(model))]
+    strain, rest = strains(result.state)
+    return [
+        ddg.Check("energy over that of the flat state", energies[0] / energies[1], 0.0, 0.1, SOURCE),
+        ddg.Check("strain of the free edge", strain, rest, 0.1, SOURCE, relative=True),
+    ]

@@ -1,0 +1,57 @@
+"""Every derivative of the terms of shells and of the rigid joint, in both precisions, against something else that computes it."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from ddg_warp import derivatives, net_derivatives
+from ddg_warp.net_derivatives import TERMS
+
+
+@cache
+def rows(term: str, precision: str, device: str) -> dict:
+    """The derivative table of a term by check."""
+    return {row["check"]: row for row in derivatives.table(term, precision, device)}
+
+
+CASES = [
+    pytest.param(precision, term, check, marks=[] if precision == "float64" else pytest.mark.slow)
+    for precision, column in (("float64", 1), ("float32", 2))
+    for term in TERMS
+    for check in net_derivatives.CHECKS
+    if derivatives.CHECKS[check][column] is not None
+]
+
+
+@pytest.mark.parametrize(("precision", "term", "check"), CASES)
+def test_derivative(device, precision, term, check):
+    row = rows(term, precision, device)[check]
+    assert row["passed"], f"error {row['error']:.2e}, tolerance {row['tolerance']:.0e}"
+
+
+def test_nothing_is_left_out():
+    """Terms of nets meet the checks of chains but `rigid`, of which `invariance` is the whole, and `exact`, of rods' vertices."""
+    assert set(derivatives.CHECKS) - set(net_derivatives.CHECKS) == {"rigid", "exact"}
+    assert set(net_derivatives.CHECKS) < set(derivatives.CHECKS)
+
+
+def test_table_has_chains_and_nets(device):
+    """The same columns for both, so that one table shows them."""
+    chain, net = (derivatives.table(name, "float64", device) for name in ("planar_stretch", "shell_tilt"))
+    assert chain[0].keys() == net[0].keys()
+    assert {row["chain"] for row in net} == {"net"}
+    assert len(net) == len(net_derivatives.CHECKS)
+
+
+def test_sample_is_general():
+    """All kinds of edges, both signs of a joint, frames that are old: no check passes by accident."""
+    bend = net_derivatives.NetCase(TERMS["shell_bend_dof"], "float64", "cpu").sample
+    assert set(bend.data["constants"][:3].ravel()) == {0.0, 1.0, 2.0, 3.0}
+    joint = net_derivatives.NetCase(TERMS["rigid_joint"], "float64", "cpu").sample
+    assert set(joint.data["constants"][0]) == {-1.0, 1.0}
+    edge = joint.data["q"][joint.slots[1]] - joint.data["q"][joint.slots[0]]
+    t = joint.data["frame"][3:6].T * joint.data["constants"][0][:, None]
+    age = np.degrees(np.arccos(np.sum(t * edge, -1) / np.linalg.norm(edge, axis=-1)))
+    assert 5.0 < age.min() and age.max() < 60.0
+    assert np.abs(joint.data["lag"][6]).max() > 2.0 * np.pi

@@ -1,0 +1,127 @@
+"""Shells of revolution in scenes: refusals name the shell and the remedy; runs, worlds, growth, and surfaces in USD."""
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp.integrate.statics import Equilibrium
+from ddg_warp.io.revolve import Revolution
+from ddg_warp.record import Recorder, export_usd
+
+RUBBER = ddg.Material(young=1e6, poisson=0.3, density=1000.0)
+ANGLE = np.linspace(0.0, 1.0, 9)
+CAP = np.column_stack([np.sin(ANGLE), np.cos(ANGLE)])
+TUBE = np.column_stack([np.ones(5), np.linspace(0.0, 1.0, 5)])
+
+
+def scene_of(points=CAP, gravity=(0.0, 0.0, 0.0), **options):
+    scene = ddg.Scene(gravity=gravity, analysis=ddg.Statics(1))
+    scene.add_axisymmetric_shell(points, **({"thickness": 0.01, "material": RUBBER, "name": "odd"} | options))
+    return scene
+
+
+def moved(node, radius, height):
+    points = CAP.copy()
+    points[node] = radius, height
+    return points
+
+
+@pytest.mark.parametrize(
+    ("action", "words"),
+    [
+        (lambda: scene_of(CAP[:2]), ("odd", "(n, 2)")),
+        (lambda: scene_of(np.zeros((4, 3))), ("odd", "(4, 3)")),
+        (lambda: scene_of("abc"), ("odd", "numbers")),
+        (lambda: scene_of(moved(3, -1.0, 0.0)), ("odd", "node 3", "negative")),
+        (lambda: scene_of(moved(3, 0.0, 0.0)), ("odd", "node 3", "axis")),
+        (lambda: scene_of(moved(3, np.nan, 0.0)), ("odd", "node 3", "finite")),
+        (lambda: scene_of(moved(3, *CAP[2])), ("odd", "edge 2", "length")),
+        (lambda: scene_of(thickness=0.0), ("odd", "thickness")),
+        (lambda: scene_of(thickness=np.ones(3)), ("odd", "8")),
+        (lambda: scene_of(material=3), ("odd", "Material")),
+        (lambda: scene_of().hold_ring(1, 0), ("shell 1", "1 so far")),
+        (lambda: scene_of().hold_ring(0, 9), ("node 9", "9 nodes")),
+        (lambda: scene_of().hold_ring(0, 0, "y"), ("'y'", "radius")),
+        (lambda: scene_of().hold_ring(0, 0, motion=ddg.Motion(angle=lambda t: t)), ("translation",)),
+        (lambda: scene_of().clamp_ring(0, "rim"), ("rim", "'last'")),
+        (lambda: scene_of().clamp_ring(0, "last", tangent=(0.0, 0.0)), ("tangent", "direction")),
+        (lambda: scene_of().add_ring_force(0, 0, (1.0, 0.0)), ("pole", "add_pole_force")),
+        (lambda: scene_of().add_pole_force(0, 1.0, "last"), ("no pole", "add_ring_force")),
+        (lambda: scene_of().add_ring_force(0, 1, (1.0, np.inf)), ("finite",)),
+        (lambda: scene_of().add_axisymmetric_pressure(0, 1.0, edges=[8]), ("edge 8", "8")),
+        (lambda: scene_of().add_axisymmetric_pressure(0, 1.0, amplitude=3), ("amplitude", "function")),
+        (lambda: scene_of(rest="round").build(), ("round", "'flat'")),
+        (lambda: scene_of(rest=(np.ones((3, 2)), np.zeros((9, 2)))).build(), ("odd", "(8, 2)")),
+        (lambda: scene_of(gravity=(1.0, 0.0, 0.0)).build(), ("gravity", "along z")),
+        (lambda: Equilibrium(scene_of().build()), ("shell 0", "hold_ring")),
+    ],
+)
+def test_refused(action, words):
+    with pytest.raises(ddg.SceneError) as caught:
+        action()
+    assert not [word for word in words if word not in str(caught.value)], caught.value
+
+
+def test_a_pole_is_not_clamped():
+    scene = scene_of()
+    scene.clamp_ring(0, "first")
+    with pytest.raises(ddg.SceneError, match="'odd': a pole"):
+        scene.build()
+
+
+def test_following_pressure_is_refused_in_dynamics(device):
+    scene = scene_of()
+    scene.add_axisymmetric_pressure(0, 1.0)
+    model = scene.build(device)
+    with pytest.raises(ddg.SceneError, match="dead=True"):
+        ddg.Integrator(model).step(model.state(), 1e-3)
+
+
+def test_worlds_and_growth(device):
+    """Each world grows by its own rest strain: a tube with a_tt / 2 at rest half of (g R)^2 and free ends has radius g R."""
+    scene = scene_of(TUBE)
+    scene.hold_ring(0, 0, "z")
+    model = scene.build(device, "float64", worlds=2)
+    growth = np.array([1.05, 1.1])
+    model.set_parameter("axisymmetric_stretch", "rest_22", 0.5 * growth**2)
+    points = Equilibrium(model).load(model.state(), 1).points()
+    np.testing.assert_allclose(points[:, :, 0], np.repeat(growth[:, None], 5, 1), atol=1e-9)
+    np.testing.assert_allclose(points[:, :, 2], [TUBE[:, 1]] * 2, atol=1e-9)
+
+
+def test_beside_rods_and_shells(device):
+    """Rows of points: rods, meridians, vertices; the shell of revolution moves as it does alone."""
+    alone = scene_of()
+    alone.clamp_ring(0, "last")
+    alone.add_pole_force(0, -1.0)
+    both = scene_of()
+    both.clamp_ring(0, "last")
+    both.add_pole_force(0, -1.0)
+    triangle = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    both.hold(both.add_shell(triangle, [[0, 1, 2]], thickness=0.1, material=RUBBER), [0, 1, 2])
+    rod = both.add_rod(triangle + 2.0, section=ddg.Circle(0.01), material=RUBBER)
+    both.clamp(rod, [0])
+    points = [
+        Equilibrium(m).load(m.state(), 1).points() for m in (scene.build(device, "float64") for scene in (alone, both))
+    ]
+    np.testing.assert_allclose(points[1], np.concatenate([triangle + 2.0, points[0], triangle]), atol=1e-9)
+
+
+def test_surface_of_revolution_in_usd(device, tmp_path):
+    """A cap turned with N sides: one triangle a side at the pole, two elsewhere; its surface tends to 2 pi (1 - cos 1)."""
+    from pxr import Usd, UsdGeom
+
+    model = scene_of().build(device)
+    with Recorder(model, tmp_path, usd=False) as recorder:
+        recorder.record(model.state())
+    export_usd(tmp_path / "trajectory.h5", tmp_path / "cap.usdc", revolve=64)
+    stage = Usd.Stage.Open(str(tmp_path / "cap.usdc"))
+    (mesh,) = [UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
+    triangles = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    corners = np.array(mesh.GetPointsAttr().Get(0.0))[triangles]
+    normals = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert len(triangles) == 64 * (1 + 2 * 7)
+    assert np.linalg.norm(normals, axis=1).sum() == pytest.approx(2.0 * np.pi * (1.0 - np.cos(1.0)), rel=5e-3)
+    assert (np.sum(normals * corners.mean(1), 1) > 0.0).all()  # to the left of the meridian as it runs is outwards here
+    turned = Revolution(model.curves, model.state().points(), 64)
+    np.testing.assert_allclose(np.linalg.norm(turned.points(model.state().points()), axis=1), 1.0, rtol=1e-12)
