@@ -57,6 +57,7 @@ class NetNewton:
         self.krylov_dots = make((worlds, blocks), self.linear)
         self.status, self.slot, self.iteration, self.halvings, self.unbalanced = flags(5)
         self.drowned, self.turned, self.wanted, self.todo, self.iterations, self.lost, self.projected = flags(7)
+        (self.stalled,), (self.best,) = flags(), scalars()
         self.coefficient, self.rate, self.step_length, self.decrement, self.merit = scalars(5)
         self.load_scale, self.residual, self.sum_change, self.sum_noise, self.sum_square = scalars(5)
         self.decrease, self.turn = scalars(2)
@@ -66,11 +67,12 @@ class NetNewton:
         self.parts = [self._part(part, make, H) for part in net.sets]
         ends = _edges(host)
         self.ends = wp.array(np.ascontiguousarray(ends, np.int32), dtype=int, device=device)
-        self.turns = make((worlds, len(ends)), self.real)
+        turning = len(ends) + blocks - host.nodes
+        self.turns = make((worlds, turning), self.real)
         self._sum, self._sum_linear = (Sums(worlds, blocks, dtype, device) for dtype in (self.real, self.linear))
-        self._largest = Sums(worlds, len(ends), self.real, device, largest=True)
+        self._largest = Sums(worlds, turning, self.real, device, largest=True)
         lengths = np.linalg.norm(np.diff(host.rest[ends], axis=1)[:, 0], axis=1)
-        self.arm = float(lengths.mean())
+        self.arm, self.longest = float(lengths.mean()), float(lengths.max())
         self._evaluate = [elements.evaluate_kernel(part.term, self.real, self.linear) for part in net.sets]
         self._outer, self._collect, self._settle = system.balance_kernels(self.real, self.linear)
         self._assembly = Assembly(net, self.system, self.parts, self.real, self.linear)
@@ -155,7 +157,7 @@ class NetNewton:
         self._launch(
             self._settle,
             [self.q, self.force, self.size, self.stiffness, self.fixed, self.status, self.load_scale]
-            + [blocks, net.host.nodes, self.arm, options.rtol, options.floor_factor * self.eps],
+            + [blocks, net.host.nodes, self.arm, self.longest, options.rtol, options.floor_factor * self.eps],
             [self.right, self.square, self.noise, self.unbalanced, self.drowned],
         )
 
@@ -172,7 +174,7 @@ class NetNewton:
             + [options.max_iterations, options.max_halvings, LOOSEST, options.linear_rtol]
             + [self.status, self.unbalanced, self.drowned, self.slot, self.iteration, self.halvings]
             + [self.step_length, self.decrement, self.merit, self.load_scale, self.residual, self.turned]
-            + [self.forcing, self.wanted, self.todo, self.active],
+            + [self.best, self.stalled, self.forcing, self.wanted, self.todo, self.active],
             device=self.device,
         )
 
@@ -242,8 +244,8 @@ class NetNewton:
         self._sum(self.dots, self.decrease)
         wp.launch(
             self._rotate,
-            self.worlds * len(self.ends),
-            [self.q, self.direction, self.ends, self.wanted, blocks],
+            self.turns.size,
+            [self.q, self.direction, self.ends, self.wanted, blocks, self.net.host.nodes],
             [self.turns],
             device=self.device,
         )

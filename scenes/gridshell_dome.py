@@ -1,8 +1,8 @@
 """Gridshell dome: two families of steel rods cross, joined rigidly or hinged, and carry their weight and a load at the crown.
 
-The crossings lie on z = rise (1 - x^2) (1 - y^2) over a square plan, x and y in half spans; every rod is pinned at both ends. Reference:
-the reactions carry weight and load, rods of twice as many segments sag alike, and the grillage of two crossing beams of length L under a
-force P at the crossing deflects by P L^3 / (96 EI), each beam carrying half (Timoshenko, Strength of Materials I, beams of one span).
+The crossings lie on z = rise (1 - x^2) (1 - y^2) over a square plan, x and y in half spans; every rod is pinned at both ends.
+Reference: the reactions carry all loads, rods of twice as many segments sag alike, and the grillage of two crossing beams of length
+L under a force P at the crossing deflects by P L^3 / (96 EI), each beam carrying half (Timoshenko, Strength of Materials I).
 """
 
 import numpy as np

@@ -112,7 +112,16 @@ class NetStep:
         self._launch(
             self._begin,
             solver.all,
-            [before.q, before.v, solver.fixed, self.integrator._dt, self.damping, self.outer, self.progress]
+            [
+                before.q,
+                before.v,
+                solver.fixed,
+                solver.mass,
+                self.integrator._dt,
+                self.damping,
+                self.outer,
+                self.progress,
+            ]
             + [self.portion, self.cautious, blocks],
             [solver.q, solver.base, solver.target, solver.coefficient, solver.rate, solver.status, solver.iteration]
             + [solver.halvings, solver.unbalanced, solver.drowned, solver.load_scale, self.moved, solver.active],
@@ -134,8 +143,6 @@ class NetStep:
             [after.q, after.v, self.moved],
         )
         self.net.carry(start, after, kept=before, moved=self.moved)
-        if self.midpoint:
-            self.net.reset_spins(after.v)
         self.net.update_strains(after)
         self.remaining.zero_()
         self._launch(
@@ -150,7 +157,7 @@ class NetStep:
         """The state whose lagged data serve the solve: for the midpoint rule carried to the predicted midpoint.
 
         Frames lagged at the start of the step would spin about their edges by O(h) at the midpoint, unseen by the rotary
-        inertia: the rule would be of first order. Rotations of joints, which have no inertia, are not predicted, so that those
+        inertia: the rule would be of first order. Rotations of joints have no inertia and are not predicted, so that those
         found are of the whole half step.
         """
         if not (self.midpoint and self.net.edges):

@@ -7,6 +7,8 @@ import warp as wp
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
 
+STALLED = 8  # iterations without progress, where energies drown in rounding, that a world is given
+
 
 @cache
 def search_kernels(real, linear):
@@ -36,12 +38,18 @@ def search_kernels(real, linear):
         load_scale: wp.array(dtype=real),
         largest: wp.array(dtype=real),
         turned: wp.array(dtype=int),
+        best: wp.array(dtype=real),
+        stalled: wp.array(dtype=int),
         forcing: wp.array(dtype=linear),
         wanted: wp.array(dtype=int),
         todo: wp.array(dtype=int),
         active: wp.array(dtype=int),
     ):
-        """Decides by the sums over all blocks; how exactly the next direction is solved follows Eisenstat and Walker (1996)."""
+        """Decides by the sums over all blocks; how exactly the next direction is solved follows Eisenstat and Walker (1996).
+
+        A world whose expected decrease of energy drowns in rounding, and whose residual has not halved in `STALLED` iterations, has
+        converged to rounding: on bad meshes rounding leaves more than the estimate block by block.
+        """
         w = wp.tid()
         wanted[w] = 0
         todo[w] = 0
@@ -49,6 +57,7 @@ def search_kernels(real, linear):
             return
         before = merit[w]
         first = iteration[w] == 0
+        drowns = not first and step_length[w] * decrement[w] <= real(10.0) * noise[w] * floor
         what = decide(
             change[w],
             noise[w] * floor,
@@ -70,6 +79,14 @@ def search_kernels(real, linear):
         )
         if what == wp.static(STOP):
             return
+        if what == wp.static(DIRECT):
+            stalled[w] = stalled[w] + 1
+            if not drowns or square[w] < real(0.25) * best[w]:
+                best[w] = square[w]
+                stalled[w] = 0
+            if stalled[w] > wp.static(STALLED):
+                status[w] = wp.static(outcome.CONVERGED_TO_ROUNDING)
+                return
         active[0] = 1
         if what == wp.static(DIRECT):
             eta = loosest
@@ -101,15 +118,20 @@ def search_kernels(real, linear):
         ends: wp.array2d(dtype=int),
         wanted: wp.array(dtype=int),
         blocks: int,
+        nodes: int,
         turn_out: wp.array2d(dtype=real),
     ):
-        """Squared turn of every edge by a whole step."""
+        """Squared turn of every edge, then of every angle and joint, by a whole step."""
         i = wp.tid()
-        count = ends.shape[0]
+        count = ends.shape[0] + blocks - nodes
         w = i / count
         if wanted[w] == 0:
             return
         k = i - w * count
+        if k >= ends.shape[0]:
+            angle = direction[k - ends.shape[0] + nodes + w * blocks]
+            turn_out[w, k] = real(wp.dot(angle, angle))
+            return
         a = ends[k, 0] + w * blocks
         b = ends[k, 1] + w * blocks
         e = q[b] - q[a]
@@ -129,7 +151,7 @@ def search_kernels(real, linear):
         todo: wp.array(dtype=int),
         work: wp.array(dtype=wp.int64),
     ):
-        """Length of the step: whole, or so that no edge turns by more than the cap."""
+        """Length of the step: whole, or so that nothing turns by more than the cap."""
         w = wp.tid()
         if wanted[w] == 0:
             return
@@ -177,6 +199,7 @@ def step_kernels(real, midpoint: bool):
         q0: wp.array(dtype=V),
         v0: wp.array(dtype=V),
         fixed: wp.array(dtype=wp.uint8),
+        mass: wp.array(dtype=V),
         dt: wp.array(dtype=real),
         damping: wp.array(dtype=real),
         outer: wp.array(dtype=real),
@@ -198,6 +221,7 @@ def step_kernels(real, midpoint: bool):
         moved_out: wp.array(dtype=int),
         active_out: wp.array(dtype=int),
     ):
+        """Starts a solve from the predictor; dofs without mass, whose rates mean nothing, start from where they are."""
         i = wp.tid()
         w = i / blocks
         k = i - w * blocks
@@ -226,7 +250,7 @@ def step_kernels(real, midpoint: bool):
         target_out[i] = here + v * (rate / coefficient)
         if cautious[w] == 0:
             for d in range(3):
-                if ((mask >> d) & 1) == 0:
+                if ((mask >> d) & 1) == 0 and mass[k][d] > real(0.0):
                     here[d] = here[d] + s * v[d]
         q_out[i] = here
         base_out[i] = here

@@ -120,6 +120,7 @@ def balance_kernels(real, linear):
         blocks: int,
         nodes: int,
         arm: real,
+        longest: real,
         rtol: real,
         floor: real,
         right_out: wp.array(dtype=H),
@@ -128,7 +129,10 @@ def balance_kernels(real, linear):
         unbalanced_out: wp.array(dtype=int),
         drowned_out: wp.array(dtype=int),
     ):
-        """Residual of free dofs, and its squares with moments over the length `arm`; see `kernels.balance` for the criterion."""
+        """Residual of free dofs, and its squares with moments over the length `arm`; see `kernels.balance` for the criterion.
+
+        What rounding leaves of an edge vector follows from the coordinates of both its ends, `longest` apart at most.
+        """
         i = wp.tid()
         w = i / blocks
         if status[w] != 0:
@@ -137,7 +141,7 @@ def balance_kernels(real, linear):
         f = force[i]
         mask = int(fixed[k])
         length = wp.where(k < nodes, real(1.0), arm)
-        reach = wp.max(wp.abs(q[i]))
+        reach = wp.max(wp.abs(q[i])) + longest
         if k >= nodes:
             reach += real(1.0)
         limit = rtol * load_scale[w] * length

@@ -1,0 +1,186 @@
+"""Hard cases of nets in dynamics: crumpled, folded, thin, in long steps, on bad meshes.
+
+Every run ends in finite states by converged steps only, or in an error that names the outcome, the place and the remedy.
+"""
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp import meshes
+
+RUBBER = ddg.Material(young=1e6, poisson=0.3, density=1000.0)
+BENDING = ("midedge_dof", "hinge")
+
+
+def sheet(cells=8, bending="midedge_dof", thickness=1e-2, gravity=0.0, material=RUBBER, **options) -> ddg.Scene:
+    points, triangles = meshes.rectangle(cells, cells, (1.0, 1.0), "alternating")
+    scene = ddg.Scene(gravity=(0.0, 0.0, -gravity))
+    scene.add_shell(points, triangles, thickness=thickness, material=material, bending=bending, **options)
+    return scene
+
+
+def run(scene, device, dt, count, start=None, may_fail=False, **options):
+    """The last state and total energies; steps that failed have been retried, or an error names what and where."""
+    model = scene.build(device, "float64")
+    state, integrator = model.state(points=start), ddg.Integrator(model, check_every=1, **options)
+    energy, error = [sum(model.energies(state).values())], None
+    for _ in range(count):
+        try:
+            state = integrator.step(state, dt)
+        except ddg.SolverError as raised:
+            assert may_fail, raised
+            error, state = raised, raised.state
+            break
+        assert np.isfinite(state.points()).all()
+        energy.append(sum(model.energies(state).values()))
+    outcomes = integrator.statistics()["outcomes"]
+    failed = {k: v for k, v in outcomes.items() if k not in ("converged", "converged_to_rounding")}
+    assert sum(failed.values()) == integrator.statistics()["retries"]
+    assert np.isfinite(state.points()).all()
+    assert np.isfinite(state.velocities()).all()
+    if error:
+        for word in (error.outcome, "world 0", "of shell 0", "smaller dt"):
+            assert word in str(error)
+    return state, np.array(energy), integrator.statistics(), error
+
+
+def assert_no_energy_is_made(energy) -> None:
+    assert np.diff(energy).max() <= 1e-8 * (np.ptp(energy) + np.abs(energy).max())
+
+
+def edge_strain(scene, state) -> float:
+    """Largest relative change of an edge's length."""
+    shell = scene.shells[0]
+    edges = np.concatenate([shell.triangles[:, [0, 1]], shell.triangles[:, [1, 2]], shell.triangles[:, [2, 0]]])
+    rest, now = (np.linalg.norm(p[edges[:, 1]] - p[edges[:, 0]], axis=1) for p in (shell.points, state.points()))
+    return float(np.abs(now / rest - 1.0).max())
+
+
+@pytest.mark.parametrize("size", [0.1, 0.5], ids=["crumpled", "inverted"])
+@pytest.mark.parametrize("bending", BENDING)
+def test_random_perturbation(device, bending, size):
+    """Vertices thrown about by a fraction of the cells, so that triangles invert: it springs back, and energy only falls."""
+    scene = sheet(6, bending)
+    start = scene.shells[0].points
+    start = start + size / 6.0 * np.random.default_rng(1).normal(size=start.shape)
+    state, energy, _, _ = run(scene, device, 0.01, 10, start)
+    assert_no_energy_is_made(energy)
+    assert energy[-1] < 0.2 * energy[0]
+    assert edge_strain(scene, state) < 0.5
+
+
+@pytest.mark.parametrize("bending", BENDING)
+def test_thickness_of_a_ten_thousandth(device, bending):
+    """h / L = 1e-4, held at two corners: it swings by its weight; nothing is stretched but by that."""
+    scene = sheet(8, bending, thickness=1e-4, gravity=9.81, material=ddg.Material(1e8, 0.3, 1000.0))
+    scene.hold(0, [0, 8])
+    state, energy, statistics, _ = run(scene, device, 0.01, 20)
+    assert_no_energy_is_made(energy)
+    assert statistics["retries"] == 0
+    assert edge_strain(scene, state) < 0.02
+    assert state.points()[:, 2].min() < -0.1
+
+
+@pytest.mark.parametrize("bending", BENDING)
+@pytest.mark.parametrize("dt", [1.0 / 30.0, 0.2])
+def test_long_steps(device, bending, dt):
+    """A hanging sheet in steps far beyond its waves: 1e6 Pa, cells of 1/8 m, sqrt(E / rho) h / l = 8 and 50."""
+    scene = sheet(8, bending, thickness=1e-3, gravity=9.81)
+    scene.hold(0, [0, 8])
+    _, energy, statistics, _ = run(scene, device, dt, 12)
+    assert_no_energy_is_made(energy)
+    assert statistics["newton_iterations"]["mean"] < 40
+
+
+def folded(points, angle: float, at: float = 0.0) -> np.ndarray:
+    """The half x > at turned about the y axis through `at` by an angle."""
+    x = points[:, 0] - at
+    turned = np.maximum(x, 0.0)
+    return np.stack([at + np.minimum(x, 0.0) + turned * np.cos(angle), points[:, 1], turned * np.sin(angle)], -1)
+
+
+@pytest.mark.parametrize(("bending", "degrees"), [("midedge_dof", 85.0), ("hinge", 175.0)])
+def test_crease_opens(device, bending, degrees):
+    """A flat sheet let go folded: it opens, and energy only falls. (Normals that turn hold folds below 90 degrees, see `shells`.)"""
+    scene = sheet(4, bending)
+    points = scene.shells[0].points
+    start = folded(points, np.radians(degrees), float(np.median(points[:, 0])))
+    state, energy, _, _ = run(scene, device, 0.02, 40, start)
+    assert_no_energy_is_made(energy)
+    far = points[:, 0] == points[:, 0].max()
+    assert np.abs(state.points()[far] - start[far]).max() > 0.05
+
+
+def test_angles_do_not_run_away(device):
+    """Folded beyond what they hold, the normals turn over, once: they have no inertia that would carry them on."""
+    scene = sheet(4, "midedge_dof")
+    points = scene.shells[0].points
+    start = folded(points, np.radians(175.0), float(np.median(points[:, 0])))
+    state, energy, _, _ = run(scene, device, 0.02, 10, start)
+    assert_no_energy_is_made(energy)
+    assert np.abs(state.net.q.numpy()[len(points) :, 0]).max() < 0.6 * np.pi
+
+
+@pytest.mark.parametrize("bending", BENDING)
+def test_crease_of_175_degrees_at_rest_stays(device, bending):
+    """A sheet creased by 175 degrees in its rest shape is at rest."""
+    points, triangles = meshes.rectangle(4, 4, (1.0, 1.0), "alternating")
+    points = folded(points, np.radians(175.0), float(np.median(points[:, 0])))
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    scene.add_shell(points, triangles, thickness=1e-2, material=RUBBER, bending=bending)
+    state, _, _, _ = run(scene, device, 0.02, 5)
+    np.testing.assert_allclose(state.points(), points, atol=1e-9)
+
+
+@pytest.mark.parametrize("bending", BENDING)
+def test_needle_triangles(device, bending):
+    """Cells of 1 : 1000: finite, and falling freely at rest in their shape."""
+    points, triangles = meshes.rectangle(4, 4, (1.0, 1e-3), "right")
+    scene = ddg.Scene()
+    scene.add_shell(points, triangles, thickness=1e-3, material=RUBBER, bending=bending)
+    state, _, _, _ = run(scene, device, 0.01, 5)
+    np.testing.assert_allclose(state.points() - points, [[0.0, 0.0, -9.81 * 1e-4 * 15.0]] * len(points), atol=1e-9)
+
+
+def test_triangles_without_area_are_refused(device):
+    points, triangles = meshes.rectangle(2, 2, (1.0, 1.0), "right")
+    points[4] = points[3] + 0.5 * (points[5] - points[3])
+    points[4], points[1] = points[3], points[1]
+    scene = ddg.Scene()
+    with pytest.raises(ddg.SceneError, match="triangle"):
+        scene.add_shell(points, triangles, thickness=1e-3, material=RUBBER)
+        scene.build(device)
+
+
+def test_turned_over_neighbours_are_refused(device):
+    """Two triangles of opposite orientation: no surface."""
+    points, triangles = meshes.rectangle(2, 2, (1.0, 1.0), "right")
+    triangles = np.array(triangles)
+    triangles[3] = triangles[3][::-1]
+    scene = ddg.Scene()
+    with pytest.raises(ddg.SceneError, match="triangle"):
+        scene.add_shell(points, triangles, thickness=1e-3, material=RUBBER)
+        scene.build(device)
+
+
+@pytest.mark.parametrize("bending", BENDING)
+def test_collapsed_to_a_point(device, bending):
+    """All vertices at one place, where no direction exists: solved, or given up with a name; never a silent NaN."""
+    scene = sheet(3, bending)
+    run(scene, device, 0.01, 3, np.zeros((16, 3)), may_fail=True)
+
+
+def test_crumpled_between_moving_supports(device):
+    """Opposite sides pushed together in 0.5 s, in steps of 1/30 s: folds, lengths kept."""
+    scene = sheet(16, "hinge", thickness=2e-3)
+    points = scene.shells[0].points
+    noise = 1e-3 * np.random.default_rng(0).normal(size=points.shape)
+    for end, sign in ((points[:, 0].min(), 1.0), (points[:, 0].max(), -1.0)):
+        motion = ddg.Motion(translation=lambda t, sign=sign: (sign * 0.33 * min(1.0, t / 0.5), 0.0, 0.0))
+        edge = np.flatnonzero(points[:, 0] == end)
+        noise[edge] = 0.0
+        scene.hold(0, edge, motion=motion)
+    state, _, statistics, _ = run(scene, device, 1.0 / 30.0, 20, points + noise)
+    assert edge_strain(scene, state) < 0.15
+    assert statistics["newton_iterations"]["mean"] < 60
