@@ -162,6 +162,16 @@ def test_frequency_of_a_square_plate(device, clamped, factor):
     assert limit == pytest.approx(factor, rel=0.01)
 
 
+@pytest.mark.parametrize("bending", ["midedge_dof", "hinge"])
+def test_newton_converges_in_long_steps(device, bending):
+    """A thin sheet that hangs from two corners, 1/30 s a step: without the stiffness of compression it takes twice as many."""
+    scene = sheet(12, bending, gravity=(0.0, 0.0, -9.81), thickness=1e-3)
+    scene.hold(0, [0, 12])
+    _, integrator = steps(scene.build(device, "float64"), 12, 1.0 / 30.0)
+    assert integrator.statistics()["newton_iterations"]["mean"] < 9.0
+    assert integrator.statistics()["retries"] == 0
+
+
 # rods that are joined --------------------------------------------------------------------------------------------------------------
 
 
