@@ -31,7 +31,9 @@ class NewtonOptions:
             compressed rods and long steps, where Gauss-Newton takes many iterations. "project": the exact one with every
             element made positive semi-definite by its eigenvalues, at twenty times the cost of an iteration. "none": the
             exact one; where it is indefinite the solve ends with the outcome `indefinite`, and a time step is tried again
-            with a shorter one. "auto": "progressive" for rods that are curved or twisted at rest, else "gauss_newton".
+            with a shorter one. "auto": "progressive" for rods that are curved or twisted at rest, else "gauss_newton"; nets
+            keep the stresses' stiffness, compression included, and leave compression out of the next matrix where conjugate
+            gradients meet negative curvature.
     """
 
     rtol: float = 1e-8

@@ -124,7 +124,15 @@ class NetStep:
             ]
             + [self.portion, self.cautious, blocks],
             [solver.q, solver.base, solver.target, solver.coefficient, solver.rate, solver.status, solver.iteration]
-            + [solver.halvings, solver.unbalanced, solver.drowned, solver.load_scale, self.moved, solver.active],
+            + [
+                solver.halvings,
+                solver.unbalanced,
+                solver.drowned,
+                solver.load_scale,
+                solver.projected,
+                self.moved,
+                solver.active,
+            ],
         )
         if len(self._moving_blocks):
             self._launch(

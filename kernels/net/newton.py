@@ -218,6 +218,7 @@ def step_kernels(real, midpoint: bool):
         unbalanced_out: wp.array(dtype=int),
         drowned_out: wp.array(dtype=int),
         load_scale_out: wp.array(dtype=real),
+        projected_out: wp.array(dtype=int),
         moved_out: wp.array(dtype=int),
         active_out: wp.array(dtype=int),
     ):
@@ -242,6 +243,7 @@ def step_kernels(real, midpoint: bool):
             halvings_out[w] = 0
             unbalanced_out[w] = 0
             drowned_out[w] = 0
+            projected_out[w] = 0
             load_scale_out[w] = outer[w]
             active_out[0] = 1
         mask = int(fixed[k])
