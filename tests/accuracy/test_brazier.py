@@ -133,7 +133,7 @@ def test_ring_is_braziers_at_small_curvature():
 
 
 def test_collapse(device):
-    """R / h = 50. The largest moment is within 5 % of Brazier's, and within 0.1 % of the ring's; order 2 or more in the length of cells."""
+    """R / h = 50: largest moment within 5 % of Brazier's and 0.1 % of the ring's; order 2 or more in the length of cells."""
     exact, flattening = collapse(ring)
     assert exact == pytest.approx(0.958679, abs=2e-6)
     assert exact / BRAZIER - 1.0 == pytest.approx(-0.029, abs=0.0005)
