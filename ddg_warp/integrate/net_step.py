@@ -7,7 +7,7 @@ from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels import outcome, step
 from ddg_warp.kernels.net import elements, frames, krylov, newton
 from ddg_warp.net_model import NetState
-from ddg_warp.net_newton import NetNewton
+from ddg_warp.net_newton import PRECONDITIONERS, NetNewton
 from ddg_warp.net_system import _lists
 from ddg_warp.tangent import Tangent
 
@@ -20,12 +20,12 @@ class NetStep:
         host, device, real = model.net.host, model.wp_device, model.types.real
         options = integrator.options
         for name, value, only in (
-            ("solver", integrator.solver, "newton"),
-            ("linear", integrator.linear, "auto"),
-            ("psd", options.psd, "auto"),
+            ("solver", integrator.solver, ("newton",)),
+            ("linear", integrator.linear, ("auto", *PRECONDITIONERS)),
+            ("psd", options.psd, ("auto",)),
         ):
-            if value != only:
-                raise SceneError(f"{name} = {value!r} is of rods on their own; with a net leave it at {only!r}")
+            if value not in only:
+                raise SceneError(f"{name} = {value!r} is of rods on their own; with a net it is {' or '.join(only)}")
         bare = np.flatnonzero(((host.mass <= 0.0) & ~host.fixed)[: host.nodes].any(1))
         if bare.size:
             raise SceneError(
@@ -36,8 +36,8 @@ class NetStep:
             raise SceneError("ends of rods in a net that turn are for statics; in dynamics move their nodes alone")
         if host.bands:
             raise SceneError("pressure that follows axisymmetric shells is for statics; in dynamics give dead=True")
-        multilevel = integrator.linear == "multilevel"
-        self.newton = NetNewton(model, integrator.options, "multilevel" if multilevel else "block_jacobi")
+        preconditioner = PRECONDITIONERS[0] if integrator.linear == "auto" else integrator.linear
+        self.newton = NetNewton(model, options, preconditioner)
         self.midpoint = integrator.scheme == "implicit_midpoint"
         self._begin, self._hold, self._finish = newton.step_kernels(real, self.midpoint)
         self._start, self._advance = step.start_kernel(real), step.advance_kernel(real)

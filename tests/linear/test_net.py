@@ -177,3 +177,57 @@ def test_negative_curvature_ends_the_solve_and_projects(device):
     right, direction = (a.numpy().reshape(2, -1) for a in (newton.right, newton.direction))
     assert ((right * direction).sum(1) > 0.0).all()
     assert np.isfinite(direction).all()
+
+
+@pytest.mark.parametrize("precision", ["float64", "mixed"])
+def test_multilevel_takes_fewer_iterations_to_the_same_step(device, precision):
+    """Groups of 8, 64 and 512 nodes carry what block Jacobi passes on edge by edge; both stop at the same residual of the step."""
+    points, triangles = meshes.rectangle(24, 24, (1.0, 1.0), "alternating")
+    found, iterations = [], []
+    for linear in ("block_jacobi", "multilevel"):
+        scene = ddg.Scene()
+        shell = scene.add_shell(
+            points, triangles, thickness=1e-3, material=ddg.Material(1e6, 0.3, 1000.0), bending="hinge"
+        )
+        scene.hold(shell, [0, 24])
+        model = scene.build(device, precision, worlds=2)
+        integrator, state = ddg.Integrator(model, linear=linear, check_every=1), model.state()
+        for _ in range(3):
+            state = integrator.step(state, 1.0 / 30.0)
+        found.append(state.points())
+        statistics = integrator.statistics()
+        iterations.append(statistics["pcg_iterations"] / statistics["newton_iterations"]["mean"])
+    np.testing.assert_allclose(found[1], found[0], rtol=0.0, atol=1e-6)
+    np.testing.assert_array_equal(found[1][0], found[1][1])
+    assert iterations[1] < 0.7 * iterations[0]
+
+
+def test_blocks_of_groups_are_those_of_the_matrix(device):
+    """D_l is the diagonal of P^T H P, with P the translations of the groups of a level on free dofs."""
+    points, triangles = meshes.rectangle(9, 7, (1.0, 0.8), "right")
+    scene = ddg.Scene()
+    shell = scene.add_shell(points, triangles, thickness=0.01, material=ddg.Material(1e6, 0.3, 1000.0))
+    scene.hold(shell, [0, 3, 9], "xz")
+    model = scene.build(device, "float64")
+    integrator = ddg.Integrator(model, linear="multilevel", check_every=1)
+    integrator.step(model.state(), 0.01)
+    newton = integrator._net.newton
+    newton.wanted.fill_(1)
+    newton.levels.prepare(newton.matrix, newton.fixed, newton.wanted)
+    table, blocks = newton.system, model.net.blocks
+    H = np.zeros((3 * blocks, 3 * blocks))
+    rows, columns, values = table.rows.numpy(), table.columns.numpy(), newton.matrix.numpy()
+    for p in np.flatnonzero(rows >= 0):
+        H[3 * rows[p] : 3 * rows[p] + 3, 3 * columns[p] : 3 * columns[p] + 3] = values[:, p].reshape(3, 3)
+    free = ~model.net.host.fixed.ravel()
+    order = newton.levels.order.numpy()
+    for level, groups in enumerate(newton.levels.counts):
+        for g in range(groups):
+            members = order[g * 8 ** (level + 1) : (g + 1) * 8 ** (level + 1)]
+            P = np.zeros((3 * blocks, 3))
+            for node in members:
+                P[3 * node : 3 * node + 3] = np.eye(3)
+            P[~free] = 0.0
+            expected = P.T @ H @ P
+            measured = newton.levels.blocks[level].numpy()[g]
+            np.testing.assert_allclose(measured, expected, rtol=0.0, atol=1e-10 * np.abs(H).max())
