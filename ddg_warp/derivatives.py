@@ -245,7 +245,8 @@ class Sample:
     def _launch(self, kernel, real, shapes, before=(), after=(), columns=(), **changed) -> list[np.ndarray]:
         out = [wp.zeros(shape, dtype=real, device=self.device) for shape in shapes]
         inputs = [*self._inputs(real, **changed), *before]
-        wp.launch(kernel, (*self.shape, *columns), inputs, [*out, *after], device=self.device)
+        outputs, grid = [*out, *after], (*self.shape, *columns)
+        wp.launch(kernel, grid, inputs, outputs, device=self.device, block_dim=128)  # `evaluate` is bound to that
         return [array.numpy().astype(float) for array in out]
 
 

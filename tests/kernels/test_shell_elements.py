@@ -66,18 +66,18 @@ def test_no_force_at_rest(device, bending, membrane, viscosity):
     plate = shells.plate(surface, place, 0.3, UNIT_D, NU, kinds, "shape", viscosity)
     moved = place + 0.1 * np.random.default_rng(6).normal(size=place.shape)
     for elements in shells.shell_elements(surface, plate, kinds, bending, membrane):
-        sizes = [np.abs(at_rest(elements, x).evaluate(device=device)["gradient"]).max() for x in (place, moved)]
+        sizes = [np.abs(at_rest(elements, x, device).evaluate(device=device)["gradient"]).max() for x in (place, moved)]
         assert sizes[0] < 1e-14 and sizes[1] > 1e-3, elements.term.name
 
 
-def at_rest(elements, place):
+def at_rest(elements, place, device):
     """Local elements; damped ones without change of strain since the last step."""
     local = gather(elements, place)
     if not elements.term.density.lagged:
         return local
     n = len(elements.term.measure.strains)
     padded = local.changed(p=np.concatenate([local.p, np.zeros((len(local.p), n + 1))], 1))
-    last = padded.evaluate()["strain"]
+    last = padded.evaluate(device=device)["strain"]
     return local.changed(p=np.concatenate([local.p, last, np.full((len(last), 1), 50.0)], 1))
 
 
@@ -145,7 +145,7 @@ def test_damping_is_a_scaled_step(device):
         plates = [shells.plate(surface, place, 0.3, UNIT_D, NU, kinds, "shape", v) for v in (None, 0.1)]
         pairs = zip(*(shells.shell_elements(surface, plate, kinds, bending) for plate in plates), strict=True)
         for elastic, damped in pairs:
-            start = at_rest(damped, place)
+            start = at_rest(damped, place, device)
             local = start.changed(q=gather(damped, moved).q)
             both = local.evaluate(device=device)["energy"]
             np.testing.assert_allclose(both, 6.0 * gather(elastic, moved).evaluate(device=device)["energy"], rtol=1e-10)
