@@ -172,3 +172,15 @@ def test_crumpled_sheet_becomes_flat(device, bending, size):
     state = Equilibrium(model).solve(model.state(points=start), 1.0, 1.0)
     assert state.points() == pytest.approx(points, abs=1e-6)
     assert sum(model.energies(state).values()) < 1e-12 * before
+
+
+def test_two_motions_of_a_point_are_refused(device):
+    """The corner between two edges that move apart: each motion alone would put it where the other does not want it."""
+    points, triangles = meshes.rectangle(2, 2)
+    scene = ddg.Scene()
+    sheet = scene.add_shell(points, triangles, thickness=1e-2, material=MATERIAL)
+    for axis, components in enumerate("xy"):
+        motion = ddg.Motion(translation=lambda t, axis=axis: tuple(0.1 * t * np.eye(3)[axis]))
+        scene.hold(sheet, np.flatnonzero(points[:, axis] > 1.0 - 1e-9), components, motion=motion)
+    with pytest.raises(ddg.SceneError, match=r"point at \(1, 1, 0\) m has two motions.*give it one"):
+        scene.build(device, "float64")
