@@ -48,8 +48,7 @@ def newton(solver, state: State, before: float, at: float) -> State | None:
             if excess <= 0.0 and (solver.outcome == "converged" or polished):
                 stable = factor.reliable and not factor.negative
                 state.time = at
-                taken = (stable or solver.options.mode == "follow") and not solver.hidden(outer, residual)
-                return state if taken else None
+                return state if stable or solver.options.mode == "follow" else None
             polished = excess <= 0.0
         else:
             residual = residual - hessian @ jump

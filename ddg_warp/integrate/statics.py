@@ -175,14 +175,14 @@ class Equilibrium:
             )
         raise SolverError(self._where("max_iterations", outer - gradient, at), state=state, outcome="max_iterations")
 
-    def hidden(self, outer: np.ndarray, residual: np.ndarray) -> bool:
+    def _hidden(self, outer: np.ndarray, residual: np.ndarray) -> bool:
         """Whether more than half of the loads is left over, of which rounding does not let the dofs tell."""
         points = self.tangent.free & ~self.tangent.angle
         return self.outcome != "converged" and np.abs(residual[points]).sum() > 0.5 * np.abs(outer[points]).sum() > 0.0
 
     def _found(self, state: State, outer: np.ndarray, residual: np.ndarray, at: float) -> State:
         """The state as the equilibrium at `at`, unless rounding hides its loads and spoils the tangent that would carry them."""
-        if self.shift > 0.0 and self.hidden(outer, residual):
+        if self.shift > 0.0 and self._hidden(outer, residual):
             raise SolverError(
                 f"no equilibrium at load parameter {at:g}: lost_in_rounding, the stiffest elements make forces as uncertain as "
                 "the loads are large; take better shaped elements, or float64",
