@@ -531,6 +531,13 @@ def _mark(net: Net, nodes, bits: int, edges, motion, motions) -> None:
     net.held.append(NetHeld(pairs[:, 0], pairs[:, 1]))
     if motion is not None:
         index = next(i for i, m in enumerate(motions) if m is motion)
+        for other, at in net.moving:
+            if at != index and (twice := np.intersect1d(nodes, other)).size:
+                place = ", ".join(f"{x:g}" for x in net.rest[twice[0]])
+                raise SceneError(
+                    f"the point at ({place}) m has two motions; a motion moves all held components of a point, so give it one "
+                    "that does both"
+                )
         net.moving.append((nodes, index))
         if len(edges):
             net.turning.append((edges, index))

@@ -39,6 +39,7 @@ from ddg_warp.shell_geometry import (
 MODELS = ("midedge_dof", "midedge_boundary", "midedge", "hinge", "isometric")
 TURNING = ("midedge_dof", "midedge_boundary")  # models whose mesh edges have an angle
 MEMBRANES = ("flat", "curved")
+FOLDED = 1e-6  # rad short of a fold by pi at which an edge has no angle
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,7 @@ def plate(surface, positions, thickness, young, poisson, kinds: EdgeKinds, rest=
     """
     positions = np.asarray(positions, float)
     count = len(surface.triangles)
+    _refuse_folds(surface, edge_angles(surface, positions, kinds))
     angle = np.zeros((len(surface.edges), 2))
     if isinstance(rest, str):
         if rest not in ("shape", "flat"):
@@ -129,6 +131,17 @@ def plate(surface, positions, thickness, young, poisson, kinds: EdgeKinds, rest=
         else _by_triangle("viscosity", viscosity, count, lambda v: v >= 0.0, "not negative"),
     }
     return Plate(abar, bbar, angle, **material)
+
+
+def _refuse_folds(surface, angle: np.ndarray) -> None:
+    """Refuse two triangles that lie on each other: their angle is as well +pi as -pi, and the curvature between them infinite."""
+    folded = (~surface.boundary[:, None] & (np.abs(angle) > np.pi - FOLDED)).any(1)
+    for edge in np.flatnonzero(folded)[:1]:
+        first, second = surface.edge_triangles[edge]
+        raise SceneError(
+            f"triangles {first} and {second} fold back on each other at the edge between the vertices "
+            f"{surface.edges[edge, 0]} and {surface.edges[edge, 1]}, where curvature is infinite; move a vertex"
+        )
 
 
 def membrane(surface, plate: Plate) -> ElementSet:

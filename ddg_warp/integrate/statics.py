@@ -70,6 +70,7 @@ class Equilibrium:
         tangent: energy, gradient and Hessian of the model.
         mixed: whether Newton with stresses of its own is tried first; where it can be, by default.
         iterations: Newton iterations so far.
+        shift: of the last tangent, over its diagonal, that made it definite; 0 where it was.
         outcome: of the last solve, `converged` or `converged_to_rounding`.
     """
 
@@ -78,7 +79,7 @@ class Equilibrium:
         self.tangent = Tangent(model)
         require_supports(model)
         self.mixed = self.tangent.shells_alone
-        self.iterations = 0
+        self.iterations, self.shift = 0, 0.0
         self.outcome = ""
 
     def load(self, state: State, load_steps: int, start: float = 0.0, end: float = 1.0) -> State:
@@ -130,8 +131,7 @@ class Equilibrium:
                 scale = np.abs(residual[free]).max()
             excess = self.excess(residual, gradient, hessian, q, scale)
             if excess <= 0.0 and (self.outcome == "converged" or polished):
-                state.time = at
-                return state
+                return self._found(state, outer, residual, at)
             polished = excess <= 0.0  # the floor is a bound: one more iteration gives what rounding allows
             self.iterations += 1
             direction, decrease = self._direction(hessian, residual)
@@ -161,8 +161,7 @@ class Equilibrium:
                     break
                 taken *= 0.5
             if not found and polished:
-                state.time = at
-                return state
+                return self._found(state, outer, residual, at)
             if not found:
                 raise SolverError(
                     self._where("line_search_failed", residual, at), state=state, outcome="line_search_failed"
@@ -175,6 +174,23 @@ class Equilibrium:
                 new_outer,
             )
         raise SolverError(self._where("max_iterations", outer - gradient, at), state=state, outcome="max_iterations")
+
+    def _hidden(self, outer: np.ndarray, residual: np.ndarray) -> bool:
+        """Whether more than half of the loads is left over, of which rounding does not let the dofs tell."""
+        points = self.tangent.free & ~self.tangent.angle
+        return self.outcome != "converged" and np.abs(residual[points]).sum() > 0.5 * np.abs(outer[points]).sum() > 0.0
+
+    def _found(self, state: State, outer: np.ndarray, residual: np.ndarray, at: float) -> State:
+        """The state as the equilibrium at `at`, unless rounding hides its loads and spoils the tangent that would carry them."""
+        if self.shift > 0.0 and self._hidden(outer, residual):
+            raise SolverError(
+                f"no equilibrium at load parameter {at:g}: lost_in_rounding, the stiffest elements make forces as uncertain as "
+                "the loads are large; take better shaped elements, or float64",
+                state=state,
+                outcome="lost_in_rounding",
+            )
+        state.time = at
+        return state
 
     def _with_supports_moved(self, state: State, before: float, at: float) -> State:
         """A copy with its supports where they are at `at`, and the free dofs following by the tangent if that is the better guess.
@@ -219,9 +235,9 @@ class Equilibrium:
     def _factor(self, matrix) -> Factorisation:
         """The tangent's factors; shifted until it is definite, or in mode "follow" until it is regular."""
         diagonal = sparse.diags(np.abs(matrix.diagonal()) + 1e-12 * np.abs(matrix.diagonal()).max())
-        for shift in (0.0, *np.geomspace(1e-6, 16.0, 13)):
+        for self.shift in (0.0, *np.geomspace(1e-6, 16.0, 13)):
             try:
-                factor = Factorisation((matrix + shift * diagonal).tocsc())
+                factor = Factorisation((matrix + self.shift * diagonal).tocsc())
             except SingularError:
                 continue
             if self.options.mode == "follow" or (factor.reliable and not factor.negative):

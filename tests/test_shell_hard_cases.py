@@ -1,0 +1,186 @@
+"""Hard cases of shells in statics: very thin, snapping, needles, folded meshes, sharp creases, crumpled starts.
+
+Every search must end in an equilibrium that is known from elsewhere, or in an error that names its outcome or the place.
+"""
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp import meshes
+from ddg_warp.integrate.statics import Equilibrium
+from ddg_warp.scenes import _sze
+from ddg_warp.scenes.hinged_roof import HALF_ANGLE, HALF_LENGTH, POISSON, RADIUS, YOUNG
+from ddg_warp.stability import spectrum
+
+MATERIAL = ddg.Material(young=1e9, poisson=0.3)
+
+
+def found(scene, device, steps: int = 1):
+    """Model, equilibrium and solver of a scene."""
+    model = scene.build(device, "float64")
+    solver = Equilibrium(model)
+    return model, solver.load(model.state(), steps), solver
+
+
+def pressed_plate(device, thickness: float, pressure: float = 1.0) -> float:
+    """Deflection of the centre of a unit square on supports that hold it in its plane, in one load step [m]."""
+    points, triangles = meshes.rectangle(10, 10, (1.0, 1.0), "crossed")
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    plate = scene.add_shell(points, triangles, thickness=thickness, material=MATERIAL)
+    scene.hold(plate, np.flatnonzero((np.minimum(points, 1.0 - points)[:, :2] < 1e-9).any(1)))
+    scene.add_pressure(plate, pressure)
+    return found(scene, device)[1].points()[:, 2].max()
+
+
+# Square membrane of half side a: p = 1.994 (1 - 0.271 nu) / (1 - nu) E h w^3 / a^4 (Maier-Schneider, Maibach and Obermeier, J. MEMS 4,
+# 1995), so w = 0.2880 (p / (E h))^(1/3) with nu = 0.3 and a = 1/2.
+@pytest.mark.parametrize("thickness", [1e-4, 1e-5])
+def test_very_thin_plate_is_a_membrane(device, thickness):
+    """A deflection of 60 and 1300 thicknesses at once, from a flat state whose tangent is that of bending alone."""
+    height = pressed_plate(device, thickness)
+    assert height / (1.0 / (MATERIAL.young * thickness)) ** (1.0 / 3.0) == pytest.approx(0.2880, rel=5e-3)
+    more = pressed_plate(device, thickness, 1000.0)  # strains are no longer small: 0.7 and 3 percent
+    assert more / height == pytest.approx(10.0, rel=0.02)
+
+
+def test_snap_through_in_one_step(device):
+    """The roof loaded above its limit load of about 2230 N: one step or ten, it ends at the same minimum on the other side."""
+    flat, triangles = _sze.sheet(4, 4, (1.0, 1.0), "crossed")
+    points = _sze.cylinder_part(flat, RADIUS, HALF_LENGTH, HALF_ANGLE)
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    roof = scene.add_shell(points, triangles, thickness=12.7, material=ddg.Material(YOUNG, POISSON))
+    scene.symmetry(roof, _sze.side(flat, 0, 0.0), "y")
+    scene.symmetry(roof, _sze.side(flat, 1, 0.0), "z")
+    scene.hold(roof, _sze.side(flat, 0, 1.0))
+    scene.add_vertex_force(roof, [0], (-3000.0 / 4.0, 0.0, 0.0))
+    (model, once, _), (_, often, _) = found(scene, device), found(scene, device, 10)
+    rise = RADIUS * (1.0 - np.cos(HALF_ANGLE))
+    assert RADIUS - once.points()[0, 0] > 2.0 * rise
+    assert once.points() == pytest.approx(often.points(), abs=1e-6)
+    assert spectrum(model, once, 1, "unit").stable
+
+
+def needles(device, aspect: float, gravity: float):
+    """A clamped strip with cells of this aspect ratio, nu = 0, under its weight: deflection of the end over that of a beam."""
+    points, triangles = meshes.rectangle(8, 4, (1.0, 0.5 / aspect), "right")
+    scene = ddg.Scene(gravity=(0.0, 0.0, -gravity))
+    strip = scene.add_shell(points, triangles, thickness=1e-3, material=ddg.Material(1e9, 0.0, density=10.0))
+    scene.clamp_boundary(strip, np.flatnonzero(points[:, 0] < 1e-9))
+    beam = 10.0 * 1e-3 * gravity / (8.0 * 1e9 * 1e-9 / 12.0)  # q L^4 / (8 EI), for the width
+    return -found(scene, device)[1].points()[:, 2].min() / beam
+
+
+@pytest.mark.parametrize("aspect", [30.0, 1000.0])
+def test_needles(device, aspect):
+    """Triangles a thousand times as long as wide bend like a beam, as those of a few times do: 1.5 % soft at 8 cells."""
+    assert needles(device, aspect, 0.01) == pytest.approx(1.0156, abs=2e-3)
+
+
+def test_loads_lost_in_rounding_are_named(device):
+    """Ten times longer ones are so stiff across that rounding of their forces exceeds the weight: no state is called equilibrium."""
+    with pytest.raises(ddg.SolverError, match=r"lost_in_rounding.*better shaped") as caught:
+        needles(device, 1e4, 0.01)
+    assert caught.value.outcome == "lost_in_rounding"
+    assert np.isfinite(caught.value.state.points()).all()
+
+
+def moved(shift: float) -> tuple[np.ndarray, np.ndarray, int]:
+    """A square of 4 x 4 cells whose middle vertex is shifted towards its neighbour by so many cells."""
+    points, triangles = meshes.rectangle(4, 4)
+    points[12, 0] += 0.25 * shift
+    return points, triangles, 12
+
+
+def test_slivers(device):
+    """A vertex moved to 1e-3 and 4e-6 cells of the next leaves the deflection of a clamped square within 3 %; nearer is refused."""
+    heights = []
+    for shift in (0.0, 0.999, 1.0 - 4e-6, 1.0 - 1e-12):
+        points, triangles, _ = moved(shift)
+        scene = ddg.Scene(gravity=(0.0, 0.0, -1.0))
+        material = ddg.Material(1e6, 0.3, density=1.0)
+        sheet = scene.add_shell(points, triangles, thickness=1e-2, material=material)
+        scene.clamp_boundary(sheet, np.flatnonzero(points[:, 0] < 1e-9))
+        if shift > 1.0 - 1e-9:
+            with pytest.raises(ddg.SceneError, match=r"triangle \d+ is degenerate"):
+                scene.build(device, "float64")
+        else:
+            heights.append(found(scene, device)[1].points()[:, 2].min())
+    assert heights == pytest.approx([heights[0]] * 3, rel=0.03)
+
+
+@pytest.mark.parametrize("bending", ["midedge_dof", "hinge"])
+@pytest.mark.parametrize("rest", ["shape", "flat"])
+def test_inverted_triangles_are_refused(device, bending, rest):
+    """A vertex moved past its neighbour, in the plane: triangles lie on others, with an angle of as well +pi as -pi."""
+    points, triangles, _ = moved(1.2)
+    scene = ddg.Scene()
+    scene.hold(scene.add_shell(points, triangles, thickness=1e-2, material=MATERIAL, bending=bending, rest=rest), [0])
+    with pytest.raises(ddg.SceneError, match=r"triangles \d+ and \d+ fold back .*vertices \d+ and \d+.*move a vertex"):
+        scene.build(device, "float64")
+
+
+def creased(device):
+    """A strip of hinges, clamped at one end, its model, and the mesh edges across its middle."""
+    points, triangles = meshes.rectangle(8, 4, (1.0, 0.5))
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    strip = scene.add_shell(points, triangles, thickness=1e-3, material=MATERIAL, bending="hinge")
+    scene.clamp_boundary(strip, np.flatnonzero(points[:, 0] < 1e-9))
+    model = scene.build(device, "float64")
+    edges = model.net.host.shells[strip].surface.edges_on(np.abs(points[:, 0] - 0.5) < 1e-9)
+    return model, edges, len(model.net.host.shells[strip].surface.edges)
+
+
+def test_crease_of_175_degrees(device):
+    """Rest angles in five steps: the free half folds over the held one by exactly that, and nothing is strained."""
+    model, edges, count = creased(device)
+    solver, state, angle = Equilibrium(model), model.state(), np.zeros(count)
+    for degrees in (35.0, 70.0, 105.0, 140.0, 175.0):
+        angle[edges] = np.radians(degrees)
+        model.set_rest(0, angle=angle)
+        state = solver.solve(state, 1.0, 1.0)
+    x, _, z = state.points()[8]
+    assert np.degrees(np.arctan2(z, x - 0.5)) == pytest.approx(-175.0, abs=1e-6)
+    assert np.hypot(x - 0.5, z) == pytest.approx(0.5, abs=1e-9)
+    assert sum(model.energies(state).values()) < 1e-12
+
+
+def test_crease_at_once_is_named(device):
+    """All of the angle in one step is too far for the search: it says so, and keeps a finite state."""
+    model, edges, count = creased(device)
+    angle = np.zeros(count)
+    angle[edges] = np.radians(175.0)
+    model.set_rest(0, angle=angle)
+    with pytest.raises(ddg.SolverError, match=r"max_iterations.*of shell 0") as caught:
+        Equilibrium(model).solve(model.state(), 1.0, 1.0)
+    assert caught.value.outcome == "max_iterations"
+    assert np.isfinite(caught.value.state.points()).all()
+
+
+@pytest.mark.parametrize("bending", ["midedge_dof", "midedge", "hinge"])
+@pytest.mark.parametrize("size", [0.3, 0.6])
+def test_crumpled_sheet_becomes_flat(device, bending, size):
+    """Every vertex but those of one clamped side moved at random by up to `size` edge lengths: back to rest, without energy."""
+    points, triangles = meshes.rectangle(8, 8)
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    sheet = scene.add_shell(points, triangles, thickness=1e-2, material=ddg.Material(1e6, 0.3), bending=bending)
+    side = points[:, 0] < 1e-9
+    scene.clamp_boundary(sheet, np.flatnonzero(side))
+    model = scene.build(device, "float64")
+    start = points + 0.125 * size * np.random.default_rng(0).uniform(-1.0, 1.0, points.shape) * ~side[:, None]
+    before = sum(model.energies(model.state(points=start)).values())
+    state = Equilibrium(model).solve(model.state(points=start), 1.0, 1.0)
+    assert state.points() == pytest.approx(points, abs=1e-6)
+    assert sum(model.energies(state).values()) < 1e-12 * before
+
+
+def test_two_motions_of_a_point_are_refused(device):
+    """The corner between two edges that move apart: each motion alone would put it where the other does not want it."""
+    points, triangles = meshes.rectangle(2, 2)
+    scene = ddg.Scene()
+    sheet = scene.add_shell(points, triangles, thickness=1e-2, material=MATERIAL)
+    for axis, components in enumerate("xy"):
+        motion = ddg.Motion(translation=lambda t, axis=axis: tuple(0.1 * t * np.eye(3)[axis]))
+        scene.hold(sheet, np.flatnonzero(points[:, axis] > 1.0 - 1e-9), components, motion=motion)
+    with pytest.raises(ddg.SceneError, match=r"point at \(1, 1, 0\) m has two motions.*give it one"):
+        scene.build(device, "float64")
