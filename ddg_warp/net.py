@@ -108,7 +108,7 @@ class Net:
         mass: of every dof (N, 3) [kg, kg m^2]; fixed: held dofs (N, 3).
         load: dead forces (N, 3); timed, pressures, bands: loads that change.
         held: what each support of `scene.supports`, then of `scene.shell_supports` and `scene.ring_supports`, holds here.
-        moving: (block, motion) of nodes with a motion, with rest positions; turning: (angle block, motion, sign) of rod edges.
+        moving: (blocks, motion, components (3,) bool) of nodes with a motion; turning: (angle block, motion, sign) of rod edges.
     """
 
     rest: np.ndarray
@@ -126,7 +126,7 @@ class Net:
     timed: list[NetLoad] = field(default_factory=list)
     pressures: list[NetPressure] = field(default_factory=list)
     held: list[NetHeld] = field(default_factory=list)
-    moving: list[tuple[np.ndarray, int]] = field(default_factory=list)
+    moving: list[tuple[np.ndarray, int, np.ndarray]] = field(default_factory=list)
     turning: list[tuple[np.ndarray, int]] = field(default_factory=list)
     meridians: list[axisymmetric.NetMeridian] = field(default_factory=list)
     bands: list[axisymmetric.NetBand] = field(default_factory=list)
@@ -531,14 +531,11 @@ def _mark(net: Net, nodes, bits: int, edges, motion, motions) -> None:
     net.held.append(NetHeld(pairs[:, 0], pairs[:, 1]))
     if motion is not None:
         index = next(i for i, m in enumerate(motions) if m is motion)
-        for other, at in net.moving:
+        for other, at, _ in net.moving:
             if at != index and (twice := np.intersect1d(nodes, other)).size:
                 place = ", ".join(f"{x:g}" for x in net.rest[twice[0]])
-                raise SceneError(
-                    f"the point at ({place}) m has two motions; a motion moves all held components of a point, so give it one "
-                    "that does both"
-                )
-        net.moving.append((nodes, index))
+                raise SceneError(f"the point at ({place}) m has two motions; give it one that does both")
+        net.moving.append((nodes, index, np.isin(np.arange(3), components)))
         if len(edges):
             net.turning.append((edges, index))
 

@@ -2,7 +2,7 @@
 
 from ddg_warp.kernels import cyclic_reduction
 from ddg_warp.kernels.terms import JOINT, REGISTRY, SHELLS
-from ddg_warp.linear.choice import automatic
+from ddg_warp.linear.choice import automatic, net_preconditioner
 from ddg_warp.net_system import NetSystem
 
 SOLVERS = {
@@ -55,7 +55,7 @@ def net_lines(model) -> list[str]:
         lines.append(f"  {part.term.name}: {part.elements * model.worlds} elements, {measure} x {density}")
     size = 9 * table.positions * model.worlds * (4 if linear.__name__ == "float32" else 8)
     lines.append(
-        f"  solver: PCG (block Jacobi), one Newton loop a world, linear algebra in {linear.__name__}; "
+        f"  solver: PCG ({net_preconditioner(model.net)}), one Newton loop a world, linear algebra in {linear.__name__}; "
         f"H: {table.entries} blocks of 3 x 3, {size / 1e6:.3g} MB"
     )
     return lines

@@ -473,3 +473,16 @@ def test_snapshots_go_on_bit_by_bit_in_long_steps(device):
         other, _ = steps(model, 1, 0.05, state=model.restore(saved))
         compare = np.testing.assert_array_equal if device == "cpu" else np.testing.assert_allclose
         compare(state.points(), other.points())
+
+
+def test_motion_leaves_other_held_components_alone(device):
+    """A corner in a plane of symmetry is moved along x and turned by its motion; what holds its y is the plane."""
+    scene = sheet(2)
+    motion = ddg.Motion(translation=lambda t: (0.1 * t, 0.3 * t, 0.0), angle=lambda t: 0.2 * t)
+    scene.hold(0, [8], "y")
+    scene.hold(0, [8], "xz", motion=motion)
+    model = scene.build(device, "float64")
+    rest = model.state().points()[8]
+    expected = motion.place(0.02, rest[None])[0] * [1.0, 0.0, 1.0] + rest * [0.0, 1.0, 0.0]
+    state, _ = steps(model, 2, 0.01)
+    np.testing.assert_allclose(state.points()[8], expected, atol=1e-14)

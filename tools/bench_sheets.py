@@ -17,6 +17,7 @@ import warp as wp
 
 import ddg_warp as ddg
 from ddg_warp import meshes
+from ddg_warp.net_newton import PRECONDITIONERS
 from ddg_warp.summary import machine, plain, table, write_json
 
 BANDWIDTH = 4.8e12  # of an H200 [bytes/s]
@@ -68,11 +69,11 @@ def clocked(device, part, repeats: int) -> float:
     return 1e-3 * wp.get_event_elapsed_time(first, last) / repeats
 
 
-def measure(bending: str, cells: int, device, quick: bool) -> dict:
+def measure(bending: str, cells: int, device, quick: bool, linear: str) -> dict:
     """A row of the table."""
     began = time.perf_counter()
     model = sheet(cells, bending).build(device.alias, "mixed" if device.is_cuda else "float64")
-    integrator = ddg.Integrator(model, check_every=1)
+    integrator = ddg.Integrator(model, linear=linear, check_every=1)
     built = time.perf_counter() - began
     state, steps, dt = model.state(), 3 if quick else 10, 1.0 / 240.0
     for _ in range(2):
@@ -109,6 +110,7 @@ def measure(bending: str, cells: int, device, quick: bool) -> dict:
         "bending": bending,
         "triangles": triangles,
         "precision": model.precision,
+        "linear": linear,
         "ms_per_step": 1e3 * step,
         **{f"{name}_ns_a_triangle": 1e9 * seconds / triangles for name, seconds in parts.items()},
         **{f"{name}_floor_ns": 1e9 * size / BANDWIDTH / triangles for name, size in floor.items()},
@@ -127,6 +129,7 @@ def main() -> int:
     parser.add_argument("--device", help="Warp device (default: CUDA if there is one)")
     parser.add_argument("--quick", action="store_true", help="small sizes: does it run?")
     parser.add_argument("--bending", nargs="*", default=list(SIZES), choices=list(SIZES))
+    parser.add_argument("--linear", default="block_jacobi", choices=PRECONDITIONERS, help="preconditioner")
     parser.add_argument("--largest", type=int, default=10**6, help="largest number of triangles")
     parser.add_argument("--commit", default="", help="commit, where there is no git checkout")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
@@ -137,7 +140,7 @@ def main() -> int:
     for bending in chosen.bending:
         for cells in SIZES[bending][:1] if chosen.quick else SIZES[bending]:
             if 2 * cells * cells <= chosen.largest:
-                rows.append(measure(bending, cells, device, chosen.quick))
+                rows.append(measure(bending, cells, device, chosen.quick, chosen.linear))
                 print(table(rows[-1:]), file=sys.stderr, flush=True)
     origin = machine()
     origin["commit"] = chosen.commit or origin["commit"]

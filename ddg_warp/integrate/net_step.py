@@ -6,6 +6,7 @@ import warp as wp
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels import outcome, step
 from ddg_warp.kernels.net import elements, frames, krylov, newton
+from ddg_warp.linear.choice import net_preconditioner
 from ddg_warp.net_model import NetState
 from ddg_warp.net_newton import PRECONDITIONERS, NetNewton
 from ddg_warp.net_system import _lists
@@ -36,7 +37,7 @@ class NetStep:
             raise SceneError("ends of rods in a net that turn are for statics; in dynamics move their nodes alone")
         if host.bands:
             raise SceneError("pressure that follows axisymmetric shells is for statics; in dynamics give dead=True")
-        preconditioner = PRECONDITIONERS[0] if integrator.linear == "auto" else integrator.linear
+        preconditioner = net_preconditioner(model.net) if integrator.linear == "auto" else integrator.linear
         self.newton = NetNewton(model, options, preconditioner)
         self.midpoint = integrator.scheme == "implicit_midpoint"
         self._begin, self._hold, self._finish = newton.step_kernels(real, self.midpoint)
@@ -55,8 +56,12 @@ class NetStep:
         outer = np.abs(dead).sum() + np.abs(host.load[host.nodes :]).sum()
         outer += sum(np.abs(load.force).sum() for load in host.timed)
         self.outer = wp.full(worlds, float(outer), dtype=real, device=device)
-        blocks = np.concatenate([b for b, _ in host.moving]) if host.moving else np.zeros(0, int)
+        blocks = np.concatenate([b for b, _, _ in host.moving]) if host.moving else np.zeros(0, int)
         self._moving_blocks = blocks
+        moving = np.zeros(host.blocks, np.uint8)
+        for places, _, components in host.moving:
+            moving[places] |= np.uint8(components @ [1, 2, 4])
+        self.moving = wp.array(moving, dtype=wp.uint8, device=device)
         self.where = wp.array(blocks.astype(np.int32), dtype=int, device=device)
         self.place = wp.zeros((2, max(1, len(blocks))), dtype=model.net.vector, device=device)
         self._loads(device, real)
@@ -82,7 +87,7 @@ class NetStep:
         host, model = self.net.host, self.model
         if len(self._moving_blocks):
             places = [
-                np.concatenate([model.motions[m].place(t, host.rest[blocks]) for blocks, m in host.moving])
+                np.concatenate([model.motions[m].place(t, host.rest[blocks]) for blocks, m, _ in host.moving])
                 for t in (t0, t1)
             ]
             self.place.assign(np.array(places))
@@ -138,7 +143,7 @@ class NetStep:
             self._launch(
                 self._hold,
                 (len(self._moving_blocks), self.model.worlds),
-                [self.where, self.place, solver.fixed, self.progress, self.portion, blocks],
+                [self.where, self.place, self.moving, self.progress, self.portion, blocks],
                 [solver.q],
             )
         self._apply_loads()
