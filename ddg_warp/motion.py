@@ -41,6 +41,11 @@ class Motion:
             raise ValueError(f"Motion: axis {self.axis} is no direction; give three numbers, not all zero")
         object.__setattr__(self, "_unit", axis / length)
 
+    @property
+    def turns(self) -> bool:
+        """Whether it was given an angle."""
+        return self.angle is not _unturned
+
     def pose(self, t0: float, t1: float) -> np.ndarray:
         """What the device needs of a step from t0 to t1: turn (3), rotation at t0 (9), pivot (3), translations (3, 3)."""
         a0, a1 = float(self.angle(t0)), float(self.angle(t1))

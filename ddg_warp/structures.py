@@ -227,6 +227,10 @@ class Structures(Meridians):
         motion = options.get("motion")
         if motion is not None and not isinstance(motion, Motion):
             raise SceneError(f"motion is {motion!r}; give Motion(translation=..., angle=...)")
+        if motion is not None and motion.turns and options.get("edges") == "clamp":
+            raise SceneError(
+                "clamp_boundary: a clamp holds the normal still; to turn an edge, hold two rows of vertices instead"
+            )
         self.shell_supports.append(ShellSupport(shell, self._vertices(shell, vertices), components, **options))
 
     def _check_shell(self, shell) -> None:

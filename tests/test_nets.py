@@ -486,3 +486,9 @@ def test_motion_leaves_other_held_components_alone(device):
     expected = motion.place(0.02, rest[None])[0] * [1.0, 0.0, 1.0] + rest * [0.0, 1.0, 0.0]
     state, _ = steps(model, 2, 0.01)
     np.testing.assert_allclose(state.points()[8], expected, atol=1e-14)
+
+
+def test_clamps_that_turn_are_refused():
+    scene = sheet(2)
+    with pytest.raises(ddg.SceneError, match="holds the normal still"):
+        scene.clamp_boundary(0, [0, 1], motion=ddg.Motion(angle=lambda t: t))
