@@ -16,7 +16,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import frames, outcome
-from ddg_warp.kernels.element import ChainKind, gather_functions
+from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions
 from ddg_warp.kernels.search import TURNED, search_functions
 
 POSE = 21  # reals of a motion over a step: rotation vector of the step, rotation at its start, pivot, both translations
@@ -28,7 +28,7 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def begin(
         x0: wp.array2d(dtype=V),
         v0: wp.array2d(dtype=V),
@@ -177,7 +177,7 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
     """Positions, angles and their velocities at the end of the step, of the rods that converged."""
     V, twist = wp.types.vector(kind.dim, real), kind.twist
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def finish(
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
@@ -248,7 +248,7 @@ def finish_frames_kernel(kind: ChainKind, real):
         )
         return wp.normalize(u - t * wp.dot(u, t)), t
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def finish(
         x: wp.array2d(dtype=V),
         frame: wp.array3d(dtype=real),
