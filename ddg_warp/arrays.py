@@ -7,6 +7,8 @@ there the same logical array has its components fastest and rods slowest, which 
 import numpy as np
 import warp as wp
 
+THREADS = 256  # in a block, where a launch does not say
+
 
 def allocate(shape: tuple[int, ...], dtype, device) -> wp.array:
     """Zeros of logical `shape`, rods last."""
@@ -35,3 +37,14 @@ def assign(array: wp.array, values: np.ndarray) -> None:
 def download(array: wp.array) -> np.ndarray:
     """Host copy in logical order."""
     return np.array(array.numpy())
+
+
+def load_kernels(kernels, device) -> None:
+    """Compile and load kernels as they will be launched; one with its own number of threads a block is given as (kernel, number).
+
+    Warp compiles a kernel for each such number; the CPU device always launches with one.
+    """
+    cuda = wp.get_device(device).is_cuda
+    for entry in kernels:
+        kernel, threads = entry if isinstance(entry, tuple) else (entry, THREADS)
+        kernel.module.load(device, block_dim=threads if cuda else 1)

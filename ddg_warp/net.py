@@ -6,6 +6,7 @@ edges), then rotations of rigid joints. In a scene of dimension 2 the net is the
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from ddg_warp.kernels.terms import JOINT
 from ddg_warp.surface import Surface
 from ddg_warp.validate import check_index
 
-COINCIDE = 1e-6  # how far joined nodes may lie apart, in lengths of their shortest edge
+COINCIDE = 1e-6  # how far joined nodes may lie apart, over the largest of their coordinates
 
 
 @dataclass
@@ -67,7 +68,7 @@ class NetSet:
 
 @dataclass(frozen=True)
 class NetHeld:
-    """Dofs that a support holds: (block, component) pairs, and whether they are positions."""
+    """Dofs that a support holds: (block, component) pairs."""
 
     blocks: np.ndarray
     components: np.ndarray
@@ -136,6 +137,18 @@ class Net:
         """Number of blocks."""
         return len(self.rest)
 
+    @cached_property
+    def edges(self) -> np.ndarray:
+        """Nodes of the edges whose turns limit a step (E, 2): of rods, meshes and meridians; of rods without twist, of all elements."""
+        shells, meridians = (s.nodes[s.surface.edges] for s in self.shells), (m.ends for m in self.meridians)
+        edges = np.concatenate([self.ends, *shells, *meridians])
+        return edges if len(edges) else np.concatenate([part.slots[:2].T for part in self.sets])
+
+    @cached_property
+    def edge_lengths(self) -> np.ndarray:
+        """Their lengths at rest (E,) [m]."""
+        return np.linalg.norm(np.diff(self.rest[self.edges], axis=1)[:, 0], axis=1)
+
     @property
     def rod_edges(self) -> int:
         """Angles that belong to rod edges; they come first."""
@@ -161,8 +174,8 @@ def compile_net(scene) -> Net | None:
             for piece in pieces_of(spatial, batch, ghosts, chosen):
                 for row, rod in enumerate(piece.rods):
                     builder.add_rod(piece, row, int(rod))
-    for index, shell in enumerate(scene.shells):
-        builder.add_shell(index, shell)
+    for shell in scene.shells:
+        builder.add_shell(shell)
     for shell in scene.axisymmetric_shells:
         builder.add_meridian(shell)
     return builder.finish()
@@ -218,7 +231,7 @@ class _Builder:
         own_edges = angles[before : edges - after] if angles.size else angles
         self.rods[rod] = NetRod(rod, nodes[own], own_edges, before, piece, row, nodes, angles)
 
-    def add_shell(self, index: int, shell) -> None:
+    def add_shell(self, shell) -> None:
         """Number a shell's vertices."""
         surface = Surface(shell.points, shell.triangles)
         self.shells.append((surface, self._number(shell.points)))

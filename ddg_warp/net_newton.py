@@ -1,5 +1,7 @@
 """Newton on a net by preconditioned conjugate gradients; every world has its own loop, all on the device."""
 
+import math
+
 import numpy as np
 import warp as wp
 
@@ -65,13 +67,13 @@ class NetNewton:
         self.active, self.busy = make(1, int), make(1, int)
         self.pcg_work = make(1, wp.int64)
         self.parts = [self._part(part, make, H) for part in net.sets]
-        ends = _edges(host)
+        ends = host.edges
         self.ends = wp.array(np.ascontiguousarray(ends, np.int32), dtype=int, device=device)
         turning = len(ends) + blocks - host.nodes
         self.turns = make((worlds, turning), self.real)
         self._sum, self._sum_linear = (Sums(worlds, blocks, dtype, device) for dtype in (self.real, self.linear))
         self._largest = Sums(worlds, turning, self.real, device, largest=True)
-        lengths = np.linalg.norm(np.diff(host.rest[ends], axis=1)[:, 0], axis=1)
+        lengths = host.edge_lengths
         self.arm, self.longest = float(lengths.mean()), float(lengths.max())
         self._evaluate = [elements.evaluate_kernel(part.term, self.real, self.linear) for part in net.sets]
         self._outer, self._collect, self._settle = system.balance_kernels(self.real, self.linear)
@@ -79,7 +81,7 @@ class NetNewton:
         self._judge, self._measure, self._rotate, self._take, self._move = newton.search_kernels(self.real, self.linear)
         self._invert, self._start, self._begin, *self._cycle = krylov.solver_kernels(self.linear)
         self.levels = Multilevel(net, self.system, self.linear) if preconditioner == "multilevel" else None
-        self._limit = max(200, 10 * int(np.sqrt(blocks)) * 10)
+        self._limit = max(200, 100 * math.isqrt(blocks))
 
     def _part(self, part, make, H) -> dict:
         """What the elements of a set write."""
@@ -98,12 +100,9 @@ class NetNewton:
         own = [self._outer, self._collect, self._settle, self._judge, self._measure, self._rotate, self._take]
         cycle = [self._move, self._invert, self._start, self._begin, *self._cycle]
         levels = self.levels.kernels if self.levels else []
-        return [*own, *cycle, *self._evaluate, *self._assembly.kernels, *levels]
-
-    @property
-    def tiled_kernels(self) -> list:
-        """Those that are launched in tiles."""
-        return [kernel for sums in (self._sum, self._sum_linear, self._largest) for kernel in sums.kernels]
+        evaluate = [(kernel, 128) for kernel in self._evaluate]
+        sums = [(k, krylov.THREADS) for part in (self._sum, self._sum_linear, self._largest) for k in part.kernels]
+        return [*own, *cycle, *evaluate, *self._assembly.kernels, *levels, *sums]
 
     def pcg_iterations(self) -> int:
         """Iterations of all solves so far."""
@@ -265,12 +264,3 @@ class NetNewton:
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
         """One thread for each block of every world."""
         wp.launch(kernel, self.all, inputs, outputs, device=self.device)
-
-
-def _edges(host) -> np.ndarray:
-    """Edges whose turns limit a step (E, 2): of rods, meshes and meridians."""
-    parts = [host.ends, *(shell.nodes[shell.surface.edges] for shell in host.shells), *(m.ends for m in host.meridians)]
-    edges = np.concatenate(parts)
-    if not len(edges):
-        edges = np.concatenate([part.slots[:2].T for part in host.sets])
-    return edges

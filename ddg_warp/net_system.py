@@ -44,12 +44,12 @@ class NetSystem:
         self.entries = len(pairs)
         at, self.adds, self.meets = 0, [], []
         for s, key in zip(slots, keys, strict=True):
-            self.adds.append(tuple(map(put, _lists(place[inverse[at : at + len(key)]], self.positions))))
-            self.meets.append(tuple(map(put, _lists(s.T.ravel(), blocks))))
+            self.adds.append(tuple(map(put, lists(place[inverse[at : at + len(key)]], self.positions))))
+            self.meets.append(tuple(map(put, lists(s.T.ravel(), blocks))))
             at += len(key)
 
 
-def _lists(target: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def lists(target: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Items (indices into `target`) of each of `count` targets, in order: starts (count + 1,) and items."""
     starts = np.concatenate([[0], np.cumsum(np.bincount(target, minlength=count))])
     return starts, np.argsort(target, kind="stable")

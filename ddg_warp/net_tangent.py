@@ -22,13 +22,6 @@ class NetTangent:
         self.free, self.angle, self.mass = (
             np.tile(values.ravel(), worlds) for values in (~host.fixed, kind, host.mass)
         )
-        self._ends = np.concatenate(
-            [host.ends, *(s.nodes[s.surface.edges] for s in host.shells), *(m.ends for m in host.meridians)]
-        )
-        if not len(self._ends):
-            self._ends = np.concatenate([s.slots[:2].T for s in host.sets])
-        length = np.linalg.norm(np.diff(host.rest[self._ends], axis=1)[:, 0], axis=1)
-        self._edge_length = float(length.mean())
         self._anchored = host.fixed[: host.nodes].copy()
         for shell in host.shells:
             self._anchored[shell.nodes] = True
@@ -197,11 +190,12 @@ class NetTangent:
     def edges(self, q: np.ndarray) -> np.ndarray:
         """Edge vectors (E, 3)."""
         x = q.reshape(self.net.worlds, -1, 3)
-        return (x[:, self._ends[:, 1]] - x[:, self._ends[:, 0]]).reshape(-1, 3)
+        first, second = self.host.edges.T
+        return (x[:, second] - x[:, first]).reshape(-1, 3)
 
     def edge_length(self) -> float:
         """Mean rest length of edges [m]."""
-        return self._edge_length
+        return float(self.host.edge_lengths.mean())
 
     def point_dofs(self) -> tuple[np.ndarray, list[int], np.ndarray]:
         """Rows of `State.points`, axes, and the dofs (rows, axes) of the first world."""

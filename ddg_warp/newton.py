@@ -114,7 +114,7 @@ class ChainNewton:
         self._evaluate = element.evaluate_kernel(kind, self.real, self.linear, self.exact_from)
         self._check = balance.check_kernel(kind, self.real, self.linear)
         self._predict = step.predict_kernel(kind, self.real, self.linear, midpoint)
-        self._sweep = None
+        self._sweep, self._threads = None, 32 if columns < MANY else 128
         if not kind.closed:
             self._sweep = chain.sweep_kernel(kind, self.real, self.linear, self.exact_from, self.psd == "none")
         self._adjust = None if kind.closed else search.adjust_kernel(kind, self.real, self.linear)
@@ -129,12 +129,12 @@ class ChainNewton:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [*self.kernels_around, self._sweep, self._adjust]
+        return [*self.kernels_around, (self._sweep, self._threads), self._adjust]
 
     @property
     def kernels_around(self) -> list:
         """Those that do not depend on how the system is solved."""
-        return [self._predict, self._evaluate, self._check, *([self._project] if self._project else [])]
+        return [self._predict, (self._evaluate, 128), self._check, *([self._project] if self._project else [])]
 
     def pcg_iterations(self) -> int:
         """None: the sweep is direct."""
@@ -211,7 +211,7 @@ class ChainNewton:
             + [self.load_scale, self.residual, self.lost, self.turned, self.clamped, self.unbalanced, self.drowned]
             + [self.angle_change, self.todo, self.placed, self.active],
             device=self.device,
-            block_dim=32 if group.columns < MANY else 128,
+            block_dim=self._threads,
         )
         wp.launch(
             self._adjust,

@@ -317,8 +317,7 @@ class _ChainStep:
             kernels.append(element.strain_kernel(self.group.kind, self.model.types.real))
         for part in (self.moving, self.loads):
             kernels += part.kernels if part else ()
-        for kernel in kernels:
-            kernel.module.load(self.model.wp_device)
+        arrays.load_kernels(kernels, self.model.wp_device)
 
     def raise_failures(self, state: State) -> None:
         """Raise for rods that were given up."""

@@ -3,13 +3,14 @@
 import numpy as np
 import warp as wp
 
+from ddg_warp import arrays
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels import outcome, step
-from ddg_warp.kernels.net import elements, frames, krylov, newton
+from ddg_warp.kernels.net import elements, frames, newton
 from ddg_warp.linear.choice import net_preconditioner
 from ddg_warp.net_model import NetState
 from ddg_warp.net_newton import PRECONDITIONERS, NetNewton
-from ddg_warp.net_system import _lists
+from ddg_warp.net_system import lists
 from ddg_warp.tangent import Tangent
 
 
@@ -73,7 +74,7 @@ class NetStep:
         self._press = self._spread = None
         if host.pressures:
             triangles = np.concatenate([p.triangles for p in host.pressures])
-            starts, items = _lists(triangles.ravel(), self.net.blocks)
+            starts, items = lists(triangles.ravel(), self.net.blocks)
             self.triangles, self.starts, self.items = (
                 wp.array(np.ascontiguousarray(v, np.int32), dtype=int, device=device)
                 for v in (triangles, starts, items // 3)
@@ -206,17 +207,18 @@ class NetStep:
     def load_modules(self) -> None:
         """Compile and load every kernel before a capture."""
         real, device = self.model.types.real, self.model.wp_device
-        kernels = [self._begin, self._hold, self._finish, self._start, self._advance, *self.newton.kernels]
-        kernels += [frames.edge_kernel(real), frames.vertex_kernel(real), frames.joint_kernel(real)]
+        kernels = [self._begin, self._finish, self._start, self._advance, *self.newton.kernels]
+        kernels += [self._hold] if len(self._moving_blocks) else []
+        kernels += [frames.edge_kernel(real)] if self.net.edges else []
         kernels += [frames.reset_kernel(real)] if self.net.host.spins else []
         kernels += [self._press, self._spread] if self._press else []
         for part in self.net.sets:
+            measure = part.term.measure
+            if measure.frames:
+                kernels.append((frames.joint_kernel if measure.spins else frames.vertex_kernel)(real))
             if part.term.density.lagged:
                 kernels.append(elements.term_kernels(part.term, real)[3])
-        for kernel in kernels:
-            kernel.module.load(device)
-        for kernel in self.newton.tiled_kernels:
-            kernel.module.load(device, block_dim=krylov.THREADS if device.is_cuda else 1)
+        arrays.load_kernels(kernels, device)
 
     def raise_failures(self, state) -> None:
         """Raise for worlds that were given up."""

@@ -201,8 +201,10 @@ class Equilibrium:
         alone = state.copy()
         step = tangent.support_step(state, before, at)
         tangent.move_supports(alone, before, at)
+        if not step.any():
+            return alone
         q, hessian = tangent.dofs(state), tangent.hessian(state)
-        if not step.any() or not np.isfinite(hessian.data).all():
+        if not np.isfinite(hessian.data).all():
             return alone
         direction, _ = self._direction(hessian, tangent.loads(at, q) - tangent.gradient(state) - hessian @ step)
         follow = tangent.advance(state, step + direction, at)

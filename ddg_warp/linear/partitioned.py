@@ -44,7 +44,8 @@ class PartitionedNewton(AssembledNewton):
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         own = [self._weigh, self._gauge, self._judge, self._take, *self._moves, self._aim, self._renew]
-        return [self._evaluate, self._check, self._assemble, *own, *self.reduction.kernels]
+        around = [kernel for kernel in self.kernels_around if kernel is not self._predict]  # it has its own
+        return [*around, self._assemble, *own, *self.reduction.kernels]
 
     def predict(self, before, progress: wp.array, bent: wp.array) -> None:
         """Redo the predictor of `bent` rods from the state `before`, with edges turned; carry frames to midpoints."""
@@ -162,7 +163,7 @@ class CyclicReduction:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [*self._reduce[:2], self._last, self._expand]
+        return [*((kernel, 64) for kernel in self._reduce[:2]), (self._last, 32), self._expand]
 
     def solve(self, matrix, right, count, wanted, solution: wp.array, bad: wp.array) -> None:
         """Solution of the wanted columns from the blocks of their nodes; adds the pivots they lose to `bad`."""

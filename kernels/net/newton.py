@@ -261,13 +261,13 @@ def step_kernels(real, midpoint: bool):
     def hold(
         where: wp.array(dtype=int),
         place: wp.array2d(dtype=V),
-        fixed: wp.array(dtype=wp.uint8),
+        moving: wp.array(dtype=wp.uint8),
         progress: wp.array(dtype=real),
         portion: wp.array(dtype=real),
         blocks: int,
         q: wp.array(dtype=V),
     ):
-        """Puts held dofs of moving supports where they are at the end (middle) of the part of the step that is taken."""
+        """Puts the components that moving supports hold where they are at the end (middle) of the part of the step that is taken."""
         i, w = wp.tid()
         if progress[w] >= real(1.0):
             return
@@ -278,7 +278,7 @@ def step_kernels(real, midpoint: bool):
         at = place[0, i] * (real(1.0) - s) + place[1, i] * s
         here = q[k + w * blocks]
         for d in range(3):
-            if ((int(fixed[k]) >> d) & 1) == 1:
+            if ((int(moving[k]) >> d) & 1) == 1:
                 here[d] = at[d]
         q[k + w * blocks] = here
 
