@@ -64,7 +64,7 @@ class NetBand:
     potential, the enclosed volume, but for the axial force on a moving rim.
     """
 
-    ends: np.ndarray
+    places: np.ndarray
     pressure: np.ndarray
     amplitude: object
 

@@ -46,8 +46,8 @@ def energies(model, state) -> dict[str, float]:
 def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     """Force and moment of every support of the scene for one world: those of rods in the order they were added, then of shells.
 
-    They balance the internal forces and the loads on held dofs; the inertia of a held node itself is left out, which a
-    moving support would have to add.
+    They balance the internal forces and the loads on held dofs, and hold the normals of clamped mesh edges and of planes of
+    symmetry; the inertia of a held node itself is left out, which a moving support would have to add.
 
     Args:
         point: what moments are about (3,); by default the first node that a support holds.
@@ -57,14 +57,16 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     q = tangent.dofs(state)
     force = np.where(tangent.free, 0.0, tangent.gradient(state) - tangent.loads(factor, q))
     net = model.net.host.held if model.net is not None else []
+    bent = _normal_moments(tangent.parts[-1], state) if net else {}
     result = []
     for i in range(max(len(model.held), len(net))):
         places = [*_chain_places(tangent, q, force, model.held[i] if i < len(model.held) else [])]
         if net:
             places += _net_places(tangent.parts[-1], q, force, net[i])
+        turn = bent.get(i - len(model.scene.supports), np.zeros(3))
         about = places[0][0] if point is None and places else np.zeros(3) if point is None else np.asarray(point, float)
         total = sum((push for _, push, _ in places), np.zeros(3))
-        moment = sum((np.cross(here - about, push) + twist for here, push, twist in places), np.zeros(3))
+        moment = sum((np.cross(here - about, push) + twist for here, push, twist in places), turn)
         result.append(Reaction(total, moment, about))
     return result
 
@@ -98,6 +100,34 @@ def _net_places(part, q: np.ndarray, force: np.ndarray, held) -> list[tuple]:
             first, last = x[host.ends[block - host.nodes]]
             places.append((first, np.zeros(3), f[block, 0] * (last - first) / np.linalg.norm(last - first)))
     return places
+
+
+def _normal_moments(part, state) -> dict[int, np.ndarray]:
+    """Moments (3,) that the shell supports exert by the normals they give, in the first world.
+
+    An element's energy does not change if its nodes and these normals turn together: the moment of the normals is minus that of
+    the forces on its nodes. Where several supports share an element, each has the part along its own edge.
+    """
+    result, x = {}, part.dofs(state).reshape(-1, 3)
+    for index, device in enumerate(part.net.sets):
+        host, measure = device.host, device.term.measure
+        element, row, support = host.normals
+        if not element.size:
+            continue
+        corners = x[host.slots[: measure.nodes]]
+        forces = part.forces(state, index)[: measure.nodes, : len(host)]
+        moments = -np.cross(corners, forces).sum(0)
+        for e in np.unique(element):
+            own = np.flatnonzero(element == e)
+            if len(set(support[own])) == 1:
+                shares = moments[e][None]
+            else:
+                corner = (row[own] - 3) // 3  # opposite to the edge
+                edges = corners[(corner + 2) % 3, e] - corners[(corner + 1) % 3, e]
+                shares = edges * np.linalg.lstsq(edges.T, moments[e], rcond=None)[0][:, None]
+            for place, share in zip(support[own], shares, strict=False):
+                result[int(place)] = result.get(int(place), np.zeros(3)) + share
+    return result
 
 
 def stresses(model, state) -> dict[str, list[np.ndarray]]:

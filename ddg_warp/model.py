@@ -139,7 +139,12 @@ class Model:
         from ddg_warp.net import compile_net
         from ddg_warp.net_model import DeviceNet
 
-        return DeviceNet(compile_net(self.scene), self.worlds, self.wp_device, self.types.real)
+        supports = self.scene.shell_supports
+        turning = [s.motion is not None and s.motion.turns for s in supports]
+        place = {id(motion): i for i, motion in enumerate(self.motions)}
+        motions = [place[id(s.motion)] if turns else -1 for s, turns in zip(supports, turning, strict=True)]
+        net = compile_net(self.scene)
+        return DeviceNet(net, self.worlds, self.wp_device, self.types.real, np.array(motions, int))
 
     @property
     def device(self) -> str:

@@ -70,6 +70,10 @@ class Motion:
         turned = (points - self.pivot) @ self.rotation(float(self.angle(t))).T
         return turned + self.pivot + np.asarray(self.translation(t), float)
 
+    def turn(self, t: float, vectors: np.ndarray) -> np.ndarray:
+        """Where vectors of the rest state (n, 3) point at t."""
+        return vectors @ self.rotation(float(self.angle(t))).T
+
     def director_angle(self, t0: float, t1: float, rest: np.ndarray, frame: np.ndarray, edge: np.ndarray, angle: float):
         """Angle at t1 of the director `rest` (3,) of the rest state, from an edge's transported reference director [rad].
 

@@ -15,11 +15,9 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels import frames, outcome
+from ddg_warp.kernels import frames, motion, outcome
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions
 from ddg_warp.kernels.search import TURNED, search_functions
-
-POSE = 21  # reals of a motion over a step: rotation vector of the step, rotation at its start, pivot, both translations
 
 
 @cache
@@ -336,32 +334,7 @@ def motion_kernels(kind: ChainKind, real, midpoint: bool):
     V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
     along, *_ = gather_functions(kind, real)
     transport, *_ = frames.functions(real)
-    turn = wp.constant(real(6.283185307179586476925286766559))
-
-    @wp.func
-    def row(pose: wp.array2d(dtype=real), m: int, at: int):
-        return X(pose[m, at], pose[m, at + 1], pose[m, at + 2])
-
-    @wp.func
-    def turned(pose: wp.array2d(dtype=real), m: int, s: real, v: X):
-        """v of the rest state, rotated to the fraction s of the step (Rodrigues)."""
-        w = X(wp.dot(row(pose, m, 3), v), wp.dot(row(pose, m, 6), v), wp.dot(row(pose, m, 9), v))
-        rotation = row(pose, m, 0) * s
-        angle = wp.length(rotation)
-        if angle > real(0.0):
-            axis = rotation / angle
-            w = (
-                w * wp.cos(angle)
-                + wp.cross(axis, w) * wp.sin(angle)
-                + axis * (wp.dot(axis, w) * (real(1.0) - wp.cos(angle)))
-            )
-        return w
-
-    @wp.func
-    def placed(pose: wp.array2d(dtype=real), m: int, s: real, rest: X):
-        pivot = row(pose, m, 12)
-        shift = row(pose, m, 15) * (real(1.0) - s) + row(pose, m, 18) * s
-        return turned(pose, m, s, rest - pivot) + pivot + shift
+    _, placed, branch = motion.functions(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def nodes(
@@ -390,28 +363,6 @@ def motion_kernels(kind: ChainKind, real, midpoint: bool):
                 here[d] = p[d]
         x[k, r] = here
 
-    @wp.func
-    def angle_at(
-        pose: wp.array2d(dtype=real),
-        m: int,
-        s0: real,
-        s1: real,
-        rest: X,
-        frame: wp.array3d(dtype=real),
-        k: int,
-        r: int,
-        t: X,
-        angle0: real,
-    ):
-        """Angle of the material frame at s1, on the branch that the rotation since s0 leads to from angle0."""
-        u = transport(
-            X(frame[0, k, r], frame[1, k, r], frame[2, k, r]), X(frame[3, k, r], frame[4, k, r], frame[5, k, r]), t
-        )
-        d = turned(pose, m, s1, rest)
-        angle = wp.atan2(wp.dot(wp.cross(u, d), t), wp.dot(u, d))
-        expected = angle0 + wp.dot(row(pose, m, 0), t) * (s1 - s0)
-        return angle - turn * wp.round((angle - expected) / turn)
-
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def angles(
         where: wp.array2d(dtype=int),
@@ -437,7 +388,10 @@ def motion_kernels(kind: ChainKind, real, midpoint: bool):
         end = start + portion[r]
         if wp.static(midpoint):
             end = start + real(0.5) * portion[r]
-        theta[k, r] = angle_at(pose, m, start, end, director, frame, k, r, t, theta[k, r])
+        u = transport(
+            X(frame[0, k, r], frame[1, k, r], frame[2, k, r]), X(frame[3, k, r], frame[4, k, r], frame[5, k, r]), t
+        )
+        theta[k, r] = branch(pose, m, start, end, director, u, t, theta[k, r])
 
     return nodes, angles
 

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp.kernels import step
+from ddg_warp.kernels import motion, step
 
 
 class PrescribedMotion:
@@ -12,7 +12,7 @@ class PrescribedMotion:
     def __init__(self, model, group, midpoint: bool = False):
         self.model, self.group = model, group
         self.kernels = step.motion_kernels(group.kind, model.types.real, midpoint)
-        self.pose = wp.zeros((len(model.motions), step.POSE), dtype=model.types.real, device=model.wp_device)
+        self.pose = wp.zeros((len(model.motions), motion.POSE), dtype=model.types.real, device=model.wp_device)
 
     def upload(self, t0: float, t1: float) -> None:
         """Poses of all motions between t0 and t1."""

@@ -203,6 +203,7 @@ class Equilibrium:
         tangent.move_supports(alone, before, at)
         if not step.any():
             return alone
+        state = tangent.with_clamps_turned(state, at)
         q, hessian = tangent.dofs(state), tangent.hessian(state)
         if not np.isfinite(hessian.data).all():
             return alone

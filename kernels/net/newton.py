@@ -191,7 +191,7 @@ def search_kernels(real, linear):
 
 @cache
 def step_kernels(real, midpoint: bool):
-    """begin(...), hold(...) and finish(...) of a time step; see `kernels.step` for the schemes."""
+    """begin(...) and finish(...) of a time step; see `kernels.step` for the schemes."""
     V = wp.types.vector(3, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -258,31 +258,6 @@ def step_kernels(real, midpoint: bool):
         base_out[i] = here
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def hold(
-        where: wp.array(dtype=int),
-        place: wp.array2d(dtype=V),
-        moving: wp.array(dtype=wp.uint8),
-        progress: wp.array(dtype=real),
-        portion: wp.array(dtype=real),
-        blocks: int,
-        q: wp.array(dtype=V),
-    ):
-        """Puts the components that moving supports hold where they are at the end (middle) of the part of the step that is taken."""
-        i, w = wp.tid()
-        if progress[w] >= real(1.0):
-            return
-        s = progress[w] + portion[w]
-        if wp.static(midpoint):
-            s = progress[w] + real(0.5) * portion[w]
-        k = where[i]
-        at = place[0, i] * (real(1.0) - s) + place[1, i] * s
-        here = q[k + w * blocks]
-        for d in range(3):
-            if ((int(moving[k]) >> d) & 1) == 1:
-                here[d] = at[d]
-        q[k + w * blocks] = here
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def finish(
         q: wp.array(dtype=V),
         q0: wp.array(dtype=V),
@@ -315,48 +290,4 @@ def step_kernels(real, midpoint: bool):
         q_out[i] = end
         v_out[i] = v
 
-    return begin, hold, finish
-
-
-@cache
-def pressure_kernel(real):
-    """Force of a pressure on each corner of a triangle, p A n / 3, on the surface q."""
-    V = wp.types.vector(3, real)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def press(
-        q: wp.array(dtype=V),
-        triangles: wp.array2d(dtype=int),
-        pressure: wp.array(dtype=real),
-        blocks: int,
-        force_out: wp.array(dtype=V),
-    ):
-        i = wp.tid()
-        count = triangles.shape[0]
-        w = i / count
-        k = i - w * count
-        x0 = q[triangles[k, 0] + w * blocks]
-        x1 = q[triangles[k, 1] + w * blocks]
-        x2 = q[triangles[k, 2] + w * blocks]
-        force_out[i] = wp.cross(x1 - x0, x2 - x0) * (pressure[k] / real(6.0))
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def spread(
-        constant: wp.array(dtype=V),
-        force: wp.array(dtype=V),
-        starts: wp.array(dtype=int),
-        items: wp.array(dtype=int),
-        blocks: int,
-        triangles: int,
-        load_out: wp.array(dtype=V),
-    ):
-        """Constant loads and the pressures of the triangles around a block."""
-        i = wp.tid()
-        w = i / blocks
-        k = i - w * blocks
-        f = constant[i]
-        for at in range(starts[k], starts[k + 1]):
-            f += force[items[at] + w * triangles]
-        load_out[i] = f
-
-    return press, spread
+    return begin, finish
