@@ -1,0 +1,160 @@
+"""Supports of nets that turn: clamps of shells and of joined rods, in statics and dynamics, past full turns, with their reactions."""
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp import meshes
+from ddg_warp.integrate.continuation import Continuation
+from ddg_warp.integrate.path import Stop
+from ddg_warp.integrate.statics import solve
+from ddg_warp.tangent import Tangent
+
+SCHEMES = ("implicit_euler", "implicit_midpoint")
+RUBBER = ddg.Material(young=1e6, poisson=0.3, density=1000.0)
+TURNED = pytest.mark.parametrize("model", ["midedge_dof", "midedge", "hinge", "curved"])
+AXIS, PIVOT = (1.0, 2.0, 0.5), (0.1, 0.2, 0.3)
+
+
+def strip(cells, size, bending="midedge_dof", thickness=0.01, material=RUBBER, **options) -> ddg.Scene:
+    """A flat sheet in the plane of x and y; `bending` "curved" is the curved membrane."""
+    points, triangles = meshes.rectangle(*cells, size, "alternating")
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), **options)
+    curved = {"membrane": "curved"} if bending == "curved" else {"bending": bending}
+    scene.add_shell(points, triangles, thickness=thickness, material=material, **curved)
+    return scene
+
+
+def end(scene, which="min", axis=0) -> np.ndarray:
+    along = scene.shells[0].points[:, axis]
+    return np.flatnonzero(along == getattr(along, which)())
+
+
+def steps(model, count, dt, scheme="implicit_euler", state=None, **options):
+    integrator = ddg.Integrator(model, scheme, **options)
+    state = model.state() if state is None else state
+    for _ in range(count):
+        state = integrator.step(state, dt)
+    return state
+
+
+def elastic(model, state) -> float:
+    return sum(value for name, value in model.energies(state).items() if name not in ("kinetic", "gravity"))
+
+
+def normals(state) -> np.ndarray:
+    """The normals that turning clamps prescribe (n, 3), as the elements read them."""
+    found = []
+    for index, data in state.net.data.items():
+        element, row, _ = state.model.net.sets[index].turning.T
+        found.append(data.numpy()[row[:, None] + np.arange(3), element[:, None]])
+    return np.concatenate(found)
+
+
+# shells --------------------------------------------------------------------------------------------------------------------------
+
+
+@TURNED
+def test_a_sheet_is_carried_through_three_turns(device, model):
+    """In statics: it is where the motion of its clamp has it, without energy, and so are the normals."""
+    scene = strip((3, 2), (1.0, 0.6), model)
+    motion = ddg.Motion(lambda t: (t, 0.0, -t), lambda t: 6.0 * np.pi * t + 0.4 * t, AXIS, PIVOT)
+    scene.clamp_boundary(0, end(scene), motion=motion)
+    built = scene.build(device, "float64")
+    state = solve(built, load_steps=40)
+    np.testing.assert_allclose(state.points(), motion.place(1.0, scene.shells[0].points), atol=1e-8)
+    assert elastic(built, state) < 1e-15
+    turned = motion.rotation(0.4) @ [0.0, 0.0, 1.0]
+    np.testing.assert_allclose(normals(state), np.tile(turned, (len(normals(state)), 1)), atol=1e-12)
+
+
+@pytest.mark.parametrize("model", ["midedge_dof", "hinge"])
+def test_a_spinning_sheet_stretches(device, model):
+    """Three turns and more at a constant rate: clamped on the axis, N' = -rho h w^2 r, so that it grows by rho w^2 L^3 / (3 E).
+
+    nu = 0; n cells with half of their mass at either end grow by 1 + 1 / (2 n^2) times that. Implicit Euler lags by the angle a of
+    a step: its acceleration is (2 sin(a / 2) / h)^2 r, turned by a.
+    """
+    rate, length, cells, turn = 1.5, 1.0, 4, 0.05
+    material = ddg.Material(1e6, 0.0, 1000.0, viscosity=0.02)
+    scene = strip((cells, 1), (length, 0.4), model, thickness=0.1, material=material)
+    points = scene.shells[0].points
+    pivot = np.array([points[:, 0].min(), points[:, 1].mean(), 0.0])
+    motion = ddg.Motion(angle=lambda t: rate * t, pivot=tuple(pivot))
+    scene.clamp_boundary(0, end(scene), motion=motion)
+    built = scene.build(device, "float64")
+    start = built.state(velocities=np.cross([0.0, 0.0, rate], points - pivot))
+    state = steps(built, int(6.5 * np.pi / turn), turn / rate, state=start, rtol=1e-7)
+    reached = rate * state.time
+    assert reached > 6.0 * np.pi
+    there = (state.points() - motion.place(state.time, points)) @ motion.rotation(reached)
+    euler = (2.0 * np.sin(0.5 * turn) / turn) ** 2 * np.cos(turn)
+    expected = 1000.0 * rate**2 * length**3 / (3.0 * 1e6) * (1.0 + 0.5 / cells**2) * euler
+    assert there[end(scene, "max"), 0].mean() == pytest.approx(expected, rel=2e-3)
+    assert np.abs(there[:, 2]).max() < 1e-9
+
+
+def twisted(device, angle, length=1.0, cells=20, across=4, ramp=None, **options):
+    """A strip 0.1 m wide and 0.01 m thick with both ends clamped, one of them turned about its middle line."""
+    scene = strip((cells, across), (length, 0.1), **options)
+    scene.clamp_boundary(0, end(scene))
+    middle = tuple(scene.shells[0].points.mean(0))
+    motion = ddg.Motion(angle=ramp or (lambda t: angle * t), axis=(1.0, 0.0, 0.0), pivot=middle)
+    scene.clamp_boundary(0, end(scene, "max"), motion=motion)
+    return scene.build(device, "float64"), middle
+
+
+def test_torsion_of_a_strip(device):
+    """Saint-Venant: T = G b h^3 / 3 times the rate of twist, of a thin plate. Clamps that hold the ends flat shorten the strip by the
+    same length whatever its own (Reissner and Stein 1951), so that two lengths give G b h^3 / 3 = (L2 - L1) / (phi / T2 - phi / T1).
+    """
+    angle, compliance = 0.01, []
+    for length, cells in ((0.5, 20), (1.0, 40)):
+        model, middle = twisted(device, angle, length, cells)
+        state = solve(model)
+        fixed, turned = model.reactions(state, point=middle)
+        np.testing.assert_allclose(fixed.moment, -turned.moment, atol=1e-9 * abs(turned.moment[0]))
+        assert turned.moment[0] * angle == pytest.approx(2.0 * elastic(model, state), rel=1e-3)
+        compliance.append(angle / turned.moment[0])
+    stiffness = RUBBER.young / 2.6 * 0.1 * 0.01**3 / 3.0
+    assert 0.5 / (compliance[1] - compliance[0]) == pytest.approx(stiffness, rel=0.02)
+
+
+@pytest.mark.parametrize("bending", ["midedge_dof", "hinge"])
+@pytest.mark.parametrize("angle", [0.6, np.deg2rad(420.0)], ids=["twisted", "wound"])
+def test_a_slow_motion_ends_in_the_static_solution(device, angle, bending):
+    """A strip twisted in 2 s and left to rest, against statics; wound by 420 degrees it is a helicoid, b12 = -phi / L."""
+    model, middle = twisted(device, angle, cells=24, bending=bending)
+    static = solve(model, load_steps=24)
+    ramp = lambda t: angle * min(1.0, 0.5 * t)  # noqa: E731
+    moved, _ = twisted(device, angle, cells=24, bending=bending, ramp=ramp, mass_damping=20.0)
+    state = steps(moved, 80, 0.05, rtol=1e-9)
+    np.testing.assert_allclose(state.points(), static.points(), atol=1e-9)
+    energies = elastic(moved, state), elastic(model, static)
+    assert energies[0] == pytest.approx(energies[1], rel=1e-9)
+    pairs = zip(moved.reactions(state, point=middle), model.reactions(static, point=middle), strict=True)
+    for slow, still in pairs:
+        np.testing.assert_allclose(slow.moment, still.moment, atol=1e-7 * np.abs(still.moment).max())
+        np.testing.assert_allclose(slow.force, still.force, atol=1e-7 * np.abs(still.force).max())
+    if bending == "midedge_dof":
+        stiffness = RUBBER.young / 2.6 * 0.1 * 0.01**3 / 3.0
+        bent = moved.energies(state)["shell_bend_dof"]
+        assert bent == pytest.approx(0.5 * stiffness * angle**2, rel=0.05)
+
+
+@pytest.mark.parametrize("bending", ["midedge_dof", "midedge_boundary"])
+def test_a_clamp_that_slides_bends_a_strip_into_an_arc(device, bending):
+    """Its normal turned by 4 rad, its vertices free in the plane of bending: M = E h^3 b / 12 * 4 / L without a force, nu = 0."""
+    scene = strip((24, 2), (1.0, 0.1), bending, material=ddg.Material(1e6, 0.0, 1000.0))
+    scene.clamp_boundary(0, end(scene))
+    motion = ddg.Motion(angle=lambda t: 4.0 * t, axis=(0.0, 1.0, 0.0))
+    scene.clamp_boundary(0, end(scene, "max"), "y", motion=motion)
+    model = scene.build(device, "float64")
+    state = solve(model, load_steps=10)
+    fixed, turned = model.reactions(state)
+    moment = 1e6 * 0.01**3 * 0.1 / 12.0 * 4.0
+    np.testing.assert_allclose(turned.moment, [0.0, moment, 0.0], atol=5e-3 * moment)
+    np.testing.assert_allclose(fixed.moment, -turned.moment, atol=1e-7 * moment)
+    np.testing.assert_allclose(fixed.force, 0.0, atol=1e-7 * moment)
+    tip = state.points()[end(scene, "max")] - state.points()[end(scene)]
+    np.testing.assert_allclose(tip[:, [0, 2]], np.tile([np.sin(4.0), np.cos(4.0) - 1.0], (3, 1)) / 4.0, atol=2e-3)
