@@ -335,6 +335,7 @@ def motion_kernels(kind: ChainKind, real, midpoint: bool):
     along, *_ = gather_functions(kind, real)
     transport, *_ = frames.functions(real)
     _, placed, branch = motion.functions(real)
+    axis = 2 if dim == 2 else 1  # of space, from one component of a node to the next: x and z, or x, y and z
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def nodes(
@@ -360,7 +361,7 @@ def motion_kernels(kind: ChainKind, real, midpoint: bool):
         here = x[k, r]
         for d in range(wp.static(dim)):
             if ((int(fixed[k, r]) >> d) & 1) == 1:
-                here[d] = p[d]
+                here[d] = p[d * wp.static(axis)]
         x[k, r] = here
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.integrate.statics import Equilibrium
+from ddg_warp.integrate.statics import Equilibrium, solve
 from ddg_warp.io.revolve import Revolution
 from ddg_warp.record import Recorder, export_usd
 
@@ -14,8 +14,8 @@ CAP = np.column_stack([np.sin(ANGLE), np.cos(ANGLE)])
 TUBE = np.column_stack([np.ones(5), np.linspace(0.0, 1.0, 5)])
 
 
-def scene_of(points=CAP, gravity=(0.0, 0.0, 0.0), **options):
-    scene = ddg.Scene(gravity=gravity, analysis=ddg.Statics(1))
+def scene_of(points=CAP, gravity=(0.0, 0.0, 0.0), mass_damping=0.0, **options):
+    scene = ddg.Scene(gravity=gravity, analysis=ddg.Statics(1), mass_damping=mass_damping)
     scene.add_axisymmetric_shell(points, **({"thickness": 0.01, "material": RUBBER, "name": "odd"} | options))
     return scene
 
@@ -69,12 +69,46 @@ def test_a_pole_is_not_clamped():
         scene.build()
 
 
-def test_following_pressure_is_refused_in_dynamics(device):
-    scene = scene_of()
-    scene.add_axisymmetric_pressure(0, 1.0)
-    model = scene.build(device)
-    with pytest.raises(ddg.SceneError, match="dead=True"):
-        ddg.Integrator(model).step(model.state(), 1e-3)
+@pytest.mark.parametrize("points", [CAP, TUBE], ids=["cap", "tube"])
+def test_following_pressure_in_dynamics(device, points):
+    """Raised slowly and damped, it ends in the static solution, from which that of a dead pressure differs."""
+
+    def pressed(dead=False, **options):
+        scene = scene_of(points, mass_damping=60.0, **options)
+        scene.clamp_ring(0, "last")
+        if points is TUBE:
+            scene.hold_ring(0, 0, "z", motion=ddg.Motion(translation=lambda t: (0.0, 0.0, -0.2 * min(1.0, t))))
+        scene.add_axisymmetric_pressure(0, 900.0, [0, 1, 2], dead=dead, amplitude=lambda t: min(1.0, t))
+        scene.add_axisymmetric_pressure(0, 400.0, [2, 3], dead=dead, amplitude=lambda t: min(1.0, t))
+        return scene.build(device, "float64")
+
+    model = pressed(material=ddg.Material(1e6, 0.3, 1000.0, viscosity=0.05))
+    state, integrator = model.state(), ddg.Integrator(model, rtol=1e-10)
+    for _ in range(120):
+        state = integrator.step(state, 0.05)
+    static, dead = (solve(pressed(d), load_steps=10).points() for d in (False, True))
+    assert np.abs(static - dead).max() > 3e-4
+    np.testing.assert_allclose(state.points(), static, atol=1e-9)
+
+
+def test_following_pressure_on_many_worlds(device):
+    """Stiffer worlds give way less, and each moves as it would alone, bit by bit."""
+    scene = scene_of(TUBE)
+    scene.clamp_ring(0, "last")
+    scene.add_axisymmetric_pressure(0, -50.0)  # outwards: the meridian runs upwards
+    factors, found = np.array([1.0, 3.0]), []
+    for worlds in (factors, factors[1:]):
+        model = scene.build(device, "float64", worlds=len(worlds))
+        stiffness = float(model.parameters()["net/axisymmetric_stretch/stiffness"].flat[0])
+        model.set_parameter(
+            "axisymmetric_stretch", "stiffness", worlds * stiffness if len(worlds) > 1 else worlds[0] * stiffness
+        )
+        state, integrator = model.state(), ddg.Integrator(model)
+        for _ in range(6):
+            state = integrator.step(state, 0.01)
+        found.append(state.points())
+    assert found[0][0, 0, 0] > found[0][1, 0, 0] > 1.0
+    np.testing.assert_array_equal(found[0][1], found[1])
 
 
 def test_worlds_and_growth(device):

@@ -1,4 +1,4 @@
-"""Supports of nets that turn: clamps of shells and of joined rods, in statics and dynamics, past full turns, with their reactions."""
+"""Clamps of shells that turn, in statics and dynamics, past full turns, and the reactions of supports."""
 
 import numpy as np
 import pytest
@@ -49,9 +49,6 @@ def normals(state) -> np.ndarray:
         element, row, _ = state.model.net.sets[index].turning.T
         found.append(data.numpy()[row[:, None] + np.arange(3), element[:, None]])
     return np.concatenate(found)
-
-
-# shells --------------------------------------------------------------------------------------------------------------------------
 
 
 @TURNED
@@ -158,3 +155,115 @@ def test_a_clamp_that_slides_bends_a_strip_into_an_arc(device, bending):
     np.testing.assert_allclose(fixed.force, 0.0, atol=1e-7 * moment)
     tip = state.points()[end(scene, "max")] - state.points()[end(scene)]
     np.testing.assert_allclose(tip[:, [0, 2]], np.tile([np.sin(4.0), np.cos(4.0) - 1.0], (3, 1)) / 4.0, atol=2e-3)
+
+
+@TURNED
+def test_reactions_balance(device, model):
+    """Supports that turn, that meet in one element, a plane of symmetry, weight and pressure: forces and moments add up to zero."""
+    scene = strip((4, 4), (1.0, 1.0), model, thickness=0.05)
+    scene.gravity = (0.3, 0.0, -1.0)
+    points = scene.shells[0].points
+    motion = ddg.Motion(lambda t: (0.05 * t, 0.0, 0.0), lambda t: 0.3 * t, (0.0, 1.0, 0.3), tuple(points.min(0)))
+    scene.clamp_boundary(0, end(scene), motion=motion)
+    free = end(scene, "max", 1)[1:]
+    scene.clamp_boundary(
+        0, free, motion=ddg.Motion(angle=lambda t: -0.2 * t, axis=(1.0, 0.0, 0.0), pivot=(0.0, 1.0, 0.0))
+    )
+    scene.symmetry(0, end(scene, "min", 1)[1:], "y")
+    scene.add_pressure(0, 40.0)
+    built = scene.build(device, "float64")
+    state = solve(built, load_steps=3)
+    tangent = Tangent(built)
+    q = tangent.dofs(state)
+    host, x = built.net.host, q.reshape(-1, 3)[: built.net.host.nodes]
+    load = tangent.loads(1.0, q).reshape(-1, 3)[: host.nodes]
+    about = np.array([0.2, -0.1, 0.4])
+    found = built.reactions(state, point=about)
+    scale = np.abs(load).sum()
+    np.testing.assert_allclose(sum(r.force for r in found), -load.sum(0), atol=1e-8 * scale)
+    np.testing.assert_allclose(sum(r.moment for r in found), -np.cross(x - about, load).sum(0), atol=1e-8 * scale)
+    assert min(np.linalg.norm(r.moment) for r in found) > 1e-3 * scale
+
+
+@TURNED
+def test_reactions_are_the_work_of_a_turn(device, model):
+    """The moment of a clamp about its axis is the derivative of the energy by its angle, central differences."""
+    angles, energies = 0.5 + 1e-3 * np.array([-1.0, 0.0, 1.0]), []
+    scene = strip((6, 3), (1.0, 0.5), model, thickness=0.05)
+    scene.clamp_boundary(0, end(scene))
+    axis = np.array([0.3, 1.0, -0.4])
+    scene.clamp_boundary(0, end(scene, "max"), motion=ddg.Motion(angle=lambda t: t, axis=tuple(axis), pivot=PIVOT))
+    built = scene.build(device, "float64")
+    for angle in angles:
+        state = solve(built, load_steps=2, end=angle)
+        energies.append(elastic(built, state))
+        if angle == angles[1]:
+            moment = built.reactions(state, point=PIVOT)[1].moment @ axis / np.linalg.norm(axis)
+    assert moment == pytest.approx((energies[2] - energies[0]) / (angles[2] - angles[0]), rel=1e-5)
+
+
+def test_a_path_with_a_clamp_that_turns(device):
+    """Arc length or load steps lead to the same equilibrium; the rate of the normals is in the tangent of the path."""
+    model, _ = twisted(device, 0.4, cells=8, across=2)
+    path = Continuation(model, step=0.05, max_step=0.4).trace(stop=Stop(load=(1.0,)))
+    np.testing.assert_allclose(path.points[-1].state.points(), solve(model).points(), atol=1e-9)
+    assert max(point.iterations for point in path.points[1:]) < 7
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_normals_belong_to_the_state(device, scheme):
+    """A run goes on bit by bit from a snapshot, and a world that was given up keeps its normals while the other turns."""
+    scene = strip((4, 2), (1.0, 0.5), material=ddg.Material(1e6, 0.3, 1000.0, viscosity=0.01))
+    scene.clamp_boundary(0, end(scene), motion=ddg.Motion(angle=lambda t: 2.0 * t, axis=AXIS, pivot=PIVOT))
+    model = scene.build(device, "float64", worlds=2)
+    points = np.array(model.state().points())
+    points[0, 7] = points[0, 6]  # a triangle without area
+    integrator = ddg.Integrator(model, scheme, check_every=10**9)
+    state = integrator.step(model.state(points=points), 0.02)
+    saved = state.snapshot()
+    other = ddg.Integrator(model, scheme, check_every=10**9)
+    other.step(model.state(points=points), 0.02)
+    again = model.restore(saved)
+    for _ in range(4):
+        state, again = integrator.step(state, 0.02), other.step(again, 0.02)
+    for name, values in state.snapshot().items():
+        np.testing.assert_array_equal(values, again.snapshot()[name], err_msg=name)
+    single = scene.build(device, "float64")
+    alone = steps(single, 5, 0.02, scheme)
+    np.testing.assert_array_equal(state.points()[1], alone.points())
+    (given_up,), (data,) = (list(s.net.data.values()) for s in (state, alone))
+    half = data.shape[1]
+    np.testing.assert_array_equal(given_up.numpy()[:, half:], data.numpy())
+    np.testing.assert_array_equal(given_up.numpy()[:, :half], next(iter(single.state().net.data.values())).numpy())
+
+
+def test_retried_steps_turn_along_the_arc(device):
+    """A step that is taken in parts has its supports on their circle in every part, not on the chord."""
+    scene = strip((3, 2), (1.0, 0.6))
+    motion = ddg.Motion(angle=lambda t: 2.0 * t, axis=AXIS, pivot=PIVOT)
+    scene.clamp_boundary(0, end(scene), motion=motion)
+    model = scene.build(device, "float64")
+    rate = 2.0 * np.asarray(AXIS) / np.linalg.norm(AXIS)
+    start = model.state(velocities=np.cross(rate, scene.shells[0].points - PIVOT))
+    integrator = ddg.Integrator(model, max_iterations=4)
+    state = integrator.step(start, 0.5)
+    assert integrator.statistics()["retries"] > 0
+    np.testing.assert_allclose(
+        state.points()[end(scene)], motion.place(0.5, scene.shells[0].points[end(scene)]), atol=1e-12
+    )
+    np.testing.assert_allclose(normals(state)[0], motion.rotation(1.0) @ [0.0, 0.0, 1.0], atol=1e-12)
+
+
+def test_two_motions_of_one_vertex(device):
+    """Of different components they go together; of the same one the point and the axis are named."""
+    scene = strip((2, 2), (1.0, 1.0))
+    corner = [int(np.argmin(scene.shells[0].points.sum(1)))]
+    scene.hold(0, corner, "x", ddg.Motion(translation=lambda t: (t, 9.0, 9.0)))
+    scene.hold(0, corner, "z", ddg.Motion(translation=lambda t: (9.0, 9.0, -2.0 * t)))
+    scene.hold(0, corner, "y")
+    model = scene.build(device, "float64")
+    moved = model.state().points()[corner] + [0.04, 0.0, -0.08]
+    np.testing.assert_allclose(steps(model, 2, 0.02).points()[corner], moved, atol=1e-14)
+    scene.hold(0, corner, "yz", ddg.Motion(translation=lambda t: (t, 0.0, 0.0)))
+    with pytest.raises(ddg.SceneError, match=r"the point at \(.*\) m has two motions along z"):
+        scene.build(device)
