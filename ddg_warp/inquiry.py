@@ -47,7 +47,8 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     """Force and moment of every support of the scene for one world: those of rods in the order they were added, then of shells.
 
     They balance the internal forces and the loads on held dofs, and hold the normals of clamped mesh edges and of planes of
-    symmetry; the inertia of a held node itself is left out, which a moving support would have to add.
+    symmetry; the inertia of a held node itself is left out, which a moving support would have to add. Of a ring, x is the radial
+    force summed around it, and moments do not hold the direction of the meridian.
 
     Args:
         point: what moments are about (3,); by default the first node that a support holds.
@@ -111,7 +112,7 @@ def _normal_moments(part, state) -> dict[int, np.ndarray]:
     result, x = {}, part.dofs(state).reshape(-1, 3)
     for index, device in enumerate(part.net.sets):
         host, measure = device.host, device.term.measure
-        element, row, support = host.normals
+        element, row, support = host.normals[:, host.normals[2] < len(part.model.scene.shell_supports)]
         if not element.size:
             continue
         corners = x[host.slots[: measure.nodes]]

@@ -139,7 +139,7 @@ class Model:
         from ddg_warp.net import compile_net
         from ddg_warp.net_model import DeviceNet
 
-        supports = self.scene.shell_supports
+        supports = [*self.scene.shell_supports, *self.scene.ring_supports]
         turning = [s.motion is not None and s.motion.turns for s in supports]
         place = {id(motion): i for i, motion in enumerate(self.motions)}
         motions = [place[id(s.motion)] if turns else -1 for s, turns in zip(supports, turning, strict=True)]

@@ -55,7 +55,8 @@ class NetSet:
     """Elements of one term on blocks: slots (n, E), own lagged rows (m, E), data (d, E), parameters as of `ElementSet`.
 
     `owner` (2, E) is the rod or shell of each element, and its place in it: edge, vertex, triangle or hinge. `normals` (3, n) are
-    element, first row of the data and shell support of every normal among the data that a support gives.
+    element, first row of the data and support, counted over those of shells and then of rings, of every direction among the data
+    that a support gives: the normal at a mesh edge, or the tangent of a meridian.
     """
 
     term: object
@@ -290,7 +291,7 @@ class _Builder:
         net.fixed[nodes : nodes + angles, 1:] = True
         joints = _joint_places(scene, net, rigid)
         net.sets = _gather_sets(
-            [*_rod_sets(net, joints), *_joint_sets(net, joints), *_shell_sets(net, scene), *_meridian_sets(net)]
+            [*_rod_sets(net, joints), *_joint_sets(net, joints), *_shell_sets(net, scene), *_meridian_sets(net, scene)]
         )
         _add_masses(scene, net)
         _hold(scene, net)
@@ -453,13 +454,16 @@ def _shell_sets(net: Net, scene) -> list[NetSet]:
     return sets
 
 
-def _meridian_sets(net: Net) -> list[NetSet]:
+def _meridian_sets(net: Net, scene) -> list[NetSet]:
     none = np.zeros(0, int)
     sets = []
     for index, shell in enumerate(net.meridians):
         net.fixed[shell.nodes, 1] = True
         net.fixed[shell.nodes[shell.points[:, 0] == 0.0], 0] = True
-        sets += [_bound(elements, shell.nodes, none, index) for elements in axisymmetric.element_sets(shell)]
+        for elements in axisymmetric.element_sets(shell):
+            sets.append(_bound(elements, shell.nodes, none, index))
+            element, row, end = elements.normals.T
+            sets[-1].normals = np.array([element, row, shell.supports[end] + len(scene.shell_supports)])
     return sets
 
 

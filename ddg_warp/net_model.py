@@ -103,7 +103,7 @@ class DeviceSet:
 
 
 class DeviceNet:
-    """A `Net` with all its worlds on a device; `motions` are those that turn the shell supports of the scene, -1 where none does."""
+    """A `Net` with all its worlds on a device; `motions` are those that turn the supports of shells and rings, -1 where none does."""
 
     def __init__(self, host: Net, worlds: int, device, real, motions: np.ndarray):
         self.host, self.worlds, self.device, self.real = host, worlds, device, real
