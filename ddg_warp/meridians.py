@@ -154,7 +154,8 @@ class Meridians:
     ) -> None:
         """Pressure [Pa] on the surface of edges (all by default), towards the left of the meridian as it runs in x and z.
 
-        It follows the surface, with its exact derivative in statics; with `dead` it keeps directions and areas of the rest shape.
+        It follows the surface: statics takes its exact derivative; in dynamics its forces are those on the predicted surface. With
+        `dead` it keeps directions and areas of the rest shape.
         """
         self._check_axisymmetric(shell)
         count = len(self.axisymmetric_shells[shell].points) - 1

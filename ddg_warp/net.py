@@ -556,9 +556,10 @@ def _mark(net: Net, nodes, bits: int, edges, motion, motions) -> None:
                 rod = next(rod for rod in net.rods if twice[0] in rod.all_edges)
                 edge = int(np.flatnonzero(rod.all_edges == twice[0])[0]) - rod.first
                 raise SceneError(f"edge {edge} of rod {rod.rod} is turned by two motions; give it one that does both")
+            edges = np.setdiff1d(edges, other)  # an angle is counted on from where it is: once
         net.moving.append((nodes, index, held))
         if len(edges):
-            net.turning.append((edges, index))
+            net.turning.append((np.unique(edges), index))
 
 
 def _load(scene, net: Net) -> None:

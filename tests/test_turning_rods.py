@@ -80,6 +80,23 @@ def test_rod_in_a_net_moves_as_alone(device, scheme, action):
         np.testing.assert_allclose(joined, alone, atol=1e-9)
 
 
+@pytest.mark.parametrize("case", ["no twist", "planar"])
+@pytest.mark.parametrize("action", [turned_end, coupled])
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_rod_without_twist_moves_as_alone(device, scheme, action, case):
+    """In the plane of x and z, and in space; nodes alone are led, and a couple is a pair of forces alone."""
+    dimension, found = 2 if case == "planar" else 3, []
+    for in_net in (False, True):
+        scene = one_rod(in_net, False, dimension)
+        action(scene, dimension)
+        model = scene.build(device, "float64")
+        found.append(steps(model, 40, 0.01, scheme, rtol=1e-11).points()[:9])
+    if action is turned_end:
+        at = scene.supports[-1].motion.place(0.4, np.array(scene.batches[0].points[0, -2:]))
+        np.testing.assert_allclose(found[0][-2:], at, atol=1e-13)
+    np.testing.assert_allclose(found[1], found[0], atol=1e-9)
+
+
 @pytest.mark.parametrize("case", ["spatial", "no twist", "planar"])
 @pytest.mark.parametrize("action", [turned_end, coupled])
 def test_rod_in_a_net_rests_as_alone(device, action, case):

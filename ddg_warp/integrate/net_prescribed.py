@@ -79,22 +79,23 @@ class NetLoads:
         net, host, device, real = model.net, model.net.host, model.wp_device, model.types.real
         self.model, self.net, self.midpoint = model, net, midpoint
         self.constant = wp.array(np.tile(host.load, (model.worlds, 1)), dtype=net.vector, device=device)
-        press, squeeze, twist, self._spread = loads.follower_kernels(real)
-        kinds = [(press, load, load.pressure, real) for load in host.pressures]
-        kinds += [(squeeze, load, load.pressure, real) for load in host.bands]
-        kinds += [(twist, load, np.tile(load.couple, (len(load.places), 1)), net.vector) for load in host.couples]
+        self._followers = []
+        if not host.followers:
+            return
 
         def put(values, dtype=int):
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
-        self._followers = [
-            (k, load, v, put(load.places.astype(np.int32)), put(v, dtype)) for k, load, v, dtype in kinds
-        ]
-        places = [load.places.ravel() for load in host.followers]
-        self.total = sum(len(p) for p in places)
-        if self._followers:
-            self.starts, self.items = (put(v.astype(np.int32)) for v in lists(np.concatenate(places), net.blocks))
-            self.force = wp.zeros(model.worlds * self.total, dtype=net.vector, device=device)
+        press, squeeze, twist, self._spread = loads.follower_kernels(real)
+        kinds = [(press, load, load.pressure, real) for load in host.pressures]
+        kinds += [(squeeze, load, load.pressure, real) for load in host.bands]
+        kinds += [(twist, load, np.tile(load.couple, (len(load.places), 1)), net.vector) for load in host.couples]
+        for kernel, load, values, dtype in kinds:
+            self._followers.append((kernel, load, values, put(load.places.astype(np.int32)), put(values, dtype)))
+        places = np.concatenate([load.places.ravel() for load in host.followers])
+        self.starts, self.items = (put(v.astype(np.int32)) for v in lists(places, net.blocks))
+        self.total = len(places)
+        self.force = wp.zeros(model.worlds * self.total, dtype=net.vector, device=device)
 
     @property
     def kernels(self) -> list:
