@@ -339,11 +339,15 @@ class Model:
                     arrays.assign(data.omega, omega)
         if self.net is not None:
             state.net = self.net.rest()
-            if spins is not None:
-                raise ValueError("spins are of rods on their own; this model has a net")
             for values, array, what in ((points, state.net.q, "points"), (velocities, state.net.v, "velocities")):
                 if values is not None:
                     array.assign(self._scatter_net(values, array.numpy(), what))
+            if spins is not None:
+                values, start = self._edge_values(spins)
+                rates = state.net.v.numpy().reshape(self.worlds, -1, 3)
+                for rod in self.net.host.rods:
+                    rates[:, rod.edges, 0] = values[..., start[rod.rod] + np.arange(len(rod.edges))]
+                state.net.v.assign(rates.reshape(-1, 3))
         if points is not None:
             self.carry_frames(state)
         self.update_strains(state)
@@ -375,17 +379,21 @@ class Model:
         return values
 
     def _scatter_edges(self, group: Group, values, out: np.ndarray) -> None:
+        values, start = self._edge_values(values)
+        own = group.host.own - (0 if group.kind.closed else 1)
+        k, column, index = _user_index(group, own, start)
+        for world in range(self.worlds):
+            out[k, column + world * group.rods] = (values if values.ndim == 1 else values[world])[index]
+
+    def _edge_values(self, values) -> tuple[np.ndarray, np.ndarray]:
+        """Spins in the user's order, checked, and where the edges of each rod begin."""
         counts = self.curves.counts - np.where(self.curves.closed, 0, 1)
-        start = np.concatenate([[0], np.cumsum(counts)])
         values = np.asarray(values, float)
         if values.shape not in ((counts.sum(),), (self.worlds, counts.sum())):
             raise ValueError(f"spins have shape {values.shape}; they are ({counts.sum()},), or one such array a world")
         if not np.isfinite(values).all():
             raise ValueError(f"spins: edge {int(np.argwhere(~np.isfinite(values))[0][-1])} is not finite")
-        own = group.host.own - (0 if group.kind.closed else 1)
-        k, column, index = _user_index(group, own, start)
-        for world in range(self.worlds):
-            out[k, column + world * group.rods] = (values if values.ndim == 1 else values[world])[index]
+        return values, np.concatenate([[0], np.cumsum(counts)])
 
     def empty_state(self) -> State:
         """Arrays of a state, not yet filled."""

@@ -80,6 +80,18 @@ def test_rod_in_a_net_moves_as_alone(device, scheme, action):
         np.testing.assert_allclose(joined, alone, atol=1e-9)
 
 
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_rod_in_a_net_spins_as_alone(device, scheme):
+    """Twisted by the rates that its edges begin with."""
+    found, rates = [], 20.0 * np.linspace(0.0, 1.0, 8)
+    for in_net in (False, True):
+        model = one_rod(in_net).build(device, "float64")
+        state = model.state(spins=np.concatenate([rates, np.zeros(2)]) if in_net else rates)
+        found.append(steps(model, 10, 0.01, scheme, state, rtol=1e-11).angles()[:8])
+    assert np.ptp(found[0]) > 0.3
+    np.testing.assert_allclose(found[1], found[0], atol=1e-9)
+
+
 @pytest.mark.parametrize("case", ["no twist", "planar"])
 @pytest.mark.parametrize("action", [turned_end, coupled])
 @pytest.mark.parametrize("scheme", SCHEMES)
