@@ -58,16 +58,18 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     q = tangent.dofs(state)
     force = np.where(tangent.free, 0.0, tangent.gradient(state) - tangent.loads(factor, q))
     net = model.net.host.held if model.net is not None else []
-    bent = _normal_moments(tangent.parts[-1], state) if net else {}
+    normals = slice(len(model.scene.supports), len(model.scene.supports) + len(model.scene.shell_supports))
+    turns = np.zeros((max(len(model.held), len(net)), 3))
+    if net:
+        turns[normals] = _normal_moments(tangent.parts[-1], state)
     result = []
     for i in range(max(len(model.held), len(net))):
         places = [*_chain_places(tangent, q, force, model.held[i] if i < len(model.held) else [])]
         if net:
             places += _net_places(tangent.parts[-1], q, force, net[i])
-        turn = bent.get(i - len(model.scene.supports), np.zeros(3))
         about = places[0][0] if point is None and places else np.zeros(3) if point is None else np.asarray(point, float)
         total = sum((push for _, push, _ in places), np.zeros(3))
-        moment = sum((np.cross(here - about, push) + twist for here, push, twist in places), turn)
+        moment = sum((np.cross(here - about, push) + twist for here, push, twist in places), turns[i])
         result.append(Reaction(total, moment, about))
     return result
 
@@ -103,31 +105,32 @@ def _net_places(part, q: np.ndarray, force: np.ndarray, held) -> list[tuple]:
     return places
 
 
-def _normal_moments(part, state) -> dict[int, np.ndarray]:
-    """Moments (3,) that the shell supports exert by the normals they give, in the first world.
+def _normal_moments(part, state) -> np.ndarray:
+    """Moments that the shell supports exert by the normals they give (supports, 3), in the first world.
 
     An element's energy does not change if its nodes and these normals turn together: the moment of the normals is minus that of
     the forces on its nodes. Where several supports share an element, each has the part along its own edge.
     """
-    result, x = {}, part.dofs(state).reshape(-1, 3)
+    result, x = np.zeros((len(part.model.scene.shell_supports), 3)), part.dofs(state).reshape(-1, 3)
     for index, device in enumerate(part.net.sets):
         host, measure = device.host, device.term.measure
-        element, row, support = host.normals[:, host.normals[2] < len(part.model.scene.shell_supports)]
+        element, row, support = host.normals[:, host.normals[2] < len(result)]
         if not element.size:
             continue
         corners = x[host.slots[: measure.nodes]]
         forces = part.forces(state, index)[: measure.nodes, : len(host)]
         moments = -np.cross(corners, forces).sum(0)
-        for e in np.unique(element):
-            own = np.flatnonzero(element == e)
-            if len(set(support[own])) == 1:
-                shares = moments[e][None]
-            else:
-                corner = (row[own] - 3) // 3  # opposite to the edge
-                edges = corners[(corner + 2) % 3, e] - corners[(corner + 1) % 3, e]
-                shares = edges * np.linalg.lstsq(edges.T, moments[e], rcond=None)[0][:, None]
-            for place, share in zip(support[own], shares, strict=False):
-                result[int(place)] = result.get(int(place), np.zeros(3)) + share
+        least, most = np.full(len(host), len(result)), np.full(len(host), -1)
+        np.minimum.at(least, element, support)
+        np.maximum.at(most, element, support)
+        alone = least == most
+        np.add.at(result, least[alone], moments[alone])
+        for e in np.flatnonzero(least < most):
+            own = element == e
+            corner = (row[own] - 3) // 3  # opposite to the edge
+            edges = corners[(corner + 2) % 3, e] - corners[(corner + 1) % 3, e]
+            shares = edges * np.linalg.lstsq(edges.T, moments[e], rcond=None)[0][:, None]
+            np.add.at(result, support[own], shares)
     return result
 
 

@@ -172,7 +172,7 @@ class Meridians:
         motion = support.motion
         if motion is not None and not isinstance(motion, Motion):
             raise SceneError(f"ring support: motion is {motion!r}; give Motion(translation=..., angle=...)")
-        if motion is not None and motion.turns and (motion.axis[0] != 0.0 or motion.axis[2] != 0.0):
+        if motion is not None and not motion.planar:
             raise SceneError(
                 f"ring support: the motion turns about {tuple(motion.axis)}; a meridian stays in the plane of x and z, give "
                 "axis=(0, 1, 0)"

@@ -46,6 +46,11 @@ class Motion:
         """Whether it was given an angle."""
         return self.angle is not _unturned
 
+    @property
+    def planar(self) -> bool:
+        """Whether what lies in the plane of x and z turns within it."""
+        return not self.turns or (self.axis[0] == 0.0 and self.axis[2] == 0.0)
+
     def pose(self, t0: float, t1: float) -> np.ndarray:
         """What the device needs of a step from t0 to t1: turn (3), rotation at t0 (9), pivot (3), translations (3, 3)."""
         a0, a1 = float(self.angle(t0)), float(self.angle(t1))

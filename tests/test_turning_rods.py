@@ -189,3 +189,10 @@ def test_an_edge_turned_twice_is_refused():
         scene.fix_twist(0, [3], motion=ddg.Motion(angle=lambda t: t))
     with pytest.raises(ddg.SceneError, match="edge 3 of rod 0 is turned by two motions; give it one"):
         scene.build("cpu")
+
+
+def test_a_turn_out_of_the_plane_is_refused():
+    with pytest.raises(
+        ddg.SceneError, match=r"turns about \(0.0, 0.0, 1.0\); a scene of dimension 2 .* axis=\(0, 1, 0\)"
+    ):
+        one_rod(False, False, 2).clamp(0, motion=ddg.Motion(angle=lambda t: t))

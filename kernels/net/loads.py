@@ -6,6 +6,7 @@ spread(...) sums them block by block in one order, without atomics.
 
 from functools import cache
 
+import numpy as np
 import warp as wp
 
 
@@ -13,6 +14,7 @@ import warp as wp
 def follower_kernels(real):
     """press(...) of triangles, squeeze(...) of meridian edges, twist(...) of couples on rod edges, and spread(...)."""
     V = wp.types.vector(3, real)
+    third = wp.constant(real(np.pi / 3.0))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def press(
@@ -48,7 +50,6 @@ def follower_kernels(real):
         k, w = wp.tid()
         a = q[places[k, 0] + w * blocks]
         b = q[places[k, 1] + w * blocks]
-        third = real(wp.static(3.14159265358979323846 / 3.0))
         across = V(a[2] - b[2], real(0.0), b[0] - a[0]) * (pressure[k] * third)
         at = first + 2 * k + w * total
         force_out[at] = across * (real(2.0) * a[0] + b[0])
