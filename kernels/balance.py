@@ -144,7 +144,7 @@ def check_kernel(kind: ChainKind, real, linear):
     ):
         start, r = wp.tid()
         n = count[r]
-        if status[r] != 0:
+        if status[r] != 0 or start >= n:
             return
         c = coefficient[r]
         limit = rtol * load_scale[r]

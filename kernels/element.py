@@ -111,17 +111,17 @@ class ChainKind:
 
 @cache
 def until_function(kind: ChainKind):
-    """until(k, n): where the nodes end that a thread takes that starts at node k of n.
+    """until(k, n): where the nodes end that a thread takes that starts at node k < n.
 
-    A CPU thread takes all nodes: for each of its threads Warp reads all arguments again, some 200 words, which is as long as the
-    balance of a node takes.
+    A CPU thread takes all nodes: for each of its threads Warp reads all arguments again, some 200 words, which takes as long as the
+    balance of a node. On CUDA the loop has one turn, which the compiler sees if nothing but k bounds it.
     """
 
     @wp.func
     def until(k: int, n: int):
         if wp.static(kind.serial):
             return n
-        return wp.min(k + 1, n)
+        return k + 1
 
     return until
 
@@ -468,7 +468,7 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
         if start == 0 and r == 0:
             active_out[0] = 0
         n = count[r]
-        if status[r] != 0:
+        if status[r] != 0 or start >= n - wp.static(0 if closed else 1):
             return
         frozen = reuse != 0 and iteration[r] > 0
         exact = iteration[r] >= wp.static(begin)

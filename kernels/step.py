@@ -64,9 +64,9 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
         active_out: wp.array(dtype=int),
     ):
         start, r = wp.tid()
-        if progress[r] >= real(1.0):
-            return
         n = count[r]
+        if progress[r] >= real(1.0) or start >= n:
+            return
         s = dt[world[r]] * portion[r]
         if wp.static(midpoint):
             s *= real(0.5)
@@ -199,8 +199,11 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
         omega_out: wp.array2d(dtype=real),
     ):
         start, r = wp.tid()
+        n = count[r]
+        if start >= n:
+            return
         moves = progress[r] < real(1.0) and status[r] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
-        for k in range(start, until(start, count[r])):
+        for k in range(start, until(start, n)):
             before = x0[k, r]
             v = v0[k, r]
             angle0 = real(0.0)
@@ -262,6 +265,8 @@ def finish_frames_kernel(kind: ChainKind, real):
     ):
         start, r = wp.tid()
         n = count[r]
+        if start >= n - wp.static(0 if closed else 1):
+            return
         for k in range(start, until(start, n - wp.static(0 if closed else 1))):
             u, t = carried(x, frame, k, n, r)
             for c in range(3):
