@@ -90,27 +90,28 @@ class Moving:
     """Device lists of the dofs of a group that have a prescribed motion.
 
     Attributes:
-        nodes: (node, column, motion) of held nodes; node_rest: their rest positions (., 3) [m].
+        nodes: (node, column, motion of each component) of held nodes; node_rest: their rest positions (., 3) [m].
         edges: (edge, column, motion) of held angles; edge_rest: first directors of these edges at rest (., 3).
     """
 
     def __init__(self, host: ChainGroup, worlds: int, rods: int, device, real):
-        def where(places):
-            rows = np.concatenate(places) if places else np.zeros((0, 3), int)
-            tiled = np.concatenate([rows + [0, world * rods, 0] for world in range(worlds)])
-            return rows, wp.array(tiled.astype(np.int32), dtype=int, device=device)
+        def where(rows):
+            shift = np.eye(1, rows.shape[1], 1, int)
+            tiled = np.concatenate([rows + world * rods * shift for world in range(worlds)])
+            return wp.array(tiled.astype(np.int32), dtype=int, device=device)
 
         def rest(values):
             return wp.array(np.concatenate([values] * worlds), dtype=real, device=device)
 
-        rows, self.nodes = where(host.moving_nodes)
+        rows = np.concatenate([np.zeros((0, 5), int), *host.moving_nodes])
+        self.nodes = where(rows)
         points = np.zeros((len(rows), 3))
         points[:, [0, 2] if host.kind.dim == 2 else [0, 1, 2]] = host.x[rows[:, 0], rows[:, 1]]
         self.node_rest = rest(points)
-        rows, self.edges = where(host.moving_edges)
-        self.edge_rest = rest(
-            np.moveaxis(host.frame[0:3], 0, -1)[rows[:, 0], rows[:, 1]] if len(rows) else np.zeros((0, 3))
-        )
+        rows = np.concatenate([np.zeros((0, 3), int), *host.moving_edges])
+        self.edges = where(rows)
+        directors = np.moveaxis(host.frame[0:3], 0, -1)
+        self.edge_rest = rest(directors[rows[:, 0], rows[:, 1]] if len(rows) else np.zeros((0, 3)))
 
 
 class Model:

@@ -351,25 +351,24 @@ def motion_kernels(kind: ChainKind, real, midpoint: bool):
         where: wp.array2d(dtype=int),
         rest: wp.array2d(dtype=real),
         pose: wp.array2d(dtype=real),
-        fixed: wp.array2d(dtype=wp.uint8),
         progress: wp.array(dtype=real),
         portion: wp.array(dtype=real),
         x: wp.array2d(dtype=V),
     ):
-        """`where` is (node, rod, motion), `rest` the positions in the rest state."""
+        """`where` is (node, rod, motion of each component, -1 for none), `rest` the positions in the rest state."""
         i = wp.tid()
         k = where[i, 0]
         r = where[i, 1]
-        m = where[i, 2]
         if progress[r] >= real(1.0):
             return
         at = X(rest[i, 0], rest[i, 1], rest[i, 2])
-        p = placed(pose, m, progress[r] + portion[r], at)
-        if wp.static(midpoint):
-            p = real(0.5) * (p + placed(pose, m, progress[r], at))
         here = x[k, r]
         for d in range(wp.static(dim)):
-            if ((int(fixed[k, r]) >> d) & 1) == 1:
+            m = where[i, 2 + d]
+            if m >= 0:
+                p = placed(pose, m, progress[r] + portion[r], at)
+                if wp.static(midpoint):
+                    p = real(0.5) * (p + placed(pose, m, progress[r], at))
                 here[d] = p[d * wp.static(axis)]
         x[k, r] = here
 

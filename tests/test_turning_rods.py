@@ -196,3 +196,17 @@ def test_a_turn_out_of_the_plane_is_refused():
         ddg.SceneError, match=r"turns about \(0.0, 0.0, 1.0\); a scene of dimension 2 .* axis=\(0, 1, 0\)"
     ):
         one_rod(False, False, 2).clamp(0, motion=ddg.Motion(angle=lambda t: t))
+
+
+@pytest.mark.parametrize("in_net", [False, True], ids=["alone", "in a net"])
+def test_motions_move_what_their_supports_hold(device, in_net):
+    """One motion each for x and z of a node, y held by a third support; a second motion of one is refused by name."""
+    scene = one_rod(in_net)
+    scene.fix(0, [-1], "y")
+    scene.fix(0, [-1], "x", motion=ddg.Motion(translation=lambda t: (-t, 9.0, 9.0)))
+    scene.fix(0, [-1], "z", motion=ddg.Motion(translation=lambda t: (9.0, 9.0, 2.0 * t)))
+    model = scene.build(device, "float64")
+    np.testing.assert_allclose(steps(model, 4, 0.01).points()[8], bow()[-1] + [-0.04, 0.0, 0.08], atol=1e-14)
+    scene.clamp(0, [-1], motion=ddg.Motion(translation=lambda t: (0.0, 0.0, t)))
+    with pytest.raises(ddg.SceneError, match="has two motions along x; give it one that does both"):
+        scene.build(device)

@@ -26,7 +26,7 @@ class PrescribedMotion:
         wp.launch(
             nodes,
             held.nodes.shape[0],
-            [held.nodes, held.node_rest, self.pose, group.fixed, progress, portion],
+            [held.nodes, held.node_rest, self.pose, progress, portion],
             [x],
             device=device,
         )
