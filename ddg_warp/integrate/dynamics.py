@@ -187,7 +187,7 @@ class Integrator:
 
 def _newton(model, group, integrator: Integrator, precision) -> ChainNewton:
     """The solver of a group that the integrator's `linear` asks for."""
-    linear = automatic(group) if integrator.linear in ("auto", "multilevel") else integrator.linear
+    linear = automatic(group) if integrator.linear in ("auto", "multilevel", "chain_multilevel") else integrator.linear
     given = (model, group, integrator.options)
     last = (precision, integrator.scheme == "implicit_midpoint")
     if integrator.solver == "projective":
