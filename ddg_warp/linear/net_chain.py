@@ -123,9 +123,10 @@ class Chains:
 class ChainPlan:
     """Chains, joints and their couplings on the host.
 
-    A chain is a rod: place k has its node k and the angle of the edge behind it. Joints take out the nodes where rods meet, the
-    rotations of rigid joints, and the last places of a closed rod, so that what is left of a chain couples over two places at most.
-    Short chains lie behind each other in columns as long as the longest chain, so that no memory is padding.
+    Place k of a rod has its node k and the angle of the edge behind it. Joints take out the nodes where rods meet, the rotations
+    of rigid joints, and the last places of a closed rod, so that what is left couples over two places at most. It falls into chains
+    at rigid joints, not at hinged ones, over which a rod bends. Short chains lie behind each other in columns as long as the longest
+    chain, so that little memory is padding.
 
     Attributes:
         twist, span: whether chains have angles, and over how many places they couple.
@@ -143,17 +144,23 @@ class ChainPlan:
         used = np.flatnonzero(rows >= 0)
         self._order = used[np.argsort(rows[used].astype(np.int64) * host.blocks + columns[used])]
         self._keys = rows[self._order].astype(np.int64) * host.blocks + columns[self._order]
-        lengths = np.array([len(rod.all_nodes) for rod in host.rods])
-        first = np.cumsum(lengths) - lengths
-        chain = np.repeat(np.arange(len(lengths)), lengths)
+        lengths = [len(rod.all_nodes) for rod in host.rods]
+        rod = np.repeat(np.arange(len(lengths)), lengths)
         node = np.concatenate([rod.all_nodes for rod in host.rods])
-        angle = np.full(len(node), -1)
-        for start, rod in zip(first, host.rods, strict=True):
-            angle[start : start + len(rod.all_edges)] = rod.all_edges
-        self.twist = bool((angle >= 0).any())
-        self._joints(host, node, angle, chain, rows[used], columns[used])
-        node, angle = (np.where((b >= 0) & (self.joint_row[b] < 0), b, -1) for b in (node, angle))
-        self._arrange(node, angle, chain, lengths)
+        edges = [(r.all_edges, len(r.all_nodes) - len(r.all_edges)) for r in host.rods]
+        angle = np.concatenate([np.append(own, np.full(missing, -1)) for own, missing in edges])
+        place, reach = self._joints(host, node, angle, rod, rows[used], columns[used])
+        node, angle = (np.where((block >= 0) & (self.joint_row[block] < 0), block, -1) for block in (node, angle))
+        kept = (node >= 0) | (angle >= 0)
+        if not kept.any():
+            raise SceneError("preconditioner 'chain': no rod of the net has a node between its joints")
+        goes_on = np.zeros(len(node), bool)  # a chain from the place before
+        for step in (1, 2):
+            goes_on[place[reach == 2] - step + 1] = True
+        goes_on[place[reach == 1]] = True
+        chain = np.cumsum(~goes_on)[kept]
+        self.twist, self.span = bool((angle >= 0).any()), 2 if (reach == 2).any() else 1
+        self._arrange(node[kept], angle[kept], np.unique(chain, return_inverse=True)[1])
         self._couple(host, rows, columns)
         self._colour(host, columns)
 
@@ -163,8 +170,8 @@ class ChainPlan:
         at = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
         return np.where((row >= 0) & (column >= 0) & (self._keys[at] == keys), self._order[at], -1)
 
-    def _joints(self, host, node, angle, chain, rows, columns) -> None:
-        """What is taken out of the chains: `pairs` and `joint_row`."""
+    def _joints(self, host, node, angle, rod, rows, columns) -> tuple[np.ndarray, ...]:
+        """What is taken out of the rods: `pairs` and `joint_row`. Returns couplings in what is left: later place, distance."""
         spins = [part.slots[[0, 3]].T for part in host.sets if part.term.measure.spins]
         turning = np.unique(np.concatenate(spins), axis=0) if spins else np.zeros((0, 2), int)
         met = np.bincount(node, minlength=host.blocks) > 1
@@ -177,11 +184,10 @@ class ChainPlan:
         place[node[~met[node]]] = at[~met[node]]
         place[angle[angle >= 0]] = at[angle >= 0]
         a, b = place[rows], place[columns]
-        inside = (a >= 0) & (b >= 0)
-        inside[inside] = chain[a[inside]] == chain[b[inside]]
-        reach = np.where(inside, a - b, 0)
-        cut = np.unique(a[reach > 2])
-        self.span = 2 if (reach == 2).any() else 1
+        inside = (b >= 0) & (a > b)
+        inside[inside] = rod[a[inside]] == rod[b[inside]]
+        a, b = a[inside], b[inside]
+        cut = np.unique(a[a - b > 2])
         shared = np.flatnonzero(met)
         pairs = [
             np.column_stack([shared, spin[shared]]),
@@ -192,9 +198,12 @@ class ChainPlan:
         self.joint_row = np.full(host.blocks, -1)
         taken = self.pairs.ravel()
         self.joint_row[taken[taken >= 0]] = np.flatnonzero(taken >= 0)
+        left = ~(np.isin(a, cut) | np.isin(b, cut))
+        return a[left], (a - b)[left]
 
-    def _arrange(self, node, angle, chain, lengths) -> None:
+    def _arrange(self, node, angle, chain) -> None:
         """Chains in columns: `places`, `count` and `where`."""
+        lengths = np.bincount(chain)
         begin, column = np.zeros(len(lengths), int), np.zeros(len(lengths), int)
         filled, longest = [0], lengths.max()
         for i in np.argsort(-lengths, kind="stable"):
