@@ -9,12 +9,12 @@ FEW = 256  # ... if there are no more rods than this
 
 LARGE = 4096  # nodes of a net, those of rods apart, from which on fewer, longer iterations of conjugate gradients pay
 
-# Rods between joints: block Jacobi takes iterations that grow with the square of their nodes (a gridshell, 1e-3: 250 at 8 edges, 2377
-# at 32), the chain preconditioner does not (16), at twice the time of an iteration on the CPU. On a GPU four substitutions of
-# serial places, about 0.35 us each, and eight launches add to the 15 us of an iteration of block Jacobi: an estimate.
+# Block Jacobi takes iterations that grow with the square of a rod's edges between joints (a gridshell, residual 1e-3: 250 at 8, 2378 at
+# 32), the chain preconditioner takes 16 whatever their number, at about twice the time of an iteration on the CPU. On a GPU a chain is
+# serial: what that costs there follows from the 2 us of the sweep, of which a substitution is a part; it is not measured.
 BETWEEN = 4  # nodes of a rod between joints from which on chains pay
-PLACES = 10  # places of a chain on a GPU that cost as much as an iteration of block Jacobi
-LAUNCHES = 3  # the launches of an iteration with chains over those of block Jacobi
+PLACES = 10  # places of a chain that take as long as an iteration of block Jacobi, on a GPU
+LAUNCHES = 3  # iterations of block Jacobi that take as long as the launches of one with chains, on a GPU
 
 
 def automatic(group) -> str:

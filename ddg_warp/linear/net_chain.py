@@ -8,6 +8,8 @@ from ddg_warp.errors import SceneError
 from ddg_warp.kernels.net import chains
 from ddg_warp.net_system import lists
 
+SERIAL = 32  # threads of a block where a thread walks along a chain, so that few chains spread over the multiprocessors
+
 
 class Chains:
     """The rods of a net as chains between their joints, and the preconditioner they make.
@@ -54,7 +56,7 @@ class Chains:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [self._gather, self._factorise, self._load, self._solve, self._finish]
+        own = [self._gather, (self._factorise, SERIAL), self._load, (self._solve, SERIAL), self._finish]
         return own + ([self._measure, self._meet] if self.joints else [])
 
     def prepare(self, matrix: wp.array, inverse: wp.array, fixed: wp.array, wanted: wp.array) -> None:
@@ -66,7 +68,7 @@ class Chains:
             [matrix, self.places, self.count, fixed, wanted, table.positions],
             [self.factors],
         )
-        self._launch(self._factorise, self.columns, [self.count, wanted], [self.factors])
+        self._launch(self._factorise, self.columns, [self.count, wanted], [self.factors], SERIAL)
         if not self.joints:
             return
         self._eliminate(matrix, fixed, wanted, plan.solves, None, self.units)
@@ -114,10 +116,10 @@ class Chains:
             + [int(moved is not None), residual or self.moved, moved or self.moved],
             [self.values],
         )
-        self._launch(self._solve, solves * self.columns, [self.factors, self.count, wanted], [self.values])
+        self._launch(self._solve, solves * self.columns, [self.factors, self.count, wanted], [self.values], SERIAL)
 
-    def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim, inputs, outputs, device=self.device)
+    def _launch(self, kernel, dim, inputs: list, outputs: list, threads: int = arrays.THREADS) -> None:
+        wp.launch(kernel, dim, inputs, outputs, device=self.device, block_dim=threads)
 
 
 class ChainPlan:

@@ -1,5 +1,6 @@
 """Preconditioned conjugate gradients on a net, every world for itself: block Jacobi, scalars on the device.
 
+What `chains` or `levels` make of z follows the kernels that begin a solve and advance it, before r . z is summed.
 `wanted` is 1 while a world iterates, 2 once it is done; sums over blocks come in one order (tiles, then a tile of tiles).
 """
 

@@ -6,7 +6,8 @@ common translation. With P_l the prolongation from groups to nodes and D_l the d
     z = D_0^-1 r + sum_l P_l D_l^-1 P_l^T r
 
 (Bramble, Pasciak and Xu 1990; Wu, Wang, Wang and Guo, A GPU-based multilevel additive Schwarz preconditioner for cloth, 2022, with
-dense blocks). D_l takes the blocks of D_l-1 of its members, and those blocks of H whose row and column meet first at level l.
+dense blocks). D_0^-1 r may be what `chains` makes of it. D_l takes the blocks of D_l-1 of its members, and those blocks of H whose
+row and column meet first at level l.
 """
 
 from functools import cache
