@@ -1,5 +1,6 @@
 """Model: a scene frozen for a device. Constant arrays, terms, dof map, and what can be asked of a state."""
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -17,13 +18,16 @@ class Group:
     """Constant device arrays of one group of rods, all worlds side by side (columns world * R + rod)."""
 
     def __init__(self, host: ChainGroup, scene, worlds: int, device, real):
-        kind = host.kind
+        kind = replace(host.kind, serial=wp.get_device(device).is_cpu)
         vector = wp.types.vector(kind.dim, real)
         self.host, self.kind, self.worlds, self.device = host, kind, worlds, device
         self.rods = len(host.rods)
         self.nodes = host.shape[0]
         self.columns = self.rods * worlds
         self.elements = self.nodes if kind.closed else self.nodes - 1
+        self.node_threads, self.element_threads = (
+            (1 if kind.serial else along, self.columns) for along in (self.nodes, self.elements)
+        )
 
         def put(values, dtype):
             return arrays.upload(np.concatenate([values] * worlds, axis=-1) if worlds > 1 else values, dtype, device)
@@ -432,7 +436,7 @@ class Model:
                 new = arrays.allocate(data.frame.shape, self.types.real, self.wp_device)
                 wp.launch(
                     step.finish_frames_kernel(group.kind, self.types.real),
-                    (group.elements, group.columns),
+                    group.element_threads,
                     [data.x, data.frame, group.count],
                     [new],
                     device=self.wp_device,

@@ -16,7 +16,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import frames, outcome
-from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions
+from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, until_function
 from ddg_warp.kernels.search import TURNED, search_functions
 
 POSE = 21  # reals of a motion over a step: rotation vector of the step, rotation at its start, pivot, both translations
@@ -27,6 +27,7 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
     """Predictor, target of the inertia, copy of the lagged frames; restarts the search of every rod that still has to move."""
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
+    until = until_function(kind)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def begin(
@@ -62,15 +63,16 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
         bent_out: wp.array(dtype=int),
         active_out: wp.array(dtype=int),
     ):
-        k, r = wp.tid()
-        if progress[r] >= real(1.0) or k >= count[r]:
+        start, r = wp.tid()
+        n = count[r]
+        if progress[r] >= real(1.0) or start >= n:
             return
         s = dt[world[r]] * portion[r]
         if wp.static(midpoint):
             s *= real(0.5)
         rate = real(1.0) / s
         coefficient = rate * (rate + damping[0])
-        if k == 0:
+        if start == 0:
             coefficient_out[r] = coefficient
             rate_out[r] = rate
             status_out[r] = 0
@@ -82,29 +84,30 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
             drowned_out[r] = 0
             load_scale_out[r] = outer[r]
             active_out[0] = 1
-        mask = int(fixed[k, r])
         ahead = wp.where(cautious[r] == 0, s, real(0.0))
-        here = x0[k, r]
-        v = v0[k, r]
-        target_out[k, r] = here + v * (rate / coefficient)
-        for d in range(wp.static(dim)):
-            if ((mask >> d) & 1) == 0:
-                here[d] = here[d] + ahead * v[d]
-        x_out[k, r] = here
-        if cautious[r] == 0 and k + 1 < count[r]:
-            turn = (v0[k + 1, r] - v) * s
-            edge = x0[k + 1, r] - x0[k, r]
-            if wp.length_sq(turn) > real(wp.static(TURNED**2)) * wp.length_sq(edge):
-                bent_out[r] = 1
-        if wp.static(twist):
-            angle = theta0[k, r]
-            spin = omega0[k, r]
-            target_angle_out[k, r] = angle + spin * (rate / coefficient)
-            if ((mask >> wp.static(dim)) & 1) == 0:
-                angle += ahead * spin
-            theta_out[k, r] = angle
-            for c in range(7):
-                frame_out[c, k, r] = frame0[c, k, r]
+        for k in range(start, until(start, n)):
+            mask = int(fixed[k, r])
+            here = x0[k, r]
+            v = v0[k, r]
+            target_out[k, r] = here + v * (rate / coefficient)
+            for d in range(wp.static(dim)):
+                if ((mask >> d) & 1) == 0:
+                    here[d] = here[d] + ahead * v[d]
+            x_out[k, r] = here
+            if cautious[r] == 0 and k + 1 < n:
+                turn = (v0[k + 1, r] - v) * s
+                edge = x0[k + 1, r] - x0[k, r]
+                if wp.length_sq(turn) > real(wp.static(TURNED**2)) * wp.length_sq(edge):
+                    bent_out[r] = 1
+            if wp.static(twist):
+                angle = theta0[k, r]
+                spin = omega0[k, r]
+                target_angle_out[k, r] = angle + spin * (rate / coefficient)
+                if ((mask >> wp.static(dim)) & 1) == 0:
+                    angle += ahead * spin
+                theta_out[k, r] = angle
+                for c in range(7):
+                    frame_out[c, k, r] = frame0[c, k, r]
 
     return begin
 
@@ -176,6 +179,7 @@ def start_kernel(real):
 def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
     """Positions, angles and their velocities at the end of the step, of the rods that converged."""
     V, twist = wp.types.vector(kind.dim, real), kind.twist
+    until = until_function(kind)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def finish(
@@ -194,39 +198,42 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
         theta_out: wp.array2d(dtype=real),
         omega_out: wp.array2d(dtype=real),
     ):
-        k, r = wp.tid()
-        if k >= count[r]:
+        start, r = wp.tid()
+        n = count[r]
+        if start >= n:
             return
-        start = x0[k, r]
-        v = v0[k, r]
-        angle0 = real(0.0)
-        spin = real(0.0)
-        if wp.static(twist):
-            angle0 = theta0[k, r]
-            spin = omega0[k, r]
-        end = start
-        angle = angle0
-        if progress[r] < real(1.0) and status[r] <= wp.static(outcome.CONVERGED_TO_ROUNDING):
-            end = x[k, r]
-            change = (end - start) * rate[r]
-            if wp.static(midpoint):
-                end = real(2.0) * end - start
-                v = real(2.0) * change - v
-            else:
-                v = change
+        moves = progress[r] < real(1.0) and status[r] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
+        for k in range(start, until(start, n)):
+            before = x0[k, r]
+            v = v0[k, r]
+            angle0 = real(0.0)
+            spin = real(0.0)
             if wp.static(twist):
-                angle = theta[k, r]
-                turn = (angle - angle0) * rate[r]
+                angle0 = theta0[k, r]
+                spin = omega0[k, r]
+            end = before
+            angle = angle0
+            if moves:
+                end = x[k, r]
+                change = (end - before) * rate[r]
                 if wp.static(midpoint):
-                    angle = real(2.0) * angle - angle0
-                    spin = real(2.0) * turn - spin
+                    end = real(2.0) * end - before
+                    v = real(2.0) * change - v
                 else:
-                    spin = turn
-        x_out[k, r] = end
-        v_out[k, r] = v
-        if wp.static(twist):
-            theta_out[k, r] = angle
-            omega_out[k, r] = spin
+                    v = change
+                if wp.static(twist):
+                    angle = theta[k, r]
+                    turn = (angle - angle0) * rate[r]
+                    if wp.static(midpoint):
+                        angle = real(2.0) * angle - angle0
+                        spin = real(2.0) * turn - spin
+                    else:
+                        spin = turn
+            x_out[k, r] = end
+            v_out[k, r] = v
+            if wp.static(twist):
+                theta_out[k, r] = angle
+                omega_out[k, r] = spin
 
     return finish
 
@@ -236,6 +243,7 @@ def finish_frames_kernel(kind: ChainKind, real):
     """Reference frames transported to the tangents of the new state, orthonormalised, and the reference twist between them."""
     V, X = wp.types.vector(kind.dim, real), wp.types.vector(3, real)
     along, *_ = gather_functions(kind, real)
+    until = until_function(kind)
     transport, reference_twist, _ = frames.functions(real)
     closed = kind.closed
 
@@ -255,17 +263,18 @@ def finish_frames_kernel(kind: ChainKind, real):
         count: wp.array(dtype=int),
         frame_out: wp.array3d(dtype=real),
     ):
-        k, r = wp.tid()
+        start, r = wp.tid()
         n = count[r]
-        if k >= n - wp.static(0 if closed else 1):
+        if start >= n - wp.static(0 if closed else 1):
             return
-        u, t = carried(x, frame, k, n, r)
-        for c in range(3):
-            frame_out[c, k, r] = u[c]
-            frame_out[3 + c, k, r] = t[c]
-        if wp.static(closed) or k < n - 2:
-            u1, t1 = carried(x, frame, k + 1, n, r)
-            frame_out[6, k, r] = reference_twist(u, u1, t, t1, frame[6, k, r])
+        for k in range(start, until(start, n - wp.static(0 if closed else 1))):
+            u, t = carried(x, frame, k, n, r)
+            for c in range(3):
+                frame_out[c, k, r] = u[c]
+                frame_out[3 + c, k, r] = t[c]
+            if wp.static(closed) or k < n - 2:
+                u1, t1 = carried(x, frame, k + 1, n, r)
+                frame_out[6, k, r] = reference_twist(u, u1, t, t1, frame[6, k, r])
 
     return finish
 

@@ -270,10 +270,9 @@ class _ChainStep:
     def _attempt(self, before, after, dt) -> None:
         """One solve of every rod that has not finished the step, from state `before` to `after`."""
         group, newton = self.group, self.newton
-        grid = (group.nodes, group.columns)
         self._launch(
             "begin",
-            grid,
+            group.node_threads,
             [before.x, before.v, before.theta, before.omega, before.frame, group.fixed, group.count, group.world, dt]
             + [self.damping, group.outer, self.progress, self.portion, self.cautious],
             [newton.x, newton.theta, newton.frame, newton.target, newton.target_angle, newton.coefficient, newton.rate]
@@ -290,13 +289,13 @@ class _ChainStep:
         newton.solve(before.last)
         self._launch(
             "nodes",
-            grid,
+            group.node_threads,
             [newton.x, newton.theta, before.x, before.v, before.theta, before.omega]
             + [group.count, newton.status, self.progress, newton.rate],
             [after.x, after.v, after.theta, after.omega],
         )
         if group.kind.twist:
-            self._launch("frames", (group.elements, group.columns), [after.x, newton.frame, group.count], [after.frame])
+            self._launch("frames", group.element_threads, [after.x, newton.frame, group.count], [after.frame])
         if group.kind.viscous:
             self.model.strains(group, after, after.last)
         self.remaining.zero_()
