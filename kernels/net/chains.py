@@ -7,9 +7,12 @@ elimination of I leaves the joints with S = H_JJ - H_JI H_II^-1 H_IJ, of which t
 
 (a substructuring method; Smith, Bjorstad and Gropp, Domain Decomposition, 1996, ch. 4). It is symmetric and positive definite, and
 S knows rods only by their ends: the number of iterations does not depend on the nodes of a rod. Columns of S come from solves for
-unit movements of joints; joints that meet on a rod have different colours, those of one colour move at once. All other blocks keep
-block Jacobi. For the gridshell of `scenes.gridshell_dome` at rest under its weight, iterations to a residual of 1e-3 at 2, 8 and 32
-edges between crossings: block Jacobi 43, 250, 2378; rods overlapping in their joints, added up, 14, 35, 51; this, 13, 16, 16.
+unit movements of joints; joints that meet on a rod have different colours, those of one colour move at once. (A rod bends on over
+hinged joints, so that there a column also holds a little of what the joints after the next do.) Blocks of S that rounding leaves
+indefinite give way to those of H. All other blocks keep block Jacobi.
+
+For the gridshell of `scenes.gridshell_dome` at rest under its weight, iterations to a residual of 1e-3 at 2, 8 and 32 edges between
+crossings: block Jacobi 43, 250, 2378; rods that overlap in their joints, added up, 14, 35, 51; this 13, 16, 16.
 
 Columns of chains are counted world by world, a solve for colour and dof d lies in column d * columns + r.
 """
