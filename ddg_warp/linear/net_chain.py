@@ -113,7 +113,8 @@ class Chains:
             (self.longest, solves * self.columns),
             [matrix, table.columns, self.places, self.count, fixed, self.starts, self.items, self.joint_row]
             + [self.joint_rows, wanted, net.blocks, table.positions, int(residual is not None)]
-            + [int(moved is not None), residual or self.moved, moved or self.moved],
+            + [int(moved is not None), self.moved if residual is None else residual]
+            + [self.moved if moved is None else moved],
             [self.values],
         )
         self._launch(self._solve, solves * self.columns, [self.factors, self.count, wanted], [self.values], SERIAL)
