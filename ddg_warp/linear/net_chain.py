@@ -1,11 +1,11 @@
-"""The chain preconditioner of a net on a device; see `kernels.net.chains`."""
+"""The chain preconditioner of a net on a device; see `kernels.net.chains` and `joints`."""
 
 import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.net import chains
+from ddg_warp.kernels.net import chains, joints
 from ddg_warp.net_system import lists
 
 SERIAL = 32  # threads of a block where a thread walks along a chain, so that few chains spread over the multiprocessors
@@ -51,7 +51,7 @@ class Chains:
         self._gather, self._factorise, self._load, self._solve, self._finish = chains.chain_kernels(
             plan.twist, plan.span, linear
         )
-        self._measure, self._meet = chains.joint_kernels(linear) if self.joints else (None, None)
+        self._measure, self._meet = joints.joint_kernels(linear) if self.joints else (None, None)
 
     @property
     def kernels(self) -> list:

@@ -4,7 +4,7 @@ from itertools import chain
 
 import numpy as np
 import pytest
-from net_problem import Problem, frame_and_sheet, sheet
+from net_problem import CABLE, SECTION, Problem, branches, frame_and_sheet, hinged_grid, line, ring_and_spokes, sheet
 
 import ddg_warp as ddg
 from ddg_warp import meshes
@@ -12,44 +12,6 @@ from ddg_warp.linear.choice import net_preconditioner
 from ddg_warp.scenes import gridshell_dome
 
 STEEL = ddg.Material(young=2.1e11, poisson=0.3, density=7850.0)
-SECTION = ddg.Stiffness(EA=300.0, EI1=0.6, EI2=0.9, GJ=0.5, mass_per_length=0.7, rotary_inertia=0.2)
-CABLE = ddg.Stiffness(EA=300.0, mass_per_length=0.7)
-
-
-def line(start, end, nodes: int) -> np.ndarray:
-    return np.linspace(np.array(start, float), np.array(end, float), nodes)
-
-
-def branches() -> ddg.Scene:
-    """A clamped trunk with two branches at its tip, a twig across one of them, of 7, 5, 6 and 7 nodes; a held node between."""
-    scene = ddg.Scene()
-    trunk = scene.add_rod(line((0, 0, 0), (0.1, 0, 1), 7), section=SECTION)
-    left = scene.add_rod(line((0.1, 0, 1), (0.5, 0.3, 1.6), 5), section=SECTION)
-    right = scene.add_rod(line((0.1, 0, 1), (-0.4, 0.1, 1.7), 6), section=SECTION)
-    tip = scene.batches[left].points[0, 2]
-    twig = scene.add_rod(line(tip - [0.3, -0.3, 0.1], tip + [0.3, -0.3, 0.1], 7), section=SECTION)
-    scene.clamp_end(trunk)
-    scene.fix(right, [3], components="xz")
-    scene.join([(trunk, -1), (left, 0), (right, 0)])
-    scene.join([(left, 2), (twig, 3)])
-    return scene
-
-
-def ring_and_spokes() -> ddg.Scene:
-    """A closed rod of ten nodes, two spokes joined rigidly to it, and a cable between these."""
-    scene = ddg.Scene()
-    angle = 2.0 * np.pi * np.arange(10) / 10
-    circle = np.column_stack([np.cos(angle), np.sin(angle), 0.1 * np.cos(2.0 * angle)])
-    ring = scene.add_rod(circle, section=SECTION, closed=True)
-    one = scene.add_rod(line(circle[2], 2.0 * circle[2], 5), section=SECTION)
-    two = scene.add_rod(line(circle[6], 2.0 * circle[6], 4), section=SECTION)
-    cable = scene.add_rod(line(2.0 * circle[2], 2.0 * circle[6], 6), section=CABLE, bend=False)
-    scene.fix(one, [3])
-    scene.join([(ring, 2), (one, 0)])
-    scene.join([(ring, 6), (two, 0)])
-    scene.join([(one, -1), (cable, 0)], rigid=False)
-    scene.join([(two, -1), (cable, -1)], rigid=False)
-    return scene
 
 
 def applied(problem: Problem, vectors: np.ndarray) -> np.ndarray:
@@ -140,18 +102,6 @@ def test_joints_of_a_net(device):
     assert sorted(blocks) == np.flatnonzero(inside).tolist()
     assert plan.count.sum() <= plan.places.shape[1] * len(plan.count)
     assert cable.nodes[1] in blocks
-
-
-def hinged_grid() -> ddg.Scene:
-    """Three rods across two, hinged where they cross: they bend on over the joints."""
-    scene = ddg.Scene()
-    along = [scene.add_rod(line((0, y, 0), (3, y, 0), 13), section=SECTION) for y in (0.5, 1.0, 1.5)]
-    across = [scene.add_rod(line((x, 0, 0), (x, 2, 0), 9), section=SECTION) for x in (0.75, 2.0)]
-    for i, rod in enumerate(along):
-        scene.fix(rod, [0])
-        for other, node in zip(across, (3, 8), strict=True):
-            scene.join([(rod, node), (other, 2 * (i + 1))], rigid=False)
-    return scene
 
 
 def indefinite(problem: Problem) -> bool:
