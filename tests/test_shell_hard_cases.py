@@ -23,24 +23,31 @@ def found(scene, device, steps: int = 1):
     return model, solver.load(model.state(), steps), solver
 
 
-def pressed_plate(device, thickness: float, pressure: float = 1.0) -> float:
+def pressed_plate(device, thickness: float, pressure: float = 1.0, bending: str = "midedge_dof") -> float:
     """Deflection of the centre of a unit square on supports that hold it in its plane, in one load step [m]."""
     points, triangles = meshes.rectangle(10, 10, (1.0, 1.0), "crossed")
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
-    plate = scene.add_shell(points, triangles, thickness=thickness, material=MATERIAL)
+    plate = scene.add_shell(points, triangles, thickness=thickness, material=MATERIAL, bending=bending)
     scene.hold(plate, np.flatnonzero((np.minimum(points, 1.0 - points)[:, :2] < 1e-9).any(1)))
     scene.add_pressure(plate, pressure)
-    return found(scene, device)[1].points()[:, 2].max()
+    _, state, solver = found(scene, device)
+    residual = solver.tangent.loads(1.0, solver.tangent.dofs(state)) - solver.tangent.gradient(state)
+    assert np.abs(residual[solver.tangent.free]).max() < 1e-9 * pressure
+    return state.points()[:, 2].max()
 
 
 # Square membrane of half side a: p = 1.994 (1 - 0.271 nu) / (1 - nu) E h w^3 / a^4 (Maier-Schneider, Maibach and Obermeier, J. MEMS 4,
 # 1995), so w = 0.2880 (p / (E h))^(1/3) with nu = 0.3 and a = 1/2.
+@pytest.mark.parametrize("bending", ["midedge_dof", "hinge"])
 @pytest.mark.parametrize("thickness", [1e-4, 1e-5])
-def test_very_thin_plate_is_a_membrane(device, thickness):
-    """A deflection of 60 and 1300 thicknesses at once, from a flat state whose tangent is that of bending alone."""
-    height = pressed_plate(device, thickness)
+def test_very_thin_plate_is_a_membrane(device, thickness, bending):
+    """A deflection of 60 and 1300 thicknesses at once, from a flat state whose tangent is that of bending alone.
+
+    The first iterate of the plate without stretch is 40 m high; its forces must not excuse the residuals of later ones.
+    """
+    height = pressed_plate(device, thickness, bending=bending)
     assert height / (1.0 / (MATERIAL.young * thickness)) ** (1.0 / 3.0) == pytest.approx(0.2880, rel=5e-3)
-    more = pressed_plate(device, thickness, 1000.0)  # strains are no longer small: 0.7 and 3 percent
+    more = pressed_plate(device, thickness, 1000.0, bending)  # strains are no longer small: 0.7 and 3 percent
     assert more / height == pytest.approx(10.0, rel=0.02)
 
 

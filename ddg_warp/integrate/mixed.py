@@ -31,7 +31,8 @@ def newton(solver, state: State, before: float, at: float) -> State | None:
     moved = state.copy()
     tangent.move_supports(moved, before, at)
     jump = tangent.dofs(moved) - tangent.dofs(state)
-    state, stress, factor, scale, polished = state.copy(), None, None, 0.0, False
+    state, stress, factor, polished = state.copy(), None, None, False
+    first = solver.first_scale(tangent.loads(at, tangent.dofs(state)), tangent.gradient(state))
     for iteration in range(MAX_ITERATIONS):
         q = tangent.dofs(state)
         outer, gradient = tangent.loads(at, q), tangent.gradient(state)
@@ -43,7 +44,7 @@ def newton(solver, state: State, before: float, at: float) -> State | None:
         if not np.isfinite(residual).all() or not np.isfinite(hessian.data).all():
             return None
         if iteration:
-            scale = max(scale, solver.load_scale(outer, gradient)) or np.abs(residual[free]).max()
+            scale = max(first, solver.load_scale(outer, gradient))
             excess = solver.excess(residual, gradient, hessian, q, scale)
             if excess <= 0.0 and (solver.outcome == "converged" or polished):
                 stable = factor.reliable and not factor.negative
