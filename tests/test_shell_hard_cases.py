@@ -11,6 +11,7 @@ from ddg_warp import meshes
 from ddg_warp.integrate.statics import Equilibrium
 from ddg_warp.scenes import _sze
 from ddg_warp.scenes.hinged_roof import HALF_ANGLE, HALF_LENGTH, POISSON, RADIUS, YOUNG
+from ddg_warp.shell_geometry import second_form
 from ddg_warp.stability import spectrum
 
 MATERIAL = ddg.Material(young=1e9, poisson=0.3)
@@ -127,24 +128,56 @@ def test_inverted_triangles_are_refused(device, bending, rest):
         scene.build(device, "float64")
 
 
-def creased(device):
-    """A strip of hinges, clamped at one end, its model, and the mesh edges across its middle."""
+@pytest.mark.parametrize("degrees", [-175.0, -120.0, 60.0, 91.0, 150.0, 175.0])
+def test_fold_is_held(device, degrees):
+    """A unit square folded along its diagonal and held: energy D t^2 / 2 and moment D t of the dihedral angle t, at any fold.
+
+    c0 = -2 h t / 2 of the diagonal, h = 1 / sqrt 2 the height of both triangles over it. Free edges turn, so that c1 and c2 are those
+    of least D/2 A tr(K^2), nu = 0, with a1 . K a2 = c0: K = 2 c0 sym(a1 x a2), a1 and a2 the sides; D A c0^2 = D t^2 / 4 each.
+    """
+    points, triangles = meshes.rectangle(1, 1, (1.0, 1.0), "right")
+    far = next(i for i in range(4) if np.sum(triangles == i) == 1)
+    on = np.setdiff1d(np.flatnonzero([np.sum(triangles == i) == 2 for i in range(4)]), [far])
+    axis, angle = points[on[1]] - points[on[0]], np.radians(degrees)
+    if np.dot(np.cross(axis, points[far] - points[on[0]]), [0.0, 0.0, 1.0]) > 0.0:
+        axis = -axis  # a positive turn folds the far corner down, convex on the side of the normals
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    sheet = scene.add_shell(points, triangles, thickness=1e-2, material=ddg.Material(1e6, 0.0))
+    scene.hold(sheet, np.setdiff1d(range(4), [far]))
+    scene.hold(sheet, [far], motion=ddg.Motion(angle=lambda t: angle * t, axis=tuple(axis), pivot=tuple(points[on[0]])))
+    model, state, solver = found(scene, device, 7)
+    stiffness = 1e6 * 1e-2**3 / 12.0
+    assert model.energies(state)["shell_bend_dof"] == pytest.approx(0.5 * stiffness * angle**2, rel=1e-9)
+    force = solver.tangent.gradient(state)[solver.tangent.point_dofs()[far]]
+    arm = state.points()[far] - points[on[0]]
+    moment = np.cross(arm, force) @ axis / np.linalg.norm(axis)
+    assert moment == pytest.approx(stiffness * angle, rel=1e-9)
+    assert np.abs(state.net.q.numpy()[4:, 0]).max() < 0.5 * np.pi
+
+
+def creased(device, bending="hinge"):
+    """A strip, clamped at one end, its model, its shell on the host, and the mesh edges across its middle."""
     points, triangles = meshes.rectangle(8, 4, (1.0, 0.5))
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
-    strip = scene.add_shell(points, triangles, thickness=1e-3, material=MATERIAL, bending="hinge")
+    strip = scene.add_shell(points, triangles, thickness=1e-3, material=MATERIAL, bending=bending)
     scene.clamp_boundary(strip, np.flatnonzero(points[:, 0] < 1e-9))
     model = scene.build(device, "float64")
-    edges = model.net.host.shells[strip].surface.edges_on(np.abs(points[:, 0] - 0.5) < 1e-9)
-    return model, edges, len(model.net.host.shells[strip].surface.edges)
+    shell = model.net.host.shells[strip]
+    return model, shell, shell.surface.edges_on(np.abs(points[:, 0] - 0.5) < 1e-9)
 
 
-def test_crease_of_175_degrees(device):
-    """Rest angles in five steps: the free half folds over the held one by exactly that, and nothing is strained."""
-    model, edges, count = creased(device)
-    solver, state, angle = Equilibrium(model), model.state(), np.zeros(count)
+@pytest.mark.parametrize("bending", ["midedge_dof", "midedge", "hinge"])
+def test_crease_of_175_degrees(device, bending):
+    """Rest angles or curvatures in five steps: the free half folds over the held one by exactly that, and nothing is strained."""
+    model, shell, edges = creased(device, bending)
+    solver, state, points = Equilibrium(model), model.state(), model.scene.shells[0].points
     for degrees in (35.0, 70.0, 105.0, 140.0, 175.0):
-        angle[edges] = np.radians(degrees)
-        model.set_rest(0, angle=angle)
+        angle, ahead = np.radians(degrees), np.maximum(points[:, 0] - 0.5, 0.0)
+        if bending == "hinge":
+            model.set_rest(0, angle=np.where(np.isin(np.arange(len(shell.surface.edges)), edges), angle, 0.0))
+        else:
+            back = np.stack([points[:, 0] - (1.0 - np.cos(angle)) * ahead, points[:, 1], -np.sin(angle) * ahead], -1)
+            model.set_rest(0, curvature=second_form(shell.surface, back, shell.kinds))
         state = solver.solve(state, 1.0, 1.0)
     x, _, z = state.points()[8]
     assert np.degrees(np.arctan2(z, x - 0.5)) == pytest.approx(-175.0, abs=1e-6)
@@ -154,8 +187,8 @@ def test_crease_of_175_degrees(device):
 
 def test_crease_at_once_is_named(device):
     """All of the angle in one step is too far for the search: it says so, and keeps a finite state."""
-    model, edges, count = creased(device)
-    angle = np.zeros(count)
+    model, shell, edges = creased(device)
+    angle = np.zeros(len(shell.surface.edges))
     angle[edges] = np.radians(175.0)
     model.set_rest(0, angle=angle)
     with pytest.raises(ddg.SolverError, match=r"max_iterations.*of shell 0") as caught:
