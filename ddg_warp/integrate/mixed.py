@@ -18,6 +18,7 @@ from ddg_warp.linear.direct import Factorisation, SingularError
 from ddg_warp.state import State
 
 MAX_ITERATIONS = 20  # without convergence by then, the load step is too long
+UNBALANCED = 1e-3  # residual over load scale at which a search does not start from an equilibrium
 ROTATION_CAP = 4.0  # rad; no more than a guard against nonsense
 
 
@@ -32,7 +33,11 @@ def newton(solver, state: State, before: float, at: float) -> State | None:
     tangent.move_supports(moved, before, at)
     jump = tangent.dofs(moved) - tangent.dofs(state)
     state, stress, factor, polished = state.copy(), None, None, False
-    first = solver.first_scale(tangent.loads(at, tangent.dofs(state)), tangent.gradient(state))
+    q, gradient = tangent.dofs(state), tangent.gradient(state)
+    first = solver.first_scale(tangent.loads(at, q), gradient)
+    if np.abs((tangent.loads(before, q) - gradient)[free]).max(initial=0.0) > UNBALANCED * first:
+        # a crumpled start, or a rest shape that has changed: stresses of no equilibrium say nothing about the next one
+        stress = [0.0 * part for part in tangent.linear_stress(state, jump)]
     for iteration in range(MAX_ITERATIONS):
         q = tangent.dofs(state)
         outer, gradient = tangent.loads(at, q), tangent.gradient(state)
