@@ -71,7 +71,10 @@ class NetNewton:
         self.parts = [self._part(part, make, H) for part in net.sets]
         ends = host.edges
         self.ends = wp.array(np.ascontiguousarray(ends, np.int32), dtype=int, device=device)
-        turning = len(ends) + blocks - host.nodes
+        # curvature is linear in the angles of mesh edges: they need no cap, which would shorten the steps of all else
+        spins = np.setdiff1d(np.arange(host.nodes, blocks), [edge for shell in host.shells for edge in shell.edges])
+        self.spins = wp.array(spins.astype(np.int32), dtype=int, device=device)
+        turning = len(ends) + len(spins)
         self.turns = make((worlds, turning), self.real)
         self._sum, self._sum_linear = (Sums(worlds, blocks, dtype, device) for dtype in (self.real, self.linear))
         self._largest = Sums(worlds, turning, self.real, device, largest=True)
@@ -256,7 +259,7 @@ class NetNewton:
         wp.launch(
             self._rotate,
             self.turns.size,
-            [self.q, self.direction, self.ends, self.wanted, blocks, self.net.host.nodes],
+            [self.q, self.direction, self.ends, self.spins, self.wanted, blocks],
             [self.turns],
             device=self.device,
         )

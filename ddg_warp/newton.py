@@ -23,7 +23,7 @@ class NewtonOptions:
         floor_factor: how many rounding units of the forces that meet at a node count as rounding.
         max_iterations: Newton iterations of one solve.
         max_halvings: shortenings of one step by the line search.
-        rotation_cap: largest turn of an edge in one update [rad].
+        rotation_cap: largest turn of an edge, a joint or the angle of a rod in one update [rad].
         linear_rtol: reduction of the residual by PCG, in the norm of the preconditioner.
         psd: the matrix. "gauss_newton": without second derivatives of bending and twist, never indefinite but for
             compression, which is left out where a pivot is lost. "progressive": from the third iteration on the exact Hessian,

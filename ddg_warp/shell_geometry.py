@@ -81,10 +81,10 @@ def second_form(surface, positions: np.ndarray, kinds: EdgeKinds, rotations: np.
         e, a, b = corners[:, (i + 2) % 3] - first, corners[:, i] - first, behind[:, i] - first
         N, k = vector[:, i], kind[:, i]
         b = np.where((k == SYMMETRY)[:, None], a - 2.0 * _dot(a, N)[:, None] * N, b)
-        phi = np.where(k == FREE, 0.0, 0.5 * dihedral(e, a, b))
+        phi = np.choose(k, [0.0 * k, 0.5 * dihedral(e, a, b), tilt(e, a, N), 0.5 * dihedral(e, a, b)])
         phi += np.where(k <= NEIGHBOUR, surface.triangle_signs[:, i] * xi[surface.triangle_edges[:, i]], 0.0)
         d = a - e * (_dot(a, e) / _dot(e, e))[:, None]
-        c[:, i] = np.where(k == CLAMPED, 2.0 * _dot(N, d), -2.0 * np.sqrt(_dot(d, d)) * np.sin(phi))
+        c[:, i] = -2.0 * np.sqrt(_dot(d, d)) * phi
     return np.stack([c[:, 0] + c[:, 1], c[:, 0], c[:, 0] + c[:, 2]], -1)
 
 
@@ -92,6 +92,12 @@ def dihedral(e: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Angle between the triangles (e, a) and (b, e) about e, positive where convex on the side of their normals [rad]."""
     n, m = np.cross(e, a), np.cross(b, e)
     return np.arctan2(_dot(np.cross(n, m), e), _dot(n, m) * np.sqrt(_dot(e, e)))
+
+
+def tilt(e: np.ndarray, a: np.ndarray, N: np.ndarray) -> np.ndarray:
+    """Angle about e between the triangle (e, a) and the unit normal N of a clamp, signed as `dihedral` [rad]."""
+    n = np.cross(e, a)
+    return np.arctan2(_dot(np.cross(n, N), e), _dot(n, N) * np.sqrt(_dot(e, e)))
 
 
 def mid_edge_nodes(surface) -> np.ndarray:
@@ -113,8 +119,7 @@ def edge_angles(surface, positions: np.ndarray, kinds: EdgeKinds) -> np.ndarray:
         first = positions[ends[:, 0]]
         corner, behind = surface.edge_opposite[:, side], surface.edge_opposite[:, 1 - side]
         e, a, b = positions[ends[:, 1]] - first, positions[corner] - first, positions[behind] - first
-        n = np.cross(e, a)
-        clamped = np.arctan2(_dot(np.cross(n, N), e), _dot(n, N) * np.sqrt(_dot(e, e)))
+        clamped = tilt(e, a, N)
         mirrored = 0.5 * dihedral(e, a, a - 2.0 * _dot(a, N)[:, None] * N)
         angle = np.choose(kinds.kind, [np.zeros(len(e)), dihedral(e, a, b), clamped, mirrored])
         result[:, side] = np.where(corner < 0, 0.0, angle)

@@ -4,9 +4,8 @@ The bending models, and what exact shapes and linear plates say about them (test
 
     midedge_dof       mid-edge normals that turn about every edge; order 2 on every mesh and support, exact for uniform bending and
                       twist of flat plates. Soft: the deflection of a square plate under pressure, h = 1/16 of its side, is
-                      1.3 % high if supported, 8.6 % if clamped. As many angles as edges. The default. An edge between flat
-                      triangles holds folds up to 90 degrees: its energy is 1 - cos(fold) cos(2 angle) times a constant, so that
-                      beyond them its normal turns over; refine, or take "hinge" for sharper creases.
+                      1.3 % high if supported, 8.6 % if clamped. As many angles as edges. The default. An edge holds any fold
+                      below 180 degrees: its moment grows with the fold, D t for t rad along the diagonal of a square.
     midedge_boundary  the same, turning at free edges only, for meshes that are alike everywhere (right or equilateral triangles):
                       order 2 with half the error of midedge_dof (0.5 % and 4.7 %). On others the error of `midedge` inside.
     midedge           averaged normals without angles, for meshes alike everywhere and clamped all around; of order 1 with free or

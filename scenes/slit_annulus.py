@@ -1,6 +1,9 @@
 """Slit annulus: one lip of a cut ring is clamped and the other lifted, by 580 times the thickness.
 
 Case 3.3 of Sze, Liu and Lo (2004). The sheet bends with hardly any stretch, which is where facets of constant strain lock.
+
+What stretch there is lies in layers along the free edges, of width sqrt(R h) / 1.3 = 0.3 m: nearly half of it in the innermost twelfth
+of the width. Even cells a metre wide do not see them: at 60 around the lip then rises 1.3 % too little, with graded cells 0.9 %.
 """
 
 import numpy as np
@@ -11,6 +14,7 @@ from ddg_warp.scenes import _sze
 INNER, OUTER, THICKNESS = 6.0, 10.0, 0.03  # m
 YOUNG = 21.0e6  # Pa
 FORCE = 0.8  # N/m
+GRADING = 0.6  # cells at the free edges are 0.4 times as wide as in the mean, those in the middle 1.6 times
 # Load factor -> vertical displacement of the inner and the outer corner of the loaded lip [m].
 TABLE = {
     0.1: (4.277, 5.876),
@@ -27,7 +31,7 @@ def build(
     """The annulus in the plane of x and y, its slit along x.
 
     Args:
-        radial: cells along the radius
+        radial: cells along the radius, narrower at the free edges
         around: cells around
         pattern: how cells become triangles: right, alternating, crossed or jittered
         membrane: flat or curved, see Scene.add_shell
@@ -35,7 +39,8 @@ def build(
     """
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), analysis=ddg.Statics(load_steps=steps))
     flat, triangles = _sze.sheet(around, radial, (np.pi * (INNER + OUTER), OUTER - INNER), pattern)
-    angle, radius = 2.0 * np.pi * flat[:, 0], INNER + (OUTER - INNER) * flat[:, 1]
+    across = flat[:, 1] - GRADING * np.sin(2.0 * np.pi * flat[:, 1]) / (2.0 * np.pi)
+    angle, radius = 2.0 * np.pi * flat[:, 0], INNER + (OUTER - INNER) * across
     points = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.0 * angle], axis=1)
     material = ddg.Material(density=1.0, young=YOUNG, poisson=0.0)
     # Triangles of (angle, radius) turn the other way in the plane.
@@ -52,6 +57,6 @@ def observe(model, state) -> dict[str, float]:
 
 
 def check(result) -> list[ddg.Check]:
-    """Displacements of the lip against the table, to 2.5 % at 60 cells around."""
+    """Displacements of the lip against the table, to 1.2 % at 60 cells around."""
     names = {"inner": "inner corner [m]", "outer": "outer corner [m]"}
-    return _sze.table_checks(result, TABLE, names, 0.025)
+    return _sze.table_checks(result, TABLE, names, 0.012)

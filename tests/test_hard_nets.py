@@ -57,17 +57,30 @@ def edge_strain(scene, state) -> float:
     return float(np.abs(now / rest - 1.0).max())
 
 
-@pytest.mark.parametrize("size", [0.1, 0.5], ids=["crumpled", "inverted"])
+@pytest.mark.parametrize("size", [0.1, 0.5, 1.0], ids=["crumpled", "inverted", "scrambled"])
 @pytest.mark.parametrize("bending", BENDING)
 def test_random_perturbation(device, bending, size):
     """Vertices thrown about by a fraction of the cells, so that triangles invert: it springs back, and energy only falls."""
     scene = sheet(6, bending)
     start = scene.shells[0].points
     start = start + size / 6.0 * np.random.default_rng(1).normal(size=start.shape)
-    state, energy, _, _ = run(scene, device, 0.01, 10, start)
+    state, energy, statistics, _ = run(scene, device, 0.01, 10, start)
     assert_no_energy_is_made(energy)
+    assert statistics["retries"] == 0
     assert energy[-1] < 0.2 * energy[0]
     assert edge_strain(scene, state) < 0.5
+
+
+@pytest.mark.parametrize("thickness", [1e-3, 1e-4])
+def test_random_perturbation_in_long_steps(device, thickness):
+    """144 cells with triangles inverted, thin, in steps of 0.1 s: no step fails, and after ten of them little energy is left."""
+    scene = sheet(12, thickness=thickness)
+    start = scene.shells[0].points
+    start = start + 0.5 / 12.0 * np.random.default_rng(1).normal(size=start.shape)
+    _, energy, statistics, _ = run(scene, device, 0.1, 10, start)
+    assert_no_energy_is_made(energy)
+    assert statistics["retries"] == 0
+    assert energy[-1] < 1e-4 * energy[0]
 
 
 @pytest.mark.parametrize("bending", BENDING)
@@ -100,26 +113,19 @@ def folded(points, angle: float, at: float = 0.0) -> np.ndarray:
     return np.stack([at + np.minimum(x, 0.0) + turned * np.cos(angle), points[:, 1], turned * np.sin(angle)], -1)
 
 
-@pytest.mark.parametrize(("bending", "degrees"), [("midedge_dof", 85.0), ("hinge", 175.0)])
+@pytest.mark.parametrize("bending", BENDING)
+@pytest.mark.parametrize("degrees", [85.0, 175.0])
 def test_crease_opens(device, bending, degrees):
-    """A flat sheet let go folded: it opens, and energy only falls. (Normals that turn hold folds below 90 degrees, see `shells`.)"""
+    """A flat sheet let go folded: it opens, and energy only falls; normals that turn do not turn over."""
     scene = sheet(4, bending)
     points = scene.shells[0].points
     start = folded(points, np.radians(degrees), float(np.median(points[:, 0])))
-    state, energy, _, _ = run(scene, device, 0.02, 40, start)
+    state, energy, statistics, _ = run(scene, device, 0.02, 40, start)
     assert_no_energy_is_made(energy)
+    assert statistics["retries"] == 0
     far = points[:, 0] == points[:, 0].max()
     assert np.abs(state.points()[far] - start[far]).max() > 0.05
-
-
-def test_angles_do_not_run_away(device):
-    """Folded beyond what they hold, the normals turn over, once: they have no inertia that would carry them on."""
-    scene = sheet(4, "midedge_dof")
-    points = scene.shells[0].points
-    start = folded(points, np.radians(175.0), float(np.median(points[:, 0])))
-    state, energy, _, _ = run(scene, device, 0.02, 10, start)
-    assert_no_energy_is_made(energy)
-    assert np.abs(state.net.q.numpy()[len(points) :, 0]).max() < 0.6 * np.pi
+    assert np.abs(state.net.q.numpy()[len(points) :, 0]).max(initial=0.0) < 0.5 * np.pi
 
 
 @pytest.mark.parametrize("bending", BENDING)

@@ -18,6 +18,7 @@ from ddg_warp.linear.direct import Factorisation, SingularError
 from ddg_warp.state import State
 
 MAX_ITERATIONS = 20  # without convergence by then, the load step is too long
+UNBALANCED = 1e-3  # residual over load scale at which a search does not start from an equilibrium
 ROTATION_CAP = 4.0  # rad; no more than a guard against nonsense
 
 
@@ -31,7 +32,12 @@ def newton(solver, state: State, before: float, at: float) -> State | None:
     moved = state.copy()
     tangent.move_supports(moved, before, at)
     jump = tangent.dofs(moved) - tangent.dofs(state)
-    state, stress, factor, scale, polished = tangent.with_clamps_turned(state, at), None, None, 0.0, False
+    q, gradient, stress = tangent.dofs(state), tangent.gradient(state), None
+    first = solver.first_scale(tangent.loads(at, q), gradient)
+    if np.abs((tangent.loads(before, q) - gradient)[free]).max(initial=0.0) > UNBALANCED * first:
+        # a crumpled start, or a rest shape that has changed: stresses of no equilibrium say nothing about the next one
+        stress = [0.0 * part for part in tangent.linear_stress(state, jump)]
+    state, factor, polished = tangent.with_clamps_turned(state, at), None, False
     for iteration in range(MAX_ITERATIONS):
         q = tangent.dofs(state)
         outer, gradient = tangent.loads(at, q), tangent.gradient(state)
@@ -43,7 +49,7 @@ def newton(solver, state: State, before: float, at: float) -> State | None:
         if not np.isfinite(residual).all() or not np.isfinite(hessian.data).all():
             return None
         if iteration:
-            scale = max(scale, solver.load_scale(outer, gradient)) or np.abs(residual[free]).max()
+            scale = max(first, solver.load_scale(outer, gradient))
             excess = solver.excess(residual, gradient, hessian, q, scale)
             if excess <= 0.0 and (solver.outcome == "converged" or polished):
                 stable = factor.reliable and not factor.negative

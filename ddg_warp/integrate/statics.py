@@ -122,7 +122,7 @@ class Equilibrium:
         energies, q = tangent.element_energies(state), tangent.dofs(state)
         outer = tangent.loads(at, q)
         gradient = tangent.gradient(state)
-        scale, polished = None, False
+        first, polished = self.first_scale(outer, gradient), False
         for _ in range(options.max_iterations):
             residual = outer - gradient
             hessian = tangent.hessian(state)
@@ -131,10 +131,7 @@ class Equilibrium:
                 hessian = hessian + following
             if not np.isfinite(residual).all() or not np.isfinite(hessian.data).all():
                 raise SolverError(self._where("non_finite", residual, at), state=state, outcome="non_finite")
-            scale = max(self.load_scale(outer, gradient), scale or 0.0)
-            if scale == 0.0:
-                scale = np.abs(residual[free]).max()
-            excess = self.excess(residual, gradient, hessian, q, scale)
+            excess = self.excess(residual, gradient, hessian, q, max(first, self.load_scale(outer, gradient)))
             if excess <= 0.0 and (self.outcome == "converged" or polished):
                 return self._found(state, outer, residual, at)
             polished = excess <= 0.0  # the floor is a bound: one more iteration gives what rounding allows
@@ -226,6 +223,13 @@ class Equilibrium:
         """What residuals are compared with [N]: sum of the outer forces, or the largest support force if that is more."""
         free, angle = self.tangent.free, self.tangent.angle
         return max(np.abs(outer[free & ~angle]).sum(), np.abs(gradient[~free & ~angle]).max(initial=0.0))
+
+    def first_scale(self, outer: np.ndarray, gradient: np.ndarray) -> float:
+        """The load scale of the state that a search starts from, or its residual where there are no loads [N].
+
+        A residual is compared with this or with the present load scale: forces of iterates on the way, however large, excuse nothing.
+        """
+        return self.load_scale(outer, gradient) or np.abs((outer - gradient)[self.tangent.free]).max(initial=0.0)
 
     def _scaled(self, residual: np.ndarray) -> np.ndarray:
         """Moments over an edge length, so that they compare with forces."""

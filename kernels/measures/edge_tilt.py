@@ -31,21 +31,12 @@ def mirror(real):
 
 
 @cache
-def _functions(real):
-    Q, S, E, M = edge_tilt.types(real)
+def tilt(real):
+    """Device function (e, a, N) -> (alpha, dalpha/de, dalpha/da) of a triangle at a clamp with the prescribed normal N."""
     V = wp.types.vector(3, real)
-    angle, derivative = dihedral(real)
-    mirrored = mirror(real)
 
     @wp.func
-    def derivatives(q: Q, s: S):
-        e = V(q[0], q[1], q[2])
-        a = V(q[3], q[4], q[5])
-        N = V(s[1], s[2], s[3])
-        half = real(0.5)
-        if s[0] > real(2.5):
-            theta, de, da, db = derivative(e, a, mirrored(a, N))
-            return half * theta, half * de, half * (da + mirrored(db, N))
+    def tilted(e: V, a: V, N: V):
         # y = (n x N) . t and x = n . N with t = e / |e|; n x N . e = (a . e) (N . e) - (N . a) |e|^2
         length = wp.length(e)
         t = e / length
@@ -62,6 +53,30 @@ def _functions(real):
             (y_e * x - wp.cross(a, N) * y) * scale,
             (y_a * x - wp.cross(N, e) * y) * scale,
         )
+
+    return tilted
+
+
+@cache
+def _functions(real):
+    Q, S, E, M = edge_tilt.types(real)
+    V = wp.types.vector(3, real)
+    angle, derivative = dihedral(real)
+    mirrored = mirror(real)
+    tilted = tilt(real)
+
+    @wp.func
+    def derivatives(q: Q, s: S):
+        e = V(q[0], q[1], q[2])
+        a = V(q[3], q[4], q[5])
+        N = V(s[1], s[2], s[3])
+        half = real(0.5)
+        if s[0] > real(2.5):
+            theta, de, da, db = derivative(e, a, mirrored(a, N))
+            return half * theta, half * de, half * (da + mirrored(db, N))
+        else:
+            alpha, alpha_e, alpha_a = tilted(e, a, N)
+            return alpha, alpha_e, alpha_a
 
     @wp.func
     def strains(q: Q, s: S, w: real):

@@ -1,21 +1,25 @@
 """Second fundamental form of a triangle, (b11, b12, b22) [m], from normals at the middles of its edges.
 
-b_ij = -dn(a_i) . a_j in the basis a1 = x1 - x0, a2 = x2 - x0, n interpolated linearly between the mid-edge normals N_i (edge i is
-opposite to corner i). With c_i = 2 N_i . d_i, d_i from edge i square to it to corner i,
+In the basis a1 = x1 - x0, a2 = x2 - x0, with edge i opposite to corner i and h_i the height over it,
 
-    b11 = c0 + c1,   b12 = c0,   b22 = c0 + c2
+    b11 = c0 + c1,   b12 = c0,   b22 = c0 + c2,   c_i = -2 h_i phi_i ,
 
-(Grinspun, Gingold, Reisman, Zorin 2006; Weischedel 2012; Chen, Sastry, van Rees, Vouga 2018). N_i is the triangle's normal turned
-about edge i by the angle phi_i, so that c_i = -2 h_i sin(phi_i), h_i the height over edge i. By the kind of the edge:
+phi_i the angle about edge i from the triangle's normal to the normal at the middle of the edge. For small angles this is
+b_ij = -dn(a_i) . a_j with n linear between the mid-edge normals (Grinspun, Gingold, Reisman, Zorin 2006; Weischedel 2012; Chen,
+Sastry, van Rees, Vouga 2018), for which c_i = -2 h_i sin(phi_i). The angle itself has the same limit on fine meshes and
+two thirds of the error of sin(phi) on a clamped strip that rolls up; and it grows with the fold, so that an edge holds any fold
+below 180 degrees and a normal can not turn over. By the kind of the edge:
 
     0 free:        phi = 0, the normal of the triangle
     1 neighbour:   phi = theta / 2, the mean of the two triangles' unit normals, theta the dihedral angle
-    2 clamped:     c = 2 N . d with the prescribed unit normal N
+    2 clamped:     phi = alpha, the angle to the prescribed unit normal N, as in `edge_tilt`
     3 symmetry:    as 1, with the mirrored triangle as neighbour; that is the normal projected into the plane and normalised
 
 `midedge_curvature_dof` adds to phi of kinds 0 and 1 the sign of the edge times an angle xi of the edge, a dof: the normal turns
 about the edge as the mesh stores it, and is the same for both triangles (the mid-edge directors of Chen et al. 2018; the rotations
-of Morley's plate). At kinds 2 and 3 xi has no effect and must be fixed.
+of Morley's plate). At kinds 2 and 3 xi has no effect and must be fixed. Across an edge between flat triangles of equal heights h the
+energy is that of phi^2 = (theta / 2 + xi)^2 and (theta / 2 - xi)^2, least at xi = 0 whatever theta; theta jumps by 2 pi where the
+surface folds onto itself.
 
 Nodes: corners 0, 1, 2 and the corners 3, 4, 5 behind edges 0, 1, 2; a missing one may be any node. Data: the three kinds, the three
 vectors (prescribed normal or unit normal of the plane), and, with angles, the three signs. w is the rest area [m^2].
@@ -31,7 +35,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.measures import Measure
-from ddg_warp.kernels.measures.edge_tilt import mirror
+from ddg_warp.kernels.measures.edge_tilt import mirror, tilt
 from ddg_warp.kernels.measures.hinge_angle import dihedral
 
 
@@ -44,35 +48,34 @@ def _edge(real):
     V = wp.types.vector(3, real)
     angle, derivative = dihedral(real)
     mirrored = mirror(real)
+    tilted = tilt(real)
 
     @wp.func
     def value(e: V, a: V, b: V, kind: real, N: V, xi: real):
-        t = wp.normalize(e)
-        d = a - t * wp.dot(a, t)
-        c = real(2.0) * wp.dot(N, d)
-        if kind < real(1.5) or kind > real(2.5):
-            phi = xi
-            if kind > real(2.5):
-                phi = real(0.5) * angle(e, a, mirrored(a, N))
-            elif kind > real(0.5):
-                phi = xi + real(0.5) * angle(e, a, b)
-            c = real(-2.0) * wp.length(d) * wp.sin(phi)
-        return c
+        phi = xi
+        if kind > real(2.5):
+            phi = real(0.5) * angle(e, a, mirrored(a, N))
+        elif kind > real(1.5):
+            alpha, _e, _a = tilted(e, a, N)
+            phi = alpha
+        elif kind > real(0.5):
+            phi = xi + real(0.5) * angle(e, a, b)
+        return real(-2.0) * phi * wp.length(wp.cross(e, a)) / wp.length(e)
 
     @wp.func
     def turned(e: V, a: V, phi: real):
-        """c = -2 h sin(phi) at constant phi: (c, dc/de, dc/da, dc/dphi)."""
+        """c = -2 h phi at constant phi, and its derivatives (c, dc/de, dc/da, dc/dphi)."""
         length = wp.length(e)
         n = wp.cross(e, a)
         unit = wp.normalize(n)
         h = wp.length(n) / length
-        s = real(-2.0) * wp.sin(phi)
+        s = real(-2.0) * phi
         along = s / length
         return (
             s * h,
             (wp.cross(a, unit) - e * (h / length)) * along,
             wp.cross(unit, e) * along,
-            real(-2.0) * h * wp.cos(phi),
+            real(-2.0) * h,
         )
 
     @wp.func
@@ -87,13 +90,9 @@ def _edge(real):
             g = half * dphi
             return c, de + g * theta_e, da + g * theta_a, g * theta_b, dphi
         elif kind < real(2.5):
-            length = wp.length(e)
-            t = e / length
-            Nt = wp.dot(N, t)
-            at = wp.dot(a, t)
-            two = real(2.0)
-            de = (N * at + (a - t * (two * at)) * Nt) * (-two / length)
-            return two * (wp.dot(N, a) - Nt * at), de, two * (N - t * Nt), V(), real(0.0)
+            alpha, alpha_e, alpha_a = tilted(e, a, N)
+            c, de, da, dphi = turned(e, a, alpha)
+            return c, de + dphi * alpha_e, da + dphi * alpha_a, V(), real(0.0)
         else:
             theta, theta_e, theta_a, theta_b = derivative(e, a, mirrored(a, N))
             c, de, da, dphi = turned(e, a, half * theta)

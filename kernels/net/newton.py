@@ -116,20 +116,20 @@ def search_kernels(real, linear):
         q: wp.array(dtype=V),
         direction: wp.array(dtype=H),
         ends: wp.array2d(dtype=int),
+        spins: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
         blocks: int,
-        nodes: int,
         turn_out: wp.array2d(dtype=real),
     ):
-        """Squared turn of every edge, then of every angle and joint, by a whole step."""
+        """Squared turn of every edge, then of the angles and joints `spins`, by a whole step."""
         i = wp.tid()
-        count = ends.shape[0] + blocks - nodes
+        count = ends.shape[0] + spins.shape[0]
         w = i / count
         if wanted[w] == 0:
             return
         k = i - w * count
         if k >= ends.shape[0]:
-            angle = direction[k - ends.shape[0] + nodes + w * blocks]
+            angle = direction[spins[k - ends.shape[0]] + w * blocks]
             turn_out[w, k] = real(wp.dot(angle, angle))
             return
         a = ends[k, 0] + w * blocks

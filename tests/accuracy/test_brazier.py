@@ -91,7 +91,7 @@ class Slice:
         return moment, 1.0 - 0.5 * (top - bottom)
 
 
-def collapse(bend, curvatures=(0.1, 0.2, 0.3, 0.36, 0.4, 0.44, 0.46, 0.48, 0.5, 0.52)) -> tuple[float, float]:
+def collapse(bend, curvatures=(0.1, 0.2, 0.3, 0.33, 0.36, 0.4, 0.44, 0.46, 0.48, 0.5, 0.52)) -> tuple[float, float]:
     """Largest moment and the flattening there, of a function c -> (m, z), by quartics through the last five curvatures."""
     values = np.array([bend(c) for c in curvatures])[-5:]
     moment, flattening = (np.polynomial.Polynomial.fit(curvatures[-5:], column, 4) for column in values.T)

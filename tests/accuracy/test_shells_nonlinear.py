@@ -25,13 +25,13 @@ def path(module, device, steps, **parameters):
 
 @pytest.mark.parametrize("membrane", ["flat", "curved"])
 def test_cantilever_plate_shear(device, membrane):
-    """Elastica of P L^2 / EI = 4: order 2 in the length of the cells, and 0.03 % of the length at 64."""
+    """Elastica of P L^2 / EI = 4: order 2 in the length of the cells, and 0.02 % of the length at 64."""
     cells, errors = (16, 32, 64), []
     for n in cells:
         scene = cantilever_plate_shear.build(n, pattern="alternating", membrane=membrane, steps=3)
         tip = cantilever_plate_shear.observe(*equilibrium(scene, device))
         errors.append(np.hypot(*(np.array([tip["inwards"], tip["along"]]) - cantilever_plate_shear.exact(1.0))))
-    assert errors[-1] < 3e-4 * cantilever_plate_shear.LENGTH
+    assert errors[-1] < 2e-4 * cantilever_plate_shear.LENGTH
     assert order(cells, errors) == pytest.approx(2.0, abs=0.15)
 
 
@@ -48,13 +48,14 @@ def test_slit_annulus_does_not_lock(device):
 
 @pytest.mark.slow
 def test_slit_annulus(device):
-    """The path at 40, 60 and 90 cells around: errors up to half of the load fall, to 1.2 % at most over all of it."""
+    """The path at 40, 60 and 90 cells around: errors fall all along it, to 0.65 % at most."""
     cells, errors = (40, 60, 90), []
     for n in cells:
         values, _ = path(slit_annulus, device, 20, radial=n // 10, around=n)
         errors.append([values[load]["inner"] / reference[0] - 1.0 for load, reference in slit_annulus.TABLE.items()])
-    assert np.abs(errors[-1]).max() < 0.012
-    assert np.all(np.diff(np.abs(np.array(errors)[:, :3]), axis=0) < 0.0)
+    assert np.abs(errors[-1]).max() < 0.0065
+    assert np.all(np.diff(np.abs(errors), axis=0) < 0.0)
+    assert np.all(order(cells, errors) > 1.0)
 
 
 @pytest.mark.slow
@@ -66,7 +67,7 @@ def test_slit_annulus_unstructured(device):
     assert values[1.0]["outer"] == pytest.approx(outer, rel=0.02)
 
 
-@pytest.mark.parametrize(("n", "tolerance"), [(8, 0.035), pytest.param(24, 0.01, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("n", "tolerance"), [(8, 0.015), pytest.param(24, 0.006, marks=pytest.mark.slow)])
 def test_pullout_cylinder(device, n, tolerance):
     values, _ = path(pullout_cylinder, device, 20, n=n)
     for load, (radial,) in pullout_cylinder.TABLE.items():

@@ -11,6 +11,7 @@ COUNT = 8
 FLAP = np.array(
     [[0.0, 0.0, 0.0], [1.0, 0.1, 0.2], [0.3, 0.9, -0.1], [1.2, 1.1, 0.4], [-0.7, 0.6, 0.3], [0.5, -0.8, 0.2]]
 )
+FLAT = ("shell_stretch", "shell_stretch_damped", "shell_isometric", "shell_isometric_damped")  # without angles
 KINDS = np.array([[1, 1, 1], [0, 1, 2], [1, 2, 3], [2, 3, 0], [3, 0, 1], [3, 3, 3], [2, 2, 2], [0, 0, 0]])
 
 
@@ -38,6 +39,34 @@ def sample(name: str) -> Elements:
     p[:, len(names) : len(names) + n] *= 0.3  # strains of the last step
     w = random.uniform(0.6, 1.4, size=COUNT)
     return Elements(name, *(values.astype(np.float32).astype(float) for values in (q, s, w, p)))
+
+
+def folded(name: str) -> Elements:
+    """The sample with edges folded by 90 to 170 degrees, to either side, and clamped normals as far from the triangles'."""
+    elements, random = sample(name), np.random.default_rng(3)
+    measure, q, s = SHELLS[name].measure, elements.q.copy(), elements.s.copy()
+    # an edge and its corner, all from node 0: that of hinges and tilts, or the three of a triangle
+    edges = [(0, 1, 2)] if len(measure.edges) < 5 else [(1, 2, 0), (2, 0, 1), (0, 1, 2)]
+    x = np.concatenate([np.zeros((COUNT, 3)), q[:, :6]], 1).reshape(COUNT, 3, 3)
+    for k, (first, second, corner) in enumerate(edges):
+        e, a = x[:, second] - x[:, first], x[:, corner] - x[:, first]
+        t = unit(e)
+        d = a - t * np.sum(a * t, -1, keepdims=True)
+        angle = np.radians(random.uniform(90.0, 170.0, COUNT) * random.choice([-1.0, 1.0], COUNT))[:, None]
+        if measure.name != "edge_tilt":
+            place = 6 + 3 * k
+            q[:, place : place + 3] = random.uniform(0.2, 0.8, (COUNT, 1)) * e - turned(d, t, angle) * 1.2
+        if measure.name != "hinge_angle":
+            kinds = s[:, :1] if measure.name == "edge_tilt" else s[:, k : k + 1]
+            place = 1 if measure.name == "edge_tilt" else 3 + 3 * k
+            plane, clamp = turned(unit(d), t, 0.5 * angle), unit(turned(unit(np.cross(e, a)), t, angle) + 0.1 * t)
+            s[:, place : place + 3] = np.where(kinds > 2.5, plane, clamp)
+    return elements.changed(q=q, s=s)
+
+
+def turned(vectors, axes, angles):
+    """Vectors square to axes, turned about them."""
+    return vectors * np.cos(angles) + np.cross(axes, vectors) * np.sin(angles)
 
 
 def unit(vectors):
@@ -107,6 +136,42 @@ def test_hessian(device, name, precision):
     assert error(hessian, hessian.swapaxes(1, 2)) < 10.0 * PRECISIONS[precision]
 
 
+@pytest.mark.parametrize("name", [name for name in SHELLS if name not in FLAT])
+def test_derivatives_of_folds(device, name):
+    """At 90 to 170 degrees: reverse mode, differences and the hand-derived Jacobian agree as at small angles."""
+    elements = folded(name)
+    at = elements.evaluate(device=device)
+    if SHELLS[name].measure.name in ("hinge_angle", "edge_tilt"):
+        halved = SHELLS[name].measure.name == "edge_tilt" and elements.s[:, :1] > 2.5
+        size = np.degrees(np.abs(at["strain"])) * np.where(halved, 2.0, 1.0)
+        assert size.min() > 89.0 and size.max() < 171.0
+    assert error(at["gradient"], elements.reverse(device=device)) < PRECISIONS["float64"]
+    assert error(at["gradient"], differences(elements, "energy", device)[:, 0]) < 1e-9
+    reference = differences(elements, "strain", device)
+    for strain in range(at["strain"].shape[1]):
+        assert error(at["jacobian"][:, strain], reference[:, strain]) < 1e-9
+    hessian = elements.hessian(device=device)
+    assert error(hessian, differences(elements, "gradient", device)) < 1e-8
+    assert error(hessian, hessian.swapaxes(1, 2)) < 10.0 * PRECISIONS["float64"]
+
+
+@pytest.mark.parametrize("kind", [1, 2])
+def test_curvature_grows_with_the_fold(device, kind):
+    """c = -2 h phi of an edge of height 0.5, phi half the dihedral angle or the angle to the clamp's normal, to 175 degrees."""
+    angles = np.radians([-175.0, -135.0, -91.0, -1.0, 30.0, 89.0, 91.0, 135.0, 175.0])
+    zero = np.zeros_like(angles)
+    e, a = np.array([1.0, 0.0, 0.0]), np.array([0.4, 0.5, 0.0])
+    across = np.stack([0.3 + zero, -0.7 * np.cos(angles), -0.7 * np.sin(angles)], -1)
+    normal = np.stack([zero, -np.sin(angles), np.cos(angles)], -1)
+    # edge 2, from node 0 to node 1, is folded; the others are free, their angles zero
+    q = np.concatenate([np.tile(np.concatenate([e, a, e, a]), (9, 1)), across, np.zeros((9, 3))], 1)
+    s = np.concatenate([np.tile([0.0, 0.0, kind], (9, 1)), np.zeros((9, 6)), normal, np.ones((9, 3))], 1)
+    p = np.tile(sample("shell_bend_dof").p[:1], (9, 1))
+    strain = Elements("shell_bend_dof", q, s, np.ones(9), p).evaluate(device=device)["strain"]
+    expected = -2.0 * 0.5 * angles * (0.5 if kind == 1 else 1.0)
+    np.testing.assert_allclose(strain, np.outer(expected, [0.0, 0.0, 1.0]), atol=1e-14)
+
+
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("name", SHELLS)
 def test_root(device, name, precision):
@@ -142,7 +207,7 @@ def test_rigid_motion(device, name, precision):
     turn = a * np.sign(np.diag(b)) * np.linalg.det(a * np.sign(np.diag(b)))
     edges = 3 * len(SHELLS[name].measure.edges)
 
-    def turned(values):
+    def moved(values):
         return np.concatenate(
             [(values[:, :edges].reshape(COUNT, -1, 3) @ turn.T).reshape(COUNT, -1), values[:, edges:]], 1
         )
@@ -150,9 +215,9 @@ def test_rigid_motion(device, name, precision):
     s = elements.s.copy()
     for place in vectors_of(name, s):
         s[:, place] = s[:, place] @ turn.T
-    before, after = (e.evaluate(precision, device) for e in (elements, elements.changed(q=turned(elements.q), s=s)))
+    before, after = (e.evaluate(precision, device) for e in (elements, elements.changed(q=moved(elements.q), s=s)))
     assert error(after["energy"], before["energy"]) < PRECISIONS[precision]
-    assert error(after["gradient"], turned(before["gradient"])) < 2.0 * PRECISIONS[precision]
+    assert error(after["gradient"], moved(before["gradient"])) < 2.0 * PRECISIONS[precision]
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
