@@ -113,14 +113,15 @@ class Corrector:
         tangent, options, solver = self.tangent, self.options, self.equilibrium
         load = here.load + step[-1]
         state = tangent.advance(here.state, step[:-1], load)
-        total, reach, scale, polished = step, self.norm(step), 0.0, False
+        total, reach, polished = step, self.norm(step), False
+        first = solver.first_scale(tangent.loads(here.load, tangent.dofs(here.state)), tangent.gradient(here.state))
         pivot = here.direction
         for iteration in range(options.max_iterations + 1):
             q = tangent.dofs(state)
             residual, stiffness, rate, support, gradient, outer = self.system(state, q, load)
             if not np.isfinite(residual).all() or not np.isfinite(stiffness.data).all():
                 raise Failed("non_finite")
-            scale = max(scale, solver.load_scale(outer, gradient))
+            scale = max(first, solver.load_scale(outer, gradient))
             missing = gap(q, load) if gap else 0.0
             excess = solver.excess(residual, gradient, stiffness, q, scale or np.abs(residual).max())
             done = excess <= 0.0 and abs(missing) <= 1e-12 * (1.0 + np.abs(row[:-1]) @ np.abs(q) + abs(row[-1] * load))

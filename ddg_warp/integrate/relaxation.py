@@ -41,7 +41,7 @@ def relax(
     state = (state or model.state()).copy()
     state.time = at
     lever = np.where(tangent.angle, tangent.edge_length(), 1.0)
-    velocity, peak, mass, scale = np.zeros(tangent.size), 0.0, None, 0.0
+    velocity, peak, mass, first = np.zeros(tangent.size), 0.0, None, None
     for _ in range(max_steps):
         q = tangent.dofs(state)
         outer, gradient = tangent.loads(at, q), tangent.gradient(state)
@@ -50,8 +50,8 @@ def relax(
             raise SolverError(
                 "relaxation: forces are not finite; begin nearer to rest", state=state, outcome="non_finite"
             )
-        scale = max(scale, equilibrium.load_scale(outer, gradient)) or np.abs(force).max()
-        if np.abs(force / lever).max() <= residual * scale:
+        first = equilibrium.first_scale(outer, gradient) if first is None else first
+        if np.abs(force / lever).max() <= residual * max(first, equilibrium.load_scale(outer, gradient)):
             return state
         if mass is None:
             mass = _masses(tangent, state)
