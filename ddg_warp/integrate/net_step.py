@@ -10,7 +10,7 @@ from ddg_warp.kernels.net import elements, frames, newton
 from ddg_warp.linear.choice import net_preconditioner
 from ddg_warp.net_model import NetState
 from ddg_warp.net_newton import PRECONDITIONERS, NetNewton
-from ddg_warp.net_system import lists
+from ddg_warp.net_pressure import Pressures
 from ddg_warp.tangent import Tangent
 
 
@@ -71,17 +71,8 @@ class NetStep:
         """Device arrays of pressures that follow the surface, and of loads that change."""
         host, worlds = self.net.host, self.model.worlds
         self.constant = wp.array(np.tile(host.load, (worlds, 1)), dtype=self.net.vector, device=device)
-        self._press = self._spread = None
-        if host.pressures:
-            triangles = np.concatenate([p.triangles for p in host.pressures])
-            starts, items = lists(triangles.ravel(), self.net.blocks)
-            self.triangles, self.starts, self.items = (
-                wp.array(np.ascontiguousarray(v, np.int32), dtype=int, device=device)
-                for v in (triangles, starts, items // 3)
-            )
-            self.pressure = wp.zeros(len(triangles), dtype=real, device=device)
-            self.force = wp.zeros(worlds * len(triangles), dtype=self.net.vector, device=device)
-            self._press, self._spread = newton.pressure_kernel(real)
+        self.pressures = Pressures(self.net) if host.pressures else None
+        self._spread = newton.spread_kernel(real)
 
     def prescribe(self, t0: float, t1: float) -> None:
         """Hand the device what supports and loads do between t0 and t1."""
@@ -98,8 +89,8 @@ class NetStep:
             for timed in host.timed:
                 np.add.at(load, timed.blocks, timed.at(at, 1.0) * timed.force)
             self.constant.assign(np.tile(load, (model.worlds, 1)))
-        if host.pressures:
-            self.pressure.assign(np.concatenate([p.at(at, 1.0) * p.pressure for p in host.pressures]))
+        if self.pressures:
+            self.pressures.assign(at, 1.0)
 
     def step(self, before, after) -> None:
         """Launch a whole step from one state to another; only launches, so that it can be captured."""
@@ -183,21 +174,16 @@ class NetStep:
     def _apply_loads(self) -> None:
         """Constant and timed loads, and pressures on the predicted surface."""
         solver = self.newton
-        if self._press is None:
+        if self.pressures is None:
             if self.net.host.timed:
                 wp.copy(solver.load, self.constant)
             return
-        count = len(self.triangles)
-        self._launch(
-            self._press,
-            self.model.worlds * count,
-            [solver.q, self.triangles, self.pressure, self.net.blocks],
-            [self.force],
-        )
+        force, meets = self.pressures.force, self.pressures.meets
+        self.pressures.on(solver.q, force)
         self._launch(
             self._spread,
             solver.all,
-            [self.constant, self.force, self.starts, self.items, self.net.blocks, count],
+            [self.constant, force, *meets, self.net.blocks, self.pressures.count],
             [solver.load],
         )
 
@@ -211,7 +197,7 @@ class NetStep:
         kernels += [self._hold] if len(self._moving_blocks) else []
         kernels += [frames.edge_kernel(real)] if self.net.edges else []
         kernels += [frames.reset_kernel(real)] if self.net.host.spins else []
-        kernels += [self._press, self._spread] if self._press else []
+        kernels += [self.pressures.kernel, self._spread] if self.pressures else []
         for part in self.net.sets:
             measure = part.term.measure
             if measure.frames:

@@ -17,6 +17,29 @@ def automatic(group) -> str:
     return "sweep"
 
 
+LARGE_STATIC = {
+    False: 50_000,
+    True: 10_000,
+}  # nodes, without and with CUDA, from which on an equilibrium takes no factors
+
+
+def static_solver(model) -> str:
+    """Name of the solver of equilibria: "pcg" for large nets that it can serve, else "direct"."""
+    net = model.net
+    if net is None or why_not_pcg(model):
+        return "direct"
+    return "pcg" if net.host.nodes * net.worlds >= LARGE_STATIC[model.wp_device.is_cuda] else "direct"
+
+
+def why_not_pcg(model) -> str:
+    """What keeps equilibria of a model from being found by conjugate gradients; empty where nothing does."""
+    if model.net is None or model.groups:
+        return "it is for shells and joined rods alone, and the model has rods on their own"
+    if model.net.host.bands:
+        return "it knows no pressure that follows axisymmetric shells"
+    return ""
+
+
 def net_preconditioner(net) -> str:
     """Name of the preconditioner of a net: "multilevel" where it is large, else "block_jacobi"."""
     return "multilevel" if net.host.nodes >= LARGE else "block_jacobi"

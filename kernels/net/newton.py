@@ -340,6 +340,14 @@ def pressure_kernel(real):
         x2 = q[triangles[k, 2] + w * blocks]
         force_out[i] = wp.cross(x1 - x0, x2 - x0) * (pressure[k] / real(6.0))
 
+    return press
+
+
+@cache
+def spread_kernel(real):
+    """Constant loads of a block, and what the pressures of the triangles around it give each of their corners."""
+    V = wp.types.vector(3, real)
+
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def spread(
         constant: wp.array(dtype=V),
@@ -350,7 +358,6 @@ def pressure_kernel(real):
         triangles: int,
         load_out: wp.array(dtype=V),
     ):
-        """Constant loads and the pressures of the triangles around a block."""
         i = wp.tid()
         w = i / blocks
         k = i - w * blocks
@@ -359,4 +366,59 @@ def pressure_kernel(real):
             f += force[items[at] + w * triangles]
         load_out[i] = f
 
-    return press, spread
+    return spread
+
+
+@cache
+def follow_kernel(real):
+    """Adds pressures that follow the iterate to the sums of forces and work at every block; see `kernels.net.system`."""
+    V = wp.types.vector(3, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def follow(
+        q: wp.array(dtype=V),
+        base: wp.array(dtype=V),
+        here: wp.array(dtype=V),
+        there: wp.array(dtype=V),
+        starts: wp.array(dtype=int),
+        items: wp.array(dtype=int),
+        status: wp.array(dtype=int),
+        blocks: int,
+        triangles: int,
+        force: wp.array(dtype=V),
+        size: wp.array(dtype=real),
+        change: wp.array2d(dtype=real),
+        noise: wp.array2d(dtype=real),
+    ):
+        """`here` and `there` are the forces on the corners of triangles at q and at the base; their mean does the work."""
+        i = wp.tid()
+        w = i / blocks
+        if status[w] != 0:
+            return
+        k = i - w * blocks
+        f = V()
+        mean = V()
+        for at in range(starts[k], starts[k + 1]):
+            t = items[at] + w * triangles
+            f += here[t]
+            mean += real(0.5) * (here[t] + there[t])
+        work = wp.dot(q[i] - base[i], mean)
+        force[i] = force[i] + f
+        size[i] = size[i] + wp.max(wp.abs(f))
+        change[w, k] = change[w, k] - work
+        noise[w, k] = noise[w, k] + wp.abs(work)
+
+    return follow
+
+
+@cache
+def less_kernel(linear):
+    """Takes one vector of blocks from another."""
+    H = wp.types.vector(3, linear)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def less(product: wp.array(dtype=H), right: wp.array(dtype=H)):
+        i = wp.tid()
+        right[i] = right[i] - product[i]
+
+    return less
