@@ -246,14 +246,7 @@ class NetNewton:
         blocks = self.net.blocks
         self._launch(self._measure, [self.right, self.direction, self.wanted, blocks], [self.dots])
         self._sum(self.dots, self.decrease)
-        wp.launch(
-            self._rotate,
-            self.turns.size,
-            [self.q, self.direction, self.ends, self.wanted, blocks, self.net.host.nodes],
-            [self.turns],
-            device=self.device,
-        )
-        self._largest(self.turns, self.turn)
+        self.measure_turns()
         wp.launch(
             self._take,
             self.worlds,
@@ -261,6 +254,17 @@ class NetNewton:
             [self.wanted, self.status, self.step_length, self.decrement, self.todo, self.pcg_work],
             device=self.device,
         )
+
+    def measure_turns(self) -> None:
+        """Largest turn that the directions make, squared."""
+        wp.launch(
+            self._rotate,
+            self.turns.size,
+            [self.q, self.direction, self.ends, self.wanted, self.net.blocks, self.net.host.nodes],
+            [self.turns],
+            device=self.device,
+        )
+        self._largest(self.turns, self.turn)
 
     def move(self) -> None:
         """Take the step that is to be taken."""

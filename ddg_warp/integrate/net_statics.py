@@ -25,6 +25,7 @@ from ddg_warp.state import State
 FORCING = (
     1e-4  # smallest reduction of the residual that a direction is solved to: Gauss-Newton's own error is no smaller
 )
+FAR = 4.0  # turns of a direction, over the cap of a step, at which it is far enough
 
 
 class StaticNewton(NetNewton):
@@ -32,17 +33,23 @@ class StaticNewton(NetNewton):
 
     def __init__(self, model, options: NewtonOptions):
         super().__init__(model, options, net_preconditioner(model.net), model.types.real)
+        self._whole = False  # whether directions may go as far as they like
         self.gravity.zero_()  # a load like others: `begin` scales them all
         self.pressures, self._there = None, None
         if self.net.host.pressures:
             self.pressures = Pressures(self.net)
             self._there, self._follow = self.pressures.make(), newton.follow_kernel(self.real)
-        self._less = newton.less_kernel(self.linear)
+        self._less, self._far = newton.solve_kernels(self.real, self.linear)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [*super().kernels, self._less, *([self.pressures.kernel, self._follow] if self.pressures else [])]
+        return [
+            *super().kernels,
+            self._less,
+            self._far,
+            *([self.pressures.kernel, self._follow] if self.pressures else []),
+        ]
 
     def begin(self, q: np.ndarray, dead: np.ndarray, at: float, scale: np.ndarray) -> None:
         """Set out from dofs `q` under dead loads (blocks, 3), the pressures at load parameter `at`, and load scales (worlds,)."""
@@ -70,6 +77,19 @@ class StaticNewton(NetNewton):
             [self.force, self.size, self.change, self.noise],
         )
 
+    def cycle(self) -> None:
+        """One iteration of conjugate gradients, whose directions grow: one that would be cut to a fraction is far enough.
+
+        (Steihaug, SIAM J. Numer. Anal. 20, 1983.) Else a flat sheet's first direction, which knows bending alone, costs the most.
+        """
+        super().cycle()
+        if self._whole:
+            return
+        self.measure_turns()
+        wp.launch(
+            self._far, self.worlds, [self.turn, FAR * self.options.rotation_cap], [self.wanted], device=self.device
+        )
+
     def follow(self, state, step: wp.array) -> None:
         """The direction of the free dofs where held ones make a `step`: H d = r - H step, from the iterate."""
         table, blocks = self.system, self.net.blocks
@@ -84,7 +104,9 @@ class StaticNewton(NetNewton):
             [self.product, self.krylov_dots],
         )
         self._launch(self._less, [self.product], [self.right])
+        self._whole = True
         self.direct()
+        self._whole = False
 
 
 class NetEquilibrium:

@@ -412,8 +412,8 @@ def follow_kernel(real):
 
 
 @cache
-def less_kernel(linear):
-    """Takes one vector of blocks from another."""
+def solve_kernels(real, linear):
+    """less(...): takes one vector of blocks from another; far(...): ends solves whose direction goes far enough."""
     H = wp.types.vector(3, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -421,4 +421,11 @@ def less_kernel(linear):
         i = wp.tid()
         right[i] = right[i] - product[i]
 
-    return less
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def far(turn: wp.array(dtype=real), rotation_cap: real, wanted: wp.array(dtype=int)):
+        """Ends the solves of worlds whose direction turns something by more than the cap already."""
+        w = wp.tid()
+        if wanted[w] == 1 and turn[w] > rotation_cap * rotation_cap:
+            wanted[w] = 2
+
+    return less, far
