@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp import meshes
+from ddg_warp import arrays, meshes
 from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
 from ddg_warp.net_newton import PRECONDITIONERS
 from ddg_warp.summary import machine, plain, table, write_json
@@ -55,8 +55,11 @@ def plate(cells: int, pressure: float) -> ddg.Scene:
 def equilibrium(cells: int, pressure: float, solver: str, device) -> dict:
     """A row of the table of equilibria."""
     model = plate(cells, pressure).build(device.alias, "mixed" if device.is_cuda else "float64")
-    Equilibrium(model, StaticsOptions(solver=solver)).load(model.state(), 1, 0.0, 1e-3)  # compiles
+    small = plate(4, pressure).build(device.alias, model.precision)
+    Equilibrium(small, StaticsOptions(solver=solver)).load(small.state(), 1)  # compiles
     search = Equilibrium(model, StaticsOptions(solver=solver))
+    if search.net:
+        arrays.load_kernels(search.net.newton.kernels, device)
     clock = time.perf_counter if device.is_cuda else time.process_time
     began = clock()
     state = search.load(model.state(), 1)

@@ -22,9 +22,7 @@ from ddg_warp.net_pressure import Pressures
 from ddg_warp.newton import NewtonOptions
 from ddg_warp.state import State
 
-FORCING = (
-    1e-4  # smallest reduction of the residual that a direction is solved to: Gauss-Newton's own error is no smaller
-)
+FORCING = 1e-4  # smallest reduction of the residual that a direction is solved to: Gauss-Newton errs by more
 FAR = 4.0  # turns of a direction, over the cap of a step, at which it is far enough
 
 
@@ -44,12 +42,8 @@ class StaticNewton(NetNewton):
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [
-            *super().kernels,
-            self._less,
-            self._far,
-            *([self.pressures.kernel, self._follow] if self.pressures else []),
-        ]
+        pressures = [self.pressures.kernel, self._follow] if self.pressures else []
+        return [*super().kernels, self._less, self._far, *pressures]
 
     def begin(self, q: np.ndarray, dead: np.ndarray, at: float, scale: np.ndarray) -> None:
         """Set out from dofs `q` under dead loads (blocks, 3), the pressures at load parameter `at`, and load scales (worlds,)."""
@@ -147,21 +141,23 @@ class NetEquilibrium:
         Raises:
             SolverError: it was not found; names the outcome.
         """
-        state = state.copy()
-        for _ in range(
-            2 if self.net.edges else 1
-        ):  # lagged frames are carried to what is found, and that is judged again
+        state, owner = state.copy(), self.owner
+        again = self.net.edges or self.model.motions  # what is found is judged by its own frames and forces on supports
+        for _ in range(2 if again else 1):
             self._begin(state, at)
             self._replay("solve", lambda: self.newton.solve(self._start))
-            self.owner.iterations += int(self.newton.iteration.numpy().sum())
+            owner.iterations += int(self.newton.iteration.numpy().sum())
             wp.copy(state.net.q, self.newton.q)
             self.model.carry_frames(state)
             status = int(self.newton.status.numpy().max())
+            q = self.tangent.dofs(state)
+            outer = self.tangent.loads(at, q)
+            residual = outer - self.tangent.gradient(state)
             if status > outcome.CONVERGED_TO_ROUNDING:
-                raise self._failure(state, at, outcome.NAMES[status])
-        self.owner.outcome = outcome.NAMES[status]
-        state.time = at
-        return state
+                name = outcome.NAMES[status]
+                raise SolverError(owner.where(name, residual, at), state=state, outcome=name)
+        owner.outcome = outcome.NAMES[status]
+        return owner.found(state, outer, residual, at)
 
     def _begin(self, state: State, at: float) -> None:
         tangent, part = self.tangent, self.tangent.parts[-1]
@@ -195,8 +191,3 @@ class NetEquilibrium:
                 gc.enable()
             self._graphs[name] = capture.graph
         wp.capture_launch(self._graphs[name])
-
-    def _failure(self, state: State, at: float, name: str) -> SolverError:
-        q = self.tangent.dofs(state)
-        residual = self.tangent.loads(at, q) - self.tangent.gradient(state)
-        return SolverError(self.owner.where(name, residual, at), state=state, outcome=name)

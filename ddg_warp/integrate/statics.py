@@ -164,7 +164,7 @@ class Equilibrium:
                 scale = np.abs(residual[free]).max()
             excess = self.excess(residual, gradient, hessian, q, scale)
             if excess <= 0.0 and (self.outcome == "converged" or polished):
-                return self._found(state, outer, residual, at)
+                return self.found(state, outer, residual, at)
             polished = excess <= 0.0  # the floor is a bound: one more iteration gives what rounding allows
             self.iterations += 1
             direction, decrease = self._direction(hessian, residual)
@@ -194,7 +194,7 @@ class Equilibrium:
                     break
                 taken *= 0.5
             if not found and polished:
-                return self._found(state, outer, residual, at)
+                return self.found(state, outer, residual, at)
             if not found:
                 raise SolverError(
                     self.where("line_search_failed", residual, at), state=state, outcome="line_search_failed"
@@ -213,9 +213,9 @@ class Equilibrium:
         points = self.tangent.free & ~self.tangent.angle
         return self.outcome != "converged" and np.abs(residual[points]).sum() > 0.5 * np.abs(outer[points]).sum() > 0.0
 
-    def _found(self, state: State, outer: np.ndarray, residual: np.ndarray, at: float) -> State:
+    def found(self, state: State, outer: np.ndarray, residual: np.ndarray, at: float) -> State:
         """The state as the equilibrium at `at`, unless rounding hides its loads and spoils the tangent that would carry them."""
-        if self.shift > 0.0 and self._hidden(outer, residual):
+        if (self.shift > 0.0 or self.net) and self._hidden(outer, residual):
             raise SolverError(
                 f"no equilibrium at load parameter {at:g}: lost_in_rounding, the stiffest elements make forces as uncertain as "
                 "the loads are large; take better shaped elements, or float64",
