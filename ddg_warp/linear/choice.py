@@ -17,10 +17,11 @@ def automatic(group) -> str:
     return "sweep"
 
 
-LARGE_STATIC = {
-    False: 50_000,
-    True: 10_000,
-}  # nodes, without and with CUDA, from which on an equilibrium takes no factors
+# Nodes from which on equilibria of a net take conjugate gradients, without and with CUDA. Where membrane forces carry the loads these
+# are faster from some thousand triangles on, on the CPU, too; where bending does, one core factorises faster
+# (tools/results/statics_cpu.csv). Without CUDA memory decides: factors of 1e5 triangles take some GB. On CUDA an iteration takes a
+# hundredth of the time (sheets_cuda.csv), and factors are made on the host all the same.
+LARGE_STATIC = {False: 50_000, True: 10_000}
 
 
 def static_solver(model) -> str:
