@@ -85,10 +85,8 @@ class StaticNewton(NetNewton):
         )
 
     def follow(self, state, step: wp.array) -> None:
-        """The direction of the free dofs where held ones make a `step`: H d = r - H step, from the iterate."""
+        """The direction of the free dofs where held ones make a `step`: H d = r - H step, in worlds that want it."""
         table, blocks = self.system, self.net.blocks
-        self.wanted.fill_(1)
-        self.forcing.fill_(FORCING)
         self.evaluate(state)
         self.balance()
         self.assemble()
@@ -131,6 +129,8 @@ class NetEquilibrium:
         """How the free dofs follow held ones that make a `step` (size,), by the tangent; None if there is no answer."""
         self._begin(state, at)
         self._step.assign(step.reshape(-1, 3))
+        self.newton.wanted.fill_(1)
+        self.newton.forcing.fill_(FORCING)
         self._replay("follow", lambda: self.newton.follow(self._start, self._step))
         direction = self.newton.direction.numpy().astype(np.float64).ravel()
         return direction if np.isfinite(direction).all() else None
