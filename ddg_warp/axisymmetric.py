@@ -25,6 +25,7 @@ class NetMeridian:
         curvature: natural curvatures at nodes, along and around (n, 2) [1/m].
         tangent: direction of the meridian at its ends (2, 2), extrapolated or as a clamp has it.
         kind: of the ends, "pole", "clamped" or "free".
+        supports: places among the scene's of the ring supports that clamp the ends (2,), -1 without.
     """
 
     nodes: np.ndarray
@@ -35,6 +36,7 @@ class NetMeridian:
     curvature: np.ndarray
     tangent: np.ndarray
     kind: tuple[str, str]
+    supports: np.ndarray
     thickness: np.ndarray
     material: object
 
@@ -64,7 +66,7 @@ class NetBand:
     potential, the enclosed volume, but for the axial force on a moving rim.
     """
 
-    ends: np.ndarray
+    places: np.ndarray
     pressure: np.ndarray
     amplitude: object
 
@@ -113,22 +115,23 @@ def meridian(shell, index: int, supports, nodes: np.ndarray) -> NetMeridian:
     first, last = points[:-1, 0], points[1:, 0]
     halves = np.column_stack([3.0 * first + last, first + 3.0 * last]) * (0.25 * np.pi * length)[:, None]
     halves *= np.sqrt(metric[:, 1])[:, None]
+    held = np.full(2, -1)
     kind, tangent = ["pole" if points[end, 0] == 0.0 else "free" for end in (0, -1)], _end_tangents(edges)
     for end, k in enumerate((0, n - 1)):
-        for support in supports:
+        for place, support in enumerate(supports):
             if support.shell == index and support.clamped and k in support.nodes:
                 if kind[end] == "pole":
                     raise SceneError(
                         f"axisymmetric shell '{shell.name}': a pole has its direction; hold it, do not clamp it"
                     )
-                kind[end] = "clamped"
+                kind[end], held[end] = "clamped", place
                 if support.tangent is not None:
                     tangent[end] = support.tangent / np.linalg.norm(support.tangent)
         if kind[end] == "pole":
             tangent[end] = (1.0, 0.0) if end == 0 else (-1.0, 0.0)
     thickness = np.broadcast_to(shell.thickness, (n - 1,))
     result = NetMeridian(
-        nodes, points, radius, length, halves, curvature, tangent, tuple(kind), thickness, shell.material
+        nodes, points, radius, length, halves, curvature, tangent, tuple(kind), held, thickness, shell.material
     )
     if isinstance(shell.rest, str) and shell.rest == "shape":
         result.curvature = _curvature(result, edges)
@@ -182,7 +185,10 @@ def _curvature(shell: NetMeridian, edges: np.ndarray) -> np.ndarray:
 
 
 def element_sets(shell: NetMeridian) -> list[ElementSet]:
-    """Membrane of edges, bending of inner nodes, bending of both ends; nodes counted along the meridian."""
+    """Membrane of edges, bending of inner nodes, bending of both ends; nodes counted along the meridian.
+
+    The last of a rim's `normals`, the directions that clamps give, is 0 at the first end and 1 at the last.
+    """
     n, material = len(shell.points), shell.material
     k, R = np.arange(n), shell.node_radius
     nu = material.poisson
@@ -195,8 +201,9 @@ def element_sets(shell: NetMeridian) -> list[ElementSet]:
         zero = np.zeros(len(area))
         return [area, stiffness, poisson + zero, metric[0], zero, metric[1], rest[0], zero, rest[1], *viscosity]
 
-    def make(name, nodes, data, parameters):
-        return ElementSet(AXISYMMETRIC[name + damped], nodes, np.zeros((len(nodes), 0), int), data, parameters)
+    def make(name, nodes, data, parameters, *normals):
+        none = np.zeros((len(nodes), 0), int)
+        return ElementSet(AXISYMMETRIC[name + damped], nodes, none, data, parameters, *normals)
 
     metric = np.stack([shell.length**2, shell.radius**2])
     sets = [
@@ -225,17 +232,18 @@ def element_sets(shell: NetMeridian) -> list[ElementSet]:
         kind, tangent, along = shell.kind[end], shell.tangent[end], sign * 2.0 / shell.length[edge]
         rest, D, poisson = shell.curvature[node].copy(), bend[edge], nu
         if kind == "pole":
-            data = [*tangent, along, along, 0.0]
-        elif kind == "clamped":  # around the axis the curvature stays as it is
-            data = [*tangent, along, 0.0, 0.0]
-            rest[1] -= tangent[1] / R[node]
+            weights = [along, along, 0.0, 0.0]
+        elif kind == "clamped":  # around the axis the curvature is that of the clamp
+            weights = [along, 0.0, 0.0, 1.0 / R[node]]
         else:  # the curvature along the meridian is such that there is no moment
-            data = [0.0, 0.0, 0.0, 0.0, 1.0 / shell.radius[edge]]
+            tangent, weights = (0.0, 0.0), [0.0, 0.0, 1.0 / shell.radius[edge], 0.0]
             rest[0], D, poisson = 0.0, D * (1.0 - nu**2), 0.0
         area = shell.halves[edge, :1] if end == 0 else shell.halves[edge, 1:]
         nodes = np.array([[edge, edge + 1]])
         law_of_end = law(area, np.array([D]), poisson, np.ones((2, 1)), rest[:, None])
-        sets.append(make("axisymmetric_rim", nodes, np.array([data]), law_of_end))
+        data = np.array([[tangent[0], 0.0, tangent[1], *weights]])
+        normals = np.array([[0, 0, end]] if kind == "clamped" else np.zeros((0, 3), int))
+        sets.append(make("axisymmetric_rim", nodes, data, law_of_end, normals))
     return sets
 
 

@@ -9,6 +9,7 @@ import warp as wp
 from scipy import sparse
 
 from ddg_warp import arrays
+from ddg_warp.couples import couple_derivatives, couple_forces
 from ddg_warp.integrate.prescribed import PrescribedMotion
 from ddg_warp.kernels import element
 from ddg_warp.turning import turned
@@ -73,7 +74,8 @@ class ChainTangent:
             if kind.twist:
                 np.add.at(force, (columns, load.k, kind.dim), scale * load.moment)
             if load.couple.any():
-                pair, about = _couple_forces(x, load, columns, kind)
+                edges = x[columns, load.k + 1, : kind.dim] - x[columns, load.k, : kind.dim]
+                pair, about = couple_forces(edges, load.couple)
                 np.add.at(force, (columns, load.k + 1, slice(0, kind.dim)), scale * pair)
                 np.add.at(force, (columns, load.k, slice(0, kind.dim)), -scale * pair)
                 if kind.twist:
@@ -92,8 +94,8 @@ class ChainTangent:
         x = self.blocks(q)
         for load, columns in self._timed():
             for column, k in zip(columns, load.k, strict=True) if load.couple.any() else ():
-                scale = load.at(factor, factor)
-                block, about = _couple_stiffness(np.diff(x[column, k : k + 2, : kind.dim], axis=0)[0], load.couple)
+                scale = -load.at(factor, factor)
+                (block,), (about,) = couple_derivatives(np.diff(x[column, k : k + 2, : kind.dim], axis=0), load.couple)
                 first = (column * group.nodes + k) * kind.block + np.arange(kind.dim)
                 second = first + kind.block
                 for i, j, sign in ((first, first, 1), (second, second, 1), (first, second, -1), (second, first, -1)):
@@ -213,26 +215,6 @@ def _incidence(group) -> sparse.csr_matrix:
             put(exists, kind.dim * kind.span + edge, at(edge), kind.dim, 1.0)
     shape = (group.columns * n * kind.window, group.columns * n * kind.block)
     return sparse.csr_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(cols))), shape=shape)
-
-
-def _couple_forces(x: np.ndarray, load, columns: np.ndarray, kind) -> tuple[np.ndarray, np.ndarray]:
-    """Of a couple M on edges e: the force M x e / |e|^2 on their second nodes, and the moment M . t about them."""
-    e = x[columns, load.k + 1, : kind.dim] - x[columns, load.k, : kind.dim]
-    square = np.sum(e * e, -1, keepdims=True)
-    if kind.dim == 2:
-        return load.couple[1] * np.stack([e[:, 1], -e[:, 0]], -1) / square, np.zeros(len(columns))
-    return np.cross(load.couple, e) / square, e @ load.couple / np.sqrt(square[:, 0])
-
-
-def _couple_stiffness(e: np.ndarray, couple: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Minus the derivatives of M x e / |e|^2 and of M . t with respect to e; the former is symmetric only in the plane."""
-    square = e @ e
-    if len(e) == 2:
-        cross, about = couple[1] * np.array([[0.0, 1.0], [-1.0, 0.0]]), np.zeros(2)
-    else:
-        cross = np.cross(couple, np.eye(3)).T
-        about = -(couple - e * (couple @ e) / square) / np.sqrt(square)
-    return (2.0 * np.outer(cross @ e, e) / square - cross) / square, about
 
 
 def _per_dof(group, nodes: np.ndarray, angles: np.ndarray | None) -> np.ndarray:

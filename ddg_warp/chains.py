@@ -70,7 +70,8 @@ class ChainGroup:
         length: of the rod (R,) [m].
         load: force on nodes (n, R, dim) [N]; load_angle: twisting moment on edges (n, R) [N m]; None without constant loads.
         parameters: rows of all terms, each broadcastable to (n, R).
-        moving_nodes, moving_edges: (node or edge, rod, motion) and rest position or director of what has a motion.
+        moving_nodes: arrays (., 5) of (node, rod, motion of each of three components, -1 for none); every node in one row.
+        moving_edges: arrays (., 3) of (edge, rod, motion).
         timed_loads: loads with an amplitude, and couples.
     """
 
@@ -135,6 +136,9 @@ def compile_chains(scene: Scene) -> tuple[list[ChainGroup], list[list[Held]]]:
         place[chain.rods] = np.column_stack([np.full(len(chain.rods), g), np.arange(len(chain.rods))])
     motions = scene_motions(scene)
     held = [_hold(chains, place, support, motions) for support in scene.supports]
+    for chain in chains:
+        if chain.moving_nodes:
+            chain.moving_nodes = [_merged_motions(chain)]
     _apply_loads(scene, chains, place)
     return chains, held
 
@@ -398,9 +402,6 @@ def component_bits(components: str, dim: int) -> int:
 def _hold(chains: list[ChainGroup], place: np.ndarray, support: Support, motions: list) -> list[Held]:
     motion = next((i for i, m in enumerate(motions) if m is support.motion), -1)
 
-    def moving(k, columns):
-        return [np.column_stack([k, columns, np.full(len(columns), motion)])] if motion >= 0 else []
-
     nodes = [at for node in support.nodes for at in _places(chains, place, support.rods, node, "node")]
     edges = [at for edge in support.edges for at in _places(chains, place, support.rods, edge, "edge")]
     if support.end:
@@ -412,14 +413,34 @@ def _hold(chains: list[ChainGroup], place: np.ndarray, support: Support, motions
     for chain, k, columns in nodes:
         bits = component_bits(support.components, chain.kind.dim)
         chain.fixed[k, columns] |= np.uint8(bits)
-        chain.moving_nodes += moving(k, columns)
+        if motion >= 0:
+            moved = np.where((bits >> np.arange(3)) & 1, motion, -1)
+            chain.moving_nodes.append(np.column_stack([k, columns, np.tile(moved, (len(k), 1))]))
         held.append(Held(chains.index(chain), k, columns, bits))
     for chain, k, columns in edges:
         if chain.kind.twist:
             chain.fixed[k, columns] |= np.uint8(1 << chain.kind.dim)
-            chain.moving_edges += moving(k, columns)
+            if motion >= 0:
+                chain.moving_edges.append(np.column_stack([k, columns, np.full(len(columns), motion)]))
             held.append(Held(chains.index(chain), k, columns, 0))
     return held
+
+
+def _merged_motions(chain: ChainGroup) -> np.ndarray:
+    """One row of `moving_nodes` a node (., 5); a component with two motions is refused."""
+    rows = np.concatenate(chain.moving_nodes)
+    places, index = np.unique(rows[:, :2], axis=0, return_inverse=True)
+    motions = np.full((len(places), 3), -1)
+    np.maximum.at(motions, index.ravel(), rows[:, 2:])
+    twice = (rows[:, 2:] >= 0) & (rows[:, 2:] != motions[index.ravel()])
+    if twice.any():
+        row, axis = np.argwhere(twice)[0]
+        node, column = rows[row, :2]
+        raise SceneError(
+            f"node {node - chain.first[column]} of rod {chain.rods[column]} has two motions along "
+            f"{('xz' if chain.kind.dim == 2 else 'xyz')[axis]}; give it one that does both"
+        )
+    return np.column_stack([places, motions])
 
 
 def _apply_loads(scene: Scene, chains: list[ChainGroup], place: np.ndarray) -> None:

@@ -1,6 +1,6 @@
 """Elements of one term on any nodes: what a net gathers by index."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -17,6 +17,8 @@ class ElementSet:
         angles: angle of each place (E, a) int, counted by whoever makes the elements; of a surface, its edges.
         data: constant data as the measure's s (E, d) float.
         parameters: rest measure first, then those of the density in its order, each broadcastable to (E,).
+        normals: (element, first of three columns of its data, mesh edge) of every normal among the data that a support of that
+            edge gives (n, 3) int.
     """
 
     term: Term
@@ -24,6 +26,7 @@ class ElementSet:
     angles: np.ndarray
     data: np.ndarray
     parameters: list[np.ndarray]
+    normals: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), int))
 
     def __post_init__(self):
         measure = self.term.measure

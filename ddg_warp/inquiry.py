@@ -46,8 +46,9 @@ def energies(model, state) -> dict[str, float]:
 def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     """Force and moment of every support of the scene for one world: those of rods in the order they were added, then of shells.
 
-    They balance the internal forces and the loads on held dofs; the inertia of a held node itself is left out, which a
-    moving support would have to add.
+    They balance the internal forces and the loads on held dofs, and hold the normals of clamped mesh edges and of planes of
+    symmetry; the inertia of a held node itself is left out, which a moving support would have to add. Of a ring, x is the radial
+    force summed around it, and moments do not hold the direction of the meridian.
 
     Args:
         point: what moments are about (3,); by default the first node that a support holds.
@@ -57,6 +58,10 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     q = tangent.dofs(state)
     force = np.where(tangent.free, 0.0, tangent.gradient(state) - tangent.loads(factor, q))
     net = model.net.host.held if model.net is not None else []
+    normals = slice(len(model.scene.supports), len(model.scene.supports) + len(model.scene.shell_supports))
+    turns = np.zeros((max(len(model.held), len(net)), 3))
+    if net:
+        turns[normals] = _normal_moments(tangent.parts[-1], state)
     result = []
     for i in range(max(len(model.held), len(net))):
         places = [*_chain_places(tangent, q, force, model.held[i] if i < len(model.held) else [])]
@@ -64,7 +69,7 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
             places += _net_places(tangent.parts[-1], q, force, net[i])
         about = places[0][0] if point is None and places else np.zeros(3) if point is None else np.asarray(point, float)
         total = sum((push for _, push, _ in places), np.zeros(3))
-        moment = sum((np.cross(here - about, push) + twist for here, push, twist in places), np.zeros(3))
+        moment = sum((np.cross(here - about, push) + twist for here, push, twist in places), turns[i])
         result.append(Reaction(total, moment, about))
     return result
 
@@ -98,6 +103,35 @@ def _net_places(part, q: np.ndarray, force: np.ndarray, held) -> list[tuple]:
             first, last = x[host.ends[block - host.nodes]]
             places.append((first, np.zeros(3), f[block, 0] * (last - first) / np.linalg.norm(last - first)))
     return places
+
+
+def _normal_moments(part, state) -> np.ndarray:
+    """Moments that the shell supports exert by the normals they give (supports, 3), in the first world.
+
+    An element's energy does not change if its nodes and these normals turn together: the moment of the normals is minus that of
+    the forces on its nodes. Where several supports share an element, each has the part along its own edge.
+    """
+    result, x = np.zeros((len(part.model.scene.shell_supports), 3)), part.dofs(state).reshape(-1, 3)
+    for index, device in enumerate(part.net.sets):
+        host, measure = device.host, device.term.measure
+        element, row, support = host.normals[:, host.normals[2] < len(result)]
+        if not element.size:
+            continue
+        corners = x[host.slots[: measure.nodes]]
+        forces = part.forces(state, index)[: measure.nodes, : len(host)]
+        moments = -np.cross(corners, forces).sum(0)
+        least, most = np.full(len(host), len(result)), np.full(len(host), -1)
+        np.minimum.at(least, element, support)
+        np.maximum.at(most, element, support)
+        alone = least == most
+        np.add.at(result, least[alone], moments[alone])
+        for e in np.flatnonzero(least < most):
+            own = element == e
+            corner = (row[own] - 3) // 3  # opposite to the edge
+            edges = corners[(corner + 2) % 3, e] - corners[(corner + 1) % 3, e]
+            shares = edges * np.linalg.lstsq(edges.T, moments[e], rcond=None)[0][:, None]
+            np.add.at(result, support[own], shares)
+    return result
 
 
 def stresses(model, state) -> dict[str, list[np.ndarray]]:

@@ -104,13 +104,16 @@ class Meridians:
         return len(self.axisymmetric_shells) - 1
 
     def hold_ring(self, shell: int, nodes, components: str = "xz", motion: Motion | None = None) -> None:
-        """Hold radius ("x") or height ("z") of nodes of a meridian; the surface may turn there (simply supported)."""
+        """Hold radius ("x") or height ("z") of nodes of a meridian; the surface may turn there (simply supported).
+
+        `motion` moves them in the plane of x and z, by a translation and a rotation about the y axis.
+        """
         self._hold_ring(RingSupport(shell, self._nodes(shell, nodes), components, motion=motion))
 
     def clamp_ring(
         self, shell: int, end: str, components: str = "xz", tangent=None, motion: Motion | None = None
     ) -> None:
-        """Hold components and the direction of the meridian at a rim, its "first" or "last" node.
+        """Hold components and the direction of the meridian at a rim, its "first" or "last" node; a motion turns it, too.
 
         Args:
             tangent: direction (2,) of the meridian there, the way it runs; by default that of the points, extrapolated.
@@ -151,7 +154,8 @@ class Meridians:
     ) -> None:
         """Pressure [Pa] on the surface of edges (all by default), towards the left of the meridian as it runs in x and z.
 
-        It follows the surface, with its exact derivative in statics; with `dead` it keeps directions and areas of the rest shape.
+        It follows the surface: statics takes its exact derivative; in dynamics its forces are those on the predicted surface. With
+        `dead` it keeps directions and areas of the rest shape.
         """
         self._check_axisymmetric(shell)
         count = len(self.axisymmetric_shells[shell].points) - 1
@@ -166,8 +170,13 @@ class Meridians:
         if not support.components or set(support.components) - set("xz"):
             raise SceneError(f"ring support: components {support.components!r}; they are 'x' (radius), 'z' or both")
         motion = support.motion
-        if motion is not None and (not isinstance(motion, Motion) or motion.angle is not Motion.angle):
-            raise SceneError(f"ring support: motion is {motion!r}; a ring moves by Motion(translation=...) alone")
+        if motion is not None and not isinstance(motion, Motion):
+            raise SceneError(f"ring support: motion is {motion!r}; give Motion(translation=..., angle=...)")
+        if motion is not None and not motion.planar:
+            raise SceneError(
+                f"ring support: the motion turns about {tuple(motion.axis)}; a meridian stays in the plane of x and z, give "
+                "axis=(0, 1, 0)"
+            )
         self.ring_supports.append(support)
 
     def _end(self, shell, end: str) -> int:

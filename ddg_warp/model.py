@@ -1,5 +1,6 @@
 """Model: a scene frozen for a device. Constant arrays, terms, dof map, and what can be asked of a state."""
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -17,13 +18,16 @@ class Group:
     """Constant device arrays of one group of rods, all worlds side by side (columns world * R + rod)."""
 
     def __init__(self, host: ChainGroup, scene, worlds: int, device, real):
-        kind = host.kind
+        kind = replace(host.kind, serial=wp.get_device(device).is_cpu)
         vector = wp.types.vector(kind.dim, real)
         self.host, self.kind, self.worlds, self.device = host, kind, worlds, device
         self.rods = len(host.rods)
         self.nodes = host.shape[0]
         self.columns = self.rods * worlds
         self.elements = self.nodes if kind.closed else self.nodes - 1
+        self.node_threads, self.element_threads = (
+            (1 if kind.serial else along, self.columns) for along in (self.nodes, self.elements)
+        )
 
         def put(values, dtype):
             return arrays.upload(np.concatenate([values] * worlds, axis=-1) if worlds > 1 else values, dtype, device)
@@ -86,27 +90,28 @@ class Moving:
     """Device lists of the dofs of a group that have a prescribed motion.
 
     Attributes:
-        nodes: (node, column, motion) of held nodes; node_rest: their rest positions (., 3) [m].
+        nodes: (node, column, motion of each component) of held nodes; node_rest: their rest positions (., 3) [m].
         edges: (edge, column, motion) of held angles; edge_rest: first directors of these edges at rest (., 3).
     """
 
     def __init__(self, host: ChainGroup, worlds: int, rods: int, device, real):
-        def where(places):
-            rows = np.concatenate(places) if places else np.zeros((0, 3), int)
-            tiled = np.concatenate([rows + [0, world * rods, 0] for world in range(worlds)])
-            return rows, wp.array(tiled.astype(np.int32), dtype=int, device=device)
+        def where(rows):
+            shift = np.eye(1, rows.shape[1], 1, int)
+            tiled = np.concatenate([rows + world * rods * shift for world in range(worlds)])
+            return wp.array(tiled.astype(np.int32), dtype=int, device=device)
 
         def rest(values):
             return wp.array(np.concatenate([values] * worlds), dtype=real, device=device)
 
-        rows, self.nodes = where(host.moving_nodes)
+        rows = np.concatenate([np.zeros((0, 5), int), *host.moving_nodes])
+        self.nodes = where(rows)
         points = np.zeros((len(rows), 3))
         points[:, [0, 2] if host.kind.dim == 2 else [0, 1, 2]] = host.x[rows[:, 0], rows[:, 1]]
         self.node_rest = rest(points)
-        rows, self.edges = where(host.moving_edges)
-        self.edge_rest = rest(
-            np.moveaxis(host.frame[0:3], 0, -1)[rows[:, 0], rows[:, 1]] if len(rows) else np.zeros((0, 3))
-        )
+        rows = np.concatenate([np.zeros((0, 3), int), *host.moving_edges])
+        self.edges = where(rows)
+        directors = np.moveaxis(host.frame[0:3], 0, -1)
+        self.edge_rest = rest(directors[rows[:, 0], rows[:, 1]] if len(rows) else np.zeros((0, 3)))
 
 
 class Model:
@@ -139,7 +144,12 @@ class Model:
         from ddg_warp.net import compile_net
         from ddg_warp.net_model import DeviceNet
 
-        return DeviceNet(compile_net(self.scene), self.worlds, self.wp_device, self.types.real)
+        supports = [*self.scene.shell_supports, *self.scene.ring_supports]
+        turning = [s.motion is not None and s.motion.turns for s in supports]
+        place = {id(motion): i for i, motion in enumerate(self.motions)}
+        motions = [place[id(s.motion)] if turns else -1 for s, turns in zip(supports, turning, strict=True)]
+        net = compile_net(self.scene)
+        return DeviceNet(net, self.worlds, self.wp_device, self.types.real, np.array(motions, int))
 
     @property
     def device(self) -> str:
@@ -334,11 +344,15 @@ class Model:
                     arrays.assign(data.omega, omega)
         if self.net is not None:
             state.net = self.net.rest()
-            if spins is not None:
-                raise ValueError("spins are of rods on their own; this model has a net")
             for values, array, what in ((points, state.net.q, "points"), (velocities, state.net.v, "velocities")):
                 if values is not None:
                     array.assign(self._scatter_net(values, array.numpy(), what))
+            if spins is not None:
+                values, start = self._edge_values(spins)
+                rates = state.net.v.numpy().reshape(self.worlds, -1, 3)
+                for rod in self.net.host.rods:
+                    rates[:, rod.edges, 0] = values[..., start[rod.rod] + np.arange(len(rod.edges))]
+                state.net.v.assign(rates.reshape(-1, 3))
         if points is not None:
             self.carry_frames(state)
         self.update_strains(state)
@@ -370,17 +384,21 @@ class Model:
         return values
 
     def _scatter_edges(self, group: Group, values, out: np.ndarray) -> None:
+        values, start = self._edge_values(values)
+        own = group.host.own - (0 if group.kind.closed else 1)
+        k, column, index = _user_index(group, own, start)
+        for world in range(self.worlds):
+            out[k, column + world * group.rods] = (values if values.ndim == 1 else values[world])[index]
+
+    def _edge_values(self, values) -> tuple[np.ndarray, np.ndarray]:
+        """Spins in the user's order, checked, and where the edges of each rod begin."""
         counts = self.curves.counts - np.where(self.curves.closed, 0, 1)
-        start = np.concatenate([[0], np.cumsum(counts)])
         values = np.asarray(values, float)
         if values.shape not in ((counts.sum(),), (self.worlds, counts.sum())):
             raise ValueError(f"spins have shape {values.shape}; they are ({counts.sum()},), or one such array a world")
         if not np.isfinite(values).all():
             raise ValueError(f"spins: edge {int(np.argwhere(~np.isfinite(values))[0][-1])} is not finite")
-        own = group.host.own - (0 if group.kind.closed else 1)
-        k, column, index = _user_index(group, own, start)
-        for world in range(self.worlds):
-            out[k, column + world * group.rods] = (values if values.ndim == 1 else values[world])[index]
+        return values, np.concatenate([[0], np.cumsum(counts)])
 
     def empty_state(self) -> State:
         """Arrays of a state, not yet filled."""
@@ -432,7 +450,7 @@ class Model:
                 new = arrays.allocate(data.frame.shape, self.types.real, self.wp_device)
                 wp.launch(
                     step.finish_frames_kernel(group.kind, self.types.real),
-                    (group.elements, group.columns),
+                    group.element_threads,
                     [data.x, data.frame, group.count],
                     [new],
                     device=self.wp_device,

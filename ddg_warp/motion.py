@@ -46,6 +46,11 @@ class Motion:
         """Whether it was given an angle."""
         return self.angle is not _unturned
 
+    @property
+    def planar(self) -> bool:
+        """Whether what lies in the plane of x and z turns within it."""
+        return not self.turns or (self.axis[0] == 0.0 and self.axis[2] == 0.0)
+
     def pose(self, t0: float, t1: float) -> np.ndarray:
         """What the device needs of a step from t0 to t1: turn (3), rotation at t0 (9), pivot (3), translations (3, 3)."""
         a0, a1 = float(self.angle(t0)), float(self.angle(t1))
@@ -69,6 +74,10 @@ class Motion:
         """Where points of the rest state (n, 3) are at t [m]."""
         turned = (points - self.pivot) @ self.rotation(float(self.angle(t))).T
         return turned + self.pivot + np.asarray(self.translation(t), float)
+
+    def turn(self, t: float, vectors: np.ndarray) -> np.ndarray:
+        """Where vectors of the rest state (n, 3) point at t."""
+        return vectors @ self.rotation(float(self.angle(t))).T
 
     def director_angle(self, t0: float, t1: float, rest: np.ndarray, frame: np.ndarray, edge: np.ndarray, angle: float):
         """Angle at t1 of the director `rest` (3,) of the rest state, from an edge's transported reference director [rad].

@@ -12,10 +12,11 @@ import numpy as np
 
 from ddg_warp import axisymmetric, shell_geometry
 from ddg_warp import shells as shell_terms
-from ddg_warp.chains import Piece, TimedLoad, component_bits, ghost_nodes, net_rods, pieces_of, scene_motions
+from ddg_warp.chains import Piece, component_bits, ghost_nodes, net_rods, pieces_of, scene_motions
 from ddg_warp.elements import ElementSet
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.terms import JOINT
+from ddg_warp.net_loads import NetCouple, NetLoad, NetPressure
 from ddg_warp.surface import Surface
 from ddg_warp.validate import check_index
 
@@ -44,6 +45,7 @@ class NetShell:
     nodes: np.ndarray
     edges: np.ndarray
     kinds: shell_geometry.EdgeKinds
+    supports: np.ndarray  # place among the scene's of the support that gives the normal at each mesh edge, -1 without
     plate: shell_terms.Plate
     first: dict[str, int] = field(default_factory=dict)  # its first element in the set of each of its terms
 
@@ -52,7 +54,9 @@ class NetShell:
 class NetSet:
     """Elements of one term on blocks: slots (n, E), own lagged rows (m, E), data (d, E), parameters as of `ElementSet`.
 
-    `owner` (2, E) is the rod or shell of each element, and its place in it: edge, vertex, triangle or hinge.
+    `owner` (2, E) is the rod or shell of each element, and its place in it: edge, vertex, triangle or hinge. `normals` (3, n) are
+    element, first row of the data and support, counted over those of shells and then of rings, of every direction among the data
+    that a support gives: the normal at a mesh edge, or the tangent of a meridian.
     """
 
     term: object
@@ -61,6 +65,7 @@ class NetSet:
     data: np.ndarray
     parameters: list[np.ndarray]
     owner: np.ndarray
+    normals: np.ndarray = field(default_factory=lambda: np.zeros((3, 0), int))
 
     def __len__(self) -> int:
         return self.slots.shape[1]
@@ -74,28 +79,6 @@ class NetHeld:
     components: np.ndarray
 
 
-@dataclass
-class NetLoad:
-    """A load that changes: forces (B, 3) [N] (or a moment in component 0 of an angle's block) on blocks."""
-
-    blocks: np.ndarray
-    force: np.ndarray
-    amplitude: object
-
-    at = TimedLoad.at
-
-
-@dataclass
-class NetPressure:
-    """Pressure [Pa] on triangles of nodes (T, 3) that follows them; amplitude or None."""
-
-    triangles: np.ndarray
-    pressure: np.ndarray
-    amplitude: object
-
-    at = TimedLoad.at
-
-
 @dataclass(eq=False)
 class Net:
     """A scene's net on the host: N blocks of three dofs.
@@ -107,9 +90,9 @@ class Net:
         sets: elements by term.
         ends: nodes of every rod edge (rod_edges, 2); frame: director and tangent of it (6, rod_edges).
         mass: of every dof (N, 3) [kg, kg m^2]; fixed: held dofs (N, 3).
-        load: dead forces (N, 3); timed, pressures, bands: loads that change.
+        load: dead forces (N, 3); timed: those that change; pressures, bands, couples: loads that follow what they act on.
         held: what each support of `scene.supports`, then of `scene.shell_supports` and `scene.ring_supports`, holds here.
-        moving: (blocks, motion, components (3,) bool) of nodes with a motion; turning: (angle block, motion, sign) of rod edges.
+        moving: (blocks, motion, components (3,) bool) of nodes with a motion; turning: (angle blocks, motion) of rod edges.
     """
 
     rest: np.ndarray
@@ -131,11 +114,17 @@ class Net:
     turning: list[tuple[np.ndarray, int]] = field(default_factory=list)
     meridians: list[axisymmetric.NetMeridian] = field(default_factory=list)
     bands: list[axisymmetric.NetBand] = field(default_factory=list)
+    couples: list[NetCouple] = field(default_factory=list)
 
     @property
     def blocks(self) -> int:
         """Number of blocks."""
         return len(self.rest)
+
+    @property
+    def followers(self) -> list:
+        """Loads that follow what they act on, each with `places`, `forces` and their `derivative`."""
+        return [*self.pressures, *self.bands, *self.couples]
 
     @cached_property
     def edges(self) -> np.ndarray:
@@ -258,7 +247,7 @@ class _Builder:
         ends = merged[np.concatenate(self.ends)] if self.ends else np.zeros((0, 2), int)
         shells, mesh_edges = [], 0
         for (surface, numbers), shell in zip(self.shells, scene.shells, strict=True):
-            kinds = self._kinds(surface, len(shells))
+            kinds, supports = self._kinds(surface, len(shells))
             turning = shell.bending in shell_terms.TURNING
             first = nodes + self.rod_edges + mesh_edges
             angle = first + np.arange(len(surface.edges)) if turning else np.full(len(surface.edges), -1)
@@ -274,7 +263,7 @@ class _Builder:
                 rest=shell.rest,
                 viscosity=material.viscosity if material.viscosity > 0.0 else None,
             )
-            shells.append(NetShell(surface, merged[numbers], angle, kinds, plate))
+            shells.append(NetShell(surface, merged[numbers], angle, kinds, supports, plate))
         angles = self.rod_edges + mesh_edges
         rigid = [joint for joint in scene.joints if joint.rigid]
         rods = sorted(self.rods.values(), key=lambda rod: rod.rod)
@@ -302,7 +291,7 @@ class _Builder:
         net.fixed[nodes : nodes + angles, 1:] = True
         joints = _joint_places(scene, net, rigid)
         net.sets = _gather_sets(
-            [*_rod_sets(net, joints), *_joint_sets(net, joints), *_shell_sets(net, scene), *_meridian_sets(net)]
+            [*_rod_sets(net, joints), *_joint_sets(net, joints), *_shell_sets(net, scene), *_meridian_sets(net, scene)]
         )
         _add_masses(scene, net)
         _hold(scene, net)
@@ -345,26 +334,29 @@ class _Builder:
         flat = np.array([find(i) for i in range(len(points))]) if self.scene.joints or self.scene.attachments else root
         return np.unique(flat, return_inverse=True)[1]
 
-    def _kinds(self, surface: Surface, index: int) -> shell_geometry.EdgeKinds:
-        """What holds the normals at mesh edges: those whose two vertices a support names."""
-        clamped, symmetry = {}, {}
+    def _kinds(self, surface: Surface, index: int) -> tuple[shell_geometry.EdgeKinds, np.ndarray]:
+        """What holds the normals at mesh edges, those whose two vertices a support names; and the place of that support."""
+        clamped, symmetry, supports = {}, {}, np.full(len(surface.edges), -1)
         corners = surface.points[surface.triangles]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        for support in self.scene.shell_supports:
+        for place, support in enumerate(self.scene.shell_supports):
             if support.shell != index or not support.edges:
                 continue
             inside = np.isin(surface.edges, support.vertices).all(1)
             if support.edges == "symmetry":
                 for edge in np.flatnonzero(inside & surface.boundary):
                     symmetry[int(edge)] = support.normal
+                    if int(edge) not in clamped:
+                        supports[edge] = place
             else:
                 for edge in np.flatnonzero(inside):
                     sides = surface.edge_triangles[edge]
                     total = normals[sides[sides >= 0]].sum(0)
                     clamped[int(edge)] = total / np.linalg.norm(total)
+                    supports[edge] = place
         for edge in set(clamped) & set(symmetry):
             del symmetry[edge]
-        return shell_geometry.edge_kinds(surface, clamped, symmetry)
+        return shell_geometry.edge_kinds(surface, clamped, symmetry), supports
 
 
 def _joint_places(scene, net: Net, rigid) -> list[tuple[int, int, list]]:
@@ -453,6 +445,8 @@ def _shell_sets(net: Net, scene) -> list[NetSet]:
         models = description.bending, description.membrane
         for elements in shell_terms.shell_elements(shell.surface, shell.plate, shell.kinds, *models):
             sets.append(_bound(elements, shell.nodes, shell.edges, index))
+            element, row, edge = elements.normals.T
+            sets[-1].normals = np.array([element, row, shell.supports[edge]])
             shell.first[elements.term.name] = count[elements.term.name]
             count[elements.term.name] += len(elements)
         if description.bending in shell_terms.TURNING:
@@ -460,13 +454,16 @@ def _shell_sets(net: Net, scene) -> list[NetSet]:
     return sets
 
 
-def _meridian_sets(net: Net) -> list[NetSet]:
+def _meridian_sets(net: Net, scene) -> list[NetSet]:
     none = np.zeros(0, int)
     sets = []
     for index, shell in enumerate(net.meridians):
         net.fixed[shell.nodes, 1] = True
         net.fixed[shell.nodes[shell.points[:, 0] == 0.0], 0] = True
-        sets += [_bound(elements, shell.nodes, none, index) for elements in axisymmetric.element_sets(shell)]
+        for elements in axisymmetric.element_sets(shell):
+            sets.append(_bound(elements, shell.nodes, none, index))
+            element, row, end = elements.normals.T
+            sets[-1].normals = np.array([element, row, shell.supports[end] + len(scene.shell_supports)])
     return sets
 
 
@@ -485,7 +482,9 @@ def _gather_sets(sets: list[NetSet]) -> list[NetSet]:
         same = [s for s in sets if s.term.name == name and len(s)]
         join = [np.concatenate([getattr(s, what) for s in same], axis=1) for what in ("slots", "lag", "data", "owner")]
         parameters = [np.concatenate(values) for values in zip(*(s.parameters for s in same), strict=True)]
-        result.append(NetSet(same[0].term, *join[:3], parameters, join[3]))
+        first = np.cumsum([0] + [len(s) for s in same])
+        normals = [s.normals + [[at], [0], [0]] for s, at in zip(same, first, strict=False)]
+        result.append(NetSet(same[0].term, *join[:3], parameters, join[3], np.concatenate(normals, axis=1)))
     return result
 
 
@@ -504,7 +503,7 @@ def _add_masses(scene, net: Net) -> None:
     for rods, node, mass in scene.masses:
         for rod in rods:
             if rod in members:
-                net.mass[members[rod].nodes[node]] += mass
+                net.mass[members[rod].nodes[_own_node(members[rod], node)]] += mass
 
 
 def _hold(scene, net: Net) -> None:
@@ -544,13 +543,23 @@ def _mark(net: Net, nodes, bits: int, edges, motion, motions) -> None:
     net.held.append(NetHeld(pairs[:, 0], pairs[:, 1]))
     if motion is not None:
         index = next(i for i, m in enumerate(motions) if m is motion)
-        for other, at, _ in net.moving:
-            if at != index and (twice := np.intersect1d(nodes, other)).size:
+        held = np.isin(np.arange(3), components)
+        for other, at, same in net.moving:
+            if at != index and (held & same).any() and (twice := np.intersect1d(nodes, other)).size:
                 place = ", ".join(f"{x:g}" for x in net.rest[twice[0]])
-                raise SceneError(f"the point at ({place}) m has two motions; give it one that does both")
-        net.moving.append((nodes, index, np.isin(np.arange(3), components)))
+                raise SceneError(
+                    f"the point at ({place}) m has two motions along {'xyz'[np.argmax(held & same)]}; "
+                    "give it one that does both"
+                )
+        for other, at in net.turning:
+            if at != index and (twice := np.intersect1d(edges, other)).size:
+                rod = next(rod for rod in net.rods if twice[0] in rod.all_edges)
+                edge = int(np.flatnonzero(rod.all_edges == twice[0])[0]) - rod.first
+                raise SceneError(f"edge {edge} of rod {rod.rod} is turned by two motions; give it one that does both")
+            edges = np.setdiff1d(edges, other)  # an angle is counted on from where it is: once
+        net.moving.append((nodes, index, held))
         if len(edges):
-            net.turning.append((edges, index))
+            net.turning.append((np.unique(edges), index))
 
 
 def _load(scene, net: Net) -> None:
@@ -560,13 +569,16 @@ def _load(scene, net: Net) -> None:
             rod = members.get(int(index))
             if rod is None:
                 continue
+            if load.edge is None:
+                place = rod.nodes[_own_node(rod, load.node)]
+                _put(net, np.array([place]), np.asarray(load.force, float)[None], load.amplitude)
+                continue
+            places = _edge_places(rod, load.edge)
+            if load.moment:
+                _put(net, places[2:], np.array([[load.moment, 0.0, 0.0]]), load.amplitude)
             if np.any(load.couple):
-                raise SceneError(
-                    f"add_couple: rod {index} is part of a net; give a pair of forces or a twisting moment"
-                )
-            place = rod.nodes[load.node] if load.edge is None else rod.edges[load.edge]
-            force = np.asarray(load.force, float) if load.edge is None else np.array([load.moment, 0.0, 0.0])
-            _put(net, np.array([place]), force[None], load.amplitude)
+                couple, length = np.asarray(load.couple, float), float(rod.piece.length[rod.row])
+                net.couples.append(NetCouple(places[None], couple, load.amplitude, length))
     for load in scene.shell_loads:
         _put(net, net.shells[load.shell].nodes[load.vertices], load.force, load.amplitude)
     for pressure in scene.pressures:
@@ -588,6 +600,20 @@ def _load(scene, net: Net) -> None:
             _put(net, ends.ravel(), band.forces(net.rest[ends]).reshape(-1, 3), pressure.amplitude)
         else:
             net.bands.append(band)
+
+
+def _own_node(rod: NetRod, node: int) -> int:
+    """A node of a rod, refused if the rod has none such."""
+    check_index("node", node, np.array([len(rod.nodes)]), np.array([rod.rod]))
+    return node
+
+
+def _edge_places(rod: NetRod, edge: int) -> np.ndarray:
+    """Blocks of an edge's nodes and, with twist, of its angle."""
+    count = len(rod.nodes) - (0 if rod.piece.kind.closed else 1)
+    check_index("edge", edge, np.array([count]), np.array([rod.rod]))
+    k = edge % count
+    return np.concatenate([rod.nodes[[k, (k + 1) % len(rod.nodes)]], rod.edges[k : k + 1]])
 
 
 def _put(net: Net, blocks: np.ndarray, force: np.ndarray, amplitude) -> None:

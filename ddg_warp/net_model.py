@@ -17,6 +17,7 @@ class NetState:
         q, v: blocks (W N,) of positions [m], angles and rotation vectors since the last step [rad], and their rates.
         frame: director and tangent of rod edges (6, W edges).
         lag: own lagged rows of each element set (rows, W E); last: strains of each damped set at this state.
+        data: data (rows, W E) of those sets, by index, with normals among them that supports turn.
     """
 
     q: wp.array
@@ -24,19 +25,24 @@ class NetState:
     frame: wp.array
     lag: list[wp.array] = field(default_factory=list)
     last: list[wp.array] = field(default_factory=list)
+    data: dict[int, wp.array] = field(default_factory=dict)
 
     def arrays(self) -> dict[str, wp.array]:
         """All arrays by name."""
         named = {"q": self.q, "v": self.v, "frame": self.frame}
         for i, (lag, last) in enumerate(zip(self.lag, self.last, strict=True)):
             named |= {f"lag_{i}": lag, f"last_{i}": last}
-        return named
+        return named | {f"data_{i}": data for i, data in self.data.items()}
 
 
 class DeviceSet:
-    """Elements of one term on the device; parameters as in `Group`: one buffer, and rows (offset, along, across worlds)."""
+    """Elements of one term on the device; parameters as in `Group`: one buffer, and rows (offset, along, across worlds).
 
-    def __init__(self, host, worlds: int, device, real):
+    `turning` (n, 3) are element, first row of the data and motion of the normals that supports turn, `turning_rest` (n, 3) these
+    normals at rest.
+    """
+
+    def __init__(self, host, worlds: int, device, real, motions: np.ndarray):
         self.host, self.term, self.worlds, self.device = host, host.term, worlds, device
         self.elements = len(host)
         self.slots = wp.array(np.ascontiguousarray(host.slots, np.int32), dtype=int, device=device)
@@ -44,6 +50,14 @@ class DeviceSet:
         self.data = wp.array(np.ascontiguousarray(data), dtype=real, device=device)
         self.parameters = [_short(np.asarray(p, float))[None] for p in host.parameters]
         self.upload(real)
+        self.turning = np.array([*host.normals[:2], motions[host.normals[2]]]).T
+        self.turning = self.turning[self.turning[:, 2] >= 0]
+        element, row, _ = self.turning.T
+        self.turning_rest = host.data[row[:, None] + np.arange(3), element[:, None]]
+
+    def own_data(self) -> wp.array:
+        """Data of every world (rows, W E) at rest."""
+        return wp.array(np.tile(self.host.data, (1, self.worlds)), dtype=self.buffer.dtype, device=self.device)
 
     def upload(self, real) -> None:
         """Parameters (1 or worlds, 1 or elements) to one buffer with its table."""
@@ -89,14 +103,14 @@ class DeviceSet:
 
 
 class DeviceNet:
-    """A `Net` with all its worlds on a device."""
+    """A `Net` with all its worlds on a device; `motions` are those that turn the supports of shells and rings, -1 where none does."""
 
-    def __init__(self, host: Net, worlds: int, device, real):
+    def __init__(self, host: Net, worlds: int, device, real, motions: np.ndarray):
         self.host, self.worlds, self.device, self.real = host, worlds, device, real
         self.vector = wp.types.vector(3, real)
         self.blocks, self.angle_start = host.blocks, host.nodes
         self.edges = host.rod_edges
-        self.sets = [DeviceSet(s, worlds, device, real) for s in host.sets]
+        self.sets = [DeviceSet(s, worlds, device, real, motions) for s in host.sets]
         self.ends = wp.array(np.ascontiguousarray(host.ends, np.int32).reshape(-1, 2), dtype=int, device=device)
         self.still = wp.zeros(worlds, dtype=real, device=device)
         self.every = wp.full(worlds, 1, dtype=int, device=device)
@@ -116,7 +130,12 @@ class DeviceNet:
             state.lag.append(zeros(rows, count if rows else 1))
             strains = len(part.term.measure.strains) if part.term.density.lagged else 0
             state.last.append(zeros(strains, count if strains else 1))
+        state.data = self.turning_data()
         return state
+
+    def turning_data(self) -> dict[int, wp.array]:
+        """Data of the sets with normals that supports turn, as at rest."""
+        return {i: part.own_data() for i, part in enumerate(self.sets) if len(part.turning)}
 
     def rest(self) -> NetState:
         """The rest state."""
@@ -140,7 +159,7 @@ class DeviceNet:
             part.buffer,
             part.table,
             part.slots,
-            part.data,
+            state.data.get(index, part.data),
             self.blocks,
             self.angle_start,
             part.elements,

@@ -8,10 +8,11 @@ import warp as wp
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.net import elements, krylov, newton, system
 from ddg_warp.linear.multilevel import Multilevel
+from ddg_warp.linear.net_chain import Chains
 from ddg_warp.net_system import Assembly, NetSystem, Sums
 from ddg_warp.newton import NewtonOptions
 
-PRECONDITIONERS = ("block_jacobi", "multilevel")
+PRECONDITIONERS = ("block_jacobi", "chain", "multilevel", "chain_multilevel")
 LOOSEST = 0.1  # largest reduction of the residual that a direction is solved to (Eisenstat and Walker's forcing term)
 
 
@@ -19,7 +20,8 @@ class NetNewton:
     """Newton's method on all worlds of a net. Owns what is needed while a solve runs; attributes as of `ChainNewton`.
 
     Args:
-        preconditioner: of conjugate gradients, "block_jacobi" or "multilevel" (see `kernels.net.levels`).
+        preconditioner: of conjugate gradients: "block_jacobi", "chain" (rods between their joints are eliminated, see
+            `kernels.net.chains`), "multilevel" (see `kernels.net.levels`), or "chain_multilevel", both.
         linear: scalar type of the linear algebra; that of the model by default.
     """
 
@@ -81,7 +83,9 @@ class NetNewton:
         self._assembly = Assembly(net, self.system, self.parts, self.real, self.linear)
         self._judge, self._measure, self._rotate, self._take, self._move = newton.search_kernels(self.real, self.linear)
         self._invert, self._start, self._begin, *self._cycle = krylov.solver_kernels(self.linear)
-        self.levels = Multilevel(net, self.system, self.linear) if preconditioner == "multilevel" else None
+        given = net, self.system, self.linear
+        self.chains = Chains(*given) if preconditioner in ("chain", "chain_multilevel") else None
+        self.levels = Multilevel(*given) if preconditioner in ("multilevel", "chain_multilevel") else None
         self._limit = max(200, 100 * math.isqrt(blocks))
 
     def _part(self, part, make, H) -> dict:
@@ -100,10 +104,10 @@ class NetNewton:
         """Kernels to load before a capture."""
         own = [self._outer, self._collect, self._settle, self._judge, self._measure, self._rotate, self._take]
         cycle = [self._move, self._invert, self._start, self._begin, *self._cycle]
-        levels = self.levels.kernels if self.levels else []
+        parts = [kernel for part in (self.chains, self.levels) if part for kernel in part.kernels]
         evaluate = [(kernel, 128) for kernel in self._evaluate]
         sums = [(k, krylov.THREADS) for part in (self._sum, self._sum_linear, self._largest) for k in part.kernels]
-        return [*own, *cycle, *evaluate, *self._assembly.kernels, *levels, *sums]
+        return [*own, *cycle, *evaluate, *self._assembly.kernels, *parts, *sums]
 
     def pcg_iterations(self) -> int:
         """Iterations of all solves so far."""
@@ -199,9 +203,11 @@ class NetNewton:
             [self.right, self.inverse, self.wanted, blocks],
             [self.rest, self.direction, self.p, self.krylov_dots],
         )
+        if self.chains:
+            self.chains.prepare(self.matrix, self.inverse, self.fixed, self.wanted)
         if self.levels:
             self.levels.prepare(self.matrix, self.fixed, self.wanted)
-            self.levels.apply(self.rest, self.inverse, self.fixed, self.wanted, self.p, self.krylov_dots)
+        self.precondition(self.p)
         self._sum_linear(self.krylov_dots, self.total)
         self.busy.zero_()
         wp.launch(
@@ -212,6 +218,13 @@ class NetNewton:
             device=self.device,
         )
         wp.capture_while(self.busy, self.cycle)
+
+    def precondition(self, z: wp.array) -> None:
+        """What chains and levels make of z, which holds the residual times the inverses of the diagonal blocks."""
+        if self.chains:
+            self.chains.apply(self.matrix, self.rest, self.fixed, self.wanted, z, self.krylov_dots)
+        if self.levels:
+            self.levels.apply(self.rest, self.fixed, self.wanted, z, self.krylov_dots)
 
     def cycle(self) -> None:
         """One iteration of conjugate gradients."""
@@ -229,8 +242,7 @@ class NetNewton:
             [self.p, self.product, self.inverse, self.rho, self.curvature, self.iterations, self.wanted, blocks],
             [self.direction, self.rest, self.z, self.krylov_dots],
         )
-        if self.levels:
-            self.levels.apply(self.rest, self.inverse, self.fixed, self.wanted, self.z, self.krylov_dots)
+        self.precondition(self.z)
         self._sum_linear(self.krylov_dots, self.total)
         self._launch(turn, [self.z, self.total, self.rho, self.wanted, blocks], [self.p])
         wp.launch(

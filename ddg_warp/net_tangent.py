@@ -51,14 +51,19 @@ class NetTangent:
     def gradient(self, state) -> np.ndarray:
         result = np.zeros((self.size // 3, 3))
         for i, part in enumerate(self.net.sets):
-            count, slots = part.elements * self.net.worlds, part.host.slots
-            out = wp.zeros((len(slots), count), dtype=self.net.vector, device=self.net.device)
-            self._launch(state, i, 1, out, ())
-            forces = out.numpy().astype(np.float64)
+            slots, forces = part.host.slots, self.forces(state, i)
             index = _tiled(slots, self.host.blocks, self.net.worlds).ravel()
             for d in range(3):
                 result[:, d] += np.bincount(index, forces[..., d].ravel(), len(result))
         return result.ravel()
+
+    def forces(self, state, index: int) -> np.ndarray:
+        """Derivative of the energy of every element of a set with respect to the blocks of its slots (slots, elements, 3)."""
+        part = self.net.sets[index]
+        shape = (len(part.host.slots), part.elements * self.net.worlds)
+        out = wp.zeros(shape, dtype=self.net.vector, device=self.net.device)
+        self._launch(state, index, 1, out, ())
+        return out.numpy().astype(np.float64)
 
     def hessian(self, state, stress: list | None = None) -> sparse.csc_matrix:
         scatter, rows, starts = self._pattern
@@ -107,45 +112,23 @@ class NetTangent:
     def loads(self, factor: float, q: np.ndarray) -> np.ndarray:
         host, x = self.host, q.reshape(self.net.worlds, -1, 3)
         result = np.tile(self.dead_loads(factor), (self.net.worlds, 1, 1))
-        for band in host.bands:
+        for load in host.followers:
             for world in range(self.net.worlds):
-                np.add.at(result[world], band.ends, band.at(factor, factor) * band.forces(x[world][band.ends]))
-        for pressure in host.pressures:
-            scale = pressure.at(factor, factor) * pressure.pressure / 6.0
-            for world in range(self.net.worlds):
-                corners = x[world][pressure.triangles]
-                area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-                np.add.at(result[world], pressure.triangles, (scale[:, None] * area)[:, None])
+                np.add.at(result[world], load.places, load.at(factor, factor) * load.forces(x[world][load.places]))
         return result.ravel()
 
     def load_stiffness(self, factor: float, q: np.ndarray) -> sparse.csc_matrix | None:
-        if not self.host.pressures and not self.host.bands:
+        if not self.host.followers:
             return None
         rows, cols, values = [], [], []
         x, N = q.reshape(self.net.worlds, -1, 3), self.host.blocks
-        axes = np.arange(3)
-        for band in self.host.bands:
+        for load in self.host.followers:
             for world in range(self.net.worlds):
-                block = -band.at(factor, factor) * band.derivative(x[world][band.ends])
-                place = 3 * (band.ends + world * N)[:, :, None] + axes
+                place = 3 * (load.places + world * N)[:, :, None] + np.arange(3)
                 row, column = np.broadcast_arrays(place[:, :, :, None, None], place[:, None, None])
                 rows.append(row)
                 cols.append(column)
-                values.append(block)
-        for pressure in self.host.pressures:
-            scale = pressure.at(factor, factor) * pressure.pressure / 6.0
-            for world in range(self.net.worlds):
-                triangles = pressure.triangles
-                corners = x[world][triangles]
-                for j in range(3):
-                    # d/dx_j of (x1 - x0) x (x2 - x0): the edge opposite to corner j, crossed
-                    e = corners[:, (j + 2) % 3] - corners[:, (j + 1) % 3]
-                    block = -scale[:, None, None] * _cross(e)
-                    for i in range(3):
-                        r, c = np.broadcast_arrays(np.arange(3)[:, None], np.arange(3))
-                        rows.append((3 * (triangles[:, i] + world * N))[:, None, None] + r)
-                        cols.append((3 * (triangles[:, j] + world * N))[:, None, None] + c)
-                        values.append(block)
+                values.append(-load.at(factor, factor) * load.derivative(x[world][load.places]))
         data, *places = (np.concatenate([part.ravel() for part in parts]) for parts in (values, rows, cols))
         return sparse.csc_matrix((data, places), shape=(self.size, self.size))
 
@@ -191,6 +174,21 @@ class NetTangent:
                             before, at, host.frame[:3, f], frame[:, world, f], x[1] - x[0], q[world, block, 0]
                         )
         state.net.q.assign(q.reshape(-1, 3))
+        self.turn_clamps(state, at)
+
+    def turn_clamps(self, state, at: float) -> None:
+        """Turn the normals that clamped mesh edges prescribe to where their motions have them at load parameter `at`."""
+        for index, data in state.net.data.items():
+            part = self.net.sets[index]
+            values = data.numpy().astype(np.float64)
+            columns = np.arange(self.net.worlds)[:, None] * part.elements
+            for motion in np.unique(part.turning[:, 2]):
+                chosen = part.turning[:, 2] == motion
+                element, row, _ = part.turning[chosen].T
+                turned = self.model.motions[motion].turn(at, part.turning_rest[chosen])
+                for d in range(3):
+                    values[row + d, element + columns] = turned[:, d]
+            data.assign(values)
 
     def edges(self, q: np.ndarray) -> np.ndarray:
         """Edge vectors (E, 3)."""
@@ -267,16 +265,3 @@ def _local(measure) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         full[at + 3 * i : at + 3 * i + 3, i] = np.eye(3)
     slot, component = np.nonzero(full.any(0))
     return full[:, slot, component], slot, component
-
-
-def _cross(e: np.ndarray) -> np.ndarray:
-    """Matrices of e x (T, 3, 3)."""
-    zero = np.zeros(len(e))
-    return np.stack(
-        [
-            np.stack([zero, -e[:, 2], e[:, 1]], -1),
-            np.stack([e[:, 2], zero, -e[:, 0]], -1),
-            np.stack([-e[:, 1], e[:, 0], zero], -1),
-        ],
-        axis=1,
-    )

@@ -165,7 +165,7 @@ class ChainNewton:
         group = self.group
         wp.launch(
             self._evaluate,
-            (group.elements, group.columns),
+            group.element_threads,
             [self.x, self.theta, self.frame, last, self.rate, group.buffer, group.table, group.count]
             + [self.status, self.slot, self.without_compression, self.iteration, int(self.reuse)],
             [self.factor, self.geometric, self.gradient, self.energy, self.stiffness, self.turned, self.active],
@@ -186,7 +186,7 @@ class ChainNewton:
         group, options = self.group, self.options
         wp.launch(
             self._check,
-            (group.nodes, group.columns),
+            group.node_threads,
             [self.gradient, self.energy, self.stiffness, group.count, group.mass, group.rotary, self.coefficient]
             + [self.x, self.theta, self.base, self.direction, self.target, self.target_angle]
             + [group.gravity, group.load, group.load_angle, int(group.host.loaded), group.fixed, group.length]

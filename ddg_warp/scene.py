@@ -281,6 +281,11 @@ class Scene(Structures):
             raise SceneError(f"fix: components {components!r}; they are letters of 'xyz', one at least")
         if motion is not None and not isinstance(motion, Motion):
             raise SceneError(f"motion is {motion!r}; give Motion(translation=..., angle=...)")
+        if motion is not None and self.dimension == 2 and not motion.planar:
+            raise SceneError(
+                f"the motion turns about {tuple(motion.axis)}; a scene of dimension 2 stays in the plane of x and z, give "
+                "axis=(0, 1, 0)"
+            )
         self.supports.append(Support(self._rods(rods), components=components, motion=motion, **held))
 
     def _load(self, rods, amplitude, **load) -> None:

@@ -157,19 +157,22 @@ def curved_membrane(surface, plate: Plate, kinds: EdgeKinds) -> ElementSet:
     squares = np.stack([b11**2, 0.5 * (b11**2 + b22**2 - (b11 + b22 - 2.0 * b12) ** 2), b22**2], -1)
     law = _law(plate, plate.membrane_stiffness, 0.5 * (plate.abar + squares / 12.0))
     bending = mid_edge_bending(surface, plate, kinds, True)
-    return ElementSet(_term("shell_stretch_curved", plate), bending.nodes, bending.angles, bending.data, law)
+    term = _term("shell_stretch_curved", plate)
+    return ElementSet(term, bending.nodes, bending.angles, bending.data, law, bending.normals)
 
 
 def mid_edge_bending(surface, plate: Plate, kinds: EdgeKinds, angles: bool) -> ElementSet:
     """Bending of all triangles by mid-edge normals; with `angles` they turn, by angles numbered as the edges of the surface."""
     kind, vector = kinds.of_triangles(surface)
     data = [kind, vector.reshape(-1, 9)] + ([surface.triangle_signs] if angles else [])
+    supported, side = np.nonzero(kind >= CLAMPED)
     return ElementSet(
         _term("shell_bend_dof" if angles else "shell_bend", plate),
         mid_edge_nodes(surface),
         surface.triangle_edges if angles else np.zeros((len(kind), 0), int),
         np.concatenate(data, axis=1).astype(float),
         _law(plate, plate.bending_stiffness, plate.bbar),
+        np.column_stack([supported, 3 + 3 * side, surface.triangle_edges[supported, side]]),
     )
 
 
@@ -194,7 +197,9 @@ def hinge_bending(surface, plate: Plate, kinds: EdgeKinds) -> list[ElementSet]:
         weight = _length_squared(surface, plate, edges, triangles) / (plate.area[triangles] / 3.0)
         law = [weight, *_quadratic(plate, triangles[:, None], plate.angle[edges, side], 1)]
         data = np.concatenate([kinds.kind[edges, None], kinds.vector[edges]], axis=1)
-        sets.append(ElementSet(_term("shell_tilt", plate), nodes, np.zeros((len(edges), 0), int), data, law))
+        normals = np.column_stack([np.arange(len(edges)), np.ones(len(edges), int), edges])
+        none = np.zeros((len(edges), 0), int)
+        sets.append(ElementSet(_term("shell_tilt", plate), nodes, none, data, law, normals))
     return sets
 
 

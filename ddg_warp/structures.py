@@ -141,11 +141,15 @@ class Structures(Meridians):
         return len(self.shells) - 1
 
     def hold(self, shell: int, vertices, components: str = "xyz", motion: Motion | None = None) -> None:
-        """Hold components of vertices of a shell; the surface may turn there (simply supported)."""
+        """Hold components of vertices of a shell, which `motion` moves; the surface may turn there (simply supported)."""
         self._hold(shell, vertices, components, motion=motion)
 
     def clamp_boundary(self, shell: int, vertices, components: str = "xyz", motion: Motion | None = None) -> None:
-        """Hold components of vertices, and the surface's normal at the mesh edges between them."""
+        """Hold components of vertices, and the surface's normal at the mesh edges between them, inside the surface, too.
+
+        `motion` moves the components and turns the normals as one body, however many times; it moves no other components, so
+        that with "yz" a clamp that turns can slide along x.
+        """
         self._hold(shell, vertices, components, edges="clamp", motion=motion)
 
     def symmetry(self, shell: int, vertices, axis: str) -> None:
@@ -227,10 +231,6 @@ class Structures(Meridians):
         motion = options.get("motion")
         if motion is not None and not isinstance(motion, Motion):
             raise SceneError(f"motion is {motion!r}; give Motion(translation=..., angle=...)")
-        if motion is not None and motion.turns and options.get("edges") == "clamp":
-            raise SceneError(
-                "clamp_boundary: a clamp holds the normal still; to turn an edge, hold two rows of vertices instead"
-            )
         self.shell_supports.append(ShellSupport(shell, self._vertices(shell, vertices), components, **options))
 
     def _check_shell(self, shell) -> None:

@@ -103,6 +103,19 @@ class Tangent:
                 part.move_supports(state, before, at)
             self.model.carry_frames(state)
 
+    @property
+    def clamps_turn(self) -> bool:
+        """Whether supports turn normals of shells."""
+        return self.model.net is not None and any(len(part.turning) for part in self.model.net.sets)
+
+    def with_clamps_turned(self, state, at: float):
+        """The state with the normals that supports turn where they are at `at`; itself where none does."""
+        if not self.clamps_turn:
+            return state
+        state = state.copy()
+        self.parts[-1].turn_clamps(state, at)
+        return state
+
     def support_step(self, state, before: float, at: float) -> np.ndarray:
         """How far the supports of a state that belongs to `before` are from where they are at `at` (size,), zero at free dofs."""
         if not self.model.motions:

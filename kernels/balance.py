@@ -1,7 +1,7 @@
 """Balance of forces at the nodes of a chain, and where a rod has converged.
 
-`check`, one thread a node, runs before a sweep: it writes the residual, and every node's share of the change of the energy since
-the accepted iterate. It decides where a rod has converged, so that the last iterate costs no sweep: at every free dof
+`check`, one thread a node (on the CPU a rod), runs before a sweep: it writes the residual, and every node's share of the change of the
+energy since the accepted iterate. It decides where a rod has converged, so that the last iterate costs no sweep: at every free dof
 |residual| <= max(rtol * load scale, floor), where floor bounds what rounding of coordinates and forces leaves,
 floor_factor * eps * (H_ii |x| + sum of |element forces|). Moments are compared over the length of the rod.
 """
@@ -10,7 +10,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions
+from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, until_function
 
 
 @cache
@@ -105,6 +105,7 @@ def check_kernel(kind: ChainKind, real, linear):
     V = wp.types.vector(dim, real)
     _, behind, balance = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
+    until = until_function(kind)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def check(
@@ -141,73 +142,75 @@ def check_kernel(kind: ChainKind, real, linear):
         unbalanced_out: wp.array(dtype=int),
         drowned_out: wp.array(dtype=int),
     ):
-        k, r = wp.tid()
+        start, r = wp.tid()
         n = count[r]
-        if status[r] != 0 or k >= n:
+        if status[r] != 0 or start >= n:
             return
         c = coefficient[r]
-        f, moment, size, elastic = balance(
-            g, mass, rotary, c, x, theta, target, target_angle, gravity, load, load_angle, loaded, k, n, r
-        )
-        stiff = real(0.0)
-        b = behind(k, n)
-        if wp.static(closed) or k < n - 1:
-            stiff = real(stiffness[k, r])
-        if b >= 0:
-            stiff = wp.max(stiff, real(stiffness[b, r]))
-        here = x[k, r]
-        m = mass[k, r]
-        reach = wp.max(wp.abs(here))
         limit = rtol * load_scale[r]
-        least = floor * ((real(2.0) * stiff + c * m) * reach + size)
-        mask = int(fixed[k, r])
-        for d in range(wp.static(dim)):
-            held = ((mask >> d) & 1) == 1
-            right_out[d, k, r] = linear(wp.where(held, real(0.0), f[d]))
-            if not held and not wp.abs(f[d]) <= limit:
-                drowned_out[r] = 1
-                if not wp.abs(f[d]) <= least:
-                    unbalanced_out[r] = 1
-        if wp.static(twist):
-            held = ((mask >> wp.static(dim)) & 1) == 1
-            right_out[wp.static(nb - 1), k, r] = linear(wp.where(held, real(0.0), moment))
-            if not held and not wp.abs(moment) <= limit * length[r]:
-                drowned_out[r] = 1
-                arm = wp.length(x[along(k + 1, n), r] - here)
-                least = floor * (
-                    real(2.0) * stiff * arm * arm * reach / length[r]
-                    + c * rotary[k, r] * (real(1.0) + wp.abs(theta[k, r]))
-                    + wp.abs(elastic)
-                )
-                if not wp.abs(moment) <= least:
-                    unbalanced_out[r] = 1
-        if iteration[r] == 0:
-            return
-        change = real(0.0)
-        noise = real(0.5) * size * reach
-        if wp.static(closed) or k < n - 1:
-            accepted = slot[r]
-            new = energy[1 - accepted, k, r]
-            change = new - energy[accepted, k, r]
-            noise += wp.abs(new)
-        # the change of inertia's and loads' energy along the step, in exact products of small numbers
+        accepted = slot[r]
         taken = step_length[r]
-        u = V()
-        if placed[r] != 0:
-            u = here - base[k, r]
-        else:
+        moved = placed[r] != 0
+        for k in range(start, until(start, n)):
+            f, moment, size, elastic = balance(
+                g, mass, rotary, c, x, theta, target, target_angle, gravity, load, load_angle, loaded, k, n, r
+            )
+            stiff = real(0.0)
+            b = behind(k, n)
+            if wp.static(closed) or k < n - 1:
+                stiff = real(stiffness[k, r])
+            if b >= 0:
+                stiff = wp.max(stiff, real(stiffness[b, r]))
+            here = x[k, r]
+            m = mass[k, r]
+            reach = wp.max(wp.abs(here))
+            least = floor * ((real(2.0) * stiff + c * m) * reach + size)
+            mask = int(fixed[k, r])
             for d in range(wp.static(dim)):
-                u[d] = taken * real(direction[d, k, r])
-        outer = gravity[0] * m
-        if loaded != 0:
-            outer += load[k, r]
-        work = wp.dot(u, (here - target[k, r] - u * real(0.5)) * (c * m) - outer)
-        if wp.static(twist):
-            turned = taken * real(direction[wp.static(nb - 1), k, r])
-            work += turned * c * rotary[k, r] * (theta[k, r] - target_angle[k, r] - real(0.5) * turned)
+                held = ((mask >> d) & 1) == 1
+                right_out[d, k, r] = linear(wp.where(held, real(0.0), f[d]))
+                if not held and not wp.abs(f[d]) <= limit:
+                    drowned_out[r] = 1
+                    if not wp.abs(f[d]) <= least:
+                        unbalanced_out[r] = 1
+            if wp.static(twist):
+                held = ((mask >> wp.static(dim)) & 1) == 1
+                right_out[wp.static(nb - 1), k, r] = linear(wp.where(held, real(0.0), moment))
+                if not held and not wp.abs(moment) <= limit * length[r]:
+                    drowned_out[r] = 1
+                    arm = wp.length(x[along(k + 1, n), r] - here)
+                    least = floor * (
+                        real(2.0) * stiff * arm * arm * reach / length[r]
+                        + c * rotary[k, r] * (real(1.0) + wp.abs(theta[k, r]))
+                        + wp.abs(elastic)
+                    )
+                    if not wp.abs(moment) <= least:
+                        unbalanced_out[r] = 1
+            if iteration[r] == 0:
+                continue
+            change = real(0.0)
+            noise = real(0.5) * size * reach
+            if wp.static(closed) or k < n - 1:
+                new = energy[1 - accepted, k, r]
+                change = new - energy[accepted, k, r]
+                noise += wp.abs(new)
+            # the change of inertia's and loads' energy along the step, in exact products of small numbers
+            u = V()
+            if moved:
+                u = here - base[k, r]
+            else:
+                for d in range(wp.static(dim)):
+                    u[d] = taken * real(direction[d, k, r])
+            outer = gravity[0] * m
             if loaded != 0:
-                work -= turned * load_angle[k, r]
-        change_out[k, r] = change + work
-        noise_out[k, r] = linear(noise + wp.abs(work))
+                outer += load[k, r]
+            work = wp.dot(u, (here - target[k, r] - u * real(0.5)) * (c * m) - outer)
+            if wp.static(twist):
+                turned = taken * real(direction[wp.static(nb - 1), k, r])
+                work += turned * c * rotary[k, r] * (theta[k, r] - target_angle[k, r] - real(0.5) * turned)
+                if loaded != 0:
+                    work -= turned * load_angle[k, r]
+            change_out[k, r] = change + work
+            noise_out[k, r] = linear(noise + wp.abs(work))
 
     return check

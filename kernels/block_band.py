@@ -15,9 +15,8 @@ from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions
 
 
 @cache
-def block_functions(kind: ChainKind, linear):
+def block_functions(nb: int, linear):
     """load(A, row, k, r), store(A, row, k, r, M), vector(v, row, k, r), put(v, row, k, r, u) for blocks and block vectors."""
-    nb = kind.block
     H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
 
     @wp.func
@@ -59,7 +58,7 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
     window, vertex_rows, edge_rows, tensions = kind.window, kind.vertex_strains, kind.edge_strains, kind.tensions
     H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     edge_row, tension_row = vertex_rows * window, vertex_rows * window + edge_rows * dim
-    _, store, _, _ = block_functions(kind, linear)
+    _, store, _, _ = block_functions(nb, linear)
     _, behind, _ = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
     curved, begin = exact_from is not None, exact_from or 0
@@ -193,7 +192,7 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
 def product_function(kind: ChainKind, linear):
     """times(blocks, v, k, n, r): row k of H v."""
     nb2, span, closed = kind.block**2, kind.span, kind.closed
-    load, _, vector, _ = block_functions(kind, linear)
+    load, _, vector, _ = block_functions(kind.block, linear)
     _, behind, _ = node_functions(kind, wp.float64)
     along, *_ = gather_functions(kind, wp.float64)
 
@@ -218,12 +217,51 @@ def product_function(kind: ChainKind, linear):
 
 
 @cache
-def factor_kernel(kind: ChainKind, linear):
-    """Block LDL^T of the open chain's part of H: per node U = D^-1 E, D^-1 F, L and inverse pivots (3 nb^2 + nb rows)."""
-    nb, nb2, span = kind.block, kind.block**2, kind.span
+def factor_function(nb: int, span: int, linear):
+    """factorise(blocks, out, n, r): block LDL^T of an open chain of n nodes; returns how many pivots were lost.
+
+    Writes U = D^-1 E, D^-1 F, L and inverse pivots of every node (3 nb^2 + nb rows); `out` may be the array of the blocks.
+    """
+    nb2 = nb**2
     M = wp.types.matrix((nb, nb), linear)
-    load, store, _, put = block_functions(kind, linear)
+    load, store, _, put = block_functions(nb, linear)
     factor, lower, upper, _, _, congruence = pivot.functions(nb, linear)
+
+    @wp.func
+    def factorise(blocks: wp.array3d(dtype=linear), out: wp.array3d(dtype=linear), n: int, r: int):
+        lost = int(0)
+        minus = M()  # what the nodes before take from the block of this node, of its coupling, and of the next node
+        minus_couple = M()
+        minus_next = M()
+        for j in range(n):
+            A = load(blocks, 0, j, r) - minus
+            L, inverse, bad = factor(A)
+            lost += bad
+            B = M()
+            if j < n - 1:
+                B = load(blocks, wp.static(nb2), j, r) - minus_couple
+            Zb = lower(L, B)
+            store(out, 0, j, r, upper(L, inverse, Zb))
+            minus = minus_next + congruence(Zb, inverse, Zb)
+            if wp.static(span == 2):
+                C = M()
+                if j < n - 2:
+                    C = load(blocks, wp.static(2 * nb2), j, r)
+                Zc = lower(L, C)
+                store(out, wp.static(nb2), j, r, upper(L, inverse, Zc))
+                minus_couple = congruence(Zb, inverse, Zc)
+                minus_next = congruence(Zc, inverse, Zc)
+            store(out, wp.static(2 * nb2), j, r, L)
+            put(out, wp.static(3 * nb2), j, r, inverse)
+        return lost
+
+    return factorise
+
+
+@cache
+def factor_kernel(kind: ChainKind, linear):
+    """Block LDL^T of the open chain's part of H; see `factor_function`."""
+    factor = factor_function(kind.block, kind.span, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def factorise(
@@ -238,52 +276,37 @@ def factor_kernel(kind: ChainKind, linear):
         r = wp.tid()
         if wanted[r] == 0 or (reuse != 0 and iteration[r] > 1):
             return
-        n = count[r]
-        minus = M()  # what the nodes before take from the block of this node, of its coupling, and of the next node
-        minus_couple = M()
-        minus_next = M()
-        for j in range(n):
-            A = load(blocks, 0, j, r) - minus
-            L, inverse, bad = factor(A)
-            lost[r] = lost[r] + bad
-            B = M()
-            if j < n - 1:
-                B = load(blocks, wp.static(nb2), j, r) - minus_couple
-            Zb = lower(L, B)
-            store(factor_out, 0, j, r, upper(L, inverse, Zb))
-            minus = minus_next + congruence(Zb, inverse, Zb)
-            if wp.static(span == 2):
-                C = M()
-                if j < n - 2:
-                    C = load(blocks, wp.static(2 * nb2), j, r)
-                Zc = lower(L, C)
-                store(factor_out, wp.static(nb2), j, r, upper(L, inverse, Zc))
-                minus_couple = congruence(Zb, inverse, Zc)
-                minus_next = congruence(Zc, inverse, Zc)
-            store(factor_out, wp.static(2 * nb2), j, r, L)
-            put(factor_out, wp.static(3 * nb2), j, r, inverse)
+        lost[r] = lost[r] + factor(blocks, factor_out, count[r], r)
 
     return factorise
 
 
 @cache
-def substitute_function(kind: ChainKind, linear):
-    """substitute(factor, v, out, n, r): out = (L D L^T)^-1 v along one rod; returns v . out."""
-    nb, nb2, span = kind.block, kind.block**2, kind.span
+def substitute_function(nb: int, span: int, linear):
+    """substitute(factor, v, out, n, r, s): out = (L D L^T)^-1 v along a chain; returns v . out.
+
+    The factors lie in column r, the vectors in column s.
+    """
+    nb2 = nb**2
     H = wp.types.vector(nb, linear)
-    load, _, vector, put = block_functions(kind, linear)
+    load, _, vector, put = block_functions(nb, linear)
     _, _, _, lower_vector, upper_vector, _ = pivot.functions(nb, linear)
 
     @wp.func
     def substitute(
-        factor: wp.array3d(dtype=linear), v: wp.array3d(dtype=linear), out: wp.array3d(dtype=linear), n: int, r: int
+        factor: wp.array3d(dtype=linear),
+        v: wp.array3d(dtype=linear),
+        out: wp.array3d(dtype=linear),
+        n: int,
+        r: int,
+        s: int,
     ):
         before = H()
         before2 = H()
         for j in range(n):
             # z = D^-1 (v - E^T z_before - ...): with U = D^-1 E stored, E^T D^-1 w = U^T w
-            w = vector(v, 0, j, r) - before
-            put(out, 0, j, r, w)
+            w = vector(v, 0, j, s) - before
+            put(out, 0, j, s, w)
             before = before2 + w * load(factor, 0, j, r)
             if wp.static(span == 2):
                 before2 = w * load(factor, wp.static(nb2), j, r)
@@ -294,12 +317,12 @@ def substitute_function(kind: ChainKind, linear):
             j = n - 1 - i
             L = load(factor, wp.static(2 * nb2), j, r)
             inverse = vector(factor, wp.static(3 * nb2), j, r)
-            u = upper_vector(L, inverse, lower_vector(L, vector(out, 0, j, r)))
+            u = upper_vector(L, inverse, lower_vector(L, vector(out, 0, j, s)))
             u -= load(factor, 0, j, r) * e1
             if wp.static(span == 2):
                 u -= load(factor, wp.static(nb2), j, r) * e2
-            total += wp.dot(vector(v, 0, j, r), u)
-            put(out, 0, j, r, u)
+            total += wp.dot(vector(v, 0, j, s), u)
+            put(out, 0, j, s, u)
             e2 = e1
             e1 = u
         return total
@@ -310,7 +333,7 @@ def substitute_function(kind: ChainKind, linear):
 @cache
 def direct_kernel(kind: ChainKind, linear):
     """Direction of every rod that wants one, straight from the factors."""
-    substitute = substitute_function(kind, linear)
+    substitute = substitute_function(kind.block, kind.span, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def direct(
@@ -322,6 +345,6 @@ def direct_kernel(kind: ChainKind, linear):
     ):
         r = wp.tid()
         if wanted[r] != 0:
-            _decrement = substitute(factor, right, solution, count[r], r)
+            _decrement = substitute(factor, right, solution, count[r], r, r)
 
     return direct

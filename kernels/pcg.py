@@ -22,9 +22,9 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
     """Kernels start, product, length, update, turn, and finish of one preconditioner; see the module's text."""
     nb = kind.block
     H = wp.types.vector(nb, linear)
-    load, _, vector, put = block_functions(kind, linear)
+    load, _, vector, put = block_functions(nb, linear)
     times = product_function(kind, linear)
-    substitute = substitute_function(kind, linear)
+    substitute = substitute_function(nb, kind.span, linear)
     factor, _, _, lower_vector, upper_vector, _ = pivot.functions(nb, linear)
     eps = wp.constant(linear(1.0e-15 if linear == wp.float64 else 1.0e-7))
     by_chain = preconditioner == "chain"
@@ -56,7 +56,7 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
     ):
         """z = M^-1 v along one rod; returns v . z."""
         if wp.static(by_chain):
-            return substitute(factors, v, z, n, r)
+            return substitute(factors, v, z, n, r, r)
         total = linear(0.0)
         for k in range(n):
             here = vector(v, 0, k, r)

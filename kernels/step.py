@@ -15,11 +15,9 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels import frames, outcome
-from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions
+from ddg_warp.kernels import frames, motion, outcome
+from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, until_function
 from ddg_warp.kernels.search import TURNED, search_functions
-
-POSE = 21  # reals of a motion over a step: rotation vector of the step, rotation at its start, pivot, both translations
 
 
 @cache
@@ -27,6 +25,7 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
     """Predictor, target of the inertia, copy of the lagged frames; restarts the search of every rod that still has to move."""
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
+    until = until_function(kind)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def begin(
@@ -62,15 +61,16 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
         bent_out: wp.array(dtype=int),
         active_out: wp.array(dtype=int),
     ):
-        k, r = wp.tid()
-        if progress[r] >= real(1.0) or k >= count[r]:
+        start, r = wp.tid()
+        n = count[r]
+        if progress[r] >= real(1.0) or start >= n:
             return
         s = dt[world[r]] * portion[r]
         if wp.static(midpoint):
             s *= real(0.5)
         rate = real(1.0) / s
         coefficient = rate * (rate + damping[0])
-        if k == 0:
+        if start == 0:
             coefficient_out[r] = coefficient
             rate_out[r] = rate
             status_out[r] = 0
@@ -82,29 +82,30 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
             drowned_out[r] = 0
             load_scale_out[r] = outer[r]
             active_out[0] = 1
-        mask = int(fixed[k, r])
         ahead = wp.where(cautious[r] == 0, s, real(0.0))
-        here = x0[k, r]
-        v = v0[k, r]
-        target_out[k, r] = here + v * (rate / coefficient)
-        for d in range(wp.static(dim)):
-            if ((mask >> d) & 1) == 0:
-                here[d] = here[d] + ahead * v[d]
-        x_out[k, r] = here
-        if cautious[r] == 0 and k + 1 < count[r]:
-            turn = (v0[k + 1, r] - v) * s
-            edge = x0[k + 1, r] - x0[k, r]
-            if wp.length_sq(turn) > real(wp.static(TURNED**2)) * wp.length_sq(edge):
-                bent_out[r] = 1
-        if wp.static(twist):
-            angle = theta0[k, r]
-            spin = omega0[k, r]
-            target_angle_out[k, r] = angle + spin * (rate / coefficient)
-            if ((mask >> wp.static(dim)) & 1) == 0:
-                angle += ahead * spin
-            theta_out[k, r] = angle
-            for c in range(7):
-                frame_out[c, k, r] = frame0[c, k, r]
+        for k in range(start, until(start, n)):
+            mask = int(fixed[k, r])
+            here = x0[k, r]
+            v = v0[k, r]
+            target_out[k, r] = here + v * (rate / coefficient)
+            for d in range(wp.static(dim)):
+                if ((mask >> d) & 1) == 0:
+                    here[d] = here[d] + ahead * v[d]
+            x_out[k, r] = here
+            if cautious[r] == 0 and k + 1 < n:
+                turn = (v0[k + 1, r] - v) * s
+                edge = x0[k + 1, r] - x0[k, r]
+                if wp.length_sq(turn) > real(wp.static(TURNED**2)) * wp.length_sq(edge):
+                    bent_out[r] = 1
+            if wp.static(twist):
+                angle = theta0[k, r]
+                spin = omega0[k, r]
+                target_angle_out[k, r] = angle + spin * (rate / coefficient)
+                if ((mask >> wp.static(dim)) & 1) == 0:
+                    angle += ahead * spin
+                theta_out[k, r] = angle
+                for c in range(7):
+                    frame_out[c, k, r] = frame0[c, k, r]
 
     return begin
 
@@ -176,6 +177,7 @@ def start_kernel(real):
 def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
     """Positions, angles and their velocities at the end of the step, of the rods that converged."""
     V, twist = wp.types.vector(kind.dim, real), kind.twist
+    until = until_function(kind)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def finish(
@@ -194,39 +196,42 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
         theta_out: wp.array2d(dtype=real),
         omega_out: wp.array2d(dtype=real),
     ):
-        k, r = wp.tid()
-        if k >= count[r]:
+        start, r = wp.tid()
+        n = count[r]
+        if start >= n:
             return
-        start = x0[k, r]
-        v = v0[k, r]
-        angle0 = real(0.0)
-        spin = real(0.0)
-        if wp.static(twist):
-            angle0 = theta0[k, r]
-            spin = omega0[k, r]
-        end = start
-        angle = angle0
-        if progress[r] < real(1.0) and status[r] <= wp.static(outcome.CONVERGED_TO_ROUNDING):
-            end = x[k, r]
-            change = (end - start) * rate[r]
-            if wp.static(midpoint):
-                end = real(2.0) * end - start
-                v = real(2.0) * change - v
-            else:
-                v = change
+        moves = progress[r] < real(1.0) and status[r] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
+        for k in range(start, until(start, n)):
+            before = x0[k, r]
+            v = v0[k, r]
+            angle0 = real(0.0)
+            spin = real(0.0)
             if wp.static(twist):
-                angle = theta[k, r]
-                turn = (angle - angle0) * rate[r]
+                angle0 = theta0[k, r]
+                spin = omega0[k, r]
+            end = before
+            angle = angle0
+            if moves:
+                end = x[k, r]
+                change = (end - before) * rate[r]
                 if wp.static(midpoint):
-                    angle = real(2.0) * angle - angle0
-                    spin = real(2.0) * turn - spin
+                    end = real(2.0) * end - before
+                    v = real(2.0) * change - v
                 else:
-                    spin = turn
-        x_out[k, r] = end
-        v_out[k, r] = v
-        if wp.static(twist):
-            theta_out[k, r] = angle
-            omega_out[k, r] = spin
+                    v = change
+                if wp.static(twist):
+                    angle = theta[k, r]
+                    turn = (angle - angle0) * rate[r]
+                    if wp.static(midpoint):
+                        angle = real(2.0) * angle - angle0
+                        spin = real(2.0) * turn - spin
+                    else:
+                        spin = turn
+            x_out[k, r] = end
+            v_out[k, r] = v
+            if wp.static(twist):
+                theta_out[k, r] = angle
+                omega_out[k, r] = spin
 
     return finish
 
@@ -236,6 +241,7 @@ def finish_frames_kernel(kind: ChainKind, real):
     """Reference frames transported to the tangents of the new state, orthonormalised, and the reference twist between them."""
     V, X = wp.types.vector(kind.dim, real), wp.types.vector(3, real)
     along, *_ = gather_functions(kind, real)
+    until = until_function(kind)
     transport, reference_twist, _ = frames.functions(real)
     closed = kind.closed
 
@@ -255,17 +261,18 @@ def finish_frames_kernel(kind: ChainKind, real):
         count: wp.array(dtype=int),
         frame_out: wp.array3d(dtype=real),
     ):
-        k, r = wp.tid()
+        start, r = wp.tid()
         n = count[r]
-        if k >= n - wp.static(0 if closed else 1):
+        if start >= n - wp.static(0 if closed else 1):
             return
-        u, t = carried(x, frame, k, n, r)
-        for c in range(3):
-            frame_out[c, k, r] = u[c]
-            frame_out[3 + c, k, r] = t[c]
-        if wp.static(closed) or k < n - 2:
-            u1, t1 = carried(x, frame, k + 1, n, r)
-            frame_out[6, k, r] = reference_twist(u, u1, t, t1, frame[6, k, r])
+        for k in range(start, until(start, n - wp.static(0 if closed else 1))):
+            u, t = carried(x, frame, k, n, r)
+            for c in range(3):
+                frame_out[c, k, r] = u[c]
+                frame_out[3 + c, k, r] = t[c]
+            if wp.static(closed) or k < n - 2:
+                u1, t1 = carried(x, frame, k + 1, n, r)
+                frame_out[6, k, r] = reference_twist(u, u1, t, t1, frame[6, k, r])
 
     return finish
 
@@ -336,81 +343,34 @@ def motion_kernels(kind: ChainKind, real, midpoint: bool):
     V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
     along, *_ = gather_functions(kind, real)
     transport, *_ = frames.functions(real)
-    turn = wp.constant(real(6.283185307179586476925286766559))
-
-    @wp.func
-    def row(pose: wp.array2d(dtype=real), m: int, at: int):
-        return X(pose[m, at], pose[m, at + 1], pose[m, at + 2])
-
-    @wp.func
-    def turned(pose: wp.array2d(dtype=real), m: int, s: real, v: X):
-        """v of the rest state, rotated to the fraction s of the step (Rodrigues)."""
-        w = X(wp.dot(row(pose, m, 3), v), wp.dot(row(pose, m, 6), v), wp.dot(row(pose, m, 9), v))
-        rotation = row(pose, m, 0) * s
-        angle = wp.length(rotation)
-        if angle > real(0.0):
-            axis = rotation / angle
-            w = (
-                w * wp.cos(angle)
-                + wp.cross(axis, w) * wp.sin(angle)
-                + axis * (wp.dot(axis, w) * (real(1.0) - wp.cos(angle)))
-            )
-        return w
-
-    @wp.func
-    def placed(pose: wp.array2d(dtype=real), m: int, s: real, rest: X):
-        pivot = row(pose, m, 12)
-        shift = row(pose, m, 15) * (real(1.0) - s) + row(pose, m, 18) * s
-        return turned(pose, m, s, rest - pivot) + pivot + shift
+    _, placed, branch = motion.functions(real)
+    axis = 2 if dim == 2 else 1  # of space, from one component of a node to the next: x and z, or x, y and z
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def nodes(
         where: wp.array2d(dtype=int),
         rest: wp.array2d(dtype=real),
         pose: wp.array2d(dtype=real),
-        fixed: wp.array2d(dtype=wp.uint8),
         progress: wp.array(dtype=real),
         portion: wp.array(dtype=real),
         x: wp.array2d(dtype=V),
     ):
-        """`where` is (node, rod, motion), `rest` the positions in the rest state."""
+        """`where` is (node, rod, motion of each component, -1 for none), `rest` the positions in the rest state."""
         i = wp.tid()
         k = where[i, 0]
         r = where[i, 1]
-        m = where[i, 2]
         if progress[r] >= real(1.0):
             return
         at = X(rest[i, 0], rest[i, 1], rest[i, 2])
-        p = placed(pose, m, progress[r] + portion[r], at)
-        if wp.static(midpoint):
-            p = real(0.5) * (p + placed(pose, m, progress[r], at))
         here = x[k, r]
         for d in range(wp.static(dim)):
-            if ((int(fixed[k, r]) >> d) & 1) == 1:
-                here[d] = p[d]
+            m = where[i, 2 + d]
+            if m >= 0:
+                p = placed(pose, m, progress[r] + portion[r], at)
+                if wp.static(midpoint):
+                    p = real(0.5) * (p + placed(pose, m, progress[r], at))
+                here[d] = p[d * wp.static(axis)]
         x[k, r] = here
-
-    @wp.func
-    def angle_at(
-        pose: wp.array2d(dtype=real),
-        m: int,
-        s0: real,
-        s1: real,
-        rest: X,
-        frame: wp.array3d(dtype=real),
-        k: int,
-        r: int,
-        t: X,
-        angle0: real,
-    ):
-        """Angle of the material frame at s1, on the branch that the rotation since s0 leads to from angle0."""
-        u = transport(
-            X(frame[0, k, r], frame[1, k, r], frame[2, k, r]), X(frame[3, k, r], frame[4, k, r], frame[5, k, r]), t
-        )
-        d = turned(pose, m, s1, rest)
-        angle = wp.atan2(wp.dot(wp.cross(u, d), t), wp.dot(u, d))
-        expected = angle0 + wp.dot(row(pose, m, 0), t) * (s1 - s0)
-        return angle - turn * wp.round((angle - expected) / turn)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def angles(
@@ -437,7 +397,10 @@ def motion_kernels(kind: ChainKind, real, midpoint: bool):
         end = start + portion[r]
         if wp.static(midpoint):
             end = start + real(0.5) * portion[r]
-        theta[k, r] = angle_at(pose, m, start, end, director, frame, k, r, t, theta[k, r])
+        u = transport(
+            X(frame[0, k, r], frame[1, k, r], frame[2, k, r]), X(frame[3, k, r], frame[4, k, r], frame[5, k, r]), t
+        )
+        theta[k, r] = branch(pose, m, start, end, director, u, t, theta[k, r])
 
     return nodes, angles
 

@@ -48,7 +48,8 @@ def sources(kernels) -> dict[str, str]:
     """Generated code of kernels by name."""
     result = {}
     for kernel in kernels:
-        folder = Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier()
+        threads = next(threads for _, threads in kernel.module.execs)  # in a block
+        folder = Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(threads)
         (code,) = (f.read_text() for f in folder.iterdir() if f.suffix in (".cpp", ".cu"))
         result[kernel.key] = code
     return result

@@ -159,7 +159,9 @@ def test_every_world_gets_it(device):
     model.set_rest(0, curvature=principal_form(points, triangles, 0.5))
     one, two = np.split(Tangent(model).gradient(model.state()), 2)
     assert np.abs(one).max() > 0.0
-    np.testing.assert_allclose(two, 2.0 * one, rtol=1e-14)  # the stiffness of each world stays
+    # rounding of the membrane, whose stiffness the worlds share
+    rounding = 64 * np.finfo(float).eps * MATERIAL.young * THICKNESS
+    np.testing.assert_allclose(two, 2.0 * one, rtol=1e-14, atol=rounding)  # the stiffness of each world stays
 
 
 # kappa h / mismatch (Timoshenko 1925): 3/2 for equal layers, also where h1 / h2 = 1/2 or E1 / E2 = 10.

@@ -8,7 +8,7 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp import meshes
-from ddg_warp.integrate.statics import Equilibrium
+from ddg_warp.integrate.statics import Equilibrium, solve
 from ddg_warp.scenes import _sze
 from ddg_warp.scenes.hinged_roof import HALF_ANGLE, HALF_LENGTH, POISSON, RADIUS, YOUNG
 from ddg_warp.stability import spectrum
@@ -174,13 +174,20 @@ def test_crumpled_sheet_becomes_flat(device, bending, size):
     assert sum(model.energies(state).values()) < 1e-12 * before
 
 
-def test_two_motions_of_a_point_are_refused(device):
-    """The corner between two edges that move apart: each motion alone would put it where the other does not want it."""
+@pytest.mark.parametrize("both", [False, True], ids=["each its own", "the same"])
+def test_two_motions_of_a_point(device, both):
+    """The corner between two edges that move apart takes each component from its motion; the same one from both is refused."""
     points, triangles = meshes.rectangle(2, 2)
-    scene = ddg.Scene()
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     sheet = scene.add_shell(points, triangles, thickness=1e-2, material=MATERIAL)
+    scene.hold(sheet, range(len(points)), "z")
     for axis, components in enumerate("xy"):
         motion = ddg.Motion(translation=lambda t, axis=axis: tuple(0.1 * t * np.eye(3)[axis]))
-        scene.hold(sheet, np.flatnonzero(points[:, axis] > 1.0 - 1e-9), components, motion=motion)
-    with pytest.raises(ddg.SceneError, match=r"point at \(1, 1, 0\) m has two motions.*give it one"):
-        scene.build(device, "float64")
+        scene.hold(sheet, np.flatnonzero(points[:, axis] > 1.0 - 1e-9), "xy" if both else components, motion=motion)
+        scene.hold(sheet, np.flatnonzero(points[:, axis] < 1e-9), components)
+    if both:
+        with pytest.raises(ddg.SceneError, match=r"point at \(1, 1, 0\) m has two motions along x.*give it one"):
+            scene.build(device, "float64")
+        return
+    state = solve(scene.build(device, "float64"))
+    np.testing.assert_allclose(state.points(), points * [1.1, 1.1, 1.0], atol=1e-9)

@@ -106,7 +106,7 @@ def pushed(device, distance: float, turn: float = 0.0, dimension: int = 2):
     motion = ddg.Motion(
         translation=lambda t: (-distance * t, 0.0, 0.0),
         angle=lambda t: turn * t,
-        axis=(1.0, 0.3, 0.0),
+        axis=(1.0, 0.3, 0.0) if dimension == 3 else (0.0, 1.0, 0.0),
         pivot=points[-1],
     )
     scene.clamp_end(rod, "first")

@@ -151,7 +151,7 @@ class Corrector:
         return Point(state, float(load), arclength, values, negative, REGULAR, direction, iterations=iteration)
 
     def system(self, state: State, q: np.ndarray, load: float):
-        """Residual, tangent stiffness, and the rates of outer forces and of supports with the load parameter."""
+        """Residual, tangent stiffness, and the rates of the residual and of supports with the load parameter."""
         tangent = self.tangent
         delta = 1e-4 * self.options.load_scale
         outer, gradient, stiffness = tangent.loads(load, q), tangent.gradient(state), tangent.hessian(state)
@@ -161,6 +161,9 @@ class Corrector:
         rate = (tangent.loads(load + delta, q) - tangent.loads(load - delta, q)) / (2.0 * delta)
         ahead, behind = (tangent.support_step(state, load, load + d) for d in (delta, -delta))
         support = (ahead - behind) / (2.0 * delta)
+        if tangent.clamps_turn:
+            ahead, behind = (tangent.gradient(tangent.with_clamps_turned(state, load + d)) for d in (delta, -delta))
+            rate = rate - (ahead - behind) / (2.0 * delta)
         return outer - gradient, stiffness, rate - stiffness @ support, support, gradient, outer
 
     def _bordered(self, matrix, rate: np.ndarray, direction: np.ndarray) -> Bordered:

@@ -44,8 +44,9 @@ class Integrator:
         solver: "newton", or "projective": the matrix of a step's first iterate serves all of its iterations.
         linear: of Newton: "auto" (the chain sweep for open rods, on CUDA cyclic reduction where they are few and long; PCG with
             the chain preconditioner for closed ones), "sweep", "partitioned" (cyclic reduction), or PCG with "jacobi",
-            "block_jacobi" or "chain" as preconditioner. Nets are solved by PCG alone, with "block_jacobi" or "multilevel",
-            which takes fewer and longer iterations ("auto" from 4,096 nodes on).
+            "block_jacobi" or "chain" as preconditioner. Nets are solved by PCG alone, with "block_jacobi", "chain" (rods between
+            their joints are eliminated), "multilevel" (fewer and longer iterations for large sheets), or "chain_multilevel",
+            both ("auto" by the nodes of rods between joints, and of everything else).
         rtol, max_iterations, ...: see `NewtonOptions`.
         retry_limit: how often in a row a rod's failed step is tried again: first from the last state instead of the predictor,
             then in halves, and so on, down to 2^-(retry_limit / 2) of the step.
@@ -187,7 +188,7 @@ class Integrator:
 
 def _newton(model, group, integrator: Integrator, precision) -> ChainNewton:
     """The solver of a group that the integrator's `linear` asks for."""
-    linear = automatic(group) if integrator.linear in ("auto", "multilevel") else integrator.linear
+    linear = automatic(group) if integrator.linear in ("auto", "multilevel", "chain_multilevel") else integrator.linear
     given = (model, group, integrator.options)
     last = (precision, integrator.scheme == "implicit_midpoint")
     if integrator.solver == "projective":
@@ -269,10 +270,9 @@ class _ChainStep:
     def _attempt(self, before, after, dt) -> None:
         """One solve of every rod that has not finished the step, from state `before` to `after`."""
         group, newton = self.group, self.newton
-        grid = (group.nodes, group.columns)
         self._launch(
             "begin",
-            grid,
+            group.node_threads,
             [before.x, before.v, before.theta, before.omega, before.frame, group.fixed, group.count, group.world, dt]
             + [self.damping, group.outer, self.progress, self.portion, self.cautious],
             [newton.x, newton.theta, newton.frame, newton.target, newton.target_angle, newton.coefficient, newton.rate]
@@ -289,13 +289,13 @@ class _ChainStep:
         newton.solve(before.last)
         self._launch(
             "nodes",
-            grid,
+            group.node_threads,
             [newton.x, newton.theta, before.x, before.v, before.theta, before.omega]
             + [group.count, newton.status, self.progress, newton.rate],
             [after.x, after.v, after.theta, after.omega],
         )
         if group.kind.twist:
-            self._launch("frames", (group.elements, group.columns), [after.x, newton.frame, group.count], [after.frame])
+            self._launch("frames", group.element_threads, [after.x, newton.frame, group.count], [after.frame])
         if group.kind.viscous:
             self.model.strains(group, after, after.last)
         self.remaining.zero_()

@@ -31,7 +31,7 @@ def newton(solver, state: State, before: float, at: float) -> State | None:
     moved = state.copy()
     tangent.move_supports(moved, before, at)
     jump = tangent.dofs(moved) - tangent.dofs(state)
-    state, stress, factor, scale, polished = state.copy(), None, None, 0.0, False
+    state, stress, factor, scale, polished = tangent.with_clamps_turned(state, at), None, None, 0.0, False
     for iteration in range(MAX_ITERATIONS):
         q = tangent.dofs(state)
         outer, gradient = tangent.loads(at, q), tangent.gradient(state)

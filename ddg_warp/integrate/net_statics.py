@@ -1,7 +1,7 @@
 """Equilibria of large nets: Newton by preconditioned conjugate gradients on the device, without any factorisation.
 
 The loop is that of a time step without its inertia: energies fall, and the matrix is Gauss-Newton's with the stiffness of the
-stresses. Pressures follow every iterate and do the work of their mean along a step; their own stiffness is left out of the
+stresses. Loads follow every iterate and do the work of their mean along a step; their own stiffness is left out of the
 matrix, which costs iterations and no accuracy. No pivot is seen, so that a saddle on which nothing pushes off is not told from a
 minimum: `ddg_warp.stability` tells.
 """
@@ -14,11 +14,11 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SolverError
+from ddg_warp.integrate.net_prescribed import NetLoads
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.net import newton
 from ddg_warp.linear.choice import net_preconditioner
 from ddg_warp.net_newton import NetNewton
-from ddg_warp.net_pressure import Pressures
 from ddg_warp.newton import NewtonOptions
 from ddg_warp.state import State
 
@@ -33,43 +33,38 @@ class StaticNewton(NetNewton):
         super().__init__(model, options, net_preconditioner(model.net), model.types.real)
         self._whole = False  # whether directions may go as far as they like
         self.gravity.zero_()  # a load like others: `begin` scales them all
-        self.pressures, self._there = None, None
-        if self.net.host.pressures:
-            self.pressures = Pressures(self.net)
-            self._there, self._follow = self.pressures.make(), newton.follow_kernel(self.real)
-        self._less, self._far = newton.solve_kernels(self.real, self.linear)
+        self.loads, self._there = NetLoads(model, midpoint=False), wp.zeros_like(self.load)
+        self._follow, self._less, self._far = newton.static_kernels(self.real, self.linear)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        pressures = [self.pressures.kernel, self._follow] if self.pressures else []
-        return [*super().kernels, self._less, self._far, *pressures]
+        return [*super().kernels, self._follow, self._less, self._far, *self.loads.kernels]
 
     def begin(self, q: np.ndarray, dead: np.ndarray, at: float, scale: np.ndarray) -> None:
-        """Set out from dofs `q` under dead loads (blocks, 3), the pressures at load parameter `at`, and load scales (worlds,)."""
+        """Set out from dofs `q` under dead loads (blocks, 3), those that follow at load parameter `at`, and load scales (worlds,)."""
         for flag in (self.status, self.iteration, self.halvings, self.unbalanced, self.drowned, self.projected):
             flag.zero_()
         for array in (self.q, self.base):
             array.assign(q.reshape(-1, 3))
-        self.load.assign(np.tile(dead, (self.worlds, 1)))
+        self.loads.scale(dead, at)
+        wp.copy(self.load, self.loads.constant)
         self.load_scale.assign(scale)
-        if self.pressures:
-            self.pressures.assign(at, at)
         self.active.fill_(1)
 
     def outer_forces(self) -> None:
-        """Loads, and pressures on the iterate."""
+        """Loads on the iterate."""
+        follows = bool(self.net.host.followers)
+        if follows:
+            self.loads.apply(self.q, self.load)
+            self.loads.apply(self.base, self._there)
         super().outer_forces()
-        if self.pressures is None:
-            return
-        self.pressures.on(self.q, self.pressures.force)
-        self.pressures.on(self.base, self._there)
-        self._launch(
-            self._follow,
-            [self.q, self.base, self.pressures.force, self._there, *self.pressures.meets, self.status]
-            + [self.net.blocks, self.pressures.count],
-            [self.force, self.size, self.change, self.noise],
-        )
+        if follows:
+            self._launch(
+                self._follow,
+                [self.q, self.base, self.load, self._there, self.status, self.net.blocks],
+                [self.change],
+            )
 
     def cycle(self) -> None:
         """One iteration of conjugate gradients, whose directions grow: one that would be cut to a fraction is far enough.

@@ -1,16 +1,18 @@
 """A time step of a net: predictor, prescribed motion and loads, Newton, end update, retries. See `kernels.step`."""
 
+from dataclasses import replace
+
 import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.integrate.net_prescribed import NetLoads, NetMotion
 from ddg_warp.kernels import outcome, step
 from ddg_warp.kernels.net import elements, frames, newton
 from ddg_warp.linear.choice import net_preconditioner
 from ddg_warp.net_model import NetState
 from ddg_warp.net_newton import PRECONDITIONERS, NetNewton
-from ddg_warp.net_pressure import Pressures
 from ddg_warp.tangent import Tangent
 
 
@@ -34,14 +36,10 @@ class NetStep:
                 f"{Tangent(model).parts[-1].where(3 * int(bare[0]))} is free and has no mass; "
                 "give the material a density, or the section a mass_per_length"
             )
-        if host.turning:
-            raise SceneError("ends of rods in a net that turn are for statics; in dynamics move their nodes alone")
-        if host.bands:
-            raise SceneError("pressure that follows axisymmetric shells is for statics; in dynamics give dead=True")
         preconditioner = net_preconditioner(model.net) if integrator.linear == "auto" else integrator.linear
         self.newton = NetNewton(model, options, preconditioner)
         self.midpoint = integrator.scheme == "implicit_midpoint"
-        self._begin, self._hold, self._finish = newton.step_kernels(real, self.midpoint)
+        self._begin, self._finish = newton.step_kernels(real, self.midpoint)
         self._start, self._advance = step.start_kernel(real), step.advance_kernel(real)
         worlds = model.worlds
         self.progress, self.portion = (wp.zeros(worlds, dtype=real, device=device) for _ in range(2))
@@ -56,41 +54,16 @@ class NetStep:
         dead = host.mass[: host.nodes] * np.asarray(model.scene.gravity, float) + host.load[: host.nodes]
         outer = np.abs(dead).sum() + np.abs(host.load[host.nodes :]).sum()
         outer += sum(np.abs(load.force).sum() for load in host.timed)
+        outer += sum(len(load.places) * np.abs(load.couple).sum() / load.length for load in host.couples)
         self.outer = wp.full(worlds, float(outer), dtype=real, device=device)
-        blocks = np.concatenate([b for b, _, _ in host.moving]) if host.moving else np.zeros(0, int)
-        self._moving_blocks = blocks
-        moving = np.zeros(host.blocks, np.uint8)
-        for places, _, components in host.moving:
-            moving[places] |= np.uint8(components @ [1, 2, 4])
-        self.moving = wp.array(moving, dtype=wp.uint8, device=device)
-        self.where = wp.array(blocks.astype(np.int32), dtype=int, device=device)
-        self.place = wp.zeros((2, max(1, len(blocks))), dtype=model.net.vector, device=device)
-        self._loads(device, real)
-
-    def _loads(self, device, real) -> None:
-        """Device arrays of pressures that follow the surface, and of loads that change."""
-        host, worlds = self.net.host, self.model.worlds
-        self.constant = wp.array(np.tile(host.load, (worlds, 1)), dtype=self.net.vector, device=device)
-        self.pressures = Pressures(self.net) if host.pressures else None
-        self._spread = newton.spread_kernel(real)
+        self.motion = NetMotion(model, self.midpoint) if host.moving else None
+        self.loads = NetLoads(model, self.midpoint)
 
     def prescribe(self, t0: float, t1: float) -> None:
         """Hand the device what supports and loads do between t0 and t1."""
-        host, model = self.net.host, self.model
-        if len(self._moving_blocks):
-            places = [
-                np.concatenate([model.motions[m].place(t, host.rest[blocks]) for blocks, m, _ in host.moving])
-                for t in (t0, t1)
-            ]
-            self.place.assign(np.array(places))
-        at = 0.5 * (t0 + t1) if self.midpoint else t1
-        if host.timed:
-            load = host.load.copy()
-            for timed in host.timed:
-                np.add.at(load, timed.blocks, timed.at(at, 1.0) * timed.force)
-            self.constant.assign(np.tile(load, (model.worlds, 1)))
-        if self.pressures:
-            self.pressures.assign(at, 1.0)
+        if self.motion:
+            self.motion.upload(t0, t1)
+        self.loads.upload(t0, t1)
 
     def step(self, before, after) -> None:
         """Launch a whole step from one state to another; only launches, so that it can be captured."""
@@ -131,15 +104,10 @@ class NetStep:
                 solver.active,
             ],
         )
-        if len(self._moving_blocks):
-            self._launch(
-                self._hold,
-                (len(self._moving_blocks), self.model.worlds),
-                [self.where, self.place, self.moving, self.progress, self.portion, blocks],
-                [solver.q],
-            )
-        self._apply_loads()
         start = self._start_frames(before)
+        if self.motion:
+            self.motion.apply(self.progress, self.portion, solver.q, start.frame)
+        self.loads.apply(solver.q, solver.load)
         solver.solve(start)
         self._launch(
             self._finish,
@@ -148,6 +116,8 @@ class NetStep:
             [after.q, after.v, self.moved],
         )
         self.net.carry(start, after, kept=before, moved=self.moved)
+        if self.motion:
+            self.motion.turn(self.progress, self.portion, self.moved, before, after)
         self.net.update_strains(after)
         self.remaining.zero_()
         self._launch(
@@ -163,29 +133,14 @@ class NetStep:
 
         Frames lagged at the start of the step would spin about their edges by O(h) at the midpoint, unseen by the rotary
         inertia: the rule would be of first order. Rotations of joints have no inertia and are not predicted, so that those
-        found are of the whole half step.
+        found are of the whole half step. Normals that supports turn are those that the solve is about.
         """
+        data = self.motion.data if self.motion else {}
         if not (self.midpoint and self.net.edges):
-            return before
-        middle = NetState(self.newton.q, before.v, self.middle.frame, self.middle.lag, before.last)
+            return replace(before, data=data)
+        middle = NetState(self.newton.q, before.v, self.middle.frame, self.middle.lag, before.last, data)
         self.net.carry(before, middle, moved=self.moved)
         return middle
-
-    def _apply_loads(self) -> None:
-        """Constant and timed loads, and pressures on the predicted surface."""
-        solver = self.newton
-        if self.pressures is None:
-            if self.net.host.timed:
-                wp.copy(solver.load, self.constant)
-            return
-        force, meets = self.pressures.force, self.pressures.meets
-        self.pressures.on(solver.q, force)
-        self._launch(
-            self._spread,
-            solver.all,
-            [self.constant, force, *meets, self.net.blocks, self.pressures.count],
-            [solver.load],
-        )
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)
@@ -194,10 +149,9 @@ class NetStep:
         """Compile and load every kernel before a capture."""
         real, device = self.model.types.real, self.model.wp_device
         kernels = [self._begin, self._finish, self._start, self._advance, *self.newton.kernels]
-        kernels += [self._hold] if len(self._moving_blocks) else []
+        kernels += [*(self.motion.kernels if self.motion else []), *self.loads.kernels]
         kernels += [frames.edge_kernel(real)] if self.net.edges else []
         kernels += [frames.reset_kernel(real)] if self.net.host.spins else []
-        kernels += [self.pressures.kernel, self._spread] if self.pressures else []
         for part in self.net.sets:
             measure = part.term.measure
             if measure.frames:

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp.kernels import step
+from ddg_warp.kernels import motion, step
 
 
 class PrescribedMotion:
@@ -11,8 +11,9 @@ class PrescribedMotion:
 
     def __init__(self, model, group, midpoint: bool = False):
         self.model, self.group = model, group
-        self.kernels = step.motion_kernels(group.kind, model.types.real, midpoint)
-        self.pose = wp.zeros((len(model.motions), step.POSE), dtype=model.types.real, device=model.wp_device)
+        nodes, angles = step.motion_kernels(group.kind, model.types.real, midpoint)
+        self.kernels = [nodes, angles] if group.moving.edges.shape[0] else [nodes]
+        self.pose = wp.zeros((len(model.motions), motion.POSE), dtype=model.types.real, device=model.wp_device)
 
     def upload(self, t0: float, t1: float) -> None:
         """Poses of all motions between t0 and t1."""
@@ -20,18 +21,18 @@ class PrescribedMotion:
 
     def apply(self, progress: wp.array, portion: wp.array, x: wp.array, frame: wp.array, theta: wp.array) -> None:
         """Put held nodes and angles where they belong once `portion` of the way follows the `progress` made, rod by rod."""
-        nodes, angles = self.kernels
+        nodes, *angles = self.kernels
         held, group, device = self.group.moving, self.group, self.model.wp_device
         wp.launch(
             nodes,
             held.nodes.shape[0],
-            [held.nodes, held.node_rest, self.pose, group.fixed, progress, portion],
+            [held.nodes, held.node_rest, self.pose, progress, portion],
             [x],
             device=device,
         )
-        if held.edges.shape[0]:
+        for kernel in angles:
             wp.launch(
-                angles,
+                kernel,
                 held.edges.shape[0],
                 [held.edges, held.edge_rest, self.pose, group.count, progress, portion, x, frame],
                 [theta],

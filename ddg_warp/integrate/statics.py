@@ -141,6 +141,11 @@ class Equilibrium:
     def solve(self, state: State, before: float, at: float) -> State:
         """The equilibrium at load parameter `at`, from a state that belongs to `before`."""
         tangent, options = self.tangent, self.options
+        if not tangent.free.any():
+            state = state.copy()
+            tangent.move_supports(state, before, at)
+            state.time, self.outcome = at, "converged"
+            return state
         if self.mixed and (found := mixed.newton(self, state, before, at)) is not None:
             return found
         state = self._with_supports_moved(state, before, at)
@@ -236,6 +241,7 @@ class Equilibrium:
         tangent.move_supports(alone, before, at)
         if not step.any():
             return alone
+        state = tangent.with_clamps_turned(state, at)
         direction = (self.net.following if self.net else self._following)(state, step, at)
         if direction is None:
             return alone

@@ -1,11 +1,20 @@
 """Which linear solver suits a group of rods, or a net."""
 
+import numpy as np
+
 # An iteration by the sweep takes about 2 us a node of the longest rod, however many rods run side by side; one by cyclic reduction
 # takes about 40 launches, and some ns a node of all rods together.
 LONG = 512  # nodes of a rod from which on cyclic reduction pays on a GPU ...
 FEW = 256  # ... if there are no more rods than this
 
-LARGE = 4096  # nodes of a net from which on fewer, longer iterations of conjugate gradients pay
+LARGE = 4096  # nodes of a net, those of rods apart, from which on fewer, longer iterations of conjugate gradients pay
+
+# Block Jacobi takes iterations that grow with the square of a rod's edges between joints (a gridshell, residual 1e-3: 250 at 8, 2378 at
+# 32), the chain preconditioner takes 16 whatever their number, at about twice the time of an iteration on the CPU. On a GPU a chain is
+# serial: what that costs there follows from the 2 us of the sweep, of which a substitution is a part; it is not measured.
+BETWEEN = 4  # nodes of a rod between joints from which on chains pay
+PLACES = 10  # places of a chain that take as long as an iteration of block Jacobi, on a GPU
+LAUNCHES = 3  # iterations of block Jacobi that take as long as the launches of one with chains, on a GPU
 
 
 def automatic(group) -> str:
@@ -36,11 +45,30 @@ def why_not_pcg(model) -> str:
     """What keeps equilibria of a model from being found by conjugate gradients; empty where nothing does."""
     if model.net is None or model.groups:
         return "it is for shells and joined rods alone, and the model has rods on their own"
-    if model.net.host.bands:
-        return "it knows no pressure that follows axisymmetric shells"
     return ""
 
 
 def net_preconditioner(net) -> str:
-    """Name of the preconditioner of a net: "multilevel" where it is large, else "block_jacobi"."""
-    return "multilevel" if net.host.nodes >= LARGE else "block_jacobi"
+    """Name of the preconditioner of a net: with "chain" where rods are long between joints, with "multilevel" where it is large."""
+    host = net.host
+    if not host.rods:
+        return "multilevel" if host.nodes >= LARGE else "block_jacobi"
+    own = np.concatenate([rod.all_nodes for rod in host.rods])
+    joints = np.bincount(own, minlength=host.nodes) > 1
+    rigid = np.zeros(host.nodes, bool)
+    for part in host.sets:
+        if part.term.measure.spins:
+            rigid[part.slots[0]] = True
+    between, places = (max(_longest_run(~at[rod.all_nodes]) for rod in host.rods) for at in (joints | rigid, rigid))
+    pays = between >= BETWEEN
+    if pays and net.device.is_cuda:
+        pays = 0.25 * between**2 > LAUNCHES + places / PLACES
+    rest = host.nodes - len(np.unique(own)) if pays else host.nodes
+    names = ["chain"] * pays + ["multilevel"] * (rest >= LARGE)
+    return "_".join(names) or "block_jacobi"
+
+
+def _longest_run(flags: np.ndarray) -> int:
+    """Length of the longest row of true ones."""
+    ends = np.flatnonzero(~np.concatenate([[False], flags, [False]]))
+    return int(np.diff(ends).max()) - 1

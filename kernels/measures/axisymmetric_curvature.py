@@ -7,12 +7,12 @@ along the meridian is, so that a uniform stretch of the surface changes neither)
 
     axisymmetric_curvature  nodes with two edges; data: l, R.
     axisymmetric_rim        an end, with the one edge there is, run as the meridian runs. With K = 2 tan(dphi / 2) from the unit
-                            vector (tx, tz) to the edge, and S = sin(phi) of the edge, the strains are (c1 K, 0, c2 K + c3 S);
-                            data: tx, tz, c1, c2, c3.
+                            vector (tx, tz) to the edge, and S = sin(phi) of the edge, the strains are
+                            (c1 K, 0, c2 K + c3 S + c4 tz); data: tx, ty = 0, tz, c1, c2, c3, c4.
                             A pole, where the meridian goes on as its mirror image across the axis and the surface is
-                            curved alike in all directions: c1 = c2 = 2 / l, (tx, tz) = (1, 0). A clamped rim: c1 = 2 / l
-                            alone. A rim that is free to turn, without moment along the meridian: c3 = 1 / R with R in the middle of
-                            the edge, all else zero.
+                            curved alike in all directions: c1 = c2 = 2 / l, (tx, tz) = (1, 0). A clamped rim, with (tx, tz)
+                            as the clamp has it: c1 = 2 / l, c4 = 1 / R. A rim that is free to turn, without moment along
+                            the meridian: c3 = 1 / R with R in the middle of the edge, all else zero.
 
 Derivatives: K' = 1 + K^2 / 4 in phi, phi' = (-z, x) / (x^2 + z^2), sin(phi)' = cos(phi) phi'.
 """
@@ -67,13 +67,13 @@ def _rim_functions(real):
     @wp.func
     def turning(q: Q, s: S, length: real):
         """K; zero without a direction."""
-        return real(2.0) * (s[0] * q[2] - s[1] * q[0]) / (length + s[0] * q[0] + s[1] * q[2])
+        return real(2.0) * (s[0] * q[2] - s[2] * q[0]) / (length + s[0] * q[0] + s[2] * q[2])
 
     @wp.func
     def strains(q: Q, s: S, w: real):
         length = wp.sqrt(q[0] * q[0] + q[2] * q[2])
         k = turning(q, s, length)
-        return E(s[2] * k, real(0.0), s[3] * k + s[4] * q[2] / length)
+        return E(s[3] * k, real(0.0), s[4] * k + s[5] * q[2] / length + s[6] * s[2])
 
     @wp.func
     def jacobian(q: Q, s: S, w: real):
@@ -81,12 +81,12 @@ def _rim_functions(real):
         ee = q[0] * q[0] + q[2] * q[2]
         k = turning(q, s, wp.sqrt(ee))
         turn = real(1.0) + real(0.25) * k * k
-        a = s[2] * turn / ee
-        b = (s[3] * turn + s[4] * q[0] / wp.sqrt(ee)) / ee
+        a = s[3] * turn / ee
+        b = (s[4] * turn + s[5] * q[0] / wp.sqrt(ee)) / ee
         return strains(q, s, w), wp.matrix_from_rows(Q(-q[2] * a, zero, q[0] * a), Q(), Q(-q[2] * b, zero, q[0] * b))
 
     return strains, jacobian, None, None
 
 
 axisymmetric_curvature = Measure("axisymmetric_curvature", 3, ((0, 1), (1, 2)), NAMES, _functions, data_size=2)
-axisymmetric_rim = Measure("axisymmetric_rim", 3, ((0, 1),), NAMES, _rim_functions, data_size=5)
+axisymmetric_rim = Measure("axisymmetric_rim", 3, ((0, 1),), NAMES, _rim_functions, data_size=7)

@@ -5,7 +5,8 @@ joints. An element has *slots*: its nodes, its angles, its rotation vectors, eac
 written a slot, so that whoever gathers them knows blocks only. Worlds lie behind each other: block i of world w is
 w * blocks + i, element i of world w is w * elements + i; topology and constant data are stored once.
 
-The lagged data of an element are, in this order: (u, t) of the rod edges its angles belong to, its own lagged rows, its data.
+The lagged data of an element are, in this order: (u, t) of the rod edges its angles belong to, its own lagged rows, its data. Data
+are shared by all worlds, or, where supports turn normals among them, each world has its own.
 """
 
 from functools import cache
@@ -80,8 +81,10 @@ def functions(term: Term, real):
                 s[wp.static(FRAME * i) + c] = frame[c, f]
         for c in range(wp.static(own)):
             s[wp.static(FRAME * frames) + c] = lag[c, tid]
-        for c in range(wp.static(data_size)):
-            s[wp.static(FRAME * frames + own) + c] = data[c, e]
+        if wp.static(data_size > 0):
+            column = wp.where(data.shape[1] > elements, tid, e)
+            for c in range(wp.static(data_size)):
+                s[wp.static(FRAME * frames + own) + c] = data[c, column]
         p = P()
         for i in range(wp.static(static_size)):
             row = i + 1

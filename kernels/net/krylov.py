@@ -1,5 +1,6 @@
 """Preconditioned conjugate gradients on a net, every world for itself: block Jacobi, scalars on the device.
 
+What `chains` or `levels` make of z follows the kernels that begin a solve and advance it, before r . z is summed.
 `wanted` is 1 while a world iterates, 2 once it is done; sums over blocks come in one order (tiles, then a tile of tiles).
 """
 
@@ -58,11 +59,42 @@ def serial_sum_kernel(real, largest: bool = False):
 
 
 @cache
+def inverse_function(linear):
+    """inverse_of(m, f) -> (inverse on the free dofs f of a matrix masked by them, whether it is definite); zero if it is not."""
+    H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
+
+    @wp.func
+    def inverse_of(masked: M, f: H):
+        m = masked + wp.diag(H(linear(1.0)) - f)
+        # scaled to a unit diagonal: a block of a rod's end holds stretching and bending stiffness
+        s = H()
+        for d in range(3):
+            s[d] = linear(1.0) / wp.sqrt(wp.max(wp.abs(m[d, d]), linear(1.0e-30)))
+        scale = wp.outer(s, s)
+        m = wp.cw_mul(m, scale)
+        inverse = wp.cw_mul(wp.cw_mul(wp.inverse(m), scale), wp.outer(f, f))
+        minor = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
+        definite = m[0, 0] > linear(0.0) and m[1, 1] > linear(0.0) and m[2, 2] > linear(0.0)
+        definite = definite and minor > linear(0.0) and wp.determinant(m) > linear(0.0)
+        if not (definite and wp.isfinite(wp.trace(inverse))):
+            return M(), False
+        return inverse, True
+
+    return inverse_of
+
+
+@cache
 def solver_kernels(linear):
     """Kernels of a solve, in the order of their use; see the module's text."""
     H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
     times, free = product_functions(linear)
+    inverse_of = inverse_function(linear)
     eps = wp.constant(linear(2.3e-16 if linear == wp.float64 else 1.2e-7))
+
+    @wp.func
+    def ends(curvature: linear, rho: linear):
+        """Curvature that is negative, or lost to rounding: the solve ends with what it has, or a step of steepest descent."""
+        return not curvature > eps * rho * linear(1.0e-6)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def invert(
@@ -86,22 +118,11 @@ def solver_kernels(linear):
         for r in range(3):
             for c in range(3):
                 m[r, c] = matrix[3 * r + c, p]
-        rows = wp.outer(f, f)
-        m = wp.cw_mul(m, rows) + wp.diag(H(linear(1.0)) - f)
-        # scaled to a unit diagonal: a block of a rod's end holds stretching and bending stiffness
-        s = H()
-        for d in range(3):
-            s[d] = linear(1.0) / wp.sqrt(wp.max(wp.abs(m[d, d]), linear(1.0e-30)))
-        scale = wp.outer(s, s)
-        m = wp.cw_mul(m, scale)
-        inverse = wp.cw_mul(wp.inverse(m), scale)
-        minor = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
-        definite = m[0, 0] > linear(0.0) and m[1, 1] > linear(0.0) and m[2, 2] > linear(0.0)
-        if not (
-            definite and minor > linear(0.0) and wp.determinant(m) > linear(0.0) and wp.isfinite(wp.trace(inverse))
-        ):
-            inverse = wp.diag(wp.cw_mul(s, s))
-        inverse_out[i] = wp.cw_mul(inverse, rows)
+        inverse, definite = inverse_of(wp.cw_mul(m, wp.outer(f, f)), f)
+        if not definite:
+            for d in range(3):
+                inverse[d, d] = f[d] / wp.max(wp.abs(m[d, d]), linear(1.0e-30))
+        inverse_out[i] = inverse
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def start(
@@ -191,9 +212,7 @@ def solver_kernels(linear):
         if wanted[w] != 1:
             return
         k = i - w * blocks
-        if not curvature[w] > eps * rho[w] * linear(1.0e-6):
-            # negative, or lost to rounding: the solve ends with what it has, or with a step of steepest descent
-            dots_out[w, k] = linear(0.0)
+        if ends(curvature[w], rho[w]):
             if iterations[w] == 0:
                 solution[i] = p[i]
             return
@@ -240,8 +259,9 @@ def solver_kernels(linear):
         iterations[w] = iterations[w] + 1
         if not curvature[w] > linear(0.0):
             projected[w] = 1
+        lost = ends(curvature[w], rho[w])
         rho[w] = total[w]
-        if total[w] > forcing[w] * forcing[w] * first[w] and iterations[w] < limit:
+        if not lost and total[w] > forcing[w] * forcing[w] * first[w] and iterations[w] < limit:
             busy_out[0] = 1
         else:
             wanted[w] = 2

@@ -6,7 +6,8 @@ common translation. With P_l the prolongation from groups to nodes and D_l the d
     z = D_0^-1 r + sum_l P_l D_l^-1 P_l^T r
 
 (Bramble, Pasciak and Xu 1990; Wu, Wang, Wang and Guo, A GPU-based multilevel additive Schwarz preconditioner for cloth, 2022, with
-dense blocks). D_l takes the blocks of D_l-1 of its members, and those blocks of H whose row and column meet first at level l.
+dense blocks). D_0^-1 r may be what `chains` makes of it. D_l takes the blocks of D_l-1 of its members, and those blocks of H whose
+row and column meet first at level l.
 """
 
 from functools import cache
@@ -140,28 +141,26 @@ def level_kernels(linear):
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def finish(
         residual: wp.array(dtype=H),
-        inverse: wp.array(dtype=M),
         correction: wp.array(dtype=H),
         group: wp.array(dtype=int),
         fixed: wp.array(dtype=wp.uint8),
         groups: int,
         blocks: int,
         wanted: wp.array(dtype=int),
-        z_out: wp.array(dtype=H),
+        z: wp.array(dtype=H),
         dots_out: wp.array2d(dtype=linear),
     ):
-        """z of every block and r . z."""
+        """Adds the corrections to z, which holds D_0^-1 r, and r . z."""
         i = wp.tid()
         w = i / blocks
         if wanted[w] != 1:
             return
         k = i - w * blocks
-        r = residual[i]
-        z = inverse[i] * r
+        y = z[i]
         g = group[k]
         if g >= 0:
-            z += wp.cw_mul(correction[g + w * groups], free(fixed[k]))
-        z_out[i] = z
-        dots_out[w, k] = wp.dot(r, z)
+            y += wp.cw_mul(correction[g + w * groups], free(fixed[k]))
+        z[i] = y
+        dots_out[w, k] = wp.dot(residual[i], y)
 
     return collect, gather, restrict, correct, finish

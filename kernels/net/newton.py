@@ -191,7 +191,7 @@ def search_kernels(real, linear):
 
 @cache
 def step_kernels(real, midpoint: bool):
-    """begin(...), hold(...) and finish(...) of a time step; see `kernels.step` for the schemes."""
+    """begin(...) and finish(...) of a time step; see `kernels.step` for the schemes."""
     V = wp.types.vector(3, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -258,31 +258,6 @@ def step_kernels(real, midpoint: bool):
         base_out[i] = here
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def hold(
-        where: wp.array(dtype=int),
-        place: wp.array2d(dtype=V),
-        moving: wp.array(dtype=wp.uint8),
-        progress: wp.array(dtype=real),
-        portion: wp.array(dtype=real),
-        blocks: int,
-        q: wp.array(dtype=V),
-    ):
-        """Puts the components that moving supports hold where they are at the end (middle) of the part of the step that is taken."""
-        i, w = wp.tid()
-        if progress[w] >= real(1.0):
-            return
-        s = progress[w] + portion[w]
-        if wp.static(midpoint):
-            s = progress[w] + real(0.5) * portion[w]
-        k = where[i]
-        at = place[0, i] * (real(1.0) - s) + place[1, i] * s
-        here = q[k + w * blocks]
-        for d in range(3):
-            if ((int(moving[k]) >> d) & 1) == 1:
-                here[d] = at[d]
-        q[k + w * blocks] = here
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def finish(
         q: wp.array(dtype=V),
         q0: wp.array(dtype=V),
@@ -315,64 +290,13 @@ def step_kernels(real, midpoint: bool):
         q_out[i] = end
         v_out[i] = v
 
-    return begin, hold, finish
+    return begin, finish
 
 
 @cache
-def pressure_kernel(real):
-    """Force of a pressure on each corner of a triangle, p A n / 3, on the surface q."""
-    V = wp.types.vector(3, real)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def press(
-        q: wp.array(dtype=V),
-        triangles: wp.array2d(dtype=int),
-        pressure: wp.array(dtype=real),
-        blocks: int,
-        force_out: wp.array(dtype=V),
-    ):
-        i = wp.tid()
-        count = triangles.shape[0]
-        w = i / count
-        k = i - w * count
-        x0 = q[triangles[k, 0] + w * blocks]
-        x1 = q[triangles[k, 1] + w * blocks]
-        x2 = q[triangles[k, 2] + w * blocks]
-        force_out[i] = wp.cross(x1 - x0, x2 - x0) * (pressure[k] / real(6.0))
-
-    return press
-
-
-@cache
-def spread_kernel(real):
-    """Constant loads of a block, and what the pressures of the triangles around it give each of their corners."""
-    V = wp.types.vector(3, real)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def spread(
-        constant: wp.array(dtype=V),
-        force: wp.array(dtype=V),
-        starts: wp.array(dtype=int),
-        items: wp.array(dtype=int),
-        blocks: int,
-        triangles: int,
-        load_out: wp.array(dtype=V),
-    ):
-        i = wp.tid()
-        w = i / blocks
-        k = i - w * blocks
-        f = constant[i]
-        for at in range(starts[k], starts[k + 1]):
-            f += force[items[at] + w * triangles]
-        load_out[i] = f
-
-    return spread
-
-
-@cache
-def follow_kernel(real):
-    """Adds pressures that follow the iterate to the sums of forces and work at every block; see `kernels.net.system`."""
-    V = wp.types.vector(3, real)
+def static_kernels(real, linear):
+    """follow(...), less(...) and far(...) of an equilibrium; see `ddg_warp.integrate.net_statics`."""
+    V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def follow(
@@ -380,44 +304,20 @@ def follow_kernel(real):
         base: wp.array(dtype=V),
         here: wp.array(dtype=V),
         there: wp.array(dtype=V),
-        starts: wp.array(dtype=int),
-        items: wp.array(dtype=int),
         status: wp.array(dtype=int),
         blocks: int,
-        triangles: int,
-        force: wp.array(dtype=V),
-        size: wp.array(dtype=real),
         change: wp.array2d(dtype=real),
-        noise: wp.array2d(dtype=real),
     ):
-        """`here` and `there` are the forces on the corners of triangles at q and at the base; their mean does the work."""
+        """Makes the work of the loads `here`, at q, that of their mean with those `there`, at the base."""
         i = wp.tid()
         w = i / blocks
-        if status[w] != 0:
-            return
-        k = i - w * blocks
-        f = V()
-        mean = V()
-        for at in range(starts[k], starts[k + 1]):
-            t = items[at] + w * triangles
-            f += here[t]
-            mean += real(0.5) * (here[t] + there[t])
-        work = wp.dot(q[i] - base[i], mean)
-        force[i] = force[i] + f
-        size[i] = size[i] + wp.max(wp.abs(f))
-        change[w, k] = change[w, k] - work
-        noise[w, k] = noise[w, k] + wp.abs(work)
-
-    return follow
-
-
-@cache
-def solve_kernels(real, linear):
-    """less(...): takes one vector of blocks from another; far(...): ends solves whose direction goes far enough."""
-    H = wp.types.vector(3, linear)
+        if status[w] == 0:
+            k = i - w * blocks
+            change[w, k] = change[w, k] + real(0.5) * wp.dot(q[i] - base[i], here[i] - there[i])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def less(product: wp.array(dtype=H), right: wp.array(dtype=H)):
+        """Takes one vector of blocks from another."""
         i = wp.tid()
         right[i] = right[i] - product[i]
 
@@ -428,4 +328,4 @@ def solve_kernels(real, linear):
         if wanted[w] == 1 and turn[w] > rotation_cap * rotation_cap:
             wanted[w] = 2
 
-    return less, far
+    return follow, less, far

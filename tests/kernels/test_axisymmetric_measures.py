@@ -25,7 +25,7 @@ def sample(name: str) -> Elements:
     s = random.uniform(0.6, 1.4, size=(COUNT, max(1, measure.data_size)))
     if measure.name == "axisymmetric_rim":
         angle = random.uniform(0.0, 0.3, COUNT)
-        s[:, 0], s[:, 1] = np.cos(angle), np.sin(angle)
+        s[:, 0], s[:, 2] = np.cos(angle), np.sin(angle)
     p = random.uniform(0.6, 1.4, size=(COUNT, term.density.parameter_size(3)))
     for i, parameter in enumerate(term.density.parameters(3)):
         p[:, i] *= {"poisson": 0.3, "metric_12": 0.3, "rest_11": 0.4, "rest_12": 0.4, "rest_22": 0.4}.get(
@@ -34,7 +34,7 @@ def sample(name: str) -> Elements:
     w = random.uniform(0.6, 1.4, size=COUNT)
     q, s, w, p = (values.astype(np.float32).astype(float) for values in (q, s, w, p))
     if measure.name == "axisymmetric_rim":
-        s[:, :2] /= np.linalg.norm(s[:, :2], axis=1, keepdims=True)
+        s[:, :3:2] /= np.linalg.norm(s[:, :3:2], axis=1, keepdims=True)
     return Elements(name, q, s, w, p)
 
 

@@ -177,7 +177,7 @@ def test_factorisation_and_substitution(device, name, closed):
     """Solves with the open part of the chain: the couplings across the seam left out."""
     problem = Problem(name, closed, device)
     newton, kind = problem.newton, problem.kind
-    substitute = block_band.substitute_function(kind, newton.linear)
+    substitute = block_band.substitute_function(kind.block, kind.span, newton.linear)
 
     @wp.kernel(module="unique", enable_backward=False)
     def solve(
@@ -188,7 +188,7 @@ def test_factorisation_and_substitution(device, name, closed):
         total: wp.array(dtype=wp.float64),
     ):
         r = wp.tid()
-        total[r] = substitute(factor, v, out, count[r], r)
+        total[r] = substitute(factor, v, out, count[r], r, r)
 
     total = wp.zeros(problem.group.columns, dtype=wp.float64, device=device)
     problem.launch(solve, problem.group.columns, [newton.factors, newton.right], [newton.z, problem.group.count, total])

@@ -1,0 +1,188 @@
+"""Joints of a net once the rods between them are eliminated: the blocks of S and what they make of a residual; see `chains`."""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.net.krylov import inverse_function
+from ddg_warp.kernels.net.system import product_functions
+
+
+@cache
+def coupling_functions(linear):
+    """multiply(matrix, p, v): block p of H times v; block(matrix, p): the block itself."""
+    H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
+
+    @wp.func
+    def multiply(matrix: wp.array2d(dtype=linear), p: int, v: H):
+        return H(
+            matrix[0, p] * v[0] + matrix[1, p] * v[1] + matrix[2, p] * v[2],
+            matrix[3, p] * v[0] + matrix[4, p] * v[1] + matrix[5, p] * v[2],
+            matrix[6, p] * v[0] + matrix[7, p] * v[1] + matrix[8, p] * v[2],
+        )
+
+    @wp.func
+    def block(matrix: wp.array2d(dtype=linear), p: int):
+        m = M()
+        for i in range(3):
+            for j in range(3):
+                m[i, j] = matrix[3 * i + j, p]
+        return m
+
+    return multiply, block
+
+
+@cache
+def joint_kernels(linear):
+    """measure(...): S_jj of every joint and its inverse; meet(...): z_J.
+
+    A joint has one block or two (a node and the rotation of its rigid joint), a and b, rows 2 m and 2 m + 1 of all joints. With
+    P = S_aa^-1, Q = P S_ab, and R = (S_bb - S_ba Q)^-1 its solution is z_b = R (t_b - Q^T t_a), z_a = P t_a - Q z_b.
+    """
+    H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
+    _, free = product_functions(linear)
+    multiply, block = coupling_functions(linear)
+    invert = inverse_function(linear)
+
+    @wp.func
+    def pull(
+        matrix: wp.array2d(dtype=linear),
+        columns: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
+        items: wp.array(dtype=int),
+        values: wp.array3d(dtype=linear),
+        where: wp.array(dtype=int),
+        width: int,
+        nodes: int,
+        row: int,
+        first: int,
+        shift: int,
+    ):
+        """Row of H_JI times the values of chains whose columns begin at `shift`."""
+        y = H()
+        for index in range(starts[row], starts[row + 1]):
+            p = items[index]
+            b = columns[p]
+            k = where[b] / width
+            s = shift + where[b] - k * width
+            v = H()
+            if b < nodes:
+                v = H(values[0, k, s], values[1, k, s], values[2, k, s])
+            else:
+                v[0] = values[values.shape[0] - 1, k, s]
+            y += multiply(matrix, p + first, v)
+        return y
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def measure(
+        matrix: wp.array2d(dtype=linear),
+        columns: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
+        items: wp.array(dtype=int),
+        values: wp.array3d(dtype=linear),
+        where: wp.array(dtype=int),
+        width: int,
+        nodes: int,
+        pairs: wp.array2d(dtype=int),
+        own: wp.array2d(dtype=int),
+        colour: wp.array(dtype=int),
+        size: int,
+        fixed: wp.array(dtype=wp.uint8),
+        inverse: wp.array(dtype=M),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        positions: int,
+        parts_out: wp.array2d(dtype=M),
+    ):
+        i = wp.tid()
+        joints = pairs.shape[0]
+        w = i / joints
+        if wanted[w] == 0:
+            return
+        m = i - w * joints
+        first = w * positions
+        all_columns = wanted.shape[0] * width
+        a = pairs[m, 0]
+        b = pairs[m, 1]
+        P = M()
+        Q = M()
+        R = M()
+        aa = M()
+        ab = M()
+        bb = M()
+        if a >= 0:
+            for d in range(3):
+                shift = (colour[m] * size + d) * all_columns + w * width
+                y = pull(matrix, columns, starts, items, values, where, width, nodes, 2 * m, first, shift)
+                for e in range(3):
+                    aa[e, d] = y[e]
+            f = free(fixed[a])
+            aa = wp.cw_mul(block(matrix, own[m, 0] + first) + linear(0.5) * (aa + wp.transpose(aa)), wp.outer(f, f))
+            P, definite = invert(aa, f)
+            if not definite:
+                P = inverse[a + w * blocks]
+        if b >= 0:
+            for d in range(3):
+                shift = (colour[m] * size + 3 + d) * all_columns + w * width
+                y = pull(matrix, columns, starts, items, values, where, width, nodes, 2 * m + 1, first, shift)
+                for e in range(3):
+                    bb[e, d] = y[e]
+                if a >= 0:
+                    y = pull(matrix, columns, starts, items, values, where, width, nodes, 2 * m, first, shift)
+                    for e in range(3):
+                        ab[e, d] = y[e]
+            f = free(fixed[b])
+            if a >= 0:
+                if own[m, 2] >= 0:
+                    ab += block(matrix, own[m, 2] + first)
+                ab = wp.cw_mul(ab, wp.outer(free(fixed[a]), f))
+                Q = P * ab
+            bb = block(matrix, own[m, 1] + first) + linear(0.5) * (bb + wp.transpose(bb)) - wp.transpose(ab) * Q
+            R, definite = invert(wp.cw_mul(bb, wp.outer(f, f)), f)
+            if not definite:
+                R = inverse[b + w * blocks]
+        parts_out[0, i] = P
+        parts_out[1, i] = Q
+        parts_out[2, i] = R
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def meet(
+        matrix: wp.array2d(dtype=linear),
+        columns: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
+        items: wp.array(dtype=int),
+        values: wp.array3d(dtype=linear),
+        where: wp.array(dtype=int),
+        width: int,
+        nodes: int,
+        pairs: wp.array2d(dtype=int),
+        parts: wp.array2d(dtype=M),
+        residual: wp.array(dtype=H),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        positions: int,
+        moved_out: wp.array(dtype=H),
+    ):
+        i = wp.tid()
+        joints = pairs.shape[0]
+        w = i / joints
+        if wanted[w] != 1:
+            return
+        m = i - w * joints
+        first = w * positions
+        shift = w * width
+        a = pairs[m, 0]
+        b = pairs[m, 1]
+        t = H()
+        if a >= 0:
+            t = residual[a + w * blocks]
+            t -= pull(matrix, columns, starts, items, values, where, width, nodes, 2 * m, first, shift)
+        u = H()
+        if b >= 0:
+            u = residual[b + w * blocks]
+            u -= pull(matrix, columns, starts, items, values, where, width, nodes, 2 * m + 1, first, shift)
+        z = parts[2, i] * (u - t * parts[1, i])
+        moved_out[2 * i] = parts[0, i] * t - parts[1, i] * z
+        moved_out[2 * i + 1] = z
+
+    return measure, meet

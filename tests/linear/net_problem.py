@@ -1,0 +1,151 @@
+"""A Newton iteration of a net at a random state, with its matrices as dense ones."""
+
+import numpy as np
+import warp as wp
+
+import ddg_warp as ddg
+from ddg_warp import meshes
+from ddg_warp.net_newton import NetNewton
+from ddg_warp.newton import NewtonOptions
+from ddg_warp.tangent import Tangent
+
+SECTION = ddg.Stiffness(EA=300.0, EI1=0.6, EI2=0.9, GJ=0.5, mass_per_length=0.7, rotary_inertia=0.2)
+CABLE = ddg.Stiffness(EA=300.0, mass_per_length=0.7)
+RUBBER = ddg.Material(young=1e5, poisson=0.3, density=900.0)
+
+
+def sheet(bending: str, cells: int = 3) -> ddg.Scene:
+    points, triangles = meshes.rectangle(cells, cells, (1.0, 1.0), "alternating")
+    scene = ddg.Scene()
+    shell = scene.add_shell(points, triangles, thickness=0.02, material=RUBBER, bending=bending)
+    scene.hold(shell, [0, 1])
+    scene.hold(shell, [4], "z")
+    return scene
+
+
+def membrane_with_springs() -> ddg.Scene:
+    """A sheet and a chain of springs along one of its edges: tension apart, every Hessian here is a constant of the geometry."""
+    scene = sheet("isometric")
+    points = scene.shells[0].points
+    edge = np.flatnonzero(points[:, 0] == points[:, 0].max())
+    edge = edge[np.argsort(points[edge, 1])]
+    section = ddg.Stiffness(EA=300.0, mass_per_length=0.4)
+    rod = scene.add_rod(points[edge], section=section, bend=False)
+    scene.attach(rod, range(len(edge)), 0, edge)
+    return scene
+
+
+def frame_and_sheet(bending: str = "midedge_dof") -> ddg.Scene:
+    """A sheet with a rod along an edge, and a second rod that leaves a corner, joined rigidly: every kind of slot."""
+    scene = sheet(bending)
+    points = scene.shells[0].points
+    edge = np.flatnonzero(points[:, 0] == points[:, 0].max())
+    edge = edge[np.argsort(points[edge, 1])]
+    section = ddg.Stiffness(EA=300.0, EI1=0.6, EI2=0.9, GJ=0.5, mass_per_length=0.7, rotary_inertia=0.2)
+    rim = scene.add_rod(points[edge], section=section)
+    scene.attach(rim, range(len(edge)), 0, edge)
+    post = scene.add_rod(np.linspace(points[edge[-1]], points[edge[-1]] + [0.2, 0.9, 0.3], 4), section=section)
+    scene.join([(rim, -1), (post, 0)])
+    return scene
+
+
+def line(start, end, nodes: int) -> np.ndarray:
+    return np.linspace(np.array(start, float), np.array(end, float), nodes)
+
+
+def branches() -> ddg.Scene:
+    """A clamped trunk with two branches at its tip, a twig across one of them, of 7, 5, 6 and 7 nodes; a held node between."""
+    scene = ddg.Scene()
+    trunk = scene.add_rod(line((0, 0, 0), (0.1, 0, 1), 7), section=SECTION)
+    left = scene.add_rod(line((0.1, 0, 1), (0.5, 0.3, 1.6), 5), section=SECTION)
+    right = scene.add_rod(line((0.1, 0, 1), (-0.4, 0.1, 1.7), 6), section=SECTION)
+    tip = scene.batches[left].points[0, 2]
+    twig = scene.add_rod(line(tip - [0.3, -0.3, 0.1], tip + [0.3, -0.3, 0.1], 7), section=SECTION)
+    scene.clamp_end(trunk)
+    scene.fix(right, [3], components="xz")
+    scene.join([(trunk, -1), (left, 0), (right, 0)])
+    scene.join([(left, 2), (twig, 3)])
+    return scene
+
+
+def ring_and_spokes() -> ddg.Scene:
+    """A closed rod of ten nodes, two spokes joined rigidly to it, and a cable between these."""
+    scene = ddg.Scene()
+    angle = 2.0 * np.pi * np.arange(10) / 10
+    circle = np.column_stack([np.cos(angle), np.sin(angle), 0.1 * np.cos(2.0 * angle)])
+    ring = scene.add_rod(circle, section=SECTION, closed=True)
+    one = scene.add_rod(line(circle[2], 2.0 * circle[2], 5), section=SECTION)
+    two = scene.add_rod(line(circle[6], 2.0 * circle[6], 4), section=SECTION)
+    cable = scene.add_rod(line(2.0 * circle[2], 2.0 * circle[6], 6), section=CABLE, bend=False)
+    scene.fix(one, [3])
+    scene.join([(ring, 2), (one, 0)])
+    scene.join([(ring, 6), (two, 0)])
+    scene.join([(one, -1), (cable, 0)], rigid=False)
+    scene.join([(two, -1), (cable, -1)], rigid=False)
+    return scene
+
+
+def hinged_grid() -> ddg.Scene:
+    """Three rods across two, hinged where they cross: they bend on over the joints."""
+    scene = ddg.Scene()
+    along = [scene.add_rod(line((0, y, 0), (3, y, 0), 13), section=SECTION) for y in (0.5, 1.0, 1.5)]
+    across = [scene.add_rod(line((x, 0, 0), (x, 2, 0), 9), section=SECTION) for x in (0.75, 2.0)]
+    for i, rod in enumerate(along):
+        scene.fix(rod, [0])
+        for other, node in zip(across, (3, 8), strict=True):
+            scene.join([(rod, node), (other, 2 * (i + 1))], rigid=False)
+    return scene
+
+
+class Problem:
+    """One Newton iteration at a random state of two worlds, dense."""
+
+    def __init__(
+        self, scene, device, stretch=1.0, precision="float64", preconditioner="block_jacobi", noise=0.02, seed=3
+    ):
+        random = np.random.default_rng(seed)
+        self.model = scene.build(device, precision, worlds=2)
+        net, self.state = self.model.net, self.model.state()
+        self.net, self.worlds, self.blocks = net, 2, net.blocks
+        q = self.state.net.q.numpy().astype(float)
+        free = np.tile(~net.host.fixed, (2, 1))
+        q[:] = q * stretch + noise * random.normal(size=q.shape) * free
+        self.state.net.q.assign(q)
+        newton = self.newton = NetNewton(self.model, NewtonOptions(), preconditioner)
+        wp.copy(newton.q, self.state.net.q)
+        wp.copy(newton.base, self.state.net.q)
+        newton.target.assign(q + 5.0 * noise * random.normal(size=q.shape) * free)
+        newton.coefficient.assign([30.0, 50.0])
+        newton.rate.fill_(1.0)
+        newton.wanted.fill_(1)
+
+    def iterate(self, forcing: float):
+        newton = self.newton
+        newton.evaluate(self.state.net)
+        newton.balance()
+        newton.assemble()
+        newton.forcing.fill_(forcing)
+        newton.direct()
+        return self
+
+    def matrix(self, world: int) -> np.ndarray:
+        """H of a world, from its slices."""
+        table, N = self.newton.system, self.blocks
+        rows, columns = table.rows.numpy(), table.columns.numpy()
+        values = self.newton.matrix.numpy().reshape(9, 2, -1)[:, world]
+        padding = rows < 0
+        assert not values[:, padding].any()
+        H = np.zeros((N, 3, N, 3))
+        for p in np.flatnonzero(~padding):
+            H[rows[p], :, columns[p]] += values[:, p].reshape(3, 3)
+        return H.reshape(3 * N, 3 * N)
+
+    def exact(self, world: int) -> np.ndarray:
+        """Exact Hessian of the elastic energy, and inertia."""
+        size = 3 * self.blocks
+        own = slice(world * size, (world + 1) * size)
+        H = Tangent(self.model).hessian(self.state).toarray()[own, own]
+        return H + np.diag(self.net.host.mass.ravel() * self.newton.coefficient.numpy()[world])
+
+    def free(self) -> np.ndarray:
+        return ~self.net.host.fixed.ravel()

@@ -1,0 +1,279 @@
+"""The chain preconditioner of nets: against dense elimination, as an operator, and in steps of nets of rods and of stiffened sheets."""
+
+from itertools import chain
+
+import numpy as np
+import pytest
+from net_problem import CABLE, SECTION, Problem, branches, frame_and_sheet, hinged_grid, line, ring_and_spokes, sheet
+
+import ddg_warp as ddg
+from ddg_warp import meshes
+from ddg_warp.linear.choice import net_preconditioner
+from ddg_warp.scenes import gridshell_dome
+
+STEEL = ddg.Material(young=2.1e11, poisson=0.3, density=7850.0)
+
+
+def applied(problem: Problem, vectors: np.ndarray) -> np.ndarray:
+    """The preconditioner on rows of vectors (n, worlds, 3 N), block by block as in a solve."""
+    newton = problem.newton
+    newton.wanted.fill_(1)
+    inverse = newton.inverse.numpy().astype(float)
+    found = []
+    for vector in vectors:
+        r = vector.reshape(-1, 3)
+        newton.rest.assign(r)
+        newton.z.assign(np.einsum("bij,bj->bi", inverse, r))
+        newton.precondition(newton.z)
+        found.append(newton.z.numpy().astype(float).reshape(vector.shape))
+        dots = newton.krylov_dots.numpy().reshape(-1)
+        np.testing.assert_allclose(dots, (r * newton.z.numpy()).sum(1), rtol=1e-4, atol=1e-6 * np.abs(dots).max())
+    return np.array(found)
+
+
+def solved(problem: Problem, forcing: float) -> np.ndarray:
+    """Iterations of conjugate gradients of each world to a residual `forcing` times the first, with a projected matrix."""
+    problem.newton.projected.fill_(1)
+    return problem.iterate(forcing).newton.iterations.numpy()
+
+
+def dense(problem: Problem, world: int) -> np.ndarray:
+    """Elimination of rods between joints, then of single joints, by the formulas of `kernels.net.chains` with dense matrices."""
+    host, free = problem.net.host, problem.free()
+    H = np.where(np.outer(free, free), problem.matrix(world), np.diag(~free))
+    pairs = problem.newton.chains.plan.pairs
+    joints = [[int(b) for b in pair if b >= 0] for pair in pairs]
+    taken = {b for joint in joints for b in joint}
+    chains = [[int(b) for b in (*rod.all_nodes, *rod.all_edges) if b not in taken] for rod in host.rods]
+
+    def dofs(blocks):
+        return (3 * np.array(blocks, int)[:, None] + np.arange(3)).ravel()
+
+    eliminated = list(chain.from_iterable(chains))
+    inner = dofs(eliminated)
+    between = np.zeros_like(H)  # H_II^-1
+    for blocks in chains:
+        between[np.ix_(dofs(blocks), dofs(blocks))] = np.linalg.inv(H[np.ix_(dofs(blocks), dofs(blocks))])
+    size = len(H)
+    result = between.copy()
+    for joint in joints:
+        j = dofs(joint)
+        extension = np.zeros((size, len(j)))  # what a movement of the joint makes of everything
+        extension[inner] = -(between @ H[:, j])[inner]
+        extension[j] = np.eye(len(j))
+        own = H[np.ix_(j, j)] - H[j] @ between @ H[:, j]
+        result += extension @ np.linalg.inv(own) @ extension.T
+    for block in set(range(problem.blocks)) - taken - set(eliminated):
+        j = dofs([block])
+        result[np.ix_(j, j)] = np.linalg.inv(H[np.ix_(j, j)])
+    return np.where(np.outer(free, free), result, 0.0)
+
+
+@pytest.mark.parametrize("scene", [branches, ring_and_spokes, frame_and_sheet])
+def test_is_the_elimination_of_chains_and_joints(device, scene):
+    problem = Problem(scene(), device, 1.02, preconditioner="chain")
+    problem.newton.projected.fill_(1)
+    problem.iterate(0.1)
+    vectors = np.random.default_rng(1).normal(size=(3, 2, 3 * problem.blocks)) * problem.free()
+    found = applied(problem, vectors)
+    for world in range(2):
+        expected = vectors[:, world] @ dense(problem, world)
+        np.testing.assert_allclose(found[:, world], expected, rtol=0.0, atol=1e-10 * np.abs(expected).max())
+
+
+def test_joints_of_a_net(device):
+    """Where rods meet, with the rotations of rigid joints, and the last two places of a ring, which couple to its first ones."""
+    problem = Problem(ring_and_spokes(), device, preconditioner="chain")
+    plan, host = problem.newton.chains.plan, problem.net.host
+    ring, one, two, cable = host.rods
+    assert {tuple(pair) for pair in plan.pairs} == {
+        (ring.nodes[2], host.nodes + host.angles),
+        (ring.nodes[6], host.nodes + host.angles + 1),
+        (one.nodes[-1], -1),
+        (two.nodes[-1], -1),
+        (ring.nodes[8], ring.edges[8]),
+        (ring.nodes[9], ring.edges[9]),
+    }
+    inside = plan.where >= 0
+    assert not (inside & (plan.joint_row >= 0)).any()
+    assert inside.sum() + (plan.joint_row >= 0).sum() == problem.blocks
+    places = plan.places[:2]
+    blocks = places[places >= 0]
+    assert sorted(blocks) == np.flatnonzero(inside).tolist()
+    assert plan.count.sum() <= plan.places.shape[1] * len(plan.count)
+    assert cable.nodes[1] in blocks
+
+
+def indefinite(problem: Problem) -> bool:
+    """Whether H of the first world is."""
+    free = problem.free()
+    return np.linalg.eigvalsh(problem.matrix(0)[np.ix_(free, free)])[0] < 0.0
+
+
+@pytest.mark.parametrize("preconditioner", ["chain", "chain_multilevel"])
+@pytest.mark.parametrize(
+    ("scene", "stretch"),
+    [(frame_and_sheet, 1.02), (frame_and_sheet, 0.8), (hinged_grid, 1.02)],
+    ids=["tension", "compression", "hinged"],
+)
+def test_is_symmetric_and_positive_definite(device, preconditioner, scene, stretch):
+    """Also where H is not, and where the columns of S of hinged joints hold some of other joints."""
+    problem = Problem(scene(), device, stretch, preconditioner=preconditioner)
+    problem.newton.coefficient.fill_(1e-3)
+    problem.iterate(0.5)
+    free = np.flatnonzero(problem.free())
+    assert indefinite(problem) or stretch > 0.9
+    units = np.zeros((len(free), 2, 3 * problem.blocks))
+    units[np.arange(len(free)), :, free] = 1.0
+    found = applied(problem, units)[:, 0]
+    assert not found[:, ~problem.free()].any()
+    M = found[:, free]
+    assert np.abs(M - M.T).max() < 1e-9 * np.abs(M).max()
+    scale = 1.0 / np.sqrt(M.diagonal())
+    assert np.linalg.eigvalsh(0.5 * scale[:, None] * (M + M.T) * scale)[0] > 1e-12
+
+
+def bent_frame() -> ddg.Scene:
+    scene = ddg.Scene()
+    column = scene.add_rod(line((0, 0, 0), (0, 0, 1), 12), section=SECTION)
+    beam = scene.add_rod(line((0, 0, 1), (1, 0.2, 1), 9), section=SECTION)
+    scene.fix(column, [0])
+    scene.join([(column, -1), (beam, 0)])
+    return scene
+
+
+def star() -> ddg.Scene:
+    scene = ddg.Scene()
+    ends = ((1, 0, 0), (-0.5, 0.8, 0.1), (-0.4, -0.9, 0.2))
+    cables = [scene.add_rod(line((0, 0, 0), end, 6 + i), section=CABLE, bend=False) for i, end in enumerate(ends)]
+    for cable in cables:
+        scene.fix(cable, [-1])
+    scene.join([(cable, 0) for cable in cables], rigid=False)
+    return scene
+
+
+def rod_on_a_held_sheet() -> ddg.Scene:
+    """The net is a rod: nothing else is free."""
+    scene = sheet("hinge", 2)
+    points = scene.shells[0].points
+    scene.hold(0, range(len(points)))
+    rod = scene.add_rod(line(points[8], points[8] + [1.0, 0.3, 0.5], 15), section=SECTION)
+    scene.attach(rod, [0], 0, [8])
+    return scene
+
+
+@pytest.mark.parametrize("precision", ["float64", "mixed"])
+@pytest.mark.parametrize("scene", [bent_frame, star, rod_on_a_held_sheet])
+def test_nets_with_one_joint_at_most_are_solved_at_once(device, scene, precision):
+    problem = Problem(scene(), device, 1.02, precision, "chain")
+    assert solved(problem, 1e-8 if precision == "float64" else 1e-3).max() <= (1 if precision == "float64" else 2)
+
+
+@pytest.mark.parametrize("rigid", [True, False])
+@pytest.mark.parametrize("precision", ["float64", "mixed"])
+def test_iterations_do_not_grow_with_the_nodes_of_a_rod(device, rigid, precision):
+    """5 or 6 of them at 5 and at 15 edges between crossings, where block Jacobi takes 55 and 250."""
+    iterations = {}
+    for segments in (5, 15):
+        for linear in ("block_jacobi", "chain"):
+            scene = gridshell_dome.build(3, segments, rigid=rigid)
+            problem = Problem(scene, device, 1.0, precision, linear, noise=0.0)
+            problem.newton.coefficient.fill_(3600.0)
+            iterations[linear, segments] = solved(problem, 1e-3).max()
+    assert iterations["chain", 15] <= iterations["chain", 5] + 2 <= 10
+    assert iterations["chain", 15] < 0.1 * iterations["block_jacobi", 15]
+    assert iterations["block_jacobi", 15] > 2 * iterations["block_jacobi", 5]
+
+
+def trajectory(scene, device, linear: str, dt: float, precision="float64", worlds=2):
+    """Points after some steps, and iterations of conjugate gradients a Newton iteration."""
+    model = scene.build(device, precision, worlds=worlds)
+    integrator, state = ddg.Integrator(model, linear=linear, check_every=1), model.state()
+    for _ in range(4):
+        state = integrator.step(state, dt)
+    statistics = integrator.statistics()
+    return state.points(), statistics["pcg_iterations"] / statistics["newton_iterations"]["mean"]
+
+
+@pytest.mark.parametrize("precision", ["float64", "mixed"])
+def test_same_steps_of_a_gridshell(device, precision):
+    scene = gridshell_dome.build(3, 8)
+    expected, many = trajectory(scene, device, "block_jacobi", 1.0 / 60.0, precision)
+    found, few = trajectory(scene, device, "chain", 1.0 / 60.0, precision)
+    moved = np.abs(expected - scene.build("cpu", "float64", worlds=2).state().points()).max()
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-5 * moved)
+    np.testing.assert_array_equal(found[0], found[1])
+    assert few < 0.2 * many
+    again, _ = trajectory(scene, device, "chain", 1.0 / 60.0, precision)
+    np.testing.assert_array_equal(again, found)
+
+
+def stiffened(cells: int = 16) -> ddg.Scene:
+    """A hanging sheet with stiff ribs along five lines of its mesh, and across five more."""
+    points, triangles = meshes.rectangle(cells, cells, (1.0, 1.0), "alternating")
+    scene = ddg.Scene()
+    shell = scene.add_shell(points, triangles, thickness=1e-3, material=ddg.Material(1e6, 0.3, 1000.0), bending="hinge")
+    for axis in (0, 1):
+        for level in np.unique(points[:, 1 - axis])[:: cells // 4]:
+            rib = np.flatnonzero(points[:, 1 - axis] == level)
+            rib = rib[np.argsort(points[rib, axis])]
+            rod = scene.add_rod(points[rib], section=ddg.Circle(3e-3), material=ddg.Material(2e9, 0.3, 1000.0))
+            scene.attach(rod, range(len(rib)), shell, rib)
+    scene.hold(shell, [0, cells])
+    return scene
+
+
+def test_composes_with_levels_on_a_stiffened_sheet(device):
+    found = {
+        linear: trajectory(stiffened(), device, linear, 1.0 / 60.0, worlds=1)
+        for linear in ("multilevel", "chain", "chain_multilevel")
+    }
+    points, many = found["multilevel"]
+    for linear in ("chain", "chain_multilevel"):
+        np.testing.assert_allclose(found[linear][0], points, rtol=0.0, atol=1e-7)
+        assert found[linear][1] < 0.25 * many
+
+
+def test_choice(device):
+    """By the nodes between joints; and nets without rods launch nothing of it."""
+    assert net_preconditioner(gridshell_dome.build(3, 12).build(device).net) == "chain"
+    assert net_preconditioner(gridshell_dome.build(3, 2).build(device).net) == "block_jacobi"
+    assert net_preconditioner(sheet("hinge").build(device).net) == "block_jacobi"
+    points, triangles = meshes.rectangle(70, 70, (1.0, 1.0), "alternating")
+    for rods, name in ((0, "multilevel"), (1, "chain_multilevel")):
+        scene = ddg.Scene()
+        shell = scene.add_shell(points, triangles, thickness=0.01, material=STEEL, bending="hinge")
+        for _ in range(rods):
+            rod = scene.add_rod(line(points[0], points[0] - [1.0, 0.0, 0.0], 30), section=SECTION)
+            scene.attach(rod, [0], shell, [0])
+        assert net_preconditioner(scene.build(device).net) == name
+
+
+@pytest.mark.parametrize("linear", ["block_jacobi", "chain"])
+def test_only_nets_with_chains_load_its_kernels(device, linear):
+    newton = Problem(bent_frame(), device, preconditioner=linear).newton
+    keys = [(entry[0] if isinstance(entry, tuple) else entry).key for entry in newton.kernels]
+    assert any("chain_kernels" in key or "joint_kernels" in key for key in keys) == (linear == "chain")
+
+
+def truss() -> ddg.Scene:
+    scene = ddg.Scene()
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0.5, 0.8, 0.1]], float)
+    bars = [scene.add_rod(corners[[i, (i + 1) % 3]], section=CABLE, bend=False) for i in range(3)]
+    for i in range(3):
+        scene.join([(bars[i], 1), (bars[(i + 1) % 3], 0)], rigid=False)
+    return scene
+
+
+@pytest.mark.parametrize(
+    ("scene", "linear", "message"),
+    [
+        (lambda: sheet("hinge"), "chain", "nets with rods; this one has none"),
+        (truss, "chain", "no rod of the net has a node between its joints"),
+        (bent_frame, "chains", "block_jacobi or chain or multilevel or chain_multilevel"),
+    ],
+    ids=["sheet", "truss", "name"],
+)
+def test_what_has_no_chains_is_refused(device, scene, linear, message):
+    with pytest.raises(ddg.SceneError, match=message):
+        ddg.Integrator(scene().build(device), linear=linear)
