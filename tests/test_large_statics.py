@@ -42,10 +42,10 @@ def hanging(cells: int, analysis=None):
 
 
 def moved(cells: int, motion: ddg.Motion):
-    """One side held, the other with a motion, under its weight."""
+    """One side held, the other clamped with a motion, under its weight."""
     scene, _, ends = sheet(cells, gravity=9.81)
     scene.hold(0, np.flatnonzero(ends[0, :, 0]))
-    scene.hold(0, np.flatnonzero(ends[1, :, 0]), "xyz", motion)
+    scene.clamp_boundary(0, np.flatnonzero(ends[1, :, 0]), "xyz", motion)
     return scene
 
 
@@ -61,7 +61,7 @@ def pushed(cells: int):
 
 
 def stiffened(cells: int):
-    """A clamped plate with a rod along its middle, whose turning and twisting couple to it."""
+    """A clamped plate with a rod along its middle, which a couple bends."""
     scene, points, ends = sheet(cells)
     scene.clamp_boundary(0, np.flatnonzero(ends.any((0, 2))))
     scene.add_pressure(0, 500.0, dead=True)
@@ -69,6 +69,7 @@ def stiffened(cells: int):
     spine = spine[np.argsort(points[spine, 0])]
     rod = scene.add_rod(points[spine], section=ddg.Circle(0.015), material=RUBBER)
     scene.attach(rod, range(len(spine)), 0, spine)
+    scene.add_couple(rod, cells // 4, (0.0, 0.2, 0.0))
     return scene
 
 
