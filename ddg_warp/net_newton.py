@@ -22,14 +22,15 @@ class NetNewton:
     Args:
         preconditioner: of conjugate gradients: "block_jacobi", "chain" (rods between their joints are eliminated, see
             `kernels.net.chains`), "multilevel" (see `kernels.net.levels`), or "chain_multilevel", both.
+        linear: scalar type of the linear algebra; that of the model by default.
     """
 
-    def __init__(self, model, options: NewtonOptions, preconditioner: str = "block_jacobi"):
+    def __init__(self, model, options: NewtonOptions, preconditioner: str = "block_jacobi", linear=None):
         if preconditioner not in PRECONDITIONERS:
             raise SceneError(f"preconditioner {preconditioner!r}: of a net it is one of {', '.join(PRECONDITIONERS)}")
         net = model.net
         self.net, self.options, self.device = net, options, net.device
-        self.real, self.linear = model.types.real, model.types.linear
+        self.real, self.linear = model.types.real, linear or model.types.linear
         self.eps = model.types.eps
         worlds, blocks, host, device = net.worlds, net.blocks, net.host, net.device
         self.worlds, self.all = worlds, worlds * blocks
@@ -147,12 +148,7 @@ class NetNewton:
     def balance(self) -> None:
         """Residuals, the change of the energy, and the worlds that are out of equilibrium."""
         net, options, blocks = self.net, self.options, self.net.blocks
-        self._launch(
-            self._outer,
-            [self.q, self.base, self.target, self.mass, self.gravity, self.load, self.coefficient, self.status]
-            + [blocks, net.host.nodes],
-            [self.force, self.size, self.stiffness, self.change, self.noise],
-        )
+        self.outer_forces()
         for part, own, (starts, items) in zip(net.sets, self.parts, self.system.meets, strict=True):
             self._launch(
                 self._collect,
@@ -165,6 +161,15 @@ class NetNewton:
             [self.q, self.force, self.size, self.stiffness, self.fixed, self.status, self.load_scale]
             + [blocks, net.host.nodes, self.arm, self.longest, options.rtol, options.floor_factor * self.eps],
             [self.right, self.square, self.noise, self.unbalanced, self.drowned],
+        )
+
+    def outer_forces(self) -> None:
+        """Begin the sums at every block: loads, gravity and inertia."""
+        self._launch(
+            self._outer,
+            [self.q, self.base, self.target, self.mass, self.gravity, self.load, self.coefficient, self.status]
+            + [self.net.blocks, self.net.host.nodes],
+            [self.force, self.size, self.stiffness, self.change, self.noise],
         )
 
     def judge(self) -> None:
@@ -256,14 +261,7 @@ class NetNewton:
         blocks = self.net.blocks
         self._launch(self._measure, [self.right, self.direction, self.wanted, blocks], [self.dots])
         self._sum(self.dots, self.decrease)
-        wp.launch(
-            self._rotate,
-            self.turns.size,
-            [self.q, self.direction, self.ends, self.spins, self.wanted, blocks],
-            [self.turns],
-            device=self.device,
-        )
-        self._largest(self.turns, self.turn)
+        self.measure_turns()
         wp.launch(
             self._take,
             self.worlds,
@@ -271,6 +269,17 @@ class NetNewton:
             [self.wanted, self.status, self.step_length, self.decrement, self.todo, self.pcg_work],
             device=self.device,
         )
+
+    def measure_turns(self) -> None:
+        """Largest turn that the directions make, squared."""
+        wp.launch(
+            self._rotate,
+            self.turns.size,
+            [self.q, self.direction, self.ends, self.spins, self.wanted, self.net.blocks],
+            [self.turns],
+            device=self.device,
+        )
+        self._largest(self.turns, self.turn)
 
     def move(self) -> None:
         """Take the step that is to be taken."""

@@ -100,13 +100,18 @@ class NetTangent:
         self.net.strains(state.net, index, strain, stress)
         return stress.numpy().astype(np.float64)
 
-    def loads(self, factor: float, q: np.ndarray) -> np.ndarray:
-        host, x = self.host, q.reshape(self.net.worlds, -1, 3)
+    def dead_loads(self, factor: float) -> np.ndarray:
+        """Outer forces of a world (blocks, 3) that do not follow it."""
+        host = self.host
         force = host.load * factor
         force[: host.nodes] += factor * host.mass[: host.nodes] * np.asarray(self.model.scene.gravity, float)
         for load in host.timed:
             np.add.at(force, load.blocks, load.at(factor, factor) * load.force)
-        result = np.tile(force, (self.net.worlds, 1, 1))
+        return force
+
+    def loads(self, factor: float, q: np.ndarray) -> np.ndarray:
+        host, x = self.host, q.reshape(self.net.worlds, -1, 3)
+        result = np.tile(self.dead_loads(factor), (self.net.worlds, 1, 1))
         for load in host.followers:
             for world in range(self.net.worlds):
                 np.add.at(result[world], load.places, load.at(factor, factor) * load.forces(x[world][load.places]))

@@ -214,7 +214,8 @@ def equilibrate(result: Result, steps: int, keep: Callable, *, options: Mapping,
     finally:
         mean = sum(iterations) / max(1, len(iterations))
         newton = {"mean": mean, "max": max(iterations, default=0)}
-        result.statistics = {"newton_iterations": newton, "pcg_iterations": 0, "outcomes": dict(outcomes)}
+        counts = {"newton_iterations": newton, "pcg_iterations": equilibrium.pcg_iterations}
+        result.statistics = {**counts, "outcomes": dict(outcomes)}
 
 
 def follow(result: Result, steps: int, keep: Callable, *, options: Mapping, clock, bar) -> None:

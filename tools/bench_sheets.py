@@ -1,8 +1,9 @@
 """Times a hanging sheet: elements, assembly, an iteration of conjugate gradients, a step; each with its floor by memory traffic.
 
-    python tools/bench_sheets.py [--device cuda:0] [--quick] [--out DIR]
+    python tools/bench_sheets.py [--device cuda:0] [--quick] [--statics] [--out DIR]
 
-Prints a table; writes sheets_DEVICE.csv and .json. On CUDA the parts are captured graphs, timed by events over many launches; on
+Prints a table; writes sheets_DEVICE.csv and .json. With --statics: equilibria of a clamped plate under pressure by factors and by
+conjugate gradients, in statics_DEVICE.csv and .json. On CUDA the parts are captured graphs, timed by events over many launches; on
 the CPU the clock is that of this process. The floor counts what a part must read and write once, at 4.8 TB/s of an H200.
 """
 
@@ -16,7 +17,8 @@ import numpy as np
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp import meshes
+from ddg_warp import arrays, meshes
+from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
 from ddg_warp.net_newton import PRECONDITIONERS
 from ddg_warp.summary import machine, plain, table, write_json
 
@@ -36,6 +38,54 @@ def sheet(cells: int, bending: str) -> ddg.Scene:
     )
     scene.hold(shell, corners)
     return scene
+
+
+def plate(cells: int, pressure: float) -> ddg.Scene:
+    """A square of 1 m and 10 mm, of rubber, clamped all around, under a pressure [Pa]; 2 kPa deflect it by 8 thicknesses."""
+    points, triangles = meshes.rectangle(cells, cells, (1.0, 1.0), "alternating")
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    material = ddg.Material(young=1e7, poisson=0.3, density=1000.0)
+    shell = scene.add_shell(points, triangles, thickness=1e-2, material=material, bending="midedge_dof")
+    rim = ((points == points.min(0)) | (points == points.max(0)))[:, :2].any(1)
+    scene.clamp_boundary(shell, np.flatnonzero(rim))
+    scene.add_pressure(shell, pressure)
+    return scene
+
+
+def equilibrium(cells: int, pressure: float, solver: str, device) -> dict:
+    """A row of the table of equilibria."""
+    model = plate(cells, pressure).build(device.alias, "mixed" if device.is_cuda else "float64")
+    small = plate(4, pressure).build(device.alias, model.precision)
+    Equilibrium(small, StaticsOptions(solver=solver)).load(small.state(), 1)  # compiles
+    search = Equilibrium(model, StaticsOptions(solver=solver))
+    if search.net:
+        arrays.load_kernels(search.net.newton.kernels, device)
+    clock = time.perf_counter if device.is_cuda else time.process_time
+    began = clock()
+    state = search.load(model.state(), 1)
+    return {
+        "triangles": len(model.surfaces.triangles),
+        "pressure_Pa": pressure,
+        "precision": model.precision,
+        "solver": solver,
+        "seconds": clock() - began,
+        "newton": search.iterations,
+        "pcg": search.pcg_iterations,
+        "outcome": search.outcome,
+        "deflection": float(state.points()[:, 2].max()),
+    }
+
+
+def equilibria(chosen, device) -> list[dict]:
+    """Rows of the table of equilibria: membrane forces carry the first pressure, bending the second."""
+    rows = []
+    for pressure, sizes in ((2e3, (32, 70, 140, 223)), (5.0, (32, 70))):
+        for cells in sizes[:1] if chosen.quick else sizes:
+            if 2 * cells * cells <= chosen.largest:
+                for solver in ("pcg", "direct"):
+                    rows.append(equilibrium(cells, pressure, solver, device))
+                    print(table(rows[-1:]), file=sys.stderr, flush=True)
+    return rows
 
 
 def floors(newton) -> dict[str, float]:
@@ -123,11 +173,23 @@ def measure(bending: str, cells: int, device, quick: bool, linear: str) -> dict:
     }
 
 
+def steps(chosen, device) -> list[dict]:
+    """Rows of the table of steps."""
+    rows = []
+    for bending in chosen.bending:
+        for cells in SIZES[bending][:1] if chosen.quick else SIZES[bending]:
+            if 2 * cells * cells <= chosen.largest:
+                rows.append(measure(bending, cells, device, chosen.quick, chosen.linear))
+                print(table(rows[-1:]), file=sys.stderr, flush=True)
+    return rows
+
+
 def main() -> int:
     """Run what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", help="Warp device (default: CUDA if there is one)")
     parser.add_argument("--quick", action="store_true", help="small sizes: does it run?")
+    parser.add_argument("--statics", action="store_true", help="equilibria instead of steps")
     parser.add_argument("--bending", nargs="*", default=list(SIZES), choices=list(SIZES))
     parser.add_argument("--linear", default="block_jacobi", choices=PRECONDITIONERS, help="preconditioner")
     parser.add_argument("--largest", type=int, default=10**6, help="largest number of triangles")
@@ -136,15 +198,10 @@ def main() -> int:
     chosen = parser.parse_args()
     wp.config.quiet = True
     device = wp.get_device(chosen.device)
-    rows = []
-    for bending in chosen.bending:
-        for cells in SIZES[bending][:1] if chosen.quick else SIZES[bending]:
-            if 2 * cells * cells <= chosen.largest:
-                rows.append(measure(bending, cells, device, chosen.quick, chosen.linear))
-                print(table(rows[-1:]), file=sys.stderr, flush=True)
+    rows = equilibria(chosen, device) if chosen.statics else steps(chosen, device)
     origin = machine()
     origin["commit"] = chosen.commit or origin["commit"]
-    stem = chosen.out / f"sheets_{'cuda' if device.is_cuda else 'cpu'}"
+    stem = chosen.out / f"{'statics' if chosen.statics else 'sheets'}_{'cuda' if device.is_cuda else 'cpu'}"
     command = " ".join(["python", "tools/bench_sheets.py", *sys.argv[1:]])
     write_json(stem.with_suffix(".json"), {"command": command, "device": str(device), "machine": origin, "rows": rows})
     with open(stem.with_suffix(".csv"), "w", newline="") as file:

@@ -114,6 +114,12 @@ class NetLoads:
             if load.amplitude is not None:
                 on_device.assign(load.at(at, 1.0) * values)
 
+    def scale(self, dead: np.ndarray, at: float) -> None:
+        """Values of an equilibrium at load parameter `at`, with the loads (blocks, 3) that follow nothing."""
+        self.constant.assign(np.tile(dead, (self.model.worlds, 1)))
+        for _, load, values, _, on_device in self._followers:
+            on_device.assign(load.at(at, at) * values)
+
     def apply(self, q: wp.array, load: wp.array) -> None:
         """Write the loads on blocks q."""
         net, first = self.net, 0

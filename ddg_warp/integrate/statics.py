@@ -3,7 +3,8 @@
 Every load step holds supports where their motion has them at the load parameter t and scales loads by t. Newton uses the exact
 tangent where it is positive definite; where it is not, mode "minimise" shifts it until it is (so that only minima attract), and
 mode "follow" takes it as it is, with the residual as merit, to follow equilibria that are not stable. Shells try Newton with stresses
-of its own first (`ddg_warp.integrate.mixed`), which takes fewer iterations, and fall back on this search.
+of its own first (`ddg_warp.integrate.mixed`), which takes fewer iterations, and fall back on this search. Large nets are solved on
+the device by conjugate gradients instead (`ddg_warp.integrate.net_statics`).
 """
 
 from dataclasses import dataclass
@@ -13,9 +14,13 @@ from scipy import sparse
 
 from ddg_warp.errors import SceneError, SolverError, check_options
 from ddg_warp.integrate import mixed
+from ddg_warp.integrate.net_statics import NetEquilibrium
+from ddg_warp.linear.choice import static_solver, why_not_pcg
 from ddg_warp.linear.direct import Factorisation, SingularError
 from ddg_warp.state import State
 from ddg_warp.tangent import Tangent
+
+SOLVERS = ("auto", "direct", "pcg")
 
 
 @dataclass(frozen=True)
@@ -29,6 +34,8 @@ class StaticsOptions:
         rotation_cap: largest turn of an edge or change of an angle in one update [rad].
         mode: "minimise" or "follow".
         max_cuts: how often a load increment is halved before the search is given up.
+        solver: "direct": the exact tangent and its factors, on the host. "pcg": conjugate gradients on the device, for nets that are
+            too large for factors; in mode "minimise" alone, and without a count of unstable directions. "auto": by size.
     """
 
     rtol: float = 1e-10
@@ -37,11 +44,19 @@ class StaticsOptions:
     rotation_cap: float = 0.5
     mode: str = "minimise"
     max_cuts: int = 10
+    solver: str = "auto"
 
     def __post_init__(self):
         check_options(self, ("rtol", "floor_factor", "rotation_cap"), ("max_iterations", "max_cuts"))
         if self.mode not in ("minimise", "follow"):
             raise SceneError(f"statics mode {self.mode!r}: it is 'minimise' or 'follow'")
+        if self.solver not in SOLVERS:
+            raise SceneError(f"statics solver {self.solver!r}: it is one of {', '.join(SOLVERS)}")
+        if self.solver == "pcg" and self.mode == "follow":
+            raise SceneError(
+                "statics mode 'follow' passes limit points by the inertia of the tangent, which solver 'pcg' does not know; "
+                "take solver='direct'"
+            )
 
 
 def solve(
@@ -68,6 +83,7 @@ class Equilibrium:
 
     Attributes:
         tangent: energy, gradient and Hessian of the model.
+        net: what solves by conjugate gradients, if that is the solver.
         mixed: whether Newton with stresses of its own is tried first; where it can be, by default.
         iterations: Newton iterations so far.
         shift: of the last tangent, over its diagonal, that made it definite; 0 where it was.
@@ -78,9 +94,24 @@ class Equilibrium:
         self.model, self.options = model, options or StaticsOptions()
         self.tangent = Tangent(model)
         require_supports(model)
-        self.mixed = self.tangent.shells_alone
+        self.net = NetEquilibrium(self) if self._solver() == "pcg" else None
+        self.mixed = self.tangent.shells_alone and self.net is None
         self.iterations, self.shift = 0, 0.0
         self.outcome = ""
+
+    @property
+    def pcg_iterations(self) -> int:
+        """Iterations of conjugate gradients so far."""
+        return self.net.pcg_iterations() if self.net else 0
+
+    def _solver(self) -> str:
+        """The solver that the options ask for, if it can serve this model."""
+        solver, obstacle = self.options.solver, why_not_pcg(self.model)
+        if solver == "pcg" and obstacle:
+            raise SceneError(f"statics solver 'pcg': {obstacle}; take solver='direct'")
+        if solver == "auto":
+            return "direct" if self.options.mode == "follow" else static_solver(self.model)
+        return solver
 
     def load(self, state: State, load_steps: int, start: float = 0.0, end: float = 1.0) -> State:
         """Load stepping; see `solve`."""
@@ -118,6 +149,8 @@ class Equilibrium:
         if self.mixed and (found := mixed.newton(self, state, before, at)) is not None:
             return found
         state = self._with_supports_moved(state, before, at)
+        if self.net:
+            return self.net.solve(state, at)
         free = tangent.free
         energies, q = tangent.element_energies(state), tangent.dofs(state)
         outer = tangent.loads(at, q)
@@ -130,10 +163,10 @@ class Equilibrium:
             if following is not None:
                 hessian = hessian + following
             if not np.isfinite(residual).all() or not np.isfinite(hessian.data).all():
-                raise SolverError(self._where("non_finite", residual, at), state=state, outcome="non_finite")
+                raise SolverError(self.where("non_finite", residual, at), state=state, outcome="non_finite")
             excess = self.excess(residual, gradient, hessian, q, max(first, self.load_scale(outer, gradient)))
             if excess <= 0.0 and (self.outcome == "converged" or polished):
-                return self._found(state, outer, residual, at)
+                return self.found(state, outer, residual, at)
             polished = excess <= 0.0  # the floor is a bound: one more iteration gives what rounding allows
             self.iterations += 1
             direction, decrease = self._direction(hessian, residual)
@@ -163,10 +196,10 @@ class Equilibrium:
                     break
                 taken *= 0.5
             if not found and polished:
-                return self._found(state, outer, residual, at)
+                return self.found(state, outer, residual, at)
             if not found:
                 raise SolverError(
-                    self._where("line_search_failed", residual, at), state=state, outcome="line_search_failed"
+                    self.where("line_search_failed", residual, at), state=state, outcome="line_search_failed"
                 )
             state, q, energies, gradient, outer = (
                 candidate,
@@ -175,16 +208,16 @@ class Equilibrium:
                 new_gradient,
                 new_outer,
             )
-        raise SolverError(self._where("max_iterations", outer - gradient, at), state=state, outcome="max_iterations")
+        raise SolverError(self.where("max_iterations", outer - gradient, at), state=state, outcome="max_iterations")
 
     def _hidden(self, outer: np.ndarray, residual: np.ndarray) -> bool:
         """Whether more than half of the loads is left over, of which rounding does not let the dofs tell."""
         points = self.tangent.free & ~self.tangent.angle
         return self.outcome != "converged" and np.abs(residual[points]).sum() > 0.5 * np.abs(outer[points]).sum() > 0.0
 
-    def _found(self, state: State, outer: np.ndarray, residual: np.ndarray, at: float) -> State:
+    def found(self, state: State, outer: np.ndarray, residual: np.ndarray, at: float) -> State:
         """The state as the equilibrium at `at`, unless rounding hides its loads and spoils the tangent that would carry them."""
-        if self.shift > 0.0 and self._hidden(outer, residual):
+        if (self.shift > 0.0 or self.net) and self._hidden(outer, residual):
             raise SolverError(
                 f"no equilibrium at load parameter {at:g}: lost_in_rounding, the stiffest elements make forces as uncertain as "
                 "the loads are large; take better shaped elements, or float64",
@@ -206,10 +239,10 @@ class Equilibrium:
         if not step.any():
             return alone
         state = tangent.with_clamps_turned(state, at)
-        q, hessian = tangent.dofs(state), tangent.hessian(state)
-        if not np.isfinite(hessian.data).all():
+        direction = (self.net.following if self.net else self._following)(state, step, at)
+        if direction is None:
             return alone
-        direction, _ = self._direction(hessian, tangent.loads(at, q) - tangent.gradient(state) - hessian @ step)
+        q = tangent.dofs(state)
         follow = tangent.advance(state, step + direction, at)
 
         def potential(candidate):
@@ -218,6 +251,15 @@ class Equilibrium:
         overturned = tangent.turned_over(q, tangent.dofs(alone))
         better = overturned or not potential(alone) <= potential(follow)
         return follow if better and np.isfinite(potential(follow)) else alone
+
+    def _following(self, state: State, step: np.ndarray, at: float) -> np.ndarray | None:
+        """How the free dofs follow held ones that make a `step` (size,), by the tangent; None if there is no answer."""
+        tangent = self.tangent
+        hessian = tangent.hessian(state)
+        if not np.isfinite(hessian.data).all():
+            return None
+        outer = tangent.loads(at, tangent.dofs(state))
+        return self._direction(hessian, outer - tangent.gradient(state) - hessian @ step)[0]
 
     def load_scale(self, outer: np.ndarray, gradient: np.ndarray) -> float:
         """What residuals are compared with [N]: sum of the outer forces, or the largest support force if that is more."""
@@ -268,7 +310,8 @@ class Equilibrium:
         self.outcome = "converged" if (size <= limit)[free].all() else "converged_to_rounding"
         return float((size - np.maximum(limit, floor))[free].max())
 
-    def _where(self, outcome: str, residual: np.ndarray, at: float) -> str:
+    def where(self, outcome: str, residual: np.ndarray, at: float) -> str:
+        """What to tell of a search that failed."""
         masked = np.where(self.tangent.free, np.abs(self._scaled(residual)), -1.0)
         worst = int(np.argmax(np.where(np.isfinite(masked), masked, np.inf)))
         return (

@@ -26,6 +26,28 @@ def automatic(group) -> str:
     return "sweep"
 
 
+# Nodes from which on equilibria of a net take conjugate gradients, without and with CUDA. Where membrane forces carry the loads these
+# are faster from some thousand triangles on, on the CPU, too; where bending does, one core factorises faster
+# (tools/results/statics_cpu.csv). Without CUDA memory decides: factors of 1e5 triangles take some GB. On CUDA an iteration takes a
+# hundredth of the time (sheets_cuda.csv), and factors are made on the host all the same.
+LARGE_STATIC = {False: 50_000, True: 10_000}
+
+
+def static_solver(model) -> str:
+    """Name of the solver of equilibria: "pcg" for large nets that it can serve, else "direct"."""
+    net = model.net
+    if net is None or why_not_pcg(model):
+        return "direct"
+    return "pcg" if net.host.nodes * net.worlds >= LARGE_STATIC[model.wp_device.is_cuda] else "direct"
+
+
+def why_not_pcg(model) -> str:
+    """What keeps equilibria of a model from being found by conjugate gradients; empty where nothing does."""
+    if model.net is None or model.groups:
+        return "it is for shells and joined rods alone, and the model has rods on their own"
+    return ""
+
+
 def net_preconditioner(net) -> str:
     """Name of the preconditioner of a net: with "chain" where rods are long between joints, with "multilevel" where it is large."""
     host = net.host

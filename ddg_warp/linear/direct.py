@@ -1,5 +1,7 @@
 """Sparse direct solution of symmetric systems with their inertia (SuperLU), for problems of moderate size."""
 
+from functools import cached_property
+
 import numpy as np
 from scipy.sparse import csc_matrix, diags
 from scipy.sparse.linalg import splu
@@ -36,7 +38,11 @@ class Factorisation:
         except RuntimeError as error:
             raise SingularError("the tangent is singular: something can move without any stiffness") from error
         self.reliable = bool(np.array_equal(self._lu.perm_r, self._lu.perm_c))
-        self.negative = int((self._lu.U.diagonal() < 0.0).sum())
+
+    @cached_property
+    def negative(self) -> int:
+        """Number of negative pivots; read when it is asked for, as SuperLU copies all of U for it."""
+        return int((self._lu.U.diagonal() < 0.0).sum())
 
     def solve(self, b: np.ndarray) -> np.ndarray:
         """x with A x = b."""

@@ -291,3 +291,41 @@ def step_kernels(real, midpoint: bool):
         v_out[i] = v
 
     return begin, finish
+
+
+@cache
+def static_kernels(real, linear):
+    """follow(...), less(...) and far(...) of an equilibrium; see `ddg_warp.integrate.net_statics`."""
+    V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def follow(
+        q: wp.array(dtype=V),
+        base: wp.array(dtype=V),
+        here: wp.array(dtype=V),
+        there: wp.array(dtype=V),
+        status: wp.array(dtype=int),
+        blocks: int,
+        change: wp.array2d(dtype=real),
+    ):
+        """Makes the work of the loads `here`, at q, that of their mean with those `there`, at the base."""
+        i = wp.tid()
+        w = i / blocks
+        if status[w] == 0:
+            k = i - w * blocks
+            change[w, k] = change[w, k] + real(0.5) * wp.dot(q[i] - base[i], here[i] - there[i])
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def less(product: wp.array(dtype=H), right: wp.array(dtype=H)):
+        """Takes one vector of blocks from another."""
+        i = wp.tid()
+        right[i] = right[i] - product[i]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def far(turn: wp.array(dtype=real), rotation_cap: real, wanted: wp.array(dtype=int)):
+        """Ends the solves of worlds whose direction turns something by more than the cap already."""
+        w = wp.tid()
+        if wanted[w] == 1 and turn[w] > rotation_cap * rotation_cap:
+            wanted[w] = 2
+
+    return follow, less, far

@@ -1,0 +1,199 @@
+"""Equilibria by conjugate gradients on the device: the same as by factors, balance, repeat, worlds, failures, choice by size."""
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp import meshes
+from ddg_warp.integrate.continuation import Continuation
+from ddg_warp.integrate.statics import Equilibrium, StaticsOptions, solve
+from ddg_warp.linear import choice
+from ddg_warp.scenes import gridshell_dome
+from ddg_warp.simulate import simulate
+from ddg_warp.stability import spectrum
+from ddg_warp.tangent import Tangent
+
+RUBBER = ddg.Material(young=1e7, poisson=0.3, density=1000.0)
+THICKNESS = 0.01  # m
+STRETCHING = 1e5 / (1.0 - 0.3**2)  # E h / (1 - nu^2) [N/m]
+
+
+def sheet(cells: int, gravity: float = 0.0, **options):
+    """A square of 1 m, its points, and masks of its vertices at the ends of x and y (2, V, 2)."""
+    points, triangles = meshes.rectangle(cells, cells, (1.0, 1.0), "alternating")
+    scene = ddg.Scene(gravity=(0.0, 0.0, -gravity), **options)
+    scene.add_shell(points, triangles, thickness=THICKNESS, material=RUBBER, bending="midedge_dof")
+    return scene, points, np.stack([points == points.min(0), points == points.max(0)])[..., :2]
+
+
+def plate(cells: int, pressure: float = 2e3):
+    """Clamped all around; 2 kPa deflect it by eight thicknesses."""
+    scene, _, ends = sheet(cells)
+    scene.clamp_boundary(0, np.flatnonzero(ends.any((0, 2))))
+    scene.add_pressure(0, pressure)
+    return scene
+
+
+def hanging(cells: int, analysis=None):
+    """Pinned at its corners, under its weight."""
+    scene, _, ends = sheet(cells, gravity=9.81, **({"analysis": analysis} if analysis else {}))
+    scene.hold(0, np.flatnonzero(ends.any(0).all(1)))
+    return scene
+
+
+def moved(cells: int, motion: ddg.Motion):
+    """One side held, the other clamped with a motion, under its weight."""
+    scene, _, ends = sheet(cells, gravity=9.81)
+    scene.hold(0, np.flatnonzero(ends[0, :, 0]))
+    scene.clamp_boundary(0, np.flatnonzero(ends[1, :, 0]), "xyz", motion)
+    return scene
+
+
+def wrung(cells: int):
+    """Stretched, lifted and turned."""
+    motion = ddg.Motion(lambda t: (0.05 * t, 0.0, 0.1 * t), lambda t: 0.4 * t, (1.0, 0.0, 0.0), (0.0, 0.5, 0.0))
+    return moved(cells, motion)
+
+
+def pushed(cells: int):
+    """The other side comes nearer and rises: the sheet buckles and sags, and has several equilibria that are stable."""
+    return moved(cells, ddg.Motion(lambda t: (-0.2 * t, 0.0, 0.1 * t)))
+
+
+def stiffened(cells: int):
+    """A clamped plate with a rod along its middle, which a couple bends."""
+    scene, points, ends = sheet(cells)
+    scene.clamp_boundary(0, np.flatnonzero(ends.any((0, 2))))
+    scene.add_pressure(0, 500.0, dead=True)
+    spine = np.flatnonzero(points[:, 1] == np.sort(np.unique(points[:, 1]))[cells // 2])
+    spine = spine[np.argsort(points[spine, 0])]
+    rod = scene.add_rod(points[spine], section=ddg.Circle(0.015), material=RUBBER)
+    scene.attach(rod, range(len(spine)), 0, spine)
+    scene.add_couple(rod, cells // 4, (0.0, 0.2, 0.0))
+    return scene
+
+
+SCENES = {
+    "plate": (plate, 10, 32),
+    "hanging": (hanging, 10, 32),
+    "wrung": (wrung, 10, 32),
+    "stiffened": (stiffened, 8, 32),
+    "dome": (lambda rods: gridshell_dome.build(rods=rods, load=1e4), 3, 9),
+}
+CASES = [(name, size) for name, (_, size, _) in SCENES.items()]
+CASES += [pytest.param(name, size, marks=pytest.mark.slow) for name, (_, _, size) in SCENES.items()]
+
+
+@pytest.mark.parametrize(("name", "size"), CASES)
+def test_same_equilibrium(device, name, size):
+    """Both solvers find one equilibrium, to their tolerance; 32 cells are 2,048 triangles."""
+    model = SCENES[name][0](size).build(device, "float64")
+    start = model.state()
+    searches = [Equilibrium(model, StaticsOptions(solver=solver)) for solver in ("pcg", "direct")]
+    found, expected = (search.load(start, 2).points() for search in searches)
+    moved = np.abs(expected - start.points()).max()
+    assert moved > 1e-3
+    assert np.abs(found - expected).max() < 1e-6 * moved
+    assert searches[0].pcg_iterations > 0 == searches[1].pcg_iterations
+    assert searches[0].outcome in ("converged", "converged_to_rounding")
+
+
+@pytest.mark.parametrize("build", [plate, pushed])
+def test_converged_is_balanced_and_stable(device, build):
+    """The residual of every free dof, by the host's own forces, is below rtol times the load scale; moments times a length."""
+    model = build(8).build(device, "float64")
+    search = Equilibrium(model, StaticsOptions(solver="pcg", rtol=1e-9))
+    state = search.load(model.state(), 2)
+    assert search.outcome == "converged"
+    assert spectrum(model, state).negative == 0
+    tangent = search.tangent
+    outer, gradient = tangent.loads(1.0, tangent.dofs(state)), tangent.gradient(state)
+    residual = np.abs(outer - gradient)[tangent.free]
+    limit = 1e-9 * search.load_scale(outer, gradient) * np.where(tangent.angle, tangent.edge_length(), 1.0)
+    assert (residual <= limit[tangent.free]).all()
+
+
+def test_supports_carry_the_weight(device):
+    """Reactions of the corners add up to the weight, rho h g over 1 m^2."""
+    model = hanging(10).build(device, "float64")
+    reactions = model.reactions(solve(model, load_steps=2, solver="pcg"))
+    weight = RUBBER.density * THICKNESS * 9.81
+    assert sum(reaction.force[2] for reaction in reactions) == pytest.approx(weight, rel=1e-7)
+
+
+def test_pressure_follows_and_does_its_work(device):
+    """Forces on the iterate are those of the host; the work along a step is that of their mean at its ends, (f0 + f1) . u / 2."""
+    model = plate(6).build(device, "float64")
+    search, tangent = Equilibrium(model, StaticsOptions(solver="pcg")), Tangent(model)
+    q0, random = tangent.dofs(model.state()), np.random.default_rng(1)
+    q0 = q0 + 0.02 * random.normal(size=q0.shape)
+    q1 = q0 + 0.02 * random.normal(size=q0.shape)
+    solver = search.net.newton
+    solver.begin(q1, tangent.parts[-1].dead_loads(0.7), 0.7, np.ones(1))
+    solver.base.assign(q0.reshape(-1, 3))
+    solver.outer_forces()
+    first, second = tangent.loads(0.7, q0), tangent.loads(0.7, q1)
+    np.testing.assert_allclose(solver.force.numpy().ravel(), second, atol=1e-12 * np.abs(second).max())
+    work = 0.5 * (first + second) @ (q1 - q0)
+    assert abs(work) > 0.1
+    assert solver.change.numpy().sum() == pytest.approx(-work, rel=1e-12)
+
+
+def test_repeats_bitwise(device):
+    model = pushed(8).build(device, "float64")
+    runs = [solve(model, load_steps=2, solver="pcg").snapshot() for _ in range(2)]
+    for name, values in runs[0].items():
+        np.testing.assert_array_equal(values, runs[1][name], err_msg=name)
+
+
+def test_worlds_and_changed_parameters(device):
+    """Worlds of other stiffness find their own equilibria, also after a change of what has been captured."""
+    names = ("shell_stretch", "stiffness")
+    alone = plate(6).build(device, "float64")
+    together = plate(6).build(device, "float64", worlds=2)
+    searches = [Equilibrium(model, StaticsOptions(solver="pcg")) for model in (alone, together)]
+    searches[1].load(together.state(), 1)
+    stiffness = np.array([1.0, 3.0]) * STRETCHING
+    together.set_parameter(*names, stiffness)
+    found = searches[1].load(together.state(), 1).points()
+    for world in range(2):
+        alone.set_parameter(*names, stiffness[world])
+        expected = searches[0].load(alone.state(), 1).points()
+        np.testing.assert_allclose(found[world], expected, atol=1e-9)
+    assert np.abs(found[0] - found[1]).max() > 1e-4
+
+
+def test_failure_is_named(device):
+    """Too few iterations for any increment: the error carries the outcome, the place and the last good state."""
+    model = plate(6).build(device, "float64")
+    with pytest.raises(ddg.SolverError, match=r"max_iterations, largest residual .* of shell 0") as caught:
+        solve(model, solver="pcg", max_iterations=2, max_cuts=2)
+    assert caught.value.outcome == "max_iterations"
+    assert np.isfinite(caught.value.state.points()).all()
+
+
+def test_what_needs_factors_says_so(device):
+    with pytest.raises(ddg.SceneError, match="'follow' passes limit points by the inertia"):
+        StaticsOptions(solver="pcg", mode="follow")
+    with pytest.raises(ddg.SceneError, match="it is one of auto, direct, pcg"):
+        StaticsOptions(solver="cholesky")
+    scene = ddg.Scene()
+    rod = scene.add_rod(np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 5), section=ddg.Circle(0.01), material=RUBBER)
+    scene.clamp_end(rod)
+    with pytest.raises(ddg.SceneError, match="rods on their own"):
+        solve(scene.build(device, "float64"), solver="pcg")
+
+
+def test_choice_by_size(device, monkeypatch):
+    """Small nets take factors, large ones conjugate gradients; what counts unstable directions always takes factors."""
+    scene = hanging(6, ddg.Statics(load_steps=2))
+    model = scene.build(device, "float64")
+    assert choice.static_solver(model) == "direct"
+    assert simulate(scene, device=device, progress=False).statistics["pcg_iterations"] == 0
+    monkeypatch.setattr(choice, "LARGE_STATIC", {False: 10, True: 10})
+    assert choice.static_solver(model) == "pcg"
+    result = simulate(scene, device=device, precision="float64", progress=False)
+    assert result.statistics["pcg_iterations"] > 0
+    assert sum(result.statistics["outcomes"].values()) == 2
+    assert Equilibrium(model, StaticsOptions(mode="follow")).net is None
+    assert Continuation(model, {}).corrector.equilibrium.net is None
