@@ -17,6 +17,7 @@ from ddg_warp.elements import ElementSet
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.terms import JOINT
 from ddg_warp.net_loads import NetCouple, NetLoad, NetPressure
+from ddg_warp.precision import float32_error
 from ddg_warp.surface import Surface
 from ddg_warp.validate import check_index
 
@@ -137,6 +138,14 @@ class Net:
     def edge_lengths(self) -> np.ndarray:
         """Their lengths at rest (E,) [m]."""
         return np.linalg.norm(np.diff(self.rest[self.edges], axis=1)[:, 0], axis=1)
+
+    def float32_error(self, s: float) -> float:
+        """What float32 makes of the worst rod over a step of s [s]; see `precision.float32_error`. Zero without rods."""
+        pieces = {id(rod.piece): rod.piece for rod in self.rods}.values()
+        return max(
+            (float32_error(p.kind, p.mass.mean(1), p.length, [v.T for v in p.parameters], s) for p in pieces),
+            default=0.0,
+        )
 
     @property
     def rod_edges(self) -> int:

@@ -14,7 +14,7 @@ from ddg_warp.linear.choice import automatic
 from ddg_warp.linear.partitioned import PartitionedNewton
 from ddg_warp.linear.pcg import PcgNewton, ProjectiveNewton
 from ddg_warp.newton import ChainNewton, NewtonOptions
-from ddg_warp.precision import FLOAT32_LIMIT, float32_error
+from ddg_warp.precision import FLOAT32_LIMIT
 from ddg_warp.state import State
 
 SOLVERS = ("newton", "projective")
@@ -149,9 +149,13 @@ class Integrator:
         self._longest = dt
         s = 0.5 * dt if self.scheme == "implicit_midpoint" else dt
         for i, chain in enumerate(self._chains):
-            if chain.newton.linear is wp.float32 and float32_error(chain.group, s) > FLOAT32_LIMIT:
+            if chain.newton.linear is wp.float32 and chain.group.float32_error(s) > FLOAT32_LIMIT:
                 self._chains[i] = _ChainStep(self, self.model, chain.group, wp.float64, counts_of=chain)
                 self._graphs.clear()
+        net = self._net
+        if net is not None and net.newton.linear is wp.float32 and net.net.host.float32_error(s) > FLOAT32_LIMIT:
+            self._net = NetStep(self, self.model, wp.float64, counts_of=net)
+            self._graphs.clear()
 
     def _own(self, state: State) -> int:
         for i, buffer in enumerate(self._buffers):

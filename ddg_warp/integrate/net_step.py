@@ -19,7 +19,7 @@ from ddg_warp.tangent import Tangent
 class NetStep:
     """Steps all worlds of a model's net; the same methods as `_ChainStep`."""
 
-    def __init__(self, integrator, model):
+    def __init__(self, integrator, model, linear=None, counts_of=None):
         self.integrator, self.model, self.net = integrator, model, model.net
         host, device, real = model.net.host, model.wp_device, model.types.real
         options = integrator.options
@@ -37,7 +37,7 @@ class NetStep:
                 "give the material a density, or the section a mass_per_length"
             )
         preconditioner = net_preconditioner(model.net) if integrator.linear == "auto" else integrator.linear
-        self.newton = NetNewton(model, options, preconditioner)
+        self.newton = NetNewton(model, options, preconditioner, linear)
         self.midpoint = integrator.scheme == "implicit_midpoint"
         self._begin, self._finish = newton.step_kernels(real, self.midpoint)
         self._start, self._advance = step.start_kernel(real), step.advance_kernel(real)
@@ -50,6 +50,9 @@ class NetStep:
         self.remaining = wp.zeros(1, dtype=int, device=device)
         self.tally = wp.zeros(len(outcome.NAMES) + 1, dtype=wp.int64, device=device)
         self.work = wp.zeros(5, dtype=wp.int64, device=device)
+        if counts_of is not None:
+            self.tally, self.work, self.reason = counts_of.tally, counts_of.work, counts_of.reason
+            self.newton.status, self.newton.pcg_work = counts_of.newton.status, counts_of.newton.pcg_work
         self.damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
         dead = host.mass[: host.nodes] * np.asarray(model.scene.gravity, float) + host.load[: host.nodes]
         outer = np.abs(dead).sum() + np.abs(host.load[host.nodes :]).sum()
