@@ -109,6 +109,7 @@ def main() -> int:
     parser.add_argument("--device", help="Warp device (default: CUDA if there is one)")
     parser.add_argument("--quick", action="store_true", help="small sizes: does it run?")
     parser.add_argument("--steps", type=int, default=3)
+    parser.add_argument("--commit", default="", help="commit, where there is no git checkout")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     chosen = parser.parse_args()
     wp.config.quiet = True
@@ -120,11 +121,11 @@ def main() -> int:
         for linear in LINEAR:
             rows.append(measure(name, edges, scene, linear, device, chosen.steps))
             print(table(rows[-1:]), file=sys.stderr, flush=True)
+    origin = machine()
+    origin["commit"] = chosen.commit or origin["commit"]
     stem = chosen.out / f"nets_{'cuda' if device.is_cuda else 'cpu'}"
     command = " ".join(["python", "tools/bench_nets.py", *sys.argv[1:]])
-    write_json(
-        stem.with_suffix(".json"), {"command": command, "device": str(device), "machine": machine(), "rows": rows}
-    )
+    write_json(stem.with_suffix(".json"), {"command": command, "device": str(device), "machine": origin, "rows": rows})
     with open(stem.with_suffix(".csv"), "w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
