@@ -1,6 +1,6 @@
 """Times steps of nets of rods with different preconditioners, at several numbers of edges between joints.
 
-    python tools/bench_nets.py [--device cuda:0] [--quick] [--out DIR]
+    python tools/bench_nets.py [--device cuda:0] [--edges 8 32 128] [--out DIR]
 
 Prints a table; writes nets_DEVICE.csv and .json. On the CPU the clock is that of this process.
 """
@@ -108,14 +108,14 @@ def main() -> int:
     """Run what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", help="Warp device (default: CUDA if there is one)")
-    parser.add_argument("--quick", action="store_true", help="small sizes: does it run?")
+    parser.add_argument("--edges", type=int, nargs="*", default=SIZES, help="edges between joints")
     parser.add_argument("--steps", type=int, default=3)
     parser.add_argument("--commit", default="", help="commit, where there is no git checkout")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     chosen = parser.parse_args()
     wp.config.quiet = True
     device = wp.get_device(chosen.device)
-    cases = [(name, n, build(n)) for name, build in SCENES.items() for n in (SIZES[:1] if chosen.quick else SIZES)]
+    cases = [(name, n, build(n)) for name, build in SCENES.items() for n in chosen.edges]
     cases.append(("parachute", 4, parachute.build()))
     rows = []
     for name, edges, scene in cases:
