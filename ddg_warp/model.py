@@ -146,7 +146,7 @@ class Model:
         self.net = self._build_net() if needs_net(scene) else None
 
     def _build_net(self):
-        from ddg_warp.net import compile_net
+        from ddg_warp.net_compile import compile_net
         from ddg_warp.net_model import DeviceNet
 
         supports = [*self.scene.shell_supports, *self.scene.ring_supports]

@@ -1,0 +1,150 @@
+"""Elements of a net: of rods, rigid joints, shells and meridians, gathered by term."""
+
+from collections import Counter
+
+import numpy as np
+
+from ddg_warp import axisymmetric
+from ddg_warp import shells as shell_terms
+from ddg_warp.chains import Piece
+from ddg_warp.elements import ElementSet
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels.terms import JOINT
+from ddg_warp.net import Net, NetSet
+
+
+def element_sets(scene, net: Net) -> list[NetSet]:
+    """Elements of a net by term; marks the dofs that none of them has."""
+    joints = _joint_places(scene, net)
+    return _gather_sets(
+        [*_rod_sets(net, joints), *_joint_sets(net, joints), *_shell_sets(net, scene), *_meridian_sets(net, scene)]
+    )
+
+
+def _joint_places(scene, net: Net) -> list[tuple[int, int, list]]:
+    """Of each rigid joint: node, block of its rotation, and its edges as (rod, edge with ghosts, sign)."""
+    by_rod = {rod.rod: rod for rod in net.rods}
+    result = []
+    for number, joint in enumerate(joint for joint in scene.joints if joint.rigid):
+        members, node = [], -1
+        for index, at in joint.members:
+            rod = by_rod[index]
+            if not rod.edges.size:
+                raise SceneError(f"rigid joint {number}: rod {index} has no twist; join it with rigid=False")
+            k = rod.first + (at if at >= 0 else len(rod.nodes) + at)
+            node = rod.all_nodes[k]
+            count, closed = len(rod.all_nodes), rod.piece.kind.closed
+            if closed or k < count - 1:
+                members.append((rod, k, 1.0))
+            if closed or k > 0:
+                members.append((rod, (k - 1) % count, -1.0))
+        result.append((node, net.nodes + net.angles + number, members))
+    return result
+
+
+def _rod_sets(net: Net, joints) -> list[NetSet]:
+    """Stretch and bending of the rods; vertices at rigid joints are left to these."""
+    skipped = {(member.rod, node) for node, _, members in joints for member, _, _ in members}
+    sets = []
+    for rod in net.rods:
+        piece, row = rod.piece, rod.row
+        kind, nodes, n = piece.kind, rod.all_nodes, len(rod.all_nodes)
+        at = 0
+        for term in kind.terms:
+            span, size = term.measure.span, len(term.parameter_names)
+            count = n if kind.closed else n - span
+            k = np.arange(count)
+            values = [_row(p, row, count) for p in piece.parameters[at : at + size]]
+            at += size
+            if span == 2:
+                keep = np.array([(rod.rod, nodes[(i + 1) % n]) not in skipped for i in k], bool)
+                k, values = k[keep], [value[keep] for value in values]
+            slots = [nodes[(k + i) % n] for i in range(span + 1)]
+            lag = np.zeros((0, len(k)))
+            if term.measure.angles:
+                slots += [rod.all_edges[k], rod.all_edges[(k + 1) % n]]
+                lag = piece.reference_twist[row][k][None]
+            owner = np.array([np.full(len(k), rod.rod), k])
+            sets.append(NetSet(term, np.array(slots), lag, np.zeros((0, len(k))), values, owner))
+    return sets
+
+
+def _row(values: np.ndarray, row: int, count: int) -> np.ndarray:
+    values = values[row if len(values) > 1 else 0]
+    return np.broadcast_to(values if len(values) == 1 else values[:count], (count,))
+
+
+def _joint_sets(net: Net, joints) -> list[NetSet]:
+    """Bending and twist of the half cells between rigid joints and the edges that meet them."""
+    sets = []
+    for node, spin, members in joints:
+        for rod, k, sign in members:
+            piece, row = rod.piece, rod.row
+            n = len(rod.all_nodes)
+            other = rod.all_nodes[(k + 1) % n if sign > 0 else k]
+            edge = net.rest[other] - net.rest[node]
+            length = np.linalg.norm(edge)
+            frame = net.frame[:, rod.all_edges[k] - net.nodes]
+            section = piece.batch.section
+            stiffness = [_edge_value(value, piece, row, k) for value in (section.EI1, section.EI2, section.GJ)]
+            lag = np.concatenate([frame[:3], edge / length, [0.0]])[:, None]
+            parameters = [np.array([0.5 * length])] + [np.array([v]) for v in (*stiffness, 0.0, 0.0, 0.0)]
+            slots = np.array([[node], [other], [rod.all_edges[k]], [spin]])
+            sets.append(NetSet(JOINT, slots, lag, np.array([[sign]]), parameters, np.array([[rod.rod], [k]])))
+    return sets
+
+
+def _edge_value(value, piece: Piece, row: int, edge: int) -> float:
+    """A stiffness of the section on an edge with ghosts."""
+    batch, (before, _) = piece.batch, piece.ghosts
+    full = np.broadcast_to(np.asarray(value, float), (batch.rods, batch.edges))
+    return float(full[piece.rods[row] - batch.first, np.clip(edge - before, 0, batch.edges - 1)])
+
+
+def _shell_sets(net: Net, scene) -> list[NetSet]:
+    sets, count = [], Counter()
+    for index, (shell, description) in enumerate(zip(net.shells, scene.shells, strict=True)):
+        models = description.bending, description.membrane
+        for elements in shell_terms.shell_elements(shell.surface, shell.plate, shell.kinds, *models):
+            sets.append(_bound(elements, shell.nodes, shell.edges, index))
+            element, row, edge = elements.normals.T
+            sets[-1].normals = np.array([element, row, shell.supports[edge]])
+            shell.first[elements.term.name] = count[elements.term.name]
+            count[elements.term.name] += len(elements)
+        if description.bending in shell_terms.TURNING:
+            net.fixed[shell.edges[~shell_terms.turning(shell.kinds, description.bending)], 0] = True
+    return sets
+
+
+def _meridian_sets(net: Net, scene) -> list[NetSet]:
+    none = np.zeros(0, int)
+    sets = []
+    for index, shell in enumerate(net.meridians):
+        net.fixed[shell.nodes, 1] = True
+        net.fixed[shell.nodes[shell.points[:, 0] == 0.0], 0] = True
+        for elements in axisymmetric.element_sets(shell):
+            sets.append(_bound(elements, shell.nodes, none, index))
+            element, row, end = elements.normals.T
+            sets[-1].normals = np.array([element, row, shell.supports[end] + len(scene.shell_supports)])
+    return sets
+
+
+def _bound(elements: ElementSet, nodes: np.ndarray, edges: np.ndarray, index: int) -> NetSet:
+    count = len(elements.nodes)
+    slots = np.concatenate([nodes[elements.nodes], edges[elements.angles]], axis=1).T
+    parameters = [np.broadcast_to(np.asarray(p, float), (count,)) for p in elements.parameters]
+    owner = np.array([np.full(count, index), np.arange(count)])
+    return NetSet(elements.term, slots, np.zeros((0, count)), elements.data.T, parameters, owner)
+
+
+def _gather_sets(sets: list[NetSet]) -> list[NetSet]:
+    """One set a term."""
+    result = []
+    for name in dict.fromkeys(s.term.name for s in sets if len(s)):
+        same = [s for s in sets if s.term.name == name and len(s)]
+        join = [np.concatenate([getattr(s, what) for s in same], axis=1) for what in ("slots", "lag", "data", "owner")]
+        parameters = [np.concatenate(values) for values in zip(*(s.parameters for s in same), strict=True)]
+        first = np.cumsum([0] + [len(s) for s in same])
+        normals = [s.normals + [[at], [0], [0]] for s, at in zip(same, first, strict=False)]
+        result.append(NetSet(same[0].term, *join[:3], parameters, join[3], np.concatenate(normals, axis=1)))
+    return result
