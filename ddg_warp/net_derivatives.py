@@ -17,6 +17,7 @@ from ddg_warp.geometry import unit
 from ddg_warp.kernels.net import elements as net_elements
 from ddg_warp.kernels.terms import JOINT, SHELLS, Term
 from ddg_warp.precision import PRECISIONS
+from ddg_warp.samples import rotation
 
 ELEMENTS = 8
 TRAP = 2.0**-30
@@ -363,10 +364,8 @@ def rest(case: NetCase) -> float:
 
 
 def invariance(case: NetCase) -> float:
-    from ddg_warp.derivatives import _rotation
-
     sample = case.sample.isotropic()
-    return _relative(sample.energy(case.real, **sample.turned(_rotation(3, 0.4))), sample.energy(case.real))
+    return _relative(sample.energy(case.real, **sample.turned(rotation(3, 0.4))), sample.energy(case.real))
 
 
 def nonzero(case: NetCase) -> float:
