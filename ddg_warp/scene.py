@@ -127,9 +127,11 @@ class Scene(Structures):
         """Number of rods added so far."""
         return sum(batch.rods for batch in self.batches)
 
-    def add_rod(self, points, **options) -> int:
-        """Add one rod with points (n, 3); options as in `add_rods`. Returns its index."""
-        return self.add_rods([points], **options)[0]
+    def add_rod(self, points, *, director=None, **options) -> int:
+        """Add one rod with points (n, 3); options as in `add_rods`, without R: a director (3,) or (edges, 3). Returns its index."""
+        if np.ndim(director) == 2 and len(director) > 1:
+            director = [director]
+        return self.add_rods([points], director=director, **options)[0]
 
     def add_rods(
         self,

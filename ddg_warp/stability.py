@@ -8,6 +8,7 @@ from scipy import linalg, sparse
 from scipy.optimize import brentq
 from scipy.sparse.linalg import LinearOperator, eigsh, splu
 
+from ddg_warp.errors import SceneError
 from ddg_warp.linear.direct import Factorisation, SingularError
 from ddg_warp.tangent import Tangent
 
@@ -49,12 +50,17 @@ def spectrum(model, state, count: int = 4, metric: str = "mass", tangent: Tangen
         metric: "mass" (lumped, rotary inertia included) or "unit" (identity, angles times an edge length squared), for
             questions of stability alone.
         tangent: reuse this instead of making one.
+
+    Raises:
+        SceneError: metric "mass" of a model without masses.
     """
     tangent = tangent or Tangent(model)
     free = np.flatnonzero(tangent.free)
     matrix = tangent.hessian(state)[free][:, free]
     if metric == "mass":
         weights = tangent.mass[free]
+        if not (weights > 0.0).any():
+            raise SceneError("nothing that can move has a mass: give the material a density, or ask with metric='unit'")
         matrix, kept = _condensed(matrix, weights > 0.0)
         weights = weights[kept]
     else:

@@ -34,7 +34,7 @@ def build(stretch: float = 2.0, turns: float = TURNS, n: int = 400) -> ddg.Scene
     rod = scene.add_rod(
         points,
         section=ddg.Stiffness(EA=EA, EI1=B, GJ=C, radius=0.1),
-        director=normals[None],
+        director=normals,
         natural=natural(n),
         name="spring",
     )

@@ -271,3 +271,13 @@ def test_lowest_frequency_of_a_cantilever(device):
     found = spectrum(model, model.state(), 2)
     assert found.frequencies[0] == pytest.approx(1.87510407**2 / np.sqrt(0.5), rel=1e-3)
     assert found.frequencies[1] == pytest.approx(1.87510407**2 * np.sqrt(1.5 / 0.5), rel=1e-3)
+
+
+def test_frequencies_need_masses(device):
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    scene.add_rod(np.eye(3), section=ddg.Stiffness(EA=1.0, EI1=1.0, GJ=1.0))
+    scene.clamp(0, edges=[0])
+    model = scene.build(device, "float64")
+    with pytest.raises(ddg.SceneError, match="metric='unit'"):
+        spectrum(model, model.state())
+    assert spectrum(model, model.state(), metric="unit").eigenvalues[0] > 0.0
