@@ -4,6 +4,7 @@ Exit codes: 0 done; 1 a check or the solver failed; 2 a mistake in what was aske
 """
 
 import argparse
+import os
 import shlex
 import sys
 from pathlib import Path
@@ -20,7 +21,7 @@ from ddg_warp.catalog import (
     stored_settings,
 )
 
-DONE, FAILED, MISTAKE, INTERRUPTED = 0, 1, 2, 130
+DONE, FAILED, MISTAKE, INTERRUPTED, UNREAD = 0, 1, 2, 130, 141
 PRECISIONS = ("float64", "mixed", "float32")
 
 
@@ -40,6 +41,9 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         chosen = parser(arguments).parse_args(arguments)
         return chosen.command(chosen)
+    except BrokenPipeError:  # whoever read the output has left, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return UNREAD
     except (InputError, OSError) as error:
         print(f"ddg-warp: {error}", file=sys.stderr)
         return MISTAKE

@@ -19,6 +19,7 @@ from ddg_warp.io.colors import SCALE
 
 DPI = 160
 FLAT = 1e-3  # thickness over size below which rods are drawn in their plane
+ELEVATION, AZIMUTH = 18.0, -58.0  # of the eye on solid scenes [degrees]
 MARGIN = 0.06  # of the size, around the rods
 GREY = "0.35"
 LIGHT = np.array([-0.37, -0.56, 0.74])  # unit vector from the surfaces to the light
@@ -61,7 +62,7 @@ def rods_picture(
         if len(curves.counts):
             _draw_rods(plot, shape[shapes.rows][:, axes], shapes.curves, color, latest)
     _explain_times(figure, plot, times, norm)
-    plot.set_title(textwrap.fill(title, 80), loc="left", fontsize=11)
+    plot.figure.suptitle(textwrap.fill(title, 80), x=0.03, ha="left", fontsize=11)
     _save(figure, path)
 
 
@@ -176,11 +177,12 @@ def _flat_axes(figure: Figure, axes: list[int], low: np.ndarray, high: np.ndarra
 def _solid_axes(figure: Figure, low: np.ndarray, high: np.ndarray):
     plot = figure.add_subplot(projection="3d", computed_zorder=False)
     plot.set_proj_type("ortho")
-    plot.view_init(elev=18.0, azim=-58.0)
+    plot.view_init(elev=ELEVATION, azim=AZIMUTH)
     margin = MARGIN * np.max(high - low)
     limits = np.stack([low - margin, high + margin], axis=1)
     plot.set(xlim=limits[0], ylim=limits[1], zlim=limits[2])
-    plot.set_box_aspect(limits[:, 1] - limits[:, 0], zoom=1.1)
+    sides = limits[:, 1] - limits[:, 0]
+    plot.set_box_aspect(sides, zoom=min(1.0, _seen_height(np.ones(3)) / _seen_height(sides)))
     for axis, name in zip((plot.xaxis, plot.yaxis, plot.zaxis), "xyz", strict=True):
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
         axis.set_label_text(f"{name} [m]", fontsize=9)
@@ -188,6 +190,13 @@ def _solid_axes(figure: Figure, low: np.ndarray, high: np.ndarray):
         axis._axinfo["grid"].update(color="0.9", linewidth=0.5)
     plot.tick_params(labelsize=8, colors=GREY)
     return plot
+
+
+def _seen_height(sides: np.ndarray) -> float:
+    """Height at which a box is seen, over its diagonal, which is what matplotlib keeps."""
+    elevation, azimuth = np.radians([ELEVATION, AZIMUTH])
+    seen = np.abs([np.cos(azimuth) * np.sin(elevation), np.sin(azimuth) * np.sin(elevation), np.cos(elevation)])
+    return float(seen @ sides / np.linalg.norm(sides))
 
 
 def _few_ticks():

@@ -1,6 +1,7 @@
 """The commands: what they write, how they end, and what they say to a mistake."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -293,3 +294,13 @@ def test_module_is_the_command():
     run = subprocess.run([sys.executable, "-m", "ddg_warp"], capture_output=True, text=True, check=False)
     assert run.returncode == 2
     assert run.stderr.startswith("ddg-warp: ")
+
+
+def test_reader_of_the_output_may_leave():
+    """As `ddg-warp list | head` does: no message, and the code of a process that a closed pipe ended."""
+    ends, into = os.pipe()
+    os.close(ends)
+    run = subprocess.run([sys.executable, "-m", "ddg_warp", "list"], stdout=into, stderr=subprocess.PIPE, check=False)
+    os.close(into)
+    assert run.returncode == 141
+    assert not run.stderr
