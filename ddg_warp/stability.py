@@ -20,9 +20,10 @@ class Spectrum:
     """Lowest eigenvalues of a constrained tangent.
 
     Attributes:
-        eigenvalues: in ascending order; with the mass as metric they are squared angular frequencies [1/s^2].
+        eigenvalues: in ascending order; with the mass as metric they are squared angular frequencies [1/s^2]. Loads that follow
+            and are not conservative may make them complex: then the equilibrium flutters.
         modes: (dofs, number), normalised in the metric; zero at held dofs.
-        negative: number of negative eigenvalues (inertia).
+        negative: number of eigenvalues that are negative (inertia), of complex ones in their real part.
     """
 
     eigenvalues: np.ndarray
@@ -31,17 +32,19 @@ class Spectrum:
 
     @property
     def stable(self) -> bool:
-        """Whether the second variation is positive."""
-        return self.negative == 0
+        """Whether the second variation is positive; with loads that follow, whether no eigenvalue is negative or complex."""
+        return self.negative == 0 and not np.iscomplexobj(self.eigenvalues)
 
     @property
     def frequencies(self) -> np.ndarray:
-        """Angular frequencies [rad/s]; NaN where an eigenvalue is negative."""
+        """Angular frequencies [rad/s]; NaN where an eigenvalue is negative, complex where it flutters."""
         with np.errstate(invalid="ignore"):
             return np.sqrt(self.eigenvalues)
 
 
-def spectrum(model, state, count: int = 4, metric: str = "mass", tangent: Tangent | None = None) -> Spectrum:
+def spectrum(
+    model, state, count: int = 4, metric: str = "mass", tangent: Tangent | None = None, load: float | None = None
+) -> Spectrum:
     """The `count` lowest eigenvalues of the constrained tangent at a state.
 
     Args:
@@ -50,13 +53,14 @@ def spectrum(model, state, count: int = 4, metric: str = "mass", tangent: Tangen
         metric: "mass" (lumped, rotary inertia included) or "unit" (identity, angles times an edge length squared), for
             questions of stability alone.
         tangent: reuse this instead of making one.
+        load: the load parameter, for loads that follow; by default that of an equilibrium, which is its time.
 
     Raises:
         SceneError: metric "mass" of a model without masses.
     """
     tangent = tangent or Tangent(model)
     free = np.flatnonzero(tangent.free)
-    matrix = tangent.hessian(state)[free][:, free]
+    matrix = tangent.stiffness(state, load)[free][:, free]
     if metric == "mass":
         weights = tangent.mass[free]
         if not (weights > 0.0).any():
@@ -68,20 +72,23 @@ def spectrum(model, state, count: int = 4, metric: str = "mass", tangent: Tangen
     scaling = 1.0 / np.sqrt(weights)
     scaled = sparse.csc_matrix(sparse.diags(scaling) @ matrix @ sparse.diags(scaling))
     count = min(count, len(kept))
-    if len(kept) <= DENSE:
+    if not _symmetric(scaled):
+        values, vectors = _unsymmetric(scaled)
+        negative = int((values.real < 0.0).sum())
+    elif len(kept) <= DENSE:
         values, vectors = linalg.eigh(scaled.toarray())
         negative = int((values < 0.0).sum())
     else:
         negative = Factorisation(scaled).negative
         values, vectors = _lowest(scaled, count, negative)
-    modes = np.zeros((tangent.size, count))
+    modes = np.zeros((tangent.size, count), vectors.dtype)
     modes[free[kept]] = scaling[:, None] * vectors[:, :count]
     return Spectrum(values[:count], modes, negative)
 
 
 def negative_eigenvalues(matrix) -> int:
     """Number of negative eigenvalues of a stiffness; of an unsymmetric one (loads that follow), of those with negative real part."""
-    symmetric = abs(matrix - matrix.T).max() <= 1e-11 * abs(matrix).max()
+    symmetric = _symmetric(matrix)
     if symmetric:
         try:
             factor = Factorisation(sparse.csc_matrix(matrix))
@@ -93,6 +100,20 @@ def negative_eigenvalues(matrix) -> int:
     scaled = (scaling @ matrix @ scaling).toarray()
     values = linalg.eigvalsh(scaled) if symmetric else linalg.eigvals(scaled).real
     return int((values < 0.0).sum())
+
+
+def _symmetric(matrix) -> bool:
+    return bool(abs(matrix - matrix.T).max() <= 1e-11 * abs(matrix).max())
+
+
+def _unsymmetric(matrix) -> tuple[np.ndarray, np.ndarray]:
+    """All eigenpairs by their real parts, real if they all are."""
+    values, vectors = linalg.eig(matrix.toarray())
+    order = np.argsort(values.real)
+    values, vectors = values[order], vectors[:, order]
+    if (np.abs(values.imag) <= 1e-9 * np.abs(values)).all():
+        return values.real, vectors.real
+    return values, vectors
 
 
 def nearest_to_zero(matrix, scaling: np.ndarray) -> tuple[float, np.ndarray]:
@@ -122,10 +143,9 @@ def _condensed(matrix, massive: np.ndarray):
     kept, slaves = np.flatnonzero(massive), np.flatnonzero(~massive)
     if not slaves.size:
         return matrix, kept
-    coupling = matrix[kept][:, slaves]
     inner = Factorisation(sparse.csc_matrix(matrix[slaves][:, slaves]))
-    follow = np.column_stack([inner.solve(column) for column in coupling.toarray()])
-    return matrix[kept][:, kept] - sparse.csc_matrix(coupling @ follow), kept
+    follow = np.column_stack([inner.solve(column) for column in matrix[slaves][:, kept].toarray().T])
+    return matrix[kept][:, kept] - sparse.csc_matrix(matrix[kept][:, slaves] @ follow), kept
 
 
 def _lowest(matrix, count: int, negative: int) -> tuple[np.ndarray, np.ndarray]:
@@ -153,7 +173,7 @@ def critical(equilibrium_at: Callable, low: float, high: float, tolerance: float
 
     def lowest(parameter: float) -> float:
         model, state = equilibrium_at(parameter)
-        return float(spectrum(model, state, 1, "unit").eigenvalues[0])
+        return float(spectrum(model, state, 1, "unit").eigenvalues[0].real)
 
     return float(brentq(lowest, low, high, xtol=tolerance * abs(high - low)))
 
@@ -161,9 +181,9 @@ def critical(equilibrium_at: Callable, low: float, high: float, tolerance: float
 def buckling(model, free, loaded, count: int = 1) -> np.ndarray:
     """Linearised buckling: the lowest positive factors for which K(free) + factor (K(loaded) - K(free)) is singular.
 
-    With K the exact tangents of two equilibria of which the first is stable. Where the state before buckling is in proportion to its
-    load, as of a flat plate, these are the critical loads over that of `loaded`; elsewhere take `critical`, or two states close to
-    the critical one.
+    With K the exact tangents of two equilibria, loads that follow included, of which the first is stable. Where the state before
+    buckling is in proportion to its load, as of a flat plate, these are the critical loads over that of `loaded`; elsewhere take
+    `critical`, or two states close to the critical one.
 
     Args:
         model: what both states belong to.
@@ -171,11 +191,13 @@ def buckling(model, free, loaded, count: int = 1) -> np.ndarray:
         count: how many factors.
 
     Raises:
-        ValueError: the first equilibrium is not stable, or no positive factor is found.
+        ValueError: the first equilibrium is not stable, loads that follow are not conservative, or no positive factor is found.
     """
     tangent = Tangent(model)
     dofs = np.flatnonzero(tangent.free)
-    start, end = (tangent.hessian(state)[dofs][:, dofs] for state in (free, loaded))
+    start, end = (tangent.stiffness(state)[dofs][:, dofs] for state in (free, loaded))
+    if not (_symmetric(start) and _symmetric(end)):
+        raise ValueError("loads that follow are not conservative here, the tangent is unsymmetric: take `critical`")
     factors = Factorisation(sparse.csc_matrix(start))
     if factors.negative:
         raise ValueError(f"the first state is no minimum: its tangent has {factors.negative} negative eigenvalues")

@@ -66,6 +66,15 @@ class Tangent:
             return self.parts[0].hessian(state)
         return sparse.block_diag([part.hessian(state) for part in self.parts], format="csc")
 
+    def stiffness(self, state, load: float | None = None, stress: list | None = None) -> sparse.csc_matrix:
+        """The tangent of the whole: `hessian`, less the derivative of the loads that follow at load parameter `load`.
+
+        By default that of an equilibrium, which is its time. Where such loads are not conservative it is unsymmetric.
+        """
+        following = self.load_stiffness(state.time if load is None else load, self.dofs(state))
+        hessian = self.hessian(state, stress)
+        return hessian if following is None else hessian + following
+
     def linear_stress(self, state, step: np.ndarray) -> list:
         """Stresses (strains, elements) of every element set of the shells after a step, with strains e + J step."""
         return self.parts[0].linear_stress(state, step)

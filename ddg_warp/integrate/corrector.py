@@ -155,10 +155,7 @@ class Corrector:
         """Residual, tangent stiffness, and the rates of the residual and of supports with the load parameter."""
         tangent = self.tangent
         delta = 1e-4 * self.options.load_scale
-        outer, gradient, stiffness = tangent.loads(load, q), tangent.gradient(state), tangent.hessian(state)
-        following = tangent.load_stiffness(load, q)
-        if following is not None:
-            stiffness = stiffness + following
+        outer, gradient, stiffness = tangent.loads(load, q), tangent.gradient(state), tangent.stiffness(state, load)
         rate = (tangent.loads(load + delta, q) - tangent.loads(load - delta, q)) / (2.0 * delta)
         ahead, behind = (tangent.support_step(state, load, load + d) for d in (delta, -delta))
         support = (ahead - behind) / (2.0 * delta)

@@ -41,10 +41,7 @@ def newton(solver, state: State, before: float, at: float) -> State | None:
     for iteration in range(MAX_ITERATIONS):
         q = tangent.dofs(state)
         outer, gradient = tangent.loads(at, q), tangent.gradient(state)
-        hessian = tangent.hessian(state, stress)
-        following = tangent.load_stiffness(at, q)
-        if following is not None:
-            hessian = hessian + following
+        hessian = tangent.stiffness(state, at, stress)
         residual = outer - gradient
         if not np.isfinite(residual).all() or not np.isfinite(hessian.data).all():
             return None

@@ -158,10 +158,7 @@ class Equilibrium:
         first, polished = self.first_scale(outer, gradient), False
         for _ in range(options.max_iterations):
             residual = outer - gradient
-            hessian = tangent.hessian(state)
-            following = tangent.load_stiffness(at, q)
-            if following is not None:
-                hessian = hessian + following
+            hessian = tangent.stiffness(state, at)
             if not np.isfinite(residual).all() or not np.isfinite(hessian.data).all():
                 raise SolverError(self.where("non_finite", residual, at), state=state, outcome="non_finite")
             excess = self.excess(residual, gradient, hessian, q, max(first, self.load_scale(outer, gradient)))
@@ -255,7 +252,7 @@ class Equilibrium:
     def _following(self, state: State, step: np.ndarray, at: float) -> np.ndarray | None:
         """How the free dofs follow held ones that make a `step` (size,), by the tangent; None if there is no answer."""
         tangent = self.tangent
-        hessian = tangent.hessian(state)
+        hessian = tangent.stiffness(state, at)
         if not np.isfinite(hessian.data).all():
             return None
         outer = tangent.loads(at, tangent.dofs(state))
