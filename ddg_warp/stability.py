@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg, sparse
 from scipy.optimize import brentq
-from scipy.sparse.linalg import LinearOperator, eigsh, splu
+from scipy.sparse.linalg import LinearOperator, eigs, eigsh, splu
 
 from ddg_warp.errors import SceneError
 from ddg_warp.linear.direct import Factorisation, SingularError
@@ -73,7 +73,7 @@ def spectrum(
     scaled = sparse.csc_matrix(sparse.diags(scaling) @ matrix @ sparse.diags(scaling))
     count = min(count, len(kept))
     if not _symmetric(scaled):
-        values, vectors = _unsymmetric(scaled)
+        values, vectors = _unsymmetric(scaled, count)
         negative = int((values.real < 0.0).sum())
     elif len(kept) <= DENSE:
         values, vectors = linalg.eigh(scaled.toarray())
@@ -106,9 +106,15 @@ def _symmetric(matrix) -> bool:
     return bool(abs(matrix - matrix.T).max() <= 1e-11 * abs(matrix).max())
 
 
-def _unsymmetric(matrix) -> tuple[np.ndarray, np.ndarray]:
-    """All eigenpairs by their real parts, real if they all are."""
-    values, vectors = linalg.eig(matrix.toarray())
+def _unsymmetric(matrix, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """`count` eigenpairs or more by their real parts, all with a negative one among them; real if they all are."""
+    size = matrix.shape[0]
+    part = None if size <= DENSE else Factorisation(sparse.csc_matrix(0.5 * (matrix + matrix.T)))
+    if part is not None and part.reliable and not part.negative:
+        # where the symmetric part is definite no eigenvalue has a negative real part (Bendixson 1902)
+        values, vectors = eigs(matrix, k=count, sigma=0.0, v0=np.ones(size))
+    else:
+        values, vectors = linalg.eig(matrix.toarray())
     order = np.argsort(values.real)
     values, vectors = values[order], vectors[:, order]
     if (np.abs(values.imag) <= 1e-9 * np.abs(values)).all():

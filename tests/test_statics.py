@@ -281,3 +281,23 @@ def test_frequencies_need_masses(device):
     with pytest.raises(ddg.SceneError, match="metric='unit'"):
         spectrum(model, model.state())
     assert spectrum(model, model.state(), metric="unit").eigenvalues[0] > 0.0
+
+
+def test_unsymmetric_spectrum(device, monkeypatch):
+    """A couple about a fixed axis has no potential; few eigenvalues by iteration are those of the whole matrix."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), analysis=ddg.Statics(load_steps=2))
+    points = np.linspace([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], 21)
+    section = ddg.Stiffness(EA=1e4, EI1=1.0, EI2=1.5, GJ=0.8, mass_per_length=1.0, rotary_inertia=0.01)
+    rod = scene.add_rod(points, section=section)
+    scene.clamp(rod, edges=[0])
+    scene.add_couple(rod, -1, (0.3, 1.0, 0.2))
+    model = scene.build(device, "float64")
+    state = solve(model, load_steps=2)
+    whole = spectrum(model, state, 6)
+    monkeypatch.setattr(stability, "DENSE", 10)
+    few = spectrum(model, state, 6)
+    assert whole.stable
+    assert few.negative == 0
+    np.testing.assert_allclose(few.eigenvalues, whole.eigenvalues, rtol=1e-7)
+    without = spectrum(model, state, 6, load=0.0)
+    assert np.abs(without.eigenvalues / whole.eigenvalues - 1.0).max() > 1e-3
