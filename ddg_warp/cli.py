@@ -40,7 +40,9 @@ def main(arguments: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
         chosen = parser(arguments).parse_args(arguments)
-        return chosen.command(chosen)
+        code = chosen.command(chosen)
+        sys.stdout.flush()  # here, where a closed pipe is expected
+        return code
     except BrokenPipeError:  # whoever read the output has left, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return UNREAD
