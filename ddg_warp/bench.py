@@ -4,7 +4,6 @@ A scene takes part by `benchmark() -> Study`. Times are of this machine and this
 ratio, so that every row also gives its time relative to the first of the same run, and never without its error.
 """
 
-import csv
 import itertools
 import time
 from collections.abc import Callable, Mapping
@@ -67,7 +66,7 @@ def benchmark(name: str, out: str | Path, *, device: str | None = None, precisio
     Raises:
         InputError: The scene has no benchmark.
     """
-    from ddg_warp.summary import machine, plain, table, write_json
+    from ddg_warp.summary import machine, table, write_table
 
     module = load_scene(name)
     if not hasattr(module, "benchmark"):
@@ -76,14 +75,7 @@ def benchmark(name: str, out: str | Path, *, device: str | None = None, precisio
     rows = measure(module, study, device=device, precision=precision)
     stem = Path(out) / scene_name(name)
     command = f"ddg-warp bench {name}"
-    write_json(
-        stem.with_suffix(".json"),
-        {"scene": name, "command": command, "machine": machine(), "fixed": study.fixed, "rows": rows},
-    )
-    with open(stem.with_suffix(".csv"), "w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(plain(rows))
+    write_table(stem, rows, {"scene": name, "command": command, "machine": machine(), "fixed": study.fixed})
     plot(study, rows, stem.with_suffix(".png"), name)
     print(table(best(study, rows)))
     return not any(row["failure"] for row in rows)

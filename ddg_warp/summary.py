@@ -1,5 +1,6 @@
 """What a run says at its end: summary.json, and the same in a few lines on the terminal."""
 
+import csv
 import json
 import math
 import os
@@ -44,6 +45,15 @@ def write_json(path: str | Path, content) -> None:
     partial.replace(path)
 
 
+def write_table(stem: Path, rows: list[Mapping], origin: Mapping) -> None:
+    """Rows as STEM.csv, and with where they come from as STEM.json."""
+    write_json(stem.with_suffix(".json"), {**origin, "rows": rows})
+    with open(stem.with_suffix(".csv"), "w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(plain(rows))
+
+
 def plain(value):
     """A value made of what JSON knows."""
     if isinstance(value, Mapping):
@@ -85,8 +95,8 @@ def checks_table(checks: Iterable) -> str:
     )
 
 
-def machine() -> dict:
-    """Where results are made: versions, processor, devices and the git commit, as far as they can be known."""
+def machine(commit: str = "") -> dict:
+    """Where results are made: versions, processor, devices and the git commit (or that given), as far as they can be known."""
     import warp as wp
 
     return {
@@ -96,7 +106,7 @@ def machine() -> dict:
         "processor": _processor(),
         "cores": os.cpu_count(),
         "devices": [f"{device.alias}: {device.name}" for device in wp.get_devices()],
-        "commit": _commit(),
+        "commit": commit or _commit(),
     }
 
 

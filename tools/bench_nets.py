@@ -6,7 +6,6 @@ Prints a table; writes nets_DEVICE.csv and .json. On the CPU the clock is that o
 """
 
 import argparse
-import csv
 import sys
 import time
 from pathlib import Path
@@ -16,7 +15,7 @@ import warp as wp
 
 import ddg_warp as ddg
 from ddg_warp.scenes import gridshell_dome, parachute
-from ddg_warp.summary import machine, plain, table, write_json
+from ddg_warp.summary import machine, table, write_table
 
 STEEL = ddg.Material(young=2.1e11, poisson=0.3, density=7850.0)
 DT = 1.0 / 60.0
@@ -122,15 +121,9 @@ def main() -> int:
         for linear in LINEAR:
             rows.append(measure(name, edges, scene, linear, device, chosen.steps))
             print(table(rows[-1:]), file=sys.stderr, flush=True)
-    origin = machine()
-    origin["commit"] = chosen.commit or origin["commit"]
     stem = chosen.out / f"nets_{'cuda' if device.is_cuda else 'cpu'}"
     command = " ".join(["python", "tools/bench_nets.py", *sys.argv[1:]])
-    write_json(stem.with_suffix(".json"), {"command": command, "device": str(device), "machine": origin, "rows": rows})
-    with open(stem.with_suffix(".csv"), "w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(plain(rows))
+    write_table(stem, rows, {"command": command, "device": str(device), "machine": machine(chosen.commit)})
     print(table(rows))
     return 0
 

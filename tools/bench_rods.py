@@ -10,7 +10,6 @@ for the device. The CPU's clock is that of this process, which others on the mac
 """
 
 import argparse
-import csv
 import gc
 import sys
 import time
@@ -23,7 +22,7 @@ import warp as wp
 
 import ddg_warp as ddg
 from ddg_warp.report import bytes_per_node
-from ddg_warp.summary import machine, plain, table, write_json
+from ddg_warp.summary import machine, table, write_table
 
 EXACT_RTOL = 1e-12  # of the reference, which rounding ends
 DEVIATION = 1e-5  # largest error of a node [m per m of rod]
@@ -307,14 +306,9 @@ def plot(rows: list[dict], path: Path, title: str) -> None:
 
 def write(rows: list[dict], stem: Path, device, commit: str) -> None:
     """The rows as CSV and, with where they come from, as JSON; a plot if there is growth to show."""
-    origin = machine()
-    origin["commit"] = commit or origin["commit"]
     command = " ".join(["python", "tools/bench_rods.py", *sys.argv[1:]])
-    write_json(stem.with_suffix(".json"), {"command": command, "device": str(device), "machine": origin, "rows": rows})
-    with open(stem.with_suffix(".csv"), "w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(plain(rows))
+    origin = machine(commit)
+    write_table(stem, rows, {"command": command, "device": str(device), "machine": origin})
     if any(row["study"] in ("rods", "nodes") for row in rows):
         plot(rows, stem.with_suffix(".png"), origin["processor"] if not device.is_cuda else device.name)
 

@@ -8,7 +8,6 @@ the CPU the clock is that of this process. The floor counts what a part must rea
 """
 
 import argparse
-import csv
 import sys
 import time
 from pathlib import Path
@@ -20,7 +19,7 @@ import ddg_warp as ddg
 from ddg_warp import arrays, meshes
 from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
 from ddg_warp.net_newton import PRECONDITIONERS
-from ddg_warp.summary import machine, plain, table, write_json
+from ddg_warp.summary import machine, table, write_table
 
 BANDWIDTH = 4.8e12  # of an H200 [bytes/s]
 SIZES = {"hinge": (32, 70, 223, 707), "midedge": (32, 70, 223, 707), "midedge_dof": (32, 70, 223, 707)}
@@ -199,15 +198,9 @@ def main() -> int:
     wp.config.quiet = True
     device = wp.get_device(chosen.device)
     rows = equilibria(chosen, device) if chosen.statics else steps(chosen, device)
-    origin = machine()
-    origin["commit"] = chosen.commit or origin["commit"]
     stem = chosen.out / f"{'statics' if chosen.statics else 'sheets'}_{'cuda' if device.is_cuda else 'cpu'}"
     command = " ".join(["python", "tools/bench_sheets.py", *sys.argv[1:]])
-    write_json(stem.with_suffix(".json"), {"command": command, "device": str(device), "machine": origin, "rows": rows})
-    with open(stem.with_suffix(".csv"), "w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(plain(rows))
+    write_table(stem, rows, {"command": command, "device": str(device), "machine": machine(chosen.commit)})
     print(table(rows))
     return 0
 

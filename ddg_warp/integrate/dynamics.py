@@ -1,12 +1,11 @@
 """Time integration: implicit Euler and the implicit midpoint rule, with retry, on the device."""
 
-import gc
-
 import numpy as np
 import warp as wp
 
 from ddg_warp import arrays, geometry
 from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.graphs import Graphs
 from ddg_warp.integrate.net_step import NetStep
 from ddg_warp.integrate.prescribed import PrescribedMotion, TimedLoads
 from ddg_warp.kernels import element, outcome, step
@@ -81,7 +80,7 @@ class Integrator:
         self._chains = [_ChainStep(self, model, group) for group in model.groups]
         self._net = NetStep(self, model) if model.net is not None else None
         self._buffers = [model.empty_state(), model.empty_state()]
-        self._graphs, self._version = {}, model.version
+        self._graphs = Graphs(model, self._load_modules)
         self._steps_since_check = 0
         self._dt = wp.zeros(model.worlds, dtype=model.types.real, device=model.wp_device)
         self._dt_host = None
@@ -104,7 +103,7 @@ class Integrator:
         start = self._buffers[source].time
         for part in self._parts:
             part.prescribe(start, start + dt)
-        self._launch(source)
+        self._graphs.replay(source, lambda: self._launch(source))
         target.time = start + dt
         self._steps_since_check += 1
         if self._steps_since_check >= self.check_every:
@@ -167,27 +166,16 @@ class Integrator:
         return 0
 
     def _launch(self, source: int) -> None:
-        """Replay the captured step from one buffer to the other; the first time, run it (which compiles) and capture it."""
-        if self.model.version != self._version:
-            self._graphs.clear()
-            self._version = self.model.version
-        if source in self._graphs:
-            wp.capture_launch(self._graphs[source])
-            return
-        if not self._graphs:
-            for part in self._parts:
-                part.load_modules()
-        gc.disable()  # a collection while capturing would free arrays into the graph
-        try:
-            with wp.ScopedCapture(device=self.model.wp_device, force_module_load=False) as capture:
-                for chain in self._chains:
-                    chain.step(self._buffers[source].groups[chain.index], self._buffers[1 - source].groups[chain.index])
-                if self._net is not None:
-                    self._net.step(self._buffers[source].net, self._buffers[1 - source].net)
-        finally:
-            gc.enable()
-        self._graphs[source] = capture.graph
-        wp.capture_launch(capture.graph)
+        """Launches of a step of all parts from one buffer to the other."""
+        before, after = self._buffers[source], self._buffers[1 - source]
+        for chain in self._chains:
+            chain.step(before.groups[chain.index], after.groups[chain.index])
+        if self._net is not None:
+            self._net.step(before.net, after.net)
+
+    def _load_modules(self) -> None:
+        for part in self._parts:
+            part.load_modules()
 
 
 def _newton(model, group, integrator: Integrator, precision) -> ChainNewton:

@@ -29,9 +29,7 @@ def newton(solver, state: State, before: float, at: float) -> State | None:
     """
     tangent = solver.tangent
     free = np.flatnonzero(tangent.free)
-    moved = state.copy()
-    tangent.move_supports(moved, before, at)
-    jump = tangent.dofs(moved) - tangent.dofs(state)
+    jump = tangent.support_step(state, before, at)
     q, gradient, stress = tangent.dofs(state), tangent.gradient(state), None
     first = solver.first_scale(tangent.loads(at, q), gradient)
     if np.abs((tangent.loads(before, q) - gradient)[free]).max(initial=0.0) > UNBALANCED * first:

@@ -6,14 +6,12 @@ matrix, which costs iterations and no accuracy. No pivot is seen, so that a sadd
 minimum: `ddg_warp.stability` tells.
 """
 
-import gc
-from collections.abc import Callable
-
 import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SolverError
+from ddg_warp.graphs import Graphs
 from ddg_warp.integrate.net_prescribed import NetLoads
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.net import newton
@@ -114,7 +112,7 @@ class NetEquilibrium:
         )
         self._start = model.net.empty()  # lagged data of a solve
         self._step = wp.zeros(self.newton.all, dtype=self.newton.right.dtype, device=model.wp_device)
-        self._graphs, self._version = {}, None
+        self._graphs = Graphs(model, lambda: arrays.load_kernels(self.newton.kernels, model.wp_device))
 
     def pcg_iterations(self) -> int:
         """Iterations of conjugate gradients so far, without those that let the free dofs follow supports."""
@@ -126,7 +124,7 @@ class NetEquilibrium:
         self._step.assign(step.reshape(-1, 3))
         self.newton.wanted.fill_(1)
         self.newton.forcing.fill_(FORCING)
-        self._replay("follow", lambda: self.newton.follow(self._start, self._step))
+        self._graphs.replay("follow", lambda: self.newton.follow(self._start, self._step))
         direction = self.newton.direction.numpy().astype(np.float64).ravel()
         return direction if np.isfinite(direction).all() else None
 
@@ -140,7 +138,7 @@ class NetEquilibrium:
         again = self.net.edges or self.model.motions  # what is found is judged by its own frames and forces on supports
         for _ in range(2 if again else 1):
             self._begin(state, at)
-            self._replay("solve", lambda: self.newton.solve(self._start))
+            self._graphs.replay("solve", lambda: self.newton.solve(self._start))
             owner.iterations += int(self.newton.iteration.numpy().sum())
             wp.copy(state.net.q, self.newton.q)
             self.model.carry_frames(state)
@@ -169,20 +167,3 @@ class NetEquilibrium:
         """For each world, values (size,) that are zero in all others."""
         worlds = self.model.worlds
         return (np.eye(worlds)[:, :, None] * values.reshape(1, worlds, -1)).reshape(worlds, -1)
-
-    def _replay(self, name: str, launch: Callable) -> None:
-        """Launch what is captured under a name; at first, and where the model has changed since, capture it."""
-        device = self.model.wp_device
-        if self.model.version != self._version:
-            self._graphs.clear()
-            self._version = self.model.version
-        if name not in self._graphs:
-            arrays.load_kernels(self.newton.kernels, device)
-            gc.disable()  # a collection while capturing would free arrays into the graph
-            try:
-                with wp.ScopedCapture(device=device, force_module_load=False) as capture:
-                    launch()
-            finally:
-                gc.enable()
-            self._graphs[name] = capture.graph
-        wp.capture_launch(self._graphs[name])

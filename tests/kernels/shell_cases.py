@@ -288,3 +288,18 @@ class Surface:
         self.edge_triangles[self.triangle_edges, side] = np.arange(len(self.triangles))[:, None]
         self.edge_opposite[self.triangle_edges, side] = self.triangles
         self.boundary = (self.edge_triangles < 0).any(1)
+
+
+def differences(elements, what, device, step=1e-5):
+    """Central differences of what(evaluate) in q, last axis."""
+    columns = []
+    for i in range(elements.q.shape[1]):
+        shift = step * np.eye(elements.q.shape[1])[i]
+        ahead, back = (elements.changed(q=elements.q + side * shift).evaluate(device=device)[what] for side in (1, -1))
+        columns.append((ahead - back) / (2.0 * step))
+    return np.stack(columns, -1)
+
+
+def error(value, reference):
+    """Largest difference over the largest reference."""
+    return np.abs(value - reference).max() / np.abs(reference).max()

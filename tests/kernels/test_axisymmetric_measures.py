@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from shell_cases import TERMS, Elements
+from shell_cases import TERMS, Elements, differences, error
 
 import ddg_warp as ddg
 from ddg_warp.axisymmetric import NetBand
@@ -36,19 +36,6 @@ def sample(name: str) -> Elements:
     if measure.name == "axisymmetric_rim":
         s[:, :3:2] /= np.linalg.norm(s[:, :3:2], axis=1, keepdims=True)
     return Elements(name, q, s, w, p)
-
-
-def differences(elements, what, device, step=1e-5):
-    columns = []
-    for i in range(elements.q.shape[1]):
-        shift = step * np.eye(elements.q.shape[1])[i]
-        ahead, back = (elements.changed(q=elements.q + side * shift).evaluate(device=device)[what] for side in (1, -1))
-        columns.append((ahead - back) / (2.0 * step))
-    return np.stack(columns, -1)
-
-
-def error(value, reference):
-    return np.abs(value - reference).max() / np.abs(reference).max()
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)

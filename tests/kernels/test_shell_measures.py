@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from shell_cases import Elements
+from shell_cases import Elements, differences, error
 
 from ddg_warp.kernels.terms import SHELLS
 
@@ -71,20 +71,6 @@ def turned(vectors, axes, angles):
 
 def unit(vectors):
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-
-
-def differences(elements, what, device, step=1e-5):
-    """Central differences of what(evaluate) in q, last axis."""
-    columns = []
-    for i in range(elements.q.shape[1]):
-        shift = step * np.eye(elements.q.shape[1])[i]
-        ahead, back = (elements.changed(q=elements.q + side * shift).evaluate(device=device)[what] for side in (1, -1))
-        columns.append((ahead - back) / (2.0 * step))
-    return np.stack(columns, -1)
-
-
-def error(value, reference):
-    return np.abs(value - reference).max() / np.abs(reference).max()
 
 
 def vectors_of(name, s):

@@ -1,0 +1,39 @@
+"""Launches captured once and replayed."""
+
+import gc
+from collections.abc import Callable, Hashable
+
+import warp as wp
+
+
+class Graphs:
+    """Captured launches of a model by name; made anew after the model has changed.
+
+    Args:
+        load: compiles and loads every kernel, which a capture can not.
+    """
+
+    def __init__(self, model, load: Callable[[], None]):
+        self._model, self._load = model, load
+        self._graphs, self._version = {}, model.version
+
+    def clear(self) -> None:
+        """Forget what was captured."""
+        self._graphs.clear()
+
+    def replay(self, name: Hashable, launch: Callable[[], None]) -> None:
+        """Launch what is captured under a name; at first, and where the model has changed since, capture it."""
+        if self._model.version != self._version:
+            self.clear()
+            self._version = self._model.version
+        if name not in self._graphs:
+            if not self._graphs:
+                self._load()
+            gc.disable()  # a collection while capturing would free arrays into the graph
+            try:
+                with wp.ScopedCapture(device=self._model.wp_device, force_module_load=False) as capture:
+                    launch()
+            finally:
+                gc.enable()
+            self._graphs[name] = capture.graph
+        wp.capture_launch(self._graphs[name])

@@ -1,0 +1,36 @@
+"""What the hard cases of rods and of nets share: a run of which nothing that failed was called done."""
+
+import numpy as np
+
+import ddg_warp as ddg
+
+
+def attempt(scene, device, dt, count, names, start=None, precision="float64", may_fail=False, **options):
+    """Take steps from the rest state, or from points `start`, and check what holds for every run.
+
+    Returns:
+        Model, last state, total energy after every step with the start first [J], statistics, and the error that ended the run or
+        None; its message has the outcome and all of `names`.
+    """
+    model = scene.build(device, precision)
+    state, integrator, error = model.state(points=start), ddg.Integrator(model, check_every=1, **options), None
+    energy = [sum(model.energies(state).values())]
+    for _ in range(count):
+        try:
+            state = integrator.step(state, dt)
+        except ddg.SolverError as raised:
+            assert may_fail, raised
+            error, state = raised, raised.state
+            break
+        assert np.isfinite(state.points()).all()
+        energy.append(sum(model.energies(state).values()))
+    statistics = integrator.statistics()
+    failed = {k: v for k, v in statistics["outcomes"].items() if k not in ("converged", "converged_to_rounding")}
+    assert sum(failed.values()) == statistics["retries"]  # no attempt that failed was called done
+    assert np.isfinite(state.points()).all()
+    assert np.isfinite(state.velocities()).all()
+    if error:
+        assert error.outcome in failed
+        for word in (error.outcome, *names):
+            assert word in str(error)
+    return model, state, np.array(energy), statistics, error
