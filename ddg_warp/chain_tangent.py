@@ -34,11 +34,12 @@ class ChainTangent:
         return state.groups[self.model.groups.index(self.group)]
 
     def energies(self, state):
-        """(term's name, energies of its elements)."""
+        """(term's name, energies of its elements (worlds, elements))."""
         for i, term in enumerate(self.group.kind.terms):
             self._energies.zero_()
             self._launch(state, i, 0, self._energies)
-            yield term.name.removesuffix("_damped"), arrays.download(self._energies).ravel()
+            values = arrays.download(self._energies).astype(np.float64)
+            yield term.name.removesuffix("_damped"), values.T.reshape(self.group.worlds, -1)
 
     def gradient(self, state) -> np.ndarray:
         result = np.zeros(self.size)

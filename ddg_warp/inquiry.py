@@ -6,15 +6,18 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
+from ddg_warp.kernels.terms import AXISYMMETRIC, SHELLS
 from ddg_warp.tangent import Tangent
+
+TWIST = 2  # place of the twist among the strains of rod vertices and of the half cells beside joints
 
 
 @dataclass(frozen=True)
 class Reaction:
-    """What one support exerts on the rods it holds.
+    """What one support exerts on all that it holds together; supports given one by one have one each.
 
     Attributes:
-        force: (3,) [N]; moment: (3,) about `point` [N m].
+        force: (3,) [N]; moment: (3,) about `point` [N m]; all three (worlds, 3) of several worlds.
     """
 
     force: np.ndarray
@@ -22,29 +25,35 @@ class Reaction:
     point: np.ndarray
 
 
-def energies(model, state) -> dict[str, float]:
-    """Energies by term [J]: elastic terms, kinetic, gravity (zero at the origin)."""
-    tangent = Tangent(model)
-    result = tangent.energy(state)
-    kinetic, potential = 0.0, 0.0
+def energies(model, state) -> dict:
+    """Energies by term [J]: elastic terms, kinetic, gravity (zero at the origin). Of several worlds arrays (worlds,)."""
+    result = Tangent(model).energy(state)
+    kinetic, potential = np.zeros(model.worlds), np.zeros(model.worlds)
     for group, data in zip(model.groups, state.groups, strict=True):
+
+        def total(values, group=group):
+            """Sums over nodes (node, column) and rods of a world."""
+            return values.sum(0).reshape(group.worlds, group.rods).sum(1)
+
         mass = np.tile(group.host.mass, (1, group.worlds))
-        x, v = arrays.download(data.x), arrays.download(data.v)
-        kinetic += 0.5 * float((mass * (v * v).sum(-1)).sum())
-        potential -= float((mass * (x @ group.gravity_host)).sum())
+        x, v = (arrays.download(array).astype(np.float64) for array in (data.x, data.v))
+        kinetic += 0.5 * total(mass * (v * v).sum(-1))
+        potential -= total(mass * (x @ group.gravity_host))
         if group.kind.twist:
             rotary = np.tile(group.host.rotary, (1, group.worlds))
-            kinetic += 0.5 * float((rotary * arrays.download(data.omega) ** 2).sum())
+            kinetic += 0.5 * total(rotary * arrays.download(data.omega).astype(np.float64) ** 2)
     if model.net is not None:
         host = model.net.host
         q, v = (array.numpy().astype(float).reshape(model.worlds, -1, 3) for array in (state.net.q, state.net.v))
-        kinetic += 0.5 * float((host.mass * v * v).sum())
-        potential -= float((host.mass[: host.nodes] * q[:, : host.nodes] * np.asarray(model.scene.gravity)).sum())
-    return result | {"kinetic": kinetic, "gravity": potential}
+        kinetic += 0.5 * (host.mass * v * v).sum((1, 2))
+        gravity = np.asarray(model.scene.gravity)
+        potential -= (host.mass[: host.nodes] * q[:, : host.nodes] * gravity).sum((1, 2))
+    every = result | {"kinetic": kinetic, "gravity": potential}
+    return {name: values if model.worlds > 1 else float(values[0]) for name, values in every.items()}
 
 
 def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
-    """Force and moment of every support of the scene for one world: those of rods in the order they were added, then of shells.
+    """Force and moment of every support of the scene: those of rods in the order they were added, then of shells, then of rings.
 
     They balance the internal forces and the loads on held dofs, and hold the normals of clamped mesh edges and of planes of
     symmetry; the inertia of a held node itself is left out, which a moving support would have to add. Of a ring, x is the radial
@@ -58,30 +67,41 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     q = tangent.dofs(state)
     force = np.where(tangent.free, 0.0, tangent.gradient(state) - tangent.loads(factor, q))
     net = model.net.host.held if model.net is not None else []
-    normals = slice(len(model.scene.supports), len(model.scene.supports) + len(model.scene.shell_supports))
-    turns = np.zeros((max(len(model.held), len(net)), 3))
+    count, shells = max(len(model.held), len(net)), len(model.scene.shell_supports)
+    turns = np.zeros((model.worlds, count, 3))
     if net:
-        turns[normals] = _normal_moments(tangent.parts[-1], state)
+        first = len(model.scene.supports)
+        turns[:, first : first + shells] = _normal_moments(tangent.parts[-1], state)
     result = []
-    for i in range(max(len(model.held), len(net))):
-        places = [*_chain_places(tangent, q, force, model.held[i] if i < len(model.held) else [])]
-        if net:
-            places += _net_places(tangent.parts[-1], q, force, net[i])
-        about = places[0][0] if point is None and places else np.zeros(3) if point is None else np.asarray(point, float)
-        total = sum((push for _, push, _ in places), np.zeros(3))
-        moment = sum((np.cross(here - about, push) + twist for here, push, twist in places), turns[i])
-        result.append(Reaction(total, moment, about))
+    for i in range(count):
+        worlds = []
+        for world in range(model.worlds):
+            places = [*_chain_places(tangent, q, force, model.held[i] if i < len(model.held) else [], world)]
+            if net:
+                places += _net_places(tangent.parts[-1], q, force, net[i], world)
+            about = (
+                places[0][0] if point is None and places else np.zeros(3) if point is None else np.asarray(point, float)
+            )
+            total = sum((push for _, push, _ in places), np.zeros(3))
+            moment = sum((np.cross(here - about, push) + twist for here, push, twist in places), turns[world, i])
+            worlds.append((total, moment, about))
+        result.append(Reaction(*(_each_world(np.array(values)) for values in zip(*worlds, strict=True))))
     return result
 
 
-def _chain_places(tangent, q: np.ndarray, force: np.ndarray, support):
-    """(place, force, moment) of the nodes and edges of chains that a support holds."""
+def _each_world(values: np.ndarray) -> np.ndarray:
+    """Values (worlds, ...) as they are given out: without their first axis of one world."""
+    return values[0] if len(values) == 1 else values
+
+
+def _chain_places(tangent, q: np.ndarray, force: np.ndarray, support, world: int):
+    """(place, force, moment) of the nodes and edges of chains that a support holds in a world."""
     for held in support:
         part = tangent.parts[held.group]
         kind = part.group.kind
         axes = [0, 2] if kind.dim == 2 else [0, 1, 2]
         x, f = (part.blocks(tangent.of(part, values))[..., : kind.block] for values in (q, force))
-        for node, column in zip(held.k, held.columns, strict=True):
+        for node, column in zip(held.k, held.columns + world * part.group.rods, strict=True):
             here, push, twist = np.zeros(3), np.zeros(3), np.zeros(3)
             here[axes] = x[column, node, : kind.dim]
             if not held.components and kind.twist:
@@ -92,10 +112,10 @@ def _chain_places(tangent, q: np.ndarray, force: np.ndarray, support):
             yield here, push, twist
 
 
-def _net_places(part, q: np.ndarray, force: np.ndarray, held) -> list[tuple]:
-    """(place, force, moment) of the blocks of the net that a support holds, in the first world."""
+def _net_places(part, q: np.ndarray, force: np.ndarray, held, world: int) -> list[tuple]:
+    """(place, force, moment) of the blocks of the net that a support holds in a world."""
     host, places = part.host, []
-    x, f = (Tangent.of(part, values).reshape(-1, 3) for values in (q, force))
+    x, f = (Tangent.of(part, values).reshape(part.net.worlds, -1, 3)[world] for values in (q, force))
     for block, component in zip(held.blocks, held.components, strict=True):
         if block < host.nodes:
             places.append((x[block], f[block] * np.eye(3)[component], np.zeros(3)))
@@ -106,58 +126,78 @@ def _net_places(part, q: np.ndarray, force: np.ndarray, held) -> list[tuple]:
 
 
 def _normal_moments(part, state) -> np.ndarray:
-    """Moments that the shell supports exert by the normals they give (supports, 3), in the first world.
+    """Moments that the shell supports exert by the normals they give (worlds, supports, 3).
 
     An element's energy does not change if its nodes and these normals turn together: the moment of the normals is minus that of
     the forces on its nodes. Where several supports share an element, each has the part along its own edge.
     """
-    result, x = np.zeros((len(part.model.scene.shell_supports), 3)), part.dofs(state).reshape(-1, 3)
+    worlds, count = part.net.worlds, len(part.model.scene.shell_supports)
+    result, x = np.zeros((worlds, count, 3)), part.dofs(state).reshape(worlds, -1, 3)
     for index, device in enumerate(part.net.sets):
         host, measure = device.host, device.term.measure
-        element, row, support = host.normals[:, host.normals[2] < len(result)]
+        element, row, support = host.normals[:, host.normals[2] < count]
         if not element.size:
             continue
-        corners = x[host.slots[: measure.nodes]]
-        forces = part.forces(state, index)[: measure.nodes, : len(host)]
-        moments = -np.cross(corners, forces).sum(0)
-        least, most = np.full(len(host), len(result)), np.full(len(host), -1)
+        least, most = np.full(len(host), count), np.full(len(host), -1)
         np.minimum.at(least, element, support)
         np.maximum.at(most, element, support)
         alone = least == most
-        np.add.at(result, least[alone], moments[alone])
-        for e in np.flatnonzero(least < most):
-            own = element == e
-            corner = (row[own] - 3) // 3  # opposite to the edge
-            edges = corners[(corner + 2) % 3, e] - corners[(corner + 1) % 3, e]
-            shares = edges * np.linalg.lstsq(edges.T, moments[e], rcond=None)[0][:, None]
-            np.add.at(result, support[own], shares)
+        forces = part.forces(state, index)[: measure.nodes].reshape(measure.nodes, worlds, len(host), 3)
+        for world in range(worlds):
+            corners = x[world, host.slots[: measure.nodes]]
+            moments = -np.cross(corners, forces[:, world]).sum(0)
+            np.add.at(result[world], least[alone], moments[alone])
+            for e in np.flatnonzero(least < most):
+                own = element == e
+                corner = (row[own] - 3) // 3  # opposite to the edge
+                edges = corners[(corner + 2) % 3, e] - corners[(corner + 1) % 3, e]
+                shares = edges * np.linalg.lstsq(edges.T, moments[e], rcond=None)[0][:, None]
+                np.add.at(result[world], support[own], shares)
     return result
 
 
 def stresses(model, state) -> dict[str, list[np.ndarray]]:
-    """Conjugate stresses of every rod and shell by term (elements, strains), in one world.
+    """Conjugate stresses of every rod and shell by term (elements, strains); of several worlds (worlds, elements, strains).
 
     Of rods: axial force [N] of edges, moments [N m] of vertices; those of clamped ends are included, at the place of the end
     node, and those beside rigid joints are in "rigid_joint". Of shells: forces per length [N/m] ("shell_stretch") and moments per
     length [N] ("shell_bend", "shell_bend_dof") of triangles, components (11, 22, 12) along the first edge at rest and across it,
     second Piola and Kirchhoff's; a moment is positive where it raises the second fundamental form. Hinges have moments per
-    their weight. What a rod or shell has not is None.
+    their weight. Of shells of revolution: the same along and around (11, 22, 12), forces of edges ("axisymmetric_stretch"),
+    moments of inner nodes ("axisymmetric_bend") and of both ends ("axisymmetric_rim"). What a rod or shell has not is None.
     """
     result: dict[str, list] = {}
     for group, data in zip(model.groups, state.groups, strict=True):
-        shape = (group.kind.strain_rows, group.nodes, group.columns)
-        strain, stress = (arrays.allocate(shape, model.types.real, model.wp_device) for _ in range(2))
-        model.strains(group, data, strain, stress)
-        values = arrays.download(stress)
+        values = _group_strains(model, group, data)[1]
         for term, place in zip(group.kind.terms, group.kind.places(), strict=True):
             rows = slice(place[3], place[3] + len(term.measure.strains))
             missing = 0 if group.kind.closed else term.measure.span
             rods = result.setdefault(term.name.removesuffix("_damped"), [None] * model.scene.rod_count)
             for column, rod in enumerate(group.host.rods):
-                rods[rod] = values[rows, : group.host.count[column] - missing, column].T
+                of_rod = values[rows, : group.host.count[column] - missing, :, column]
+                rods[rod] = _each_world(np.moveaxis(of_rod, (2, 1), (0, 1)))
     for index in range(len(model.net.sets) if model.net is not None else 0):
         _add_net_stresses(model, state, index, result)
     return result
+
+
+def _group_strains(model, group, data) -> tuple[np.ndarray, np.ndarray]:
+    """Strains and stresses of a group's elements (strains, nodes, worlds, rods)."""
+    shape = (group.kind.strain_rows, group.nodes, group.columns)
+    strain, stress = (arrays.allocate(shape, model.types.real, model.wp_device) for _ in range(2))
+    model.strains(group, data, strain, stress)
+    split = (*shape[:2], group.worlds, group.rods)
+    return arrays.download(strain).reshape(split), arrays.download(stress).reshape(split)
+
+
+def _net_strains(net, state, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Strains and stresses of a set of the net (strains, worlds, elements)."""
+    part = net.sets[index]
+    shape = (len(part.term.measure.strains), net.worlds * part.elements)
+    strain, stress = (wp.zeros(shape, dtype=net.real, device=net.device) for _ in range(2))
+    net.strains(state.net, index, strain, stress)
+    split = (shape[0], net.worlds, part.elements)
+    return strain.numpy().astype(float).reshape(split), stress.numpy().astype(float).reshape(split)
 
 
 def triangle_fields(model, state) -> dict[str, np.ndarray]:
@@ -174,9 +214,7 @@ def triangle_fields(model, state) -> dict[str, np.ndarray]:
         if not (part.term.name.startswith("shell") and part.term.density.coupled):
             continue
         E, W = part.elements, net.worlds
-        strain, stress = (wp.zeros((3, W * E), dtype=net.real, device=net.device) for _ in range(2))
-        net.strains(state.net, index, strain, stress)
-        values, slope = (array.numpy().astype(float).reshape(3, W, E) for array in (strain, stress))
+        values, slope = _net_strains(net, state, index)
         change = np.moveaxis(values - np.stack([np.broadcast_to(p, (W, E)) for p in part.parameters[6:9]]), 0, -1)
         metric = [np.broadcast_to(p, (W, E)).ravel() for p in part.parameters[3:6]]
         principal = _principal(change.reshape(-1, 3), metric).reshape(W, E)
@@ -198,19 +236,19 @@ def _principal(covariant: np.ndarray, metric) -> np.ndarray:
 
 def _add_net_stresses(model, state, index: int, result: dict[str, list]) -> None:
     """Stresses of a set of the net, rod by rod or shell by shell."""
-    net, part = model.net, model.net.sets[index]
+    net, part, scene = model.net, model.net.sets[index], model.scene
     term, E = part.term, part.elements
-    shape = (len(term.measure.strains), E * net.worlds)
-    strain, stress = (wp.zeros(shape, dtype=net.real, device=net.device) for _ in range(2))
-    net.strains(state.net, index, strain, stress)
-    values = stress.numpy()[:, :E].T.astype(float)
+    values = np.moveaxis(_net_strains(net, state, index)[1], 0, -1)
     if term.density.coupled:
-        values = _resultants(values, [np.broadcast_to(p[0], E) for p in part.parameters[3:6]])
-    of_shell = term.name.startswith("shell")
-    count = len(model.scene.shells) if of_shell else model.scene.rod_count
+        metric = [np.broadcast_to(p, (net.worlds, E)).ravel() for p in part.parameters[3:6]]
+        values = _resultants(values.reshape(-1, values.shape[-1]), metric).reshape(values.shape)
+    of_shells = (
+        scene.shells if term.name in SHELLS else scene.axisymmetric_shells if term.name in AXISYMMETRIC else None
+    )
+    count = scene.rod_count if of_shells is None else len(of_shells)
     owners = result.setdefault(term.name.removesuffix("_damped"), [None] * count)
     for owner in np.unique(part.host.owner[0]):
-        owners[owner] = values[part.host.owner[0] == owner]
+        owners[owner] = _each_world(values[:, part.host.owner[0] == owner])
 
 
 def _resultants(slope: np.ndarray, metric) -> np.ndarray:
@@ -243,22 +281,35 @@ def writhe(points: np.ndarray) -> float:
     return float((sign * solid).sum() / (2.0 * np.pi))
 
 
-def total_twist(model, state, rod: int = 0) -> float:
+def total_twist(model, state, rod: int = 0) -> float | np.ndarray:
     """Turns of a rod's directors about its centreline: the sum of the angles between neighbours, after parallel transport.
 
     Full turns between neighbours count as they were wound. Of a closed rod, this plus `writhe` is the link of its centreline and
-    a first director's edge, a whole number (Calugareanu, White, Fuller), exactly so for polygons.
+    a first director's edge, a whole number (Calugareanu, White, Fuller), exactly so for polygons. The half cells beside a rigid
+    joint count with the rod they belong to. Of several worlds an array (worlds,).
+
+    Raises:
+        ValueError: there is no such rod, or it has no twist.
     """
+    if not 0 <= rod < model.scene.rod_count:
+        raise ValueError(f"rod {rod} does not exist; the scene has {model.scene.rod_count}")
+    turns, found = np.zeros(model.worlds), False
     for group, data in zip(model.groups, state.groups, strict=True):
-        column = np.flatnonzero(group.host.rods == rod)
+        (column,) = np.nonzero(group.host.rods == rod)
         if column.size and group.kind.twist:
-            shape = (group.kind.strain_rows, group.nodes, group.columns)
-            strain = arrays.allocate(shape, model.types.real, model.wp_device)
-            model.strains(group, data, strain)
-            index = next(i for i, term in enumerate(group.kind.terms) if term.measure.angles)
+            index, column = next(i for i, term in enumerate(group.kind.terms) if term.measure.angles), column[0]
             parameter, _, _, row = group.kind.places()[index]
-            values = arrays.download(strain)[row + 2, :, column[0]]
-            weight = np.broadcast_to(group.parameter(parameter), (group.nodes, group.columns))[:, column[0]]
-            vertices = group.host.count[column[0]] - (0 if group.kind.closed else 2)
-            return float((values * weight)[:vertices].sum() / (2.0 * np.pi))
-    raise ValueError(f"rod {rod} has no twist")
+            values = _group_strains(model, group, data)[0][row + TWIST, :, :, column]
+            weight = np.broadcast_to(group.parameter(parameter), (group.nodes, group.columns))[:, column :: group.rods]
+            vertices = group.host.count[column] - (0 if group.kind.closed else 2)
+            turns += (values * weight)[:vertices].sum(0)
+            found = True
+    for index, part in enumerate(model.net.sets if model.net is not None else ()):
+        of_rod = part.host.owner[0] == rod
+        if part.term.measure.angles and part.term.name not in SHELLS and of_rod.any():
+            weight = np.broadcast_to(part.parameters[0], (model.worlds, part.elements))
+            turns += (_net_strains(model.net, state, index)[0][TWIST] * weight)[:, of_rod].sum(1)
+            found = True
+    if not found or model.scene.dimension == 2:
+        raise ValueError(f"rod {rod} has no twist")
+    return turns / (2.0 * np.pi) if model.worlds > 1 else float(turns[0] / (2.0 * np.pi))

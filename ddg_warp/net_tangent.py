@@ -42,11 +42,12 @@ class NetTangent:
         return list(zip(local, places, strict=True)), rows, np.searchsorted(columns, np.arange(self.size + 1))
 
     def energies(self, state):
-        """(term's name, energies of its elements)."""
+        """(term's name, energies of its elements (worlds, elements))."""
         for i, part in enumerate(self.net.sets):
             out = wp.zeros(part.elements * self.net.worlds, dtype=self.net.real, device=self.net.device)
             self._launch(state, i, 0, out, ())
-            yield part.term.name.removesuffix("_damped"), out.numpy().astype(np.float64)
+            values = out.numpy().astype(np.float64)
+            yield part.term.name.removesuffix("_damped"), values.reshape(self.net.worlds, -1)
 
     def gradient(self, state) -> np.ndarray:
         result = np.zeros((self.size // 3, 3))

@@ -37,17 +37,17 @@ class Tangent:
             np.concatenate([getattr(part, name) for part in self.parts]) for name in ("free", "angle", "mass")
         )
 
-    def energy(self, state) -> dict[str, float]:
-        """Elastic energy of every term [J]."""
+    def energy(self, state) -> dict[str, np.ndarray]:
+        """Elastic energy of every term (worlds,) [J]."""
         result = {}
         for part in self.parts:
             for name, values in part.energies(state):
-                result[name] = result.get(name, 0.0) + float(values.sum())
+                result[name] = result.get(name, 0.0) + values.sum(1)
         return result
 
     def element_energies(self, state) -> np.ndarray:
         """Elastic energies of all elements [J], for differences free of cancellation."""
-        return np.concatenate([values for part in self.parts for _, values in part.energies(state)])
+        return np.concatenate([values.ravel() for part in self.parts for _, values in part.energies(state)])
 
     def gradient(self, state) -> np.ndarray:
         """Derivative of the elastic energy (size,) [N, N m]; minus the internal force."""
