@@ -120,7 +120,7 @@ def compile_chains(scene: Scene) -> tuple[list[ChainGroup], list[list[Held]]]:
         raise SceneError(
             "the scene has no rods and no shells; add some with scene.add_rods(points, section=..., material=...)"
         )
-    ghosts, joined = ghost_nodes(scene), net_rods(scene)
+    ghosts, joined = Ghosts(scene), net_rods(scene)
     pieces = [piece for batch in scene.batches for piece in pieces_of(scene, batch, ghosts, ~joined)]
     pieces.sort(key=lambda piece: (repr(piece.kind), piece.x.shape[1]))
     groups: list[list[Piece]] = []
@@ -143,13 +143,37 @@ def compile_chains(scene: Scene) -> tuple[list[ChainGroup], list[list[Held]]]:
     return chains, held
 
 
-def ghost_nodes(scene: Scene) -> np.ndarray:
-    """Ghost nodes of every rod at its first and last node (R, 2), 0 or 1."""
-    ghosts = np.zeros((scene.rod_count, 2), int)
-    for support in scene.supports:
-        if support.end:
-            ghosts[support.rods, 0 if support.end == "first" else 1] = 1
-    return ghosts
+class Ghosts:
+    """Ghost nodes outside the ends of a scene's rods.
+
+    Attributes:
+        count: at the first and last node of every rod (R, 2), 0 or 1.
+        tangent, director: prescribed there (R, 2, 3); NaN where they are to be extrapolated.
+
+    Raises:
+        SceneError: two supports prescribe different tangents or directors of an end.
+    """
+
+    def __init__(self, scene: Scene):
+        self.count = np.zeros((scene.rod_count, 2), int)
+        self.tangent, self.director = (np.full((scene.rod_count, 2, 3), np.nan) for _ in range(2))
+        for support in scene.supports:
+            if not support.end:
+                continue
+            end = 0 if support.end == "first" else 1
+            self.count[support.rods, end] = 1
+            for name in ("tangent", "director"):
+                given, known = getattr(support, name), getattr(self, name)
+                if given is None:
+                    continue
+                before = known[support.rods, end]
+                other = np.flatnonzero(np.abs(before - given).max(1) > 1e-12)  # nothing before is NaN, and not larger
+                if other.size:
+                    raise SceneError(
+                        f"the {support.end} end of rod {support.rods[other[0]]} is clamped twice, with a {name} "
+                        f"{before[other[0]]} and {given[other[0]]}; clamp it once"
+                    )
+                known[support.rods, end] = given
 
 
 def net_rods(scene: Scene) -> np.ndarray:
@@ -168,17 +192,17 @@ def scene_motions(scene: Scene) -> list:
     return list({id(s.motion): s.motion for s in supports if s.motion is not None}.values())
 
 
-def pieces_of(scene: Scene, batch: RodBatch, ghosts: np.ndarray, chosen: np.ndarray) -> list[Piece]:
+def pieces_of(scene: Scene, batch: RodBatch, ghosts: Ghosts, chosen: np.ndarray) -> list[Piece]:
     """The chosen rods (R,) of a batch, those with the same ghosts together."""
     check_batch(batch, scene.dimension)
     chosen = chosen[batch.first : batch.first + batch.rods]
-    flags = ghosts[batch.first : batch.first + batch.rods]
+    flags = ghosts.count[batch.first : batch.first + batch.rods]
     if batch.closed and flags.any():
         raise SceneError(f"rod {batch.first + int(np.argmax(flags.any(1)))} is closed: it has no end to clamp")
     result = []
     for pattern in np.unique(flags[chosen], axis=0):
         rows = np.flatnonzero((flags == pattern).all(1) & chosen)
-        result.append(_piece(scene.dimension, batch, rows, (int(pattern[0]), int(pattern[1]))))
+        result.append(_piece(scene.dimension, batch, rows, ghosts))
     return result
 
 
@@ -191,15 +215,16 @@ def _kind(dimension: int, batch: RodBatch) -> ChainKind:
     return ChainKind(dimension, batch.twist, batch.closed, tuple(REGISTRY[name + suffix] for name in names))
 
 
-def _piece(dimension: int, batch: RodBatch, rows: np.ndarray, ghosts: tuple[int, int]) -> Piece:
-    before, after = ghosts
+def _piece(dimension: int, batch: RodBatch, rows: np.ndarray, outside: Ghosts) -> Piece:
+    rods = batch.first + rows
+    before, after = ghosts = tuple(int(count) for count in outside.count[rods[0]])
     points = batch.points[rows]
     if dimension == 2:
         points = points * [1.0, 0.0, 1.0]
     if before:
-        points = np.concatenate([_ghost(points, 0, 1), points], axis=1)
+        points = np.concatenate([_ghost(points, 0, 1, outside.tangent[rods, 0]), points], axis=1)
     if after:
-        points = np.concatenate([points, _ghost(points, -1, -2)], axis=1)
+        points = np.concatenate([points, _ghost(points, -1, -2, outside.tangent[rods, 1])], axis=1)
     edges = geometry.edge_vectors(points, batch.closed)
     lengths = np.linalg.norm(edges, axis=-1)
     real = slice(before, lengths.shape[1] - after)
@@ -224,14 +249,20 @@ def _piece(dimension: int, batch: RodBatch, rows: np.ndarray, ghosts: tuple[int,
         mass[:, :-1] += 0.5 * line_mass
         mass[:, 1:] += 0.5 * line_mass
     given = batch.director
-    if given is not None and given.ndim == 3:
-        given = np.pad(
-            np.broadcast_to(given, (batch.rods, *given.shape[1:]))[rows], ((0, 0), (before, after), (0, 0)), "edge"
-        )
-    elif given is not None and given.ndim == 2:
-        given = given[rows]
+    if given is not None and given.ndim > 1:
+        given = np.broadcast_to(given, (batch.rods, *given.shape[1:]))[rows]
     kind = _kind(dimension, batch)
-    frames = geometry.directors(tangents, given) if kind.twist else np.zeros_like(tangents)
+    frames = np.zeros_like(tangents)
+    if kind.twist:
+        frames[:, real] = geometry.directors(tangents[:, real], given)
+        for end, neighbour in ((0, 1),) * before + ((-1, -2),) * after:
+            frames[:, end] = _end_director(end, neighbour, lengths, tangents, frames, outside.director[rods, end])
+            bad = np.flatnonzero(~np.isfinite(frames[:, end]).all(1))
+            if bad.size:
+                raise SceneError(
+                    f"rod {rods[bad[0]]} ('{batch.name}'): the director or tangent prescribed at its {'last' if end else 'first'} "
+                    "end lies along the other or points back; give a tangent along the rod and a director across it"
+                )
     twist = geometry.reference_twist(tangents, frames, batch.closed) if kind.twist else np.zeros((len(rows), 0))
     voronoi = 0.5 * sum(geometry.ahead(lengths, batch.closed))
     if before:
@@ -259,7 +290,7 @@ def _piece(dimension: int, batch: RodBatch, rows: np.ndarray, ghosts: tuple[int,
     keep = [0, 2] if dimension == 2 else [0, 1, 2]
     return Piece(
         batch,
-        batch.first + rows,
+        rods,
         ghosts,
         kind,
         points[..., keep],
@@ -273,8 +304,8 @@ def _piece(dimension: int, batch: RodBatch, rows: np.ndarray, ghosts: tuple[int,
     )
 
 
-def _ghost(points: np.ndarray, end: int, neighbour: int) -> np.ndarray:
-    """Ghost node outside the end of rods: along the tangent at the end, extrapolated from the two edges there."""
+def _ghost(points: np.ndarray, end: int, neighbour: int, given: np.ndarray) -> np.ndarray:
+    """Ghost node outside the end of rods: along the `given` tangent (R, 3), or one extrapolated from the two edges there."""
     edge = points[:, end] - points[:, neighbour]
     length = np.linalg.norm(edge, axis=-1, keepdims=True)
     tangent = edge / length
@@ -282,7 +313,27 @@ def _ghost(points: np.ndarray, end: int, neighbour: int) -> np.ndarray:
         inner = points[:, neighbour] - points[:, 2 * neighbour - end]
         inner_length = np.linalg.norm(inner, axis=-1, keepdims=True)
         tangent = geometry.unit(tangent + (tangent - inner / inner_length) * (length / (length + inner_length)))
+    outwards = given if end else -given
+    tangent = np.where(np.isnan(given), tangent, outwards)
     return (points[:, end] + tangent * length)[:, None]
+
+
+def _end_director(
+    end: int, neighbour: int, lengths: np.ndarray, tangents: np.ndarray, frames: np.ndarray, given: np.ndarray
+) -> np.ndarray:
+    """First director of the ghost edges at an end of rods (R, 3): `given`, or turning on as between the two edges inside of it.
+
+    NaN where there is none, since the tangent points back or `given` lies along it.
+    """
+    edges = [tuple(v[:, e] for v in (frames, tangents, lengths)) for e in (2 * neighbour - end, neighbour)]
+    inner, outer = tangents[:, neighbour], tangents[:, end]
+    bad = np.sum(inner * outer, -1, keepdims=True) <= -1.0 + 1e-12
+    _, turned = geometry.frames_at_nodes(*edges, 1.0, np.where(bad, inner, outer))
+    u = np.where(np.isnan(given), turned, given)
+    across = u - outer * np.sum(u * outer, -1, keepdims=True)
+    length = np.linalg.norm(across, axis=-1, keepdims=True)
+    bad |= length < 1e-9
+    return np.where(bad, np.nan, across / np.where(bad, 1.0, length))
 
 
 def _bending(section, kind: ChainKind) -> list:

@@ -51,6 +51,23 @@ def directors(tangents: np.ndarray, given: np.ndarray | None) -> np.ndarray:
     return result
 
 
+def frames_at_nodes(first: tuple, second: tuple, beyond, tangents: np.ndarray | None = None):
+    """Tangents and first directors (..., 3) at nodes of rods, on the line through those in the middles of two edges.
+
+    Args:
+        first, second: edges that meet, each as first director and tangent (..., 3) and length (...).
+        beyond: +1 at the other node of the second edge, -1 at the node between both.
+        tangents: those at the nodes, where they are known (..., 3).
+    """
+    (u0, t0, l0), (u1, t1, l1) = first, second
+    share = (beyond * l1 / (l0 + l1))[..., None]
+    if tangents is None:
+        tangents = unit(t1 + share * (t1 - t0))
+    angle = share * signed_angle(transport(u0, t0, t1), u1, t1)[..., None]
+    u = transport(u1, t1, tangents)
+    return tangents, u * np.cos(angle) + np.cross(tangents, u) * np.sin(angle)
+
+
 def ahead(values: np.ndarray, closed: bool) -> tuple[np.ndarray, np.ndarray]:
     """Values on the edges before and after every vertex."""
     return (values, np.roll(values, -1, axis=1)) if closed else (values[:, :-1], values[:, 1:])

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import arrays, end_moments
 from ddg_warp.kernels.terms import AXISYMMETRIC, SHELLS
 from ddg_warp.tangent import Tangent
 
@@ -159,8 +159,9 @@ def _normal_moments(part, state) -> np.ndarray:
 def stresses(model, state) -> dict[str, list[np.ndarray]]:
     """Conjugate stresses of every rod and shell by term (elements, strains); of several worlds (worlds, elements, strains).
 
-    Of rods: axial force [N] of edges, moments [N m] of vertices; those of clamped ends are included, at the place of the end
-    node, and those beside rigid joints are in "rigid_joint". Of shells: forces per length [N/m] ("shell_stretch") and moments per
+    Of rods: axial force [N] of edges, moments [N m] of vertices about the directors there: means of those of both edges, and at
+    clamped ends, which are included, the directors that the clamp holds. Those beside rigid joints are in "rigid_joint", about
+    the directors of the rod at the joint. Of shells: forces per length [N/m] ("shell_stretch") and moments per
     length [N] ("shell_bend", "shell_bend_dof") of triangles, components (11, 22, 12) along the first edge at rest and across it,
     second Piola and Kirchhoff's; a moment is positive where it raises the second fundamental form. Hinges have moments per
     their weight. Of shells of revolution: the same along and around (11, 22, 12), forces of edges ("axisymmetric_stretch"),
@@ -173,6 +174,8 @@ def stresses(model, state) -> dict[str, list[np.ndarray]]:
             rows = slice(place[3], place[3] + len(term.measure.strains))
             missing = 0 if group.kind.closed else term.measure.span
             rods = result.setdefault(term.name.removesuffix("_damped"), [None] * model.scene.rod_count)
+            if term.measure.angles:
+                end_moments.of_group(group, data, values[rows])
             for column, rod in enumerate(group.host.rods):
                 of_rod = values[rows, : group.host.count[column] - missing, :, column]
                 rods[rod] = _each_world(np.moveaxis(of_rod, (2, 1), (0, 1)))
@@ -238,7 +241,10 @@ def _add_net_stresses(model, state, index: int, result: dict[str, list]) -> None
     """Stresses of a set of the net, rod by rod or shell by shell."""
     net, part, scene = model.net, model.net.sets[index], model.scene
     term, E = part.term, part.elements
-    values = np.moveaxis(_net_strains(net, state, index)[1], 0, -1)
+    values = _net_strains(net, state, index)[1]
+    if term.measure.angles and term.name not in SHELLS:
+        end_moments.of_net(net, state.net, index, values)
+    values = np.moveaxis(values, 0, -1)
     if term.density.coupled:
         metric = [np.broadcast_to(p, (net.worlds, E)).ravel() for p in part.parameters[3:6]]
         values = _resultants(values.reshape(-1, values.shape[-1]), metric).reshape(values.shape)

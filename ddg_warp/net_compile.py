@@ -9,7 +9,7 @@ import numpy as np
 
 from ddg_warp import axisymmetric, net_conditions, net_elements, shell_geometry
 from ddg_warp import shells as shell_terms
-from ddg_warp.chains import Piece, ghost_nodes, net_rods, pieces_of
+from ddg_warp.chains import Ghosts, Piece, net_rods, pieces_of
 from ddg_warp.errors import SceneError
 from ddg_warp.net import Net, NetRod, NetShell
 from ddg_warp.surface import Surface
@@ -29,7 +29,7 @@ def compile_net(scene) -> Net | None:
         return None
     if scene.shells and scene.dimension == 2:
         raise SceneError("a scene with shells has dimension 3; leave dimension=2 to rods")
-    builder, ghosts, spatial = _Builder(scene), ghost_nodes(scene), spatial_scene(scene)
+    builder, ghosts, spatial = _Builder(scene), Ghosts(scene), spatial_scene(scene)
     for batch in scene.batches:
         if chosen[batch.first : batch.first + batch.rods].any():
             if scene.dimension == 2:

@@ -4,7 +4,7 @@ from collections import Counter
 
 import numpy as np
 
-from ddg_warp import axisymmetric
+from ddg_warp import axisymmetric, geometry
 from ddg_warp import shells as shell_terms
 from ddg_warp.chains import Piece
 from ddg_warp.elements import ElementSet
@@ -75,23 +75,57 @@ def _row(values: np.ndarray, row: int, count: int) -> np.ndarray:
 
 
 def _joint_sets(net: Net, joints) -> list[NetSet]:
-    """Bending and twist of the half cells between rigid joints and the edges that meet them."""
+    """Bending and twist of the half cells between rigid joints and the edges that meet them.
+
+    The joint holds each rod by the frame that the rod has at the node: between its edges there, or extrapolated at an end.
+    """
     sets = []
     for node, spin, members in joints:
         for rod, k, sign in members:
-            piece, row = rod.piece, rod.row
-            n = len(rod.all_nodes)
+            piece, row, n = rod.piece, rod.row, len(rod.all_nodes)
+            frames, tangents = piece.director[row], piece.tangent[row]
+            points = net.rest[rod.all_nodes]
+            edges = len(tangents)
+            lengths = np.linalg.norm(np.roll(points, -1, 0)[:edges] - points[:edges], axis=1)
             other = rod.all_nodes[(k + 1) % n if sign > 0 else k]
-            edge = net.rest[other] - net.rest[node]
-            length = np.linalg.norm(edge)
-            frame = net.frame[:, rod.all_edges[k] - net.nodes]
+            across = (
+                k - 1 if sign > 0 else k + 1
+            )  # the rod's edge on the other side of the node; at an end there is none
+            if piece.kind.closed:
+                across %= edges
+            inside = 0 <= across < edges
+            second = across if inside else k + (1 if sign > 0 else -1)
+            ends = [(frames[e], tangents[e], lengths[e]) for e in (second, k)]
+            tangent, director = geometry.frames_at_nodes(*ends, -1.0 if inside else 1.0)
+            half = 0.5 * lengths[k]
+            pair = [np.array([[sign * tangent, sign * tangents[k]]]), np.array([[director, frames[k]]])]
+            twist = geometry.reference_twist(*pair, False)[0, 0]
             section = piece.batch.section
             stiffness = [_edge_value(value, piece, row, k) for value in (section.EI1, section.EI2, section.GJ)]
-            lag = np.concatenate([frame[:3], edge / length, [0.0]])[:, None]
-            parameters = [np.array([0.5 * length])] + [np.array([v]) for v in (*stiffness, 0.0, 0.0, 0.0)]
+            if isinstance(piece.batch.natural, str) and piece.batch.natural == "shape":
+                rest = np.array([*(value[0, 0] for value in geometry.curvatures(*pair, False)), twist]) / half
+            else:
+                rest = _natural_at(piece, row, k if sign > 0 else k + 1) * [1.0, sign, 1.0]
+            lag = np.concatenate([director, sign * tangent, [twist]])[:, None]
+            parameters = [np.array([value]) for value in (half, *stiffness, *rest)]
             slots = np.array([[node], [other], [rod.all_edges[k]], [spin]])
             sets.append(NetSet(JOINT, slots, lag, np.array([[sign]]), parameters, np.array([[rod.rod], [k]])))
     return sets
+
+
+def _natural_at(piece: Piece, row: int, node: int) -> np.ndarray:
+    """Natural curvatures and twist of the rod's bending term at a node, at an end those of the vertex next to it [1/m]."""
+    at = 0
+    for term in piece.kind.terms:
+        names = term.parameter_names
+        if term.measure.angles:
+            values = piece.parameters[at : at + len(names)]
+            rest = [value for name, value in zip(names, values, strict=True) if name.startswith("rest")]
+            vertices = len(piece.x[row]) - (0 if piece.kind.closed else 2)
+            vertex = (node - 1) % vertices if piece.kind.closed else min(max(node - 1, 0), vertices - 1)
+            return np.array([_row(value, row, vertices)[vertex] for value in rest])
+        at += len(names)
+    raise AssertionError("a rod of a rigid joint has a bending term")
 
 
 def _edge_value(value, piece: Piece, row: int, edge: int) -> float:

@@ -75,7 +75,10 @@ class RodBatch:
 
 @dataclass(frozen=True)
 class Support:
-    """Dofs held on some rods: nodes (with components), edge angles, or an end frame (`end` is "first" or "last")."""
+    """Dofs held on some rods: nodes (with components), edge angles, or an end frame (`end` is "first" or "last").
+
+    `tangent` and `director` (rods, 3) are those of the end at rest, extrapolated from the rod where they are None.
+    """
 
     rods: np.ndarray
     nodes: tuple[int, ...] = ()
@@ -83,6 +86,8 @@ class Support:
     edges: tuple[int, ...] = ()
     end: str = ""
     motion: Motion | None = None
+    tangent: np.ndarray | None = None
+    director: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -207,14 +212,45 @@ class Scene(Structures):
         nodes = tuple(dict.fromkeys(n for e in edges for n in ((e, e + 1) if e >= 0 else (e - 1, e))))
         self._support(rods, nodes=nodes, edges=edges, motion=motion)
 
-    def clamp_end(self, rods, end: str = "first", motion: Motion | None = None, components: str = "xyz") -> None:
+    def clamp_end(
+        self,
+        rods,
+        end: str = "first",
+        motion: Motion | None = None,
+        components: str = "xyz",
+        tangent=None,
+        director=None,
+    ) -> None:
         """Hold position and frame exactly at an end node: the tangent is prescribed there and the end cell is half a cell.
 
-        `components` leaves the others free, so that a clamped end can slide along an axis of space.
+        Args:
+            rods: one rod or several.
+            end: "first" or "last".
+            motion: moves and turns the end; it stays as it is at rest without.
+            components: of the position that are held; the others are free, so that a clamped end can slide along an axis of space.
+            tangent: of the rod at the end at rest, (3,) or (rods, 3), pointing from the first node to the last; a rod whose natural
+                shape is that of its points is free of stress with it. By default extrapolated from the two edges at the end.
+            director: first material director at the end at rest, (3,) or (rods, 3), made perpendicular to the tangent; by default
+                extrapolated likewise, so that a rod whose directors turn along it goes on turning up to its end.
+
+        Raises:
+            SceneError: the end, the tangent or the director is none; the message says which.
         """
         if end not in ("first", "last"):
             raise SceneError(f"clamp_end: end is {end!r}; it is 'first' or 'last'")
-        self._support(rods, components=components, end=end, motion=motion)
+        index = self._rods(rods)
+        tangent = None if tangent is None else validate.directions("clamp_end: tangent", tangent, index)
+        director = None if director is None else validate.directions("clamp_end: director", director, index)
+        if tangent is not None and self.dimension == 2 and tangent[:, 1].any():
+            raise SceneError(
+                f"clamp_end: tangent {tangent[0]} leaves the plane of x and z that a scene of dimension 2 stays in"
+            )
+        for batch in self._batches(index) if director is not None else ():
+            if not batch.twist:
+                raise SceneError(
+                    f"clamp_end: rod {batch.first} ('{batch.name}') has no twist, and so no director; leave director out"
+                )
+        self._support(rods, components=components, end=end, motion=motion, tangent=tangent, director=director)
 
     def fix(self, rods, nodes: Iterable[int], components: str = "xyz", motion: Motion | None = None) -> None:
         """Hold components of nodes (a hinge)."""

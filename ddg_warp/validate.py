@@ -66,6 +66,19 @@ def index(what: str, value) -> int:
     return indices(what, value)[0]
 
 
+def directions(what: str, value, rods: np.ndarray) -> np.ndarray:
+    """Unit vectors (rods, 3) from a direction (3,), or one a rod."""
+    try:
+        result = np.broadcast_to(np.asarray(value, float), (len(rods), 3))
+    except (TypeError, ValueError):
+        raise SceneError(f"{what} is {value!r}; give (3,), or ({len(rods)}, 3) for {len(rods)} rods") from None
+    length = np.linalg.norm(result, axis=1, keepdims=True)
+    bad = np.flatnonzero(~(np.isfinite(length[:, 0]) & (length[:, 0] > 0.0)))
+    if bad.size:
+        raise SceneError(f"{what} of rod {rods[bad[0]]} is {result[bad[0]]}; give a finite vector that is not zero")
+    return result / length
+
+
 def check_batch(batch, dimension: int) -> None:
     """Points, lengths, folds and parameters of one `RodBatch`.
 

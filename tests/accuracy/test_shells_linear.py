@@ -170,7 +170,7 @@ def bent(device, cells: int, bending: str, mesh: str, angle: float) -> float:
     if bending == "hinge":
         weight = 0.5 * weight[shell.surface.edge_triangles[~shell.surface.boundary]].sum(1)
     energies = dict(Tangent(model).parts[0].energies(state))
-    return weight @ energies[model.net.host.sets[-1].term.name] / area * 8.0
+    return weight @ energies[model.net.host.sets[-1].term.name][0] / area * 8.0
 
 
 def _relax_normals(model, state) -> None:
