@@ -57,7 +57,8 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
 
     They balance the internal forces and the loads on held dofs, and hold the normals of clamped mesh edges and of planes of
     symmetry; the inertia of a held node itself is left out, which a moving support would have to add. Of a ring, x is the radial
-    force summed around it, and moments do not hold the direction of the meridian.
+    force summed around it, and moments do not hold the direction of the meridian. A dof that several supports hold counts with the
+    first of them, so that the reactions add up.
 
     Args:
         point: what moments are about (3,); by default the first node that a support holds.
@@ -95,7 +96,7 @@ def _each_world(values: np.ndarray) -> np.ndarray:
 
 
 def _chain_places(tangent, q: np.ndarray, force: np.ndarray, support, world: int):
-    """(place, force, moment) of the nodes and edges of chains that a support holds in a world."""
+    """(place, force, moment) of the nodes and edges of chains that a support holds in a world, taken from `force`."""
     for held in support:
         part = tangent.parts[held.group]
         kind = part.group.kind
@@ -107,13 +108,16 @@ def _chain_places(tangent, q: np.ndarray, force: np.ndarray, support, world: int
             if not held.components and kind.twist:
                 along = x[column, (node + 1) % part.group.nodes, : kind.dim] - x[column, node, : kind.dim]
                 twist = f[column, node, kind.dim] * along / np.linalg.norm(along)
+                f[column, node, kind.dim] = 0.0
             else:
-                push[axes] = f[column, node, : kind.dim] * [(held.components >> d) & 1 for d in range(kind.dim)]
+                bits = [(held.components >> d) & 1 for d in range(kind.dim)]
+                push[axes] = f[column, node, : kind.dim] * bits
+                f[column, node, : kind.dim] -= push[axes]
             yield here, push, twist
 
 
 def _net_places(part, q: np.ndarray, force: np.ndarray, held, world: int) -> list[tuple]:
-    """(place, force, moment) of the blocks of the net that a support holds in a world."""
+    """(place, force, moment) of the blocks of the net that a support holds in a world, taken from `force`."""
     host, places = part.host, []
     x, f = (Tangent.of(part, values).reshape(part.net.worlds, -1, 3)[world] for values in (q, force))
     for block, component in zip(held.blocks, held.components, strict=True):
@@ -122,6 +126,7 @@ def _net_places(part, q: np.ndarray, force: np.ndarray, held, world: int) -> lis
         else:
             first, last = x[host.ends[block - host.nodes]]
             places.append((first, np.zeros(3), f[block, 0] * (last - first) / np.linalg.norm(last - first)))
+        f[block, component] = 0.0
     return places
 
 

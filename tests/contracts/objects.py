@@ -1,0 +1,212 @@
+"""Every kind of object that a scene may hold, small: how it is added, held and loaded, and what it has."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+import ddg_warp as ddg
+from ddg_warp import meshes
+
+RECTANGLE = ddg.Rectangle(0.04, 0.02)
+X, Y, Z = np.eye(3)
+
+
+def rubber(viscosity: float = 0.0) -> ddg.Material:
+    return ddg.Material(young=1e7, poisson=0.35, density=1000.0, viscosity=viscosity)
+
+
+@dataclass
+class Added:
+    """What an object's `add` put into a scene, and how questions take hold of it.
+
+    Attributes:
+        rods, shells, rings: indices.
+        hold: (scene, motion) -> None: supports that leave no rigid motion and only move by `motion`.
+        load: (scene, size, amplitude) -> None: a force of some size along -z, away from the supports.
+    """
+
+    hold: Callable
+    load: Callable
+    rods: list[int] = field(default_factory=list)
+    shells: list[int] = field(default_factory=list)
+    rings: list[int] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Object:
+    """A kind of object; `turns` says whether its supports may turn as a rigid body about `axis`."""
+
+    add: Callable
+    dimension: int = 3
+    axis: tuple = (0.0, 0.0, 1.0)
+    turns: bool = True
+
+    def scene(self, viscosity: float = 0.0, motion=None, held: bool = True, **options) -> tuple[ddg.Scene, Added]:
+        """A scene with this object alone, held."""
+        scene = ddg.Scene(**({"dimension": self.dimension} | options))
+        added = self.add(scene, rubber(viscosity))
+        if held:
+            added.hold(scene, motion)
+        return scene, added
+
+
+def arc(n: int = 8, lift: float = 0.0) -> np.ndarray:
+    """A flat arc of a circle in the plane of x and z, or rising out of it."""
+    s = np.linspace(0.0, 0.5, n + 1)
+    return np.stack([np.sin(s), lift * s, 1.0 - np.cos(s)], -1)
+
+
+def line(start, end, n: int) -> np.ndarray:
+    return np.linspace(np.asarray(start, float), np.asarray(end, float), n + 1)
+
+
+def _force_on_rod(rod: int, node: int):
+    return lambda scene, size, amplitude=None: scene.add_force(rod, node, (0.0, 0.0, -size), amplitude)
+
+
+def _rod(points=None, clamp: str = "edge", **options):
+    def add(scene, material) -> Added:
+        given = {"section": RECTANGLE} | options
+        rod = scene.add_rod(arc(lift=0.3) if points is None else points, material=material, **given)
+
+        def hold(scene, motion=None):
+            if clamp == "edge":
+                scene.clamp(rod, edges=[0], motion=motion)
+            elif clamp == "end":
+                scene.clamp_end(rod, motion=motion)
+            else:
+                scene.fix(rod, [0], motion=motion)
+
+        return Added(hold, _force_on_rod(rod, -1), rods=[rod])
+
+    return add
+
+
+def _ring(scene, material) -> Added:
+    angle = 2.0 * np.pi * np.arange(12) / 12
+    points = 0.3 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], -1)
+    rod = scene.add_rod(points, section=RECTANGLE, material=material, closed=True)
+    return Added(
+        lambda scene, motion=None: scene.clamp(rod, edges=[0], motion=motion), _force_on_rod(rod, 6), rods=[rod]
+    )
+
+
+def _joined(rigid: bool, **options):
+    def add(scene, material) -> Added:
+        first = scene.add_rod(line(0.0 * X, 0.5 * X, 4), section=RECTANGLE, material=material, **options)
+        second = scene.add_rod(line(0.5 * X, X, 4), section=RECTANGLE, material=material, **options)
+        scene.join([(first, -1), (second, 0)], rigid=rigid)
+
+        def hold(scene, motion=None):
+            scene.clamp(first, edges=[0], motion=motion)
+            if not rigid:  # a hinge alone would let the second rod swing
+                scene.clamp(second, edges=[-1], motion=motion)
+
+        return Added(hold, _force_on_rod(second, 1), rods=[first, second])
+
+    return add
+
+
+def _sheet(bending: str, membrane: str = "flat"):
+    def add(scene, material) -> Added:
+        points, triangles = meshes.rectangle(4, 3, (0.8, 0.5), "alternating")
+        shell = scene.add_shell(
+            points, triangles, thickness=0.01, material=material, bending=bending, membrane=membrane
+        )
+        return _of_sheet(scene, shell, points)
+
+    return add
+
+
+def _of_sheet(scene, shell: int, points: np.ndarray) -> Added:
+    low = points[:, 0].min()
+    column = np.unique(points[:, 0])[1]
+    clamped = np.flatnonzero(points[:, 0] <= low + 1e-9)
+    inside = np.flatnonzero(np.abs(points[:, 0] - column) < 1e-9)
+    tip = np.flatnonzero(points[:, 0] >= points[:, 0].max() - 1e-9)
+
+    def hold(scene, motion=None):
+        if (
+            scene.shells[shell].bending == "isometric"
+        ):  # has no normals at its boundary to clamp: two columns of vertices
+            scene.hold(shell, np.concatenate([clamped, inside]), motion=motion)
+        else:
+            scene.clamp_boundary(shell, clamped, motion=motion)
+
+    def load(scene, size, amplitude=None):
+        scene.add_vertex_force(shell, tip, (0.0, 0.0, -size / len(tip)), amplitude)
+
+    return Added(hold, load, shells=[shell])
+
+
+def _stiffened(scene, material) -> Added:
+    points, triangles = meshes.rectangle(4, 3, (0.8, 0.5), "alternating")
+    shell = scene.add_shell(points, triangles, thickness=0.01, material=material)
+    added = _of_sheet(scene, shell, points)
+    edge = np.flatnonzero(points[:, 1] <= points[:, 1].min() + 1e-9)
+    edge = edge[np.argsort(points[edge, 0])]
+    rod = scene.add_rod(points[edge], section=ddg.Circle(0.01), material=material)
+    scene.attach(rod, range(len(edge)), shell, edge)
+    sheet = added.hold
+
+    def hold(scene, motion=None):
+        sheet(scene, motion)
+        scene.clamp(rod, edges=[0], motion=motion)
+
+    return Added(hold, added.load, rods=[rod], shells=[shell])
+
+
+def _dome(scene, material) -> Added:
+    angle = np.linspace(0.0, 0.8, 9)
+    points = np.column_stack([np.sin(angle), np.cos(angle)])
+    shell = scene.add_axisymmetric_shell(points, thickness=0.02, material=material)
+    return Added(
+        lambda scene, motion=None: scene.clamp_ring(shell, "last", motion=motion),
+        lambda scene, size, amplitude=None: scene.add_pole_force(shell, -size, amplitude=amplitude),
+        rings=[shell],
+    )
+
+
+def _mixed(*adders):
+    def add(scene, material) -> Added:
+        parts = [adder(scene, material) for adder in adders]
+
+        def hold(scene, motion=None):
+            for part in parts:
+                part.hold(scene, motion)
+
+        def load(scene, size, amplitude=None):
+            for part in parts:
+                part.load(scene, size, amplitude)
+
+        several = {name: [i for part in parts for i in getattr(part, name)] for name in ("rods", "shells", "rings")}
+        return Added(hold, load, **several)
+
+    return add
+
+
+UP = (0.0, 1.0, 0.0)  # the axis that turns within the plane of x and z
+HANGING = line(0.0 * X, -0.5 * Z, 6)
+
+OBJECTS = {
+    "rod": Object(_rod()),
+    "rod clamped at its end": Object(_rod(clamp="end")),
+    "planar rod": Object(_rod(arc()), dimension=2, axis=UP),
+    "rod without twist": Object(_rod(line(0.0 * X, X, 8), twist=False, section=ddg.Circle(0.02)), axis=UP),
+    "rod without bending": Object(_rod(HANGING, clamp="node", bend=False), turns=False),
+    "closed rod": Object(_ring),
+    "rods joined rigidly": Object(_joined(True)),
+    "rods joined by a hinge": Object(_joined(False)),
+    "planar rods joined rigidly": Object(_joined(True), dimension=2, axis=UP),
+    "rod on a shell": Object(_stiffened),
+    **{
+        f"shell, {bending}": Object(_sheet(bending))
+        for bending in ("midedge_dof", "midedge_boundary", "midedge", "hinge", "isometric")
+    },
+    "shell, curved membrane": Object(_sheet("midedge_dof", "curved")),
+    "shell of revolution": Object(_dome, axis=UP, turns=False),
+    "rods alone and joined": Object(_mixed(_rod(), _ring, _joined(True))),
+    "rods and shells": Object(_mixed(_rod(), _joined(False), _stiffened, _sheet("hinge"))),
+    "shells of both kinds": Object(_mixed(_sheet("midedge_dof"), _dome), axis=UP, turns=False),
+}

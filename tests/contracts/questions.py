@@ -1,0 +1,445 @@
+"""Everything that can be asked of an object or done with it. A question raises where the answer is wrong."""
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import ddg_warp as ddg
+from ddg_warp import inquiry, stability
+from ddg_warp.integrate import statics
+from ddg_warp.integrate.continuation import Continuation
+from ddg_warp.kernels.terms import AXISYMMETRIC, REGISTRY, SHELLS
+from objects import Object
+
+DT = 0.004
+
+
+@dataclass(frozen=True)
+class Variant:
+    """How a scene is built."""
+
+    device: str = "cpu"
+    precision: str = "float64"
+    worlds: int = 1
+
+    @property
+    def exact(self) -> float:
+        """Relative error that the state's own rounding may make."""
+        return 1e-9
+
+    def build(self, scene) -> ddg.Model:
+        return scene.build(self.device, self.precision, worlds=self.worlds)
+
+    def each(self, values) -> np.ndarray:
+        """Values with an axis of worlds in front, which they have or, of one world, have not."""
+        values = np.asarray(values, float)
+        if self.worlds == 1:
+            return values[None]
+        assert values.shape[:1] == (self.worlds,), f"{values.shape} has no axis of {self.worlds} worlds"
+        return values
+
+
+def elastic(model, state, variant) -> np.ndarray:
+    """Elastic energy of every world [J]."""
+    names = model.energies(state)
+    return sum(variant.each(value) for name, value in names.items() if name not in ("kinetic", "gravity"))
+
+
+def close(found, expected, rtol: float = 1e-9, atol: float = 0.0, what: str = "") -> None:
+    np.testing.assert_allclose(found, expected, rtol=rtol, atol=atol, err_msg=what)
+
+
+def still(kind: Object, variant: Variant, **options):
+    """A model without gravity, and its rest state."""
+    scene, added = kind.scene(**({"gravity": (0.0, 0.0, 0.0)} | options))
+    model = variant.build(scene)
+    return model, model.state(), added
+
+
+def bent(model, variant: Variant, size: float = 1e-3):
+    """A state that is strained in every element, alike in all worlds."""
+    points = variant.each(model.state().points())[0]
+    wave = np.sin(7.0 * points + np.arange(len(points))[:, None] + [0.3, 1.1, 2.0])
+    if model.scene.axisymmetric_shells:
+        wave[:, 1] = 0.0
+        wave[points[:, 0] == 0.0, 0] = 0.0
+    return model.state(points=points + size * wave)
+
+
+# What is asked of a state.
+
+
+def energies(kind, variant):
+    """Elastic terms are zero at rest, kinetic is m v^2 / 2, gravity -m g . x; every world has its own."""
+    scene, _ = kind.scene(gravity=(0.0, 0.0, -5.0))
+    model = variant.build(scene)
+    rest = model.energies(model.state())
+    mass = _mass(model)
+    points = variant.each(model.state().points())
+    for name, value in rest.items():
+        if name not in ("kinetic", "gravity"):
+            assert np.abs(variant.each(value)).max() < 1e-18, (name, value)
+    close(variant.each(rest["gravity"]), (mass[:, None] * points * [0.0, 0.0, 5.0]).sum((1, 2)), rtol=1e-6, atol=1e-9)
+    speed = np.zeros_like(points)
+    speed[..., 2] = (1.0 + np.arange(variant.worlds))[:, None]
+    moving = model.energies(model.state(velocities=speed if variant.worlds > 1 else speed[0]))
+    close(variant.each(moving["kinetic"]), 0.5 * mass.sum() * (1.0 + np.arange(variant.worlds)) ** 2, rtol=1e-6)
+
+
+def _mass(model) -> np.ndarray:
+    """Mass of every row of the points (P,) [kg], shared out where rows share a node."""
+    from ddg_warp.tangent import Tangent
+
+    tangent = Tangent(model)
+    dofs = tangent.point_dofs()
+    along = dofs[:, 2]
+    return tangent.mass[along] / np.bincount(along)[along]
+
+
+def reactions(kind, variant):
+    """Supports carry the weight: their forces and gravity add up to nothing in z, in every world."""
+    scene, _ = kind.scene(gravity=(0.0, 0.0, -0.5))
+    model = variant.build(scene)
+    state = statics.solve(model)
+    lift = sum(variant.each(reaction.force)[:, 2] for reaction in model.reactions(state))
+    close(lift, 0.5 * _mass(model).sum(), rtol=1e-4 if variant.precision == "float32" else 1e-5)
+
+
+def stresses(kind, variant):
+    """Every rod and shell has its stresses, zero at rest and finite where it is bent, one entry a world."""
+    model, rest, added = still(kind, variant)
+    at_rest, found = model.stresses(rest), model.stresses(bent(model, variant))
+    assert found
+    owners = set()
+    for name, values in found.items():
+        for index, value in enumerate(values):
+            if value is not None:
+                assert np.isfinite(variant.each(value)).all()
+                assert variant.each(value).ndim == 3
+                assert np.abs(variant.each(at_rest[name][index])).max() < 1e-6 * np.abs(value).max() + 1e-12, name
+                owners.add((_sort_of(name), index))
+    expected = {("rods", i) for i in added.rods} | {("shells", i) for i in added.shells}
+    assert owners == expected | {("rings", i) for i in added.rings}
+
+
+def _sort_of(term: str) -> str:
+    return "shells" if term in SHELLS else "rings" if term in AXISYMMETRIC else "rods"
+
+
+def total_twist(kind, variant):
+    """Turns of the directors of the first rod: none where it is at rest and its directors are carried along."""
+    model, state, _ = still(kind, variant)
+    assert np.abs(variant.each(inquiry.total_twist(model, state, 0))).max() < 1e-9 or model.scene.batches[0].closed
+
+
+def fields(kind, variant):
+    """Strain, curvature and energy of triangles: none at rest, some where the surface is strained."""
+    model, rest, _ = still(kind, variant)
+    for name, values in inquiry.triangle_fields(model, rest).items():
+        assert values.shape[0] == variant.worlds, name
+        assert np.abs(values).max() < 1e-9
+    assert inquiry.triangle_fields(model, bent(model, variant))["strain"].max() > 1e-5
+
+
+def report(kind, variant):
+    """Names every term that is there."""
+    model, _, _ = still(kind, variant)
+    text = model.report()
+    for name in {key.split("/")[1] for key in model.parameters() if key.count("/") == 2}:
+        assert f"  {name}: " in text, name
+
+
+# Parameters and rest shapes.
+
+
+def parameters(kind, variant):
+    """Every term's parameters are there by name, with numbers."""
+    model, _, _ = still(kind, variant)
+    found = model.parameters()
+    terms = {key.split("/")[1] for key in found if key.count("/") == 2}
+    assert terms
+    assert terms <= {*REGISTRY, *SHELLS, *AXISYMMETRIC, "rigid_joint", *_other_terms()}
+    assert all(np.isfinite(value).all() for value in found.values())
+
+
+def _other_terms() -> set[str]:
+    from ddg_warp.kernels import terms
+
+    return {term.name for term in vars(terms).values() if isinstance(term, terms.Term)}
+
+
+def set_parameter(kind, variant):
+    """Stiffness times a factor a world makes that much more energy in each."""
+    model, _, _ = still(kind, variant)
+    state = bent(model, variant)
+    names = {tuple(key.split("/")[1:]) for key in model.parameters() if "/stiffness" in key}
+    found = []
+    for factors in (1.0, 2.0 + np.arange(variant.worlds) if variant.worlds > 1 else 2.0):
+        for number, (term, parameter) in enumerate(sorted(names)):
+            model.set_parameter(term, parameter, (30.0 + number) * factors)
+        found.append(elastic(model, state, variant))
+    close(found[1], found[0] * factors)
+
+
+def set_rest(kind, variant):
+    """A deformed state as rest shape has no energy but that of bending which knows no rest shape."""
+    model, _, added = still(kind, variant)
+    state = bent(model, variant)
+    before = elastic(model, state, variant)
+    points, at = variant.each(state.points())[0], int(model.curves.counts.sum())
+    counts = [len(shell.points) for shell in model.scene.shells]
+    for shell in added.shells or [0]:
+        first = at + sum(counts[:shell])
+        model.set_rest(
+            shell, points=points[first : first + len(model.scene.shells[shell].points)] if counts else points
+        )
+    assert (elastic(model, state, variant) < before).all()
+
+
+# Supports, loads, damping.
+
+
+def _steps(model, count: int = 4, dt: float = DT, scheme: str = "implicit_euler", **options):
+    integrator = ddg.Integrator(model, scheme=scheme, **options)
+    state = model.state()
+    for _ in range(count):
+        state = integrator.step(state, dt)
+    integrator.check(state)
+    outcomes = integrator.statistics()["outcomes"]
+    assert set(outcomes) <= {"converged", "converged_to_rounding"}, outcomes
+    assert np.isfinite(state.points()).all()
+    return state
+
+
+def motion(kind, variant):
+    """Held nodes go where the motion takes them; in the end all follows, as a body that was moved has no energy."""
+    shift = (0.0, 0.0, 0.02) if kind.dimension == 3 else (0.01, 0.0, 0.02)
+    if kind.axis == (0.0, 1.0, 0.0) and kind.dimension == 3:
+        shift = (0.0, 0.0, 0.02)
+    move = ddg.Motion(translation=lambda t: tuple(min(t, 1.0) * np.array(shift)))
+    model, rest, _ = still(kind, variant, motion=move)
+    state = statics.solve(model)
+    close(variant.each(state.points()), variant.each(rest.points()) + shift, atol=1e-6)
+    assert elastic(model, state, variant).max() < 1e-9
+
+
+def turned_clamp(kind, variant):
+    """A clamp that turns takes everything along as a rigid body, and counts its turns in dynamics."""
+    turn = ddg.Motion(angle=lambda t: 0.4 * t, axis=kind.axis)
+    model, rest, _ = still(kind, variant, motion=turn)
+    state = statics.solve(model, load_steps=2)
+    if kind.turns:
+        expected = turn.place(1.0, variant.each(rest.points())[0])[None]
+        close(variant.each(state.points()), np.broadcast_to(expected, (variant.worlds, *expected.shape[1:])), atol=1e-5)
+        assert elastic(model, state, variant).max() < 1e-7
+    _steps(model)
+
+
+def load(kind, variant):
+    """A force moves its node its way, and a timed one does nothing before its time."""
+    scene, added = kind.scene(gravity=(0.0, 0.0, 0.0))
+    added.load(scene, 1e-3, None)
+    model = variant.build(scene)
+    state = statics.solve(model)
+    work = (variant.each(state.points()) - variant.each(model.state().points()))[..., 2]
+    assert (work.min(1) < -1e-9).all()
+    close(work, np.broadcast_to(work[:1], work.shape), atol=1e-9)
+    scene, added = kind.scene(gravity=(0.0, 0.0, 0.0))
+    added.load(scene, 1e-3, lambda t: 0.0 if t < 1.0 else 1.0)
+    model = variant.build(scene)
+    close(_steps(model, 2).points(), model.state().points(), atol=1e-12)
+
+
+def couple(kind, variant):
+    """A couple on an edge of a rod bends it: supports carry the opposite moment."""
+    scene, added = kind.scene(gravity=(0.0, 0.0, -0.5))
+    about = np.array([0.0, 1e-3, 0.0])
+    rod = added.rods[-1] if added.rods else 0
+    scene.add_couple(rod, scene.batches[-1].edges // 2 if added.rods else 0, about)
+    model = variant.build(scene)
+    state = statics.solve(model)
+    total = sum(variant.each(reaction.moment) for reaction in model.reactions(state, point=(0.0, 0.0, 0.0)))
+    weight = _mass(model)[:, None] * np.array([0.0, 0.0, -0.5])
+    total = total + np.cross(variant.each(state.points()), weight).sum(1)
+    close(total[:, 1], -about[1], rtol=1e-4)
+    _steps(model, 2)
+
+
+def pressure(kind, variant):
+    """Pressure that follows loads every shell; supports carry it."""
+    scene, added = kind.scene(gravity=(0.0, 0.0, 0.0))
+    for shell in added.shells or ([] if added.rings else [0]):
+        scene.add_pressure(shell, 0.05)
+    for shell in added.rings:
+        scene.add_axisymmetric_pressure(shell, -0.05)
+    model = variant.build(scene)
+    state = statics.solve(model)
+    forces = sum(np.abs(variant.each(reaction.force)) for reaction in model.reactions(state))
+    assert (forces.max(1) > 1e-3).all()
+    _steps(model, 2)
+
+
+def mass_damping(kind, variant):
+    """What moves is held back: after a step of h, so short that forces do nothing, v = v0 / (1 + alpha h)."""
+    h, alpha = 1e-6, 1e5
+    scene, _ = kind.scene(gravity=(0.0, 0.0, 0.0), mass_damping=alpha)
+    model = variant.build(scene)
+    speed = np.zeros((model.points_count, 3))
+    speed[:, 2] = 1e-3
+    state = ddg.Integrator(model).step(model.state(velocities=speed), h)
+    # nodes that are held, and the first beside them, are the few
+    close(np.median(variant.each(state.velocities())[..., 2], axis=1), 1e-3 / (1.0 + alpha * h), rtol=1e-4)
+
+
+def strain_rate_damping(kind, variant):
+    """Viscosity takes energy out of a strained state as it lets go."""
+    kept = []
+    for viscosity in (0.0, 0.05):
+        scene, _ = kind.scene(viscosity=viscosity, gravity=(0.0, 0.0, 0.0))
+        model = variant.build(scene)
+        integrator = ddg.Integrator(model)
+        state = bent(model, variant)
+        for _ in range(3):
+            state = integrator.step(state, 1e-5)
+        kept.append(variant.each(model.energies(state)["kinetic"]))
+    assert (kept[1] < 0.9 * kept[0]).all()
+
+
+# Analyses.
+
+
+def _falls(kind, variant, scheme: str):
+    scene, _ = kind.scene(gravity=(0.0, 0.0, -1.0))
+    model = variant.build(scene)
+    points = variant.each(_steps(model, scheme=scheme).points())
+    close(points, np.broadcast_to(points[:1], points.shape), atol=1e-9, what="worlds differ")
+    assert (points - variant.each(model.state().points()))[..., 2].min() < -1e-6
+
+
+def implicit_euler(kind, variant):
+    """Steps converge, alike in all worlds."""
+    _falls(kind, variant, "implicit_euler")
+
+
+def implicit_midpoint(kind, variant):
+    """The same by the other scheme."""
+    _falls(kind, variant, "implicit_midpoint")
+
+
+def equilibrium(kind, variant):
+    """Residual below the tolerance at free dofs, in every world alike."""
+    from ddg_warp.tangent import Tangent
+
+    scene, _ = kind.scene(gravity=(0.0, 0.0, -0.5))
+    model = variant.build(scene)
+    state, tangent = statics.solve(model), Tangent(model)
+    residual = tangent.loads(1.0, tangent.dofs(state)) - tangent.gradient(state)
+    weight = 0.5 * _mass(model).sum()
+    assert np.abs(residual[tangent.free]).max() < (1e-3 if variant.precision == "float32" else 1e-6) * weight
+
+
+def spectrum(kind, variant):
+    """Held structures that hang a little are stable: positive frequencies, in ascending order."""
+    scene, _ = kind.scene(gravity=(0.0, 0.0, -0.5))
+    model = variant.build(scene)
+    found = stability.spectrum(model, statics.solve(model), 3)
+    assert found.stable, found.eigenvalues
+    assert (np.diff(found.eigenvalues) >= -1e-9 * found.eigenvalues[-1]).all()
+    assert (found.frequencies > 1e-3).all()
+
+
+def continuation(kind, variant):
+    """A path from rest along a small load: its first points are regular and stable."""
+    scene, added = kind.scene(gravity=(0.0, 0.0, 0.0))
+    added.load(scene, 1e-2, None)
+    model = variant.build(scene)
+    path = Continuation(model, {"z": ddg.Displacement.of(-1, "z")}).trace(stop=ddg.Stop(steps=3))
+    assert len(path.points) >= 3
+    assert path.points[-1].load > 0.0
+    assert all(point.stable for point in path.points)
+
+
+# Files.
+
+
+def record(kind, variant):
+    """What is recorded is read back bit by bit; a run that is resumed is the run that went on."""
+    from ddg_warp.io.hdf5 import TrajectoryReader
+
+    def run(model, directory, count, **options):
+        integrator = ddg.Integrator(model, check_every=1)
+        seen = []
+        with ddg.Recorder(model, directory, block=2, **options) as recorder:
+            state = model.state()
+            if options.get("resume"):
+                with TrajectoryReader(Path(directory) / "trajectory.h5") as reader:
+                    state = model.restore(reader.checkpoint())
+            recorder.record(state)
+            while round(state.time / DT) < count:
+                state = integrator.step(state, DT)
+                recorder.record(state)
+                seen.append(state.points().copy())
+        return state, seen
+
+    scene, _ = kind.scene()
+    model = variant.build(scene)
+    with tempfile.TemporaryDirectory() as folder:
+        straight, seen = run(model, f"{folder}/a", 5)
+        run(model, f"{folder}/b", 3)
+        resumed, _ = run(model, f"{folder}/b", 5, resume=True)
+        with TrajectoryReader(Path(folder) / "a" / "trajectory.h5") as reader:
+            assert len(reader) == 6
+            last = np.asarray(reader.positions[-1]) if hasattr(reader, "positions") else None
+        if last is not None:
+            close(last.reshape(np.shape(seen[-1])), seen[-1], rtol=1e-6, atol=1e-6)
+        for name, values in straight.snapshot().items():
+            compare = np.testing.assert_array_equal if variant.device == "cpu" else np.testing.assert_allclose
+            compare(values, resumed.snapshot()[name], err_msg=name)
+
+
+def export(kind, variant):
+    """The scene that a recorded run exports is valid USD."""
+    from ddg_warp.cli import main
+    from ddg_warp.io.usd_check import validate
+
+    scene, _ = kind.scene()
+    model = variant.build(scene)
+    with tempfile.TemporaryDirectory() as folder:
+        with ddg.Recorder(model, folder) as recorder:
+            recorder.record(model.state())
+            recorder.record(_steps(model, 1))
+        assert not validate(f"{folder}/scene.usdc")
+        assert main(["export", folder, "--to", f"{folder}/out.usda"]) == 0
+        assert not validate(f"{folder}/out.usda")
+
+
+def failure(kind, variant):
+    """A step that cannot converge says which object, and where it ended; the state is the last good one."""
+    model, _, _ = still(kind, variant)
+    integrator = ddg.Integrator(model, max_iterations=1, retry_limit=0, check_every=1)
+    state = bent(model, variant, 0.03)
+    try:
+        for _ in range(3):
+            state = integrator.step(state, 0.05)
+    except ddg.SolverError as error:
+        assert error.outcome, error
+        assert error.outcome in str(error)
+        assert any(word in str(error) for word in ("rod", "shell", "node", "vertex", "joint")), error
+        assert error.state is not None
+        assert np.isfinite(error.state.points()).all()
+    else:
+        raise AssertionError("one iteration a step was enough")
+
+
+QUESTIONS = {
+    function.__name__.replace("_", " "): function
+    for function in (
+        *(energies, reactions, stresses, total_twist, fields, report),
+        *(parameters, set_parameter, set_rest),
+        *(motion, turned_clamp, load, couple, pressure, mass_damping, strain_rate_damping),
+        *(implicit_euler, implicit_midpoint, equilibrium, spectrum, continuation),
+        *(record, export, failure),
+    )
+}

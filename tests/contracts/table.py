@@ -1,0 +1,106 @@
+"""The table of contracts: every object against every question. Each cell works, or is refused by a sentence that says why.
+
+python tests/contracts/table.py [--device cuda:0]     # prints the table with its counts
+"""
+
+import argparse
+import itertools
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import ddg_warp as ddg  # noqa: E402
+from objects import OBJECTS  # noqa: E402
+from questions import QUESTIONS, Variant  # noqa: E402
+
+VARIANTS = [(worlds, precision) for worlds in (1, 3) for precision in ("float64", "mixed")]
+RODS = ("rod", "rod clamped at its end", "planar rod", "rod without twist", "rod without bending", "closed rod")
+JOINED = ("rods joined rigidly", "rods joined by a hinge", "planar rods joined rigidly")
+SHELLS = tuple(name for name in OBJECTS if name.startswith("shell,"))
+
+# What is refused: question -> objects -> words of the message.
+REFUSED = {
+    "total twist": {
+        **dict.fromkeys(
+            ("planar rod", "rod without twist", "rod without bending", "planar rods joined rigidly"),
+            ("rod 0", "no twist"),
+        ),
+        **dict.fromkeys((*SHELLS, "shell of revolution", "shells of both kinds"), ("rod 0", "does not exist")),
+    },
+    "fields": dict.fromkeys((*RODS, *JOINED, "shell of revolution", "rods alone and joined"), ("no surfaces",)),
+    "set rest": {
+        **dict.fromkeys(
+            (*RODS, *JOINED, "shell of revolution", "rods alone and joined"), ("shell 0", "does not exist")
+        ),
+        "shell, isometric": ("'isometric'", "flat rest shape", "use"),
+    },
+    "pressure": dict.fromkeys((*RODS, *JOINED, "rods alone and joined"), ("shell 0", "does not exist")),
+    "couple": dict.fromkeys((*SHELLS, "shell of revolution", "shells of both kinds"), ("rod 0", "does not exist")),
+    "continuation": {"rod without bending": ("singular_start", "hold what can move without any stiffness")},
+}
+MANY = {"continuation": ("one world",)}  # what several worlds are refused
+
+
+def answer(name: str, question: str, variant: Variant) -> str:
+    """The sentence by which a cell is refused, empty where it works; anything else is raised."""
+    try:
+        with np.errstate(over="raise", invalid="raise", divide="raise"):
+            QUESTIONS[question](OBJECTS[name], variant)
+    except (ddg.SceneError, ddg.SolverError, ValueError) as error:
+        return str(error) or repr(error)
+    return ""
+
+
+def expected(name: str, question: str, variant: Variant) -> tuple[str, ...]:
+    """Words of the sentence by which a cell is refused; none where it works."""
+    if variant.worlds > 1 and question in MANY:
+        return MANY[question]
+    return REFUSED.get(question, {}).get(name, ())
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--device", default="cpu")
+    device = parser.parse_args().device
+    wide = max(map(len, OBJECTS))
+    counts = {"works": 0, "refused": 0, "broken": 0}
+    for number, question in enumerate(QUESTIONS, 1):
+        print(f"{number:3d}  {question}")
+    print(" " * wide, *(f"{number:3d}" for number in range(1, len(QUESTIONS) + 1)))
+    broken = []
+    for name in OBJECTS:
+        cells = []
+        for question in QUESTIONS:
+            marks = set()
+            for worlds, precision in VARIANTS:
+                variant = Variant(device, precision, worlds)
+                try:
+                    refused, words = answer(name, question, variant), expected(name, question, variant)
+                    good = all(word in refused for word in words) and bool(words) == bool(refused)
+                    mark = ("refused" if refused else "works") if good else "broken"
+                except Exception as error:
+                    refused, mark = repr(error), "broken"
+                counts[mark] += 1
+                marks.add(mark)
+                if mark == "broken":
+                    broken.append(f"{name} / {question} / {worlds} / {precision}: {refused.splitlines()[0]}")
+            cells.append("!" if "broken" in marks else "+" if "works" in marks else "-")
+        print(name.ljust(wide), *(f"{cell:>3}" for cell in cells), flush=True)
+    print(*broken, sep="\n")
+    total = len(OBJECTS) * len(QUESTIONS) * len(VARIANTS)
+    print(
+        f"{total} cells: {counts['works']} work (+), {counts['refused']} are refused by name (-), {counts['broken']} broken (!)"
+    )
+    return 1 if counts["broken"] else 0
+
+
+def cells():
+    """Every cell of the table: object, question, worlds, precision."""
+    return [(name, question, *variant) for name, question, variant in itertools.product(OBJECTS, QUESTIONS, VARIANTS)]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

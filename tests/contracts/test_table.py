@@ -1,0 +1,30 @@
+"""Every object against every question: each cell works, or is refused by a sentence that names object and remedy.
+
+Each cell is run in one of the variants of worlds and precision; all of them in all variants are slow. `table.py` prints the table.
+"""
+
+import pytest
+from objects import OBJECTS
+from questions import QUESTIONS, Variant
+from table import REFUSED, VARIANTS, answer, cells, expected
+
+
+def _fast(name: str, question: str, worlds: int, precision: str) -> bool:
+    place = list(OBJECTS).index(name) + list(QUESTIONS).index(question)
+    return VARIANTS[place % len(VARIANTS)] == (worlds, precision)
+
+
+@pytest.mark.parametrize(
+    ("name", "question", "worlds", "precision"),
+    [pytest.param(*cell, marks=() if _fast(*cell) else pytest.mark.slow) for cell in cells()],
+)
+def test_cell(device, name, question, worlds, precision):
+    variant = Variant(device, precision, worlds)
+    refused, words = answer(name, question, variant), expected(name, question, variant)
+    assert bool(refused) == bool(words), refused or f"it works now, and was refused by a sentence with {words}"
+    assert all(word in refused for word in words), refused
+
+
+def test_refusals_are_of_objects_and_questions_that_exist():
+    assert set(REFUSED) <= set(QUESTIONS)
+    assert all(set(refused) <= set(OBJECTS) for refused in REFUSED.values())
