@@ -5,13 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from objects import Object
 
 import ddg_warp as ddg
 from ddg_warp import inquiry, stability
 from ddg_warp.integrate import statics
 from ddg_warp.integrate.continuation import Continuation
 from ddg_warp.kernels.terms import AXISYMMETRIC, REGISTRY, SHELLS
-from objects import Object
 
 DT = 0.004
 

@@ -12,9 +12,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-import ddg_warp as ddg  # noqa: E402
-from objects import OBJECTS  # noqa: E402
-from questions import QUESTIONS, Variant  # noqa: E402
+from objects import OBJECTS
+from questions import QUESTIONS, Variant
+
+import ddg_warp as ddg
 
 VARIANTS = [(worlds, precision) for worlds in (1, 3) for precision in ("float64", "mixed")]
 RODS = ("rod", "rod clamped at its end", "planar rod", "rod without twist", "rod without bending", "closed rod")
