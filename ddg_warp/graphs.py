@@ -5,6 +5,8 @@ from collections.abc import Callable, Hashable
 
 import warp as wp
 
+from ddg_warp.threads import capturing
+
 
 class Graphs:
     """Captured launches of a model by name; made anew after the model has changed.
@@ -27,13 +29,17 @@ class Graphs:
             self.clear()
             self._version = self._model.version
         if name not in self._graphs:
-            if not self._graphs:
-                self._load()
-            gc.disable()  # a collection while capturing would free arrays into the graph
-            try:
-                with wp.ScopedCapture(device=self._model.wp_device, force_module_load=False) as capture:
-                    launch()
-            finally:
-                gc.enable()
-            self._graphs[name] = capture.graph
+            with capturing():
+                self._capture(name, launch)
         wp.capture_launch(self._graphs[name])
+
+    def _capture(self, name: Hashable, launch: Callable[[], None]) -> None:
+        if not self._graphs:
+            self._load()
+        gc.disable()  # a collection while capturing would free arrays into the graph
+        try:
+            with wp.ScopedCapture(device=self._model.wp_device, force_module_load=False) as capture:
+                launch()
+        finally:
+            gc.enable()
+        self._graphs[name] = capture.graph

@@ -8,6 +8,7 @@ import warp as wp
 from ddg_warp import arrays, end_moments
 from ddg_warp.kernels.terms import AXISYMMETRIC, SHELLS
 from ddg_warp.tangent import Tangent
+from ddg_warp.threads import launches
 
 TWIST = 2  # place of the twist among the strains of rod vertices and of the half cells beside joints
 
@@ -25,6 +26,7 @@ class Reaction:
     point: np.ndarray
 
 
+@launches
 def energies(model, state) -> dict:
     """Energies by term [J]: elastic terms, kinetic, gravity (zero at the origin). Of several worlds arrays (worlds,)."""
     result = Tangent(model).energy(state)
@@ -52,6 +54,7 @@ def energies(model, state) -> dict:
     return {name: values if model.worlds > 1 else float(values[0]) for name, values in every.items()}
 
 
+@launches
 def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     """Force and moment of every support of the scene: those of rods in the order they were added, then of shells, then of rings.
 
@@ -161,6 +164,7 @@ def _normal_moments(part, state) -> np.ndarray:
     return result
 
 
+@launches
 def stresses(model, state) -> dict[str, list[np.ndarray]]:
     """Conjugate stresses of every rod and shell by term (elements, strains); of several worlds (worlds, elements, strains).
 
@@ -208,6 +212,7 @@ def _net_strains(net, state, index: int) -> tuple[np.ndarray, np.ndarray]:
     return strain.numpy().astype(float).reshape(split), stress.numpy().astype(float).reshape(split)
 
 
+@launches
 def triangle_fields(model, state) -> dict[str, np.ndarray]:
     """Numbers to color surfaces by (worlds, triangles), in the order of `model.surfaces`.
 
@@ -292,6 +297,7 @@ def writhe(points: np.ndarray) -> float:
     return float((sign * solid).sum() / (2.0 * np.pi))
 
 
+@launches
 def total_twist(model, state, rod: int = 0) -> float | np.ndarray:
     """Turns of a rod's directors about its centreline: the sum of the angles between neighbours, after parallel transport.
 

@@ -12,8 +12,10 @@ from ddg_warp.group import Group
 from ddg_warp.io import Curves, Surfaces
 from ddg_warp.kernels import element, step
 from ddg_warp.state import GroupState, State
+from ddg_warp.threads import launches
 
 
+@launches
 class Model:
     """A built scene; see `Scene.build`.
 

@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
+from ddg_warp.threads import launches
 
 
 @dataclass
@@ -31,6 +32,7 @@ class GroupState:
         return self.__dict__
 
 
+@launches
 class State:
     """Positions, velocities, frames and time of a model's rods and shells. A step returns another state and does not change this one.
 

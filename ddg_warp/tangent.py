@@ -8,8 +8,10 @@ import numpy as np
 from scipy import sparse
 
 from ddg_warp.chain_tangent import ChainTangent
+from ddg_warp.threads import launches
 
 
+@launches
 class Tangent:
     """The potential energy of a model and its derivatives at a state, loads and held dofs included.
 

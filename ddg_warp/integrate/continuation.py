@@ -17,10 +17,12 @@ from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.integrate.corrector import ContinuationOptions, Corrector, Failed
 from ddg_warp.integrate.path import BIFURCATION, LIMIT_POINT, Displacement, Path, Point, Stop
 from ddg_warp.state import State
+from ddg_warp.threads import launches
 
 BISECTIONS = 12  # of a bifurcation, before one linear interpolation of the critical eigenvalue
 
 
+@launches
 class Continuation:
     """Follows the equilibria of one model.
 

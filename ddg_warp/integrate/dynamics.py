@@ -15,6 +15,7 @@ from ddg_warp.linear.pcg import PcgNewton, ProjectiveNewton
 from ddg_warp.newton import ChainNewton, NewtonOptions
 from ddg_warp.precision import FLOAT32_LIMIT
 from ddg_warp.state import State
+from ddg_warp.threads import launches
 
 SOLVERS = ("newton", "projective")
 SCHEMES = ("implicit_euler", "implicit_midpoint")
@@ -22,6 +23,7 @@ DIRECT = {"sweep": ChainNewton, "partitioned": PartitionedNewton}  # solvers of 
 FOLDED = 1e-5  # how close to opposite [rad] edges that meet are called folded, in messages
 
 
+@launches
 class Integrator:
     """Advances states of a model in time.
 

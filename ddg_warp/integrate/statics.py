@@ -19,6 +19,7 @@ from ddg_warp.linear.choice import static_solver, why_not_pcg
 from ddg_warp.linear.direct import Factorisation, SingularError
 from ddg_warp.state import State
 from ddg_warp.tangent import Tangent
+from ddg_warp.threads import launches
 
 SOLVERS = ("auto", "direct", "pcg")
 
@@ -78,6 +79,7 @@ def solve(
     return Equilibrium(model, StaticsOptions(**options)).load(state or model.state(), load_steps, start, end)
 
 
+@launches
 class Equilibrium:
     """A static solver of one model; keeps its tangent between solves.
 

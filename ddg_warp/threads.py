@@ -1,0 +1,84 @@
+"""Who may launch while others capture.
+
+While Warp captures on the CPU device, it records the launches and copies of every thread of the process (Warp 1.19). So a capture,
+and whatever compiles or loads kernels, waits until no other thread is inside of this package, and keeps them out meanwhile; all else
+runs side by side. Launches that a user makes in threads of his own are his to keep apart.
+"""
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import wraps
+
+
+class _Turns:
+    """Many threads that launch, or one that captures; a thread may enter again, and may capture while it launches."""
+
+    def __init__(self):
+        self._changed = threading.Condition()
+        self._inside, self._capturing = 0, False
+        self._own = threading.local()
+
+    @contextmanager
+    def launching(self) -> Iterator[None]:
+        depth = getattr(self._own, "depth", 0)
+        if not depth:
+            with self._changed:
+                self._changed.wait_for(lambda: not self._capturing)
+                self._inside += 1
+        self._own.depth = depth + 1
+        try:
+            yield
+        finally:
+            self._own.depth = depth
+            if not depth:
+                with self._changed:
+                    self._inside -= 1
+                    self._changed.notify_all()
+
+    @contextmanager
+    def capturing(self) -> Iterator[None]:
+        if getattr(self._own, "alone", False):
+            yield
+            return
+        depth = getattr(self._own, "depth", 0)
+        with self._changed:
+            self._inside -= depth > 0
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: not self._capturing and not self._inside)
+            self._capturing = True
+        self._own.alone, self._own.depth = True, depth + 1
+        try:
+            yield
+        finally:
+            self._own.alone, self._own.depth = False, depth
+            with self._changed:
+                self._capturing = False
+                self._inside += depth > 0
+                self._changed.notify_all()
+
+
+_turns = _Turns()
+capturing = _turns.capturing
+
+
+def launches(what):
+    """Decorate what launches: a function, or a class, whose constructor may load kernels and whose other methods launch."""
+    if not isinstance(what, type):
+        return _within(_turns.launching, what)
+    for name, member in list(vars(what).items()):
+        if callable(member) and not isinstance(member, type | staticmethod | classmethod):
+            if name == "__init__":
+                setattr(what, name, _within(_turns.capturing, member))
+            elif not name.startswith("_"):
+                setattr(what, name, _within(_turns.launching, member))
+    return what
+
+
+def _within(turn, function):
+    @wraps(function)
+    def entered(*args, **kwargs):
+        with turn():
+            return function(*args, **kwargs)
+
+    return entered

@@ -1,0 +1,84 @@
+"""Several threads, each with a model of its own: as one after the other, bit by bit."""
+
+import subprocess
+import sys
+import threading
+
+import numpy as np
+
+SCRIPT = """
+import sys, threading
+import numpy as np
+import ddg_warp as ddg
+from ddg_warp import meshes
+from ddg_warp.integrate import statics
+from ddg_warp.stability import spectrum
+
+def scene(number):
+    s = ddg.Scene()
+    points = np.zeros((10 + number, 3))
+    points[:, 0] = np.linspace(0.0, 1.0, len(points))
+    material = ddg.Material(1e7)
+    if number % 2:
+        sheet = s.add_shell(*meshes.rectangle(3, 3), thickness=0.05, material=material, bending="hinge")
+        s.clamp_boundary(sheet, [0, 1, 2, 3])
+    else:
+        s.clamp(s.add_rod(points, section=ddg.Circle(0.02), material=material))
+    return s
+
+def run(number, found):
+    model = scene(number).build(sys.argv[1], "float64")
+    integrator, state = ddg.Integrator(model), model.state()
+    for _ in range(20):
+        state = integrator.step(state, 0.01)
+    rest = statics.solve(model)
+    found[number] = state.points(), rest.points(), spectrum(model, rest, 2).eigenvalues, model.energies(state)["kinetic"]
+
+together, alone = {}, {}
+threads = [threading.Thread(target=run, args=(number, together)) for number in range(4)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+for number in range(4):
+    run(number, alone)
+for number in range(4):
+    for one, other in zip(together[number], alone[number], strict=True):
+        assert np.allclose(one, other, rtol=0.0 if sys.argv[1] == "cpu" else 1e-6), number
+print("alike")
+"""
+
+
+def test_each_thread_its_own_model(device):
+    """In a process of its own, where nothing has been loaded before the threads start."""
+    done = subprocess.run([sys.executable, "-c", SCRIPT, device], capture_output=True, text=True, check=False)
+    assert done.stdout.endswith("alike\n"), done.stderr[-2000:]
+
+
+def test_capture_waits_for_those_who_launch():
+    from ddg_warp.threads import capturing, launches
+
+    inside, seen, release = threading.Event(), [], threading.Event()
+
+    @launches
+    def launch():
+        inside.set()
+        release.wait()
+        seen.append("launched")
+
+    def capture():
+        with capturing():
+            seen.append("captured")
+
+    threads = [threading.Thread(target=launch), threading.Thread(target=capture)]
+    threads[0].start()
+    inside.wait()
+    threads[1].start()
+    release.set()
+    for thread in threads:
+        thread.join()
+    assert seen == ["launched", "captured"]
+    with np.testing.assert_raises(ZeroDivisionError), capturing():
+        raise ZeroDivisionError
+    launch()  # what failed inside left nothing locked
+    capture()
