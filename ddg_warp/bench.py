@@ -1,7 +1,8 @@
 """Speed against error: a scene over a grid of settings, each run timed and compared with a reference.
 
-A scene takes part by `benchmark() -> Study`. Times are of this machine and this moment; what carries over is their
-ratio, so that every row also gives its time relative to the first of the same run, and never without its error.
+A scene takes part by `benchmark() -> Study`, and by a default study where it has none. Times are of this machine and this moment;
+what carries over is their ratio, so that every row also gives its time relative to that of the scene's defaults, and never without
+its error. `ddg_warp.bench_overview` sums up many scenes.
 """
 
 import itertools
@@ -13,11 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from ddg_warp.catalog import InputError, load_scene, parameters, scene_files, scene_name
+from ddg_warp.catalog import InputError, load_scene, parameters, scene_name
+from ddg_warp.scene import Dynamics
 from ddg_warp.simulate import Result, simulate
 
 RUN_SETTINGS = ("dt", "duration", "precision")
 SOLVER_OPTIONS = ("solver", "linear", "rtol")
+RESOLUTION = ("n", "cells", "segments", "rings", "around")  # what scenes call their number of edges or cells
+REFINED = 4  # how much finer the reference of a default study is than the scene, where no check has one
 
 
 @dataclass(frozen=True)
@@ -25,37 +29,66 @@ class Study:
     """What to vary and what to measure.
 
     Attributes:
-        grid: Values by name; every combination is run. A name is a parameter of `build`, a setting of the run (dt,
-            duration, precision) or an option of the integrator (scheme, solver, linear, rtol).
-        measure: What is compared: a number or an array, from a result.
-        reference: What `measure` should give; or settings, by name, that turn a case into its reference run.
+        grid: Values by name; every combination is run, and the scene's defaults. A name is a parameter of `build`, a setting of the
+            run (dt, duration, precision) or an option of the solver (scheme, solver, linear, rtol).
+        measure: What is compared: the beginning of the name of one of the scene's checks, or a function of a result that gives a
+            number or an array.
+        reference: What `measure` should give; or settings, by name, that turn a case into its reference run. A check has its own.
         fixed: Settings of all runs.
         series: Names of the grid that tell the lines of the plot apart; a line then joins the cases that no other of its
             series beats in both error and time, and the table shows these. By default all names but the first, and
             every case.
+        unit: Of what is measured; that of a check stands in its name.
+        scale: What errors are divided by to be relative ones; by default the size of the reference.
     """
 
     grid: Mapping[str, tuple]
-    measure: Callable[[Result], Any]
-    reference: Any
+    measure: Callable[[Result], Any] | str
+    reference: Any = None
     fixed: Mapping[str, Any] = field(default_factory=dict)
     series: tuple[str, ...] = ()
+    unit: str = ""
+    scale: float | None = None
 
     def cases(self) -> list[dict]:
         """Every combination of the grid, the last name varying fastest."""
         return [dict(zip(self.grid, values, strict=True)) for values in itertools.product(*self.grid.values())]
 
 
-def scenes_with_benchmark() -> list[str]:
-    """Names of the scenes that have a benchmark."""
-    return [name for name, path in scene_files().items() if "def benchmark(" in path.read_text()]
+def study_of(module) -> Study:
+    """The study of a scene: its own, or one of its first check over its resolution, or, without, over the time step.
+
+    Raises:
+        InputError: There is nothing to measure by.
+    """
+    if hasattr(module, "benchmark"):
+        return module.benchmark()
+    settings = parameters(module, {})
+    found = [name for name in RESOLUTION if isinstance(settings.get(name), int)]
+    if found:
+        value = settings[found[0]]
+        grid, finer = {found[0]: (value // 4, value // 2, value)}, {found[0]: REFINED * value}
+    else:
+        analysis = module.build().analysis
+        if not isinstance(analysis, Dynamics):
+            raise InputError(
+                f"{module.__name__} has no benchmark(), and no parameter of {', '.join(RESOLUTION)} to vary; give it "
+                "benchmark() -> ddg_warp.bench.Study"
+            )
+        grid = {"dt": tuple(analysis.dt / division for division in (1, 2, 4))}
+        finer = {"dt": analysis.dt / (4 * REFINED)}
+    if hasattr(module, "check"):
+        return Study(grid, "")
+    if hasattr(module, "observe"):
+        return Study(grid, lambda result: [values[-1] for values in result.series.values()], finer)
+    raise InputError(f"{module.__name__} has no check(), observe() or benchmark(): there is nothing to measure by")
 
 
 def benchmark(name: str, out: str | Path, *, device: str | None = None, precision: str | None = None) -> bool:
     """Run a scene's study; write NAME.csv, NAME.json and NAME.png into `out`.
 
     Args:
-        name: A scene with a benchmark.
+        name: A scene.
         out: Directory for the results.
         device: Warp device.
         precision: Precision of the cases that set none.
@@ -64,77 +97,145 @@ def benchmark(name: str, out: str | Path, *, device: str | None = None, precisio
         Whether every run reached its end.
 
     Raises:
-        InputError: The scene has no benchmark.
+        InputError: The scene has nothing to measure by.
     """
     from ddg_warp.summary import machine, table, write_table
 
     module = load_scene(name)
-    if not hasattr(module, "benchmark"):
-        raise InputError(f"scene '{name}' has no benchmark; there are {', '.join(scenes_with_benchmark()) or 'none'}")
-    study = module.benchmark()
-    rows = measure(module, study, device=device, precision=precision)
+    study = study_of(module)
+    rows, unit = measure(module, study, device=device, precision=precision)
     stem = Path(out) / scene_name(name)
-    command = f"ddg-warp bench {name}"
-    write_table(stem, rows, {"scene": name, "command": command, "machine": machine(), "fixed": study.fixed})
-    plot(study, rows, stem.with_suffix(".png"), name)
-    print(table(best(study, rows)))
+    origin = {
+        "scene": name,
+        "command": f"ddg-warp bench {name}" + (f" --device {device}" if device else ""),
+        "machine": machine(),
+        "measure": study.measure if isinstance(study.measure, str) else "",
+        "unit": unit,
+        "orders": orders(study, rows),
+        "fixed": study.fixed,
+    }
+    write_table(stem, rows, origin)
+    plot(study, rows, stem.with_suffix(".png"), name, unit)
+    print(table([{**row, "error": f"{row['error']:.3g} {unit}"} for row in best(study, rows)]))
+    for setting, order in origin["orders"].items():
+        print(f"observed order in {setting}: {order:.2f}")
     return not any(row["failure"] for row in rows)
 
 
-def measure(module, study: Study, *, device: str | None = None, precision: str | None = None) -> list[dict]:
-    """Run every case of a study, and the reference runs it needs, each once.
+def measure(module, study: Study, *, device: str | None = None, precision: str | None = None) -> tuple[list[dict], str]:
+    """Run every case of a study and the scene's defaults, and the reference runs they need, each once.
 
     Returns:
-        A row a case: its settings, error, ms_per_step, seconds (of all steps), relative_time, steps, newton_iterations,
-        failure.
+        A row a case: its settings, error, relative_error, ms_per_step, seconds, relative_time (over that of the defaults), steps,
+        newton_iterations, default (whether it is the scene's), failure. And the unit of the error.
     """
     shared = dict(study.fixed) | ({} if precision is None else {"precision": precision})
+    usual = defaults(module, study, device)
+    cases = study.cases()
+    if not any(_alike(case, usual) for case in cases):
+        cases.append(usual)
     references: dict[tuple, Result] = {}
-    rows = []
-    for case in study.cases():
+    loaded: set[tuple] = set()
+    rows, unit = [], study.unit
+    for case in cases:
         settings = {**shared, **case}
+        kernels = tuple(value for value in settings.values() if isinstance(value, str | bool))
+        if kernels not in loaded:  # once for the kernels, whose loading is no part of what is measured
+            run(module, settings, device)
+            loaded.add(kernels)
+        began = (clock_of(device) or time.perf_counter)()
         result = run(module, settings, device)
-        reference, failure = study.reference, result.failure
-        if isinstance(reference, Mapping):
-            finer = {**settings, **reference}
-            key = tuple(sorted(finer.items()))
-            if key not in references:
-                references[key] = run(module, finer, device)
-            failure = failure or references[key].failure
-            reference = np.nan if failure else study.measure(references[key])
-        # NaN where a run broke off: there is nothing to compare.
-        error = np.nan if failure else np.max(np.abs(np.asarray(study.measure(result)) - np.asarray(reference)))
+        failure, error, scale = result.failure, np.nan, 1.0
+        if isinstance(study.measure, str):
+            if not failure:
+                error, scale, unit = _of_check(module, study, result)
+        else:
+            reference = study.reference
+            if isinstance(reference, Mapping):
+                finer = {**settings, **reference}
+                key = tuple(sorted(finer.items()))
+                if key not in references:
+                    references[key] = run(module, finer, device)
+                failure = failure or references[key].failure
+                reference = np.nan if failure else study.measure(references[key])
+            # NaN where a run broke off: there is nothing to compare.
+            if not failure:
+                reference = np.asarray(reference, float)
+                error = float(np.max(np.abs(np.asarray(study.measure(result)) - reference)))
+                scale = float(np.max(np.abs(reference))) or 1.0
         # The first two steps compile and capture, one for each of the two buffers.
         steady = result.step_times[2:] or result.step_times
         seconds_per_step = float(np.mean(steady)) if steady else 0.0
         seconds = seconds_per_step * len(result.step_times)
+        if not isinstance(result.scene.analysis, Dynamics):  # much of it may be done by the check
+            seconds = (clock_of(device) or time.perf_counter)() - began
         rows.append(
             case
             | {
                 "error": float(error),
+                "relative_error": float(error) / (study.scale or scale),
                 "ms_per_step": 1e3 * seconds_per_step,
                 "seconds": seconds,
-                "relative_time": seconds / first if (first := rows[0]["seconds"] if rows else seconds) else np.nan,
                 "steps": len(result.step_times),
                 "newton_iterations": result.statistics.get("newton_iterations", {}).get("mean", 0.0),
+                "default": _alike(case, usual),
                 "failure": failure,
             }
         )
-    return rows
+    first = next(row["seconds"] for row in rows if row["default"])
+    return [row | {"relative_time": row["seconds"] / first if first else np.nan} for row in rows], unit
+
+
+def _of_check(module, study: Study, result: Result) -> tuple[float, float, str]:
+    """Error, size of the reference and unit of the check that a study measures by."""
+    checks = [check for check in module.check(result) if check.name.startswith(study.measure)]
+    if not checks:
+        raise InputError(f"{module.__name__}: no check is named '{study.measure}...' with these settings")
+    check = checks[0]
+    if check.relative:
+        return check.error, 1.0, "relative"
+    unit = check.name.partition("[")[2].partition("]")[0]
+    return check.error, abs(float(check.reference)) or 1.0, unit or "1"
+
+
+def defaults(module, study: Study, device: str | None) -> dict:
+    """What the names of a study's grid are where nobody sets them."""
+    import warp as wp
+
+    from ddg_warp.integrate.statics import StaticsOptions
+    from ddg_warp.newton import NewtonOptions
+
+    known = parameters(module, {})
+    analysis = module.build(**{name: value for name, value in study.fixed.items() if name in known}).analysis
+    options = NewtonOptions() if isinstance(analysis, Dynamics) else StaticsOptions()
+    usual = {"precision": "mixed" if wp.get_device(device).is_cuda else "float64", "linear": "auto", "solver": "newton"}
+    usual["rtol"] = options.rtol
+    if isinstance(analysis, Dynamics):
+        usual |= {"dt": analysis.dt, "duration": analysis.duration, "scheme": analysis.scheme}
+    else:
+        usual["solver"] = "auto"
+    return {name: {**usual, **known}[name] for name in study.grid}
+
+
+def _alike(case: Mapping, usual: Mapping) -> bool:
+    return all(
+        np.isclose(case[name], value, rtol=1e-9, atol=0.0) if isinstance(value, float) else case[name] == value
+        for name, value in usual.items()
+    )
 
 
 def run(module, settings: Mapping, device: str | None) -> Result:
     """Run one case without recording it.
 
     Raises:
-        InputError: A setting is neither a parameter of the scene, nor of the run, nor of the integrator.
+        InputError: A setting is neither a parameter of the scene, nor of the run, nor of the solver.
     """
     known = parameters(module, {})
     unknown = [name for name in settings if name not in (*known, *RUN_SETTINGS, *SOLVER_OPTIONS, "scheme")]
     if unknown:
         raise InputError(f"the benchmark of {module.__name__} sets '{unknown[0]}', which is no setting of a run")
     scene = module.build(**{name: value for name, value in settings.items() if name in known})
-    if "scheme" in settings:
+    if "scheme" in settings and "scheme" not in known:
         scene.analysis = replace(scene.analysis, scheme=settings["scheme"])
     return simulate(
         scene,
@@ -143,7 +244,7 @@ def run(module, settings: Mapping, device: str | None) -> Result:
         options={name: value for name, value in settings.items() if name in SOLVER_OPTIONS},
         clock=clock_of(device),
         progress=False,
-        **{name: value for name, value in settings.items() if name in RUN_SETTINGS},
+        **{name: value for name, value in settings.items() if name in RUN_SETTINGS and name not in known},
     )
 
 
@@ -172,22 +273,42 @@ def best(study: Study, rows: list[dict]) -> list[dict]:
     return sorted(front, key=lambda row: order.index(tuple(row[name] for name in study.series)))
 
 
-def plot(study: Study, rows: list[dict], path: Path, title: str) -> None:
-    """Error over stepping time, a line a series; see `Study.series`."""
+def orders(study: Study, rows: list[dict]) -> dict[str, float]:
+    """Observed orders in the settings that refine: log(error) over log(setting) between the two finest cases beside the best.
+
+    Of a number of edges or cells the order is that in their size. What else is set is as in the case of least error.
+    """
+    result = {}
+    good = [row for row in rows if row["error"] > 0.0]
+    for name, values in study.grid.items():
+        if name == "rtol" or len(values) < 3 or not good or isinstance(values[0], str | bool):
+            continue
+        finest = min(good, key=lambda row: row["error"])
+        line = {
+            row[name]: row["error"]
+            for row in good
+            if all(row[other] == finest[other] for other in study.grid if other != name)
+        }
+        order = sorted(line, reverse=isinstance(values[0], float))[-2:]
+        if len(order) == 2:
+            slope = np.log(line[order[1]] / line[order[0]]) / np.log(order[1] / order[0])
+            result[name] = float(abs(slope) * np.sign(slope if isinstance(values[0], float) else -slope))
+    return result
+
+
+def plot(study: Study, rows: list[dict], path: Path, title: str, unit: str) -> None:
+    """Error over time, a line a series, the scene's defaults marked; see `Study.series`."""
     try:
         from ddg_warp.figure import error_plot
     except ModuleNotFoundError as error:
         print(f"no plot without {error.name}: `pip install matplotlib`")
         return
     names = list(study.series or list(study.grid)[1:])
-    label = " / ".join(names) or "scene"
-    lines = [
-        {
-            "stepping time [s]": row["seconds"],
-            "error": row["error"],
-            label: ", ".join(str(row[name]) if name in study.series else f"{name} {row[name]}" for name in names)
-            or title,
-        }
-        for row in best(study, rows)
-    ]
-    error_plot(path, lines, x="stepping time [s]", y="error", series=label, title=title)
+    label, across, up = " / ".join(names) or "scene", "time [s]", f"error [{unit}]" if unit else "error"
+
+    def shown(row) -> dict:
+        text = ", ".join(str(row[name]) if name in study.series else f"{name} {row[name]}" for name in names)
+        return {across: row["seconds"], up: row["error"], label: text or title}
+
+    usual = [shown(row) for row in rows if row["default"]]
+    error_plot(path, [shown(row) for row in best(study, rows)], x=across, y=up, series=label, title=title, marked=usual)

@@ -83,7 +83,8 @@ def parser(arguments: list[str]) -> Parser:
 
     bench = commands.add_parser("bench", help="measure a scene's error against its time")
     bench.set_defaults(command=bench_scene)
-    bench.add_argument("scene", nargs="?", metavar="NAME", help="a scene with a benchmark (default: list them)")
+    bench.add_argument("scene", nargs="?", metavar="NAME", help="a scene (default: list them)")
+    bench.add_argument("--all", action="store_true", help="every scene in turn, and an overview of them")
     add_settings(bench)
     bench.add_argument("--out", type=Path, default=Path("out/bench"), metavar="DIR", help="default: out/bench")
 
@@ -235,13 +236,23 @@ def check_terms(chosen: argparse.Namespace) -> int:
 
 def bench_scene(chosen: argparse.Namespace) -> int:
     """`bench`: a scene's error against its time."""
-    from ddg_warp.bench import benchmark, scenes_with_benchmark
+    from ddg_warp.bench import benchmark
+    from ddg_warp.bench_overview import overview
+    from ddg_warp.summary import table
 
-    if chosen.scene is None:
-        print("\n".join(scenes_with_benchmark()))
+    if chosen.scene is None and not chosen.all:
+        print("\n".join(scene_files()))
         return DONE
+    if chosen.scene is not None and chosen.all:
+        raise InputError(f"bench --all measures every scene; leave out '{chosen.scene}', or --all")
     require_device(chosen.device)
-    return DONE if benchmark(chosen.scene, chosen.out, device=chosen.device, precision=chosen.precision) else FAILED
+    done = True
+    for name in scene_files() if chosen.all else [chosen.scene]:
+        print(f"== {name}", flush=True)
+        done &= benchmark(name, chosen.out, device=chosen.device, precision=chosen.precision)
+    if chosen.all:
+        print(table(overview(chosen.out)))
+    return DONE if done else FAILED
 
 
 def export_run(chosen: argparse.Namespace) -> int:

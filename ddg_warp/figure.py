@@ -66,7 +66,9 @@ def rods_picture(
     _save(figure, path)
 
 
-def error_plot(path, rows: Iterable[Mapping], x: str, y: str, series: str, title: str = "") -> None:
+def error_plot(
+    path, rows: Iterable[Mapping], x: str, y: str, series: str, title: str = "", marked: Iterable[Mapping] = ()
+) -> None:
     """Draws a table with logarithmic axes, one line for each value of a column.
 
     Args:
@@ -76,6 +78,7 @@ def error_plot(path, rows: Iterable[Mapping], x: str, y: str, series: str, title
         y: Column along the vertical axis, and its label.
         series: Column that tells the lines apart.
         title: A line above.
+        marked: Rows of the scene's defaults, which a cross marks.
     """
     rows = [row for row in rows if (row[x] or 0.0) > 0.0 and (row[y] or 0.0) > 0.0]
     names = list(dict.fromkeys(row[series] for row in rows))
@@ -86,6 +89,8 @@ def error_plot(path, rows: Iterable[Mapping], x: str, y: str, series: str, title
         color = TIME_COLORS(0.3 + 0.7 * k / max(1, len(names) - 1))
         marker = MARKERS[k % len(MARKERS)]
         plot.loglog(*zip(*line, strict=True), marker=marker, markersize=5, linewidth=1.4, color=color, label=str(name))
+    for k, row in enumerate(row for row in marked if (row[y] or 0.0) > 0.0):
+        plot.loglog(row[x], row[y], "x", color="k", markersize=9, markeredgewidth=1.8, label="" if k else "defaults")
     plot.set(xlabel=x, ylabel=y)
     plot.set_title(textwrap.fill(title, 80), loc="left", fontsize=11)
     plot.grid(which="major", color="0.85", linewidth=0.7)
@@ -93,6 +98,33 @@ def error_plot(path, rows: Iterable[Mapping], x: str, y: str, series: str, title
     plot.spines[["top", "right"]].set_visible(False)
     if names:
         plot.legend(frameon=False, fontsize=9, title=series, title_fontsize=9)
+    _save(figure, path)
+
+
+def levels_plot(path, names: list[str], marks: Mapping[str, list], usual: list[float], errors: list[float]) -> None:
+    """Draws times on a logarithmic axis, a line a name: a marker for each level reached, a cross for the defaults with its error.
+
+    Args:
+        path: The picture to write; its suffix is the format.
+        names: One a line, the first on top.
+        marks: Level -> time [s] of every name; None where it is not reached.
+        usual: Times of the defaults [s].
+        errors: Their relative errors.
+    """
+    figure = Figure(figsize=(7.5, 1.0 + 0.24 * len(names)), layout="constrained")
+    plot, place = figure.add_subplot(), -np.arange(len(names))
+    for k, (level, times) in enumerate(marks.items()):
+        values = np.array([np.nan if time is None else time for time in times])
+        color = TIME_COLORS(0.3 + 0.7 * k / max(1, len(marks) - 1))
+        plot.semilogx(values, place, MARKERS[k], color=color, markersize=6 - k, label=level, alpha=0.85)
+    plot.semilogx(usual, place, "x", color="k", markersize=6, label="defaults")
+    for x, y, error in zip(usual, place, errors, strict=True):
+        plot.annotate(f"{error:.0e}", (x, y), xytext=(5, -3), textcoords="offset points", fontsize=7, color=GREY)
+    plot.set_yticks(place, names, fontsize=8)
+    plot.set_xlabel("time [s]")
+    plot.grid(color="0.92", linewidth=0.6)
+    plot.spines[["top", "right"]].set_visible(False)
+    plot.legend(frameon=False, fontsize=8, ncols=len(marks) + 1, loc="lower left", bbox_to_anchor=(0.0, 1.0))
     _save(figure, path)
 
 

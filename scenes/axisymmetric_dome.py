@@ -67,3 +67,8 @@ def check(result) -> list[ddg.Check]:
         ddg.Check(name, point.load, limit, tolerance, SOURCE, relative=True)
         for name, point, limit in zip(names, result.path.limit_points, limits, strict=True)
     ]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The largest load over the edges of the meridian."""
+    return ddg.bench.Study({"n": (20, 40, 80, 160)}, "largest load")

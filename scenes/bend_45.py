@@ -71,3 +71,8 @@ def check(result) -> list[ddg.Check]:
         ddg.Check(f"tip {axis} [in]", measured, reference, tolerance, SOURCE, relative=True)
         for axis, measured, reference in zip("xyz", result.state.points()[-1] if tip else (), tip, strict=True)
     ]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The tip over the edges of the rod."""
+    return ddg.bench.Study({"n": (16, 32, 64, 128)}, "tip y")

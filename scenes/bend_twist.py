@@ -97,3 +97,8 @@ def check(result) -> list[ddg.Check]:
         ddg.Check(f"critical weight {i} [B/L^3]", branch.flip(0.8 * G, 1.2 * G), G, 0.02, SOURCE, relative=True)
         for i, G in enumerate(flips, 1)
     ]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The lowest critical weight over the nodes of the rod."""
+    return ddg.bench.Study({"n": (25, 50, 100, 200)}, "critical weight 1")

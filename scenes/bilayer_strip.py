@@ -100,3 +100,8 @@ def check(result) -> list[ddg.Check]:
     reference = exact(kappa * THICKNESS / 1.5, width)
     measured = curvature(result.model, result.state)
     return [ddg.Check("curvature [1/m]", measured, reference, 0.01 + 1.0 / cells**2, SOURCE, relative=True)]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The curvature over meshes; the reference is that of a wide plate, which the narrow strip is not."""
+    return ddg.bench.Study({"cells": (4, 8, 16), "mesh": ("right", "crossed")}, "curvature", series=("mesh",))

@@ -120,3 +120,14 @@ def check(result) -> list[ddg.Check]:
         ddg.Check("how often the cable passed through itself", np.abs(passes).max(), 0.0, 0.0, LINK),
         ddg.Check("cable from where it was, at the end [m]", back, 0.0, 1e-5, "equilibrium"),
     ]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The writhe of the cable over its nodes and steps, halfway through, against a finer cable in shorter steps."""
+    return ddg.bench.Study(
+        {"n": (20, 40, 80), "dt": (0.02, 0.01)},
+        lambda result: result.series["writhe"][-1],
+        {"n": 240, "dt": 0.005},
+        fixed={"duration": 2.0},
+        series=("dt",),
+    )

@@ -69,4 +69,5 @@ def benchmark() -> ddg.bench.Study:
         reference={"dt": 0.001, "n": 800, "scheme": "implicit_midpoint", "precision": "float64", "rtol": 1e-8},
         fixed={"duration": 0.5},
         series=("scheme", "precision"),
+        unit="m",
     )

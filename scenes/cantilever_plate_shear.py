@@ -57,3 +57,10 @@ def check(result) -> list[ddg.Check]:
         if result.reached(load)
         for name, reference in zip(("inwards", "along"), exact(load), strict=True)
     ]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The largest deflection over meshes and membranes."""
+    return ddg.bench.Study(
+        {"n": (8, 16, 32), "membrane": ("flat", "curved")}, "displacement inwards at 1 P", series=("membrane",)
+    )

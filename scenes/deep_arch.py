@@ -46,3 +46,8 @@ def check(result) -> list[ddg.Check]:
         ddg.Check("drop of the crown [m]", limit.values["drop"], DROP, 2e-3 * finer, SOURCE, relative=True),
         ddg.Check("shift of the crown [m]", limit.values["shift"], SHIFT, 2e-3 * finer, SOURCE, relative=True),
     ]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The critical load over the edges of the arch."""
+    return ddg.bench.Study({"n": (60, 120, 240, 480)}, "critical load")

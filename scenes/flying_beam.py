@@ -107,3 +107,15 @@ def check(result) -> list[ddg.Check]:
         drift = np.abs(energy / energy[0] - 1.0).max()
         checks.append(ddg.Check("drift of the energy, unloaded", drift, 0.0, 2e-3 * order, "no load"))
     return checks
+
+
+def benchmark() -> ddg.bench.Study:
+    """Both ends of the beam after 3 s over edges and steps, by both schemes, against a finer beam in shorter steps."""
+    return ddg.bench.Study(
+        {"n": (10, 20, 40), "dt": (0.04, 0.02, 0.01), "scheme": ("implicit_euler", "implicit_midpoint")},
+        lambda result: result.state.points()[[0, -1]],
+        {"n": 160, "dt": 0.0025, "scheme": "implicit_midpoint"},
+        fixed={"duration": 3.0},
+        series=("scheme",),
+        unit="m",
+    )

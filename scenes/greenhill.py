@@ -83,3 +83,8 @@ def check(result) -> list[ddg.Check]:
     reference = exact(tension)
     measured = critical_moment(tension, n, result.model.device)
     return [ddg.Check("critical moment [B/L]", measured, reference, (reference / n) ** 2 / 5.0, SOURCE, relative=True)]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The critical moment over the nodes of the shaft."""
+    return ddg.bench.Study({"n": (50, 100, 200, 400)}, "critical moment")

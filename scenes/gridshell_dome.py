@@ -102,3 +102,14 @@ def check(result) -> list[ddg.Check]:
         ddg.Check("grillage with hinged joint, deflection 96 EI / P L^3", grillage(False), 1.0, 0.01, "beam theory"),
         ddg.Check("grillage with rigid joint, deflection 96 EI / P L^3", grillage(True), 1.0, 0.01, "beam theory"),
     ]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The sag of the crown over the segments of a rib between crossings, against four times as many as the defaults."""
+    return ddg.bench.Study(
+        {"segments": (2, 4, 8, 16), "rigid": (True, False)},
+        lambda result: result.series["crown"][0] - result.series["crown"][-1],
+        {"segments": 32},
+        series=("rigid",),
+        unit="m",
+    )

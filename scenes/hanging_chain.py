@@ -100,3 +100,8 @@ def check(result) -> list[ddg.Check]:
     checks.append(ddg.Check("frequency of the run over that of its mode", frequency / nearest, 1.0, 1e-4, "eigenvalue"))
     checks.append(ddg.Check("amplitude factor of a step", factor, 1.0, 1e-5, "implicit midpoint, linear mode"))
     return checks
+
+
+def benchmark() -> ddg.bench.Study:
+    """The third frequency over the nodes of the chain."""
+    return ddg.bench.Study({"n": (13, 25, 50, 100)}, "frequency 3")

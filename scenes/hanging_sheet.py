@@ -85,6 +85,7 @@ def benchmark() -> ddg.bench.Study:
         measure=lambda result: result.state.points()[_marks(result.model)],
         reference={"dt": 1 / 1920, "cells": 64, "scheme": "implicit_midpoint", "rtol": 1e-8},
         series=("scheme", "cells", "rtol"),
+        unit="m",
     )
 
 

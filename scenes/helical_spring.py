@@ -105,3 +105,8 @@ def check(result) -> list[ddg.Check]:
         ddg.Check("axial force [N]", measured[0], force, tolerance, SOURCE),
         ddg.Check("axial moment [N m]", measured[1], moment, tolerance * RADIUS, SOURCE),
     ]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The axial force over the nodes of ten turns."""
+    return ddg.bench.Study({"n": (100, 200, 400, 800)}, "axial force")

@@ -73,3 +73,8 @@ def check(result) -> list[ddg.Check]:
     if thickness not in LIMIT:
         return []
     return [ddg.Check("limit load [N]", limit(result.series)[0], LIMIT[thickness], 0.015, _sze.SOURCE, relative=True)]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The limit load over meshes and membranes; the published one is of a finite mesh, too."""
+    return ddg.bench.Study({"n": (4, 8, 12), "membrane": ("flat", "curved")}, "limit load", series=("membrane",))

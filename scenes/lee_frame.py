@@ -51,3 +51,8 @@ def check(result) -> list[ddg.Check]:
         ):
             checks.append(ddg.Check(f"{name} limit, {what}", measured, exact, tolerance, SOURCE, relative=True))
     return checks
+
+
+def benchmark() -> ddg.bench.Study:
+    """The first limit load over the edges of each leg."""
+    return ddg.bench.Study({"n": (20, 40, 60, 120)}, "first limit, load")

@@ -100,3 +100,8 @@ def check(result) -> list[ddg.Check]:
     tolerance = 0.04 * max(0.25, (400.0 / (result.model.curves.counts[0] - 1)) ** 2)
     names = ("largest angle [rad]", "width of the envelope [m]", "moment [N m]", "tension [N]")
     return [ddg.Check(*entry, tolerance, SOURCE, relative=True) for entry in zip(names, measured, values, strict=True)]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The moment over the nodes; the reference is that of an infinite rod."""
+    return ddg.bench.Study({"n": (200, 400, 800)}, "moment")

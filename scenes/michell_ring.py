@@ -66,3 +66,8 @@ def check(result) -> list[ddg.Check]:
     ratio = section.GJ / section.EI1
     measured = critical_twist(ratio, n, result.model.device)
     return [ddg.Check("critical twist [rad]", measured, exact(ratio), 40.0 / n**2, SOURCE, relative=True)]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The critical twist over the nodes of the ring."""
+    return ddg.bench.Study({"n": (50, 100, 200)}, "critical twist")

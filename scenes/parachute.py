@@ -100,3 +100,15 @@ def check(result) -> list[ddg.Check]:
 def _last_edges(model) -> list[float]:
     """Rest lengths of the edges at the payload [m]."""
     return [float(np.linalg.norm(batch.points[0, -1] - batch.points[0, -2])) for batch in model.scene.batches]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The speed of payload and canopy at 2 s over steps, rings and tolerances, against a finer canopy in shorter steps."""
+    return ddg.bench.Study(
+        {"dt": (0.04, 0.02, 0.01), "rings": (3, 6), "rtol": (1e-4, 1e-8)},
+        lambda result: [result.series[name][-1] for name in ("payload", "canopy")],
+        {"dt": 0.005, "rings": 12, "rtol": 1e-8},
+        fixed={"duration": 2.0},
+        series=("rings", "rtol"),
+        unit="m/s",
+    )

@@ -65,3 +65,13 @@ def check(result) -> list[ddg.Check]:
     """Compliance at rest, to 7 % at 12 cells: the error of a point force falls with the size of the cells under it."""
     name = "w E h / P at rest"
     return [ddg.Check(name, compliance(result.model), LINEAR, 0.07, SOURCE, relative=True)]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The compliance under a small force over meshes and membranes."""
+    return ddg.bench.Study(
+        {"n": (6, 12, 24), "membrane": ("flat", "curved")},
+        "w E h / P at rest",
+        fixed={"load": 1e-3, "steps": 1},
+        series=("membrane",),
+    )

@@ -88,3 +88,12 @@ def check(result) -> list[ddg.Check]:
     cells = np.sqrt(0.25 * len(result.model.scene.shells[0].triangles))  # of four triangles
     measured = critical_load(result.model, result.state)
     return [ddg.Check("critical load over exact", measured, 1.0, 20.0 / cells**2, SOURCE, relative=True)]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The critical load over meshes and bending models."""
+    return ddg.bench.Study(
+        {"cells": (6, 12, 24, 48), "bending": ("midedge_dof", "midedge_boundary", "hinge")},
+        "critical load",
+        series=("bending",),
+    )

@@ -81,3 +81,12 @@ def check(result) -> list[ddg.Check]:
     cells = np.sqrt(0.25 * len(scene.shells[0].triangles))  # of four triangles
     tolerance = (25.0 if scene.shell_loads else 12.0) / cells**2
     return [ddg.Check("deflection over exact", deflection(result.state), 1.0, tolerance, SOURCE, relative=True)]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The deflection over meshes and bending models."""
+    return ddg.bench.Study(
+        {"cells": (8, 16, 32, 64), "bending": ("midedge_dof", "midedge_boundary", "hinge")},
+        "deflection",
+        series=("bending",),
+    )

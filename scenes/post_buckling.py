@@ -72,3 +72,8 @@ def check(result) -> list[ddg.Check]:
     names = ("axial load [N]", "amplitude [m]", "angle of the ends [rad]")
     values = zip(names, measure(result.model, result.state), exact(shortening), strict=True)
     return [ddg.Check(name, measured, reference, tolerance, SOURCE, True) for name, measured, reference in values]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The axial load over the edges of the column."""
+    return ddg.bench.Study({"n": (25, 50, 100, 200)}, "axial load")

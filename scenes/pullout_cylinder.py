@@ -38,3 +38,10 @@ def observe(model, state) -> dict[str, float]:
 def check(result) -> list[ddg.Check]:
     """Displacement under the force against the table, to 1 % at 16 cells."""
     return _sze.table_checks(result, TABLE, {"radial": "radial displacement [m]"}, 0.01)
+
+
+def benchmark() -> ddg.bench.Study:
+    """The largest displacement over meshes and membranes."""
+    return ddg.bench.Study(
+        {"n": (8, 16), "membrane": ("flat", "curved")}, "radial displacement [m] at 1 P", series=("membrane",)
+    )

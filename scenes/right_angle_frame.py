@@ -51,3 +51,8 @@ def check(result) -> list[ddg.Check]:
     return [
         ddg.Check("lateral buckling load [N]", force * first.load, CRITICAL[int(force)], 1e-2, SOURCE, relative=True)
     ]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The buckling load over the edges of each leg."""
+    return ddg.bench.Study({"n": (5, 10, 20, 40)}, "lateral buckling load")

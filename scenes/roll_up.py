@@ -65,3 +65,8 @@ def check(result) -> list[ddg.Check]:
         ddg.Check("spread of the curvature [1/m]", np.ptp(kappa), 0.0, 1e-6, SOURCE),
         ddg.Check("length [m]", length, LENGTH, 1e-8, SOURCE),
     ]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The tip over the edges of the rod."""
+    return ddg.bench.Study({"n": (25, 50, 100, 200)}, "tip x", scale=1.0)

@@ -60,3 +60,12 @@ def check(result) -> list[ddg.Check]:
     """Displacements of the lip against the table, to 1.2 % at 60 cells around."""
     names = {"inner": "inner corner [m]", "outer": "outer corner [m]"}
     return _sze.table_checks(result, TABLE, names, 0.012)
+
+
+def benchmark() -> ddg.bench.Study:
+    """The outer corner over meshes and membranes; the published one is of a finite mesh, too."""
+    return ddg.bench.Study(
+        {"radial": (3, 6), "around": (30, 60), "membrane": ("flat", "curved")},
+        "outer corner [m] at 1 P",
+        series=("membrane",),
+    )

@@ -63,3 +63,8 @@ def check(result) -> list[ddg.Check]:
     """The stiffness against Reissner's."""
     measured = stiffness(result.model, result.state)
     return [ddg.Check("stiffness over exact", measured, 1.0, 0.03, SOURCE, relative=True)]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The stiffness over the rings of triangles."""
+    return ddg.bench.Study({"rings": (16, 32, 64)}, "stiffness")

@@ -95,3 +95,12 @@ def check(result) -> list[ddg.Check]:
         ddg.Check("drift of the angular momentum", np.abs(momentum / momentum[0] - 1.0).max(), 0.0, rounding, SYMMETRY),
         ddg.Check("drift of the energy", np.abs(energy / energy[0] - 1.0).max(), 0.0, 2.0 * tolerance, "time symmetry"),
     ]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The mean length over steps and schemes."""
+    return ddg.bench.Study(
+        {"steps": (50, 100, 200, 400), "scheme": ("implicit_euler", "implicit_midpoint")},
+        "length over that at rest",
+        series=("scheme",),
+    )

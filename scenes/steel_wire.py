@@ -56,3 +56,15 @@ def check(result) -> list[ddg.Check]:
     # A wire of 7800 kg/m^3 strains by rho g L / E = 4e-7 under its own weight; inertia adds a few times that.
     strain = max(result.series["strain"])
     return [*tips, ddg.Check("largest strain of an edge", strain, 0.0, 1e-6, "weight and inertia over EA")]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The tip at 0.1 s over steps, nodes and schemes, against a finer wire in shorter steps by the midpoint rule."""
+    return ddg.bench.Study(
+        {"dt": (0.01, 0.005, 0.0025), "n": (50, 100), "scheme": ("implicit_euler", "implicit_midpoint")},
+        lambda result: result.series["tip_z"][-1],
+        {"dt": 0.000625, "n": 400, "scheme": "implicit_midpoint"},
+        fixed={"duration": 0.1},
+        series=("scheme",),
+        unit="m",
+    )

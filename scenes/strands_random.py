@@ -93,3 +93,19 @@ def check(result) -> list[ddg.Check]:
         name = f"rod {rod} ({scene.batches[rod].name}, {len(points[rod])} nodes) from where it is alone [m]"
         checks.append(ddg.Check(name, off, 0.0, tolerance, SOURCE))
     return checks
+
+
+def benchmark() -> ddg.bench.Study:
+    """All nodes at 0.5 s over steps, schemes and tolerances, against shorter steps of the midpoint rule."""
+    return ddg.bench.Study(
+        {
+            "dt": (0.02, 0.01, 0.005, 0.0025),
+            "scheme": ("implicit_euler", "implicit_midpoint"),
+            "rtol": (1e-4, 1e-8),
+        },
+        lambda result: result.state.points(),
+        {"dt": 0.000625, "scheme": "implicit_midpoint", "rtol": 1e-8},
+        fixed={"duration": 0.5},
+        series=("scheme", "rtol"),
+        unit="m",
+    )

@@ -68,3 +68,8 @@ def check(result) -> list[ddg.Check]:
     tolerance = 1e-4 * max(1.0, (100.0 / (result.model.curves.counts[0] - 1)) ** 2)
     values = zip(("tip x [m]", "tip z [m]", "tip angle [rad]"), tip(result.state), exact(load), strict=True)
     return [ddg.Check(name, measured, reference, tolerance, SOURCE) for name, measured, reference in values]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The tip over the edges of the rod."""
+    return ddg.bench.Study({"n": (25, 50, 100, 200)}, "tip x", scale=1.0)

@@ -184,3 +184,8 @@ def check(result) -> list[ddg.Check]:
         checks.append(ddg.Check(f"amplitude factor of a step at w h = 0.5, {scheme}", factor, exact[0], 1e-6, ONE_STEP))
         checks.append(ddg.Check(f"phase of a step at w h = 0.5, {scheme}", phase, exact[1], 1e-6, ONE_STEP))
     return checks
+
+
+def benchmark() -> ddg.bench.Study:
+    """The fourth frequency over the nodes of the beam."""
+    return ddg.bench.Study({"n": (13, 25, 50, 100)}, "beta 4")

@@ -142,3 +142,8 @@ def check(result) -> list[ddg.Check]:
         measured = critical_rate(support, edges, device=model.device)
         checks.append(ddg.Check(f"critical rate, {support}", measured, value, space, SOURCE, True))
     return checks
+
+
+def benchmark() -> ddg.bench.Study:
+    """The amplitude over the steps of a turn and the nodes of the shaft."""
+    return ddg.bench.Study({"steps": (30, 60, 120, 240), "n": (20, 40)}, "amplitude over the bow", series=("n",))

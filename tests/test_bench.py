@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp import bench
+from ddg_warp import bench, bench_overview, catalog
 from ddg_warp.catalog import InputError, load_scene
+from ddg_warp.cli import main
 
 ROOT = Path(__file__).parents[1]
 COLUMNS = "study rods nodes precision rtol ms_per_step newton_mean newton_max outcomes residual error".split()
@@ -34,11 +35,18 @@ def study(cantilever) -> bench.Study:
 
 
 def test_every_case_has_its_error_and_its_time(cantilever, study, device):
-    rows = bench.measure(cantilever, study, device=device)
+    rows, unit = bench.measure(cantilever, study, device=device)
+    assert unit == "m"
+    *rows, usual = rows
+    assert usual["default"]
+    assert usual["dt"] == 0.01
+    assert usual["n"] == 50
     assert [{name: row[name] for name in study.grid} for row in rows] == study.cases()
     assert all(row["error"] > 0.0 and row["ms_per_step"] > 0.0 and row["seconds"] > 0.0 for row in rows)
     assert all(row["newton_iterations"] >= 1.0 and not row["failure"] for row in rows)
-    assert rows[0]["relative_time"] == 1.0
+    assert usual["relative_time"] == 1.0
+    assert all(row["relative_time"] == row["seconds"] / usual["seconds"] for row in rows)
+    assert not any(row["default"] for row in rows)
     assert [row["steps"] for row in rows] == [5, 5, 10, 10]
     euler, midpoint = ([row["error"] for row in rows if row["scheme"] == scheme] for scheme in study.grid["scheme"])
     assert euler[1] < euler[0]  # the step is what makes the error: nodes are those of the reference
@@ -50,7 +58,8 @@ def test_reference_is_run_once(cantilever, study, device, monkeypatch):
     run = bench.run
     monkeypatch.setattr(bench, "run", lambda module, case, where: asked.append(case) or run(module, case, where))
     bench.measure(cantilever, study, device=device)
-    assert len(asked) == len(study.cases()) + 1
+    # the defaults, too; and the first of each scheme a second time, since its first run loads kernels
+    assert len(asked) == len(study.cases()) + 2 + len(study.grid["scheme"])
     assert [case["dt"] for case in asked].count(study.reference["dt"]) == 1
 
 
@@ -59,7 +68,7 @@ def test_failed_case_has_no_error(cantilever, study, device, monkeypatch):
         raise ddg.SolverError("rod 0 could not be stepped", state=state)
 
     monkeypatch.setattr(ddg.Integrator, "step", fail)
-    rows = bench.measure(cantilever, study, device=device)
+    rows, _ = bench.measure(cantilever, study, device=device)
     assert all(np.isnan(row["error"]) and np.isnan(row["relative_time"]) for row in rows)
     assert {row["failure"] for row in rows} == {"rod 0 could not be stepped"}
     assert bench.best(study, rows) == []
@@ -97,3 +106,67 @@ def test_many_rods(tmp_path):
         assert row["error"] <= 1e-5
         assert (row["retries"], row["lost_pivots"], row["failure"], row["passed"]) == (0, 0, "", True)
     assert (tmp_path / "rods_cpu.png").stat().st_size > 0
+
+
+def test_order_of_what_converges():
+    """error = c n^-2 over edges and c dt over steps, with the least error of other settings held."""
+    study = bench.Study({"n": (10, 20, 40), "dt": (0.1, 0.05, 0.025)}, "tip", 0.0)
+    rows = [{"n": n, "dt": dt, "error": 3.0 * n**-2.0 + 1e-9 * dt} for n in (10, 20, 40) for dt in (0.1, 0.05, 0.025)]
+    assert bench.orders(study, rows)["n"] == pytest.approx(2.0, abs=1e-4)
+    rows = [{"n": n, "dt": dt, "error": 0.5 * dt} for n in (10, 20, 40) for dt in (0.1, 0.05, 0.025)]
+    assert bench.orders(study, rows)["dt"] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_every_scene_has_a_study():
+    """Its grid names what a run can set, and holds the scene's defaults or gets them as a case of their own."""
+    for name in catalog.scene_files():
+        module = load_scene(name)
+        study = bench.study_of(module)
+        usual = bench.defaults(module, study, "cpu")
+        assert set(usual) == set(study.grid), name
+        assert study.cases(), name
+        assert isinstance(study.measure, str) or study.reference is not None, name
+
+
+def test_a_scene_without_benchmark_gets_a_study(tmp_path, device):
+    """By its first check over its resolution: a hanging chain of springs, L = m g / k (n + 1) / 2n over its n edges."""
+    path = tmp_path / "springs.py"
+    path.write_text(
+        """
+import numpy as np
+import ddg_warp as ddg
+
+def build(n: int = 16) -> ddg.Scene:
+    scene = ddg.Scene(analysis=ddg.Statics())
+    points = np.outer(np.linspace(0.0, -1.0, n + 1), [0.0, 0.0, 1.0])
+    scene.fix(scene.add_rod(points, section=ddg.Stiffness(EA=1e3, mass_per_length=1.0), bend=False), [0])
+    return scene
+
+def check(result):
+    found = -1.0 - result.state.points()[-1, 2]
+    return [ddg.Check("sag [m]", found, 0.5 * 9.81 / 1e3, 1e-6, "EA u'' = -rho A g")]
+"""
+    )
+    assert main(["bench", str(path), "--device", device, "--out", str(tmp_path)]) == 0
+    content = json.loads((tmp_path / "springs.json").read_text())
+    assert [row["n"] for row in content["rows"]] == [4, 8, 16]
+    assert [row["default"] for row in content["rows"]] == [False, False, True]
+    assert content["unit"] == "m"
+    # consistent nodal loads: the ends of straight springs are exact whatever n
+    assert all(row["error"] < 1e-9 for row in content["rows"])
+    assert (tmp_path / "springs.png").stat().st_size > 0
+
+
+def test_overview_of_scenes(tmp_path, device):
+    assert main(["bench", "tip_load", "--device", device, "--out", str(tmp_path)]) == 0
+    (row,) = bench_overview.overview(tmp_path)
+    assert row["scene"] == "tip_load"
+    assert row["relative_error"] < 1e-3
+    assert row["to_1_percent"] <= row["to_0.1_percent"]
+    assert "n 2.0" in row["orders"]
+    assert (tmp_path / "overview.png").stat().st_size > 0
+
+
+def test_all_and_one_are_two_things(capsys):
+    assert main(["bench", "cantilever", "--all"]) != 0
+    assert "leave out 'cantilever'" in capsys.readouterr().err

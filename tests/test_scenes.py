@@ -1,0 +1,73 @@
+"""Every scene's own check at a small size; by its defaults, and those that take longer, they are slow."""
+
+import pytest
+
+from ddg_warp.catalog import load_scene, parameters, scene_files
+from ddg_warp.simulate import simulate
+
+SMALL = {
+    "axisymmetric_dome": {"n": 40},
+    "bend_45": {"n": 32},
+    "bend_twist": {"n": 50},
+    "bilayer_strip": {"cells": 4},
+    "cable_gripped_at_both_ends": {"n": 40},
+    "cantilever": {},
+    "cantilever_plate_shear": {"n": 16, "steps": 5},
+    "deep_arch": {},
+    "flying_beam": {"n": 20},
+    "greenhill": {"n": 100},
+    "gridshell_dome": {"rods": 3},
+    "hanging_chain": {"n": 25},
+    "hanging_sheet": {},
+    "helical_spring": {"n": 200},
+    "hinged_roof": {"n": 6, "steps": 16},
+    "leaf": {"cells": 20},
+    "lee_frame": {"n": 40},
+    "localized_helix": {},
+    "michell_ring": {"n": 100},
+    "parachute": {"rings": 3, "lines": 6},
+    "pinched_cylinder": {"n": 12, "steps": 1, "load": 1e-3},
+    "plate_buckling": {"cells": 12},
+    "plate_square": {"cells": 16},
+    "post_buckling": {"n": 50},
+    "pullout_cylinder": {"n": 8, "steps": 10},
+    "right_angle_frame": {},
+    "roll_up": {"n": 100},
+    "slit_annulus": {},
+    "sphere_indentation": {"rings": 16},
+    "spinning_rod": {"steps": 100},
+    "steel_wire": {},
+    "strands": {"count": 16},
+    "strands_random": {"count": 6},
+    "tip_load": {"n": 50},
+    "vibration": {"n": 25},
+    "whirling": {},
+}
+LONG = ("cable_gripped_at_both_ends", "hanging_sheet", "parachute", "pullout_cylinder", "slit_annulus", "hinged_roof")
+
+
+def checked(name: str, device: str, **given) -> None:
+    """Run a scene and hold it to its own check, of which there is one at least."""
+    module = load_scene(name)
+    assert set(given) <= set(parameters(module, {})), "the scene has no such parameter"
+    result = simulate(module.build(**given), device=device, observe=getattr(module, "observe", None), progress=False)
+    assert not result.failure
+    checks = module.check(result)
+    failed = [f"{check.name}: {check.error:.2e} > {check.tolerance:.2e}" for check in checks if not check.passed]
+    assert checks, "nothing was checked"
+    assert not failed, failed
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in SMALL])
+def test_small(device, name):
+    checked(name, device, **SMALL[name])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name, small in SMALL.items() if small])
+def test_defaults(device, name):
+    checked(name, device)
+
+
+def test_no_scene_is_left_out():
+    assert set(SMALL) == set(scene_files())
