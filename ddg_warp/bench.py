@@ -274,25 +274,21 @@ def best(study: Study, rows: list[dict]) -> list[dict]:
 
 
 def orders(study: Study, rows: list[dict]) -> dict[str, float]:
-    """Observed orders in the settings that refine: log(error) over log(setting) between the two finest cases beside the best.
+    """Observed orders in the settings that refine: the median of log(error) over log(setting) between neighbouring cases.
 
-    Of a number of edges or cells the order is that in their size. What else is set is as in the case of least error.
+    Of a number of edges, cells or steps the order is that in their size. What else is set is as in the case of least error.
     """
     result = {}
     good = [row for row in rows if row["error"] > 0.0]
     for name, values in study.grid.items():
         if name == "rtol" or len(values) < 3 or not good or isinstance(values[0], str | bool):
             continue
-        finest = min(good, key=lambda row: row["error"])
-        line = {
-            row[name]: row["error"]
-            for row in good
-            if all(row[other] == finest[other] for other in study.grid if other != name)
-        }
-        order = sorted(line, reverse=isinstance(values[0], float))[-2:]
-        if len(order) == 2:
-            slope = np.log(line[order[1]] / line[order[0]]) / np.log(order[1] / order[0])
-            result[name] = float(abs(slope) * np.sign(slope if isinstance(values[0], float) else -slope))
+        finest, others = min(good, key=lambda row: row["error"]), [other for other in study.grid if other != name]
+        line = {row[name]: row["error"] for row in good if all(row[other] == finest[other] for other in others)}
+        if len(line) > 1:
+            values, errors = np.log(np.array(sorted(line.items()))).T
+            slope = float(np.median(np.diff(errors) / np.diff(values)))
+            result[name] = slope if isinstance(next(iter(line)), float) else -slope
     return result
 
 
