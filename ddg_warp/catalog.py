@@ -5,6 +5,7 @@ import ast
 import importlib
 import importlib.util
 import inspect
+import sys
 from difflib import get_close_matches
 from pathlib import Path
 from types import ModuleType
@@ -41,6 +42,9 @@ def load_scene(name: str) -> ModuleType:
         path = Path(name)
         if not path.is_file():
             raise InputError(f"there is no scene file {name}")
+        folder = str(path.resolve().parent)
+        if folder not in sys.path:
+            sys.path.insert(0, folder)  # files beside the scene can be imported, as beside a script
         spec = importlib.util.spec_from_file_location(path.stem, path)
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)

@@ -1,0 +1,45 @@
+"""Every example of the README runs as it stands there."""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+README = Path(__file__).parents[1] / "README.md"
+BLOCKS = re.findall(r"^```python(?: file=(\S+))?\n(.*?)^```", README.read_text(), re.M | re.S)
+COMMANDS = re.findall(r"^    (ddg-warp (?:run|bench|check|export|info|list).*?)(?: *#.*)?$", README.read_text(), re.M)
+LONG = ("strands", "bench")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Where the examples run, one after the other."""
+    return tmp_path_factory.mktemp("readme")
+
+
+def test_examples(folder, device):
+    """One script of all of them, in their order; a block with a file is that file."""
+    assert BLOCKS
+    lines = [f"import warp as wp; wp.set_device({device!r})"]
+    for file, text in BLOCKS:
+        if file:
+            (folder / file).write_text(text)
+        else:
+            lines.append(text)
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join(lines)], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+@pytest.mark.parametrize("command", [c for c in COMMANDS if not any(word in c for word in LONG)])
+def test_commands(folder, command):
+    """Short ones, in their order; those of a scene file find it from the examples."""
+    words = shlex.split(command.split("   ")[0])
+    done = subprocess.run(
+        [sys.executable, "-m", "ddg_warp", *words[1:]], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
