@@ -160,6 +160,9 @@ class Scene(Structures):
             closed: whether the last node is joined to the first.
             natural: "shape" takes curvature and twist at rest from the points and directors; "straight" sets both to zero; or
                 three arrays (curvature 1, curvature 2, twist) [1/m] that broadcast to (R, vertices), of vertices between edges.
+                With tangent t and first director d1: curvature 1 > 0 bends the rod towards d1, curvature 2 > 0 towards the
+                second director t x d1, twist > 0 turns both right-handed about t on the way from the first node to the last
+                (tools/results/natural_curvature.png). In dimension 2 one array, positive from x towards z.
             director: first director of the first edge (3,) or (R, 3), carried along without twist, or of all edges
                 (R, edges, 3); made perpendicular to the tangents. By default one is chosen.
             twist: False leaves twist out: 3 dofs a node, for isotropic rods that are straight at rest.

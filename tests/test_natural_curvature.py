@@ -1,0 +1,47 @@
+"""Which way positive natural curvatures and twists bend a rod: as the docstring of `Scene.add_rods` and its picture say."""
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp.integrate import statics
+
+SECTION = ddg.Stiffness(EA=1e6, EI1=1.0, EI2=2.0, GJ=1.5)
+X, Y, Z = np.eye(3)
+RATE = 0.8  # 1/m
+
+
+def at_rest(device, natural, dimension: int = 3, director=Y, joined: bool = False):
+    """State of a rod along x of length 1, clamped at its first end, that has relaxed to its natural shape."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=dimension)
+    given = {"section": SECTION, "natural": natural, "director": director}
+    points = np.linspace(0.0 * X, X, 33)
+    if joined:
+        rods = [scene.add_rod(half, **given) for half in (points[:17], points[16:])]
+        scene.join([(rods[0], -1), (rods[1], 0)])
+    else:
+        scene.add_rod(points, **given)
+    scene.clamp_end(0)
+    return statics.solve(scene.build(device, "float64"), load_steps=2)
+
+
+# The tip of an arc of length 1 and curvature k: along (sin k / k), across (1 - cos k) / k.
+@pytest.mark.parametrize("joined", [False, True], ids=["alone", "joined"])
+@pytest.mark.parametrize(("natural", "towards"), [((RATE, 0.0, 0.0), Y), ((0.0, RATE, 0.0), np.cross(X, Y))])
+def test_curvature_bends_towards_its_director(device, natural, towards, joined):
+    """The first towards the first director, the second towards the second, tangent x first."""
+    tip = at_rest(device, natural, joined=joined).points()[-1]
+    np.testing.assert_allclose(tip, (np.sin(RATE) * X + (1.0 - np.cos(RATE)) * towards) / RATE, atol=1e-3)
+
+
+@pytest.mark.parametrize("joined", [False, True], ids=["alone", "joined"])
+def test_twist_turns_directors_right_handed(device, joined):
+    """From y towards z about a tangent along x."""
+    directors = at_rest(device, (0.0, 0.0, RATE), joined=joined).directors()
+    middle = RATE * (np.arange(32) + 0.5) / 32
+    np.testing.assert_allclose(directors, np.outer(np.cos(middle), Y) + np.outer(np.sin(middle), Z), atol=1e-6)
+
+
+def test_planar_curvature_turns_x_towards_z(device):
+    tip = at_rest(device, (np.full(31, RATE),), dimension=2, director=None).points()[-1]
+    np.testing.assert_allclose(tip, (np.sin(RATE) * X + (1.0 - np.cos(RATE)) * Z) / RATE, atol=1e-3)
