@@ -40,6 +40,8 @@ class Study:
             every case.
         unit: Of what is measured; that of a check stands in its name.
         scale: What errors are divided by to be relative ones; by default the size of the reference.
+        whole: Whether the time is that of the run and its check, as it always is in statics, instead of that of the steps: for what
+            the check computes.
     """
 
     grid: Mapping[str, tuple]
@@ -49,6 +51,7 @@ class Study:
     series: tuple[str, ...] = ()
     unit: str = ""
     scale: float | None = None
+    whole: bool = False
 
     def cases(self) -> list[dict]:
         """Every combination of the grid, the last name varying fastest."""
@@ -167,7 +170,7 @@ def measure(module, study: Study, *, device: str | None = None, precision: str |
         steady = result.step_times[2:] or result.step_times
         seconds_per_step = float(np.mean(steady)) if steady else 0.0
         seconds = seconds_per_step * len(result.step_times)
-        if not isinstance(result.scene.analysis, Dynamics):  # much of it may be done by the check
+        if study.whole or not isinstance(result.scene.analysis, Dynamics):
             seconds = (clock_of(device) or time.perf_counter)() - began
         rows.append(
             case

@@ -114,7 +114,7 @@ def benchmark() -> ddg.bench.Study:
     return ddg.bench.Study(
         {"n": (10, 20, 40), "dt": (0.04, 0.02, 0.01), "scheme": ("implicit_euler", "implicit_midpoint")},
         lambda result: result.state.points()[[0, -1]],
-        {"n": 160, "dt": 0.0025, "scheme": "implicit_midpoint"},
+        {"n": 160, "dt": 0.001, "scheme": "implicit_midpoint"},
         fixed={"duration": 3.0},
         series=("scheme",),
         unit="m",

@@ -104,4 +104,4 @@ def check(result) -> list[ddg.Check]:
 
 def benchmark() -> ddg.bench.Study:
     """The third frequency over the nodes of the chain."""
-    return ddg.bench.Study({"n": (13, 25, 50, 100)}, "frequency 3")
+    return ddg.bench.Study({"n": (13, 25, 50, 100)}, "frequency 3", whole=True)

@@ -188,4 +188,4 @@ def check(result) -> list[ddg.Check]:
 
 def benchmark() -> ddg.bench.Study:
     """The fourth frequency over the nodes of the beam."""
-    return ddg.bench.Study({"n": (13, 25, 50, 100)}, "beta 4")
+    return ddg.bench.Study({"n": (13, 25, 50, 100)}, "beta 4", whole=True)
