@@ -6,6 +6,7 @@ import warp as wp
 from ddg_warp import arrays, geometry
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.graphs import Graphs
+from ddg_warp.integrate.buffers import Buffer
 from ddg_warp.integrate.net_step import NetStep
 from ddg_warp.integrate.prescribed import PrescribedMotion, TimedLoads
 from ddg_warp.kernels import element, outcome, step
@@ -79,7 +80,7 @@ class Integrator:
         _require_mass(model)
         self._chains = [_ChainStep(self, model, group) for group in model.groups]
         self._net = NetStep(self, model) if model.net is not None else None
-        self._buffers = [model.empty_state(), model.empty_state()]
+        self._buffers = [Buffer(model), Buffer(model)]
         self._graphs = Graphs(model, self._load_modules)
         self._steps_since_check = 0
         self._dt = wp.zeros(model.worlds, dtype=model.types.real, device=model.wp_device)
@@ -87,7 +88,7 @@ class Integrator:
         self._longest = 0.0
 
     def step(self, state: State, dt: float) -> State:
-        """The state after a step of dt [s].
+        """The state after a step of dt [s]. No state changes that is held: see `State`.
 
         Raises:
             SolverError: a rod could not be stepped within the retries; its message names rod and outcome.
@@ -95,12 +96,13 @@ class Integrator:
         if not (np.isfinite(dt) and dt > 0.0):
             raise SceneError(f"dt = {dt}; a time step is positive and finite")
         source = self._own(state)
-        target = self._buffers[1 - source]
+        self._vacate(1 - source)
+        target = self._buffers[1 - source].state
         if dt != self._dt_host:
             self._dt.fill_(dt)
             self._dt_host = dt
         self._promote(dt)
-        start = self._buffers[source].time
+        start = state.time
         for part in self._parts:
             part.prescribe(start, start + dt)
         self._graphs.replay(source, lambda: self._launch(source))
@@ -158,16 +160,22 @@ class Integrator:
 
     def _own(self, state: State) -> int:
         for i, buffer in enumerate(self._buffers):
-            if state is buffer:
+            if state is buffer.state:
                 return i
         if state.model is not self.model:
             raise SceneError("the state is of another model; step states that this integrator's model made")
-        self._buffers[0].assign(state)
+        self._vacate(0)
+        self._buffers[0].state.assign(state)
         return 0
+
+    def _vacate(self, index: int) -> None:
+        """Make sure that nobody holds the state in a buffer."""
+        if self._buffers[index].vacate():
+            self._graphs.clear()
 
     def _launch(self, source: int) -> None:
         """Launches of a step of all parts from one buffer to the other."""
-        before, after = self._buffers[source], self._buffers[1 - source]
+        before, after = self._buffers[source].own, self._buffers[1 - source].own
         for chain in self._chains:
             chain.step(before.groups[chain.index], after.groups[chain.index])
         if self._net is not None:
