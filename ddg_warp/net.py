@@ -15,6 +15,7 @@ from ddg_warp.chains import Piece
 from ddg_warp.net_loads import NetCouple, NetLoad, NetPressure
 from ddg_warp.precision import float32_error
 from ddg_warp.surface import Surface
+from ddg_warp.tolerance import Bodies
 
 
 @dataclass
@@ -119,6 +120,11 @@ class Net:
     def followers(self) -> list:
         """Loads that follow what they act on, each with `places`, `forces` and their `derivative`."""
         return [*self.pressures, *self.bands, *self.couples]
+
+    @cached_property
+    def bodies(self) -> Bodies:
+        """What its blocks belong to."""
+        return Bodies(self)
 
     @cached_property
     def edges(self) -> np.ndarray:

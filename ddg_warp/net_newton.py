@@ -6,11 +6,12 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.net import elements, krylov, newton, system
+from ddg_warp.kernels.net import elements, krylov, newton, parts, system
 from ddg_warp.linear.multilevel import Multilevel
 from ddg_warp.linear.net_chain import Chains
 from ddg_warp.net_system import Assembly, NetSystem, Sums
 from ddg_warp.newton import NewtonOptions
+from ddg_warp.tolerance import outer_forces
 
 PRECONDITIONERS = ("block_jacobi", "chain", "multilevel", "chain_multilevel")
 LOOSEST = 0.1  # largest reduction of the residual that a direction is solved to (Eisenstat and Walker's forcing term)
@@ -65,7 +66,7 @@ class NetNewton:
         (self.stalled,), (self.best,) = flags(), scalars()
         self.coefficient, self.rate, self.step_length, self.decrement, self.merit = scalars(5)
         self.load_scale, self.residual, self.sum_change, self.sum_noise, self.sum_square = scalars(5)
-        self.decrease, self.turn = scalars(2)
+        self.decrease, self.turn, self.largest_square = scalars(3)
         self.forcing, self.rho, self.rho_first, self.total, self.curvature = scalars(5, self.linear)
         self.active, self.busy = make(1, int), make(1, int)
         self.pcg_work = make(1, wp.int64)
@@ -87,6 +88,10 @@ class NetNewton:
         self._assembly = Assembly(net, self.system, self.parts, self.real, self.linear)
         self._judge, self._measure, self._rotate, self._take, self._move = newton.search_kernels(self.real, self.linear)
         self._invert, self._start, self._begin, *self._cycle = krylov.solver_kernels(self.linear)
+        self.allowed = Allowed(net, self.real, self.linear)
+        outer = outer_forces(host, gravity)
+        self.outer = self.allowed.assign(self.allowed.bodies.loads(outer)[None])
+        self._largest_square = Sums(worlds, blocks, self.real, device, largest=True)
         given = net, self.system, self.linear
         self.chains = Chains(*given) if preconditioner in ("chain", "chain_multilevel") else None
         self.levels = Multilevel(*given) if preconditioner in ("multilevel", "chain_multilevel") else None
@@ -107,10 +112,12 @@ class NetNewton:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         own = [self._outer, self._collect, self._settle, self._judge, self._measure, self._rotate, self._take]
+        own += self.allowed.kernels
         cycle = [self._move, self._invert, self._start, self._begin, *self._cycle]
         parts = [kernel for part in (self.chains, self.levels) if part for kernel in part.kernels]
         evaluate = [(kernel, 128) for kernel in self._evaluate]
-        sums = [(k, krylov.THREADS) for part in (self._sum, self._sum_linear, self._largest) for k in part.kernels]
+        sums = (self._sum, self._sum_linear, self._largest, self._largest_square)
+        sums = [(k, krylov.THREADS) for part in sums for k in part.kernels]
         return [*own, *cycle, *evaluate, *self._assembly.kernels, *parts, *sums]
 
     def pcg_iterations(self) -> int:
@@ -160,9 +167,11 @@ class NetNewton:
         self._launch(
             self._settle,
             [self.q, self.force, self.size, self.stiffness, self.fixed, self.status, self.load_scale]
-            + [blocks, net.host.nodes, self.arm, self.longest, options.rtol, options.floor_factor * self.eps],
-            [self.right, self.square, self.noise, self.unbalanced, self.drowned],
+            + [self.allowed.blocks, blocks, net.host.nodes, self.arm, self.longest]
+            + [options.rtol, options.floor_factor * self.eps],
+            [self.right, self.allowed.least, self.square, self.noise, self.unbalanced, self.drowned],
         )
+        self.allowed.sum_up(self.right, options.rtol, self.load_scale, self.status, self.unbalanced, self.drowned)
 
     def outer_forces(self) -> None:
         """Begin the sums at every block: loads, gravity and inertia."""
@@ -179,10 +188,11 @@ class NetNewton:
         self._sum(self.change, self.sum_change)
         self._sum(self.noise, self.sum_noise)
         self._sum(self.square, self.sum_square)
+        self._largest_square(self.square, self.largest_square)
         wp.launch(
             self._judge,
             self.worlds,
-            [self.sum_change, self.sum_noise, self.sum_square, options.floor_factor * self.eps]
+            [self.sum_change, self.sum_noise, self.sum_square, self.largest_square, options.floor_factor * self.eps]
             + [options.max_iterations, options.max_halvings, LOOSEST, options.linear_rtol]
             + [self.status, self.unbalanced, self.drowned, self.slot, self.iteration, self.halvings]
             + [self.step_length, self.decrement, self.merit, self.load_scale, self.residual, self.turned]
@@ -289,3 +299,58 @@ class NetNewton:
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
         """One thread for each block of every world."""
         wp.launch(kernel, self.all, inputs, outputs, device=self.device)
+
+
+class Allowed:
+    """What residuals of blocks and their sums over parts may be, over rtol and the load scale; see `ddg_warp.tolerance`.
+
+    Attributes:
+        blocks: of every block of all worlds [N, N m]; least: what rounding leaves there, which `settle` writes.
+    """
+
+    def __init__(self, net, real, linear):
+        self.net, self.bodies, self._real = net, net.host.bodies, real
+        worlds, device = net.worlds, net.device
+
+        def put(values):
+            return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
+
+        def make(shape, dtype=real):
+            return wp.zeros(shape, dtype=dtype, device=device)
+
+        self.blocks, self.least = make(worlds * net.blocks), make(worlds * net.blocks)
+        self.kernels = [parts.part_kernel(real, linear, leaf) for leaf in (True, False)]
+        self._levels = []
+        for level in self.bodies.levels:
+            n = len(level.weight)
+            arrays = (
+                put(level.starts),
+                put(level.items),
+                make((worlds, n)),
+                make(worlds * n, net.vector),
+                make(worlds * n),
+            )
+            self._levels.append(arrays)
+
+    def assign(self, loads: np.ndarray) -> wp.array:
+        """Take the loads of bodies (worlds or 1, bodies) [N]; load scales of the worlds: 1, or 0 where there are none."""
+        loads = np.broadcast_to(loads, (self.net.worlds, self.bodies.count))
+        given = (loads > 0.0).any(1)
+        loads = np.where(given[:, None], loads, 1.0)
+        self.blocks.assign(np.concatenate([self.bodies.limits(own) for own in loads]))
+        for level, (*_, limit, _, _) in zip(self.bodies.levels, self._levels, strict=True):
+            limit.assign(loads[:, level.body] * level.weight)
+        return wp.array(given.astype(float), dtype=self._real, device=self.net.device)
+
+    def sum_up(self, right, rtol: float, load_scale, status, unbalanced, drowned) -> None:
+        """Raise the flags of worlds with a part whose residuals sum up to too much."""
+        value, rounding, below, kernel = right, self.least, self.net.blocks, self.kernels[0]
+        for starts, items, limit, sums, squares in self._levels:
+            wp.launch(
+                kernel,
+                (limit.shape[1], self.net.worlds),
+                [value, rounding, starts, items, below, limit, rtol, load_scale, status],
+                [sums, squares, unbalanced, drowned],
+                device=self.net.device,
+            )
+            value, rounding, below, kernel = sums, squares, limit.shape[1], self.kernels[1]

@@ -54,11 +54,6 @@ class NetStep:
             self.tally, self.work, self.reason = counts_of.tally, counts_of.work, counts_of.reason
             self.newton.status, self.newton.pcg_work = counts_of.newton.status, counts_of.newton.pcg_work
         self.damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
-        dead = host.mass[: host.nodes] * np.asarray(model.scene.gravity, float) + host.load[: host.nodes]
-        outer = np.abs(dead).sum() + np.abs(host.load[host.nodes :]).sum()
-        outer += sum(np.abs(load.force).sum() for load in host.timed)
-        outer += sum(len(load.places) * np.abs(load.couple).sum() / load.length for load in host.couples)
-        self.outer = wp.full(worlds, float(outer), dtype=real, device=device)
         self.motion = NetMotion(model, self.midpoint) if host.moving else None
         self.loads = NetLoads(model, self.midpoint)
 
@@ -92,7 +87,7 @@ class NetStep:
                 solver.mass,
                 self.integrator._dt,
                 self.damping,
-                self.outer,
+                self.newton.outer,
                 self.progress,
             ]
             + [self.portion, self.cautious, blocks],

@@ -21,6 +21,7 @@ def search_kernels(real, linear):
         change: wp.array(dtype=real),
         noise: wp.array(dtype=real),
         square: wp.array(dtype=real),
+        worst: wp.array(dtype=real),
         floor: real,
         max_iterations: int,
         max_halvings: int,
@@ -45,10 +46,11 @@ def search_kernels(real, linear):
         todo: wp.array(dtype=int),
         active: wp.array(dtype=int),
     ):
-        """Decides by the sums over all blocks; how exactly the next direction is solved follows Eisenstat and Walker (1996).
+        """Decides by the sums over all blocks; `worst` is the largest square of a residual.
 
-        A world whose expected decrease of energy drowns in rounding, and whose residual has not halved in `STALLED` iterations, has
-        converged to rounding: on bad meshes rounding leaves more than the estimate block by block.
+        How exactly the next direction is solved follows Eisenstat and Walker (1996). A world whose expected decrease of energy drowns
+        in rounding, and whose residual has not halved in `STALLED` iterations, has converged to rounding: on bad meshes rounding
+        leaves more than the estimate block by block.
         """
         w = wp.tid()
         wanted[w] = 0
@@ -62,7 +64,7 @@ def search_kernels(real, linear):
             change[w],
             noise[w] * floor,
             square[w],
-            wp.sqrt(square[w]),
+            wp.sqrt(worst[w]),
             max_iterations,
             max_halvings,
             status,

@@ -117,6 +117,7 @@ def balance_kernels(real, linear):
         fixed: wp.array(dtype=wp.uint8),
         status: wp.array(dtype=int),
         load_scale: wp.array(dtype=real),
+        allowed: wp.array(dtype=real),
         blocks: int,
         nodes: int,
         arm: real,
@@ -124,6 +125,7 @@ def balance_kernels(real, linear):
         rtol: real,
         floor: real,
         right_out: wp.array(dtype=H),
+        least_out: wp.array(dtype=real),
         square_out: wp.array2d(dtype=real),
         noise: wp.array2d(dtype=real),
         unbalanced_out: wp.array(dtype=int),
@@ -131,6 +133,7 @@ def balance_kernels(real, linear):
     ):
         """Residual of free dofs, and its squares with moments over the length `arm`; see `kernels.balance` for the criterion.
 
+        `allowed` is what the residual of a block may be at rtol = 1, over `load_scale`; see `ddg_warp.tolerance`.
         What rounding leaves of an edge vector follows from the coordinates of both its ends, `longest` apart at most.
         """
         i = wp.tid()
@@ -144,8 +147,9 @@ def balance_kernels(real, linear):
         reach = wp.max(wp.abs(q[i])) + longest
         if k >= nodes:
             reach += real(1.0)
-        limit = rtol * load_scale[w] * length
+        limit = rtol * load_scale[w] * allowed[i]
         least = floor * (real(stiffness[i]) * reach + size[i])
+        least_out[i] = least
         r = H()
         square = real(0.0)
         for d in range(3):
