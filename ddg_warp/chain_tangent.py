@@ -12,6 +12,7 @@ from ddg_warp import arrays
 from ddg_warp.couples import couple_derivatives, couple_forces
 from ddg_warp.integrate.prescribed import PrescribedMotion
 from ddg_warp.kernels import element
+from ddg_warp.tolerance import support_forces
 from ddg_warp.turning import turned
 
 
@@ -148,9 +149,10 @@ class ChainTangent:
 
     def body_loads(self, outer: np.ndarray, gradient: np.ndarray) -> np.ndarray:
         """Sum of the outer forces on every rod, or its largest support force if that is more (columns,) [N]."""
-        columns, force = self.group.columns, ~self.angle
+        columns, nodes, force = self.group.columns, self.group.nodes, ~self.angle
         total = np.where(self.free & force, np.abs(outer), 0.0).reshape(columns, -1).sum(1)
-        return np.maximum(total, np.where(~self.free & force, np.abs(gradient), 0.0).reshape(columns, -1).max(1))
+        held = np.where(~self.free & force, gradient, 0.0).reshape(columns * nodes, -1)
+        return np.maximum(total, support_forces(held, np.repeat(np.arange(columns), nodes), columns))
 
     def allowed(self, loads: np.ndarray) -> np.ndarray:
         """Residuals at rtol = 1 (size,) [N, N m] of rods with such loads; see `ddg_warp.tolerance`."""
@@ -158,8 +160,12 @@ class ChainTangent:
         return np.repeat(loads, self._dofs) * lengths
 
     def sums(self, loads: np.ndarray, rtol: float, residual: np.ndarray, floor: np.ndarray) -> tuple[bool, float]:
-        """Whole Newton steps with the exact tangent leave none; see `kernels.balance`."""
-        return True, -np.inf
+        """Whether residuals add up to little along the rods from their first node, and the largest excess over rounding."""
+        dim = self.group.kind.dim
+        sums = np.abs(np.cumsum(self.blocks(residual)[..., :dim], axis=1))
+        limit = (rtol * loads)[:, None, None]
+        noise = np.sqrt(np.cumsum(self.blocks(floor)[..., :dim] ** 2, axis=1))
+        return bool((sums <= limit).all()), float((sums - np.maximum(limit, noise)).max())
 
     @property
     def _dofs(self) -> int:

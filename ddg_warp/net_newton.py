@@ -66,7 +66,7 @@ class NetNewton:
         (self.stalled,), (self.best,) = flags(), scalars()
         self.coefficient, self.rate, self.step_length, self.decrement, self.merit = scalars(5)
         self.load_scale, self.residual, self.sum_change, self.sum_noise, self.sum_square = scalars(5)
-        self.decrease, self.turn, self.largest_square = scalars(3)
+        self.decrease, self.turn, self.worst = scalars(3)
         self.forcing, self.rho, self.rho_first, self.total, self.curvature = scalars(5, self.linear)
         self.active, self.busy = make(1, int), make(1, int)
         self.pcg_work = make(1, wp.int64)
@@ -91,7 +91,7 @@ class NetNewton:
         self.allowed = Allowed(net, self.real, self.linear)
         outer = outer_forces(host, gravity)
         self.outer = self.allowed.assign(self.allowed.bodies.loads(outer)[None])
-        self._largest_square = Sums(worlds, blocks, self.real, device, largest=True)
+        self._worst = Sums(worlds, self.allowed.ratio.shape[1], self.real, device, largest=True)
         given = net, self.system, self.linear
         self.chains = Chains(*given) if preconditioner in ("chain", "chain_multilevel") else None
         self.levels = Multilevel(*given) if preconditioner in ("multilevel", "chain_multilevel") else None
@@ -116,7 +116,7 @@ class NetNewton:
         cycle = [self._move, self._invert, self._start, self._begin, *self._cycle]
         parts = [kernel for part in (self.chains, self.levels) if part for kernel in part.kernels]
         evaluate = [(kernel, 128) for kernel in self._evaluate]
-        sums = (self._sum, self._sum_linear, self._largest, self._largest_square)
+        sums = (self._sum, self._sum_linear, self._largest, self._worst)
         sums = [(k, krylov.THREADS) for part in sums for k in part.kernels]
         return [*own, *cycle, *evaluate, *self._assembly.kernels, *parts, *sums]
 
@@ -169,7 +169,15 @@ class NetNewton:
             [self.q, self.force, self.size, self.stiffness, self.fixed, self.status, self.load_scale]
             + [self.allowed.blocks, blocks, net.host.nodes, self.arm, self.longest]
             + [options.rtol, options.floor_factor * self.eps],
-            [self.right, self.allowed.least, self.square, self.noise, self.unbalanced, self.drowned],
+            [
+                self.right,
+                self.allowed.least,
+                self.allowed.ratio,
+                self.square,
+                self.noise,
+                self.unbalanced,
+                self.drowned,
+            ],
         )
         self.allowed.sum_up(self.right, options.rtol, self.load_scale, self.status, self.unbalanced, self.drowned)
 
@@ -188,11 +196,12 @@ class NetNewton:
         self._sum(self.change, self.sum_change)
         self._sum(self.noise, self.sum_noise)
         self._sum(self.square, self.sum_square)
-        self._largest_square(self.square, self.largest_square)
+        self._worst(self.allowed.ratio, self.worst)
         wp.launch(
             self._judge,
             self.worlds,
-            [self.sum_change, self.sum_noise, self.sum_square, self.largest_square, options.floor_factor * self.eps]
+            [self.sum_change, self.sum_noise, self.sum_square, self.worst, options.rtol]
+            + [options.floor_factor * self.eps]
             + [options.max_iterations, options.max_halvings, LOOSEST, options.linear_rtol]
             + [self.status, self.unbalanced, self.drowned, self.slot, self.iteration, self.halvings]
             + [self.step_length, self.decrement, self.merit, self.load_scale, self.residual, self.turned]
@@ -306,6 +315,7 @@ class Allowed:
 
     Attributes:
         blocks: of every block of all worlds [N, N m]; least: what rounding leaves there, which `settle` writes.
+        ratio: of residuals of blocks, then of sums over parts, to what they may be.
     """
 
     def __init__(self, net, real, linear):
@@ -319,6 +329,7 @@ class Allowed:
             return wp.zeros(shape, dtype=dtype, device=device)
 
         self.blocks, self.least = make(worlds * net.blocks), make(worlds * net.blocks)
+        self.ratio = make((worlds, net.blocks + sum(len(level.weight) for level in self.bodies.levels)))
         self.kernels = [parts.part_kernel(real, linear, leaf) for leaf in (True, False)]
         self._levels = []
         for level in self.bodies.levels:
@@ -345,12 +356,14 @@ class Allowed:
     def sum_up(self, right, rtol: float, load_scale, status, unbalanced, drowned) -> None:
         """Raise the flags of worlds with a part whose residuals sum up to too much."""
         value, rounding, below, kernel = right, self.least, self.net.blocks, self.kernels[0]
+        place = below
         for starts, items, limit, sums, squares in self._levels:
             wp.launch(
                 kernel,
                 (limit.shape[1], self.net.worlds),
-                [value, rounding, starts, items, below, limit, rtol, load_scale, status],
-                [sums, squares, unbalanced, drowned],
+                [value, rounding, starts, items, below, limit, place, rtol, load_scale, status],
+                [sums, squares, self.ratio, unbalanced, drowned],
                 device=self.net.device,
             )
+            place += limit.shape[1]
             value, rounding, below, kernel = sums, squares, limit.shape[1], self.kernels[1]

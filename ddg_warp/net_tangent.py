@@ -203,12 +203,10 @@ class NetTangent:
         result = []
         for own, force in zip(
             np.where(self.free & ~self.angle, np.abs(outer), 0.0).reshape(shape),
-            np.where(~self.free & ~self.angle, np.abs(gradient), 0.0).reshape(shape),
+            np.where(~self.free & ~self.angle, gradient, 0.0).reshape(shape),
             strict=True,
         ):
-            support = np.zeros(bodies.count)
-            np.maximum.at(support, bodies.owner, force.max(1))
-            result.append(bodies.loads(own.sum(1), support))
+            result.append(bodies.loads(own.sum(1), bodies.support(force)))
         return np.concatenate(result)
 
     def allowed(self, loads: np.ndarray) -> np.ndarray:

@@ -72,6 +72,8 @@ class Bodies:
         )
         is_shell = (body >= len(lines)) & (body < len(lines) + len(host.shells))
         self._blocks, self._body = blocks, body
+        self._line = np.concatenate([np.zeros(0, int), *(nodes for nodes, *_ in lines)])
+        self._line_body = np.repeat(np.arange(len(lines)), [len(nodes) for nodes, *_ in lines])
         self._weight = np.where(is_shell, np.sqrt(share), 1.0) * arm
         self.owner, self.arm = np.zeros(host.blocks, int), np.ones(host.blocks)
         self.owner[blocks[::-1]], self.arm[blocks[::-1]] = body[::-1], arm[::-1]
@@ -109,6 +111,13 @@ class Bodies:
         total = np.bincount(self._component, own) / np.maximum(1, np.bincount(self._component))
         return np.maximum(own, np.where(total > 0.0, total, own.mean())[self._component])
 
+    def support(self, force: np.ndarray) -> np.ndarray:
+        """The largest support force of every body (count,) [N], from the forces on held nodes (N, 3), zero elsewhere."""
+        result = support_forces(force[self._line], self._line_body, self.count)
+        sheets = np.isin(self.owner, np.unique(self._line_body), invert=True)
+        np.maximum.at(result, self.owner[sheets], np.abs(force[sheets]).max(1))
+        return result
+
     def limits(self, loads: np.ndarray) -> np.ndarray:
         """Residual at rtol = 1 of every block (N,) [N, N m], of bodies with such loads (count,)."""
         result = np.zeros(self.host.blocks)
@@ -142,6 +151,25 @@ def largest_excess(levels: list[Level], loads: np.ndarray, rtol: float, residual
         small &= bool((size <= limit).all())
         excess = max(excess, float((size - np.maximum(limit, np.sqrt(square))).max()))
     return small, excess
+
+
+def support_forces(force: np.ndarray, body: np.ndarray, count: int) -> np.ndarray:
+    """The largest force that neighbouring held nodes carry together, of every body (count,) [N].
+
+    The two nodes of a clamp carry its moment as a pair of forces that grows as edges shrink; over the length it is a force, too.
+
+    Args:
+        force: on the nodes along rods, one after the other (n, d) [N], zero at free nodes.
+        body: of these nodes (n,).
+    """
+    held = np.flatnonzero(force.any(1))
+    result = np.zeros(count)
+    if held.size:
+        first = (np.diff(held, prepend=-2) != 1) | (np.diff(body[held], prepend=-1) != 0)
+        together = np.abs(np.add.reduceat(force[held], np.flatnonzero(first), axis=0)).max(1)
+        np.maximum.at(result, body[held][first], together)
+        np.maximum.at(result, body[held], np.abs(force[held]).max(1) / np.bincount(body)[body[held]])
+    return result
 
 
 def _areas(surface) -> np.ndarray:

@@ -7,6 +7,7 @@ import warp as wp
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
 
+SPARE = 0.25  # of the tolerance that the residual of a linear solve may make up
 STALLED = 8  # iterations without progress, where energies drown in rounding, that a world is given
 
 
@@ -22,6 +23,7 @@ def search_kernels(real, linear):
         noise: wp.array(dtype=real),
         square: wp.array(dtype=real),
         worst: wp.array(dtype=real),
+        rtol: real,
         floor: real,
         max_iterations: int,
         max_halvings: int,
@@ -46,11 +48,11 @@ def search_kernels(real, linear):
         todo: wp.array(dtype=int),
         active: wp.array(dtype=int),
     ):
-        """Decides by the sums over all blocks; `worst` is the largest square of a residual.
+        """Decides by the sums over all blocks; `worst` is the largest residual over what it may be at rtol = 1.
 
-        How exactly the next direction is solved follows Eisenstat and Walker (1996). A world whose expected decrease of energy drowns
-        in rounding, and whose residual has not halved in `STALLED` iterations, has converged to rounding: on bad meshes rounding
-        leaves more than the estimate block by block.
+        How exactly the next direction is solved follows Eisenstat and Walker (1996), but no more exactly than to a fraction `SPARE`
+        of the tolerance. A world whose expected decrease of energy drowns in rounding, and whose residual has not halved in
+        `STALLED` iterations, has converged to rounding: on bad meshes rounding leaves more than the estimate block by block.
         """
         w = wp.tid()
         wanted[w] = 0
@@ -64,7 +66,7 @@ def search_kernels(real, linear):
             change[w],
             noise[w] * floor,
             square[w],
-            wp.sqrt(worst[w]),
+            worst[w],
             max_iterations,
             max_halvings,
             status,
@@ -94,6 +96,7 @@ def search_kernels(real, linear):
             eta = loosest
             if not first and before > real(0.0):
                 eta = wp.clamp(real(0.9) * square[w] / before, tightest, loosest)
+            eta = wp.clamp(real(wp.static(SPARE)) * rtol * load_scale[w] / worst[w], eta, loosest)
             forcing[w] = linear(eta)
             wanted[w] = 1
         else:

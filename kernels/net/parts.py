@@ -22,15 +22,17 @@ def part_kernel(real, linear, leaf: bool):
         items: wp.array(dtype=int),
         below: int,
         limit: wp.array2d(dtype=real),
+        place: int,
         rtol: real,
         load_scale: wp.array(dtype=real),
         status: wp.array(dtype=int),
         value_out: wp.array(dtype=V),
         rounding_out: wp.array(dtype=real),
+        ratio_out: wp.array2d(dtype=real),
         unbalanced_out: wp.array(dtype=int),
         drowned_out: wp.array(dtype=int),
     ):
-        """`below` is how many the level below has in a world."""
+        """`below` is how many the level below has in a world; ratios of sums to their limits go to `place` and after."""
         part, w = wp.tid()
         if status[w] != 0:
             return
@@ -48,6 +50,7 @@ def part_kernel(real, linear, leaf: bool):
         value_out[i] = total
         rounding_out[i] = square
         largest = wp.max(wp.abs(total))
+        ratio_out[w, place + part] = largest / limit[w, part]
         if not largest <= rtol * load_scale[w] * limit[w, part]:
             drowned_out[w] = 1
             if not largest <= wp.sqrt(square):
