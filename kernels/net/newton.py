@@ -7,7 +7,6 @@ import warp as wp
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
 
-SPARE = 0.25  # of the tolerance that the residual of a linear solve may make up
 STALLED = 8  # iterations without progress, where energies drown in rounding, that a world is given
 
 
@@ -29,6 +28,7 @@ def search_kernels(real, linear):
         max_halvings: int,
         loosest: real,
         tightest: real,
+        spare: real,
         status: wp.array(dtype=int),
         unbalanced: wp.array(dtype=int),
         drowned: wp.array(dtype=int),
@@ -50,7 +50,7 @@ def search_kernels(real, linear):
     ):
         """Decides by the sums over all blocks; `worst` is the largest residual over what it may be at rtol = 1.
 
-        How exactly the next direction is solved follows Eisenstat and Walker (1996), but no more exactly than to a fraction `SPARE`
+        How exactly the next direction is solved follows Eisenstat and Walker (1996), but no more exactly than to a fraction `spare`
         of the tolerance. A world whose expected decrease of energy drowns in rounding, and whose residual has not halved in
         `STALLED` iterations, has converged to rounding: on bad meshes rounding leaves more than the estimate block by block.
         """
@@ -96,7 +96,7 @@ def search_kernels(real, linear):
             eta = loosest
             if not first and before > real(0.0):
                 eta = wp.clamp(real(0.9) * square[w] / before, tightest, loosest)
-            eta = wp.clamp(real(wp.static(SPARE)) * rtol * load_scale[w] / worst[w], eta, loosest)
+            eta = wp.clamp(spare * rtol * load_scale[w] / worst[w], eta, loosest)
             forcing[w] = linear(eta)
             wanted[w] = 1
         else:
