@@ -48,6 +48,7 @@ class NetStep:
         )
         self.middle = model.net.empty() if self.midpoint and model.net.edges else None
         self.remaining = wp.zeros(1, dtype=int, device=device)
+        self.rounded = outcome.CONVERGED_TO_ROUNDING  # how solves that rounding ends are counted
         self.tally = wp.zeros(len(outcome.NAMES) + 1, dtype=wp.int64, device=device)
         self.work = wp.zeros(5, dtype=wp.int64, device=device)
         if counts_of is not None:
@@ -121,7 +122,8 @@ class NetStep:
         self._launch(
             self._advance,
             self.model.worlds,
-            [solver.iteration, solver.lost, self.integrator.retry_limit, 0.5 ** (self.integrator.retry_limit // 2)],
+            [solver.iteration, solver.lost, self.integrator.retry_limit, 0.5 ** (self.integrator.retry_limit // 2)]
+            + [self.rounded],
             [solver.status, self.progress, self.portion, self.cautious, self.retries, self.reason]
             + [self.tally, self.work, self.remaining],
         )

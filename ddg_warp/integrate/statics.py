@@ -17,6 +17,7 @@ from ddg_warp.integrate import mixed
 from ddg_warp.integrate.net_statics import NetEquilibrium
 from ddg_warp.linear.choice import static_solver, why_not_pcg
 from ddg_warp.linear.direct import Factorisation, SingularError
+from ddg_warp.precision import lost_in_rounding
 from ddg_warp.state import State
 from ddg_warp.tangent import Tangent
 
@@ -95,6 +96,7 @@ class Equilibrium:
         self.model, self.options = model, options or StaticsOptions()
         self.tangent = Tangent(model)
         require_supports(model)
+        lost_in_rounding(model)
         self.net = NetEquilibrium(self) if self._solver() == "pcg" else None
         self.mixed = self.tangent.shells_alone and self.net is None
         self.iterations, self.shift = 0, 0.0
