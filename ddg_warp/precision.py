@@ -45,7 +45,7 @@ def choose(name: str | None, device) -> Precision:
 FLOAT32_LIMIT = (
     0.02  # relative error of a direction that Newton still corrects quickly; beyond it a state in float32 is doubtful
 )
-FLOAT32_LOST = 0.2  # and beyond this one its motion is that of its rounding, not of the scene
+FLOAT32_LOST = 0.1  # and beyond this one its motion is that of its rounding, not of the scene
 
 
 def float32_errors(kind, mass: np.ndarray, length: np.ndarray, parameters: list[np.ndarray], s: float) -> np.ndarray:

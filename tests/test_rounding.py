@@ -76,9 +76,9 @@ def test_what_rounding_decides_is_refused(device, name):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             fall(scene_of(build).build(device, precision), 0.01, 1)
-    # the bound goes with the square of the step, but for what bending adds
-    short = 0.01 * np.sqrt(0.5 * FLOAT32_LIMIT / rounding(model, 0.01)[0])
-    assert rounding(model, short)[0] < FLOAT32_LIMIT
+    short = 0.01
+    while rounding(model, short)[0] > 0.5 * FLOAT32_LIMIT:
+        short *= 0.5
     state, outcomes = fall(model, short, 1)
     assert "lost_in_rounding" not in outcomes
     with pytest.raises(SolverError, match="lost_in_rounding"):

@@ -7,6 +7,7 @@ import warp as wp
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
 
+POLISH = 1e-3  # reduction to which a direction must have been solved before rounding excuses what it leaves
 STALLED = 8  # iterations without progress, where energies drown in rounding, that a world is given
 
 
@@ -57,6 +58,12 @@ def search_kernels(real, linear):
         w = wp.tid()
         wanted[w] = 0
         todo[w] = 0
+        # what an inexact direction leaves is not rounding yet
+        polish = (
+            status[w] == 0 and unbalanced[w] == 0 and drowned[w] != 0 and real(forcing[w]) > real(wp.static(POLISH))
+        )
+        if polish and iteration[w] > 0:
+            unbalanced[w] = 1
         if balanced(status, unbalanced, drowned, iteration, w):
             return
         before = merit[w]
@@ -97,6 +104,8 @@ def search_kernels(real, linear):
             if not first and before > real(0.0):
                 eta = wp.clamp(real(0.9) * square[w] / before, tightest, loosest)
             eta = wp.clamp(spare * rtol * load_scale[w] / worst[w], eta, loosest)
+            if polish:
+                eta = wp.min(eta, real(wp.static(POLISH)))
             forcing[w] = linear(eta)
             wanted[w] = 1
         else:
