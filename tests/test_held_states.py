@@ -29,7 +29,7 @@ def net(scene):
 
 def shell(scene):
     points, triangles = meshes.rectangle(3, 3)
-    scene.hold(scene.add_shell(points, triangles, thickness=0.01, material=RUBBER), [0, 3])
+    scene.hold(scene.add_shell(points, triangles, thickness=0.01, material=RUBBER, bending="hinge"), [0, 3])
 
 
 SCENES = {"rods": [rods], "net": [net], "shell": [shell], "all": [rods, net, shell]}
