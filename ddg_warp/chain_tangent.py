@@ -12,6 +12,7 @@ from ddg_warp import arrays
 from ddg_warp.couples import couple_derivatives, couple_forces
 from ddg_warp.integrate.prescribed import PrescribedMotion
 from ddg_warp.kernels import element
+from ddg_warp.tolerance import support_forces
 from ddg_warp.turning import turned
 
 
@@ -22,7 +23,7 @@ class ChainTangent:
         self.model, self.group, self.offset = model, group, offset
         kind, real, device = group.kind, model.types.real, model.wp_device
         shape = (group.nodes, group.columns)
-        self.size = group.columns * group.nodes * kind.block
+        self.size, self.bodies = group.columns * group.nodes * kind.block, group.columns
         self.incidence = _incidence(group)
         self.free, self.angle, self.mass = _free(group), _angle(group), _mass(group)
         self._windows = arrays.allocate((kind.window, *shape), real, device)
@@ -146,6 +147,30 @@ class ChainTangent:
     def edges(self, q: np.ndarray) -> np.ndarray:
         """Edge vectors of the windows (E, dim), zero where there is none."""
         return (self.incidence @ q).reshape(-1, self.group.kind.window)[:, : self.group.kind.dim]
+
+    def body_loads(self, outer: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """Sum of the outer forces on every rod, or its largest support force if that is more (columns,) [N]."""
+        columns, nodes, force = self.group.columns, self.group.nodes, ~self.angle
+        total = np.where(self.free & force, np.abs(outer), 0.0).reshape(columns, -1).sum(1)
+        held = np.where(~self.free & force, gradient, 0.0).reshape(columns * nodes, -1)
+        return np.maximum(total, support_forces(held, np.repeat(np.arange(columns), nodes), columns))
+
+    def allowed(self, loads: np.ndarray) -> np.ndarray:
+        """Residuals at rtol = 1 (size,) [N, N m] of rods with such loads; see `ddg_warp.tolerance`."""
+        lengths = np.where(self.angle, np.repeat(np.tile(self.group.host.length, self.group.worlds), self._dofs), 1.0)
+        return np.repeat(loads, self._dofs) * lengths
+
+    def sums(self, loads: np.ndarray, rtol: float, residual: np.ndarray, floor: np.ndarray) -> tuple[bool, float]:
+        """Whether residuals add up to little along the rods from their first node, and the largest excess over rounding."""
+        dim = self.group.kind.dim
+        sums = np.abs(np.cumsum(self.blocks(residual)[..., :dim], axis=1))
+        limit = (rtol * loads)[:, None, None]
+        noise = np.sqrt(np.cumsum(self.blocks(floor)[..., :dim] ** 2, axis=1))
+        return bool((sums <= limit).all()), float((sums - np.maximum(limit, noise)).max())
+
+    @property
+    def _dofs(self) -> int:
+        return self.size // self.group.columns
 
     def edge_length(self) -> float:
         """Mean rest length of edges [m]."""

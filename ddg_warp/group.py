@@ -76,10 +76,10 @@ class Group:
         self._parameters[row] = np.ascontiguousarray(new)
         self.upload_parameters(self.buffer.dtype)
 
-    def float32_error(self, s: float) -> float:
-        """What float32 makes of the worst rod over a step of s [s]; see `precision.float32_error`."""
+    def float32_errors(self, s: float) -> np.ndarray:
+        """What float32 makes of every rod over a step of s [s]; see `precision.float32_errors`."""
         host, rows = self.host, [row[:, : self.rods] for row in self._parameters]
-        return precision.float32_error(self.kind, host.mass.sum(0) / host.count, host.length, rows, s)
+        return precision.float32_errors(self.kind, host.mass.sum(0) / host.count, host.length, rows, s)
 
     def parameter(self, row: int) -> np.ndarray:
         """Row of the parameter table on the host, broadcastable to (node, column)."""

@@ -5,12 +5,13 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays, axisymmetric, precision
+from ddg_warp import arrays, axisymmetric
 from ddg_warp.chains import compile_chains, scene_motions
 from ddg_warp.errors import SceneError
 from ddg_warp.group import Group
 from ddg_warp.io import Curves, Surfaces
 from ddg_warp.kernels import element, step
+from ddg_warp.precision import choose, warn_of_rounding
 from ddg_warp.state import GroupState, State
 from ddg_warp.threads import launches
 
@@ -27,20 +28,25 @@ class Model:
         held: what each support of the scene's rods holds in the groups.
         precision: scalar types.
         worlds: number of independent copies.
+        allow_rounding: whether what float32 loses in rounding is stepped and solved nevertheless.
     """
 
-    def __init__(self, scene, *, device=None, precision: str | None = None, worlds: int = 1):
+    def __init__(
+        self, scene, *, device=None, precision: str | None = None, worlds: int = 1, allow_rounding: bool = False
+    ):
         if worlds < 1:
             raise SceneError(f"worlds = {worlds}; there is at least one")
         self.scene = scene
         self.wp_device = wp.get_device(device or ("cuda:0" if wp.is_cuda_available() else "cpu"))
-        self.types = _precision(precision, self.wp_device)
+        self.types = choose(precision, self.wp_device)
         self.worlds = worlds
         self.version = 0  # rises with every change of a constant array, so that captured steps are captured anew
         self.chains, self.held = compile_chains(scene)
         self.motions = scene_motions(scene)
         self.groups = [Group(chain, scene, worlds, self.wp_device, self.types.real) for chain in self.chains]
         self.net = self._build_net() if needs_net(scene) else None
+        self.allow_rounding = allow_rounding
+        warn_of_rounding(self, scene.analysis)
 
     def _build_net(self):
         from ddg_warp.net_compile import compile_net
@@ -435,9 +441,6 @@ class Model:
             u, t = np.moveaxis(frame[0:3], 0, -1), np.moveaxis(frame[3:6], 0, -1)
             values.append(u * np.cos(theta)[..., None] + np.cross(t, u) * np.sin(theta)[..., None])
         return self._gather_edges(values, net, 3)
-
-
-_precision = precision.choose
 
 
 def needs_net(scene) -> bool:

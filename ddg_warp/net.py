@@ -13,8 +13,9 @@ from ddg_warp import axisymmetric, shell_geometry
 from ddg_warp import shells as shell_terms
 from ddg_warp.chains import Piece
 from ddg_warp.net_loads import NetCouple, NetLoad, NetPressure
-from ddg_warp.precision import float32_error
+from ddg_warp.precision import float32_error, float32_errors
 from ddg_warp.surface import Surface
+from ddg_warp.tolerance import Bodies
 
 
 @dataclass
@@ -121,6 +122,11 @@ class Net:
         return [*self.pressures, *self.bands, *self.couples]
 
     @cached_property
+    def bodies(self) -> Bodies:
+        """What its blocks belong to."""
+        return Bodies(self)
+
+    @cached_property
     def edges(self) -> np.ndarray:
         """Nodes of the edges whose turns limit a step (E, 2): of rods, meshes and meridians; of rods without twist, of all elements."""
         shells, meridians = (s.nodes[s.surface.edges] for s in self.shells), (m.ends for m in self.meridians)
@@ -132,13 +138,24 @@ class Net:
         """Their lengths at rest (E,) [m]."""
         return np.linalg.norm(np.diff(self.rest[self.edges], axis=1)[:, 0], axis=1)
 
-    def float32_error(self, s: float) -> float:
-        """What float32 makes of the worst rod over a step of s [s]; see `precision.float32_error`. Zero without rods."""
-        pieces = {id(rod.piece): rod.piece for rod in self.rods}.values()
-        return max(
-            (float32_error(p.kind, p.mass.mean(1), p.length, [v.T for v in p.parameters], s) for p in pieces),
-            default=0.0,
-        )
+    def rod_errors(self, s: float) -> np.ndarray:
+        """What float32 makes of every rod over a step of s [s] (rods,); see `precision.float32_errors`."""
+        pieces = {id(rod.piece): rod.piece for rod in self.rods}
+        errors = {
+            key: float32_errors(p.kind, p.mass.mean(1), p.length, [v.T for v in p.parameters], s)
+            for key, p in pieces.items()
+        }
+        return np.array([errors[id(rod.piece)][rod.row] for rod in self.rods])
+
+    def shell_errors(self, s: float) -> np.ndarray:
+        """The same of shells (shells,): their membrane against inertia over a step and the lowest bending mode of a plate."""
+        errors = []
+        for shell in self.shells:
+            plate, nodes = shell.plate, len(shell.nodes)
+            area, membrane = plate.area.sum(), plate.young * plate.thickness / (1.0 - plate.poisson**2)
+            bending = (membrane * plate.thickness**2).min() / 12.0 * (np.pi**4 / area**2) * (area / nodes)
+            errors.append(float32_error(membrane.max(), self.mass[shell.nodes].mean() / s**2 + bending))
+        return np.array(errors, float)
 
     @property
     def rod_edges(self) -> int:

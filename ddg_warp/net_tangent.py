@@ -7,6 +7,7 @@ import warp as wp
 from scipy import sparse
 
 from ddg_warp.kernels.net import elements
+from ddg_warp.tolerance import largest_excess
 from ddg_warp.turning import turned
 
 
@@ -16,7 +17,7 @@ class NetTangent:
     def __init__(self, model, offset: int):
         self.model, self.net, self.host, self.offset = model, model.net, model.net.host, offset
         worlds, host = self.net.worlds, self.host
-        self.size = 3 * host.blocks * worlds
+        self.size, self.bodies = 3 * host.blocks * worlds, host.bodies.count * worlds
         kind = np.zeros((host.blocks, 3), bool)
         kind[host.nodes :] = True
         self.free, self.angle, self.mass = (
@@ -196,6 +197,33 @@ class NetTangent:
         x = q.reshape(self.net.worlds, -1, 3)
         first, second = self.host.edges.T
         return (x[:, second] - x[:, first]).reshape(-1, 3)
+
+    def body_loads(self, outer: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """Sum of the outer forces on every body, or its largest support force if that is more (worlds bodies,) [N]."""
+        bodies, shape = self.host.bodies, (self.net.worlds, self.host.blocks, 3)
+        result = []
+        for own, force in zip(
+            np.where(self.free & ~self.angle, np.abs(outer), 0.0).reshape(shape),
+            np.where(~self.free & ~self.angle, gradient, 0.0).reshape(shape),
+            strict=True,
+        ):
+            result.append(bodies.loads(own.sum(1), bodies.support(force)))
+        return np.concatenate(result)
+
+    def allowed(self, loads: np.ndarray) -> np.ndarray:
+        """Residuals at rtol = 1 (size,) [N, N m] of bodies with such loads; see `ddg_warp.tolerance`."""
+        blocks = [self.host.bodies.limits(own) for own in loads.reshape(self.net.worlds, -1)]
+        return np.repeat(np.concatenate(blocks), 3)
+
+    def sums(self, loads: np.ndarray, rtol: float, residual: np.ndarray, floor: np.ndarray) -> tuple[bool, float]:
+        """Whether residuals add up to little, and the largest excess over rounding; see `tolerance.largest_excess`."""
+        by_world = loads.reshape(self.net.worlds, -1), residual.reshape(self.net.worlds, -1, 3)
+        floors = floor.reshape(self.net.worlds, -1, 3).max(2)
+        found = [
+            largest_excess(self.host.bodies.levels, own, rtol, r, f)
+            for own, r, f in zip(*by_world, floors, strict=True)
+        ]
+        return all(small for small, _ in found), max(excess for _, excess in found)
 
     def edge_length(self) -> float:
         """Mean rest length of edges [m]."""

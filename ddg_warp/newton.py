@@ -18,8 +18,9 @@ class NewtonOptions:
     """How a Newton solve searches and when it stops.
 
     Attributes:
-        rtol: a dof is in equilibrium where its residual is below rtol times the load scale of the rod (sum of its outer forces;
-            without any, the first residual), or below what rounding leaves of it.
+        rtol: a dof is in equilibrium where its residual is below rtol times the load scale of its rod or shell (sum of its outer
+            forces; without any, the first residual), in shells times the root of its share of the area, or below what rounding
+            leaves of it; so are sums of residuals over parts. See `ddg_warp.tolerance`.
         floor_factor: how many rounding units of the forces that meet at a node count as rounding.
         max_iterations: Newton iterations of one solve.
         max_halvings: shortenings of one step by the line search.

@@ -1,11 +1,12 @@
 """Precisions: the scalar type of state, energy and gradient (`real`) and of the linear solve (`linear`)."""
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
-from ddg_warp.errors import SceneError
+from ddg_warp.errors import SceneError, SolverError
 
 
 @dataclass(frozen=True)
@@ -41,15 +42,18 @@ def choose(name: str | None, device) -> Precision:
     return PRECISIONS[name]
 
 
-FLOAT32_LIMIT = 0.02  # relative error of a direction that Newton still corrects quickly
+FLOAT32_LIMIT = (
+    0.02  # relative error of a direction that Newton still corrects quickly; beyond it a state in float32 is doubtful
+)
+FLOAT32_LOST = 0.1  # and beyond this one its motion is that of its rounding, not of the scene
 
 
-def float32_error(kind, mass: np.ndarray, length: np.ndarray, parameters: list[np.ndarray], s: float) -> float:
-    """Estimate of the relative error that a float32 solution makes in the direction of the worst of rods of one kind.
+def float32_errors(kind, mass: np.ndarray, length: np.ndarray, parameters: list[np.ndarray], s: float) -> np.ndarray:
+    """Estimate of the relative error that a float32 solution makes in the direction of rods of one kind (R,).
 
     The rounding unit times the ratio of the stiffest to the softest mode: stretching of an edge against inertia over the step
-    of s [s] and the lowest bending mode. For a curved steel rod of r/L = 2e-3 (64 nodes, 1/240 s) it gives 0.1, where 9 % were
-    measured.
+    of s [s] and the lowest bending mode; at rest, s = inf, against bending alone. For a curved steel rod of r/L = 2e-3 (64 nodes,
+    1/240 s) it gives 0.1, where 9 % were measured.
 
     Args:
         kind: `ChainKind` of the rods.
@@ -63,5 +67,54 @@ def float32_error(kind, mass: np.ndarray, length: np.ndarray, parameters: list[n
             stiffest = (stiffness / measure).max(0)
         else:
             softest = softest + (stiffness * measure).min(0) * (np.pi / length) ** 4
-    eps = float(np.finfo(np.float32).eps) / 2.0
-    return float(np.max(eps * np.broadcast_to(stiffest, length.shape) / softest))
+    return float32_error(np.broadcast_to(stiffest, length.shape), softest)
+
+
+def float32_error(stiffest, softest) -> np.ndarray:
+    """The rounding unit of float32 times the ratio of stiffnesses [N/m]."""
+    with np.errstate(divide="ignore"):
+        return 0.5 * float(np.finfo(np.float32).eps) * np.asarray(stiffest) / softest
+
+
+def rounding(model, s: float = np.inf) -> tuple[float, str]:
+    """The largest such error in a model over a step of s [s], or at rest; and where it is."""
+    worst = [(0.0, "")]
+    for group in model.groups:
+        errors = group.float32_errors(s)
+        rod = int(group.host.rods[int(errors.argmax())])
+        worst.append((float(errors.max()), f"rod {rod} ('{model.curves.names[rod]}')"))
+    if model.net is not None:
+        host = model.net.host
+        names = [f"rod {rod.rod} ('{model.curves.names[rod.rod]}')" for rod in host.rods]
+        names += [f"shell {i} ('{shell.name}')" for i, shell in enumerate(model.scene.shells)]
+        worst += zip(np.concatenate([host.rod_errors(s), host.shell_errors(s)]).tolist(), names, strict=True)
+    return max(worst)
+
+
+def warn_of_rounding(model, analysis) -> None:
+    """Warn where a state in float32 is doubtful over the steps of an analysis, or at rest if it has none."""
+    s = getattr(analysis, "dt", np.inf) * (0.5 if getattr(analysis, "scheme", "") == "implicit_midpoint" else 1.0)
+    error, where = rounding(model, s) if model.precision == "float32" else (0.0, "")
+    if error > FLOAT32_LIMIT:
+        warnings.warn(_message(error, where, s, "float32 is doubtful here"), stacklevel=4)
+
+
+def lost_in_rounding(model, s: float = np.inf, state=None) -> bool:
+    """Whether rounding decides what a model in float32 does over a step of s [s], or at rest; of one built to allow that.
+
+    Raises:
+        SolverError: it does, and the model was not built to allow that; names the worst rod or shell.
+    """
+    error, where = rounding(model, s) if model.precision == "float32" else (0.0, "")
+    if error > FLOAT32_LOST and not model.allow_rounding:
+        advice = "lost_in_rounding; build with allow_rounding=True to look at it nevertheless"
+        raise SolverError(_message(error, where, s, advice), state=state, outcome="lost_in_rounding")
+    return error > FLOAT32_LOST
+
+
+def _message(error: float, where: str, s: float, end: str) -> str:
+    steps = f"over {s:g} s" if np.isfinite(s) else "at rest"
+    return (
+        f"{where}: precision 'float32' leaves a relative error of {error:.2g} in its displacements {steps} (doubtful above "
+        f"{FLOAT32_LIMIT}, decided by rounding above {FLOAT32_LOST}); take 'mixed' or 'float64': {end}"
+    )

@@ -293,13 +293,14 @@ class Scene(Structures):
             raise SceneError(f"add_mass: {mass} kg at node {node}; a point mass is positive and finite")
         self.masses.append((self._rods(rods), validate.index("add_mass: node", node), float(mass)))
 
-    def build(self, device=None, precision: str | None = None, worlds: int = 1):
+    def build(self, device=None, precision: str | None = None, worlds: int = 1, allow_rounding: bool = False):
         """Freeze the scene into a `Model` on a device.
 
         Args:
             device: Warp device, such as "cpu" or "cuda:0"; by default CUDA if there is one.
             precision: "float64" (default on the CPU), "mixed" (default on CUDA) or "float32".
             worlds: independent copies.
+            allow_rounding: step and solve in "float32" also where its rounding decides what comes out; counted as `lost_in_rounding`.
 
         Raises:
             SceneError: see `ddg_warp.validate`.
@@ -308,7 +309,7 @@ class Scene(Structures):
 
         validate.check_scene(self)
         worlds = validate.index("worlds", worlds)
-        return Model(self, device=device, precision=precision, worlds=worlds)
+        return Model(self, device=device, precision=precision, worlds=worlds, allow_rounding=allow_rounding)
 
     def _rods(self, rods) -> np.ndarray:
         index = np.array(validate.indices("rods", rods), int)

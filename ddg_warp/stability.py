@@ -10,6 +10,7 @@ from scipy.sparse.linalg import LinearOperator, eigs, eigsh, splu
 
 from ddg_warp.errors import SceneError
 from ddg_warp.linear.direct import Factorisation, SingularError
+from ddg_warp.precision import lost_in_rounding
 from ddg_warp.tangent import Tangent
 
 DENSE = 600  # free dofs up to which a dense eigenvalue solver is the quicker and safer choice
@@ -57,7 +58,9 @@ def spectrum(
 
     Raises:
         SceneError: metric "mass" of a model without masses.
+        SolverError: float32 would lose the softest modes in rounding.
     """
+    lost_in_rounding(model, state=state)
     tangent = tangent or Tangent(model)
     free = np.flatnonzero(tangent.free)
     matrix = tangent.stiffness(state, load)[free][:, free]

@@ -29,14 +29,17 @@ class GroupState:
 
     def arrays(self) -> dict[str, wp.array]:
         """All arrays by name."""
-        return self.__dict__
+        return dict(self.__dict__)
 
 
 @launches
 class State:
     """Positions, velocities, frames and time of a model's rods and shells. A step returns another state and does not change this one.
 
-    The integrator writes into two states in turn: a state stays valid until the step after the next; `copy()` keeps it.
+    A state stays as it is for as long as something refers to it, or to a part or an array of it. Memory of states that nothing refers
+    to is written again, so that a loop which keeps none needs that of two. A state kept takes a copy of its arrays with it. Who keeps
+    bare arrays of a state that it let go (`state.groups[0].x`, or a view of them) keeps their memory, and steps are captured
+    anew: rather keep the state.
     """
 
     def __init__(self, model, groups: list[GroupState], net=None, time: float = 0.0):

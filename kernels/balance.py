@@ -3,7 +3,9 @@
 `check`, one thread a node (on the CPU a rod), runs before a sweep: it writes the residual, and every node's share of the change of the
 energy since the accepted iterate. It decides where a rod has converged, so that the last iterate costs no sweep: at every free dof
 |residual| <= max(rtol * load scale, floor), where floor bounds what rounding of coordinates and forces leaves,
-floor_factor * eps * (H_ii |x| + sum of |element forces|). Moments are compared over the length of the rod.
+floor_factor * eps * (H_ii |x| + sum of |element forces|). Moments are compared over the length of the rod. See `ddg_warp.tolerance`:
+that residuals do not add up either is what a whole Newton step sees to, whose remainder is of second order; where none has been
+made, at the start or after a shortened step, the limit is divided by the nodes, so that they can not.
 """
 
 from functools import cache
@@ -147,9 +149,11 @@ def check_kernel(kind: ChainKind, real, linear):
         if status[r] != 0 or start >= n:
             return
         c = coefficient[r]
-        limit = rtol * load_scale[r]
         accepted = slot[r]
         taken = step_length[r]
+        limit = rtol * load_scale[r]
+        if iteration[r] == 0 or taken < real(1.0):
+            limit /= real(n)
         moved = placed[r] != 0
         for k in range(start, until(start, n)):
             f, moment, size, elastic = balance(

@@ -8,6 +8,9 @@ LINE_SEARCH_FAILED = 4
 NON_FINITE = 5
 INDEFINITE = 6  # the exact Hessian has a negative pivot, and nothing was to be put in its place
 GIVEN_UP = 7  # an earlier step failed for good; the rod rests at its last good state
+LOST_IN_ROUNDING = (
+    8  # counted instead of CONVERGED_TO_ROUNDING where rounding decides the motion, and the user allowed that
+)
 
 NAMES = {
     CONVERGED: "converged",
@@ -17,4 +20,5 @@ NAMES = {
     NON_FINITE: "non_finite",
     INDEFINITE: "indefinite",
     GIVEN_UP: "given_up",
+    LOST_IN_ROUNDING: "lost_in_rounding",
 }

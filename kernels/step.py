@@ -281,7 +281,8 @@ def finish_frames_kernel(kind: ChainKind, real):
 def advance_kernel(real):
     """After a (partial) step: count its outcome, go on (with longer parts again), retry, or give the rod up.
 
-    `tally` counts outcomes by their code; `work` holds Newton iterations (sum, largest), solves, retries, lost pivots.
+    `tally` counts outcomes by their code, solves that rounding ended as `rounded`. `work` holds Newton iterations (sum, largest),
+    solves, retries, lost pivots.
     """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -290,6 +291,7 @@ def advance_kernel(real):
         lost: wp.array(dtype=int),
         retry_limit: int,
         smallest: real,
+        rounded: int,
         status: wp.array(dtype=int),
         progress: wp.array(dtype=real),
         portion: wp.array(dtype=real),
@@ -304,7 +306,10 @@ def advance_kernel(real):
         if progress[r] >= real(1.0):
             return
         result = status[r]
-        wp.atomic_add(tally, result, wp.int64(1))
+        counted = result
+        if result == wp.static(outcome.CONVERGED_TO_ROUNDING):
+            counted = rounded
+        wp.atomic_add(tally, counted, wp.int64(1))
         wp.atomic_add(work, 0, wp.int64(iteration[r]))
         wp.atomic_max(work, 1, wp.int64(iteration[r]))
         wp.atomic_add(work, 2, wp.int64(1))

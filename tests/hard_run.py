@@ -4,15 +4,19 @@ import numpy as np
 
 import ddg_warp as ddg
 
+DONE = ("converged", "converged_to_rounding", "lost_in_rounding")
 
-def attempt(scene, device, dt, count, names, start=None, precision="float64", may_fail=False, **options):
+
+def attempt(scene, device, dt, count, names, start=None, precision="float64", may_fail=False, lossy=False, **options):
     """Take steps from the rest state, or from points `start`, and check what holds for every run.
+
+    `lossy`: whether float32 may lose its motion in rounding.
 
     Returns:
         Model, last state, total energy after every step with the start first [J], statistics, and the error that ended the run or
         None; its message has the outcome and all of `names`.
     """
-    model = scene.build(device, precision)
+    model = scene.build(device, precision, allow_rounding=lossy)
     state, integrator, error = model.state(points=start), ddg.Integrator(model, check_every=1, **options), None
     energy = [sum(model.energies(state).values())]
     for _ in range(count):
@@ -25,7 +29,7 @@ def attempt(scene, device, dt, count, names, start=None, precision="float64", ma
         assert np.isfinite(state.points()).all()
         energy.append(sum(model.energies(state).values()))
     statistics = integrator.statistics()
-    failed = {k: v for k, v in statistics["outcomes"].items() if k not in ("converged", "converged_to_rounding")}
+    failed = {k: v for k, v in statistics["outcomes"].items() if k not in DONE}
     assert sum(failed.values()) == statistics["retries"]  # no attempt that failed was called done
     assert np.isfinite(state.points()).all()
     assert np.isfinite(state.velocities()).all()

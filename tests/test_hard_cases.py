@@ -305,11 +305,12 @@ def test_random_start_with_less_precision(device, precision, amplitude):
     run(scene, device, 0.01, 5, start=start, precision=precision, may_fail=True, retry_limit=8)
 
 
+@pytest.mark.filterwarnings("ignore:.*precision 'float32' leaves")
 @pytest.mark.parametrize("precision", ["mixed", "float32"])
 def test_stiff_with_less_precision(device, precision):
     """Steel at r / L = 1e-4: nothing stretches, nothing gains energy; mixed falls as float64 does."""
     scene = cantilever(64, ddg.Circle(1e-4), STEEL)
-    result = run(scene, device, 0.01, 20, precision=precision, may_fail=True)
+    result = run(scene, device, 0.01, 20, precision=precision, may_fail=True, lossy=True)
     assert result.stretch() < 1e-3
     if precision == "mixed":
         np.testing.assert_allclose(result.tip, run(scene, device, 0.01, 20).tip, atol=1e-5)

@@ -88,7 +88,7 @@ def test_increments_are_halved(device, monkeypatch):
         return result
 
     monkeypatch.setattr(Equilibrium, "solve", recorded)
-    state = solve(model, max_iterations=3)
+    state = solve(model, max_iterations=4)
     assert tried[:2] == [(0.0, 1.0), (0.0, 0.5)]
     assert len(taken) > 1
     assert taken[0][0] == 0.0

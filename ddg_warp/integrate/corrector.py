@@ -121,9 +121,11 @@ class Corrector:
             residual, stiffness, rate, support, gradient, outer = self.system(state, q, load)
             if not np.isfinite(residual).all() or not np.isfinite(stiffness.data).all():
                 raise Failed("non_finite")
-            scale = max(first, solver.load_scale(outer, gradient))
+            scale = np.maximum(first, solver.load_scale(outer, gradient))
             missing = gap(q, load) if gap else 0.0
-            excess = solver.excess(residual, gradient, stiffness, q, scale or np.abs(residual).max())
+            excess = solver.excess(
+                residual, gradient, stiffness, q, scale if scale.any() else scale + np.abs(residual).max()
+            )
             done = excess <= 0.0 and abs(missing) <= 1e-12 * (1.0 + np.abs(row[:-1]) @ np.abs(q) + abs(row[-1] * load))
             matrix = sparse.csc_matrix(stiffness[self.free][:, self.free])
             bordered = self._bordered(matrix, rate, pivot)

@@ -6,6 +6,7 @@ import warp as wp
 from ddg_warp import arrays, geometry
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.graphs import Graphs
+from ddg_warp.integrate.buffers import Buffer
 from ddg_warp.integrate.net_step import NetStep
 from ddg_warp.integrate.prescribed import PrescribedMotion, TimedLoads
 from ddg_warp.kernels import element, outcome, step
@@ -13,7 +14,7 @@ from ddg_warp.linear.choice import automatic
 from ddg_warp.linear.partitioned import PartitionedNewton
 from ddg_warp.linear.pcg import PcgNewton, ProjectiveNewton
 from ddg_warp.newton import ChainNewton, NewtonOptions
-from ddg_warp.precision import FLOAT32_LIMIT
+from ddg_warp.precision import FLOAT32_LIMIT, lost_in_rounding
 from ddg_warp.state import State
 from ddg_warp.threads import launches
 
@@ -81,7 +82,7 @@ class Integrator:
         _require_mass(model)
         self._chains = [_ChainStep(self, model, group) for group in model.groups]
         self._net = NetStep(self, model) if model.net is not None else None
-        self._buffers = [model.empty_state(), model.empty_state()]
+        self._buffers = [Buffer(model), Buffer(model)]
         self._graphs = Graphs(model, self._load_modules)
         self._steps_since_check = 0
         self._dt = wp.zeros(model.worlds, dtype=model.types.real, device=model.wp_device)
@@ -89,20 +90,22 @@ class Integrator:
         self._longest = 0.0
 
     def step(self, state: State, dt: float) -> State:
-        """The state after a step of dt [s].
+        """The state after a step of dt [s]. No state changes that is held: see `State`.
 
         Raises:
-            SolverError: a rod could not be stepped within the retries; its message names rod and outcome.
+            SolverError: a rod could not be stepped within the retries, or float32 would lose its motion in rounding; the message
+                names rod and outcome.
         """
         if not (np.isfinite(dt) and dt > 0.0):
             raise SceneError(f"dt = {dt}; a time step is positive and finite")
         source = self._own(state)
-        target = self._buffers[1 - source]
+        self._vacate(1 - source)
+        target = self._buffers[1 - source].state
         if dt != self._dt_host:
             self._dt.fill_(dt)
             self._dt_host = dt
-        self._promote(dt)
-        start = self._buffers[source].time
+        self._weigh(dt, state)
+        start = state.time
         for part in self._parts:
             part.prescribe(start, start + dt)
         self._graphs.replay(source, lambda: self._launch(source))
@@ -143,33 +146,52 @@ class Integrator:
         """Steps of the groups of rods and of the net."""
         return self._chains if self._net is None else [*self._chains, self._net]
 
-    def _promote(self, dt: float) -> None:
-        """Solve in float64 where float32 factors would not be good enough for a step of dt, from now on."""
-        if dt <= self._longest or self.model.precision != "mixed":
+    def _weigh(self, dt: float, state: State) -> None:
+        """What float32 does to steps of dt, where they are longer than those before: solve in float64, or refuse them."""
+        if dt <= self._longest or self.model.precision == "float64":
             return
-        self._longest = dt
         s = 0.5 * dt if self.scheme == "implicit_midpoint" else dt
+        if self.model.precision == "float32" and lost_in_rounding(self.model, s, state):
+            for part in self._parts:
+                part.rounded = outcome.LOST_IN_ROUNDING
+            self._graphs.clear()
+        if self.model.precision == "mixed":
+            self._promote(s)
+        self._longest = dt
+
+    def _promote(self, s: float) -> None:
+        """Solve in float64 where float32 factors would not be good enough for a step of s, from now on."""
         for i, chain in enumerate(self._chains):
-            if chain.newton.linear is wp.float32 and chain.group.float32_error(s) > FLOAT32_LIMIT:
+            if chain.newton.linear is wp.float32 and chain.group.float32_errors(s).max() > FLOAT32_LIMIT:
                 self._chains[i] = _ChainStep(self, self.model, chain.group, wp.float64, counts_of=chain)
                 self._graphs.clear()
         net = self._net
-        if net is not None and net.newton.linear is wp.float32 and net.net.host.float32_error(s) > FLOAT32_LIMIT:
+        if (
+            net is not None
+            and net.newton.linear is wp.float32
+            and net.net.host.rod_errors(s).max(initial=0.0) > FLOAT32_LIMIT
+        ):
             self._net = NetStep(self, self.model, wp.float64, counts_of=net)
             self._graphs.clear()
 
     def _own(self, state: State) -> int:
         for i, buffer in enumerate(self._buffers):
-            if state is buffer:
+            if state is buffer.state:
                 return i
         if state.model is not self.model:
             raise SceneError("the state is of another model; step states that this integrator's model made")
-        self._buffers[0].assign(state)
+        self._vacate(0)
+        self._buffers[0].state.assign(state)
         return 0
+
+    def _vacate(self, index: int) -> None:
+        """Make sure that nobody holds the state in a buffer."""
+        if self._buffers[index].vacate():
+            self._graphs.clear()
 
     def _launch(self, source: int) -> None:
         """Launches of a step of all parts from one buffer to the other."""
-        before, after = self._buffers[source], self._buffers[1 - source]
+        before, after = self._buffers[source].own, self._buffers[1 - source].own
         for chain in self._chains:
             chain.step(before.groups[chain.index], after.groups[chain.index])
         if self._net is not None:
@@ -234,6 +256,7 @@ class _ChainStep:
             wp.zeros(columns, dtype=int, device=device) for _ in range(4)
         )
         self.remaining = wp.zeros(1, dtype=int, device=device)
+        self.rounded = outcome.CONVERGED_TO_ROUNDING  # how solves that rounding ends are counted
         self.tally = wp.zeros(len(outcome.NAMES) + 1, dtype=wp.int64, device=device)
         self.work = wp.zeros(5, dtype=wp.int64, device=device)
         if counts_of is not None:
@@ -296,7 +319,8 @@ class _ChainStep:
         self._launch(
             "advance",
             group.columns,
-            [newton.iteration, newton.lost, self.integrator.retry_limit, 0.5 ** (self.integrator.retry_limit // 2)],
+            [newton.iteration, newton.lost, self.integrator.retry_limit, 0.5 ** (self.integrator.retry_limit // 2)]
+            + [self.rounded],
             [newton.status, self.progress, self.portion, self.cautious, self.retries, self.reason]
             + [self.tally, self.work, self.remaining],
         )

@@ -32,7 +32,7 @@ def newton(solver, state: State, before: float, at: float) -> State | None:
     jump = tangent.support_step(state, before, at)
     q, gradient, stress = tangent.dofs(state), tangent.gradient(state), None
     first = solver.first_scale(tangent.loads(at, q), gradient)
-    if np.abs((tangent.loads(before, q) - gradient)[free]).max(initial=0.0) > UNBALANCED * first:
+    if (np.abs(tangent.loads(before, q) - gradient) > UNBALANCED * solver.allowed(first))[free].any():
         # a crumpled start, or a rest shape that has changed: stresses of no equilibrium say nothing about the next one
         stress = [0.0 * part for part in tangent.linear_stress(state, jump)]
     state, factor, polished = tangent.with_clamps_turned(state, at), None, False
@@ -44,7 +44,7 @@ def newton(solver, state: State, before: float, at: float) -> State | None:
         if not np.isfinite(residual).all() or not np.isfinite(hessian.data).all():
             return None
         if iteration:
-            scale = max(first, solver.load_scale(outer, gradient))
+            scale = np.maximum(first, solver.load_scale(outer, gradient))
             excess = solver.excess(residual, gradient, hessian, q, scale)
             if excess <= 0.0 and (solver.outcome == "converged" or polished):
                 stable = factor.reliable and not factor.negative

@@ -40,14 +40,14 @@ class StaticNewton(NetNewton):
         return [*super().kernels, self._follow, self._less, self._far, *self.loads.kernels]
 
     def begin(self, q: np.ndarray, dead: np.ndarray, at: float, scale: np.ndarray) -> None:
-        """Set out from dofs `q` under dead loads (blocks, 3), those that follow at load parameter `at`, and load scales (worlds,)."""
+        """Set out from dofs `q` under dead loads (blocks, 3), those that follow at load parameter `at`; load scales of bodies."""
         for flag in (self.status, self.iteration, self.halvings, self.unbalanced, self.drowned, self.projected):
             flag.zero_()
         for array in (self.q, self.base):
             array.assign(q.reshape(-1, 3))
         self.loads.scale(dead, at)
         wp.copy(self.load, self.loads.constant)
-        self.load_scale.assign(scale)
+        wp.copy(self.load_scale, self.allowed.assign(scale.reshape(self.worlds, -1)))
         self.active.fill_(1)
 
     def outer_forces(self) -> None:
@@ -156,14 +156,6 @@ class NetEquilibrium:
         tangent, part = self.tangent, self.tangent.parts[-1]
         q = tangent.dofs(state)
         outer, gradient = tangent.loads(at, q), tangent.gradient(state)
-        scales = [
-            self.owner.load_scale(*pair) for pair in zip(self._by_world(outer), self._by_world(gradient), strict=True)
-        ]
-        self.newton.begin(q, part.dead_loads(at), at, np.array(scales))
+        self.newton.begin(q, part.dead_loads(at), at, self.owner.load_scale(outer, gradient))
         for name, array in self._start.arrays().items():
             wp.copy(array, state.net.arrays()[name])
-
-    def _by_world(self, values: np.ndarray) -> np.ndarray:
-        """For each world, values (size,) that are zero in all others."""
-        worlds = self.model.worlds
-        return (np.eye(worlds)[:, :, None] * values.reshape(1, worlds, -1)).reshape(worlds, -1)

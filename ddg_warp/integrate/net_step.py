@@ -48,17 +48,13 @@ class NetStep:
         )
         self.middle = model.net.empty() if self.midpoint and model.net.edges else None
         self.remaining = wp.zeros(1, dtype=int, device=device)
+        self.rounded = outcome.CONVERGED_TO_ROUNDING  # how solves that rounding ends are counted
         self.tally = wp.zeros(len(outcome.NAMES) + 1, dtype=wp.int64, device=device)
         self.work = wp.zeros(5, dtype=wp.int64, device=device)
         if counts_of is not None:
             self.tally, self.work, self.reason = counts_of.tally, counts_of.work, counts_of.reason
             self.newton.status, self.newton.pcg_work = counts_of.newton.status, counts_of.newton.pcg_work
         self.damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
-        dead = host.mass[: host.nodes] * np.asarray(model.scene.gravity, float) + host.load[: host.nodes]
-        outer = np.abs(dead).sum() + np.abs(host.load[host.nodes :]).sum()
-        outer += sum(np.abs(load.force).sum() for load in host.timed)
-        outer += sum(len(load.places) * np.abs(load.couple).sum() / load.length for load in host.couples)
-        self.outer = wp.full(worlds, float(outer), dtype=real, device=device)
         self.motion = NetMotion(model, self.midpoint) if host.moving else None
         self.loads = NetLoads(model, self.midpoint)
 
@@ -92,7 +88,7 @@ class NetStep:
                 solver.mass,
                 self.integrator._dt,
                 self.damping,
-                self.outer,
+                self.newton.outer,
                 self.progress,
             ]
             + [self.portion, self.cautious, blocks],
@@ -126,7 +122,8 @@ class NetStep:
         self._launch(
             self._advance,
             self.model.worlds,
-            [solver.iteration, solver.lost, self.integrator.retry_limit, 0.5 ** (self.integrator.retry_limit // 2)],
+            [solver.iteration, solver.lost, self.integrator.retry_limit, 0.5 ** (self.integrator.retry_limit // 2)]
+            + [self.rounded],
             [solver.status, self.progress, self.portion, self.cautious, self.retries, self.reason]
             + [self.tally, self.work, self.remaining],
         )

@@ -51,7 +51,8 @@ def relax(
                 "relaxation: forces are not finite; begin nearer to rest", state=state, outcome="non_finite"
             )
         first = equilibrium.first_scale(outer, gradient) if first is None else first
-        if np.abs(force / lever).max() <= residual * max(first, equilibrium.load_scale(outer, gradient)):
+        scale = np.maximum(first, equilibrium.load_scale(outer, gradient))
+        if (np.abs(force) <= residual * equilibrium.allowed(scale)).all():
             return state
         if mass is None:
             mass = _masses(tangent, state)

@@ -17,6 +17,7 @@ from ddg_warp.integrate import mixed
 from ddg_warp.integrate.net_statics import NetEquilibrium
 from ddg_warp.linear.choice import static_solver, why_not_pcg
 from ddg_warp.linear.direct import Factorisation, SingularError
+from ddg_warp.precision import lost_in_rounding
 from ddg_warp.state import State
 from ddg_warp.tangent import Tangent
 from ddg_warp.threads import launches
@@ -29,7 +30,8 @@ class StaticsOptions:
     """How an equilibrium is searched.
 
     Attributes:
-        rtol: residual over load scale (sum of outer forces, or largest support force) at which a dof is in equilibrium.
+        rtol: residual over load scale (sum of the outer forces on a rod or shell, or largest support force) at which a dof is in
+            equilibrium; see `ddg_warp.tolerance`.
         floor_factor: rounding units of the forces that meet at a dof which count as rounding.
         max_iterations: Newton iterations of one load step.
         rotation_cap: largest turn of an edge or change of an angle in one update [rad].
@@ -96,6 +98,7 @@ class Equilibrium:
         self.model, self.options = model, options or StaticsOptions()
         self.tangent = Tangent(model)
         require_supports(model)
+        lost_in_rounding(model)
         self.net = NetEquilibrium(self) if self._solver() == "pcg" else None
         self.mixed = self.tangent.shells_alone and self.net is None
         self.iterations, self.shift = 0, 0.0
@@ -163,7 +166,8 @@ class Equilibrium:
             hessian = tangent.stiffness(state, at)
             if not np.isfinite(residual).all() or not np.isfinite(hessian.data).all():
                 raise SolverError(self.where("non_finite", residual, at), state=state, outcome="non_finite")
-            excess = self.excess(residual, gradient, hessian, q, max(first, self.load_scale(outer, gradient)))
+            scale = np.maximum(first, self.load_scale(outer, gradient))
+            excess = self.excess(residual, gradient, hessian, q, scale)
             if excess <= 0.0 and (self.outcome == "converged" or polished):
                 return self.found(state, outer, residual, at)
             polished = excess <= 0.0  # the floor is a bound: one more iteration gives what rounding allows
@@ -260,17 +264,35 @@ class Equilibrium:
         outer = tangent.loads(at, tangent.dofs(state))
         return self._direction(hessian, outer - tangent.gradient(state) - hessian @ step)[0]
 
-    def load_scale(self, outer: np.ndarray, gradient: np.ndarray) -> float:
-        """What residuals are compared with [N]: sum of the outer forces, or the largest support force if that is more."""
-        free, angle = self.tangent.free, self.tangent.angle
-        return max(np.abs(outer[free & ~angle]).sum(), np.abs(gradient[~free & ~angle]).max(initial=0.0))
+    def load_scale(self, outer: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """What residuals of the bodies are compared with [N]: sums of their outer forces, or the largest support force if more.
 
-    def first_scale(self, outer: np.ndarray, gradient: np.ndarray) -> float:
-        """The load scale of the state that a search starts from, or its residual where there are no loads [N].
+        A body without either is compared with the mean of all.
+        """
+        tangent = self.tangent
+        loads = np.concatenate(
+            [part.body_loads(tangent.of(part, outer), tangent.of(part, gradient)) for part in tangent.parts]
+        )
+        return np.where(loads > 0.0, loads, loads.mean())
+
+    def first_scale(self, outer: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """The load scales of the state that a search starts from, or its residual where there are no loads [N].
 
         A residual is compared with this or with the present load scale: forces of iterates on the way, however large, excuse nothing.
         """
-        return self.load_scale(outer, gradient) or np.abs((outer - gradient)[self.tangent.free]).max(initial=0.0)
+        scale = self.load_scale(outer, gradient)
+        return scale if scale.any() else scale + np.abs((outer - gradient)[self.tangent.free]).max(initial=0.0)
+
+    def allowed(self, scale: np.ndarray) -> np.ndarray:
+        """Residuals of all dofs at rtol = 1 (size,) [N, N m], for such load scales; see `ddg_warp.tolerance`."""
+        return np.concatenate([part.allowed(own) for part, own in self._by_part(scale)])
+
+    def _by_part(self, scale: np.ndarray):
+        """The parts of the tangent, each with the scales of its bodies."""
+        at = 0
+        for part in self.tangent.parts:
+            yield part, scale[at : at + part.bodies]
+            at += part.bodies
 
     def _scaled(self, residual: np.ndarray) -> np.ndarray:
         """Moments over an edge length, so that they compare with forces."""
@@ -297,17 +319,23 @@ class Equilibrium:
                 break
         return factor
 
-    def excess(self, residual, gradient, hessian, q, scale: float) -> float:
-        """How far the worst dof is from equilibrium; not positive when all are."""
-        free, angle = self.tangent.free, self.tangent.angle
+    def excess(self, residual, gradient, hessian, q, scale: np.ndarray) -> float:
+        """How far the worst dof, or sum of residuals, is from equilibrium; not positive when all are. `scale`: of the bodies."""
+        tangent, rtol = self.tangent, self.options.rtol
+        free, angle = tangent.free, tangent.angle
         reach = np.abs(q[free & ~angle]).max(initial=1.0)
         rounding = self.options.floor_factor * self.model.types.eps
         floor = rounding * (np.asarray(abs(hessian).sum(axis=1)).ravel() * reach + np.abs(gradient))
-        length = self.tangent.edge_length()
-        limit = np.where(angle, length, 1.0) * self.options.rtol * scale
-        size = np.abs(residual)
-        self.outcome = "converged" if (size <= limit)[free].all() else "converged_to_rounding"
-        return float((size - np.maximum(limit, floor))[free].max())
+        limit, size = rtol * self.allowed(scale), np.abs(residual)
+        masked = np.where(free, residual, 0.0)
+        sums = [
+            part.sums(own, rtol, tangent.of(part, masked), tangent.of(part, floor))
+            for part, own in self._by_part(scale)
+        ]
+        small = (size <= limit)[free].all() and all(good for good, _ in sums)
+        self.outcome = "converged" if small else "converged_to_rounding"
+        worst = float((size - np.maximum(limit, floor))[free].max())
+        return max(worst, *(excess for _, excess in sums))
 
     def where(self, outcome: str, residual: np.ndarray, at: float) -> str:
         """What to tell of a search that failed."""

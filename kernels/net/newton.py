@@ -7,6 +7,7 @@ import warp as wp
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
 
+POLISH = 1e-3  # reduction to which a direction must have been solved before rounding excuses what it leaves
 STALLED = 8  # iterations without progress, where energies drown in rounding, that a world is given
 
 
@@ -21,11 +22,14 @@ def search_kernels(real, linear):
         change: wp.array(dtype=real),
         noise: wp.array(dtype=real),
         square: wp.array(dtype=real),
+        worst: wp.array(dtype=real),
+        rtol: real,
         floor: real,
         max_iterations: int,
         max_halvings: int,
         loosest: real,
         tightest: real,
+        spare: real,
         status: wp.array(dtype=int),
         unbalanced: wp.array(dtype=int),
         drowned: wp.array(dtype=int),
@@ -45,14 +49,21 @@ def search_kernels(real, linear):
         todo: wp.array(dtype=int),
         active: wp.array(dtype=int),
     ):
-        """Decides by the sums over all blocks; how exactly the next direction is solved follows Eisenstat and Walker (1996).
+        """Decides by the sums over all blocks; `worst` is the largest residual over what it may be at rtol = 1.
 
-        A world whose expected decrease of energy drowns in rounding, and whose residual has not halved in `STALLED` iterations, has
-        converged to rounding: on bad meshes rounding leaves more than the estimate block by block.
+        How exactly the next direction is solved follows Eisenstat and Walker (1996), but no more exactly than to a fraction `spare`
+        of the tolerance. A world whose expected decrease of energy drowns in rounding, and whose residual has not halved in
+        `STALLED` iterations, has converged to rounding: on bad meshes rounding leaves more than the estimate block by block.
         """
         w = wp.tid()
         wanted[w] = 0
         todo[w] = 0
+        # what an inexact direction leaves is not rounding yet
+        polish = (
+            status[w] == 0 and unbalanced[w] == 0 and drowned[w] != 0 and real(forcing[w]) > real(wp.static(POLISH))
+        )
+        if polish and iteration[w] > 0:
+            unbalanced[w] = 1
         if balanced(status, unbalanced, drowned, iteration, w):
             return
         before = merit[w]
@@ -62,7 +73,7 @@ def search_kernels(real, linear):
             change[w],
             noise[w] * floor,
             square[w],
-            wp.sqrt(square[w]),
+            worst[w],
             max_iterations,
             max_halvings,
             status,
@@ -92,6 +103,9 @@ def search_kernels(real, linear):
             eta = loosest
             if not first and before > real(0.0):
                 eta = wp.clamp(real(0.9) * square[w] / before, tightest, loosest)
+            eta = wp.clamp(spare * rtol * load_scale[w] / worst[w], eta, loosest)
+            if polish:
+                eta = wp.min(eta, real(wp.static(POLISH)))
             forcing[w] = linear(eta)
             wanted[w] = 1
         else:

@@ -117,6 +117,7 @@ def balance_kernels(real, linear):
         fixed: wp.array(dtype=wp.uint8),
         status: wp.array(dtype=int),
         load_scale: wp.array(dtype=real),
+        allowed: wp.array(dtype=real),
         blocks: int,
         nodes: int,
         arm: real,
@@ -124,6 +125,8 @@ def balance_kernels(real, linear):
         rtol: real,
         floor: real,
         right_out: wp.array(dtype=H),
+        least_out: wp.array(dtype=real),
+        ratio_out: wp.array2d(dtype=real),
         square_out: wp.array2d(dtype=real),
         noise: wp.array2d(dtype=real),
         unbalanced_out: wp.array(dtype=int),
@@ -131,6 +134,8 @@ def balance_kernels(real, linear):
     ):
         """Residual of free dofs, and its squares with moments over the length `arm`; see `kernels.balance` for the criterion.
 
+        `allowed` is what the residual of a block may be at rtol = 1, over `load_scale`, and `ratio_out` how often it is that; see
+        `ddg_warp.tolerance`.
         What rounding leaves of an edge vector follows from the coordinates of both its ends, `longest` apart at most.
         """
         i = wp.tid()
@@ -144,12 +149,15 @@ def balance_kernels(real, linear):
         reach = wp.max(wp.abs(q[i])) + longest
         if k >= nodes:
             reach += real(1.0)
-        limit = rtol * load_scale[w] * length
+        limit = rtol * load_scale[w] * allowed[i]
         least = floor * (real(stiffness[i]) * reach + size[i])
+        least_out[i] = least
         r = H()
         square = real(0.0)
+        ratio = real(0.0)
         for d in range(3):
             if ((mask >> d) & 1) == 0:
+                ratio = wp.max(ratio, wp.abs(f[d]) / allowed[i])
                 r[d] = linear(f[d])
                 square += f[d] * f[d] / (length * length)
                 if not wp.abs(f[d]) <= limit:
@@ -157,6 +165,7 @@ def balance_kernels(real, linear):
                     if not wp.abs(f[d]) <= least:
                         unbalanced_out[w] = 1
         right_out[i] = r
+        ratio_out[w, k] = ratio
         square_out[w, k] = square
         noise[w, k] = noise[w, k] + real(0.5) * size[i] * reach
 

@@ -1,0 +1,59 @@
+"""Sums of the residual over parts of a net, small to large, against what they may be; see `ddg_warp.tolerance`."""
+
+from functools import cache
+
+import warp as wp
+
+
+@cache
+def part_kernel(real, linear, leaf: bool):
+    """Sums of one level from those of the level below, or from blocks (`leaf`); raises the flags of worlds with one too large.
+
+    Rounding of single residuals adds up like that of independent numbers: as the root of the sum of squares.
+    """
+    V = wp.types.vector(3, real)
+    R = wp.types.vector(3, linear) if leaf else V
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def add(
+        value: wp.array(dtype=R),
+        rounding: wp.array(dtype=real),
+        starts: wp.array(dtype=int),
+        items: wp.array(dtype=int),
+        below: int,
+        limit: wp.array2d(dtype=real),
+        place: int,
+        rtol: real,
+        load_scale: wp.array(dtype=real),
+        status: wp.array(dtype=int),
+        value_out: wp.array(dtype=V),
+        rounding_out: wp.array(dtype=real),
+        ratio_out: wp.array2d(dtype=real),
+        unbalanced_out: wp.array(dtype=int),
+        drowned_out: wp.array(dtype=int),
+    ):
+        """`below` is how many the level below has in a world; ratios of sums to their limits go to `place` and after."""
+        part, w = wp.tid()
+        if status[w] != 0:
+            return
+        total = V()
+        square = real(0.0)
+        for at in range(starts[part], starts[part + 1]):
+            i = items[at] + w * below
+            v = value[i]
+            total += V(real(v[0]), real(v[1]), real(v[2]))
+            noise = rounding[i]
+            if wp.static(leaf):
+                noise *= noise
+            square += noise
+        i = part + w * limit.shape[1]
+        value_out[i] = total
+        rounding_out[i] = square
+        largest = wp.max(wp.abs(total))
+        ratio_out[w, place + part] = largest / limit[w, part]
+        if not largest <= rtol * load_scale[w] * limit[w, part]:
+            drowned_out[w] = 1
+            if not largest <= wp.sqrt(square):
+                unbalanced_out[w] = 1
+
+    return add

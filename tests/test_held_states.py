@@ -1,0 +1,170 @@
+"""States that are held never change; where none is held, two of them take turns in the same memory."""
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp import meshes
+from ddg_warp.errors import SolverError
+from ddg_warp.simulate import simulate
+from ddg_warp.state import State
+
+RUBBER = ddg.Material(young=1e6, poisson=0.4, density=1000.0)
+DT = 0.01
+
+
+def rods(scene):
+    points = np.zeros((2, 6, 3))
+    points[:, :, 0] = np.linspace(0.0, 0.5, 6)
+    scene.clamp(scene.add_rods(points, section=ddg.Circle(0.01), material=RUBBER), edges=[0])
+
+
+def net(scene):
+    points = np.linspace([0.0, 1.0, 0.0], [0.5, 1.0, 0.0], 6)
+    first = scene.add_rod(points, section=ddg.Circle(0.01), material=RUBBER)
+    second = scene.add_rod(points[-1] + points - points[0], section=ddg.Circle(0.01), material=RUBBER)
+    scene.clamp(first, edges=[0])
+    scene.join([(first, -1), (second, 0)])
+
+
+def shell(scene):
+    points, triangles = meshes.rectangle(3, 3)
+    scene.hold(scene.add_shell(points, triangles, thickness=0.01, material=RUBBER, bending="hinge"), [0, 3])
+
+
+SCENES = {"rods": [rods], "net": [net], "shell": [shell], "all": [rods, net, shell]}
+
+
+def model_of(name: str, device, worlds: int = 1, **options):
+    scene = ddg.Scene(gravity=(0.0, 0.0, -9.81), **options)
+    for build in SCENES[name]:
+        build(scene)
+    return scene.build(device, worlds=worlds)
+
+
+def memory(state) -> list[int]:
+    return [array.ptr for part in state.parts().values() for array in part.arrays().values()]
+
+
+def alone(model, steps: int) -> list[np.ndarray]:
+    """Everything of every state, copied while it is the last one."""
+    integrator, state, found = ddg.Integrator(model), model.state(), []
+    for _ in range(steps):
+        state = integrator.step(state, DT)
+        found.append(state.snapshot())
+    return found
+
+
+def same(states, expected) -> None:
+    for state, wanted in zip(states, expected, strict=True):
+        found = state.snapshot()
+        assert found.keys() == wanted.keys()
+        for name, values in wanted.items():
+            np.testing.assert_array_equal(found[name], values, err_msg=name)
+
+
+@pytest.mark.parametrize(("name", "worlds"), [("rods", 1), ("rods", 3), ("net", 1), ("shell", 3), ("all", 1)])
+def test_states_in_a_list_stay_as_they_were(device, name, worlds):
+    """Held states are those of a run that holds none, bit by bit; memory and captured steps stay two."""
+    model = model_of(name, device, worlds)
+    expected = alone(model, 6)
+    integrator, states = ddg.Integrator(model), [model.state()]
+    for _ in range(6):
+        states.append(integrator.step(states[-1], DT))
+    np.testing.assert_allclose([state.time for state in states], np.arange(7) * DT, atol=1e-15)
+    same(states[1:], expected)
+    assert len({id(state) for state in states}) == 7
+    assert len(integrator._graphs._graphs) == 2
+    # and they can be gone on from: the last of them, and one that was left behind
+    again = integrator.step(states[3], DT)
+    same([again], expected[3:4])
+    same(states[1:], expected)
+
+
+@pytest.mark.parametrize("name", ["rods", "all"])
+def test_nobody_holds_nothing_is_allocated(device, monkeypatch, name):
+    """Twenty steps of a loop that keeps the last state alone use the memory of two."""
+    model = model_of(name, device)
+    integrator, state, seen = ddg.Integrator(model), model.state(), set()
+    state = integrator.step(state, DT)
+    monkeypatch.setattr(model, "empty_state", lambda: pytest.fail("a state was allocated"))
+    for _ in range(20):
+        state = integrator.step(state, DT)
+        seen.add(tuple(memory(state)))
+    assert len(seen) == 2
+
+
+@pytest.mark.parametrize("name", ["rods", "net", "shell"])
+def test_parts_arrays_and_views_are_held_too(device, name):
+    """What is taken from a state that is let go stays: a part, an array, a slice, what NumPy sees of it on the CPU."""
+    model = model_of(name, device)
+    takes = {
+        "part": lambda state: state.groups[0] if state.groups else state.net,
+        "array": lambda state: state.groups[0].x if state.groups else state.net.q,
+        "slice": lambda state: (state.groups[0].v if state.groups else state.net.v)[:2],
+        "list": lambda state: state.groups or state.net.lag,
+        "names": lambda state: (state.groups[0] if state.groups else state.net).arrays(),
+    }
+    if model.wp_device.is_cpu:
+        takes["view"] = lambda state: (state.groups[0].x if state.groups else state.net.q).numpy()
+
+    def values(taken):
+        if isinstance(taken, list):
+            return [values(item) for item in taken]
+        if isinstance(taken, dict):
+            return [values(item) for item in taken.values()]
+        if hasattr(taken, "arrays"):
+            return values(taken.arrays())
+        return np.array(taken if isinstance(taken, np.ndarray) else taken.numpy())
+
+    for what, take in takes.items():
+        integrator, state = ddg.Integrator(model), model.state()
+        state = integrator.step(state, DT)
+        taken = take(state)
+        before = values(taken)
+        state = integrator.step(state, DT)
+        moved = state.points()
+        for _ in range(4):
+            state = integrator.step(state, DT)
+        for one, other in zip(_flat(values(taken)), _flat(before), strict=True):
+            np.testing.assert_array_equal(one, other, err_msg=what)
+        assert not np.array_equal(state.points(), moved)
+
+
+def _flat(nested):
+    return [array for item in nested for array in _flat(item)] if isinstance(nested, list) else [nested]
+
+
+def test_callbacks_and_a_run_hold_states(device):
+    """A callback that keeps its states, and the last state of `simulate`."""
+    kept: list[State] = []
+    scene = ddg.Scene(gravity=(0.0, 0.0, -9.81), callbacks=[kept.append])
+    rods(scene)
+    shell(scene)
+    scene.analysis = ddg.Dynamics(duration=6 * DT, dt=DT)
+    result = simulate(scene, device=device, progress=False)
+    assert kept[-1] is result.state
+    points = [state.points() for state in kept]
+    np.testing.assert_allclose([state.time for state in kept], (1 + np.arange(6)) * DT, atol=1e-15)
+    falls = [at[1:6, 2].mean() for at in points]
+    assert (np.diff(falls) < 0.0).all()
+
+
+def test_the_last_good_state_of_an_error_stays(device):
+    """`SolverError.state` is not what later steps write."""
+    model = model_of("rods", device)
+    integrator, strict = ddg.Integrator(model), ddg.Integrator(model, max_iterations=1, retry_limit=0, check_every=1)
+    state = model.state()
+    with pytest.raises(SolverError) as caught:
+        for _ in range(10):
+            state = strict.step(state, DT)
+    good = caught.value.state.snapshot()
+    assert caught.value.state.model is model
+    other = model.state()
+    for _ in range(4):
+        other = integrator.step(other, DT)
+        try:
+            strict.step(other, DT)
+        except SolverError:
+            pass
+    same([caught.value.state], [good])

@@ -1,0 +1,151 @@
+"""Single precision where its rounding decides the motion: warned of at build, refused by name, or counted by name if allowed."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp import meshes
+from ddg_warp.errors import SolverError
+from ddg_warp.integrate import statics
+from ddg_warp.integrate.continuation import Continuation
+from ddg_warp.precision import FLOAT32_LIMIT, FLOAT32_LOST, lost_in_rounding, rounding
+from ddg_warp.stability import spectrum
+
+STEEL = ddg.Material(young=2e11, poisson=0.3, density=7800.0)
+RUBBER = ddg.Material(young=1e6, poisson=0.4, density=1000.0)
+pytestmark = pytest.mark.filterwarnings("ignore:.*precision 'float32' leaves")
+
+
+def wire(scene, nodes=101):
+    """Steel, 1 m long, 2 mm thick, held at its first edge."""
+    points = np.linspace([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], nodes)
+    scene.clamp(scene.add_rod(points, section=ddg.Circle(2e-3), material=STEEL, name="wire"), edges=[0])
+
+
+def joined(scene):
+    points = np.linspace([0.0, 0.0, 0.0], [0.5, 0.0, 0.0], 51)
+    first, second = (
+        scene.add_rod(points + [x, 0.0, 0.0], section=ddg.Circle(2e-3), material=STEEL, name="half") for x in (0.0, 0.5)
+    )
+    scene.clamp(first, edges=[0])
+    scene.join([(first, -1), (second, 0)])
+
+
+def foil(scene, material=STEEL):
+    """Steel of 0.05 mm, 1 m wide, held along one side."""
+    points, triangles = meshes.rectangle(40, 40)
+    shell = scene.add_shell(points, triangles, thickness=5e-5, material=material, bending="hinge", name="foil")
+    scene.hold(shell, np.flatnonzero(points[:, 0] == points[:, 0].min()))
+
+
+THINGS = {
+    "rod": (wire, "rod 0 \\('wire'\\)"),
+    "net": (joined, "rod . \\('half'\\)"),
+    "shell": (foil, "shell 0 \\('foil'\\)"),
+}
+
+
+def scene_of(build, dt=0.01, **options) -> ddg.Scene:
+    scene = ddg.Scene(gravity=(0.0, 0.0, -9.81), analysis=ddg.Dynamics(dt=dt), **options)
+    build(scene)
+    return scene
+
+
+def fall(model, dt: float, steps: int):
+    integrator, state = ddg.Integrator(model), model.state()
+    for _ in range(steps):
+        state = integrator.step(state, dt)
+    return state, integrator.statistics()["outcomes"]
+
+
+@pytest.mark.parametrize("name", THINGS)
+def test_what_rounding_decides_is_refused(device, name):
+    """The error names object, outcome and remedies; a warning came at build; other precisions and short steps go."""
+    build, where = THINGS[name]
+    with pytest.warns(UserWarning, match=f"{where}: precision 'float32' leaves a relative error"):
+        model = scene_of(build).build(device, "float32")
+    with pytest.raises(
+        SolverError, match=f"{where}.*over 0.01 s.*'mixed' or 'float64'.*lost_in_rounding.*allow_rounding"
+    ) as caught:
+        ddg.Integrator(model).step(model.state(), 0.01)
+    assert caught.value.outcome == "lost_in_rounding"
+    assert caught.value.state.points().shape == model.state().points().shape
+    for precision in ("mixed", "float64"):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            fall(scene_of(build).build(device, precision), 0.01, 1)
+    short = 0.01
+    while rounding(model, short)[0] > 0.5 * FLOAT32_LIMIT:
+        short *= 0.5
+    state, outcomes = fall(model, short, 1)
+    assert "lost_in_rounding" not in outcomes
+    with pytest.raises(SolverError, match="lost_in_rounding"):
+        integrator = ddg.Integrator(model)
+        integrator.step(integrator.step(state, short), 0.01)
+
+
+@pytest.mark.parametrize("name", THINGS)
+def test_allowed_rounding_is_counted_by_its_name(device, name):
+    """Who asks for it gets it, under its name and not as converged to rounding; and it is indeed not the motion."""
+    build, _ = THINGS[name]
+    state, outcomes = fall(scene_of(build).build(device, "float32", allow_rounding=True), 0.01, 20)
+    assert outcomes.get("lost_in_rounding", 0) > 0 == outcomes.get("converged_to_rounding", 0)
+    assert np.isfinite(state.points()).all()
+    if name == "rod":
+        exact, _ = fall(scene_of(build).build(device, "float64"), 0.01, 20)
+        moved = np.abs(exact.points() - scene_of(build).build(device, "float64").state().points()).max()
+        assert np.abs(state.points() - exact.points()).max() > 0.05 * moved
+
+
+def test_soft_things_go_on_in_silence(device):
+    """A rod and a sheet of rubber: errors below the bound say nothing, and the motion is that of float64 to its share."""
+    for build in (wire_of_rubber, lambda scene: foil(scene, RUBBER)):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            model = scene_of(build, dt=0.005).build(device, "float32")
+            state, outcomes = fall(model, 0.005, 10)
+        exact, _ = fall(scene_of(build, dt=0.005).build(device, "float64"), 0.005, 10)
+        moved = np.abs(exact.points() - model.state().points()).max()
+        assert np.abs(state.points() - exact.points()).max() < FLOAT32_LIMIT * moved
+        assert set(outcomes) <= {"converged", "converged_to_rounding"}
+
+
+def wire_of_rubber(scene):
+    points = np.linspace([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], 31)
+    scene.clamp(scene.add_rod(points, section=ddg.Circle(0.02), material=RUBBER), edges=[0])
+
+
+def strut(scene):
+    """Clamped at one end, pushed by 1 % at the other: twice its critical strain or so."""
+    points = np.linspace([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], 101)
+    rod = scene.add_rod(points, section=ddg.Circle(2e-3), material=STEEL, name="strut")
+    scene.clamp(rod, edges=[0])
+    scene.clamp(rod, edges=[-1], motion=ddg.Motion(translation=lambda t: (0.0, 0.0, -0.01 * t)))
+
+
+def test_at_rest_too(device):
+    """Equilibria, paths and spectra, displacement-driven ones as well, where no load could tell."""
+    scene = scene_of(strut)
+    scene.gravity = (0.0, 0.0, 0.0)
+    model = scene.build(device, "float32")
+    for ask in (
+        lambda: statics.solve(model),
+        lambda: Continuation(model, {}).trace(model.state()),
+        lambda: spectrum(model, model.state()),
+    ):
+        with pytest.raises(SolverError, match=r"rod 0 \('strut'\).*at rest.*lost_in_rounding") as caught:
+            ask()
+        assert caught.value.outcome == "lost_in_rounding"
+    assert lost_in_rounding(scene.build(device, "float32", allow_rounding=True))
+
+
+def test_the_bound(device):
+    """Half a rounding unit times EA / l over m / s^2 + EI l (pi / L)^4, l = L / n; m = rho A l in the mean of n + 1 nodes."""
+    model = scene_of(wire).build(device, "float32", allow_rounding=True)
+    n, r, s = 100, 2e-3, 0.01
+    stiff = 2e11 * np.pi * r**2 * n
+    soft = 7800.0 * np.pi * r**2 / (n + 1) / s**2 + 2e11 * np.pi * r**4 / 4.0 / n * np.pi**4
+    assert rounding(model, s)[0] == pytest.approx(2.0**-24 * stiff / soft, rel=1e-6)
+    assert rounding(model, s)[0] > FLOAT32_LOST > FLOAT32_LIMIT
