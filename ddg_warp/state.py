@@ -35,9 +35,14 @@ class State:
     """Positions, velocities, frames and time of a model's rods and shells. A step returns another state and does not change this one.
 
     The integrator writes into two states in turn: a state stays valid until the step after the next; `copy()` keeps it.
+
+    Attributes:
+        stable: of an equilibrium that a static solver found, whether it is stable, in all worlds; None where that was not asked, as
+            in dynamics. See `Equilibrium.solve`.
     """
 
     def __init__(self, model, groups: list[GroupState], net=None, time: float = 0.0):
+        self.stable: bool | None = None
         self.model = model
         self.groups = groups
         self.net = net
@@ -67,6 +72,7 @@ class State:
         """An independent copy."""
         other = self.model.empty_state()
         other.assign(self)
+        other.stable = self.stable
         return other
 
     def assign(self, other: "State") -> None:
@@ -74,7 +80,7 @@ class State:
         for mine, theirs in zip(self.parts().values(), other.parts().values(), strict=True):
             for array, source in zip(mine.arrays().values(), theirs.arrays().values(), strict=True):
                 wp.copy(array, source)
-        self.time = other.time
+        self.time, self.stable = other.time, None
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Everything a bitwise restart needs."""
