@@ -12,6 +12,7 @@ from ddg_warp import arrays
 from ddg_warp.couples import couple_derivatives, couple_forces
 from ddg_warp.integrate.prescribed import PrescribedMotion
 from ddg_warp.kernels import element
+from ddg_warp.rigid import Body
 from ddg_warp.tolerance import support_forces
 from ddg_warp.turning import turned
 
@@ -182,6 +183,20 @@ class ChainTangent:
         k, column, rows = self.model.places(group)
         dofs = ((column * group.nodes + k) * kind.block)[:, None] + np.arange(kind.dim)
         return rows, [0, 2] if kind.dim == 2 else [0, 1, 2], dofs
+
+    def bodies(self) -> list[Body]:
+        """Every rod of every world."""
+        group, kind, result = self.group, self.group.kind, []
+        axes = [0, 2] if kind.dim == 2 else [0, 1, 2]
+        for column in range(group.columns):
+            n = group.host.count[column % group.rods]
+            first = self.offset + (column * group.nodes + np.arange(n)) * kind.block
+            nodes = np.full((n, 3), -1)
+            nodes[:, axes] = first[:, None] + np.arange(kind.dim)
+            edges = np.arange((n if kind.closed else n - 1) if kind.twist else 0)
+            ends = np.stack([edges, (edges + 1) % n], axis=1)
+            result.append(Body(nodes, first[edges] + kind.dim, ends, np.zeros((0, 3), int)))
+        return result
 
     def where(self, dof: int) -> str:
         """Name of a dof's place."""

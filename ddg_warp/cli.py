@@ -174,6 +174,13 @@ def say(result, content: dict, checks: list, directory: Path) -> None:
         f"{content['scene']}: {content['sim_time']:g} s in {steps}; "
         f"{content['wall_time']:.3g} s in all, {content['compile_time']:.3g} s to build and compile"
     )
+    if "stable" in content:
+        verdicts = {
+            True: "stable",
+            False: "UNSTABLE",
+            None: "not asked whether stable: ddg_warp.stability.spectrum tells",
+        }
+        print(f"last equilibrium: {verdicts[content['stable']]}")
     if checks:
         print(checks_table(checks))
     print(f"results are in {directory}")

@@ -7,6 +7,7 @@ import warp as wp
 from scipy import sparse
 
 from ddg_warp.kernels.net import elements
+from ddg_warp.rigid import Body
 from ddg_warp.tolerance import largest_excess
 from ddg_warp.turning import turned
 
@@ -233,6 +234,26 @@ class NetTangent:
         """Rows of `State.points`, axes, and the dofs (rows, axes) of the first world."""
         rows, blocks = self.model.net_rows
         return rows, [0, 1, 2], 3 * blocks[:, None] + np.arange(3)
+
+    def bodies(self) -> list[Body]:
+        """Rods with the rotations of their rigid joints, shells, and shells of revolution, of every world."""
+        host, none = self.host, np.zeros(0, int)
+        joints = [part for part in host.sets if part.term.measure.spins]
+        parts = []
+        for rod in host.rods:
+            edges = rod.all_edges
+            ends = np.stack([np.arange(len(edges)), (np.arange(len(edges)) + 1) % len(rod.all_nodes)], axis=1)
+            spins = [part.slots[-1, np.isin(part.slots[-2], edges)] for part in joints]
+            parts.append((rod.all_nodes, edges, ends, np.unique(np.concatenate([none, *spins]))))
+        parts += [(body.nodes, none, np.zeros((0, 2), int), none) for body in (*host.shells, *host.meridians)]
+        result = []
+        for world in range(self.net.worlds):
+            dofs = self.offset + 3 * world * host.blocks
+            for nodes, edges, ends, spins in parts:
+                places = (dofs + 3 * blocks[:, None] + np.arange(3) for blocks in (nodes, spins))
+                nodes, spins = places
+                result.append(Body(nodes, dofs + 3 * edges, ends, spins))
+        return result
 
     def where(self, dof: int) -> str:
         """Name of a dof's place."""

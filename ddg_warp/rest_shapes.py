@@ -81,6 +81,7 @@ def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, ang
         count = 0 if model.net is None else len(model.net.host.shells)
         raise ValueError(f"shell {shell} does not exist; the model has {count} shells")
     held, bending = model.net.host.shells[shell], model.scene.shells[shell].bending
+    membrane = model.scene.shells[shell].membrane
     surface, plate = held.surface, held.plate
     count = len(surface.triangles)
     if all(values is None for values in (points, metric, curvature, angle)):
@@ -108,12 +109,12 @@ def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, ang
         angle = _shaped("angle", angle, (len(surface.edges),))
         changes["angle"] = np.repeat(angle[:, None], 2, axis=1)
     plate = replace(plate, **changes)
-    elements_of = shell_terms.shell_elements(surface, plate, held.kinds, bending)
-    held.plate = plate
-    for elements in elements_of:
-        if len(elements):
-            part = next(part for part in model.net.sets if part.term is elements.term)
-            part.set_rest(held.first[elements.term.name], elements.parameters)
+    sets = {part.term.name: part for part in model.net.sets}
+    elements_of = shell_terms.shell_elements(surface, plate, held.kinds, bending, membrane)
+    places = [(sets[e.term.name], held.first[e.term.name], e.parameters) for e in elements_of if len(e)]
+    held.plate = plate  # from here on nothing can fail
+    for part, first, parameters in places:
+        part.set_rest(first, parameters)
     model.version += 1
 
 

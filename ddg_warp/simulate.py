@@ -235,6 +235,7 @@ def follow(result: Result, steps: int, keep: Callable, *, options: Mapping, cloc
         for point in points:
             state = point.state.copy()
             state.time = point.arclength
+            state.stable = point.stable
             keep(state, load=point.load, **point.values)
             bar.update()
         result.step_times = [(clock() - started) / max(1, len(points))] * len(points)

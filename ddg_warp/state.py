@@ -40,9 +40,14 @@ class State:
     to is written again, so that a loop which keeps none needs that of two. A state kept takes a copy of its arrays with it. Who keeps
     bare arrays of a state that it let go (`state.groups[0].x`, or a view of them) keeps their memory, and steps are captured
     anew: rather keep the state.
+
+    Attributes:
+        stable: of an equilibrium that a static solver found, whether it is stable, in all worlds; None where that was not asked, as
+            in dynamics. See `Equilibrium.solve`.
     """
 
     def __init__(self, model, groups: list[GroupState], net=None, time: float = 0.0):
+        self.stable: bool | None = None
         self.model = model
         self.groups = groups
         self.net = net
@@ -72,6 +77,7 @@ class State:
         """An independent copy."""
         other = self.model.empty_state()
         other.assign(self)
+        other.stable = self.stable
         return other
 
     def assign(self, other: "State") -> None:
@@ -79,7 +85,7 @@ class State:
         for mine, theirs in zip(self.parts().values(), other.parts().values(), strict=True):
             for array, source in zip(mine.arrays().values(), theirs.arrays().values(), strict=True):
                 wp.copy(array, source)
-        self.time = other.time
+        self.time, self.stable = other.time, None
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Everything a bitwise restart needs."""

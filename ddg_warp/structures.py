@@ -112,7 +112,8 @@ class Structures(Meridians):
             material: `Material`; its density gives the mass, its viscosity the strain-rate damping.
             bending: "midedge_dof", "midedge_boundary", "midedge", "hinge" or "isometric"; see `ddg_warp.shells`.
             membrane: "flat" (constant strain triangles) or "curved" (their sides have the length of the arcs over them, by the
-                normals of bending "midedge_dof"): thin shells that bend far do not lock. It costs about twice the time.
+                normals of bending "midedge_dof"): thin shells that bend far do not lock. For statics, where an iteration costs
+                about twice the time; dynamics refuses it.
             rest: "shape" takes metric and curvature at rest from the points, "flat" the metric alone; or two arrays
                 (abar (T, 3) [m^2], bbar (T, 3) [m]), first and second fundamental form in the basis of the first two edges.
             name: shown in reports and output.

@@ -14,7 +14,7 @@ PACKAGES = ("ddg-warp", "warp-lang", "numpy", "scipy", "h5py", "usd-core", "matp
 
 
 def summary(scene: str, parameters: Mapping, result, checks: Iterable) -> dict:
-    """The content of summary.json; `failure` is there only where the solver failed."""
+    """The content of summary.json; `failure` is there only where the solver failed, `stable` only of equilibria (null: not asked)."""
     statistics = result.statistics
     content = {
         "scene": scene,
@@ -33,6 +33,8 @@ def summary(scene: str, parameters: Mapping, result, checks: Iterable) -> dict:
         "energy": result.energies,
         "checks": [check.as_dict() for check in checks],
     }
+    if result.dt is None:
+        content["stable"] = result.state.stable
     return content | ({"failure": result.failure} if result.failure else {})
 
 

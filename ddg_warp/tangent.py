@@ -106,6 +106,7 @@ class Tangent:
         for part in self.parts:
             part.assign(state, self.of(part, q))
         self.model.carry_frames(state)
+        state.stable = None
 
     def move_supports(self, state, before: float, at: float) -> None:
         """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""
@@ -169,6 +170,16 @@ class Tangent:
             rows, axes, dofs = part.point_dofs()
             result[rows[:, None], axes] = dofs + part.offset
         return result
+
+    def at_points(self, values: np.ndarray) -> np.ndarray:
+        """The entries of dofs (size,) at points, in the shape of `State.points`; zero along what a planar rod has not."""
+        worlds = self.model.worlds
+        result = np.zeros((worlds, self.model.points_count, 3), values.dtype)
+        for part in self.parts:
+            rows, axes, dofs = part.point_dofs()
+            own = self.of(part, values).reshape(worlds, -1)
+            result[:, rows[:, None], axes] = own[:, dofs]
+        return result if worlds > 1 else result[0]
 
     def where(self, dof: int) -> str:
         """Name of a dof's place, such as "node 3 of rod 1"."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp import stability
+from ddg_warp import meshes, stability
 from ddg_warp.integrate.continuation import Continuation
 from ddg_warp.integrate.path import Displacement, Stop
 from ddg_warp.integrate.statics import Equilibrium, StaticsOptions, solve
@@ -159,6 +159,101 @@ def test_branch_follows_the_elastica(device):
     assert post_buckling.exact(0.3)[:2] == pytest.approx((11.65303, 0.3143126), rel=1e-6)
     assert np.abs(errors[-1]).max() < 1e-3
     assert order(edges, np.array(errors)[:, 0]) == pytest.approx(2.0, abs=0.1)
+
+
+def arch(device, load_scale: float, imperfection: float = 0.0):
+    """A shallow elastic arch of 20 edges between hinges, pressed down at its crown."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2)
+    x = np.linspace(-1.0, 1.0, 21)
+    points = np.stack([x, 0.0 * x, 0.3 * (1.0 - x**2) + imperfection * np.sin(np.pi * x)], axis=1)
+    rod = scene.add_rod(points, section=ddg.Stiffness(EA=1e4, EI1=1.0, radius=0.01))
+    scene.fix(rod, [0, -1])
+    scene.add_force(rod, 10, (0.0, 0.0, -1.0))
+    watch = {"drop": Displacement.of(10, "z", -1.0), "sway": Displacement.of(10, "x")}
+    return Continuation(scene.build(device, "float64"), watch, load_scale=load_scale, floor_factor=1.0)
+
+
+@pytest.mark.parametrize("load_scale", [30.0, pytest.param(300.0, marks=pytest.mark.slow)])
+def test_branch_comes_back_through_the_pitchforks(device, load_scale):
+    """The asymmetric states of an arch close in a loop through both pitchforks of the symmetric ones: each is one event, in turn.
+
+    There the load is stationary, yet it is no limit point: the load does no work on the mode, along which the branch runs.
+    """
+    continuation = arch(device, load_scale)
+    first = continuation.trace(stop=Stop(displacement=("drop", -1.0, 0.1))).bifurcations[0]
+    branch = continuation.switch(first, stop=Stop(steps=45))
+    found = [point for point in branch.points[1:] if point.kind != "regular"]
+    assert {point.kind for point in found} == {"bifurcation"}
+    assert len(found) >= 2
+    for point, back in zip(found, (False, True), strict=False):
+        assert point.values["sway"] == pytest.approx(0.0, abs=1e-3)
+        assert (point.load == pytest.approx(first.load, rel=1e-4)) == back
+    assert np.abs(branch.values("sway")).max() > 0.02
+    # leaving the other pitchfork across the loop leads to symmetric states
+    through = continuation.switch(found[0], stop=Stop(steps=3))
+    assert np.abs(through.values("sway")[1:]).max() < 1e-3 < np.ptp(through.values("drop"))
+
+
+def test_imperfect_arch_turns_off_where_the_perfect_one_forks(device):
+    """It follows its own path around the pitchfork, with limit points instead, and leaps to no other."""
+    path = arch(device, 30.0, 1e-4).trace(stop=Stop(displacement=("drop", -1.0, 0.55)))
+    assert [point.kind for point in path.points if point.kind != "regular"] == ["limit point"]
+    (limit,) = path.limit_points
+    perfect = arch(device, 30.0).trace(stop=Stop(displacement=("drop", -1.0, 0.1))).bifurcations[0]
+    assert limit.load < perfect.load
+    assert limit.load == pytest.approx(perfect.load, rel=0.02)
+    assert np.abs(path.values("sway")).max() > 0.02
+
+
+@pytest.mark.parametrize("load_scale", [pytest.param(0.3, marks=pytest.mark.slow), 3.0, 30.0])
+def test_every_event_is_listed_once(device, load_scale):
+    """Six crossings of the steep truss on its way down and through, by closed form (see above), whatever the metric."""
+    continuation, height = truss(device, 3.0, load_scale=load_scale)
+    path = continuation.trace(stop=Stop(displacement=("drop", -1.0, 2.2 * height)))
+    roots = np.sort(np.roots([1.0, -3.0, 0.0, 3.0]).real)[:0:-1]
+    bars = [roots[0], 3.0 ** (1.0 / 3.0), roots[1]]
+    kinds = ["bifurcation", "limit point", "bifurcation"]
+    found = [point for point in path.points if point.kind != "regular"]
+    assert [point.kind for point in found] == kinds + kinds[::-1]
+    lengths = [np.hypot(1.0, height - point.values["drop"]) for point in found]
+    assert lengths == pytest.approx(bars + bars[::-1], abs=1e-5)
+    assert path.stable.tolist() == (path.negative == 0).tolist()
+    assert path.kinds == [point.kind for point in path.points]
+
+
+def cap(device):
+    """A shallow cap of triangles, twice as high as it is thick, between hinges under a pressure that keeps its direction."""
+    points, triangles = meshes.disc(3)
+    radius = np.linalg.norm(points, axis=1)
+    points = points + (0.02 * (1.0 - radius**2))[:, None] * [0.0, 0.0, 1.0]
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    shell = scene.add_shell(
+        points, triangles, thickness=0.01, material=ddg.Material(young=1e7, poisson=0.3), bending="hinge"
+    )
+    scene.hold(shell, np.flatnonzero(radius > 1.0 - 1e-9))
+    scene.add_pressure(shell, -50.0, dead=True)
+    return Continuation(scene.build(device, "float64"), {"drop": Displacement.of(int(radius.argmin()), "z", -1.0)})
+
+
+def test_defaults_do_not_leap_over_a_snap(device):
+    """Its whole snap is shorter than the first step of the defaults: the path is found, by the loads that control finds on it."""
+    continuation = cap(device)
+    path = continuation.trace(stop=Stop(displacement=("drop", -1.0, 0.042)))
+    assert np.diff(path.values("drop")).max() < 0.01  # a thickness
+    assert [point.kind for point in path.points if point.kind != "regular"] == [
+        "bifurcation",
+        "limit point",
+        "limit point",
+        "bifurcation",
+    ]
+    assert path.negative[0] == path.negative[-1] == 0
+    drops = np.linspace(0.001, 0.042, 12)
+    controlled = continuation.control("drop", drops)
+    upper, lower = (point.load for point in path.limit_points)
+    assert upper >= controlled.load[drops < 0.036].max() - 1e-3 * upper
+    assert lower <= controlled.load.min() + 1e-3 * upper
+    assert path.bifurcations[0].mode_displacements.shape == path.points[0].state.points().shape
+    assert np.abs(path.bifurcations[0].mode_displacements).max() > 0.0
 
 
 def test_path_under_moving_supports(device):

@@ -152,6 +152,39 @@ def test_pre_stress(device):
     assert Tangent(model).energy(model.state())["shell_stretch"] == pytest.approx(exact, rel=1e-12)
 
 
+def test_curved_membrane_gets_it(device):
+    """Its elements are others than those of the flat one; a bowl set as rest shape bears no force."""
+    points, triangles = meshes.rectangle(4, 3)
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    scene.add_shell(points, triangles, thickness=THICKNESS, material=MATERIAL, membrane="curved")
+    model = scene.build(device, "float64")
+    grown = grown_metric(points, triangles, 0.98)
+    model.set_rest(0, metric=grown)
+    start = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    rest = (grown, np.zeros_like(grown))
+    start.add_shell(points, triangles, thickness=THICKNESS, material=MATERIAL, membrane="curved", rest=rest)
+    other = start.build(device, "float64")
+    forces = [Tangent(m).gradient(m.state()) for m in (model, other)]
+    assert np.abs(forces[0]).max() > 0.0
+    np.testing.assert_allclose(forces[0], forces[1], rtol=1e-12, atol=1e-12 * np.abs(forces[1]).max())
+
+
+def test_what_fails_changes_nothing(device):
+    """All that may fail comes before the first change: the plate and the elements stay those of before."""
+    scene, points, triangles = patch()
+    model = scene.build(device, "float64")
+    plate, version = model.net.host.shells[0].plate, model.version
+    before = Tangent(model).gradient(model.state())
+    first = dict(model.net.host.shells[0].first)
+    model.net.host.shells[0].first.pop("shell_bend_dof")
+    with pytest.raises(KeyError):
+        model.set_rest(0, metric=grown_metric(points, triangles, 0.9))
+    model.net.host.shells[0].first.update(first)
+    assert model.net.host.shells[0].plate is plate
+    assert model.version == version
+    np.testing.assert_array_equal(Tangent(model).gradient(model.state()), before)
+
+
 def test_every_world_gets_it(device):
     scene, points, triangles = patch()
     model = scene.build(device, "float64", worlds=2)

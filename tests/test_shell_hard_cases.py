@@ -245,3 +245,16 @@ def test_two_motions_of_a_point(device, both):
         return
     state = solve(scene.build(device, "float64"))
     np.testing.assert_allclose(state.points(), points * [1.1, 1.1, 1.0], atol=1e-9)
+
+
+def test_curved_membrane_is_for_statics(device):
+    """A sheet with it sags in statics; dynamics, whose matrix loses it, refuses it by name and remedy."""
+    points, triangles = meshes.rectangle(4, 4)
+    scene = ddg.Scene()
+    material = ddg.Material(young=1e6, poisson=0.3, density=100.0)
+    sheet = scene.add_shell(points, triangles, thickness=0.01, material=material, membrane="curved", name="flag")
+    scene.clamp_boundary(sheet, np.flatnonzero(points[:, 0] < 1e-9))
+    model = scene.build(device, "float64")
+    assert Equilibrium(model).load(model.state(), 2).points()[:, 2].min() < -0.01
+    with pytest.raises(ddg.SceneError, match=r"shell 0 \('flag'\): membrane 'curved'.*membrane='flat'"):
+        ddg.Integrator(model)

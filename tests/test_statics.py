@@ -7,9 +7,11 @@ import pytest
 from scipy import linalg
 
 import ddg_warp as ddg
-from ddg_warp import stability
+from ddg_warp import meshes, stability
 from ddg_warp.integrate.statics import Equilibrium, StaticsOptions, solve
+from ddg_warp.simulate import simulate
 from ddg_warp.stability import spectrum
+from ddg_warp.summary import summary
 from ddg_warp.tangent import Tangent
 
 SECTION = ddg.Stiffness(EA=1e4, EI1=1.0, EI2=1.5, GJ=0.8, mass_per_length=0.5, rotary_inertia=1e-3)
@@ -63,6 +65,79 @@ def test_follow_stays_where_minimise_leaves(device):
     assert tip < work  # its total energy is below that of the straight column
 
 
+# A straight column of EI = L = 1 on a clamp under 2 P_cr and 10 P_cr = 24.7: below lie P_cr, and 9 P_cr = 22.2.
+@pytest.mark.parametrize(("factor", "negative"), [(2.0, 1), (10.0, 2)])
+def test_a_minimum_is_no_saddle(device, factor, negative):
+    """A search that symmetry leads to the straight column goes on to the buckled one; mode "follow" keeps and names the saddle."""
+    model = column(device, factor * np.pi**2 / 4.0)
+    saddle, buckled = solve(model, mode="follow"), solve(model)
+    assert np.abs(saddle.points()[:, 0]).max() == 0.0
+    assert saddle.stable is False
+    assert spectrum(model, saddle).negative == negative
+    assert buckled.stable is True
+    assert spectrum(model, buckled).stable
+    assert np.abs(buckled.points()[:, 0]).max() > 0.4
+    assert residual(model, buckled) < 1e-6
+    np.testing.assert_array_equal(solve(model).points(), buckled.points())
+    in_steps = solve(model, load_steps=5)
+    np.testing.assert_allclose(np.abs(in_steps.points()), np.abs(buckled.points()), atol=1e-6)
+
+
+def test_a_pressed_plate_is_no_saddle(device):
+    """The same for a shell, whose Newton with stresses of its own sees the tangent at rest alone: a strip at 2 P_cr."""
+    points, triangles = meshes.rectangle(10, 2, (1.0, 0.1))
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    strip = scene.add_shell(points, triangles, thickness=0.01, material=ddg.Material(young=1e9, poisson=0.0))
+    scene.clamp_boundary(strip, np.flatnonzero(points[:, 0] < 1e-9))
+    tip = np.flatnonzero(points[:, 0] > 1.0 - 1e-9)
+    bending = 1e9 * 0.1 * 0.01**3 / 12.0
+    scene.add_vertex_force(strip, tip, (-2.0 * np.pi**2 / 4.0 * bending / len(tip), 0.0, 0.0))
+    model = scene.build(device, "float64")
+    saddle, buckled = solve(model, mode="follow"), solve(model)
+    assert (saddle.stable, buckled.stable) == (False, True)
+    assert np.abs(saddle.points()[:, 2]).max() == 0.0
+    assert np.abs(buckled.points()[:, 2]).max() > 0.5
+    by_gradients = solve(model, solver="pcg")
+    assert by_gradients.stable in (False, None)  # it is not told by them that the strip is stable
+    assert model.state().stable is None
+
+
+def test_stability_belongs_to_a_state(device):
+    """A copy keeps it, what takes another configuration over has none; loads without a potential are not asked."""
+    model = column(device, 1.0)
+    state = solve(model)
+    assert state.stable is True
+    assert state.copy().stable is True
+    other = model.state()
+    other.assign(state)
+    assert other.stable is None
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    rod = scene.add_rod(straight(11), section=SECTION)
+    scene.clamp_end(rod)
+    scene.add_couple(rod, -1, (0.3, 1.0, 0.2))
+    assert solve(scene.build(device, "float64"), load_steps=2).stable is None
+
+
+@pytest.mark.parametrize(("mode", "stable"), [("minimise", True), ("follow", False)])
+def test_the_summary_of_a_run_says_whether_its_end_is_stable(device, mode, stable):
+    scene = column(device, 2.0 * np.pi**2 / 4.0).scene
+    scene.analysis = ddg.Statics(load_steps=1)
+    result = simulate(scene, device=device, precision="float64", options={"mode": mode}, progress=False)
+    assert summary("column", {}, result, [])["stable"] is stable
+
+
+def test_free_spin_is_no_instability(device):
+    """A rod between two hinges, free to turn about its own axis, is stable whatever the sign that rounding gives that zero."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
+    section = ddg.Stiffness(EA=1e4, EI1=1.0, GJ=0.8, mass_per_length=0.5, rotary_inertia=1e-3)
+    rod = scene.add_rod(straight(21), section=section)
+    scene.fix(rod, [0, -1])
+    model = scene.build(device, "float64")
+    assert spectrum(model, solve(model)).rigid == 1
+    for mode in ("minimise", "follow"):
+        assert solve(model, mode=mode).stable is True
+
+
 def test_follow_passes_the_critical_load(device):
     """Loaded from zero, the exactly straight column stays an equilibrium, with one negative eigenvalue past the critical load."""
     model = column(device, 4.0)
@@ -95,6 +170,23 @@ def test_increments_are_halved(device, monkeypatch):
     assert taken[-1][1] == 1.0
     assert all(a[1] == b[0] for a, b in pairwise(taken))  # without gaps
     np.testing.assert_allclose(state.points(), solve(model, load_steps=8).points(), atol=1e-8)
+
+
+def test_increments_grow_again(device, monkeypatch):
+    """Where one place alone takes short increments, those after it are as long as before; the second half is one increment."""
+    model, taken = cantilever(device), []
+
+    def picky(self, state, before, at):
+        if before < 0.1 and at - before > 0.01:
+            raise ddg.SolverError("too far", state=state, outcome="max_iterations")
+        taken.append(at - before)
+        return state
+
+    monkeypatch.setattr(Equilibrium, "solve", picky)
+    solve(model, load_steps=2)
+    assert len(taken) < 40
+    assert max(taken) > 0.3
+    assert sum(taken) == pytest.approx(1.0)
 
 
 def pushed(device, distance: float, turn: float = 0.0, dimension: int = 2):

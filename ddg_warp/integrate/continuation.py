@@ -19,6 +19,8 @@ from ddg_warp.integrate.path import BIFURCATION, LIMIT_POINT, Displacement, Path
 from ddg_warp.state import State
 from ddg_warp.threads import launches
 
+FORK = 1e-2  # work of the load along the path, over its largest along any, at which a stationary load is no limit point
+LEAP = 4.0  # distance of two points over the length between them at which they are not on one path
 BISECTIONS = 12  # of a bifurcation, before one linear interpolation of the critical eigenvalue
 
 
@@ -81,7 +83,11 @@ class Continuation:
         if bifurcation.kind != BIFURCATION:
             raise ValueError(f"the point is a {bifurcation.kind}; a path branches at a bifurcation")
         across = np.append(bifurcation.mode, 0.0)
-        across -= bifurcation.direction * self.corrector.dot(across, bifurcation.direction)
+        along = self.corrector.dot(across, bifurcation.direction)
+        if abs(along) > (1.0 - 1e-6) * self.corrector.norm(across):  # the path came along the mode
+            across = self.corrector.other(bifurcation)
+            along = self.corrector.dot(across, bifurcation.direction)
+        across -= bifurcation.direction * along
         across *= side / self.corrector.norm(across)
         distance = step or self.options.step
         for _ in range(12):
@@ -156,6 +162,7 @@ class Continuation:
                     there = self.corrector.at(here, step)
                     outcome, row, value = self._bound(here, there, stop) or ("", None, 0.0)
                     there = self.corrector.to(here, row, value) if outcome else there
+                    self.corrector.follows(here, there)
                     events = self._events(here, there)
                     break
                 except Failed as failed:
@@ -199,12 +206,20 @@ class Continuation:
         length, found, jump, fold = there.arclength - here.arclength, [], 0, np.inf
         if here.direction[-1] * there.direction[-1] < 0.0:
             limit = self._limit_point(here, length)
-            limit.negative = min(here.negative, there.negative)
-            fold = limit.arclength - here.arclength
             _, _, rate, *_ = self.corrector.system(limit.state, self.tangent.dofs(limit.state), limit.load)
-            sense = np.sign(rate @ limit.direction[:-1])
-            jump = int(sense * there.direction[-1] < 0.0) - int(sense * here.direction[-1] < 0.0)
+            limit.negative = min(here.negative, there.negative)
+            free, step = self.corrector.free, limit.direction[:-1]
+            work = rate[free] @ step[free]
+            size = np.sqrt((rate[free] ** 2 / self.corrector.metric[free]).sum()) * self.corrector.norm(limit.direction)
             found.append(limit)
+            if here.negative == there.negative and abs(work) <= FORK * size:
+                # f . t vanishes, too: the tangent t is the critical mode, as where asymmetric states cross symmetric ones
+                limit.kind, limit.mode = BIFURCATION, step / self.corrector.norm(limit.direction)
+                limit.mode_displacements = self.tangent.at_points(limit.mode)
+            else:
+                fold = limit.arclength - here.arclength
+                sense = np.sign(work)
+                jump = int(sense * there.direction[-1] < 0.0) - int(sense * here.direction[-1] < 0.0)
         low, count = 0.0, here.negative
         ends = there.negative - jump if fold < np.inf else there.negative
         while count != ends:
@@ -238,12 +253,17 @@ class Continuation:
                 low = middle
             else:
                 high, after = middle, found
-        a, b = (self.corrector.critical(point_at(step))[0] for step in (low, high))
+        ends = [point_at(step) for step in (low, high)]
+        gap = self.tangent.dofs(ends[1].state) - self.tangent.dofs(ends[0].state)
+        if self.corrector.norm(np.append(gap, 0.0)) > LEAP * (high - low) + 1e-6 * length:
+            raise Failed("leap")  # from one path to another, which does not meet it: where an imperfection parts them
+        a, b = (self.corrector.critical(end)[0] for end in ends)
         root = low + (high - low) * (a / (a - b) if a * b < 0.0 else 0.5)
         point = point_at(root)
         point.kind = BIFURCATION
         point.negative = min(count, after) + (jump if root > fold else 0)
         point.mode = self.corrector.critical(point)[1]
+        point.mode_displacements = self.tangent.at_points(point.mode)
         # the tangent of the path itself, between those beside it
         along = here.direction + root / length * (there.direction - here.direction)
         point.direction = along / self.corrector.norm(along)

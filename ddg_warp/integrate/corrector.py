@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
+from scipy.sparse.linalg import splu
 
 from ddg_warp import stability
 from ddg_warp.errors import SceneError, SolverError, check_options
@@ -46,6 +47,9 @@ class ContinuationOptions:
     def __post_init__(self):
         positive = ("step", "max_step", "min_step", "load_scale", "rotation_cap", "tolerance", "rtol", "floor_factor")
         check_options(self, positive, ("iterations", "max_iterations"))
+
+
+BEND = 0.2  # of a step: how far its chord may be from the mean of the tangents at its ends
 
 
 class Failed(Exception):
@@ -89,6 +93,20 @@ class Corrector:
             raise Failed("sharp_turn")
         there.arclength = here.arclength + step
         return there
+
+    def follows(self, here: Point, there: Point) -> None:
+        """Refuse a step over which the path does more than its ends tell: the chord is the mean of the tangents, times arc length.
+
+        A step that leaps to another part of the path, or over a rise and fall of the load, has one that is not. The load is looked
+        at by itself, as its scale may hide it. (The trapezoidal rule errs by a third of s^3 where it says half as much again.)
+        """
+        length = there.arclength - here.arclength
+        chord = np.append(self.tangent.dofs(there.state) - self.tangent.dofs(here.state), there.load - here.load)
+        ends = length * here.direction, length * there.direction
+        gap = chord - 0.5 * (ends[0] + ends[1])
+        rates = max(abs(end[-1]) for end in ends)
+        if self.norm(gap) > BEND * length or abs(gap[-1]) > BEND * rates:
+            raise Failed("leap")
 
     def to(self, here: Point, row: np.ndarray, value: float) -> Point:
         """The equilibrium at which a linear functional of dofs (from rest) and load has a value."""
@@ -150,7 +168,8 @@ class Corrector:
         direction = along / self.norm(along)
         values = {name: float(row @ (q - self.rest)) for name, row in self.watched.items()}
         arclength = here.arclength + abs(self.dot(total, here.direction))
-        negative = stability.negative_eigenvalues(matrix)
+        negative = stability.instabilities(tangent, state, stiffness)
+        state.stable = negative == 0
         return Point(state, float(load), arclength, values, negative, REGULAR, direction, iterations=iteration)
 
     def system(self, state: State, q: np.ndarray, load: float):
@@ -209,6 +228,19 @@ class Corrector:
         mode = np.zeros(self.tangent.size)
         mode[self.free] = vector
         return value, mode
+
+    def other(self, point: Point) -> np.ndarray:
+        """Direction (size + 1,) of the path that is crossed at a bifurcation by one along its critical mode.
+
+        K v = f l', solvable as the mode does no work on f, with v across the mode.
+        """
+        q = self.tangent.dofs(point.state)
+        _, stiffness, rate, support, *_ = self.system(point.state, q, point.load)
+        free = self.free
+        mode = sparse.csc_matrix(point.mode[free][:, None])
+        weighted = sparse.csc_matrix((self.metric[free] * point.mode[free])[None])
+        matrix = sparse.bmat([[stiffness[free][:, free], mode], [weighted, None]], format="csc")
+        return self._full(np.append(splu(matrix).solve(np.append(rate[free], 0.0))[:-1], 1.0), support)
 
     def dot(self, a: np.ndarray, b: np.ndarray) -> float:
         """Product of two increments (size + 1,) in the metric."""

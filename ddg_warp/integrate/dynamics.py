@@ -80,6 +80,7 @@ class Integrator:
         self.retry_limit = retry_limit
         self.check_every = check_every or (32 if model.wp_device.is_cuda else 1)
         _require_mass(model)
+        _refuse_curved_membranes(model)
         self._chains = [_ChainStep(self, model, group) for group in model.groups]
         self._net = NetStep(self, model) if model.net is not None else None
         self._buffers = [Buffer(model), Buffer(model)]
@@ -216,6 +217,15 @@ def _newton(model, group, integrator: Integrator, precision) -> ChainNewton:
     if linear in DIRECT:
         return DIRECT[linear](*given, *last)
     return PcgNewton(*given, linear, *last)
+
+
+def _refuse_curved_membranes(model) -> None:
+    """Its strains turn with the normals, so that the matrix of a time step, which is made positive, is far from the tangent."""
+    for i, shell in enumerate(model.scene.shells):
+        if shell.membrane == "curved":
+            raise SceneError(
+                f"shell {i} ('{shell.name}'): membrane 'curved' serves statics and spectra; for dynamics add it with membrane='flat'"
+            )
 
 
 def _require_mass(model) -> None:

@@ -48,7 +48,7 @@ def newton(solver, state: State, before: float, at: float) -> State | None:
             excess = solver.excess(residual, gradient, hessian, q, scale)
             if excess <= 0.0 and (solver.outcome == "converged" or polished):
                 stable = factor.reliable and not factor.negative
-                state.time = at
+                state.time, solver.stiffness = at, hessian
                 return state if stable or solver.options.mode == "follow" else None
             polished = excess <= 0.0
         else:

@@ -150,6 +150,7 @@ class NetEquilibrium:
                 name = outcome.NAMES[status]
                 raise SolverError(owner.where(name, residual, at), state=state, outcome=name)
         owner.outcome = outcome.NAMES[status]
+        state.stable = False if self.newton.projected.numpy().any() else None
         return owner.found(state, outer, residual, at)
 
     def _begin(self, state: State, at: float) -> None:

@@ -59,6 +59,7 @@ class Point:
         direction: unit tangent of the path: dofs (size,) and load parameter at the end.
         mode: of a bifurcation, the critical eigenvector (size,) of unit length in the metric; None elsewhere.
         iterations: Newton iterations it took.
+        mode_displacements: the mode by node (P, 3), in the order of `State.points`; None where there is none.
     """
 
     state: Any
@@ -70,6 +71,7 @@ class Point:
     direction: np.ndarray
     mode: np.ndarray | None = None
     iterations: int = 0
+    mode_displacements: np.ndarray | None = None
 
     @property
     def stable(self) -> bool:
@@ -103,12 +105,22 @@ class Path:
         return np.array([point.negative for point in self.points])
 
     @property
+    def stable(self) -> np.ndarray:
+        """Whether each point is stable (points,) bool."""
+        return self.negative == 0
+
+    @property
+    def kinds(self) -> list[str]:
+        """Kind of each point: "regular", "limit point" or "bifurcation"."""
+        return [point.kind for point in self.points]
+
+    @property
     def arclength(self) -> np.ndarray:
         """Arc lengths (points,)."""
         return np.array([point.arclength for point in self.points])
 
     def values(self, name: str) -> np.ndarray:
-        """A watched displacement (points,) [m]."""
+        """A watched displacement (points,) [m]; their names are the keys of `points[0].values`."""
         return np.array([point.values[name] for point in self.points])
 
     def of_kind(self, kind: str) -> list[Point]:

@@ -2,7 +2,9 @@
 
 Every load step holds supports where their motion has them at the load parameter t and scales loads by t. Newton uses the exact
 tangent where it is positive definite; where it is not, mode "minimise" shifts it until it is (so that only minima attract), and
-mode "follow" takes it as it is, with the residual as merit, to follow equilibria that are not stable. Shells try Newton with stresses
+mode "follow" takes it as it is, with the residual as merit, to follow equilibria that are not stable. Where symmetry makes a search in
+mode "minimise" end at a saddle, it goes on from beside it, along the direction of lowest stiffness. Every state says whether it is
+stable (`State.stable`). Shells try Newton with stresses
 of its own first (`ddg_warp.integrate.mixed`), which takes fewer iterations, and fall back on this search. Large nets are solved on
 the device by conjugate gradients instead (`ddg_warp.integrate.net_statics`).
 """
@@ -12,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
+from ddg_warp import stability
 from ddg_warp.errors import SceneError, SolverError, check_options
 from ddg_warp.integrate import mixed
 from ddg_warp.integrate.net_statics import NetEquilibrium
@@ -23,6 +26,8 @@ from ddg_warp.tangent import Tangent
 from ddg_warp.threads import launches
 
 SOLVERS = ("auto", "direct", "pcg")
+DESCENTS = 8  # from saddles, in one solve
+FIRST_TURN = 0.1  # rad, by which a search leaves a saddle
 
 
 @dataclass(frozen=True)
@@ -36,7 +41,8 @@ class StaticsOptions:
         max_iterations: Newton iterations of one load step.
         rotation_cap: largest turn of an edge or change of an angle in one update [rad].
         mode: "minimise" or "follow".
-        max_cuts: how often a load increment is halved before the search is given up.
+        max_cuts: how often a load increment is halved before the search is given up; after one that succeeds the next is doubled,
+            up to its first size.
         solver: "direct": the exact tangent and its factors, on the host. "pcg": conjugate gradients on the device, for nets that are
             too large for factors; in mode "minimise" alone, and without a count of unstable directions. "auto": by size.
     """
@@ -74,8 +80,13 @@ def solve(
         start, end: load parameter, which scales gravity and loads and is the time of motions and amplitudes.
         options: see `StaticsOptions`.
 
+    Returns:
+        The equilibrium. Its `stable` says whether the tangent stiffness is positive but for rigid modes: True, False (in mode
+        "follow" alone, or by conjugate gradients), or None where it was not asked: by conjugate gradients, which only notice what
+        is unstable, and under loads without a potential. Then `ddg_warp.stability.spectrum` tells.
+
     Raises:
-        SolverError: no equilibrium was found; carries the last good state.
+        SolverError: no equilibrium was found, or in mode "minimise" none that is stable; carries the last good state.
         SceneError: nothing holds the rods.
     """
     return Equilibrium(model, StaticsOptions(**options)).load(state or model.state(), load_steps, start, end)
@@ -92,6 +103,7 @@ class Equilibrium:
         iterations: Newton iterations so far.
         shift: of the last tangent, over its diagonal, that made it definite; 0 where it was.
         outcome: of the last solve, `converged` or `converged_to_rounding`.
+        stiffness: the tangent at the last equilibrium (size, size), None by conjugate gradients.
     """
 
     def __init__(self, model, options: StaticsOptions | None = None):
@@ -102,7 +114,7 @@ class Equilibrium:
         self.net = NetEquilibrium(self) if self._solver() == "pcg" else None
         self.mixed = self.tangent.shells_alone and self.net is None
         self.iterations, self.shift = 0, 0.0
-        self.outcome = ""
+        self.outcome, self.stiffness = "", None
 
     @property
     def pcg_iterations(self) -> int:
@@ -124,13 +136,14 @@ class Equilibrium:
             raise SceneError(f"load_steps = {load_steps!r}; it is a whole number of at least 1")
         if start == end:
             return self.solve(state, start, end)
-        at, increment, cuts = start, (end - start) / load_steps, 0
+        at, whole, cuts = start, (end - start) / load_steps, 0
         state = state.copy()
         while at != end:
+            increment = whole * 0.5**cuts
             target = end if abs(end - at) <= abs(increment) * (1.0 + 1e-12) else at + increment
             try:
                 state = self.solve(state, at, target)
-                at = target
+                at, cuts = target, max(0, cuts - 1)  # what was too much before may do now
             except SolverError as error:
                 cuts += 1
                 if cuts > self.options.max_cuts:
@@ -139,23 +152,64 @@ class Equilibrium:
                         state=state,
                         outcome=error.outcome,
                     ) from None
-                increment *= 0.5
         state.time = end
         return state
 
     def solve(self, state: State, before: float, at: float) -> State:
-        """The equilibrium at load parameter `at`, from a state that belongs to `before`."""
-        tangent, options = self.tangent, self.options
+        """The equilibrium at load parameter `at`, from a state that belongs to `before`.
+
+        Mode "minimise" leaves a saddle along its lowest mode for the minimum that lies that way; `saddle` is the outcome where after
+        some such descents there still is none. Conjugate gradients see no more than negative curvature on their way, and leave none.
+        """
+        tangent, self.stiffness = self.tangent, None
         if not tangent.free.any():
             state = state.copy()
             tangent.move_supports(state, before, at)
-            state.time, self.outcome = at, "converged"
+            state.time, state.stable, self.outcome = at, True, "converged"
             return state
         if self.mixed and (found := mixed.newton(self, state, before, at)) is not None:
-            return found
-        state = self._with_supports_moved(state, before, at)
-        if self.net:
-            return self.net.solve(state, at)
+            state = found
+        else:
+            state = self._with_supports_moved(state, before, at)
+            if self.net:
+                return self.net.solve(state, at)
+            state = self._descend(state, at)
+        for _ in range(DESCENTS):
+            state.stable = stability.stable(tangent, state, self.stiffness)
+            if state.stable is not False or self.options.mode == "follow":
+                return state
+            beside = self._beside(state, at)
+            if beside is None:
+                state.stable = None
+                return state
+            state = self._descend(beside, at)
+        raise SolverError(
+            f"no stable equilibrium at load parameter {at:g}: saddle, {DESCENTS} descents from saddles led to others; begin from a "
+            "state without symmetry, or take mode='follow' to accept what is unstable",
+            state=state,
+            outcome="saddle",
+        )
+
+    def _beside(self, state: State, at: float) -> State | None:
+        """A state of less energy beside a saddle, along its lowest mode; None if rounding leaves no such difference."""
+        tangent = self.tangent
+        mode = stability.spectrum(self.model, state, 1, "unit", tangent, at).modes[:, 0]
+        q, energies = tangent.dofs(state), tangent.element_energies(state)
+        step = FIRST_TURN * np.sign(mode[np.argmax(np.abs(mode))]) / max(1e-300, tangent.rotation(q, mode)) * mode
+        for _ in range(20):
+            beside = state.copy()
+            tangent.assign(beside, tangent.retract(q, step))
+            moved = tangent.dofs(beside)
+            work = 0.5 * (tangent.loads(at, q) + tangent.loads(at, moved)) @ (moved - q)
+            noise = 64 * self.model.types.eps * np.abs(energies).sum()
+            if (tangent.element_energies(beside) - energies).sum() - work < -noise:
+                return beside
+            step = 0.5 * step
+        return None
+
+    def _descend(self, state: State, at: float) -> State:
+        """The equilibrium at load parameter `at` from a state with its supports in place, by Newton with a line search."""
+        tangent, options = self.tangent, self.options
         free = tangent.free
         energies, q = tangent.element_energies(state), tangent.dofs(state)
         outer = tangent.loads(at, q)
@@ -168,6 +222,7 @@ class Equilibrium:
                 raise SolverError(self.where("non_finite", residual, at), state=state, outcome="non_finite")
             scale = np.maximum(first, self.load_scale(outer, gradient))
             excess = self.excess(residual, gradient, hessian, q, scale)
+            self.stiffness = hessian
             if excess <= 0.0 and (self.outcome == "converged" or polished):
                 return self.found(state, outer, residual, at)
             polished = excess <= 0.0  # the floor is a bound: one more iteration gives what rounding allows

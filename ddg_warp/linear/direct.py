@@ -3,8 +3,11 @@
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import qr
 from scipy.sparse import csc_matrix, diags
 from scipy.sparse.linalg import splu
+
+SHIFTS = (1e-13, 1e-11, 1e-9)  # of a singular matrix, over its largest eigenvalue as its diagonal shows it
 
 
 class SingularError(RuntimeError):
@@ -45,5 +48,41 @@ class Factorisation:
         return int((self._lu.U.diagonal() < 0.0).sum())
 
     def solve(self, b: np.ndarray) -> np.ndarray:
-        """x with A x = b."""
-        return self._scale * self._lu.solve(self._scale * b)
+        """x with A x = b, for a vector or for columns."""
+        scale = self._scale if b.ndim == 1 else self._scale[:, None]
+        return scale * self._lu.solve(scale * b)
+
+
+def pinned(matrix: csc_matrix, known: np.ndarray) -> csc_matrix:
+    """A symmetric matrix with null vectors (n, m), made regular by a spring at each of m dofs that together move in all of them.
+
+    It has as many negative eigenvalues as before, and where the right side does no work along the null vectors its solution is one
+    of the matrix without springs.
+    """
+    if not known.shape[1]:
+        return matrix
+    diagonal = np.abs(matrix.diagonal())
+    diagonal = np.where(diagonal > 0.0, diagonal, diagonal.max(initial=0.0) or 1.0)
+    chosen = qr((np.sqrt(diagonal)[:, None] * known).T, mode="r", pivoting=True)[1][: known.shape[1]]
+    springs = np.zeros(len(diagonal))
+    springs[chosen] = diagonal[chosen]
+    return csc_matrix(matrix + diags(springs))
+
+
+def regular(matrix: csc_matrix, mass: np.ndarray) -> tuple[Factorisation, float]:
+    """Factors of K - s M and s, which is zero unless K is singular; then it is as little below zero as rounding lets it be.
+
+    Args:
+        matrix: K, symmetric.
+        mass: diagonal of M; what has none is given a part of its own stiffness instead.
+    """
+    diagonal, massive = np.abs(matrix.diagonal()), mass > 0.0
+    own = np.where(diagonal > 0.0, diagonal, diagonal.max(initial=0.0) or 1.0)
+    rate = (own[massive] / mass[massive]).max(initial=0.0) or 1.0
+    for part in (0.0, *SHIFTS):
+        added = np.where(massive, part * rate * mass, part * own)
+        try:
+            return Factorisation(csc_matrix(matrix + diags(added))), -part * rate
+        except SingularError:
+            continue
+    raise SingularError("the tangent is singular whatever is added to it: it is not finite")

@@ -1,0 +1,296 @@
+"""Spectra and critical loads: singular tangents, rigid modes, clusters, massless dofs, and modes by node."""
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp import meshes, stability
+from ddg_warp.integrate.statics import solve
+from ddg_warp.linear import lowest
+from ddg_warp.linear.direct import Factorisation
+from ddg_warp.rigid import rigid_modes
+from ddg_warp.stability import spectrum
+from ddg_warp.tangent import Tangent
+
+SECTION = ddg.Stiffness(EA=1e4, EI1=1.0, EI2=1.5, GJ=0.8, mass_per_length=0.5, rotary_inertia=1e-3)
+STEEL = ddg.Material(young=1e6, poisson=0.3, density=1000.0)
+
+
+def line(nodes: int = 7, start=(0.0, 0.0, 0.0), end=(1.0, 0.0, 0.0)) -> np.ndarray:
+    return np.linspace(start, end, nodes)
+
+
+def still(**options) -> ddg.Scene:
+    return ddg.Scene(gravity=(0.0, 0.0, 0.0), **options)
+
+
+def stretched_string(device, tension: float):
+    """A string whose end is pulled by a dead force; its state as it is, in equilibrium along the axis."""
+    scene = still()
+    points = line(5)
+    rod = scene.add_rod(points, section=ddg.Stiffness(EA=4.0, mass_per_length=1.0), bend=False)
+    scene.fix(rod, [0])
+    scene.fix(rod, [-1], "yz")
+    scene.add_force(rod, -1, (tension, 0.0, 0.0))
+    model = scene.build(device, "float64")
+    return model, model.state(points=points * (1.0 + 0.25 * tension))
+
+
+@pytest.mark.parametrize("limit", [10**6, 1], ids=["dense", "sparse"])
+def test_singular_tangent(device, monkeypatch, limit):
+    """A string without tension: its tangent has zero rows, those across. T (w[i-1] - 2 w[i] + w[i+1]) / h is the stiffness."""
+    monkeypatch.setattr(stability, "DENSE", limit)
+    model, state = stretched_string(device, 0.0)
+    tangent = Tangent(model)
+    matrix = tangent.stiffness(state)[tangent.free][:, tangent.free]
+    assert (abs(matrix).sum(axis=1) == 0.0).sum() == 6
+    found = spectrum(model, state, 7, "unit")
+    np.testing.assert_allclose(found.eigenvalues[:6], 0.0, atol=1e-9)
+    # EA / h = 16; a chain of four springs, one end free: 4 EA / h sin(pi / 16)^2 at unit masses
+    exact = 16.0 * (2.0 - 2.0 * np.cos(np.pi / 9.0))
+    assert found.eigenvalues[6] == pytest.approx(exact, rel=1e-9)
+    assert found.negative == 0
+    assert stability.negative_eigenvalues(matrix) == 0
+    assert stability.instabilities(tangent, state, tangent.stiffness(state)) == 0
+    assert stability.nearest_to_zero(matrix, np.ones(matrix.shape[0]))[0] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_critical_load_where_the_tangent_is_exactly_singular(device):
+    """The string is slack where |p| < 0.2; the search ends there, whatever side of zero rounding puts its lowest eigenvalue."""
+    tensions = []
+
+    def at(parameter):
+        tensions.append(0.0 if abs(parameter) < 0.2 else parameter)
+        return stretched_string(device, tensions[-1])
+
+    assert abs(stability.critical(at, -0.5, 0.6)) < 0.2 + 1e-7
+    assert 0.0 in tensions
+
+
+def test_buckling_from_a_singular_state(device):
+    model, state = stretched_string(device, 0.0)
+    with pytest.raises(ValueError, match="no minimum"):
+        stability.buckling(model, state, stretched_string(device, 0.1)[1])
+
+
+def free_body(kind: str) -> tuple[ddg.Scene, int]:
+    """Things that nothing holds, and how many rigid modes they have."""
+    scene = still(dimension=2) if kind == "planar rod" else still()
+    bend = np.stack([np.cos(np.linspace(0.0, 2.0, 9)), 0.0 * np.zeros(9), np.sin(np.linspace(0.0, 2.0, 9))], axis=1)
+    if kind == "curved rod":  # with bending stiffnesses that differ it cannot spin
+        scene.add_rod(bend, section=SECTION)
+        return scene, 6
+    if kind == "straight rod":  # rotation about its axis is its spin
+        scene.add_rod(line(), section=SECTION)
+        return scene, 6
+    if kind == "two rods":
+        scene.add_rods(np.array([line(), line() + [0.0, 1.0, 0.0]]), section=SECTION)
+        return scene, 12
+    if kind == "curved rod, naturally straight":  # uniform: turns every director alike
+        scene.add_rod(line(), section=ddg.Stiffness(EA=1e3, EI1=1.0, GJ=1.0, mass_per_length=1.0, rotary_inertia=1e-3))
+        return scene, 6
+    if kind == "planar rod":
+        scene.add_rod(bend, section=ddg.Stiffness(EA=1e4, EI1=1.0, mass_per_length=1.0))
+        return scene, 3
+    if kind == "hinged rods":  # two rigid bodies that share a point
+        for end in ((1.0, 0.2, 0.0), (0.0, 0.3, 1.0)):
+            scene.add_rod(line(6, end=end), section=SECTION)
+        scene.join([(0, 0), (1, 0)], rigid=False)
+        return scene, 9
+    if kind == "rigid joint":
+        for end in ((1.0, 0.2, 0.0), (0.0, 0.3, 1.0)):
+            scene.add_rod(line(6, end=end), section=SECTION)
+        scene.join([(0, 0), (1, 0)])
+        return scene, 6
+    bending = "hinge" if kind == "hinge shell" else "midedge_dof"
+    points, triangles = meshes.rectangle(4, 3, (1.0, 0.7))
+    if kind == "shell of revolution":
+        scene.add_axisymmetric_shell(np.array([[0.5, 0.0], [0.7, 0.3], [0.8, 0.6]]), thickness=0.01, material=STEEL)
+        return scene, 1
+    scene.add_shell(points, triangles, thickness=0.01, material=STEEL, bending=bending)
+    return scene, 6
+
+
+KINDS = ["curved rod", "straight rod", "two rods", "curved rod, naturally straight", "planar rod", "hinged rods"]
+KINDS += ["rigid joint", "shell", "hinge shell", "shell of revolution"]
+
+
+@pytest.mark.parametrize("worlds", [1, 3])
+@pytest.mark.parametrize("metric", ["mass", "unit"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_rigid_modes_of_free_bodies(device, monkeypatch, kind, metric, worlds):
+    """They are zero, counted, and no instability; dense and sparse agree on all others."""
+    scene, rigid = free_body(kind)
+    model = scene.build(device, "float64", worlds=worlds)
+    state = model.state()
+    rigid *= worlds
+    found = {}
+    for name, limit in (("dense", 10**6), ("sparse", 1)):
+        monkeypatch.setattr(stability, "DENSE", limit)
+        found[name] = spectrum(model, state, rigid + 4, metric)
+        assert found[name].rigid == rigid
+        assert found[name].negative == 0
+        assert found[name].stable
+        assert (found[name].eigenvalues[:rigid] == 0.0).all()
+        assert (found[name].eigenvalues[rigid:] > 0.0).all()
+        assert np.isfinite(found[name].frequencies).all()
+        assert len(found[name].elastic) == 4
+    np.testing.assert_allclose(found["sparse"].eigenvalues, found["dense"].eigenvalues, rtol=1e-8)
+    tangent = Tangent(model)
+    modes = rigid_modes(tangent, state, tangent.stiffness(state))
+    scale = abs(tangent.stiffness(state)).max() * np.abs(modes).max()
+    assert np.abs((tangent.stiffness(state) @ modes)[tangent.free]).max() < 1e-9 * scale
+
+
+def test_supports_leave_some_rigid_modes(device):
+    """A hinged rod hangs under its weight: it turns about the vertical and its axis; a swing is a frequency, w^2 = 3 g / 2 L."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
+    section = ddg.Stiffness(EA=1e6, EI1=1e3, EI2=1e3, GJ=1e3, mass_per_length=1.0, rotary_inertia=1e-6)
+    rod = scene.add_rod(line(41, end=(0.0, 0.0, -1.0)), section=section)
+    scene.fix(rod, [0])
+    model = scene.build(device, "float64")
+    found = spectrum(model, solve(model), 4)
+    assert found.rigid == 1
+    assert found.stable
+    np.testing.assert_allclose(found.eigenvalues[1:3], 1.5 * 9.81, rtol=2e-3)
+
+
+def test_stiffener_spins_on_its_line(device):
+    """Attached by its nodes alone, a straight stiffener is held by nothing against a turn about its own axis: a named rigid mode."""
+    points, triangles = meshes.rectangle(4, 4)
+    scene = still()
+    plate = scene.add_shell(points, triangles, thickness=0.01, material=STEEL)
+    scene.clamp_boundary(plate, np.flatnonzero(points[:, 0] < 1e-9))
+    line_of = np.flatnonzero(np.abs(points[:, 1] - 0.5) < 1e-9)
+    line_of = line_of[np.argsort(points[line_of, 0])]
+    rod = scene.add_rod(points[line_of], section=SECTION)
+    scene.attach(rod, range(len(line_of)), plate, line_of)
+    model = scene.build(device, "float64")
+    found = spectrum(model, model.state(), 4)
+    assert (found.rigid, found.stable) == (1, True)
+    assert found.eigenvalues[0] == 0.0 < found.eigenvalues[1]
+    assert (
+        np.abs(found.displacements[0]).max() < 1e-9 * np.abs(found.displacements[1]).max()
+    )  # nothing moves, the stiffener turns
+    assert np.isfinite(found.frequencies).all()
+    scene.fix_twist(rod, [0])
+    model = scene.build(device, "float64")
+    assert spectrum(model, model.state(), 4).rigid == 0
+
+
+def test_an_instability_is_no_rigid_mode(device):
+    """The same rod upside down falls: w^2 = -3 g / 2 L, twice."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 9.81))
+    section = ddg.Stiffness(EA=1e6, EI1=1e3, EI2=1e3, GJ=1e3, mass_per_length=1.0, rotary_inertia=1e-6)
+    rod = scene.add_rod(line(41, end=(0.0, 0.0, -1.0)), section=section)
+    scene.fix(rod, [0])
+    model = scene.build(device, "float64")
+    state = solve(model, mode="follow")
+    found = spectrum(model, state, 4)
+    assert (found.rigid, found.negative, found.stable) == (1, 2, False)
+    np.testing.assert_allclose(found.eigenvalues[:2], -1.5 * 9.81, rtol=2e-3)
+
+
+@pytest.mark.parametrize("metric", ["mass", "unit"])
+def test_sparse_spectrum_is_the_dense_one(device, monkeypatch, metric):
+    """A square plate with massless dofs at mesh edges and pairs of equal frequencies."""
+    points, triangles = meshes.rectangle(6, 6, (1.0, 1.0), "crossed")
+    scene = still()
+    plate = scene.add_shell(points, triangles, thickness=0.01, material=STEEL)
+    edge = np.flatnonzero((np.abs(points[:, :2] - 0.5) > 0.5 - 1e-9).any(axis=1))
+    scene.clamp_boundary(plate, edge)
+    model = scene.build(device, "float64")
+    found = []
+    for limit in (10**6, 1):
+        monkeypatch.setattr(stability, "DENSE", limit)
+        found.append(spectrum(model, model.state(), 12, metric))
+    whole, few = found
+    np.testing.assert_allclose(few.eigenvalues, whole.eigenvalues, rtol=1e-8)
+    assert few.eigenvalues[1] == pytest.approx(few.eigenvalues[2], rel=1e-8)
+    tangent = Tangent(model)
+    stiffness = tangent.stiffness(model.state())
+    weights = tangent.mass if metric == "mass" else np.where(tangent.angle, tangent.edge_length() ** 2, 1.0)
+    for values, modes in ((few.eigenvalues, few.modes), (whole.eigenvalues, whole.modes)):
+        rest = (stiffness @ modes - weights[:, None] * modes * values)[tangent.free]
+        assert np.abs(rest).max() < 1e-7 * abs(stiffness @ modes).max()  # massless dofs follow
+        np.testing.assert_allclose(modes.T @ (weights[:, None] * modes), np.eye(12), atol=1e-8)
+
+
+def test_iteration_finds_every_copy(device):
+    """Eleven equal rods in one model: every eigenvalue comes eleven times, and the count of pivots asks for each."""
+    scene = still()
+    rods = scene.add_rods(np.stack([line(9) + [0.0, float(i), 0.0] for i in range(11)]), section=SECTION)
+    for rod in rods:
+        scene.clamp_end(rod)
+    model = scene.build(device, "float64")
+    tangent = Tangent(model)
+    matrix = tangent.stiffness(model.state())[tangent.free][:, tangent.free]
+    values, _ = lowest.Lowest(matrix, tangent.mass[tangent.free], np.zeros((matrix.shape[0], 0)))(25)
+    exact, _ = lowest.dense(matrix, tangent.mass[tangent.free], np.zeros((matrix.shape[0], 0)))
+    np.testing.assert_allclose(values, exact[:25], rtol=1e-8)
+    assert np.ptp(values[:11]) < 1e-8 * values[0]
+    assert values[11] > 1.01 * values[10]
+
+
+def test_modes_by_node(device):
+    """Displacements of modes are the entries of the raw modes at nodes, in the order of the points of a state."""
+    scene = still()
+    scene.add_rod(line(6), section=SECTION)
+    scene.clamp_end(0)
+    points, triangles = meshes.rectangle(3, 2)
+    plate = scene.add_shell(points + [0.0, 3.0, 0.0], triangles, thickness=0.01, material=STEEL)
+    scene.clamp_boundary(plate, np.flatnonzero(points[:, 0] < 1e-9))
+    for worlds in (1, 3):
+        model = scene.build(device, "float64", worlds=worlds)
+        state = model.state()
+        found = spectrum(model, state, 5, "unit")
+        assert found.displacements.shape == (5, *state.points().shape)
+        tangent = Tangent(model)
+        moved, q = state.copy(), tangent.dofs(state)
+        for mode, displacement in zip(found.modes.T, found.displacements, strict=True):
+            tangent.assign(moved, q + 1e-3 * mode)
+            np.testing.assert_allclose(moved.points() - state.points(), 1e-3 * displacement, atol=1e-15)
+
+
+def sphere(device, subdivisions: int):
+    """A closed sphere under an outer pressure that follows it, held against rigid motions; its state at a tenth of the critical."""
+    points, triangles = meshes.sphere(subdivisions)
+    young, nu, thickness = 1e9, 0.3, 0.02
+    scene = still()
+    shell = scene.add_shell(
+        points, triangles, thickness=thickness, material=ddg.Material(young, nu, density=1.0), bending="hinge"
+    )
+    for vertex, components in (
+        (points[:, 0].argmax(), "xyz"),
+        (points[:, 0].argmin(), "yz"),
+        (points[:, 1].argmax(), "z"),
+    ):
+        scene.hold(shell, [vertex], components)
+    scene.add_pressure(shell, -0.1 * 2.0 * young * thickness**2 / np.sqrt(3.0 * (1.0 - nu**2)))  # Zoelly 1915
+    model = scene.build(device, "float64")
+    return model, solve(model)
+
+
+@pytest.mark.parametrize("limit", [10**6, 1], ids=["dense", "sparse"])
+def test_buckling_of_a_closed_sphere(device, monkeypatch, limit):
+    """Its critical loads come in clusters; few solves find the lowest and its copies, those that all eigenvalues show."""
+    model, state = sphere(device, 2)
+    monkeypatch.setattr(stability, "DENSE", limit)
+    solves = []
+    search = Factorisation.solve
+    monkeypatch.setattr(Factorisation, "solve", lambda self, b: solves.append(1) or search(self, b))
+    found = stability.buckling(model, model.state(), state, 6)
+    monkeypatch.setattr(stability, "DENSE", 10**6)
+    np.testing.assert_allclose(found, stability.buckling(model, model.state(), state, 6), rtol=1e-8)
+    assert np.ptp(found[:3]) < 1e-4 * found[0]
+    assert len(solves) < 400
+
+
+def test_mistakes(device):
+    scene = still()
+    scene.add_rod(line(), section=SECTION)
+    model = scene.build(device, "float64")
+    with pytest.raises(ddg.SceneError, match=r"metric 'foo'.*'mass' or 'unit'"):
+        spectrum(model, model.state(), metric="foo")
+    with pytest.raises(ddg.SceneError, match="count = 0"):
+        spectrum(model, model.state(), 0)
