@@ -86,7 +86,8 @@ class Net:
         mass: of every dof (N, 3) [kg, kg m^2]; fixed: held dofs (N, 3).
         load: dead forces (N, 3); timed: those that change; pressures, bands, couples: loads that follow what they act on.
         held: what each support of `scene.supports`, then of `scene.shell_supports` and `scene.ring_supports`, holds here.
-        moving: (blocks, motion, components (3,) bool) of nodes with a motion; turning: (angle blocks, motion) of rod edges.
+        moving: (blocks, motion, components (3,) bool, rows of its displacements) of nodes with a motion.
+        turning: (angle blocks, motion) of rod edges.
     """
 
     rest: np.ndarray
@@ -104,7 +105,7 @@ class Net:
     timed: list[NetLoad] = field(default_factory=list)
     pressures: list[NetPressure] = field(default_factory=list)
     held: list[NetHeld] = field(default_factory=list)
-    moving: list[tuple[np.ndarray, int, np.ndarray]] = field(default_factory=list)
+    moving: list[tuple[np.ndarray, int, np.ndarray, np.ndarray]] = field(default_factory=list)
     turning: list[tuple[np.ndarray, int]] = field(default_factory=list)
     meridians: list[axisymmetric.NetMeridian] = field(default_factory=list)
     bands: list[axisymmetric.NetBand] = field(default_factory=list)

@@ -159,8 +159,8 @@ class NetTangent:
         """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""
         host = self.host
         q = state.net.q.numpy().astype(np.float64).reshape(self.net.worlds, -1, 3)
-        for blocks, motion, components in host.moving:
-            target = self.model.motions[motion].place(at, host.rest[blocks])
+        for blocks, motion, components, rows in host.moving:
+            target = self.model.motions[motion].place(at, host.rest[blocks], rows)
             q[:, blocks] = np.where(components, target, q[:, blocks])
         if host.turning:
             frame = state.net.frame.numpy().astype(np.float64).reshape(6, self.net.worlds, -1)
