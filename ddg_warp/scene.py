@@ -23,12 +23,20 @@ class Dynamics:
     duration: float = 1.0
     scheme: str = "implicit_euler"
 
+    def __post_init__(self):
+        arguments.positive("Dynamics: dt", self.dt, "s")
+        arguments.positive("Dynamics: duration", self.duration, "s")
+        arguments.choice("Dynamics: scheme", self.scheme, ("implicit_euler", "implicit_midpoint"))
+
 
 @dataclass(frozen=True)
 class Statics:
     """Find the equilibrium: loads and motions grow with the load parameter from 0 to 1 in `load_steps` increments."""
 
     load_steps: int = 1
+
+    def __post_init__(self):
+        arguments.count("Statics: load_steps", self.load_steps)
 
 
 @dataclass(frozen=True)
@@ -46,6 +54,16 @@ class Trace:
     step: float = 0.02
     max_step: float = 0.1
     load_scale: float = 1.0
+
+    def __post_init__(self):
+        for name in ("step", "max_step", "load_scale"):
+            arguments.positive(f"Trace: {name}", getattr(self, name))
+        if not isinstance(self.stop, Stop):
+            raise SceneError(f"Trace: stop is {self.stop!r}; give Stop(...)")
+        if not isinstance(self.watch, dict) or not all(isinstance(w, Displacement) for w in self.watch.values()):
+            raise SceneError(
+                f"Trace: watch is {self.watch!r}; give displacements by name, {{'tip': Displacement.of(row, axis)}}"
+            )
 
 
 @dataclass

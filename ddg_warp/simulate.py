@@ -13,7 +13,7 @@ from ddg_warp.errors import SolverError
 from ddg_warp.scene import Dynamics, Scene, Statics
 
 
-@dataclass
+@dataclass(repr=False)
 class Result:
     """What a run leaves behind; `check(result)` of a scene judges it.
 
@@ -47,6 +47,12 @@ class Result:
     compile_time: float = 0.0
     failure: str = ""
     path: Any = None
+
+    def __repr__(self) -> str:
+        reached = f"{self.times[0]:g} to {self.times[-1]:g}" if self.times else "none"
+        names = ", ".join(self.series) or "nothing"
+        ended = f"; failed: {self.failure}" if self.failure else ""
+        return f"<Result: {len(self.times)} states, times {reached}, observed {names}, {self.wall_time:.3g} s of wall time{ended}>"
 
     @property
     def seconds_per_step(self) -> float:

@@ -8,6 +8,7 @@ from scipy import linalg, sparse
 from scipy.optimize import brentq
 from scipy.sparse.linalg import LinearOperator, eigs, eigsh, splu
 
+from ddg_warp import arguments, validate
 from ddg_warp.errors import SceneError
 from ddg_warp.linear.direct import Factorisation, SingularError
 from ddg_warp.tangent import Tangent
@@ -58,6 +59,10 @@ def spectrum(
     Raises:
         SceneError: metric "mass" of a model without masses.
     """
+    validate.check_model("spectrum", model)
+    validate.check_state("spectrum", model, state)
+    arguments.count("spectrum: count", count)
+    arguments.choice("spectrum: metric", metric, ("mass", "unit"))
     tangent = tangent or Tangent(model)
     free = np.flatnonzero(tangent.free)
     matrix = tangent.stiffness(state, load)[free][:, free]
@@ -199,6 +204,10 @@ def buckling(model, free, loaded, count: int = 1) -> np.ndarray:
     Raises:
         ValueError: the first equilibrium is not stable, loads that follow are not conservative, or no positive factor is found.
     """
+    validate.check_model("buckling", model)
+    for state in (free, loaded):
+        validate.check_state("buckling", model, state)
+    arguments.count("buckling: count", count)
     tangent = Tangent(model)
     dofs = np.flatnonzero(tangent.free)
     start, end = (tangent.stiffness(state)[dofs][:, dofs] for state in (free, loaded))

@@ -1,9 +1,11 @@
 """What a scene must fulfil before anything is built: every refusal names the object, its index and the remedy."""
 
+import warnings
+
 import numpy as np
 
 from ddg_warp import arguments, geometry
-from ddg_warp.errors import SceneError
+from ddg_warp.errors import SceneError, SceneWarning
 from ddg_warp.motion import Motion
 
 DOUBLED = 1e-10  # length of an edge, over the longest of its rod, at which its two nodes are one
@@ -212,3 +214,23 @@ def _refuse(bad: np.ndarray, batch, message: str) -> None:
     if bad.any():
         rod, k = np.argwhere(bad)[0]
         raise SceneError(f"rod {batch.first + rod} ('{batch.name}'): " + message.format(k=k))
+
+
+def warn_of_massless(model) -> None:
+    """Warn of what gravity does not act on in statics, because it has no mass."""
+    if not any(model.scene.gravity):
+        return
+    for batch in model.scene.batches:
+        if not np.any(np.asarray(batch.section.mass_per_length)):
+            weighed = {rod for rods, _, _ in model.scene.masses for rod in rods}
+            for rod in [rod for rod in range(batch.first, batch.first + batch.rods) if rod not in weighed][:1]:
+                _warn(f"rod {rod} ('{batch.name}')", "mass_per_length, or its material a density")
+    for kind, shells in (("shell", model.scene.shells), ("axisymmetric shell", model.scene.axisymmetric_shells)):
+        for i, shell in enumerate(shells):
+            if not np.any(np.asarray(shell.material.density)):
+                _warn(f"{kind} {i} ('{shell.name}')", "a density")
+
+
+def _warn(name: str, remedy: str) -> None:
+    text = f"{name} has no mass, so that gravity does not act on it: give it {remedy}, or the scene gravity=(0, 0, 0)"
+    warnings.warn(text, SceneWarning, stacklevel=5)

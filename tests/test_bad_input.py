@@ -272,7 +272,7 @@ def test_sweep_needs_open_rods(device):
 def test_step(device, dt):
     model = scene_of().build(device)
     integrator, state = ddg.Integrator(model), model.state()
-    refused(lambda: integrator.step(state, dt), f"dt = {dt}", "positive and finite")
+    refused(lambda: integrator.step(state, dt), f"dt is {dt}", "positive and finite")
     assert state.time == 0.0
     assert integrator.statistics()["outcomes"] == {}
 

@@ -186,7 +186,7 @@ def test_an_edge_turned_twice_is_refused():
     scene = one_rod(True)
     for _ in range(2):
         scene.fix_twist(0, [3], motion=ddg.Motion(angle=lambda t: t))
-    with pytest.raises(ddg.SceneError, match="edge 3 of rod 0 is turned by two motions; give it one"):
+    with pytest.raises(ddg.SceneError, match="edge 3 of rod 0 has two motions; give it one"):
         scene.build("cpu")
 
 

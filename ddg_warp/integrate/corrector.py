@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from ddg_warp import stability
+from ddg_warp import stability, validate
 from ddg_warp.errors import SceneError, SolverError, check_options
 from ddg_warp.integrate.path import REGULAR, Displacement, Point
 from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
@@ -62,6 +62,7 @@ class Corrector:
     """
 
     def __init__(self, model, watch: Mapping[str, Displacement], options: ContinuationOptions):
+        validate.check_model("continuation", model)
         if model.worlds != 1:
             raise SceneError(f"a path is followed in one world; the model has {model.worlds}")
         self.options = options

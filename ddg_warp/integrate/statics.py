@@ -12,9 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
+from ddg_warp import arguments, validate
 from ddg_warp.errors import SceneError, SolverError, check_options
 from ddg_warp.integrate import mixed
 from ddg_warp.integrate.net_statics import NetEquilibrium
+from ddg_warp.integrate.prescribed import jump_between
 from ddg_warp.linear.choice import static_solver, why_not_pcg
 from ddg_warp.linear.direct import Factorisation, SingularError
 from ddg_warp.state import State
@@ -75,6 +77,12 @@ def solve(
         SolverError: no equilibrium was found; carries the last good state.
         SceneError: nothing holds the rods.
     """
+    validate.check_model("statics", model)
+    if state is not None:
+        validate.check_state("statics", model, state)
+    for name, value in (("start", start), ("end", end)):
+        arguments.number(f"statics: {name}", value)
+    load_steps = arguments.count("load_steps", load_steps)
     return Equilibrium(model, StaticsOptions(**options)).load(state or model.state(), load_steps, start, end)
 
 
@@ -94,6 +102,7 @@ class Equilibrium:
         self.model, self.options = model, options or StaticsOptions()
         self.tangent = Tangent(model)
         require_supports(model)
+        validate.warn_of_massless(model)
         self.net = NetEquilibrium(self) if self._solver() == "pcg" else None
         self.mixed = self.tangent.shells_alone and self.net is None
         self.iterations, self.shift = 0, 0.0
@@ -115,8 +124,6 @@ class Equilibrium:
 
     def load(self, state: State, load_steps: int, start: float = 0.0, end: float = 1.0) -> State:
         """Load stepping; see `solve`."""
-        if not (isinstance(load_steps, int) and load_steps >= 1):
-            raise SceneError(f"load_steps = {load_steps!r}; it is a whole number of at least 1")
         if start == end:
             return self.solve(state, start, end)
         at, increment, cuts = start, (end - start) / load_steps, 0
@@ -128,9 +135,12 @@ class Equilibrium:
                 at = target
             except SolverError as error:
                 cuts += 1
+                if error.outcome == arguments.PRESCRIBED:
+                    raise
                 if cuts > self.options.max_cuts:
+                    advice = jump_between(self.model, at, target)
                     raise SolverError(
-                        f"{error} (load parameter {at:g} of {end:g} reached, {cuts - 1} increments halved)",
+                        f"{advice and advice + '; '}{error} (load parameter {at:g} of {end:g} reached, {cuts - 1} increments halved)",
                         state=state,
                         outcome=error.outcome,
                     ) from None
