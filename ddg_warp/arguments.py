@@ -7,13 +7,21 @@ import numpy as np
 
 from ddg_warp.errors import SceneError, SolverError
 
+NAN = np.nan
+
+
+def floats(value, otherwise=NAN) -> np.ndarray:
+    """An array of numbers; of what is none, such as text, `otherwise`."""
+    try:
+        value = np.asarray(value)
+        return np.asarray(otherwise if value.dtype.kind in "US" else value, float)
+    except (TypeError, ValueError):
+        return np.asarray(otherwise)
+
 
 def vector(what: str, value) -> tuple[float, float, float]:
     """Three finite numbers, or a refusal that names `what`."""
-    try:
-        result = np.asarray(value, float)
-    except (TypeError, ValueError):
-        result = np.array(np.nan)
+    result = floats(value)
     if result.shape != (3,) or not np.isfinite(result).all():
         raise SceneError(f"{what} is {value!r}; give three finite numbers")
     return tuple(result.tolist())
@@ -67,8 +75,8 @@ def components(what: str, value, letters: str = "xyz") -> str:
 def broadcast(what: str, values, shape: tuple) -> np.ndarray:
     """Finite numbers of a shape, a copy; or a refusal that names `what`."""
     try:
-        values = np.broadcast_to(np.asarray(values, float), shape).copy()
-    except (TypeError, ValueError):
+        values = np.broadcast_to(floats(values), shape).copy()
+    except ValueError:
         values = np.full(1, np.nan)
     if not np.isfinite(values).all():
         raise SceneError(f"{what}: give finite numbers that broadcast to {shape}")
@@ -153,10 +161,7 @@ def value_at(what: str, function, t: float, columns: int = 0, error=SolverError)
     except Exception as reason:
         text = f"{_written(what, function)} fails at t = {t:g}: {type(reason).__name__}: {reason}"
         raise _refusal(error, f"{text}; make it defined from t = 0 on") from reason
-    try:
-        value = np.asarray(given, float)
-    except (TypeError, ValueError):
-        value = np.zeros((0, 0, 0))
+    value = np.zeros((0, 0, 0)) if given is None else floats(given, np.zeros((0, 0, 0)))
     fits = value.ndim in (1, 2) and value.shape[-1] == columns if columns else value.ndim == 0
     if not fits:
         raise _refusal(error, f"{_written(what, function)} is {given!r} at t = {t:g}; it is {shapes}")

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -125,6 +126,8 @@ def simulate(
     from tqdm import tqdm
 
     began = time.perf_counter()
+    if not isinstance(scene, Scene):
+        raise InputError(f"the scene is {type(scene).__name__}; `build` returns a Scene")
     analysis = scene.analysis
     dynamic = isinstance(analysis, Dynamics)
     if not dynamic and (dt, duration, resume) != (None, None, None):
@@ -256,8 +259,10 @@ def step_count(dt: float, duration: float) -> int:
     Raises:
         InputError: One of them is not positive, or they do not fit.
     """
-    if not (dt > 0.0 and duration > 0.0):
-        raise InputError(f"dt = {dt} s and duration = {duration} s must be positive")
+    for value in (dt, duration):
+        number = isinstance(value, Real) and not isinstance(value, bool)
+        if not (number and 0.0 < value < float("inf")):
+            raise InputError(f"dt = {dt} s and duration = {duration} s must be positive and finite numbers")
     steps = round(duration / dt)
     if steps < 1 or abs(steps * dt - duration) > 1e-6 * dt:
         raise InputError(f"a duration of {duration} s is no whole number of steps of {dt} s; change one of them")
