@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:  # what editors and type checkers read; at run time see `_HOME`
     from ddg_warp import inquiry, io, meshes, rest_shapes, stability
     from ddg_warp.check import Check
+    from ddg_warp.descriptions import Dynamics, Statics, Trace
     from ddg_warp.errors import SceneError, SceneWarning, SolverError
     from ddg_warp.integrate import continuation, statics
     from ddg_warp.integrate.dynamics import Integrator
@@ -22,7 +23,7 @@ if TYPE_CHECKING:  # what editors and type checkers read; at run time see `_HOME
     from ddg_warp.model import Model
     from ddg_warp.motion import Motion
     from ddg_warp.record import Recorder
-    from ddg_warp.scene import Dynamics, Scene, Statics, Trace
+    from ddg_warp.scene import Scene
     from ddg_warp.state import State
 
 __version__ = "0.1.0"
@@ -60,7 +61,7 @@ _HOME = {
     "Check": "check",
     "Circle": "material",
     "Displacement": "integrate.path",
-    "Dynamics": "scene",
+    "Dynamics": "descriptions",
     "Ellipse": "material",
     "Integrator": "integrate.dynamics",
     "Material": "material",
@@ -73,10 +74,10 @@ _HOME = {
     "SceneWarning": "errors",
     "SolverError": "errors",
     "State": "state",
-    "Statics": "scene",
+    "Statics": "descriptions",
     "Stiffness": "material",
     "Stop": "integrate.path",
-    "Trace": "scene",
+    "Trace": "descriptions",
 }
 _MODULES = {"continuation": "integrate.continuation", "statics": "integrate.statics"}
 

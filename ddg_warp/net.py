@@ -12,7 +12,7 @@ import numpy as np
 from ddg_warp import axisymmetric, shell_geometry
 from ddg_warp import shells as shell_terms
 from ddg_warp.chains import Piece
-from ddg_warp.net_loads import NetCouple, NetLoad, NetPressure
+from ddg_warp.net_loads import NetCouple, NetEdgeCouple, NetLoad, NetPressure
 from ddg_warp.precision import float32_error
 from ddg_warp.surface import Surface
 
@@ -84,7 +84,7 @@ class Net:
         sets: elements by term.
         ends: nodes of every rod edge (rod_edges, 2); frame: director and tangent of it (6, rod_edges).
         mass: of every dof (N, 3) [kg, kg m^2]; fixed: held dofs (N, 3).
-        load: dead forces (N, 3); timed: those that change; pressures, bands, couples: loads that follow what they act on.
+        load: dead forces (N, 3); timed: those that change; pressures, bands, couples, edge_couples: loads that follow what they act on.
         held: what each support of `scene.supports`, then of `scene.shell_supports` and `scene.ring_supports`, holds here.
         moving: (blocks, motion, components (3,) bool, rows of its displacements) of nodes with a motion.
         turning: (angle blocks, motion) of rod edges.
@@ -110,6 +110,7 @@ class Net:
     meridians: list[axisymmetric.NetMeridian] = field(default_factory=list)
     bands: list[axisymmetric.NetBand] = field(default_factory=list)
     couples: list[NetCouple] = field(default_factory=list)
+    edge_couples: list[NetEdgeCouple] = field(default_factory=list)
 
     @property
     def blocks(self) -> int:
@@ -119,7 +120,7 @@ class Net:
     @property
     def followers(self) -> list:
         """Loads that follow what they act on, each with `places`, `forces` and their `derivative`."""
-        return [*self.pressures, *self.bands, *self.couples]
+        return [*self.pressures, *self.bands, *self.couples, *self.edge_couples]
 
     @cached_property
     def edges(self) -> np.ndarray:

@@ -6,7 +6,8 @@ from ddg_warp import axisymmetric
 from ddg_warp.chains import FREE, STILL, component_bits, disagreement, pose_starts, scene_motions
 from ddg_warp.errors import SceneError
 from ddg_warp.net import Net, NetHeld, NetRod
-from ddg_warp.net_loads import NetCouple, NetLoad, NetPressure
+from ddg_warp.net_loads import NetCouple, NetEdgeCouple, NetLoad, NetPressure
+from ddg_warp.shell_geometry import FREE as FREE_EDGE
 from ddg_warp.validate import check_index
 
 _NONE = np.zeros(0, int)
@@ -132,6 +133,8 @@ def load(scene, net: Net) -> None:
             _put(net, triangles.ravel(), np.repeat(area, 3, axis=0), pressure.amplitude)
         else:
             net.pressures.append(NetPressure(triangles, pressure.pressure, pressure.amplitude))
+    for given in scene.edge_couples:
+        net.edge_couples.append(_edge_couple(net.shells[given.shell], given))
     for given in scene.ring_loads:
         force = np.column_stack([given.force[:, 0], 0.0 * given.force[:, 0], given.force[:, 1]])
         _put(net, net.meridians[given.shell].nodes[given.nodes], force, given.amplitude)
@@ -142,6 +145,23 @@ def load(scene, net: Net) -> None:
             _put(net, ends.ravel(), band.forces(net.rest[ends]).reshape(-1, 3), pressure.amplitude)
         else:
             net.bands.append(band)
+
+
+def _edge_couple(shell, given) -> NetEdgeCouple:
+    """A couple about boundary edges, which nothing may hold."""
+    surface, edges = shell.surface, given.edges
+    for edge in edges[shell.kinds.kind[edges] != FREE_EDGE][:1]:
+        raise SceneError(
+            "add_edge_couple: the normal at the edge between the vertices {} and {} of shell {} is held, by a clamp or a plane of "
+            "symmetry, which would take the couple; load a free edge".format(*surface.edges[edge], given.shell)
+        )
+    side = np.where(surface.edge_triangles[edges, 0] >= 0, 0, 1)  # the triangle runs the edge forwards or backwards
+    ends = np.where(side[:, None] == 0, surface.edges[edges], surface.edges[edges, ::-1])
+    corners = np.column_stack([ends, surface.edge_opposite[edges, side]])
+    length = np.linalg.norm(np.diff(surface.points[ends], axis=1)[:, 0], axis=1)
+    places = np.column_stack([shell.nodes[corners], shell.edges[edges]])
+    size = float(np.ptp(surface.points, axis=0).max())
+    return NetEdgeCouple(places, given.couple * length, 1.0 - 2.0 * side, given.amplitude, size)
 
 
 def _own_node(rod: NetRod, node: int) -> int:

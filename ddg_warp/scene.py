@@ -8,118 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ddg_warp import arguments, validate
+from ddg_warp.descriptions import Dynamics, Load, RodBatch, Statics, Support, Trace
 from ddg_warp.errors import SceneError
-from ddg_warp.integrate.path import Displacement, Stop
 from ddg_warp.material import Material, Stiffness
 from ddg_warp.motion import Motion
 from ddg_warp.structures import Structures
 
 
-@dataclass(frozen=True)
-class Dynamics:
-    """Advance in time: step dt [s] to duration [s] by `scheme` (`implicit_euler` or `implicit_midpoint`)."""
-
-    dt: float = 0.01
-    duration: float = 1.0
-    scheme: str = "implicit_euler"
-
-    def __post_init__(self):
-        arguments.positive("Dynamics: dt", self.dt, "s")
-        arguments.positive("Dynamics: duration", self.duration, "s")
-        arguments.choice("Dynamics: scheme", self.scheme, ("implicit_euler", "implicit_midpoint"))
-
-
-@dataclass(frozen=True)
-class Statics:
-    """Find the equilibrium: loads and motions grow with the load parameter from 0 to 1 in `load_steps` increments."""
-
-    load_steps: int = 1
-
-    def __post_init__(self):
-        arguments.count("Statics: load_steps", self.load_steps)
-
-
-@dataclass(frozen=True)
-class Trace:
-    """Follow the path of equilibria from load parameter 0 by arc length, through limit points.
-
-    Attributes:
-        watch: displacements to record by name (`Displacement`).
-        stop: where to end.
-        step, max_step, load_scale: see `ddg_warp.integrate.continuation.ContinuationOptions`.
-    """
-
-    watch: dict[str, Displacement] = field(default_factory=dict)
-    stop: Stop = field(default_factory=Stop)
-    step: float = 0.02
-    max_step: float = 0.1
-    load_scale: float = 1.0
-
-    def __post_init__(self):
-        for name in ("step", "max_step", "load_scale"):
-            arguments.positive(f"Trace: {name}", getattr(self, name))
-        if not isinstance(self.stop, Stop):
-            raise SceneError(f"Trace: stop is {self.stop!r}; give Stop(...)")
-        if not isinstance(self.watch, dict) or not all(isinstance(w, Displacement) for w in self.watch.values()):
-            raise SceneError(
-                f"Trace: watch is {self.watch!r}; give displacements by name, {{'tip': Displacement.of(row, axis)}}"
-            )
-
-
-@dataclass
-class RodBatch:
-    """Rods of one `add_rods` call: same node count and closedness; section, shape and rest shape may differ."""
-
-    points: np.ndarray  # (R, n, 3) [m]
-    section: Stiffness
-    closed: bool
-    natural: object
-    director: np.ndarray | None  # (3,), (R, 3) or (R, edges, 3)
-    twist: bool
-    bend: bool
-    name: str
-    first: int  # index of its first rod
-
-    @property
-    def rods(self) -> int:
-        return self.points.shape[0]
-
-    @property
-    def nodes(self) -> int:
-        return self.points.shape[1]
-
-    @property
-    def edges(self) -> int:
-        return self.nodes if self.closed else self.nodes - 1
-
-
-@dataclass(frozen=True)
-class Support:
-    """Dofs held on some rods: nodes (with components), edge angles, or an end frame (`end` is "first" or "last")."""
-
-    rods: np.ndarray
-    nodes: tuple[int, ...] = ()
-    components: str = "xyz"
-    edges: tuple[int, ...] = ()
-    end: str = ""
-    motion: Motion | None = None
-    call: str = "fix"  # what users know it by
-
-
-@dataclass(frozen=True)
-class Load:
-    """A dead force on a node [N], or on an edge a twisting moment or a couple [N m]; times amplitude(t) if given."""
-
-    rods: np.ndarray
-    node: int = 0
-    force: tuple = (0.0, 0.0, 0.0)
-    edge: int | None = None
-    moment: float = 0.0
-    couple: tuple = (0.0, 0.0, 0.0)
-    amplitude: Callable[[float], float] | None = None
-
-
-@dataclass(kw_only=True, repr=False)
+@dataclass(kw_only=True, repr=False, eq=False)
 class Scene(Structures):
     """Rods and shells with supports and loads, ready to be built for a device.
 
@@ -154,7 +50,12 @@ class Scene(Structures):
     def __repr__(self) -> str:
         joined = f", {len(self.joints)} joints, {len(self.attachments)} attachments" if self.joints else ""
         held = len(self.supports) + len(self.shell_supports) + len(self.ring_supports)
-        loads = sum(map(len, (self.loads, self.shell_loads, self.pressures, self.ring_loads, self.ring_pressures)))
+        loads = sum(
+            map(
+                len,
+                (self.loads, self.shell_loads, self.pressures, self.edge_couples, self.ring_loads, self.ring_pressures),
+            )
+        )
         nodes = sum(batch.rods * batch.nodes for batch in self.batches)
         triangles = sum(len(shell.triangles) for shell in self.shells)
         return (

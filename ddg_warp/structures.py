@@ -8,95 +8,18 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ddg_warp import arguments, validate
+from ddg_warp.descriptions import Attachment, EdgeCouple, Joint, Pressure, Shell, ShellLoad, ShellSupport
 from ddg_warp.errors import SceneError, SceneWarning
 from ddg_warp.material import Material
 from ddg_warp.meridians import Meridians
 from ddg_warp.motion import Motion
-from ddg_warp.shell_geometry import MEMBRANES, MODELS
+from ddg_warp.shell_geometry import MEMBRANES, MODELS, TURNING
 from ddg_warp.surface import Surface
 
 COINCIDE = 1e-6  # how far points that are meant to be one, or in one plane, may be apart, over the largest coordinate
 
 
-@dataclass
-class Shell:
-    """A triangle mesh with thickness and material; see `Scene.add_shell`."""
-
-    surface: Surface
-    thickness: np.ndarray
-    material: Material
-    bending: str
-    membrane: str
-    rest: object
-    name: str
-
-    @property
-    def points(self) -> np.ndarray:
-        """Vertices at rest (P, 3) [m]."""
-        return self.surface.points
-
-    @property
-    def triangles(self) -> np.ndarray:
-        """Corners (T, 3)."""
-        return self.surface.triangles
-
-
-@dataclass(frozen=True)
-class ShellSupport:
-    """What is held of a shell: components of vertices, and what the surface does at the mesh edges between them.
-
-    `edges` is "" (free to turn), "clamp" (the normal is held) or "symmetry" (mirrored across the plane with normal `normal`).
-    """
-
-    shell: int
-    vertices: np.ndarray
-    components: str
-    edges: str = ""
-    normal: tuple = (0.0, 0.0, 0.0)
-    motion: Motion | None = None
-    call: str = "hold"  # what users know it by
-
-
-@dataclass(frozen=True)
-class ShellLoad:
-    """Dead forces (V, 3) [N] on vertices of a shell, times amplitude(t) if given."""
-
-    shell: int
-    vertices: np.ndarray
-    force: np.ndarray
-    amplitude: Callable[[float], float] | None = None
-
-
-@dataclass(frozen=True)
-class Pressure:
-    """Pressure [Pa] along the normals of triangles, which follow the surface unless `dead`; times amplitude(t) if given."""
-
-    shell: int
-    triangles: np.ndarray
-    pressure: np.ndarray
-    dead: bool = False
-    amplitude: Callable[[float], float] | None = None
-
-
-@dataclass(frozen=True)
-class Joint:
-    """Rods joined at nodes, (rod, node) each: hinged (positions alone) or rigid (their frames turn together)."""
-
-    members: tuple[tuple[int, int], ...]
-    rigid: bool
-
-
-@dataclass(frozen=True)
-class Attachment:
-    """Nodes of a rod that are vertices of a shell."""
-
-    rod: int
-    nodes: np.ndarray
-    shell: int
-    vertices: np.ndarray
-
-
-@dataclass(kw_only=True, repr=False)
+@dataclass(kw_only=True, repr=False, eq=False)
 class Structures(Meridians):
     """The part of a scene that is a net: whatever is not a rod of its own."""
 
@@ -104,6 +27,7 @@ class Structures(Meridians):
     shell_supports: list[ShellSupport] = field(default_factory=list, init=False)
     shell_loads: list[ShellLoad] = field(default_factory=list, init=False)
     pressures: list[Pressure] = field(default_factory=list, init=False)
+    edge_couples: list[EdgeCouple] = field(default_factory=list, init=False)
     joints: list[Joint] = field(default_factory=list, init=False)
     attachments: list[Attachment] = field(default_factory=list, init=False)
 
@@ -217,6 +141,37 @@ class Structures(Meridians):
         vertices = np.flatnonzero(share)
         amplitude = arguments.amplitude("add_edge_force", amplitude)
         self.shell_loads.append(ShellLoad(shell, vertices, share[vertices, None] * force, amplitude))
+
+    def add_edge_couple(self, shell: int, path, couple, amplitude: Callable[[float], float] | None = None) -> None:
+        """Couple per length [N] about boundary edges, as long as at rest: an edge moment, which follows the edge.
+
+        It is positive by the right hand about the edge with the surface to its left, so that it makes the surface convex on the side
+        of its normals. It does the work of the angle of the normal at the edge, so that bending needs one there: "midedge_dof" or
+        "midedge_boundary". It has no potential where the edge moves out of its direction.
+
+        Args:
+            shell: index.
+            path: as for `add_edge_force`, of the boundary alone.
+            couple: one number, or one an edge where edges are given as pairs [N].
+            amplitude: of the time, or None.
+
+        Raises:
+            SceneError: an edge inside the surface, or one without an angle.
+        """
+        surface, edges = self._mesh_edges("add_edge_couple", shell, path)
+        bending = self.shells[shell].bending
+        if bending not in TURNING:
+            raise SceneError(
+                f"add_edge_couple: the edges of shell {shell} have no angle with bending {bending!r}; take {' or '.join(TURNING)}"
+            )
+        for edge in edges[~surface.boundary[edges]][:1]:
+            raise SceneError(
+                "add_edge_couple: the edge between the vertices {} and {} is inside the surface; give edges of its boundary".format(
+                    *surface.edges[edge]
+                )
+            )
+        couple = arguments.broadcast("add_edge_couple: couple", couple, edges.shape)
+        self.edge_couples.append(EdgeCouple(shell, edges, couple, arguments.amplitude("add_edge_couple", amplitude)))
 
     def add_pressure(
         self, shell: int, pressure, triangles=None, *, dead: bool = False, amplitude: Callable | None = None

@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 
 from ddg_warp import arguments, geometry
+from ddg_warp.descriptions import Dynamics, Statics, Trace
 from ddg_warp.errors import SceneError, SceneWarning
 from ddg_warp.motion import Motion
 
@@ -18,8 +19,6 @@ def check_settings(scene) -> None:
     Raises:
         SceneError: the first thing found wrong.
     """
-    from ddg_warp.scene import Dynamics, Statics, Trace
-
     arguments.vector("gravity", scene.gravity)
     if scene.dimension not in (2, 3):
         raise SceneError(f"dimension = {scene.dimension!r}; a scene is of dimension 2 or 3")

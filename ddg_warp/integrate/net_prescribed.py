@@ -93,10 +93,11 @@ class NetLoads:
         def put(values, dtype=int):
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
-        press, squeeze, twist, self._spread = loads.follower_kernels(real)
+        press, squeeze, twist, bend, self._spread = loads.follower_kernels(real)
         kinds = [(press, load, load.pressure, real) for load in host.pressures]
         kinds += [(squeeze, load, load.pressure, real) for load in host.bands]
         kinds += [(twist, load, np.tile(load.couple, (len(load.places), 1)), net.vector) for load in host.couples]
+        kinds += [(bend, load, load.values, net.vector) for load in host.edge_couples]
         for kernel, load, values, dtype in kinds:
             self._followers.append((kernel, load, values, put(load.places.astype(np.int32)), put(values, dtype)))
         places = np.concatenate([load.places.ravel() for load in host.followers])

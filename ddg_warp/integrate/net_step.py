@@ -59,6 +59,7 @@ class NetStep:
         outer = np.abs(dead).sum() + np.abs(host.load[host.nodes :]).sum()
         outer += sum(np.abs(load.force).sum() for load in host.timed)
         outer += sum(len(load.places) * np.abs(load.couple).sum() / load.length for load in host.couples)
+        outer += sum(np.abs(load.moment).sum() / load.length for load in host.edge_couples)
         self.outer = wp.full(worlds, float(outer), dtype=real, device=device)
         self.motion = NetMotion(model, self.midpoint) if host.moving else None
         self.loads = NetLoads(model, self.midpoint)
