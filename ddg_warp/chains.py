@@ -11,10 +11,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ddg_warp import arguments, geometry
+from ddg_warp.descriptions import RodBatch, Support
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.element import ChainKind
 from ddg_warp.kernels.terms import REGISTRY
-from ddg_warp.scene import RodBatch, Scene, Support
+from ddg_warp.scene import Scene
 from ddg_warp.validate import check_batch, check_index
 
 PADDING = 1.25  # longest over shortest rod of a group

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from ddg_warp.catalog import InputError
+from ddg_warp.descriptions import Dynamics, Statics
 from ddg_warp.errors import SolverError
-from ddg_warp.scene import Dynamics, Scene, Statics
+from ddg_warp.scene import Scene
 
 
 @dataclass(repr=False)
