@@ -112,7 +112,8 @@ class Meridians:
     def hold_ring(self, shell: int, nodes, components: str = "xz", motion: Motion | None = None) -> None:
         """Hold radius ("x") or height ("z") of nodes of a meridian; the surface may turn there (simply supported).
 
-        `motion` moves them in the plane of x and z, by a translation and a rotation about the y axis.
+        `motion` moves them in the plane of x and z, by a translation, which may be another one for each node, and a rotation about the
+        y axis.
         """
         self._hold_ring(RingSupport(shell, self._nodes(shell, nodes), components, motion=motion))
 
