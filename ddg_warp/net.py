@@ -67,10 +67,11 @@ class NetSet:
 
 @dataclass(frozen=True)
 class NetHeld:
-    """Dofs that a support holds: (block, component) pairs."""
+    """Dofs that a support holds: (block, component) pairs; or the blocks on an oblique plane with this normal."""
 
     blocks: np.ndarray
     components: np.ndarray
+    normal: tuple | None = None
 
 
 @dataclass(eq=False)
@@ -88,6 +89,7 @@ class Net:
         held: what each support of `scene.supports`, then of `scene.shell_supports` and `scene.ring_supports`, holds here.
         moving: (blocks, motion, components (3,) bool, rows of its displacements) of nodes with a motion.
         turning: (angle blocks, motion) of rod edges.
+        frames: orthonormal rows (3, 3) that the held components of a node on an oblique plane refer to; see `net_planes`.
     """
 
     rest: np.ndarray
@@ -111,11 +113,20 @@ class Net:
     bands: list[axisymmetric.NetBand] = field(default_factory=list)
     couples: list[NetCouple] = field(default_factory=list)
     edge_couples: list[NetEdgeCouple] = field(default_factory=list)
+    frames: dict[int, np.ndarray] = field(default_factory=dict)
 
     @property
     def blocks(self) -> int:
         """Number of blocks."""
         return len(self.rest)
+
+    @property
+    def holds(self) -> np.ndarray:
+        """Whether something of every dof in space is held (N, 3) bool."""
+        result = self.fixed.copy()
+        for block, frame in self.frames.items():
+            result[block] = (np.abs(frame[self.fixed[block]]) > 1e-9).any(0)
+        return result
 
     @property
     def followers(self) -> list:

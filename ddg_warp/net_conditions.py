@@ -7,6 +7,7 @@ from ddg_warp.chains import FREE, STILL, component_bits, disagreement, pose_star
 from ddg_warp.errors import SceneError
 from ddg_warp.net import Net, NetHeld, NetRod
 from ddg_warp.net_loads import NetCouple, NetEdgeCouple, NetLoad, NetPressure
+from ddg_warp.net_planes import frames_of_planes
 from ddg_warp.shell_geometry import FREE as FREE_EDGE
 from ddg_warp.validate import check_index
 
@@ -54,12 +55,16 @@ def hold(scene, net: Net) -> None:
                 rows += [0, 0]
                 edges += [rod.all_edges[-1 if last else 0]] if rod.all_edges.size else []
         claims.mark(np.array(nodes, int), np.array(rows, int), support, np.array(edges, int))
+    normals: dict[int, list] = {}
     for support in scene.shell_supports:
         nodes = net.shells[support.shell].nodes[support.vertices]
         claims.mark(nodes, np.arange(len(nodes)), support)
+        for node in nodes if not support.components else ():
+            normals.setdefault(int(node), []).append(support.normal)
     for support in scene.ring_supports:
         nodes = net.meridians[support.shell].nodes[support.nodes]
         claims.mark(nodes, np.arange(len(nodes)), support)
+    frames_of_planes(net, normals, (claims.poses > STILL).any(1))
 
 
 class _Claims:
@@ -72,10 +77,11 @@ class _Claims:
     def mark(self, nodes: np.ndarray, rows: np.ndarray, support, edges: np.ndarray = _NONE) -> None:
         """Hold nodes, the `rows` of their displacements where a motion has one for each, and angles of edges."""
         net, bits = self.net, component_bits(support.components, 3)
-        components = np.array([d for d in range(3) if (bits >> d) & 1])
+        components = np.array([d for d in range(3) if (bits >> d) & 1], int)
         pairs = np.array([(n, d) for n in nodes for d in components] + [(e, 0) for e in edges], int).reshape(-1, 2)
         net.fixed[pairs[:, 0], pairs[:, 1]] = True
-        net.held.append(NetHeld(pairs[:, 0], pairs[:, 1]))
+        oblique = not support.components
+        net.held.append(NetHeld(nodes, 0 * nodes, support.normal) if oblique else NetHeld(pairs[:, 0], pairs[:, 1]))
         if not self.motions:
             return
         index = next((i for i, m in enumerate(self.motions) if m is support.motion), STILL)

@@ -102,20 +102,35 @@ class Structures(Meridians):
         self._need_edges("clamp_boundary", shell, vertices, np.arange(len(surface.edges)), "mesh edge", "hold")
         self._hold("clamp_boundary", shell, vertices, components, edges="clamp", motion=motion)
 
-    def symmetry(self, shell: int, vertices, axis: str) -> None:
-        """Put vertices on a symmetry plane across an axis of space, "x", "y" or "z", which the surface meets at a right angle."""
-        arguments.choice("symmetry: axis", axis, ("x", "y", "z"))
+    def symmetry(self, shell: int, vertices, axis) -> None:
+        """Put vertices on a symmetry plane, which the surface meets at a right angle.
+
+        Args:
+            shell: index.
+            vertices: at the boundary, in one plane.
+            axis: of space that the plane is across, "x", "y" or "z"; or the plane's normal (3,), of any length.
+        """
+        if isinstance(axis, str):
+            normal = np.eye(3)["xyz".index(arguments.choice("symmetry: axis", axis, ("x", "y", "z")))]
+        else:
+            normal = np.array(arguments.vector("symmetry: axis, 'x', 'y' or 'z' or the plane's normal,", axis))
+            if not normal.any():
+                raise SceneError("symmetry: the normal is zero; give three numbers that are not, or 'x', 'y' or 'z'")
+            normal /= np.linalg.norm(normal)
+            # to rounding, an axis of space is one
+            axis = "xyz"[np.argmax(np.abs(normal))] if np.sort(np.abs(normal))[1] < 1e-15 else ""
+            normal = np.round(normal) if axis else normal
         vertices = self._vertices(shell, vertices)
-        surface, normal = self.shells[shell].surface, np.eye(3)["xyz".index(axis)]
+        surface = self.shells[shell].surface
         height = surface.points[vertices] @ normal
         off = np.abs(height - np.median(height))
         if off.max() > COINCIDE * np.ptp(surface.points, axis=0).max():
             raise SceneError(
                 f"symmetry: vertex {vertices[np.argmax(off)]} of shell {shell} is {off.max():.3g} m off the plane "
-                f"{axis} = {np.median(height):g} m of the others; choose the vertices of one plane"
+                f"{axis or 'with this normal at'} = {np.median(height):g} m of the others; choose the vertices of one plane"
             )
         self._need_edges("symmetry", shell, vertices, surface.boundary_edges, "boundary edge", "hold")
-        self._hold("symmetry", shell, vertices, axis, edges="symmetry", normal=tuple(normal))
+        self._hold("symmetry", shell, vertices, axis, edges="symmetry", normal=tuple(normal.tolist()))
 
     def add_vertex_force(self, shell: int, vertices, force, amplitude: Callable[[float], float] | None = None) -> None:
         """Dead force [N] on each of some vertices, (3,) or (V, 3). In statics it grows with the load parameter."""
@@ -218,7 +233,8 @@ class Structures(Meridians):
         self.attachments.append(Attachment(int(rod), np.array(nodes), shell, vertices))
 
     def _hold(self, call: str, shell, vertices, components, **options) -> None:
-        arguments.components(call, components)
+        if options.get("edges") != "symmetry":  # an oblique plane has none
+            arguments.components(call, components)
         motion, vertices = options.get("motion"), self._vertices(shell, vertices)
         validate.check_motion(call, motion, planar=False)
         if motion is not None and motion.count not in (None, len(vertices)):

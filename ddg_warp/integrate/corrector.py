@@ -73,7 +73,7 @@ class Corrector:
         self.rest = tangent.dofs(model.state())
         self.free = np.flatnonzero(tangent.free)
         position = tangent.point_dofs()
-        size = np.linalg.norm(np.ptp(np.where(position >= 0, self.rest[position], 0.0), axis=0))
+        size = np.linalg.norm(np.ptp(model.state().points(), axis=0))
         lengths = np.where(tangent.angle, tangent.edge_length(), 1.0) / size
         weights = np.append(lengths**2 / len(position), self.options.load_scale**-2)
         self.metric = np.where(np.append(tangent.free, True), weights, 0.0)

@@ -73,6 +73,8 @@ class StaticNewton(NetNewton):
         if self._whole:
             return
         self.measure_turns()
+        if self.planes:
+            self.planes.into(self.direction, self.wanted)
         wp.launch(
             self._far, self.worlds, [self.turn, FAR * self.options.rotation_cap], [self.wanted], device=self.device
         )
@@ -159,7 +161,7 @@ class NetEquilibrium:
         scales = [
             self.owner.load_scale(*pair) for pair in zip(self._by_world(outer), self._by_world(gradient), strict=True)
         ]
-        self.newton.begin(q, part.dead_loads(at), at, np.array(scales))
+        self.newton.begin(tangent.back(q), part.dead_loads(at), at, np.array(scales))
         for name, array in self._start.arrays().items():
             wp.copy(array, state.net.arrays()[name])
 

@@ -90,7 +90,7 @@ class NetStep:
             [
                 before.q,
                 before.v,
-                solver.fixed,
+                solver.held,
                 solver.mass,
                 self.integrator._dt,
                 self.damping,

@@ -50,7 +50,7 @@ class Displacement:
             if dof < 0:
                 raise SceneError(f"displacement of point {row} along {axis!r}: the scene is planar")
             result[dof] += weight
-        return result
+        return tangent.into(result)
 
 
 @dataclass(eq=False)

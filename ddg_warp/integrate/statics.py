@@ -348,7 +348,7 @@ def require_supports(model) -> None:
                     "scene.clamp_ring(...)"
                 )
         spatial = np.setdiff1d(np.arange(host.nodes), [node for shell in host.meridians for node in shell.nodes])
-        loose = np.flatnonzero(~host.fixed[spatial].any(0)) if spatial.size else spatial
+        loose = np.flatnonzero(~host.holds[spatial].any(0)) if spatial.size else spatial
         if loose.size:
             raise SceneError(
                 f"no node of the shells and joined rods is held along {'xyz'[loose[0]]}: a static solve needs supports; "

@@ -380,3 +380,109 @@ def test_scripts_print_no_module_loads(verbose):
     assert done.returncode == 0, done.stderr
     assert ("Module ddg_warp" in done.stdout or "Warp 1." in done.stdout) == bool(verbose)
     assert verbose or not done.stdout
+
+
+# --- symmetry planes across any direction ---
+def quarter(turn: float = 0.0, bending: str = "midedge_dof", axes: bool = False, gravity: float = 1.0) -> ddg.Scene:
+    """A quarter of a square plate on supported sides under its weight, turned by an angle about z, on two symmetry planes."""
+    rotation = ddg.Motion().rotation(turn)
+    points, triangles = meshes.rectangle(4, 4)
+    scene = ddg.Scene(gravity=(0.0, 0.0, -gravity))
+    scene.add_shell(points @ rotation.T, triangles, thickness=0.05, material=RUBBER, bending=bending)
+    x, y, _ = points.T
+    for mask, axis, letter in ((x == 0.0, rotation[:, 0], "x"), (y == 0.0, 2.0 * rotation[:, 1], "y")):
+        scene.symmetry(0, mask, letter if axes else axis)
+    scene.hold(0, (x == 1.0) | (y == 1.0), "z")
+    return scene
+
+
+TURN = np.pi / 6.0
+
+
+@pytest.mark.parametrize("bending", ["midedge_dof", "hinge"])
+def test_oblique_symmetry_is_axis_aligned_symmetry_turned(device, bending):
+    """Statics by factors and by conjugate gradients, and steps of both schemes: turned by 30 degrees, all is turned, nothing else."""
+    found = []
+    for turn, axes in ((0.0, True), (TURN, False)):
+        back = ddg.Motion().rotation(turn)
+        model = quarter(turn, bending, axes).build(device, "float64")
+        points = [statics.solve(model, solver=solver).points() for solver in ("direct", "pcg")]
+        for scheme in ("implicit_euler", "implicit_midpoint"):
+            integrator, state = ddg.Integrator(model, scheme), model.state()
+            for _ in range(5):
+                state = integrator.step(state, 0.01)
+            points.append(state.points())
+        found.append([x @ back for x in points])
+    for aligned, oblique in zip(*found, strict=True):
+        np.testing.assert_allclose(oblique, aligned, atol=1e-7)
+    assert found[0][0][0, 2] < -1e-3  # the middle sags
+
+
+def test_oblique_symmetry_in_worlds_precisions_and_paths(device):
+    """Three worlds are alike; mixed and float32 agree within their rounding; frequencies and the end of a path are as aligned."""
+    from ddg_warp.integrate.continuation import Continuation
+    from ddg_warp.stability import spectrum
+
+    found = []
+    for turn, axes in ((0.0, True), (TURN, False)):
+        model = quarter(turn, axes=axes).build(device, "float64")
+        state = statics.solve(model)
+        watch = {"middle": ddg.Displacement.of(0, "z")}
+        path = Continuation(model, watch).trace(stop=ddg.Stop(load=(-1.0, 0.5))).values("middle")
+        found.append([*spectrum(model, state, 3).frequencies, path[-1]])
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-6)
+    reference = ddg.Integrator(model).step(model.state(), 0.02).points()
+    for precision, tolerance in (("mixed", 1e-6), ("float32", 1e-4)):
+        worlds = quarter(TURN).build(device, precision, worlds=3)
+        points = ddg.Integrator(worlds).step(worlds.state(), 0.02).points()
+        np.testing.assert_array_equal(points[1:], points[:1].repeat(2, axis=0))
+        np.testing.assert_allclose(points[0], reference, atol=tolerance)
+
+
+def test_points_stay_on_oblique_planes_and_reactions_are_across_them(device):
+    """A sheet swings freely along its planes; what each plane bears points along its normal, and all bear the weight."""
+    scene = quarter(TURN)
+    model = scene.build(device, "float64")
+    first, second, sides = model.reactions(statics.solve(model))
+    rotation = ddg.Motion().rotation(TURN)
+    np.testing.assert_allclose(np.cross(first.force, rotation[:, 0]), 0.0, atol=1e-7)
+    np.testing.assert_allclose(np.cross(second.force, rotation[:, 1]), 0.0, atol=1e-7)
+    np.testing.assert_allclose(sides.force, (0.0, 0.0, 50.0), rtol=1e-6)
+    state = ddg.Integrator(model).step(model.state(), 0.1)
+    for support in scene.shell_supports[:2]:
+        offset = (state.points() - model.state().points())[support.vertices] @ support.normal
+        np.testing.assert_allclose(offset, 0.0, atol=1e-12)
+
+
+def test_a_wedge_sags_like_the_disc_it_is_of(device):
+    """A sixth of a disc of six equal sectors, between planes 60 degrees apart that meet on the axis: the disc itself."""
+    points, triangles = meshes.disc(4)
+    scenes = []
+    for sector in (False, True):
+        angle = np.arctan2(points[:, 1], points[:, 0])
+        inside = (angle > -1e-9) & (angle < np.pi / 3.0 + 1e-9) | (np.arange(len(points)) == 0)
+        chosen = triangles[inside[triangles].all(1)] if sector else triangles
+        used, corners = np.unique(chosen, return_inverse=True)
+        scene = ddg.Scene(gravity=(0.0, 0.0, -1.0))
+        x = points[used]
+        scene.add_shell(x, corners.reshape(-1, 3), thickness=0.05, material=RUBBER)
+        if sector:
+            for normal in ((0.0, 1.0, 0.0), (-np.sin(np.pi / 3.0), np.cos(np.pi / 3.0), 0.0)):
+                scene.symmetry(0, np.abs(x @ normal) < 1e-9, normal)
+        else:
+            scene.hold(0, [0], "xy")
+            scene.hold(0, [1], "y")
+        scene.hold(0, np.abs(np.linalg.norm(x, axis=1) - 1.0) < 1e-9, "z")
+        scenes.append((scene, used))
+    whole, part = (statics.solve(scene.build(device, "float64")).points() for scene, _ in scenes)
+    np.testing.assert_allclose(part, whole[scenes[1][1]], atol=1e-7)
+
+
+def test_a_moved_vertex_is_on_no_oblique_plane(device):
+    scene = quarter(TURN)
+    scene.hold(0, [0], motion=ddg.Motion(translation=lambda t: (0.0, 0.0, t)))
+    with pytest.raises(ddg.SceneError, match=r"\(0, 0, 0\) m is on a symmetry plane across .* and moved by a support"):
+        scene.build(device)
+    for normal in ((0.0, 0.0, 0.0), (1.0, 0.0), "xy", None):
+        with pytest.raises(ddg.SceneError, match="symmetry"):
+            quarter().symmetry(0, [0, 1], normal)
