@@ -81,9 +81,7 @@ class Continuation:
         if stop is not None and not isinstance(stop, Stop):
             raise SceneError(f"stop is {stop!r}; give Stop(...)")
         if stop is not None and stop.displacement is not None and stop.displacement[0] not in self.watched:
-            raise SceneError(
-                f"stop: no displacement {stop.displacement[0]!r} is watched; there is {list(self.watched)}"
-            )
+            raise SceneError(f"stop at {stop.displacement[0]!r}: it is not watched; there is {list(self.watched)}")
         return stop or Stop()
 
     def switch(self, bifurcation: Point, *, side: int = 1, step: float | None = None, stop: Stop | None = None) -> Path:
