@@ -10,14 +10,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ddg_warp import geometry
+from ddg_warp import arguments, geometry
+from ddg_warp.descriptions import RodBatch, Support
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.element import ChainKind
 from ddg_warp.kernels.terms import REGISTRY
-from ddg_warp.scene import RodBatch, Scene, Support
+from ddg_warp.scene import Scene
 from ddg_warp.validate import check_batch, check_index
 
 PADDING = 1.25  # longest over shortest rod of a group
+STILL, FREE = -1, -2  # instead of a pose, of a dof that is held still, and of one that is free
 
 
 @dataclass
@@ -50,8 +52,12 @@ class TimedLoad:
     amplitude: Callable[[float], float] | None
 
     def at(self, t: float, otherwise: float) -> float:
-        """Its amplitude at t, or `otherwise` if it has none."""
-        return otherwise if self.amplitude is None else float(self.amplitude(t))
+        """Its amplitude at t, or `otherwise` if it has none.
+
+        Raises:
+            SolverError: the amplitude is not finite; names the function and the time.
+        """
+        return otherwise if self.amplitude is None else float(arguments.value_at("the amplitude", self.amplitude, t))
 
 
 @dataclass(eq=False)
@@ -134,11 +140,9 @@ def compile_chains(scene: Scene) -> tuple[list[ChainGroup], list[list[Held]]]:
     place = np.full((scene.rod_count, 2), -1)  # rods of the net have none
     for g, chain in enumerate(chains):
         place[chain.rods] = np.column_stack([np.full(len(chain.rods), g), np.arange(len(chain.rods))])
-    motions = scene_motions(scene)
-    held = [_hold(chains, place, support, motions) for support in scene.supports]
-    for chain in chains:
-        if chain.moving_nodes:
-            chain.moving_nodes = [_merged_motions(chain)]
+    claims = _Claims(scene, chains)
+    held = [_hold(chains, place, support, claims) for support in scene.supports]
+    claims.finish()
     _apply_loads(scene, chains, place)
     return chains, held
 
@@ -450,48 +454,95 @@ def component_bits(components: str, dim: int) -> int:
     return sum(1 << axes.index(c) for c in components if c in axes)
 
 
-def _hold(chains: list[ChainGroup], place: np.ndarray, support: Support, motions: list) -> list[Held]:
-    motion = next((i for i, m in enumerate(motions) if m is support.motion), -1)
+def _hold(chains: list[ChainGroup], place: np.ndarray, support: Support, claims: "_Claims") -> list[Held]:
+    first = claims.first(support)
+    each = first >= 0 and support.motion.count is not None
 
-    nodes = [at for node in support.nodes for at in _places(chains, place, support.rods, node, "node")]
-    edges = [at for edge in support.edges for at in _places(chains, place, support.rods, edge, "edge")]
+    def rows(chain, nth: int) -> np.ndarray:
+        """Pose of the motion of the nth place named of each rod in a group, -1 for none."""
+        among = np.flatnonzero(place[support.rods, 0] == chains.index(chain))
+        return first + (among * len(support.nodes) + nth if each else 0 * among)
+
+    found = [
+        (n, at) for n, node in enumerate(support.nodes) for at in _places(chains, place, support.rods, node, "node")
+    ]
+    nodes = [(*at, rows(at[0], n)) for n, at in found]
+    edges = [
+        (*at, rows(at[0], 0)) for edge in support.edges for at in _places(chains, place, support.rods, edge, "edge")
+    ]
     if support.end:
         for chain, k, columns in _places(chains, place, support.rods, 0 if support.end == "first" else -1, "node"):
-            ghost = k + (-1 if support.end == "first" else 1)
-            nodes += [(chain, k, columns), (chain, ghost, columns)]
-            edges += [(chain, np.minimum(k, ghost), columns)]
+            ghost, row = k + (-1 if support.end == "first" else 1), rows(chain, 0)
+            nodes += [(chain, k, columns, row), (chain, ghost, columns, row)]
+            edges += [(chain, np.minimum(k, ghost), columns, row)]
     held = []
-    for chain, k, columns in nodes:
+    for chain, k, columns, row in nodes:
         bits = component_bits(support.components, chain.kind.dim)
         chain.fixed[k, columns] |= np.uint8(bits)
-        if motion >= 0:
-            moved = np.where((bits >> np.arange(3)) & 1, motion, -1)
-            chain.moving_nodes.append(np.column_stack([k, columns, np.tile(moved, (len(k), 1))]))
+        claims.take(chain, k, columns, bits, row)
         held.append(Held(chains.index(chain), k, columns, bits))
-    for chain, k, columns in edges:
+    for chain, k, columns, row in edges:
         if chain.kind.twist:
             chain.fixed[k, columns] |= np.uint8(1 << chain.kind.dim)
-            if motion >= 0:
-                chain.moving_edges.append(np.column_stack([k, columns, np.full(len(columns), motion)]))
+            claims.take(chain, k, columns, 1 << chain.kind.dim, row)
             held.append(Held(chains.index(chain), k, columns, 0))
     return held
 
 
-def _merged_motions(chain: ChainGroup) -> np.ndarray:
-    """One row of `moving_nodes` a node (., 5); a component with two motions is refused."""
-    rows = np.concatenate(chain.moving_nodes)
-    places, index = np.unique(rows[:, :2], axis=0, return_inverse=True)
-    motions = np.full((len(places), 3), -1)
-    np.maximum.at(motions, index.ravel(), rows[:, 2:])
-    twice = (rows[:, 2:] >= 0) & (rows[:, 2:] != motions[index.ravel()])
-    if twice.any():
-        row, axis = np.argwhere(twice)[0]
-        node, column = rows[row, :2]
-        raise SceneError(
-            f"node {node - chain.first[column]} of rod {chain.rods[column]} has two motions along "
-            f"{('xz' if chain.kind.dim == 2 else 'xyz')[axis]}; give it one that does both"
+class _Claims:
+    """Which pose moves each held dof of the chains; a dof that two poses, or one and a still support, claim is refused."""
+
+    def __init__(self, scene: Scene, chains: list[ChainGroup]):
+        motions = scene_motions(scene)
+        start = pose_starts(motions)
+        self.place = {id(motion): int(start[i]) for i, motion in enumerate(motions)}
+        # without motions nothing can disagree
+        shapes = [(*chain.shape, chain.kind.dim + 1) for chain in chains] if motions else []
+        self.poses = {id(chain): np.full(shape, FREE) for chain, shape in zip(chains, shapes, strict=False)}
+        self.chains = chains
+
+    def first(self, support: Support) -> int:
+        """First pose of a support's motion, `STILL` without."""
+        return STILL if support.motion is None else self.place[id(support.motion)]
+
+    def take(self, chain: ChainGroup, k: np.ndarray, columns: np.ndarray, bits: int, row: np.ndarray) -> None:
+        """Give the dofs of nodes or edges k to the poses `row`, `STILL` for supports that stay."""
+        if not self.poses:
+            return
+        poses, dim = self.poses[id(chain)], chain.kind.dim
+        for d in (d for d in range(dim + 1) if (bits >> d) & 1):
+            before = poses[k, columns, d]
+            for i in np.flatnonzero((before != FREE) & (before != row))[:1]:
+                at = f"{k[i] - chain.first[columns[i]]} of rod {chain.rods[columns[i]]}"
+                where, axis = ("edge", "") if d == dim else ("node", f" along {('xz' if dim == 2 else 'xyz')[d]}")
+                raise SceneError(disagreement(f"{where} {at}", axis, min(before[i], row[i]) == STILL))
+            poses[k, columns, d] = row
+
+    def finish(self) -> None:
+        """Leave what moves to the chains."""
+        for chain in self.chains if self.poses else ():
+            poses, dim = self.poses[id(chain)], chain.kind.dim
+            k, column = np.nonzero((poses[..., :dim] > STILL).any(-1))
+            rows = np.full((len(k), 3), STILL)
+            rows[:, :dim] = np.maximum(poses[k, column, :dim], STILL)
+            chain.moving_nodes = [np.column_stack([k, column, rows])] if len(k) else []
+            k, column = np.nonzero(poses[..., dim] > STILL)
+            chain.moving_edges = [np.column_stack([k, column, poses[k, column, dim]])] if len(k) else []
+
+
+def pose_starts(motions: list) -> np.ndarray:
+    """First pose of every motion, among those of all: one a motion, or one for each node that it displaces."""
+    return np.cumsum([0, *(motion.count or 1 for motion in motions)])
+
+
+def disagreement(where: str, axis: str, still: bool) -> str:
+    """What to tell of a dof that two supports would have in two places."""
+    if still:
+        return (
+            f"{where} is held still by one support and moved by another{axis}; leave one of them out, give the moving one other "
+            "components, or give both the same motion"
         )
-    return np.column_stack([places, motions])
+    return f"{where} has two motions{axis}; give it one that does both"
 
 
 def _apply_loads(scene: Scene, chains: list[ChainGroup], place: np.ndarray) -> None:

@@ -295,7 +295,8 @@ def require_device(name: str | None) -> None:
     """Start Warp without its chatter; refuse a device that it does not have."""
     import warp as wp
 
-    wp.config.log_level = wp.LOG_WARNING
+    import ddg_warp.kernels  # noqa: F401, quietens Warp
+
     if name is None:
         return
     known = [device.alias for device in wp.get_devices()]

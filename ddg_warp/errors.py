@@ -1,8 +1,14 @@
 """Errors that a user of ddg_warp can meet; every message names the object, its index and the remedy."""
 
+import numbers
+
 
 class SceneError(ValueError):
     """A scene cannot be built as described."""
+
+
+class SceneWarning(UserWarning):
+    """A scene that can be built, but is likely not what was meant."""
 
 
 class SolverError(RuntimeError):
@@ -29,9 +35,11 @@ def check_options(options, positive: tuple[str, ...], counts: tuple[str, ...]) -
     """
     for name in positive:
         value = getattr(options, name)
-        if not (isinstance(value, int | float) and 0.0 < value < float("inf")):
+        real = isinstance(value, numbers.Real) and not isinstance(value, bool)
+        if not (real and 0.0 < value < float("inf")):
             raise SceneError(f"{name} = {value!r}; it is a positive number")
     for name in counts:
         value = getattr(options, name)
-        if not (isinstance(value, int) and value >= 1):
+        whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+        if not (whole and value >= 1):
             raise SceneError(f"{name} = {value!r}; it is a whole number of at least 1")

@@ -66,7 +66,11 @@ class Group:
             new = np.repeat(values, self.rods)[None]
         else:
             along = np.atleast_2d(values)
-            if along.shape[0] not in (1, self.worlds) or not elements - 2 <= along.shape[1] <= elements:
+            if (
+                along.ndim > 2
+                or along.shape[0] not in (1, self.worlds)
+                or not elements - 2 <= along.shape[1] <= elements
+            ):
                 raise ValueError(
                     f"{name} has shape {values.shape}; give one number, ({self.worlds},), (elements,) or ({self.worlds}, elements)"
                     f" with {elements - 2} vertices or {elements - 1} edges"

@@ -69,7 +69,8 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     """
     tangent = Tangent(model)
     q = tangent.dofs(state)
-    force = np.where(tangent.free, 0.0, tangent.gradient(state) - tangent.loads(factor, q))
+    force = tangent.back(np.where(tangent.free, 0.0, tangent.gradient(state) - tangent.loads(factor, q)))
+    q = tangent.back(q)
     net = model.net.host.held if model.net is not None else []
     count, shells = max(len(model.held), len(net)), len(model.scene.shell_supports)
     turns = np.zeros((model.worlds, count, 3))
@@ -124,7 +125,10 @@ def _net_places(part, q: np.ndarray, force: np.ndarray, held, world: int) -> lis
     host, places = part.host, []
     x, f = (Tangent.of(part, values).reshape(part.net.worlds, -1, 3)[world] for values in (q, force))
     for block, component in zip(held.blocks, held.components, strict=True):
-        if block < host.nodes:
+        if held.normal is not None:
+            normal = np.array(held.normal)
+            places.append((x[block], (f[block] @ normal) * normal, np.zeros(3)))
+        elif block < host.nodes:
             places.append((x[block], f[block] * np.eye(3)[component], np.zeros(3)))
         else:
             first, last = x[host.ends[block - host.nodes]]
@@ -140,7 +144,7 @@ def _normal_moments(part, state) -> np.ndarray:
     the forces on its nodes. Where several supports share an element, each has the part along its own edge.
     """
     worlds, count = part.net.worlds, len(part.model.scene.shell_supports)
-    result, x = np.zeros((worlds, count, 3)), part.dofs(state).reshape(worlds, -1, 3)
+    result, x = np.zeros((worlds, count, 3)), part.back(part.dofs(state)).reshape(worlds, -1, 3)
     for index, device in enumerate(part.net.sets):
         host, measure = device.host, device.term.measure
         element, row, support = host.normals[:, host.normals[2] < count]

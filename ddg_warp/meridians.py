@@ -1,11 +1,12 @@
 """What a scene says about axisymmetric shells: their meridians, and what holds and loads them."""
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from ddg_warp import validate
+from ddg_warp import arguments, validate
 from ddg_warp.errors import SceneError
 from ddg_warp.material import Material
 from ddg_warp.motion import Motion
@@ -34,6 +35,7 @@ class RingSupport:
     tangent: tuple | None = None
     clamped: bool = False
     motion: Motion | None = None
+    call: str = "hold_ring"  # what users know it by
 
 
 @dataclass(frozen=True)
@@ -57,14 +59,14 @@ class RingPressure:
     amplitude: Callable[[float], float] | None = None
 
 
-@dataclass
+@dataclass(kw_only=True, repr=False, eq=False)
 class Meridians:
     """The part of a scene that turns about the z axis: every energy, force and mass is that of the whole revolution."""
 
-    axisymmetric_shells: list[AxisymmetricShell] = field(default_factory=list)
-    ring_supports: list[RingSupport] = field(default_factory=list)
-    ring_loads: list[RingLoad] = field(default_factory=list)
-    ring_pressures: list[RingPressure] = field(default_factory=list)
+    axisymmetric_shells: list[AxisymmetricShell] = field(default_factory=list, init=False)
+    ring_supports: list[RingSupport] = field(default_factory=list, init=False)
+    ring_loads: list[RingLoad] = field(default_factory=list, init=False)
+    ring_pressures: list[RingPressure] = field(default_factory=list, init=False)
 
     def add_axisymmetric_shell(
         self, points, *, thickness, material: Material, rest="shape", name: str = "shell of revolution"
@@ -99,14 +101,19 @@ class Meridians:
             )
         if not isinstance(material, Material):
             raise SceneError(f"axisymmetric shell '{name}': material is {material!r}; give material=Material(...)")
+        if np.any(np.abs(material.poisson) >= 1.0):
+            raise SceneError(f"axisymmetric shell '{name}': Poisson's ratio {material.poisson}; it is between -1 and 1")
         _check_meridian(points, thickness, name)
-        self.axisymmetric_shells.append(AxisymmetricShell(points, thickness, material, rest, name))
+        points.setflags(write=False)
+        thickness.setflags(write=False)
+        self.axisymmetric_shells.append(AxisymmetricShell(points, thickness, deepcopy(material), deepcopy(rest), name))
         return len(self.axisymmetric_shells) - 1
 
     def hold_ring(self, shell: int, nodes, components: str = "xz", motion: Motion | None = None) -> None:
         """Hold radius ("x") or height ("z") of nodes of a meridian; the surface may turn there (simply supported).
 
-        `motion` moves them in the plane of x and z, by a translation and a rotation about the y axis.
+        `motion` moves them in the plane of x and z, by a translation, which may be another one for each node, and a rotation about the
+        y axis.
         """
         self._hold_ring(RingSupport(shell, self._nodes(shell, nodes), components, motion=motion))
 
@@ -119,11 +126,17 @@ class Meridians:
             tangent: direction (2,) of the meridian there, the way it runs; by default that of the points, extrapolated.
         """
         if tangent is not None:
-            tangent = np.array(tangent, float)
-            if tangent.shape != (2,) or not np.isfinite(tangent).all() or not tangent.any():
-                raise SceneError(f"clamp_ring: tangent is {tangent!r}; give a direction (2,)")
-        nodes = self._nodes(shell, self._end(shell, end))
-        self._hold_ring(RingSupport(shell, nodes, components, tangent=tangent, clamped=True, motion=motion))
+            tangent = arguments.broadcast("clamp_ring: tangent (2,)", tangent, (2,))
+            if not tangent.any():
+                raise SceneError(f"clamp_ring: tangent is {tangent!r}; give a direction (2,), not zero")
+        node = self._end(shell, end)
+        if self.axisymmetric_shells[shell].points[node, 0] == 0.0:
+            raise SceneError(
+                f"clamp_ring: the {end} node of shell {shell} is a pole, which has its direction; use hold_ring"
+            )
+        nodes = self._nodes(shell, node)
+        support = RingSupport(shell, nodes, components, tangent=tangent, clamped=True, motion=motion, call="clamp_ring")
+        self._hold_ring(support)
 
     def symmetry_ring(self, shell: int, end: str) -> None:
         """Put a rim on a plane of symmetry across the axis, which the meridian meets at a right angle."""
@@ -134,20 +147,22 @@ class Meridians:
 
     def add_ring_force(self, shell: int, nodes, force, amplitude: Callable[[float], float] | None = None) -> None:
         """Dead force per length of ring at rest on nodes (2,) or (n, 2): radial and axial [N/m]."""
-        nodes = self._nodes(shell, nodes)
+        nodes = arguments.once("add_ring_force: nodes", self._nodes(shell, nodes))
         radius = self.axisymmetric_shells[shell].points[nodes, 0]
         if not radius.all():
             raise SceneError(f"add_ring_force: shell {shell} has a pole there; use add_pole_force")
-        force = _forces("add_ring_force", force, (len(nodes), 2))
-        self.ring_loads.append(RingLoad(shell, nodes, 2.0 * np.pi * radius[:, None] * force, _amplitude(amplitude)))
+        force = arguments.broadcast("add_ring_force: force", force, (len(nodes), 2))
+        amplitude = arguments.amplitude("add_ring_force", amplitude)
+        self.ring_loads.append(RingLoad(shell, nodes, 2.0 * np.pi * radius[:, None] * force, amplitude))
 
     def add_pole_force(self, shell: int, force: float, end: str = "first", amplitude=None) -> None:
         """Dead axial force [N] on a pole."""
         node = self._end(shell, end)
         if self.axisymmetric_shells[shell].points[node, 0] != 0.0:
             raise SceneError(f"add_pole_force: the {end} node of shell {shell} is no pole; use add_ring_force")
-        force = np.array([[0.0, validate.number("add_pole_force: force", force)]])
-        self.ring_loads.append(RingLoad(shell, self._nodes(shell, node), force, _amplitude(amplitude)))
+        force = np.array([[0.0, arguments.number("add_pole_force: force", force)]])
+        amplitude = arguments.amplitude("add_pole_force", amplitude)
+        self.ring_loads.append(RingLoad(shell, self._nodes(shell, node), force, amplitude))
 
     def add_axisymmetric_pressure(
         self, shell: int, pressure, edges=None, *, dead: bool = False, amplitude=None
@@ -159,41 +174,39 @@ class Meridians:
         """
         self._check_axisymmetric(shell)
         count = len(self.axisymmetric_shells[shell].points) - 1
-        index = np.arange(count) if edges is None else np.array(validate.indices("edges", edges), int)
+        what = "add_axisymmetric_pressure"
+        index = slice(None) if edges is None else edges
+        index = arguments.once(f"{what}: edges", arguments.indices(f"{what}: edges", index, count))
         bad = index[(index < 0) | (index >= count)]
         if bad.size:
-            raise SceneError(f"add_axisymmetric_pressure: edge {bad[0]} does not exist; shell {shell} has {count}")
-        pressure = _forces("add_axisymmetric_pressure", pressure, index.shape)
-        self.ring_pressures.append(RingPressure(shell, index, pressure, dead, _amplitude(amplitude)))
+            raise SceneError(f"{what}: edge {bad[0]} does not exist; shell {shell} has {count}")
+        pressure = arguments.broadcast(f"{what}: pressure", pressure, index.shape)
+        dead, amplitude = arguments.flag(f"{what}: dead", dead), arguments.amplitude(what, amplitude)
+        self.ring_pressures.append(RingPressure(shell, index, pressure, dead, amplitude))
 
     def _hold_ring(self, support: RingSupport) -> None:
-        if not support.components or set(support.components) - set("xz"):
-            raise SceneError(f"ring support: components {support.components!r}; they are 'x' (radius), 'z' or both")
+        arguments.components(support.call, support.components, "xz")
         motion = support.motion
-        if motion is not None and not isinstance(motion, Motion):
-            raise SceneError(f"ring support: motion is {motion!r}; give Motion(translation=..., angle=...)")
-        if motion is not None and not motion.planar:
+        validate.check_motion(support.call, motion, planar=True)
+        if motion is not None and motion.count not in (None, len(support.nodes)):
             raise SceneError(
-                f"ring support: the motion turns about {tuple(motion.axis)}; a meridian stays in the plane of x and z, give "
-                "axis=(0, 1, 0)"
+                f"{support.call}: the motion has {motion.count} displacements of {len(support.nodes)} nodes; give one for each"
             )
         self.ring_supports.append(support)
 
     def _end(self, shell, end: str) -> int:
         self._check_axisymmetric(shell)
-        if end not in ENDS:
-            raise SceneError(f"end is {end!r}; it is 'first' or 'last'")
-        return ENDS[end]
+        return ENDS[arguments.choice("end", end, tuple(ENDS))]
 
     def _check_axisymmetric(self, shell) -> None:
         count = len(self.axisymmetric_shells)
-        if not 0 <= validate.index("shell", shell) < count:
+        if not 0 <= arguments.index("shell", shell) < count:
             raise SceneError(f"axisymmetric shell {shell} does not exist; the scene has {count} so far")
 
     def _nodes(self, shell, nodes) -> np.ndarray:
         self._check_axisymmetric(shell)
         count = len(self.axisymmetric_shells[shell].points)
-        index = np.array(validate.indices("nodes", nodes), int)
+        index = arguments.indices("nodes", nodes, count)
         bad = index[(index < -count) | (index >= count)]
         if bad.size:
             raise SceneError(f"node {bad[0]} does not exist: axisymmetric shell {shell} has {count} nodes")
@@ -208,7 +221,10 @@ def _check_meridian(points: np.ndarray, thickness: np.ndarray, name: str) -> Non
         (~np.isfinite(points).all(1), "node {} is at a non-finite position"),
         (points[:, 0] < 0.0, "node {} has a negative radius"),
         (inner & (points[:, 0] == 0.0), "node {} is on the axis; only the ends of a meridian may be"),
-        (lengths == 0.0, "edge {} has no length; remove the doubled node"),
+        (
+            lengths <= validate.DOUBLED * lengths.max(),
+            "edge {} has no length, two nodes lie at one point; remove one of them",
+        ),
     ):
         for node in np.flatnonzero(bad)[:1]:
             raise SceneError(f"axisymmetric shell '{name}': {text.format(node)}")
@@ -216,19 +232,3 @@ def _check_meridian(points: np.ndarray, thickness: np.ndarray, name: str) -> Non
         raise SceneError(
             f"axisymmetric shell '{name}': thickness is {thickness}; give one positive number or {len(lengths)} of edges"
         )
-
-
-def _forces(what: str, values, shape) -> np.ndarray:
-    try:
-        values = np.broadcast_to(np.asarray(values, float), shape).copy()
-    except (TypeError, ValueError):
-        values = np.full(1, np.nan)
-    if not np.isfinite(values).all():
-        raise SceneError(f"{what}: give finite numbers that broadcast to {shape}")
-    return values
-
-
-def _amplitude(amplitude):
-    if amplitude is not None and not callable(amplitude):
-        raise SceneError(f"amplitude is {amplitude!r}; give a function of the time, or None")
-    return amplitude

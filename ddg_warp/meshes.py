@@ -6,6 +6,7 @@ The vertex (i, j) of a grid with m vertices in a row is i + m j.
 
 import numpy as np
 
+from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -28,6 +29,8 @@ def rectangle(nx: int, ny: int, size: tuple[float, float] = (1.0, 1.0), pattern:
     vertices, at x = 0, 1/2, 3/2, ..., nx - 1/2, nx cells.
     """
     _check_counts(nx=nx, ny=ny)
+    size = _size(size)
+    arguments.choice("pattern", pattern, ("right", "alternating", "crossed", "equilateral"))
     scale = np.array([size[0] / nx, size[1] / ny])
     if pattern == "equilateral":
         flat, triangles = _equilateral(nx, ny)
@@ -52,8 +55,9 @@ def jittered_rectangle(
     from scipy.spatial import Delaunay
 
     _check_counts(nx=nx, ny=ny)
-    if not 0.0 <= jitter < 0.5:
-        raise SceneError(f"jitter = {jitter}; it is a fraction of a cell, from 0 to less than 0.5")
+    size = _size(size)
+    arguments.number("jitter", jitter, "a fraction of a cell, from 0 to less than 0.5", lambda v: 0.0 <= v < 0.5)
+    arguments.count("seed", seed, 0)
     flat = _lattice(nx, ny)
     inside = ((flat > 0) & (flat < [nx, ny])).all(axis=1)
     flat[inside] += np.random.default_rng(seed).uniform(-jitter, jitter, (np.count_nonzero(inside), 2))
@@ -67,6 +71,7 @@ def disc(rings: int, radius: float = 1.0) -> Mesh:
     Vertex 0 is the centre; ring k has 6 k vertices from 1 + 3 k (k - 1) on, at angles from +x towards +y.
     """
     distance, angle, triangles = _rings(rings)
+    _check_lengths(radius=radius)
     return radius * _polar(distance, angle), triangles
 
 
@@ -84,7 +89,10 @@ def annulus(
     Vertex (i, j) is i + (n_radial + 1) j, with i from the inner circle outwards and j around, from +x towards +y.
     """
     _check_counts(n_radial=n_radial)
-    _check_around(n_around, 1 if slit else 3)
+    _check_around("n_around", n_around, 1 if arguments.flag("slit", slit) else 3)
+    _check_lengths(inner=inner, outer=outer)
+    if inner >= outer:
+        raise SceneError(f"inner = {inner}, outer = {outer}; the inner radius is less than the outer one")
     columns = n_around + 1 if slit else n_around
     i, j = _lattice(n_radial, columns - 1).T
     points = _polar(inner + (outer - inner) * i / n_radial, 2.0 * np.pi * j / n_around)
@@ -105,6 +113,9 @@ def cylinder_panel(
     Vertex (i, j) is i + (n_around + 1) j, with i around from -angle/2 to angle/2 and j along the axis.
     """
     _check_counts(n_around=n_around, n_along=n_along)
+    _check_lengths(radius=radius, length=length)
+    rule = "an angle in radians, more than 0 and less than 2 pi"
+    arguments.number("angle", angle, rule, lambda v: 0.0 < v < 2.0 * np.pi)
     i, j = _lattice(n_around, n_along).T
     points = radius * _polar(np.ones(len(i)), angle * (i / n_around - 0.5))
     points[:, 2] = length * j / n_along
@@ -117,7 +128,8 @@ def cylinder(n_around: int, n_along: int, radius: float, length: float, pattern:
     Vertex (i, j) is i + n_around j, with i around from +x towards +y and j along the axis; arguments as in `cylinder_panel`.
     """
     _check_counts(n_along=n_along)
-    _check_around(n_around, 3)
+    _check_around("n_around", n_around, 3)
+    _check_lengths(radius=radius, length=length)
     i, j = _lattice(n_around - 1, n_along).T
     points = radius * _polar(np.ones(len(i)), 2.0 * np.pi * i / n_around)
     points[:, 2] = length * j / n_along
@@ -131,6 +143,8 @@ def sphere(subdivisions: int, radius: float = 1.0) -> Mesh:
     """
     from ddg_warp.surface import Surface
 
+    arguments.count("subdivisions", subdivisions, 0)
+    _check_lengths(radius=radius)
     golden = 0.5 * (1.0 + np.sqrt(5.0))
     points = np.array([[0.0, s, t * golden] for s in (-1, 1) for t in (-1, 1)])
     points = np.concatenate([points, np.roll(points, 1, axis=1), np.roll(points, 2, axis=1)])
@@ -155,6 +169,8 @@ def spherical_cap(rings: int, radius: float = 1.0, angle: float = 0.5 * np.pi) -
     The vertices are numbered as in `disc`: 0 is the pole, ring k is at the angle k / rings of `angle`.
     """
     distance, around, triangles = _rings(rings)
+    _check_lengths(radius=radius)
+    arguments.number("angle", angle, "an angle in radians, more than 0 and less than pi", lambda v: 0.0 < v < np.pi)
     points = _polar(np.sin(angle * distance), around)
     points[:, 2] = np.cos(angle * distance)
     return radius * points, triangles
@@ -170,8 +186,11 @@ def torus(n_around: int, n_tube: int, major: float, minor: float, pattern: str =
 
     Vertex (i, j) is i + n_around j, with i around the axis from +x towards +y, and j around the tube from outside towards +z.
     """
-    _check_around(n_around, 3)
-    _check_around(n_tube, 3)
+    _check_around("n_around", n_around, 3)
+    _check_around("n_tube", n_tube, 3)
+    _check_lengths(major=major, minor=minor)
+    if minor >= major:
+        raise SceneError(f"major = {major}, minor = {minor}; a tube that does not meet itself is thinner than its ring")
     i, j = _lattice(n_around - 1, n_tube - 1).T
     tube = 2.0 * np.pi * j / n_tube
     points = _polar(major + minor * np.cos(tube), 2.0 * np.pi * i / n_around)
@@ -179,15 +198,50 @@ def torus(n_around: int, n_tube: int, major: float, minor: float, pattern: str =
     return points, _grid(n_around, n_tube, pattern, wrap_x=True, wrap_y=True)
 
 
+def weld(points, triangles, tolerance: float) -> Mesh:
+    """The mesh with vertices that lie within a tolerance [m] of each other made one, and triangles that shrink by it left out.
+
+    Raises:
+        SceneError: no positive tolerance, or one that leaves no triangle.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    arguments.positive("weld: tolerance", tolerance, "m")
+    points, triangles = np.asarray(points, float), np.asarray(triangles)
+    pairs = cKDTree(points).query_pairs(tolerance, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points), len(points)))
+    count, group = connected_components(graph, directed=False)
+    first = np.full(count, len(points))
+    np.minimum.at(first, group, np.arange(len(points)))
+    kept, place = np.unique(first[group], return_inverse=True)  # the first of each group says where, in the order given
+    triangles = place.reshape(-1)[triangles]
+    triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
+    if not len(triangles):
+        raise SceneError(f"weld: a tolerance of {tolerance} m leaves no triangle; give less than the lengths of edges")
+    return points[kept], triangles
+
+
 def _check_counts(**counts: int) -> None:
     for name, value in counts.items():
-        if value < 1:
-            raise SceneError(f"{name} = {value}; it is a number of cells, at least 1")
+        arguments.count(name, value)
 
 
-def _check_around(count: int, least: int) -> None:
-    if count < least:
-        raise SceneError(f"{count} cells around; it takes at least {least}")
+def _check_around(name: str, value: int, least: int) -> None:
+    arguments.count(f"{name} (cells around)", value, least)
+
+
+def _check_lengths(**lengths: float) -> None:
+    for name, value in lengths.items():
+        arguments.positive(name, value, "m")
+
+
+def _size(size) -> np.ndarray:
+    size = arguments.broadcast("size", size, (2,))
+    if np.any(size <= 0.0):
+        raise SceneError(f"size = {tuple(size.tolist())}; give two positive lengths [m]")
+    return size
 
 
 def _lattice(nx: int, ny: int) -> np.ndarray:
@@ -207,6 +261,7 @@ def _polar(distance: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 def _grid(nx: int, ny: int, pattern: str, wrap_x: bool = False, wrap_y: bool = False) -> np.ndarray:
     """Triangles of nx x ny cells; where it wraps, the last row or column of vertices is the first."""
+    arguments.choice("pattern", pattern, ("right", "alternating"))
     mx, my = nx if wrap_x else nx + 1, ny if wrap_y else ny + 1
     j, i = np.divmod(np.arange(nx * ny), nx)
     a, b = i + mx * j, (i + 1) % mx + mx * j
@@ -214,12 +269,10 @@ def _grid(nx: int, ny: int, pattern: str, wrap_x: bool = False, wrap_y: bool = F
     rising = np.stack([a, b, c, a, c, d], axis=1)
     if pattern == "right":
         return rising.reshape(-1, 3)
-    if pattern == "alternating":
-        if (wrap_x and nx % 2) or (wrap_y and ny % 2):
-            raise SceneError(f"{nx} x {ny} cells of pattern 'alternating': give an even number of cells around")
-        falling = np.stack([a, b, d, b, c, d], axis=1)
-        return np.where(((i + j) % 2 == 0)[:, None], rising, falling).reshape(-1, 3)
-    raise SceneError(f"there is no pattern '{pattern}' of this mesh; its docstring lists them")
+    if (wrap_x and nx % 2) or (wrap_y and ny % 2):
+        raise SceneError(f"{nx} x {ny} cells of pattern 'alternating': give an even number of cells around")
+    falling = np.stack([a, b, d, b, c, d], axis=1)
+    return np.where(((i + j) % 2 == 0)[:, None], rising, falling).reshape(-1, 3)
 
 
 def _crossed(nx: int, ny: int) -> Mesh:

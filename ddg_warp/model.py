@@ -5,12 +5,13 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays, axisymmetric
+from ddg_warp import arrays, axisymmetric, validate
 from ddg_warp.chains import compile_chains, scene_motions
 from ddg_warp.errors import SceneError
 from ddg_warp.group import Group
 from ddg_warp.io import Curves, Surfaces
 from ddg_warp.kernels import element, step
+from ddg_warp.kernels.densities import valid
 from ddg_warp.precision import choose, warn_of_rounding
 from ddg_warp.state import GroupState, State
 from ddg_warp.threads import launches
@@ -34,10 +35,8 @@ class Model:
     def __init__(
         self, scene, *, device=None, precision: str | None = None, worlds: int = 1, allow_rounding: bool = False
     ):
-        if worlds < 1:
-            raise SceneError(f"worlds = {worlds}; there is at least one")
         self.scene = scene
-        self.wp_device = wp.get_device(device or ("cuda:0" if wp.is_cuda_available() else "cpu"))
+        self.wp_device = _device(device)
         self.types = choose(precision, self.wp_device)
         self.worlds = worlds
         self.version = 0  # rises with every change of a constant array, so that captured steps are captured anew
@@ -58,6 +57,18 @@ class Model:
         motions = [place[id(s.motion)] if turns else -1 for s, turns in zip(supports, turning, strict=True)]
         net = compile_net(self.scene)
         return DeviceNet(net, self.worlds, self.wp_device, self.types.real, np.array(motions, int))
+
+    def __repr__(self) -> str:
+        scene, net = self.scene, self.net
+        lines = [f"<Model on {self.device} in {self.precision}, {self.worlds} worlds of {self.points_count} points:"]
+        if self.groups:
+            lines.append(f"{sum(group.rods for group in self.groups)} rods of their own in {len(self.groups)} groups,")
+        if net:
+            rods, shells, turned = len(net.host.rods), len(net.host.shells), len(scene.axisymmetric_shells)
+            lines.append(
+                f"a net of {rods} rods, {shells} shells, {turned} shells of revolution ({net.host.blocks} blocks);"
+            )
+        return "\n ".join([*lines, "model.report() says more>"])
 
     @property
     def device(self) -> str:
@@ -138,18 +149,21 @@ class Model:
         """Energies by term at a state [J]; see `ddg_warp.inquiry`."""
         from ddg_warp.inquiry import energies
 
+        validate.check_state("energies", self, state)
         return energies(self, state)
 
     def reactions(self, state: State, **options) -> list:
         """Forces and moments of the supports; see `ddg_warp.inquiry.reactions`."""
         from ddg_warp.inquiry import reactions
 
+        validate.check_state("reactions", self, state)
         return reactions(self, state, **options)
 
     def stresses(self, state: State) -> dict:
         """Axial forces and moments along the rods; see `ddg_warp.inquiry.stresses`."""
         from ddg_warp.inquiry import stresses
 
+        validate.check_state("stresses", self, state)
         return stresses(self, state)
 
     def set_parameter(self, term: str, parameter: str, values) -> None:
@@ -161,28 +175,32 @@ class Model:
                 rod of a group, those of clamped ends included.
 
         Raises:
-            ValueError: no rod has the term, the term has no such parameter, or the shape or a value is wrong.
+            ValueError: nothing has the term, the term has no such parameter, or the shape or a value is wrong; nothing is changed.
         """
-        values = np.asarray(values, float)
-        if not np.isfinite(values).all():
-            raise ValueError(f"{term}.{parameter}: value {int(np.flatnonzero(~np.isfinite(values))[0])} is not finite")
-        found = False
+        terms = {t.name: t for group in self.groups for t in group.kind.terms}
+        terms |= {part.term.name: part.term for part in (self.net.sets if self.net is not None else ())}
+        if not isinstance(term, str) or term not in terms:
+            raise ValueError(
+                f"set_parameter: no rod or shell has the term {term!r}; this model has {', '.join(sorted(terms))}"
+            )
+        names = terms[term].parameter_names
+        if not isinstance(parameter, str) or parameter not in names:
+            raise ValueError(f"set_parameter: {term} has no parameter {parameter!r}; it has {', '.join(names)}")
+        row, name, (rule, holds) = names.index(parameter), f"{term}.{parameter}", valid(parameter)
+        try:
+            values = np.array(values, float)
+        except (TypeError, ValueError):
+            raise ValueError(f"{name} = {values!r}; give numbers") from None
+        bad = np.flatnonzero(~(np.isfinite(values) & holds(values)))
+        if bad.size:
+            raise ValueError(f"{name}: value {bad[0]} is {values.ravel()[bad[0]]:g}; it is finite and {rule}")
         for group in self.groups:
             for candidate, place in zip(group.kind.terms, group.kind.places(), strict=True):
                 if candidate.name == term:
-                    if parameter not in candidate.parameter_names:
-                        raise ValueError(
-                            f"{term} has no parameter {parameter!r}; it has {', '.join(candidate.parameter_names)}"
-                        )
-                    row = place[0] + candidate.parameter_names.index(parameter)
-                    group.set_parameter(row, values, f"{term}.{parameter}")
-                    found = True
+                    group.set_parameter(place[0] + row, values, name)
         for part in self.net.sets if self.net is not None else ():
-            if part.term.name == term and parameter in part.term.parameter_names:
-                part.set_parameter(part.term.parameter_names.index(parameter), values, f"{term}.{parameter}")
-                found = True
-        if not found:
-            raise ValueError(f"no rod has the term {term!r}; this model has {', '.join(self._term_names())}")
+            if part.term.name == term:
+                part.set_parameter(row, values, name)
         self.version += 1
 
     def set_rest(self, shell: int, *, points=None, metric=None, curvature=None, angle=None) -> None:
@@ -204,10 +222,6 @@ class Model:
         from ddg_warp.rest_shapes import set_rest
 
         set_rest(self, shell, points=points, metric=metric, curvature=curvature, angle=angle)
-
-    def _term_names(self) -> list[str]:
-        nets = [part.term.name for part in self.net.sets] if self.net is not None else []
-        return sorted({term.name for group in self.groups for term in group.kind.terms} | set(nets))
 
     def parameters(self) -> dict[str, np.ndarray]:
         """Parameters of all terms by name, `group/term/parameter`, broadcastable to (node, column of the group)."""
@@ -284,7 +298,7 @@ class Model:
         return out.reshape(-1, 3)
 
     def _point_values(self, values, what: str) -> np.ndarray:
-        values, count = np.asarray(values, float), self.points_count
+        values, count = _numbers(what, values), self.points_count
         if values.shape not in ((count, 3), (self.worlds, count, 3)):
             raise ValueError(f"{what} have shape {values.shape}; they are ({count}, 3), or one such array a world")
         if not np.isfinite(values).all():
@@ -301,7 +315,7 @@ class Model:
     def _edge_values(self, values) -> tuple[np.ndarray, np.ndarray]:
         """Spins in the user's order, checked, and where the edges of each rod begin."""
         counts = self.curves.counts - np.where(self.curves.closed, 0, 1)
-        values = np.asarray(values, float)
+        values = _numbers("spins", values)
         if values.shape not in ((counts.sum(),), (self.worlds, counts.sum())):
             raise ValueError(f"spins have shape {values.shape}; they are ({counts.sum()},), or one such array a world")
         if not np.isfinite(values).all():
@@ -319,6 +333,8 @@ class Model:
         Raises:
             ValueError: the snapshot is of another model.
         """
+        if not isinstance(snapshot, dict):
+            raise ValueError(f"restore: {type(snapshot).__name__} is no snapshot; give what state.snapshot() returns")
         state = self.empty_state()
         names = {"time"} | {f"{part}/{name}" for part, data in state.parts().items() for name in data.arrays()}
         if names ^ set(snapshot):
@@ -441,6 +457,22 @@ class Model:
             u, t = np.moveaxis(frame[0:3], 0, -1), np.moveaxis(frame[3:6], 0, -1)
             values.append(u * np.cos(theta)[..., None] + np.cross(t, u) * np.sin(theta)[..., None])
         return self._gather_edges(values, net, 3)
+
+
+def _device(name):
+    """A Warp device by its name; by default CUDA if there is one."""
+    try:
+        return wp.get_device(name or ("cuda:0" if wp.is_cuda_available() else "cpu"))
+    except (ValueError, RuntimeError, TypeError, AttributeError):
+        known = ", ".join(device.alias for device in wp.get_devices())
+        raise SceneError(f"device is {name!r}; there is {known}") from None
+
+
+def _numbers(what: str, values) -> np.ndarray:
+    try:
+        return np.asarray(values, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{what} are no array of numbers: {values!r}") from None
 
 
 def needs_net(scene) -> bool:

@@ -1,9 +1,14 @@
-"""Prescribed motion of supports: rigid motions that count their turns."""
+"""Prescribed motion of supports: rigid motions that count their turns, and displacements node by node."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+
+from ddg_warp import arguments
+from ddg_warp.errors import SceneError, SolverError
+
+JUMP = 0.25  # part of its change over a step that a motion makes at one instant, from which it is a jump
 
 
 def _still(t: float) -> tuple[float, float, float]:
@@ -21,8 +26,11 @@ class Motion:
     A point X of the rest state is at pivot + R(angle(t)) (X - pivot) + translation(t). The angle is cumulative: it counts turns
     past 2 pi, however far it goes in a step, so that an end can be wound up. In statics t is the load parameter.
 
+    Both are zero at t = 0: supports start where they are at rest.
+
     Attributes:
-        translation: t -> displacement (3,) [m].
+        translation: t -> displacement (3,) [m]; or (n, 3), one for each node that `fix` names (of one rod after the other), or each
+            vertex that `hold` does, in that order.
         angle: t -> cumulative angle about `axis` [rad].
         axis: direction of the rotation (3,), any length.
         pivot: a point on the axis (3,) [m].
@@ -32,14 +40,23 @@ class Motion:
     angle: Callable[[float], float] = _unturned
     axis: tuple = (0.0, 0.0, 1.0)
     pivot: tuple = (0.0, 0.0, 0.0)
+    count: int | None = field(init=False, default=None, repr=False, compare=False)  # of nodes, one displacement each
     _unit: np.ndarray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self):
-        axis = np.asarray(self.axis, float)
-        length = np.linalg.norm(axis)
-        if not (axis.shape == (3,) and np.isfinite(length) and length > 0.0):
-            raise ValueError(f"Motion: axis {self.axis} is no direction; give three numbers, not all zero")
-        object.__setattr__(self, "_unit", axis / length)
+        for name in ("translation", "angle"):
+            function = getattr(self, name)
+            if not callable(function):
+                raise SceneError(f"Motion: {name} is {function!r}; give a function of the time, such as lambda t: ...")
+        for name in ("axis", "pivot"):
+            arguments.vector(f"Motion: {name}", getattr(self, name))
+        length = np.linalg.norm(self.axis)
+        if not length > 0.0:
+            raise SceneError(f"Motion: axis {self.axis} is no direction; give three numbers, not all zero")
+        object.__setattr__(self, "_unit", np.asarray(self.axis, float) / length)
+        shift = arguments.value_at("Motion: translation", self.translation, 0.0, 3, error=SceneError)
+        arguments.value_at("Motion: angle", self.angle, 0.0, error=SceneError)
+        object.__setattr__(self, "count", len(shift) if shift.ndim == 2 else None)
 
     @property
     def turns(self) -> bool:
@@ -51,18 +68,54 @@ class Motion:
         """Whether what lies in the plane of x and z turns within it."""
         return not self.turns or (self.axis[0] == 0.0 and self.axis[2] == 0.0)
 
+    def shift(self, t: float) -> np.ndarray:
+        """Translations at t, (1, 3) or (n, 3) [m].
+
+        Raises:
+            SolverError: they are not finite, or not as many as at t = 0.
+        """
+        value = arguments.value_at("the motion's translation", self.translation, t, 3)
+        if (len(value) if value.ndim == 2 else None) != self.count:
+            raise SolverError(
+                f"the motion's translation has shape {value.shape} at t = {t:g}, another one than at t = 0; keep its shape",
+                outcome=arguments.PRESCRIBED,
+            )
+        return np.atleast_2d(value)
+
+    def turned(self, t: float) -> float:
+        """Cumulative angle at t [rad].
+
+        Raises:
+            SolverError: it is not finite.
+        """
+        return float(arguments.value_at("the motion's angle", self.angle, t))
+
     def pose(self, t0: float, t1: float) -> np.ndarray:
-        """What the device needs of a step from t0 to t1: turn (3), rotation at t0 (9), pivot (3), translations (3, 3)."""
-        a0, a1 = float(self.angle(t0)), float(self.angle(t1))
-        return np.concatenate(
-            [
-                self._unit * (a1 - a0),
-                self.rotation(a0).ravel(),
-                self.pivot,
-                np.asarray(self.translation(t0), float),
-                np.asarray(self.translation(t1), float),
-            ]
-        )
+        """What the device needs of a step from t0 to t1: turn (3), rotation at t0 (9), pivot (3), translations (3, 3) in a row.
+
+        One row, or one for each node.
+        """
+        a0, a1 = self.turned(t0), self.turned(t1)
+        first, last = self.shift(t0), self.shift(t1)
+        same = np.concatenate([self._unit * (a1 - a0), self.rotation(a0).ravel(), self.pivot])
+        return np.column_stack([np.tile(same, (len(first), 1)), first, last])
+
+    def jump(self, t0: float, t1: float) -> float | None:
+        """A time between t0 and t1 at which the motion jumps, found by halving where it changes most; None where it does not."""
+
+        def at(t):
+            return np.append(self.shift(t).ravel(), self.turned(t))
+
+        low, high = at(t0), at(t1)
+        whole = np.abs(high - low).max()
+        while t1 - t0 > 64.0 * np.spacing(max(abs(t0), abs(t1))):
+            middle = 0.5 * (t0 + t1)
+            here = at(middle)
+            if np.abs(here - low).max() >= np.abs(high - here).max():
+                t1, high = middle, here
+            else:
+                t0, low = middle, here
+        return t1 if np.abs(high - low).max() > JUMP * whole > 0.0 else None
 
     def rotation(self, angle: float) -> np.ndarray:
         """Rotation matrix about the axis (Rodrigues)."""
@@ -70,14 +123,14 @@ class Motion:
         cross = np.array([[0.0, -k[2], k[1]], [k[2], 0.0, -k[0]], [-k[1], k[0], 0.0]])
         return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
 
-    def place(self, t: float, points: np.ndarray) -> np.ndarray:
-        """Where points of the rest state (n, 3) are at t [m]."""
-        turned = (points - self.pivot) @ self.rotation(float(self.angle(t))).T
-        return turned + self.pivot + np.asarray(self.translation(t), float)
+    def place(self, t: float, points: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Where points of the rest state (n, 3) are at t [m]; `rows` are those of their translations where each has its own."""
+        turned = (points - self.pivot) @ self.rotation(self.turned(t)).T
+        return turned + self.pivot + self.shift(t)[slice(None) if self.count is None else rows]
 
     def turn(self, t: float, vectors: np.ndarray) -> np.ndarray:
         """Where vectors of the rest state (n, 3) point at t."""
-        return vectors @ self.rotation(float(self.angle(t))).T
+        return vectors @ self.rotation(self.turned(t)).T
 
     def director_angle(self, t0: float, t1: float, rest: np.ndarray, frame: np.ndarray, edge: np.ndarray, angle: float):
         """Angle at t1 of the director `rest` (3,) of the rest state, from an edge's transported reference director [rad].
@@ -91,7 +144,7 @@ class Motion:
         b = np.cross(t_old, t)
         c = t_old @ t
         u = u0 * c + np.cross(b, u0) + b * (b @ u0) / (1.0 + c)
-        a0, a1 = float(self.angle(t0)), float(self.angle(t1))
+        a0, a1 = self.turned(t0), self.turned(t1)
         d = self.rotation(a1) @ rest
         new = np.arctan2(np.cross(u, d) @ t, u @ d)
         expected = angle + (self._unit @ t) * (a1 - a0)

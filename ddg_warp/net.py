@@ -12,7 +12,7 @@ import numpy as np
 from ddg_warp import axisymmetric, shell_geometry
 from ddg_warp import shells as shell_terms
 from ddg_warp.chains import Piece
-from ddg_warp.net_loads import NetCouple, NetLoad, NetPressure
+from ddg_warp.net_loads import NetCouple, NetEdgeCouple, NetLoad, NetPressure
 from ddg_warp.precision import float32_error, float32_errors
 from ddg_warp.surface import Surface
 from ddg_warp.tolerance import Bodies
@@ -68,10 +68,11 @@ class NetSet:
 
 @dataclass(frozen=True)
 class NetHeld:
-    """Dofs that a support holds: (block, component) pairs."""
+    """Dofs that a support holds: (block, component) pairs; or the blocks on an oblique plane with this normal."""
 
     blocks: np.ndarray
     components: np.ndarray
+    normal: tuple | None = None
 
 
 @dataclass(eq=False)
@@ -85,9 +86,11 @@ class Net:
         sets: elements by term.
         ends: nodes of every rod edge (rod_edges, 2); frame: director and tangent of it (6, rod_edges).
         mass: of every dof (N, 3) [kg, kg m^2]; fixed: held dofs (N, 3).
-        load: dead forces (N, 3); timed: those that change; pressures, bands, couples: loads that follow what they act on.
+        load: dead forces (N, 3); timed: those that change; pressures, bands, couples, edge_couples: loads that follow what they act on.
         held: what each support of `scene.supports`, then of `scene.shell_supports` and `scene.ring_supports`, holds here.
-        moving: (blocks, motion, components (3,) bool) of nodes with a motion; turning: (angle blocks, motion) of rod edges.
+        moving: (blocks, motion, components (3,) bool, rows of its displacements) of nodes with a motion.
+        turning: (angle blocks, motion) of rod edges.
+        frames: orthonormal rows (3, 3) that the held components of a node on an oblique plane refer to; see `net_planes`.
     """
 
     rest: np.ndarray
@@ -105,11 +108,13 @@ class Net:
     timed: list[NetLoad] = field(default_factory=list)
     pressures: list[NetPressure] = field(default_factory=list)
     held: list[NetHeld] = field(default_factory=list)
-    moving: list[tuple[np.ndarray, int, np.ndarray]] = field(default_factory=list)
+    moving: list[tuple[np.ndarray, int, np.ndarray, np.ndarray]] = field(default_factory=list)
     turning: list[tuple[np.ndarray, int]] = field(default_factory=list)
     meridians: list[axisymmetric.NetMeridian] = field(default_factory=list)
     bands: list[axisymmetric.NetBand] = field(default_factory=list)
     couples: list[NetCouple] = field(default_factory=list)
+    edge_couples: list[NetEdgeCouple] = field(default_factory=list)
+    frames: dict[int, np.ndarray] = field(default_factory=dict)
 
     @property
     def blocks(self) -> int:
@@ -117,9 +122,17 @@ class Net:
         return len(self.rest)
 
     @property
+    def holds(self) -> np.ndarray:
+        """Whether something of every dof in space is held (N, 3) bool."""
+        result = self.fixed.copy()
+        for block, frame in self.frames.items():
+            result[block] = (np.abs(frame[self.fixed[block]]) > 1e-9).any(0)
+        return result
+
+    @property
     def followers(self) -> list:
         """Loads that follow what they act on, each with `places`, `forces` and their `derivative`."""
-        return [*self.pressures, *self.bands, *self.couples]
+        return [*self.pressures, *self.bands, *self.couples, *self.edge_couples]
 
     @cached_property
     def bodies(self) -> Bodies:

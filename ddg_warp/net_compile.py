@@ -12,10 +12,8 @@ from ddg_warp import shells as shell_terms
 from ddg_warp.chains import Ghosts, Piece, net_rods, pieces_of
 from ddg_warp.errors import SceneError
 from ddg_warp.net import Net, NetRod, NetShell
+from ddg_warp.structures import COINCIDE
 from ddg_warp.surface import Surface
-from ddg_warp.validate import check_index
-
-COINCIDE = 1e-6  # how far joined nodes may lie apart, over the largest of their coordinates
 
 
 def compile_net(scene) -> Net | None:
@@ -46,7 +44,7 @@ def compile_net(scene) -> Net | None:
 
 def spatial_scene(scene):
     """The scene as one of dimension 3, for what is compiled as in space."""
-    return replace(scene, dimension=3) if scene.dimension == 2 else scene
+    return scene.copy(dimension=3) if scene.dimension == 2 else scene
 
 
 def _spatial(batch):
@@ -96,8 +94,7 @@ class _Builder:
 
     def add_shell(self, shell) -> None:
         """Number a shell's vertices."""
-        surface = Surface(shell.points, shell.triangles)
-        self.shells.append((surface, self._number(shell.points)))
+        self.shells.append((shell.surface, self._number(shell.points)))
 
     def add_meridian(self, shell) -> None:
         """Number the nodes of a shell of revolution."""
@@ -122,21 +119,24 @@ class _Builder:
         shells, mesh_edges = [], 0
         for (surface, numbers), shell in zip(self.shells, scene.shells, strict=True):
             kinds, supports = self._kinds(surface, len(shells))
-            turning = shell.bending in shell_terms.TURNING
+            turning = shell.bending in shell_geometry.TURNING
             first = nodes + self.rod_edges + mesh_edges
             angle = first + np.arange(len(surface.edges)) if turning else np.full(len(surface.edges), -1)
             mesh_edges += len(surface.edges) if turning else 0
             material = shell.material
-            plate = shell_terms.plate(
-                surface,
-                shell.points,
-                shell.thickness,
-                material.young,
-                material.poisson,
-                kinds,
-                rest=shell.rest,
-                viscosity=material.viscosity if material.viscosity > 0.0 else None,
-            )
+            try:
+                plate = shell_terms.plate(
+                    surface,
+                    shell.points,
+                    shell.thickness,
+                    material.young,
+                    material.poisson,
+                    kinds,
+                    rest=shell.rest,
+                    viscosity=material.viscosity if np.any(np.asarray(material.viscosity) > 0.0) else None,
+                )
+            except SceneError as error:
+                raise SceneError(f"shell '{shell.name}': {error}") from None
             shells.append(NetShell(surface, merged[numbers], angle, kinds, supports, plate))
         angles = self.rod_edges + mesh_edges
         spins = sum(joint.rigid for joint in scene.joints)
@@ -186,15 +186,12 @@ class _Builder:
         for number, joint in enumerate(self.scene.joints):
             places = []
             for rod, node in joint.members:
-                nodes = self.rods[rod].nodes
-                check_index("node", node, np.array([len(nodes)]), np.array([rod]))
-                places.append(nodes[node])
+                places.append(self.rods[rod].nodes[node])
             for place in places[1:]:
                 unite(places[0], place, f"joint {number}: its members")
         for link in self.scene.attachments:
             nodes, vertices = self.rods[link.rod].nodes, self.shells[link.shell][1]
             for node, vertex in zip(link.nodes, link.vertices, strict=True):
-                check_index("node", int(node), np.array([len(nodes)]), np.array([link.rod]))
                 unite(nodes[node], vertices[vertex], f"node {node} of rod {link.rod} and vertex {vertex}")
         if not pairs:
             return np.arange(len(points))

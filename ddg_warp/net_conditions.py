@@ -3,11 +3,15 @@
 import numpy as np
 
 from ddg_warp import axisymmetric
-from ddg_warp.chains import component_bits, scene_motions
+from ddg_warp.chains import FREE, STILL, component_bits, disagreement, pose_starts, scene_motions
 from ddg_warp.errors import SceneError
 from ddg_warp.net import Net, NetHeld, NetRod
-from ddg_warp.net_loads import NetCouple, NetLoad, NetPressure
+from ddg_warp.net_loads import NetCouple, NetEdgeCouple, NetLoad, NetPressure
+from ddg_warp.net_planes import frames_of_planes
+from ddg_warp.shell_geometry import FREE as FREE_EDGE
 from ddg_warp.validate import check_index
+
+_NONE = np.zeros(0, int)
 
 
 def add_masses(scene, net: Net) -> None:
@@ -32,57 +36,78 @@ def add_masses(scene, net: Net) -> None:
 def hold(scene, net: Net) -> None:
     """Mark held dofs; remember what each support holds and what moves."""
     members = {rod.rod: rod for rod in net.rods}
-    motions = scene_motions(scene)
+    claims = _Claims(net, scene_motions(scene))
     for support in scene.supports:
-        bits = component_bits(support.components, 3)
-        nodes, edges = [], []
-        for index in support.rods:
+        nodes, edges, rows = [], [], []
+        for place, index in enumerate(support.rods):
             rod = members.get(int(index))
             if rod is None:
                 continue
-            for node in support.nodes:
-                check_index("node", node, np.array([len(rod.nodes)]), np.array([rod.rod]))
+            for nth, node in enumerate(support.nodes):
                 nodes.append(rod.nodes[node])
+                rows.append(place * len(support.nodes) + nth)
             for edge in support.edges:
                 if rod.edges.size:
                     edges.append(rod.edges[edge])
             if support.end:
                 last = support.end == "last"
                 nodes += [rod.all_nodes[-1 if last else 0], rod.nodes[-1 if last else 0]]
+                rows += [0, 0]
                 edges += [rod.all_edges[-1 if last else 0]] if rod.all_edges.size else []
-        _mark(net, np.array(nodes, int), bits, np.array(edges, int), support.motion, motions)
+        claims.mark(np.array(nodes, int), np.array(rows, int), support, np.array(edges, int))
+    normals: dict[int, list] = {}
     for support in scene.shell_supports:
         nodes = net.shells[support.shell].nodes[support.vertices]
-        _mark(net, nodes, component_bits(support.components, 3), np.zeros(0, int), support.motion, motions)
+        claims.mark(nodes, np.arange(len(nodes)), support)
+        for node in nodes if not support.components else ():
+            normals.setdefault(int(node), []).append(support.normal)
     for support in scene.ring_supports:
         nodes = net.meridians[support.shell].nodes[support.nodes]
-        _mark(net, nodes, component_bits(support.components, 3), np.zeros(0, int), support.motion, motions)
+        claims.mark(nodes, np.arange(len(nodes)), support)
+    frames_of_planes(net, normals, (claims.poses > STILL).any(1))
 
 
-def _mark(net: Net, nodes, bits: int, edges, motion, motions) -> None:
-    components = np.array([d for d in range(3) if (bits >> d) & 1])
-    pairs = np.array([(n, d) for n in nodes for d in components] + [(e, 0) for e in edges], int).reshape(-1, 2)
-    net.fixed[pairs[:, 0], pairs[:, 1]] = True
-    net.held.append(NetHeld(pairs[:, 0], pairs[:, 1]))
-    if motion is not None:
-        index = next(i for i, m in enumerate(motions) if m is motion)
-        held = np.isin(np.arange(3), components)
-        for other, at, same in net.moving:
-            if at != index and (held & same).any() and (twice := np.intersect1d(nodes, other)).size:
-                place = ", ".join(f"{x:g}" for x in net.rest[twice[0]])
-                raise SceneError(
-                    f"the point at ({place}) m has two motions along {'xyz'[np.argmax(held & same)]}; "
-                    "give it one that does both"
-                )
-        for other, at in net.turning:
-            if at != index and (twice := np.intersect1d(edges, other)).size:
-                rod = next(rod for rod in net.rods if twice[0] in rod.all_edges)
-                edge = int(np.flatnonzero(rod.all_edges == twice[0])[0]) - rod.first
-                raise SceneError(f"edge {edge} of rod {rod.rod} is turned by two motions; give it one that does both")
-            edges = np.setdiff1d(edges, other)  # an angle is counted on from where it is: once
-        net.moving.append((nodes, index, held))
-        if len(edges):
-            net.turning.append((np.unique(edges), index))
+class _Claims:
+    """Which pose moves each held dof of the net; a dof that two poses, or one and a still support, claim is refused."""
+
+    def __init__(self, net: Net, motions: list):
+        self.net, self.motions, self.start = net, motions, pose_starts(motions)
+        self.poses = np.full((net.blocks, 3), FREE)
+
+    def mark(self, nodes: np.ndarray, rows: np.ndarray, support, edges: np.ndarray = _NONE) -> None:
+        """Hold nodes, the `rows` of their displacements where a motion has one for each, and angles of edges."""
+        net, bits = self.net, component_bits(support.components, 3)
+        components = np.array([d for d in range(3) if (bits >> d) & 1], int)
+        pairs = np.array([(n, d) for n in nodes for d in components] + [(e, 0) for e in edges], int).reshape(-1, 2)
+        net.fixed[pairs[:, 0], pairs[:, 1]] = True
+        oblique = not support.components
+        net.held.append(NetHeld(nodes, 0 * nodes, support.normal) if oblique else NetHeld(pairs[:, 0], pairs[:, 1]))
+        if not self.motions:
+            return
+        index = next((i for i, m in enumerate(self.motions) if m is support.motion), STILL)
+        rows = rows if index >= 0 and self.motions[index].count is not None else 0 * rows
+        first = self.start[index] if index >= 0 else STILL
+        pose = first + rows
+        for d in components:
+            self._take(nodes, d, pose)
+        known = self.poses[edges, 0] if edges.size else edges
+        self._take(edges, 0, np.full(len(edges), first))
+        if index >= 0:
+            net.moving.append((nodes, index, np.isin(np.arange(3), components), rows))
+            edges = edges[known == FREE]  # an angle is counted on from where it is: once
+            if len(edges):
+                net.turning.append((np.unique(edges), index))
+
+    def _take(self, blocks: np.ndarray, component: int, pose: np.ndarray) -> None:
+        before = self.poses[blocks, component]
+        for i in np.flatnonzero((before != FREE) & (before != pose))[:1]:
+            block, axis = blocks[i], f" along {'xyz'[component]}"
+            where = "the point at ({:g}, {:g}, {:g}) m".format(*self.net.rest[block])
+            for rod in self.net.rods if block >= self.net.nodes else ():
+                if block in rod.all_edges:
+                    where, axis = f"edge {int(np.argmax(rod.all_edges == block)) - rod.first} of rod {rod.rod}", ""
+            raise SceneError(disagreement(where, axis, min(before[i], pose[i]) == STILL))
+        self.poses[blocks, component] = pose
 
 
 def load(scene, net: Net) -> None:
@@ -114,6 +139,8 @@ def load(scene, net: Net) -> None:
             _put(net, triangles.ravel(), np.repeat(area, 3, axis=0), pressure.amplitude)
         else:
             net.pressures.append(NetPressure(triangles, pressure.pressure, pressure.amplitude))
+    for given in scene.edge_couples:
+        net.edge_couples.append(_edge_couple(net.shells[given.shell], given))
     for given in scene.ring_loads:
         force = np.column_stack([given.force[:, 0], 0.0 * given.force[:, 0], given.force[:, 1]])
         _put(net, net.meridians[given.shell].nodes[given.nodes], force, given.amplitude)
@@ -124,6 +151,23 @@ def load(scene, net: Net) -> None:
             _put(net, ends.ravel(), band.forces(net.rest[ends]).reshape(-1, 3), pressure.amplitude)
         else:
             net.bands.append(band)
+
+
+def _edge_couple(shell, given) -> NetEdgeCouple:
+    """A couple about boundary edges, which nothing may hold."""
+    surface, edges = shell.surface, given.edges
+    for edge in edges[shell.kinds.kind[edges] != FREE_EDGE][:1]:
+        raise SceneError(
+            "add_edge_couple: the normal at the edge between the vertices {} and {} of shell {} is held, by a clamp or a plane of "
+            "symmetry, which would take the couple; load a free edge".format(*surface.edges[edge], given.shell)
+        )
+    side = np.where(surface.edge_triangles[edges, 0] >= 0, 0, 1)  # the triangle runs the edge forwards or backwards
+    ends = np.where(side[:, None] == 0, surface.edges[edges], surface.edges[edges, ::-1])
+    corners = np.column_stack([ends, surface.edge_opposite[edges, side]])
+    length = np.linalg.norm(np.diff(surface.points[ends], axis=1)[:, 0], axis=1)
+    places = np.column_stack([shell.nodes[corners], shell.edges[edges]])
+    size = float(np.ptp(surface.points, axis=0).max())
+    return NetEdgeCouple(places, given.couple * length, 1.0 - 2.0 * side, given.amplitude, size)
 
 
 def _own_node(rod: NetRod, node: int) -> int:

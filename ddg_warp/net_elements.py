@@ -4,7 +4,7 @@ from collections import Counter
 
 import numpy as np
 
-from ddg_warp import axisymmetric, geometry
+from ddg_warp import axisymmetric, geometry, shell_geometry
 from ddg_warp import shells as shell_terms
 from ddg_warp.chains import Piece
 from ddg_warp.elements import ElementSet
@@ -145,7 +145,7 @@ def _shell_sets(net: Net, scene) -> list[NetSet]:
             sets[-1].normals = np.array([element, row, shell.supports[edge]])
             shell.first[elements.term.name] = count[elements.term.name]
             count[elements.term.name] += len(elements)
-        if description.bending in shell_terms.TURNING:
+        if description.bending in shell_geometry.TURNING:
             net.fixed[shell.edges[~shell_terms.turning(shell.kinds, description.bending)], 0] = True
     return sets
 

@@ -9,6 +9,7 @@ from ddg_warp.errors import SceneError
 from ddg_warp.kernels.net import elements, krylov, newton, system
 from ddg_warp.linear.multilevel import Multilevel
 from ddg_warp.linear.net_chain import Chains
+from ddg_warp.net_planes import DevicePlanes
 from ddg_warp.net_system import Assembly, NetSystem, Sums
 from ddg_warp.net_tolerance import Allowed
 from ddg_warp.newton import NewtonOptions
@@ -59,6 +60,11 @@ class NetNewton:
         self.mass = wp.array(host.mass, dtype=V, device=device)
         bits = (host.fixed * [1, 2, 4]).sum(1).astype(np.uint8)
         self.fixed = wp.array(bits, dtype=wp.uint8, device=device)
+        self.held = self.fixed  # components in space, for predictors: rates along oblique planes stay in them
+        self.planes = DevicePlanes(net, self.system, self.real, self.linear) if host.frames else None
+        if self.planes:
+            bits[list(host.frames)] = 0
+            self.held = wp.array(bits, dtype=wp.uint8, device=device)
         gravity = np.asarray(model.scene.gravity, float)
         self.gravity = wp.array(gravity[None], dtype=V, device=device)
         self.right, self.rest, self.z, self.p, self.product, self.direction = (make(self.all, H) for _ in range(6))
@@ -118,7 +124,7 @@ class NetNewton:
         own = [self._outer, self._collect, self._settle, self._judge, self._measure, self._rotate, self._take]
         own += self.allowed.kernels
         cycle = [self._move, self._invert, self._start, self._begin, *self._cycle]
-        parts = [kernel for part in (self.chains, self.levels) if part for kernel in part.kernels]
+        parts = [k for part in (self.chains, self.levels, self.planes) if part for k in part.kernels]
         evaluate = [(kernel, 128) for kernel in self._evaluate]
         sums = (self._sum, self._sum_linear, self._largest, self._worst)
         sums = [(k, krylov.THREADS) for part in sums for k in part.kernels]
@@ -168,6 +174,8 @@ class NetNewton:
                 + [part.elements, self.status, self.slot, blocks],
                 [self.force, self.size, self.stiffness, self.change, self.noise],
             )
+        if self.planes:
+            self.planes.forces(self.force)
         self._launch(
             self._settle,
             [self.q, self.force, self.size, self.stiffness, self.fixed, self.status, self.load_scale]
@@ -216,6 +224,8 @@ class NetNewton:
     def assemble(self) -> None:
         """H of the worlds that want a direction."""
         self._assembly(self.mass, self.coefficient, self.wanted, self.matrix)
+        if self.planes:
+            self.planes.matrix(self.matrix, self.wanted)
 
     def direct(self) -> None:
         """Directions by conjugate gradients."""
@@ -295,7 +305,9 @@ class NetNewton:
         )
 
     def measure_turns(self) -> None:
-        """Largest turn that the directions make, squared."""
+        """Largest turn that the directions make, squared; these are in space then."""
+        if self.planes:
+            self.planes.back(self.direction, self.wanted)
         wp.launch(
             self._rotate,
             self.turns.size,

@@ -7,6 +7,7 @@ import warp as wp
 from scipy import sparse
 
 from ddg_warp.kernels.net import elements
+from ddg_warp.net_planes import HostPlanes
 from ddg_warp.rigid import Body
 from ddg_warp.tolerance import largest_excess
 from ddg_warp.turning import turned
@@ -24,6 +25,7 @@ class NetTangent:
         self.free, self.angle, self.mass = (
             np.tile(values.ravel(), worlds) for values in (~host.fixed, kind, host.mass)
         )
+        self.planes = HostPlanes(host, worlds) if host.frames else None
         self._anchored = host.fixed[: host.nodes].copy()
         for shell in host.shells:
             self._anchored[shell.nodes] = True
@@ -58,7 +60,15 @@ class NetTangent:
             index = _tiled(slots, self.host.blocks, self.net.worlds).ravel()
             for d in range(3):
                 result[:, d] += np.bincount(index, forces[..., d].ravel(), len(result))
-        return result.ravel()
+        return self.into(result.ravel())
+
+    def into(self, values: np.ndarray) -> np.ndarray:
+        """Vectors in space (size,) as the dofs are: in the frames of oblique planes where there are any."""
+        return self.planes.into(values) if self.planes else values
+
+    def back(self, values: np.ndarray) -> np.ndarray:
+        """Dofs, forces or steps (size,) as vectors in space."""
+        return self.planes.back(values) if self.planes else values
 
     def forces(self, state, index: int) -> np.ndarray:
         """Derivative of the energy of every element of a set with respect to the blocks of its slots (slots, elements, 3)."""
@@ -83,12 +93,13 @@ class NetTangent:
             to_local, places = scatter[i]
             spread = np.matmul(to_local.T, (values.reshape(-1, size) @ to_local).reshape(count, size, -1))
             total += np.bincount(places, spread.ravel(), len(total))
-        return sparse.csc_matrix((total, rows, starts), shape=(self.size, self.size))
+        matrix = sparse.csc_matrix((total, rows, starts), shape=(self.size, self.size))
+        return self.planes.matrix(matrix) if self.planes else matrix
 
     def linear_stress(self, state, step: np.ndarray) -> list:
         """Stresses (strains, elements) of every set that the strains e + J step have."""
         result = []
-        change = wp.array(step.reshape(-1, 3), dtype=self.net.vector, device=self.net.device)
+        change = wp.array(self.back(step).reshape(-1, 3), dtype=self.net.vector, device=self.net.device)
         for i, part in enumerate(self.net.sets):
             shape = (len(part.term.measure.strains), part.elements * self.net.worlds)
             out = wp.zeros(shape, dtype=self.net.real, device=self.net.device)
@@ -113,18 +124,18 @@ class NetTangent:
         return force
 
     def loads(self, factor: float, q: np.ndarray) -> np.ndarray:
-        host, x = self.host, q.reshape(self.net.worlds, -1, 3)
+        host, x = self.host, self.back(q).reshape(self.net.worlds, -1, 3)
         result = np.tile(self.dead_loads(factor), (self.net.worlds, 1, 1))
         for load in host.followers:
             for world in range(self.net.worlds):
                 np.add.at(result[world], load.places, load.at(factor, factor) * load.forces(x[world][load.places]))
-        return result.ravel()
+        return self.into(result.ravel())
 
     def load_stiffness(self, factor: float, q: np.ndarray) -> sparse.csc_matrix | None:
         if not self.host.followers:
             return None
         rows, cols, values = [], [], []
-        x, N = q.reshape(self.net.worlds, -1, 3), self.host.blocks
+        x, N = self.back(q).reshape(self.net.worlds, -1, 3), self.host.blocks
         for load in self.host.followers:
             for world in range(self.net.worlds):
                 place = 3 * (load.places + world * N)[:, :, None] + np.arange(3)
@@ -133,19 +144,21 @@ class NetTangent:
                 cols.append(column)
                 values.append(-load.at(factor, factor) * load.derivative(x[world][load.places]))
         data, *places = (np.concatenate([part.ravel() for part in parts]) for parts in (values, rows, cols))
-        return sparse.csc_matrix((data, places), shape=(self.size, self.size))
+        matrix = sparse.csc_matrix((data, places), shape=(self.size, self.size))
+        return self.planes.matrix(matrix) if self.planes else matrix
 
     def dofs(self, state) -> np.ndarray:
-        return state.net.q.numpy().astype(np.float64).ravel()
+        return self.into(state.net.q.numpy().astype(np.float64).ravel())
 
     def assign(self, state, q: np.ndarray) -> None:
-        state.net.q.assign(q.reshape(-1, 3))
+        state.net.q.assign(self.back(q).reshape(-1, 3))
 
     def retract(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
         """q moved along `step`, with edges of rods turned instead of sheared; see `ddg_warp.turning`.
 
         Rods are taken from held nodes outwards: where one meets others that are placed already, or a shell, it is anchored there.
         """
+        q, step = self.back(q), self.back(step)
         moved = q + step
         x, dx, out = (v.reshape(self.net.worlds, -1, 3) for v in (q, step, moved))
         for world in range(self.net.worlds):
@@ -156,14 +169,14 @@ class NetTangent:
                 excess[at] = turned(x[world][at], dx[world][at], placed[at], excess[at], closed)
                 placed[at] = True
             out[world][: self.host.nodes] += excess
-        return moved
+        return self.into(moved)
 
     def move_supports(self, state, before: float, at: float) -> None:
         """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""
         host = self.host
         q = state.net.q.numpy().astype(np.float64).reshape(self.net.worlds, -1, 3)
-        for blocks, motion, components in host.moving:
-            target = self.model.motions[motion].place(at, host.rest[blocks])
+        for blocks, motion, components, rows in host.moving:
+            target = self.model.motions[motion].place(at, host.rest[blocks], rows)
             q[:, blocks] = np.where(components, target, q[:, blocks])
         if host.turning:
             frame = state.net.frame.numpy().astype(np.float64).reshape(6, self.net.worlds, -1)
@@ -195,7 +208,7 @@ class NetTangent:
 
     def edges(self, q: np.ndarray) -> np.ndarray:
         """Edge vectors (E, 3)."""
-        x = q.reshape(self.net.worlds, -1, 3)
+        x = self.back(q).reshape(self.net.worlds, -1, 3)
         first, second = self.host.edges.T
         return (x[:, second] - x[:, first]).reshape(-1, 3)
 

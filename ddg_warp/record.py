@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ddg_warp import arguments
+from ddg_warp.errors import SceneError
 from ddg_warp.io import Shapes
 
 TRAJECTORY, SCENE = "trajectory.h5", "scene.usdc"
@@ -55,13 +57,20 @@ class Recorder:
         control: Mapping | None = None,
         resume: bool = False,
     ):
+        if not hasattr(model, "curves"):
+            raise SceneError(f"Recorder: the model is {type(model).__name__}; give what scene.build() returns")
+        every, block = arguments.count("Recorder: every", every), arguments.count("Recorder: block", block)
+        if fps is not None:
+            arguments.positive("Recorder: fps", fps, "1/s")
         if resume and not hdf5:
             raise ValueError("a run resumes from its trajectory.h5: leave hdf5=True, or start again with resume=False")
         self.directory = Path(directory)
         self.directory.mkdir(parents=True, exist_ok=True)
-        self._every = every
+        self._model, self._every = model, every
         self._calls, self._last = 0, None
         self._velocities, self._color_by = velocities, color_by
+        if color_by is not None and (not isinstance(color_by, tuple | list) or len(color_by) != 3):
+            raise ValueError(f"color_by is {color_by!r}; give (name, value at the low end, value at the high end)")
         if color_by is not None and (color_by[0] not in COLORS or model.surfaces is None):
             raise ValueError(
                 f"color_by {color_by[0]!r}: surfaces, if there are any, are colored by {', '.join(COLORS)}"
@@ -103,6 +112,8 @@ class Recorder:
             state: The state; it is only read.
             observed: Numbers measured of it, by name; the same names at every call.
         """
+        if not hasattr(state, "points") or getattr(state, "model", self._model) is not self._model:
+            raise SceneError(f"record: {state!r} is no state of the recorded model; give one that this model made")
         if self._last is not None and state.time <= self._last:
             return
         due = self._calls % self._every == 0

@@ -9,8 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ddg_warp import shell_geometry
+from ddg_warp import arguments, shell_geometry
 from ddg_warp import shells as shell_terms
+from ddg_warp.surface import DEGENERATE
 
 
 def principal_form(points, triangles, first, second=0.0, direction=(1.0, 0.0, 0.0)) -> np.ndarray:
@@ -71,13 +72,15 @@ def bilayer_curvature(mismatch: float, h1: float, h2: float, young1: float = 1.0
         h1, h2: thickness of the layers [m].
         young1, young2: their Young's moduli, in any unit.
     """
+    for name, value in (("h1", h1), ("h2", h2), ("young1", young1), ("young2", young2)):
+        arguments.positive(f"bilayer_curvature: {name}", value)
     m, n, h = h1 / h2, young1 / young2, h1 + h2
     return 6.0 * mismatch * (1.0 + m) ** 2 / (h * (3.0 * (1.0 + m) ** 2 + (1.0 + m * n) * (m**2 + 1.0 / (m * n))))
 
 
 def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, angle=None) -> None:
     """See `Model.set_rest`."""
-    if model.net is None or not 0 <= shell < len(model.net.host.shells):
+    if model.net is None or not 0 <= arguments.index("set_rest: shell", shell) < len(model.net.host.shells):
         count = 0 if model.net is None else len(model.net.host.shells)
         raise ValueError(f"shell {shell} does not exist; the model has {count} shells")
     held, bending = model.net.host.shells[shell], model.scene.shells[shell].bending
@@ -91,14 +94,13 @@ def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, ang
     changes = {}
     if points is not None:
         points = _shaped("points", points, surface.points.shape)
+        _refuse_without_area("points", shell_geometry.metric(surface, points))
         changes["abar"] = shell_geometry.metric(surface, points)
         changes["bbar"] = shell_geometry.second_form(surface, points, held.kinds)
         changes["angle"] = shell_geometry.edge_angles(surface, points, held.kinds)
     if metric is not None:
         changes["abar"] = _shaped("metric", metric, (count, 3))
-        a11, a12, a22 = changes["abar"].T
-        for t in np.flatnonzero((a11 <= 0.0) | (a11 * a22 - a12**2 <= 0.0))[:1]:
-            raise ValueError(f"metric of triangle {t} is {changes['abar'][t]}; a11 > 0 and a11 a22 > a12^2")
+        _refuse_without_area("metric", changes["abar"])
     if curvature is not None:
         if bending not in ("midedge_dof", "midedge"):
             raise ValueError(f"bending {bending!r} has no rest curvature of a triangle; give the angles of its edges")
@@ -118,8 +120,18 @@ def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, ang
     model.version += 1
 
 
+def _refuse_without_area(name: str, metric: np.ndarray) -> None:
+    a11, a12, a22 = metric.T
+    for t in np.flatnonzero((a11 <= 0.0) | (a11 * a22 - a12**2 <= DEGENERATE**2 * (a11 + a22) ** 2))[:1]:
+        text = f"set_rest: {name} give triangle {t} no area: the metric of triangle {t} is {metric[t]}"
+        raise ValueError(f"{text}; a11 > 0 and a11 a22 > a12^2")
+
+
 def _shaped(name: str, values, shape: tuple) -> np.ndarray:
-    values = np.asarray(values, float)
+    try:
+        values = np.asarray(values, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} is {values!r}; give finite numbers of shape {shape}") from None
     if values.shape != shape or not np.isfinite(values).all():
         raise ValueError(f"{name} has shape {values.shape}; give finite numbers of shape {shape}")
     return values

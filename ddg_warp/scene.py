@@ -1,119 +1,36 @@
 """The description of a simulation: rods, supports, loads. NumPy only; nothing here knows a device."""
 
-from collections.abc import Callable, Iterable
+from bisect import bisect_right
+from collections.abc import Callable
+from copy import copy, deepcopy
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from ddg_warp import validate
+from ddg_warp import arguments, validate
+from ddg_warp.descriptions import Dynamics, Load, RodBatch, Statics, Support, Trace
 from ddg_warp.errors import SceneError
-from ddg_warp.integrate.path import Displacement, Stop
 from ddg_warp.material import Material, Stiffness
 from ddg_warp.motion import Motion
 from ddg_warp.structures import Structures
 
 
-@dataclass(frozen=True)
-class Dynamics:
-    """Advance in time: step dt [s] to duration [s] by `scheme` (`implicit_euler` or `implicit_midpoint`)."""
-
-    dt: float = 0.01
-    duration: float = 1.0
-    scheme: str = "implicit_euler"
-
-
-@dataclass(frozen=True)
-class Statics:
-    """Find the equilibrium: loads and motions grow with the load parameter from 0 to 1 in `load_steps` increments."""
-
-    load_steps: int = 1
-
-
-@dataclass(frozen=True)
-class Trace:
-    """Follow the path of equilibria from load parameter 0 by arc length, through limit points.
-
-    Attributes:
-        watch: displacements to record by name (`Displacement`).
-        stop: where to end.
-        step, max_step, load_scale: see `ddg_warp.integrate.continuation.ContinuationOptions`.
-    """
-
-    watch: dict[str, Displacement] = field(default_factory=dict)
-    stop: Stop = field(default_factory=Stop)
-    step: float = 0.02
-    max_step: float = 0.1
-    load_scale: float = 1.0
-
-
-@dataclass
-class RodBatch:
-    """Rods of one `add_rods` call: same node count and closedness; section, shape and rest shape may differ."""
-
-    points: np.ndarray  # (R, n, 3) [m]
-    section: Stiffness
-    closed: bool
-    natural: object
-    director: np.ndarray | None  # (3,), (R, 3) or (R, edges, 3)
-    twist: bool
-    bend: bool
-    name: str
-    first: int  # index of its first rod
-
-    @property
-    def rods(self) -> int:
-        return self.points.shape[0]
-
-    @property
-    def nodes(self) -> int:
-        return self.points.shape[1]
-
-    @property
-    def edges(self) -> int:
-        return self.nodes if self.closed else self.nodes - 1
-
-
-@dataclass(frozen=True)
-class Support:
-    """Dofs held on some rods: nodes (with components), edge angles, or an end frame (`end` is "first" or "last").
-
-    `tangent` and `director` (rods, 3) are those of the end at rest, extrapolated from the rod where they are None.
-    """
-
-    rods: np.ndarray
-    nodes: tuple[int, ...] = ()
-    components: str = "xyz"
-    edges: tuple[int, ...] = ()
-    end: str = ""
-    motion: Motion | None = None
-    tangent: np.ndarray | None = None
-    director: np.ndarray | None = None
-
-
-@dataclass(frozen=True)
-class Load:
-    """A dead force on a node [N], or on an edge a twisting moment or a couple [N m]; times amplitude(t) if given."""
-
-    rods: np.ndarray
-    node: int = 0
-    force: tuple = (0.0, 0.0, 0.0)
-    edge: int | None = None
-    moment: float = 0.0
-    couple: tuple = (0.0, 0.0, 0.0)
-    amplitude: Callable[[float], float] | None = None
-
-
-@dataclass
+@dataclass(kw_only=True, repr=False, eq=False)
 class Scene(Structures):
     """Rods and shells with supports and loads, ready to be built for a device.
 
+    A model is made of the scene as it is when `build` is called: what is added or changed later does not reach it.
+
     Args:
         gravity: acceleration (3,) [m/s^2].
-        dimension: 3, or 2 for a scene that stays in the plane of x and z (y of every point is then ignored).
+        dimension: 3, or 2 for a scene that stays in a plane y = const: forces, couples, motions and gravity out of it are refused.
         analysis: `Dynamics`, `Statics` or `Trace`: what `ddg-warp run` does with the scene.
         mass_damping: mass-proportional damping alpha [1/s].
         initial: makes the first state of a run from the model; the rest state by default.
         callbacks: functions of the state, called between steps.
+
+    Raises:
+        SceneError: an argument that is none of these; the message names it.
     """
 
     gravity: tuple = (0.0, 0.0, -9.81)
@@ -121,22 +38,55 @@ class Scene(Structures):
     analysis: Dynamics | Statics | Trace = field(default_factory=Dynamics)
     mass_damping: float = 0.0
     initial: Callable | None = None
-    batches: list[RodBatch] = field(default_factory=list)
-    supports: list[Support] = field(default_factory=list)
-    loads: list[Load] = field(default_factory=list)
-    masses: list[tuple[np.ndarray, int, float]] = field(default_factory=list)
     callbacks: list[Callable] = field(default_factory=list)
+    batches: list[RodBatch] = field(default_factory=list, init=False)
+    supports: list[Support] = field(default_factory=list, init=False)
+    loads: list[Load] = field(default_factory=list, init=False)
+    masses: list[tuple[np.ndarray, int, float]] = field(default_factory=list, init=False)
+
+    def __post_init__(self):
+        validate.check_settings(self)
+
+    def __repr__(self) -> str:
+        joined = f", {len(self.joints)} joints, {len(self.attachments)} attachments" if self.joints else ""
+        held = len(self.supports) + len(self.shell_supports) + len(self.ring_supports)
+        loads = sum(
+            map(
+                len,
+                (self.loads, self.shell_loads, self.pressures, self.edge_couples, self.ring_loads, self.ring_pressures),
+            )
+        )
+        nodes = sum(batch.rods * batch.nodes for batch in self.batches)
+        triangles = sum(len(shell.triangles) for shell in self.shells)
+        return (
+            f"<Scene of dimension {self.dimension}, gravity {tuple(self.gravity)} m/s^2, {type(self.analysis).__name__}: "
+            f"{self.rod_count} rods of {nodes} nodes, {len(self.shells)} shells of {triangles} triangles, "
+            f"{len(self.axisymmetric_shells)} shells of revolution{joined}, {held} supports, {loads} loads>"
+        )
 
     @property
     def rod_count(self) -> int:
         """Number of rods added so far."""
-        return sum(batch.rods for batch in self.batches)
+        return self.batches[-1].first + self.batches[-1].rods if self.batches else 0
 
-    def add_rod(self, points, *, director=None, **options) -> int:
-        """Add one rod with points (n, 3); options as in `add_rods`, without R: a director (3,) or (edges, 3). Returns its index."""
+    def add_rod(
+        self,
+        points,
+        *,
+        section,
+        material: Material | None = None,
+        closed: bool = False,
+        natural="shape",
+        director=None,
+        twist: bool = True,
+        bend: bool = True,
+        name: str = "rod",
+    ) -> int:
+        """Add one rod with points (n, 3); arguments as in `add_rods`, without R: a director (3,) or (edges, 3). Returns its index."""
         if np.ndim(director) == 2 and len(director) > 1:
             director = [director]
-        return self.add_rods([points], director=director, **options)[0]
+        options = {"closed": closed, "natural": natural, "twist": twist, "bend": bend, "name": name}
+        return self.add_rods([points], section=section, material=material, director=director, **options)[0]
 
     def add_rods(
         self,
@@ -177,7 +127,7 @@ class Scene(Structures):
         """
         try:
             points = np.array(points, float)
-            director = None if director is None else np.asarray(director, float)
+            director = None if director is None else np.array(director, float)
         except (TypeError, ValueError):
             raise SceneError(
                 f"rods '{name}': points or director are no arrays of numbers; points are (rods, nodes, 3)"
@@ -186,17 +136,20 @@ class Scene(Structures):
             points = points[None]
         if points.ndim != 3 or points.shape[2] != 3:
             raise SceneError(f"rods '{name}': points have shape {points.shape}; give (rods, nodes, 3)")
+        flags = {"closed": closed, "twist": twist, "bend": bend}
+        closed, twist, bend = (arguments.flag(f"rods '{name}': {what}", value) for what, value in flags.items())
         stiffness = getattr(section, "stiffness", None)
         if stiffness is None:
             raise SceneError(f"rods '{name}': section {section!r} is none; use Circle, Ellipse, Rectangle or Stiffness")
         if not isinstance(material, Material) and not isinstance(section, Stiffness):
             raise SceneError(f"rods '{name}': a {type(section).__name__} needs a material; give material=Material(...)")
         planar = self.dimension == 2
+        points.setflags(write=False)
         batch = RodBatch(
             points,
-            stiffness(material),
+            deepcopy(stiffness(material)),
             closed,
-            natural,
+            deepcopy(natural),
             director,
             twist and bend and not planar,
             bend,
@@ -206,14 +159,15 @@ class Scene(Structures):
         self.batches.append(batch)
         return range(batch.first, batch.first + batch.rods)
 
-    def clamp(self, rods, edges: Iterable[int] = (0,), motion: Motion | None = None) -> None:
+    def clamp(self, rods, edges=(0,), motion: Motion | None = None) -> None:
         """Hold edges: both nodes and the angle. The continuum clamp then lies at the middle of the edge.
 
-        Negative indices count from the last edge. `motion` moves them; without it they stay where they are at rest.
+        Negative indices count from the last edge; a mask of bools, or a slice, chooses among the edges, too. `motion` moves them;
+        without it they stay where they are at rest.
         """
-        edges = validate.indices("clamp: edges", edges)
+        rods, edges = self._on_rods("clamp", rods, "edge", edges)
         nodes = tuple(dict.fromkeys(n for e in edges for n in ((e, e + 1) if e >= 0 else (e - 1, e))))
-        self._support(rods, nodes=nodes, edges=edges, motion=motion)
+        self._support("clamp", rods, nodes=nodes, edges=edges, motion=motion)
 
     def clamp_end(
         self,
@@ -239,44 +193,48 @@ class Scene(Structures):
         Raises:
             SceneError: the end, the tangent or the director is none; the message says which.
         """
-        if end not in ("first", "last"):
-            raise SceneError(f"clamp_end: end is {end!r}; it is 'first' or 'last'")
-        index = self._rods(rods)
-        tangent = None if tangent is None else validate.directions("clamp_end: tangent", tangent, index)
-        director = None if director is None else validate.directions("clamp_end: director", director, index)
+        arguments.choice("clamp_end: end", end, ("first", "last"))
+        rods = self._rods(rods)
+        tangent = None if tangent is None else validate.directions("clamp_end: tangent", tangent, rods)
+        director = None if director is None else validate.directions("clamp_end: director", director, rods)
         if tangent is not None and self.dimension == 2 and tangent[:, 1].any():
             raise SceneError(
                 f"clamp_end: tangent {tangent[0]} leaves the plane of x and z that a scene of dimension 2 stays in"
             )
-        for batch in self._batches(index) if director is not None else ():
-            if not batch.twist:
+        for batch in self._batches(rods):
+            if batch.closed:
+                raise SceneError(
+                    f"clamp_end: rod {batch.first} ('{batch.name}') is closed: it has no end to clamp; use clamp"
+                )
+            if director is not None and not batch.twist:
                 raise SceneError(
                     f"clamp_end: rod {batch.first} ('{batch.name}') has no twist, and so no director; leave director out"
                 )
-        self._support(rods, components=components, end=end, motion=motion, tangent=tangent, director=director)
+        held = {"components": components, "end": end, "tangent": tangent, "director": director}
+        self._support("clamp_end", rods, motion=motion, **held)
 
-    def fix(self, rods, nodes: Iterable[int], components: str = "xyz", motion: Motion | None = None) -> None:
-        """Hold components of nodes (a hinge)."""
-        self._support(rods, nodes=validate.indices("fix: nodes", nodes), components=components, motion=motion)
+    def fix(self, rods, nodes, components: str = "xyz", motion: Motion | None = None) -> None:
+        """Hold components of nodes (a hinge). A motion may give every node a displacement of its own."""
+        rods, nodes = self._on_rods("fix", rods, "node", nodes)
+        self._support("fix", rods, nodes=nodes, components=components, motion=motion)
 
-    def fix_twist(self, rods, edges: Iterable[int], motion: Motion | None = None) -> None:
+    def fix_twist(self, rods, edges, motion: Motion | None = None) -> None:
         """Hold the angle of edges."""
-        self._support(rods, edges=validate.indices("fix_twist: edges", edges), motion=motion)
+        rods, edges = self._on_rods("fix_twist", rods, "edge", edges)
+        self._need_twist("fix_twist", rods)
+        self._support("fix_twist", rods, edges=edges, motion=motion)
 
     def add_force(self, rods, node: int, force, amplitude: Callable[[float], float] | None = None) -> None:
         """Dead force [N] on a node, times amplitude(t). In statics it grows with the load parameter if amplitude is None."""
-        force = validate.vector(f"add_force: force on node {node}", force)
-        self._load(rods, amplitude, node=validate.index("add_force: node", node), force=force)
+        force = arguments.vector(f"add_force: force on node {node}", force)
+        self._in_plane("add_force: force", force, (1,))
+        self._load("add_force", rods, "node", node, amplitude, force=force)
 
     def add_twisting_moment(self, rods, edge: int, moment: float, amplitude=None) -> None:
         """Moment [N m] about the tangent of an edge, conjugate to its angle."""
-        for batch in self._batches(self._rods(rods)):
-            if not batch.twist:
-                raise SceneError(
-                    f"add_twisting_moment: rod {batch.first} ('{batch.name}') has no twist; add it with twist=True, in dimension 3"
-                )
-        moment = validate.number(f"add_twisting_moment: moment on edge {edge}", moment)
-        self._load(rods, amplitude, edge=validate.index("add_twisting_moment: edge", edge), moment=moment)
+        self._need_twist("add_twisting_moment", self._rods(rods))
+        moment = arguments.number(f"add_twisting_moment: moment on edge {edge}", moment)
+        self._load("add_twisting_moment", rods, "edge", edge, amplitude, moment=moment)
 
     def add_couple(self, rods, edge: int, couple, amplitude=None) -> None:
         """Couple (3,) [N m] on an edge, its axis fixed in space: a pair of forces across the edge and a moment about it.
@@ -284,17 +242,19 @@ class Scene(Structures):
         Outside the plane it has no potential (Ziegler, Principles of Structural Stability, 1968). Statics takes it as it is; in
         dynamics its forces are those on the predicted edge and stay as they are within a step.
         """
-        couple = validate.vector(f"add_couple: couple on edge {edge}", couple)
-        self._load(rods, amplitude, edge=validate.index("add_couple: edge", edge), couple=couple)
+        couple = arguments.vector(f"add_couple: couple on edge {edge}", couple)
+        self._in_plane("add_couple: couple", couple, (0, 2))
+        self._load("add_couple", rods, "edge", edge, amplitude, couple=couple)
 
     def add_mass(self, rods, node: int, mass: float) -> None:
         """Point mass [kg] on a node."""
-        if not 0.0 < mass < np.inf:
-            raise SceneError(f"add_mass: {mass} kg at node {node}; a point mass is positive and finite")
-        self.masses.append((self._rods(rods), validate.index("add_mass: node", node), float(mass)))
+        rods = arguments.once("add_mass: rods", self._rods(rods))
+        rods, (node,) = self._on_rods("add_mass", rods, "node", arguments.index("add_mass: node", node))
+        mass = arguments.positive(f"add_mass: mass at node {node}", mass, "kg")
+        self.masses.append((rods, node, mass))
 
     def build(self, device=None, precision: str | None = None, worlds: int = 1, allow_rounding: bool = False):
-        """Freeze the scene into a `Model` on a device.
+        """Freeze the scene, as it is now, into a `Model` on a device.
 
         Args:
             device: Warp device, such as "cpu" or "cuda:0"; by default CUDA if there is one.
@@ -308,34 +268,70 @@ class Scene(Structures):
         from ddg_warp.model import Model
 
         validate.check_scene(self)
-        worlds = validate.index("worlds", worlds)
-        return Model(self, device=device, precision=precision, worlds=worlds, allow_rounding=allow_rounding)
+        worlds = arguments.count("worlds", worlds)
+        return Model(self.copy(), device=device, precision=precision, worlds=worlds, allow_rounding=allow_rounding)
+
+    def copy(self, **changes) -> "Scene":
+        """The scene as it is now, with attributes changed; lists and entries are its own, their arrays are shared."""
+        other, own = copy(self), vars(self).items()
+        other.__dict__.update({name: list(map(copy, value)) for name, value in own if isinstance(value, list)})
+        other.__dict__.update(changes)
+        return other
 
     def _rods(self, rods) -> np.ndarray:
-        index = np.array(validate.indices("rods", rods), int)
+        index = arguments.indices("rods", rods, self.rod_count)
         bad = index[(index < 0) | (index >= self.rod_count)]
         if bad.size:
             raise SceneError(f"rod {bad[0]} does not exist; the scene has {self.rod_count} rods so far")
         return index
 
-    def _support(self, rods, *, motion, components: str = "xyz", **held) -> None:
-        if not components or set(components) - set("xyz"):
-            raise SceneError(f"fix: components {components!r}; they are letters of 'xyz', one at least")
-        if motion is not None and not isinstance(motion, Motion):
-            raise SceneError(f"motion is {motion!r}; give Motion(translation=..., angle=...)")
-        if motion is not None and self.dimension == 2 and not motion.planar:
-            raise SceneError(
-                f"the motion turns about {tuple(motion.axis)}; a scene of dimension 2 stays in the plane of x and z, give "
-                "axis=(0, 1, 0)"
-            )
-        self.supports.append(Support(self._rods(rods), components=components, motion=motion, **held))
+    def _on_rods(self, call: str, rods, what: str, chosen) -> tuple[np.ndarray, tuple[int, ...]]:
+        """Rods, and the nodes or edges (`what`) chosen of each of them."""
+        rods = self._rods(rods)
+        batches = self._batches(rods)
+        sizes = np.array([getattr(batch, what + "s") for batch in batches])
+        chosen = arguments.indices(f"{call}: {what}s", chosen, int(sizes[0]) if (sizes == sizes[0]).all() else None)
+        starts = [batch.first for batch in batches]
+        size = sizes[np.searchsorted(starts, rods, side="right") - 1]
+        for place in chosen[(chosen >= sizes.min()) | (chosen < -sizes.min())][:1].tolist():
+            validate.check_index(what, place, size, rods)
+        return rods, tuple(chosen.tolist())
 
-    def _load(self, rods, amplitude, **load) -> None:
-        if amplitude is not None and not callable(amplitude):
-            raise SceneError(f"amplitude is {amplitude!r}; give a function of the time, or None")
-        self.loads.append(Load(self._rods(rods), amplitude=amplitude, **load))
+    def _support(self, call: str, rods: np.ndarray, *, motion, components: str = "xyz", **held) -> None:
+        arguments.components(call, components)
+        validate.check_motion(call, motion, planar=self.dimension == 2)
+        if motion is not None and motion.count is not None:
+            if call != "fix":
+                raise SceneError(f"{call}: the motion has a displacement for each node, which turns no edge; use fix")
+            if motion.count != (there := len(rods) * len(held["nodes"])):
+                raise SceneError(
+                    f"fix: the motion has {motion.count} displacements of {there} nodes; give one for each"
+                )
+        self.supports.append(Support(rods, components=components, motion=motion, call=call, **held))
+
+    def _load(self, call: str, rods, what: str, place, amplitude, **load) -> None:
+        rods = arguments.once(f"{call}: rods", self._rods(rods))
+        rods, (place,) = self._on_rods(call, rods, what, arguments.index(f"{call}: {what}", place))
+        self.loads.append(Load(rods, amplitude=arguments.amplitude(call, amplitude), **{what: place}, **load))
+
+    def _need_twist(self, call: str, rods: np.ndarray) -> None:
+        for batch in self._batches(rods):
+            if not batch.twist:
+                raise SceneError(
+                    f"{call}: rod {batch.first} ('{batch.name}') has no twist; add it with twist=True, in dimension 3"
+                )
+
+    def _in_plane(self, what: str, value: tuple, out: tuple[int, ...]) -> None:
+        """Refuse components that a planar scene cannot feel."""
+        if self.dimension == 2 and any(value[d] != 0.0 for d in out):
+            zero = " and ".join("xyz"[d] for d in out)
+            raise SceneError(
+                f"{what} is {value}; a scene of dimension 2 stays in the plane of x and z, give 0 along {zero}"
+            )
 
     def _batches(self, rods: np.ndarray) -> list[RodBatch]:
-        """The batches that some rods belong to."""
-        starts = [batch.first for batch in self.batches]
-        return [self.batches[i] for i in np.unique(np.searchsorted(starts, rods, side="right") - 1)]
+        """The batches that some rods belong to, in order."""
+        first, last = (bisect_right(self.batches, r, key=lambda batch: batch.first) for r in (rods.min(), rods.max()))
+        near = self.batches[first - 1 : last]
+        starts = [batch.first for batch in near]
+        return [near[i] for i in np.unique(np.searchsorted(starts, rods, side="right") - 1)]

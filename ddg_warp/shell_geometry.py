@@ -6,6 +6,9 @@ import numpy as np
 
 from ddg_warp.errors import SceneError
 
+MODELS = ("midedge_dof", "midedge_boundary", "midedge", "hinge", "isometric")  # of bending; see `ddg_warp.shells`
+TURNING = ("midedge_dof", "midedge_boundary")  # models whose mesh edges have an angle
+MEMBRANES = ("flat", "curved")
 FREE, NEIGHBOUR, CLAMPED, SYMMETRY = range(4)  # kinds of an edge, as kernels/measures/midedge_curvature.py numbers them
 
 

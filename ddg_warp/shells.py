@@ -27,6 +27,8 @@ from ddg_warp.kernels.terms import SHELLS
 from ddg_warp.shell_geometry import (
     CLAMPED,
     FREE,
+    MEMBRANES,
+    MODELS,
     NEIGHBOUR,
     EdgeKinds,
     edge_angles,
@@ -35,9 +37,6 @@ from ddg_warp.shell_geometry import (
     second_form,
 )
 
-MODELS = ("midedge_dof", "midedge_boundary", "midedge", "hinge", "isometric")
-TURNING = ("midedge_dof", "midedge_boundary")  # models whose mesh edges have an angle
-MEMBRANES = ("flat", "curved")
 FOLDED = 1e-6  # rad short of a fold by pi at which an edge has no angle
 
 

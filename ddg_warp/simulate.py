@@ -5,15 +5,17 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
 from ddg_warp.catalog import InputError
+from ddg_warp.descriptions import Dynamics, Statics
 from ddg_warp.errors import SolverError
-from ddg_warp.scene import Dynamics, Scene, Statics
+from ddg_warp.scene import Scene
 
 
-@dataclass
+@dataclass(repr=False)
 class Result:
     """What a run leaves behind; `check(result)` of a scene judges it.
 
@@ -47,6 +49,12 @@ class Result:
     compile_time: float = 0.0
     failure: str = ""
     path: Any = None
+
+    def __repr__(self) -> str:
+        reached = f"{self.times[0]:g} to {self.times[-1]:g}" if self.times else "none"
+        names = ", ".join(self.series) or "nothing"
+        ended = f"; failed: {self.failure}" if self.failure else ""
+        return f"<Result: {len(self.times)} states, times {reached}, observed {names}, {self.wall_time:.3g} s of wall time{ended}>"
 
     @property
     def seconds_per_step(self) -> float:
@@ -119,6 +127,8 @@ def simulate(
     from tqdm import tqdm
 
     began = time.perf_counter()
+    if not isinstance(scene, Scene):
+        raise InputError(f"the scene is {type(scene).__name__}; `build` returns a Scene")
     analysis = scene.analysis
     dynamic = isinstance(analysis, Dynamics)
     if not dynamic and (dt, duration, resume) != (None, None, None):
@@ -251,8 +261,10 @@ def step_count(dt: float, duration: float) -> int:
     Raises:
         InputError: One of them is not positive, or they do not fit.
     """
-    if not (dt > 0.0 and duration > 0.0):
-        raise InputError(f"dt = {dt} s and duration = {duration} s must be positive")
+    for value in (dt, duration):
+        number = isinstance(value, Real) and not isinstance(value, bool)
+        if not (number and 0.0 < value < float("inf")):
+            raise InputError(f"dt = {dt} s and duration = {duration} s must be positive and finite numbers")
     steps = round(duration / dt)
     if steps < 1 or abs(steps * dt - duration) > 1e-6 * dt:
         raise InputError(f"a duration of {duration} s is no whole number of steps of {dt} s; change one of them")

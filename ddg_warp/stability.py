@@ -8,6 +8,7 @@ from scipy import linalg, sparse
 from scipy.optimize import brentq
 from scipy.sparse.linalg import LinearOperator, eigs, splu
 
+from ddg_warp import arguments, validate
 from ddg_warp.errors import SceneError
 from ddg_warp.linear.direct import Factorisation, SingularError, pinned, regular
 from ddg_warp.linear.lowest import Lowest, LowestFactors, dense
@@ -74,10 +75,10 @@ def spectrum(
         SceneError: metric "mass" of a model without masses, or a metric or count that does not exist.
         SolverError: float32 would lose the softest modes in rounding.
     """
-    if metric not in ("mass", "unit"):
-        raise SceneError(f"spectrum: metric {metric!r}; it is 'mass' or 'unit'")
-    if not (isinstance(count, int | np.integer) and count >= 1):
-        raise SceneError(f"spectrum: count = {count!r}; it is a whole number of at least 1")
+    validate.check_model("spectrum", model)
+    validate.check_state("spectrum", model, state)
+    arguments.count("spectrum: count", count)
+    arguments.choice("spectrum: metric", metric, ("mass", "unit"))
     lost_in_rounding(model, state=state)
     tangent = tangent or Tangent(model)
     free = np.flatnonzero(tangent.free)
@@ -261,6 +262,10 @@ def buckling(model, free, loaded, count: int = 1) -> np.ndarray:
     Raises:
         ValueError: the first equilibrium is not stable, loads that follow are not conservative, or no positive factor is found.
     """
+    validate.check_model("buckling", model)
+    for state in (free, loaded):
+        validate.check_state("buckling", model, state)
+    arguments.count("buckling: count", count)
     tangent = Tangent(model)
     dofs = np.flatnonzero(tangent.free)
     whole = tangent.stiffness(free)

@@ -53,6 +53,10 @@ class State:
         self.net = net
         self.time = time
 
+    def __repr__(self) -> str:
+        model = self.model
+        return f"<State at t = {self.time:g} s: {model.worlds} worlds of {model.points_count} points on {model.device}>"
+
     def parts(self) -> dict:
         """State of every group of rods, and of the net if there is one, by name."""
         return {str(i): group for i, group in enumerate(self.groups)} | ({"net": self.net} if self.net else {})

@@ -1,95 +1,35 @@
 """What joins a scene's rods and adds surfaces to them: shells, joints, attachments, and what holds and loads shells."""
 
+import warnings
 from collections.abc import Callable, Iterable
+from copy import deepcopy
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from ddg_warp import validate
-from ddg_warp.errors import SceneError
+from ddg_warp import arguments, validate
+from ddg_warp.descriptions import Attachment, EdgeCouple, Joint, Pressure, Shell, ShellLoad, ShellSupport
+from ddg_warp.errors import SceneError, SceneWarning
 from ddg_warp.material import Material
 from ddg_warp.meridians import Meridians
 from ddg_warp.motion import Motion
+from ddg_warp.shell_geometry import MEMBRANES, MODELS, TURNING
+from ddg_warp.surface import Surface
+
+COINCIDE = 1e-6  # how far points that are meant to be one, or in one plane, may be apart, over the largest coordinate
 
 
-@dataclass
-class Shell:
-    """A triangle mesh with thickness and material; see `Scene.add_shell`."""
-
-    points: np.ndarray  # (P, 3) [m]
-    triangles: np.ndarray  # (T, 3)
-    thickness: np.ndarray
-    material: Material
-    bending: str
-    membrane: str
-    rest: object
-    name: str
-
-
-@dataclass(frozen=True)
-class ShellSupport:
-    """What is held of a shell: components of vertices, and what the surface does at the mesh edges between them.
-
-    `edges` is "" (free to turn), "clamp" (the normal is held) or "symmetry" (mirrored across the plane with normal `normal`).
-    """
-
-    shell: int
-    vertices: np.ndarray
-    components: str
-    edges: str = ""
-    normal: tuple = (0.0, 0.0, 0.0)
-    motion: Motion | None = None
-
-
-@dataclass(frozen=True)
-class ShellLoad:
-    """Dead forces (V, 3) [N] on vertices of a shell, times amplitude(t) if given."""
-
-    shell: int
-    vertices: np.ndarray
-    force: np.ndarray
-    amplitude: Callable[[float], float] | None = None
-
-
-@dataclass(frozen=True)
-class Pressure:
-    """Pressure [Pa] along the normals of triangles, which follow the surface unless `dead`; times amplitude(t) if given."""
-
-    shell: int
-    triangles: np.ndarray
-    pressure: np.ndarray
-    dead: bool = False
-    amplitude: Callable[[float], float] | None = None
-
-
-@dataclass(frozen=True)
-class Joint:
-    """Rods joined at nodes, (rod, node) each: hinged (positions alone) or rigid (their frames turn together)."""
-
-    members: tuple[tuple[int, int], ...]
-    rigid: bool
-
-
-@dataclass(frozen=True)
-class Attachment:
-    """Nodes of a rod that are vertices of a shell."""
-
-    rod: int
-    nodes: np.ndarray
-    shell: int
-    vertices: np.ndarray
-
-
-@dataclass
+@dataclass(kw_only=True, repr=False, eq=False)
 class Structures(Meridians):
     """The part of a scene that is a net: whatever is not a rod of its own."""
 
-    shells: list[Shell] = field(default_factory=list)
-    shell_supports: list[ShellSupport] = field(default_factory=list)
-    shell_loads: list[ShellLoad] = field(default_factory=list)
-    pressures: list[Pressure] = field(default_factory=list)
-    joints: list[Joint] = field(default_factory=list)
-    attachments: list[Attachment] = field(default_factory=list)
+    shells: list[Shell] = field(default_factory=list, init=False)
+    shell_supports: list[ShellSupport] = field(default_factory=list, init=False)
+    shell_loads: list[ShellLoad] = field(default_factory=list, init=False)
+    pressures: list[Pressure] = field(default_factory=list, init=False)
+    edge_couples: list[EdgeCouple] = field(default_factory=list, init=False)
+    joints: list[Joint] = field(default_factory=list, init=False)
+    attachments: list[Attachment] = field(default_factory=list, init=False)
 
     def add_shell(
         self,
@@ -124,26 +64,33 @@ class Structures(Meridians):
         Raises:
             SceneError: what is given is no surface; the message names shell and triangle.
         """
-        try:
-            points, triangles = np.array(points, float), np.array(triangles)
-        except (TypeError, ValueError):
-            raise SceneError(f"shell '{name}': points or triangles are no arrays of numbers") from None
-        if points.ndim != 2 or points.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
-            raise SceneError(
-                f"shell '{name}': points have shape {points.shape}, triangles {triangles.shape}; give (P, 3) and (T, 3)"
-            )
-        if not np.issubdtype(triangles.dtype, np.integer):
-            raise SceneError(f"shell '{name}': triangles are {triangles.dtype}; give whole numbers")
+        surface = Surface(points, triangles, name)
         if not isinstance(material, Material):
             raise SceneError(f"shell '{name}': material is {material!r}; give material=Material(...)")
-        self.shells.append(
-            Shell(points, triangles, np.asarray(thickness, float), material, bending, membrane, rest, name)
-        )
+        if np.any(np.abs(material.poisson) >= 1.0):
+            raise SceneError(f"shell '{name}': Poisson's ratio {material.poisson}; that of a shell is between -1 and 1")
+        arguments.choice(f"shell '{name}': bending", bending, MODELS)
+        arguments.choice(f"shell '{name}': membrane", membrane, MEMBRANES)
+        if isinstance(rest, str):
+            arguments.choice(f"shell '{name}': rest", rest, ("shape", "flat"))
+        else:
+            rest = _forms(f"shell '{name}': rest", rest, len(surface.triangles))
+        try:
+            thickness = np.array(thickness, float)
+        except (TypeError, ValueError):
+            raise SceneError(
+                f"shell '{name}': thickness is {thickness!r}; give one number, or one a triangle [m]"
+            ) from None
+        _warn_of_pieces(surface)
+        self.shells.append(Shell(surface, thickness, deepcopy(material), bending, membrane, rest, name))
         return len(self.shells) - 1
 
     def hold(self, shell: int, vertices, components: str = "xyz", motion: Motion | None = None) -> None:
-        """Hold components of vertices of a shell, which `motion` moves; the surface may turn there (simply supported)."""
-        self._hold(shell, vertices, components, motion=motion)
+        """Hold components of vertices of a shell, which `motion` moves; the surface may turn there (simply supported).
+
+        The motion may give every vertex a displacement of its own.
+        """
+        self._hold("hold", shell, vertices, components, motion=motion)
 
     def clamp_boundary(self, shell: int, vertices, components: str = "xyz", motion: Motion | None = None) -> None:
         """Hold components of vertices, and the surface's normal at the mesh edges between them, inside the surface, too.
@@ -151,34 +98,96 @@ class Structures(Meridians):
         `motion` moves the components and turns the normals as one body, however many times; it moves no other components, so
         that with "yz" a clamp that turns can slide along x.
         """
-        self._hold(shell, vertices, components, edges="clamp", motion=motion)
+        vertices = self._vertices(shell, vertices)
+        surface = self.shells[shell].surface
+        self._need_edges("clamp_boundary", shell, vertices, np.arange(len(surface.edges)), "mesh edge", "hold")
+        self._hold("clamp_boundary", shell, vertices, components, edges="clamp", motion=motion)
 
-    def symmetry(self, shell: int, vertices, axis: str) -> None:
-        """Put vertices on a symmetry plane across an axis of space, "x", "y" or "z", which the surface meets at a right angle."""
-        if axis not in ("x", "y", "z"):
-            raise SceneError(f"symmetry: axis is {axis!r}; it is 'x', 'y' or 'z'")
-        self._hold(shell, vertices, axis, edges="symmetry", normal=tuple(np.eye(3)["xyz".index(axis)]))
+    def symmetry(self, shell: int, vertices, axis) -> None:
+        """Put vertices on a symmetry plane, which the surface meets at a right angle.
+
+        Args:
+            shell: index.
+            vertices: at the boundary, in one plane.
+            axis: of space that the plane is across, "x", "y" or "z"; or the plane's normal (3,), of any length.
+        """
+        if isinstance(axis, str):
+            normal = np.eye(3)["xyz".index(arguments.choice("symmetry: axis", axis, ("x", "y", "z")))]
+        else:
+            normal = np.array(arguments.vector("symmetry: axis, 'x', 'y' or 'z' or the plane's normal,", axis))
+            if not normal.any():
+                raise SceneError("symmetry: the normal is zero; give three numbers that are not, or 'x', 'y' or 'z'")
+            normal /= np.linalg.norm(normal)
+            # to rounding, an axis of space is one
+            axis = "xyz"[np.argmax(np.abs(normal))] if np.sort(np.abs(normal))[1] < 1e-15 else ""
+            normal = np.round(normal) if axis else normal
+        vertices = self._vertices(shell, vertices)
+        surface = self.shells[shell].surface
+        height = surface.points[vertices] @ normal
+        off = np.abs(height - np.median(height))
+        if off.max() > COINCIDE * np.ptp(surface.points, axis=0).max():
+            raise SceneError(
+                f"symmetry: vertex {vertices[np.argmax(off)]} of shell {shell} is {off.max():.3g} m off the plane "
+                f"{axis or 'with this normal at'} = {np.median(height):g} m of the others; choose the vertices of one plane"
+            )
+        self._need_edges("symmetry", shell, vertices, surface.boundary_edges, "boundary edge", "hold")
+        self._hold("symmetry", shell, vertices, axis, edges="symmetry", normal=tuple(normal.tolist()))
 
     def add_vertex_force(self, shell: int, vertices, force, amplitude: Callable[[float], float] | None = None) -> None:
         """Dead force [N] on each of some vertices, (3,) or (V, 3). In statics it grows with the load parameter."""
-        vertices = self._vertices(shell, vertices)
-        try:
-            force = np.broadcast_to(np.asarray(force, float), (len(vertices), 3)).copy()
-        except (TypeError, ValueError):
-            force = np.full(1, np.nan)
-        if not np.isfinite(force).all():
-            raise SceneError(f"add_vertex_force: give finite forces, (3,) or one for each of {len(vertices)} vertices")
-        self.shell_loads.append(ShellLoad(shell, vertices, force, _amplitude(amplitude)))
+        vertices = arguments.once("add_vertex_force: vertices", self._vertices(shell, vertices))
+        force = arguments.broadcast("add_vertex_force: force", force, (len(vertices), 3))
+        amplitude = arguments.amplitude("add_vertex_force", amplitude)
+        self.shell_loads.append(ShellLoad(shell, vertices, force, amplitude))
 
     def add_edge_force(self, shell: int, path, force, amplitude: Callable[[float], float] | None = None) -> None:
-        """Dead force per length (3,) [N/m] along a path of vertices, shared out by half the length to either side at rest."""
-        path = self._vertices(shell, path)
-        force = np.array(validate.vector("add_edge_force: force", force))
-        lengths = np.linalg.norm(np.diff(self.shells[shell].points[path], axis=0), axis=1)
-        if not lengths.size or not lengths.all():
-            raise SceneError("add_edge_force: the path has no length; give two different vertices at least, in order")
-        share = 0.5 * (np.concatenate([[0.0], lengths]) + np.concatenate([lengths, [0.0]]))
-        self.shell_loads.append(ShellLoad(shell, path, share[:, None] * force, _amplitude(amplitude)))
+        """Dead force per length (3,) [N/m] along mesh edges, shared out by half the length to either end at rest.
+
+        Args:
+            shell: index.
+            path: vertices, in any order, of a part of the boundary: all boundary edges between them are loaded; or mesh edges, inside
+                the surface, too, as pairs of vertices (E, 2).
+            force: per length [N/m].
+            amplitude: of the time, or None.
+        """
+        surface, edges = self._mesh_edges("add_edge_force", shell, path)
+        force = np.array(arguments.vector("add_edge_force: force", force))
+        half = 0.5 * np.linalg.norm(np.diff(surface.points[surface.edges[edges]], axis=1)[:, 0], axis=1)
+        share = np.bincount(surface.edges[edges].ravel(), np.repeat(half, 2), len(surface.points))
+        vertices = np.flatnonzero(share)
+        amplitude = arguments.amplitude("add_edge_force", amplitude)
+        self.shell_loads.append(ShellLoad(shell, vertices, share[vertices, None] * force, amplitude))
+
+    def add_edge_couple(self, shell: int, path, couple, amplitude: Callable[[float], float] | None = None) -> None:
+        """Couple per length [N] about boundary edges, as long as at rest: an edge moment, which follows the edge.
+
+        It is positive by the right hand about the edge with the surface to its left, so that it makes the surface convex on the side
+        of its normals. It does the work of the angle of the normal at the edge, so that bending needs one there: "midedge_dof" or
+        "midedge_boundary". It has no potential where the edge moves out of its direction.
+
+        Args:
+            shell: index.
+            path: as for `add_edge_force`, of the boundary alone.
+            couple: one number, or one an edge where edges are given as pairs [N].
+            amplitude: of the time, or None.
+
+        Raises:
+            SceneError: an edge inside the surface, or one without an angle.
+        """
+        surface, edges = self._mesh_edges("add_edge_couple", shell, path)
+        bending = self.shells[shell].bending
+        if bending not in TURNING:
+            raise SceneError(
+                f"add_edge_couple: the edges of shell {shell} have no angle with bending {bending!r}; take {' or '.join(TURNING)}"
+            )
+        for edge in edges[~surface.boundary[edges]][:1]:
+            raise SceneError(
+                "add_edge_couple: the edge between the vertices {} and {} is inside the surface; give edges of its boundary".format(
+                    *surface.edges[edge]
+                )
+            )
+        couple = arguments.broadcast("add_edge_couple: couple", couple, edges.shape)
+        self.edge_couples.append(EdgeCouple(shell, edges, couple, arguments.amplitude("add_edge_couple", amplitude)))
 
     def add_pressure(
         self, shell: int, pressure, triangles=None, *, dead: bool = False, amplitude: Callable | None = None
@@ -190,17 +199,14 @@ class Structures(Meridians):
         """
         self._check_shell(shell)
         count = len(self.shells[shell].triangles)
-        index = np.arange(count) if triangles is None else np.array(validate.indices("triangles", triangles), int)
+        index = slice(None) if triangles is None else triangles
+        index = arguments.once("add_pressure: triangles", arguments.indices("add_pressure: triangles", index, count))
         bad = index[(index < 0) | (index >= count)]
         if bad.size:
             raise SceneError(f"add_pressure: triangle {bad[0]} does not exist; shell {shell} has {count}")
-        try:
-            pressure = np.broadcast_to(np.asarray(pressure, float), index.shape).copy()
-        except (TypeError, ValueError):
-            pressure = np.full(1, np.nan)
-        if not np.isfinite(pressure).all():
-            raise SceneError(f"add_pressure: give one finite number, or one for each of {len(index)} triangles")
-        self.pressures.append(Pressure(shell, index, pressure, dead, _amplitude(amplitude)))
+        pressure = arguments.broadcast("add_pressure: pressure", pressure, index.shape)
+        dead, amplitude = arguments.flag("add_pressure: dead", dead), arguments.amplitude("add_pressure", amplitude)
+        self.pressures.append(Pressure(shell, index, pressure, dead, amplitude))
 
     def join(self, members: Iterable[tuple[int, int]], rigid: bool = True) -> None:
         """Join rods at nodes, (rod, node) each: at the same point at rest.
@@ -209,46 +215,98 @@ class Structures(Meridians):
         two collinear rods joined rigidly are one rod. A hinged joint shares the position alone.
         """
         pairs = []
-        for member in members:
-            rod, node = validate.indices("join: member", member)
-            self._rods(rod)
-            pairs.append((rod, node))
+        for member in members if np.iterable(members) else [members]:
+            pair = tuple(member) if np.iterable(member) else ()
+            if len(pair) != 2:
+                raise SceneError(f"join: {member!r} is no member; give (rod, node) each")
+            rods, (node,) = self._on_rods("join", *pair[:1], "node", arguments.index("join: node", pair[1]))
+            pairs.append((int(rods[0]), node))
         if len(set(pairs)) < 2:
             raise SceneError(f"join: {pairs}; a joint has two different members at least, (rod, node) each")
-        self.joints.append(Joint(tuple(pairs), bool(rigid)))
+        self.joints.append(Joint(tuple(pairs), arguments.flag("join: rigid", rigid)))
 
     def attach(self, rod: int, nodes, shell: int, vertices) -> None:
         """Make nodes of a rod and vertices of a shell one: a stiffener, a line, a rim. They are at the same points at rest."""
-        self._rods(rod)
-        nodes = np.array(validate.indices("attach: nodes", nodes), int)
+        (rod,), nodes = self._on_rods("attach", arguments.index("attach: rod", rod), "node", nodes)
         vertices = self._vertices(shell, vertices)
         if len(nodes) != len(vertices):
             raise SceneError(f"attach: {len(nodes)} nodes of rod {rod} and {len(vertices)} vertices; give as many")
-        self.attachments.append(Attachment(rod, nodes, shell, vertices))
+        self.attachments.append(Attachment(int(rod), np.array(nodes), shell, vertices))
 
-    def _hold(self, shell, vertices, components, **options) -> None:
-        if not components or set(components) - set("xyz"):
-            raise SceneError(f"hold: components {components!r}; they are letters of 'xyz', one at least")
-        motion = options.get("motion")
-        if motion is not None and not isinstance(motion, Motion):
-            raise SceneError(f"motion is {motion!r}; give Motion(translation=..., angle=...)")
-        self.shell_supports.append(ShellSupport(shell, self._vertices(shell, vertices), components, **options))
+    def _hold(self, call: str, shell, vertices, components, **options) -> None:
+        if options.get("edges") != "symmetry":  # an oblique plane has none
+            arguments.components(call, components)
+        motion, vertices = options.get("motion"), self._vertices(shell, vertices)
+        validate.check_motion(call, motion, planar=False)
+        if motion is not None and motion.count not in (None, len(vertices)):
+            raise SceneError(
+                f"{call}: the motion has {motion.count} displacements of {len(vertices)} vertices; give one for each"
+            )
+        self.shell_supports.append(ShellSupport(shell, vertices, components, call=call, **options))
 
     def _check_shell(self, shell) -> None:
-        if not 0 <= validate.index("shell", shell) < len(self.shells):
+        if not 0 <= arguments.index("shell", shell) < len(self.shells):
             raise SceneError(f"shell {shell} does not exist; the scene has {len(self.shells)} shells so far")
 
     def _vertices(self, shell, vertices) -> np.ndarray:
         self._check_shell(shell)
         count = len(self.shells[shell].points)
-        index = np.array(validate.indices("vertices", vertices), int)
+        index = arguments.indices("vertices", vertices, count)
         bad = index[(index < 0) | (index >= count)]
         if bad.size:
             raise SceneError(f"vertex {bad[0]} does not exist: shell {shell} has {count} vertices")
         return index
 
+    def _mesh_edges(self, call: str, shell: int, path) -> tuple[Surface, np.ndarray]:
+        """The surface of a shell, and its edges that vertices of its boundary, or pairs of vertices, name."""
+        self._check_shell(shell)
+        surface = self.shells[shell].surface
+        if np.ndim(path) == 2 and np.shape(path)[1] == 2 and np.asarray(path).dtype.kind in "iu":
+            edges = surface.edge_between(*np.asarray(path).T)
+            return surface, arguments.once(f"{call}: edges", edges)
+        vertices = self._vertices(shell, path)
+        return surface, self._need_edges(
+            call, shell, vertices, surface.boundary_edges, "boundary edge", "pairs of vertices"
+        )
 
-def _amplitude(amplitude):
-    if amplitude is not None and not callable(amplitude):
-        raise SceneError(f"amplitude is {amplitude!r}; give a function of the time, or None")
-    return amplitude
+    def _need_edges(self, call: str, shell: int, vertices, among: np.ndarray, kind: str, instead: str) -> np.ndarray:
+        """The edges between vertices; refuses a vertex that is at none of them."""
+        surface = self.shells[shell].surface
+        edges = np.intersect1d(surface.edges_on(vertices), among)
+        alone = np.setdiff1d(vertices, surface.edges[edges])
+        if alone.size:
+            raise SceneError(
+                f"{call}: no {kind} leads from vertex {alone[0]} of shell {shell} to another of the {len(vertices)} vertices given; "
+                f"choose the ends of edges, or use {instead}"
+            )
+        return edges
+
+
+def _forms(what: str, rest, triangles: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rest forms (abar, bbar), copies."""
+    if not isinstance(rest, list | tuple) or len(rest) != 2:
+        raise SceneError(f"{what} is {rest!r}; it is 'shape', 'flat' or two arrays (abar, bbar)")
+    try:
+        forms = tuple(np.array(values, float) for values in rest)
+    except (TypeError, ValueError):
+        forms = (np.zeros(0),)
+    for values in forms:
+        if values.shape != (triangles, 3) or not np.isfinite(values).all():
+            raise SceneError(f"{what} has shape {values.shape}; both arrays are finite and of shape {(triangles, 3)}")
+    return forms
+
+
+def _warn_of_pieces(surface: Surface) -> None:
+    """Warn of a mesh in pieces some vertices of which lie on each other: it was likely meant to be welded."""
+    pieces = surface.pieces
+    if pieces == 1:
+        return
+    step = COINCIDE * max(1e-300, np.ptp(surface.points, axis=0).max())
+    shared = len(surface.points) - len(np.unique(np.round(surface.points / step), axis=0))
+    if shared:
+        warnings.warn(
+            f"shell '{surface.name}' falls into {pieces} pieces, though {shared} of its vertices lie on others: weld them with "
+            "read_mesh(path, weld=1e-6) or meshes.weld(points, triangles, 1e-6)",
+            SceneWarning,
+            stacklevel=3,
+        )

@@ -60,6 +60,8 @@ class Surface:
         self.boundary = (halves < 0).any(axis=1)
         self._refuse_doubled()
         self._refuse_several_fans(halves)
+        self.points.setflags(write=False)
+        self.triangles.setflags(write=False)
 
     @property
     def boundary_edges(self) -> np.ndarray:
@@ -77,6 +79,16 @@ class Surface:
     def euler_characteristic(self) -> int:
         """Vertices - edges + triangles: 2 for a sphere, 1 for a disc, 0 for a torus, an annulus or a cylinder."""
         return len(self.points) - len(self.edges) + len(self.triangles)
+
+    @cached_property
+    def pieces(self) -> int:
+        """Number of parts that share no vertex."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        count = len(self.points)
+        graph = coo_array((np.ones(len(self.edges)), self.edges.T), shape=(count, count))
+        return int(connected_components(graph, directed=False)[0])
 
     def boundary_loops(self) -> list[np.ndarray]:
         """Vertices of each boundary curve, with the surface to the left; the loop with the lowest vertex first, from there."""

@@ -186,6 +186,18 @@ class Tangent:
         part = next(part for part in self.parts if part.offset <= dof < part.offset + part.size)
         return part.where(dof - part.offset)
 
+    def into(self, values: np.ndarray) -> np.ndarray:
+        """Vectors in space (size,) as dofs are: components in the frames of oblique planes; see `ddg_warp.net_planes`."""
+        return self._each("into", values)
+
+    def back(self, values: np.ndarray) -> np.ndarray:
+        """Dofs, forces or steps (size,) as vectors in space."""
+        return self._each("back", values)
+
+    def _each(self, how: str, values: np.ndarray) -> np.ndarray:
+        parts = [(part, self.of(part, values)) for part in self.parts]
+        return np.concatenate([getattr(part, how)(own) if hasattr(part, how) else own for part, own in parts])
+
     @staticmethod
     def of(part, values: np.ndarray) -> np.ndarray:
         """The entries of a part."""

@@ -1,69 +1,103 @@
 """What a scene must fulfil before anything is built: every refusal names the object, its index and the remedy."""
 
-import operator
+import warnings
 
 import numpy as np
 
-from ddg_warp import geometry
-from ddg_warp.errors import SceneError
+from ddg_warp import arguments, geometry
+from ddg_warp.descriptions import Dynamics, Statics, Trace
+from ddg_warp.errors import SceneError, SceneWarning
+from ddg_warp.motion import Motion
+
+DOUBLED = 1e-10  # length of an edge, over the longest of its rod, at which its two nodes are one
+STARTS = 1e-9  # displacement over the size of the scene, or angle [rad], up to which a motion starts at zero
 
 
-def check_scene(scene) -> None:
-    """What belongs to no rod: gravity, damping, dimension; and the edges that supports name.
+def check_settings(scene) -> None:
+    """Gravity, dimension, damping, analysis and functions of a scene.
 
     Raises:
         SceneError: the first thing found wrong.
     """
-    vector("gravity", scene.gravity)
+    arguments.vector("gravity", scene.gravity)
     if scene.dimension not in (2, 3):
-        raise SceneError(f"dimension = {scene.dimension}; a scene is of dimension 2 or 3")
-    damping = scene.mass_damping
-    if not (np.ndim(damping) == 0 and np.isfinite(damping) and damping >= 0.0):
-        raise SceneError(f"mass_damping = {damping}; it is one number, finite and not negative [1/s]")
-    if not scene.batches:
-        return
-    edges = np.concatenate([np.full(batch.rods, batch.edges) for batch in scene.batches])
-    for support in scene.supports:
-        for edge in support.edges:
-            check_index("edge", edge, edges[support.rods], support.rods)
+        raise SceneError(f"dimension = {scene.dimension!r}; a scene is of dimension 2 or 3")
+    arguments.number(
+        "mass_damping", scene.mass_damping, "one number, finite and not negative [1/s]", lambda v: v >= 0.0
+    )
+    if not isinstance(scene.analysis, Dynamics | Statics | Trace):
+        raise SceneError(f"analysis is {scene.analysis!r}; give Dynamics(...), Statics(...) or Trace(...)")
+    if scene.initial is not None and not callable(scene.initial):
+        raise SceneError(f"initial is {scene.initial!r}; give a function of the model that returns a state, or None")
+    if not isinstance(scene.callbacks, list | tuple):
+        raise SceneError(f"callbacks are {scene.callbacks!r}; give a list of functions of the state")
+    for i, callback in enumerate(scene.callbacks):
+        if not callable(callback):
+            raise SceneError(f"callbacks[{i}] is {callback!r}; give functions of the state")
 
 
-def vector(what: str, value) -> tuple[float, float, float]:
-    """Three finite numbers, or a refusal that names `what`."""
-    try:
-        result = np.asarray(value, float)
-    except (TypeError, ValueError):
-        result = np.array(np.nan)
-    if result.shape != (3,) or not np.isfinite(result).all():
-        raise SceneError(f"{what} is {value!r}; give three finite numbers")
-    return tuple(result.tolist())
+def check_scene(scene) -> None:
+    """What belongs to no rod: settings, gravity in the plane, and motions that start where their supports are at rest.
+
+    Raises:
+        SceneError: the first thing found wrong.
+    """
+    check_settings(scene)
+    if scene.dimension == 2 and scene.gravity[1] != 0.0:
+        raise SceneError(
+            f"gravity is {tuple(scene.gravity)}; a scene of dimension 2 stays in the plane of x and z, give 0 along y"
+        )
+    objects = [*scene.batches, *scene.shells, *scene.axisymmetric_shells]
+    size = max(
+        (np.nanmax(np.ptp(o.points.reshape(-1, o.points.shape[-1]), axis=0)) for o in objects if o.points.size),
+        default=1.0,
+    )
+    for support in (*scene.supports, *scene.shell_supports, *scene.ring_supports):
+        motion = support.motion
+        if motion is None:
+            continue
+        held = ["xyz".index(c) for c in support.components]
+        shift, angle = motion.shift(0.0)[:, held], motion.turned(0.0)
+        if np.abs(shift).max() > STARTS * size:
+            row = int(np.argmax(np.abs(shift).max(axis=1)))
+            raise SceneError(
+                f"{support.call}: the motion's translation at t = 0 is {tuple(shift[row].tolist())} m along "
+                f"{support.components}; supports start where they are "
+                "at rest, so subtract its value at 0, or move the points"
+            )
+        if abs(angle) > STARTS:
+            raise SceneError(
+                f"{support.call}: the motion's angle at t = 0 is {angle:g} rad; supports start as they are at rest, so subtract its "
+                "value at 0, or turn the points"
+            )
 
 
-def number(what: str, value) -> float:
-    """One finite number, or a refusal that names `what`."""
-    try:
-        result = float(value)
-    except (TypeError, ValueError):
-        result = np.nan
-    if not np.isfinite(result):
-        raise SceneError(f"{what} is {value!r}; give one finite number")
-    return result
+def check_motion(call: str, motion, planar: bool) -> None:
+    """Refuse what is no motion, or turns out of the plane of x and z where that is all there is."""
+    if motion is not None and not isinstance(motion, Motion):
+        raise SceneError(f"{call}: motion is {motion!r}; give Motion(translation=..., angle=...)")
+    if motion is not None and planar and not motion.planar:
+        raise SceneError(
+            f"{call}: the motion turns about {tuple(motion.axis)}, out of the plane of x and z; give axis=(0, 1, 0)"
+        )
 
 
-def indices(what: str, values) -> tuple[int, ...]:
-    """One or several whole numbers, or a refusal that names `what`."""
-    values = list(values) if np.iterable(values) else [values]
-    try:
-        return tuple(operator.index(value) for value in values)
-    except TypeError:
-        raise SceneError(f"{what} {values} are no indices; give whole numbers") from None
+def check_model(call: str, model) -> None:
+    """Refuse what is no model, where one is asked for."""
+    from ddg_warp.model import Model
+
+    if not isinstance(model, Model):
+        raise SceneError(f"{call}: the model is {type(model).__name__}; give what scene.build() returns")
 
 
-def index(what: str, value) -> int:
-    """One whole number, or a refusal that names `what`."""
-    if np.iterable(value):
-        raise SceneError(f"{what} is {value!r}; give one whole number")
-    return indices(what, value)[0]
+def check_state(call: str, model, state) -> None:
+    """Refuse what is no state of a model."""
+    from ddg_warp.state import State
+
+    if not isinstance(state, State):
+        raise SceneError(f"{call}: the state is {state!r}; give one of this model, such as model.state()")
+    if state.model is not model:
+        raise SceneError(f"{call}: the state is of another model; give one that this model made, such as model.state()")
 
 
 def directions(what: str, value, rods: np.ndarray) -> np.ndarray:
@@ -94,9 +128,22 @@ def check_batch(batch, dimension: int) -> None:
     _refuse(~np.isfinite(batch.points).all(-1), batch, "node {k} is at a non-finite position; check the points")
     edges = geometry.edge_vectors(batch.points, batch.closed)
     if dimension == 2:
+        outside = np.abs(edges[..., 1]) > DOUBLED * np.linalg.norm(edges, axis=-1)
+        _refuse(
+            outside,
+            batch,
+            "edge {k} leaves the plane of x and z, in which a scene of dimension 2 stays; give all nodes one y",
+        )
         edges = edges[..., [0, 2]]
     lengths = np.linalg.norm(edges, axis=-1)
-    _refuse(lengths <= 0.0, batch, "edge {k} has no length; remove the doubled node")
+    doubled = lengths <= DOUBLED * lengths.max(axis=-1, keepdims=True)
+    if batch.closed:
+        _refuse(
+            doubled & (np.arange(batch.edges) == batch.edges - 1),
+            batch,
+            f"node {batch.nodes - 1} lies on node 0, to which a closed rod joins it; leave the last point out",
+        )
+    _refuse(doubled, batch, "edge {k} has no length, nodes {k} and {k} + 1 lie at one point; remove one of them")
     if batch.bend:
         before, after = geometry.ahead(edges / lengths[..., None], batch.closed)
         _refuse(
@@ -179,3 +226,23 @@ def _refuse(bad: np.ndarray, batch, message: str) -> None:
     if bad.any():
         rod, k = np.argwhere(bad)[0]
         raise SceneError(f"rod {batch.first + rod} ('{batch.name}'): " + message.format(k=k))
+
+
+def warn_of_massless(model) -> None:
+    """Warn of what gravity does not act on in statics, because it has no mass."""
+    if not any(model.scene.gravity):
+        return
+    for batch in model.scene.batches:
+        if not np.any(np.asarray(batch.section.mass_per_length)):
+            weighed = {rod for rods, _, _ in model.scene.masses for rod in rods}
+            for rod in [rod for rod in range(batch.first, batch.first + batch.rods) if rod not in weighed][:1]:
+                _warn(f"rod {rod} ('{batch.name}')", "mass_per_length, or its material a density")
+    for kind, shells in (("shell", model.scene.shells), ("axisymmetric shell", model.scene.axisymmetric_shells)):
+        for i, shell in enumerate(shells):
+            if not np.any(np.asarray(shell.material.density)):
+                _warn(f"{kind} {i} ('{shell.name}')", "a density")
+
+
+def _warn(name: str, remedy: str) -> None:
+    text = f"{name} has no mass, so that gravity does not act on it: give it {remedy}, or the scene gravity=(0, 0, 0)"
+    warnings.warn(text, SceneWarning, stacklevel=5)

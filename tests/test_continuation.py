@@ -365,7 +365,11 @@ def test_mistakes(device):
         continuation.trace(stop=Stop(displacement=("rise", 0.0, 1.0)))
     with pytest.raises(ValueError, match=r"regular.*bifurcation"):
         continuation.switch(continuation.trace(stop=Stop(steps=1)).points[0])
-    for row, axis, message in ((3, "z", "there are 3 points"), (1, "w", "axes x, y and z"), (1, "y", "planar")):
+    for row, axis, message in (
+        (3, "z", "there are 3 points"),
+        (1, "w", "axis is 'w'; it is 'x', 'y' or 'z'"),
+        (1, "y", "planar"),
+    ):
         with pytest.raises(ddg.SceneError, match=message):
             Continuation(continuation.model, {"d": Displacement.of(row, axis)})
     with pytest.raises(ddg.SceneError, match="step = 0"):

@@ -20,7 +20,9 @@ KINDS = {"full": {}, "untwisted": {"twist": False}, "planar": {"dimension": 2}, 
 def build(device, scale=1.0, kind="full", worlds=1, viscosity=0.0):
     """Three cantilevers of random rest lengths, all sections `scale` times a common one."""
     options = dict(KINDS[kind])
-    scene = ddg.Scene(gravity=(0.0, 1.0, -9.81), dimension=options.pop("dimension", 3))
+    dimension = options.pop("dimension", 3)
+    across = 1.0 if dimension == 3 else 0.0
+    scene = ddg.Scene(gravity=(0.0, across, -9.81), dimension=dimension)
     points = np.zeros((RODS, NODES, 3))
     points[..., 0] = np.cumsum(np.random.default_rng(3).uniform(0.05, 0.15, size=NODES))
     section = ddg.Stiffness(
@@ -34,7 +36,7 @@ def build(device, scale=1.0, kind="full", worlds=1, viscosity=0.0):
     )
     rods = scene.add_rods(points, section=section, natural="straight", **options)
     scene.clamp(rods, edges=[0])
-    scene.add_force(rods, NODES - 1, (0.1, 0.05, 0.0))
+    scene.add_force(rods, NODES - 1, (0.1, 0.05 * across, 0.0))
     return scene.build(device=device, precision="float64", worlds=worlds)
 
 

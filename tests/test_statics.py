@@ -393,3 +393,22 @@ def test_unsymmetric_spectrum(device, monkeypatch):
     np.testing.assert_allclose(few.eigenvalues, whole.eigenvalues, rtol=1e-7)
     without = spectrum(model, state, 6, load=0.0)
     assert np.abs(without.eigenvalues / whole.eigenvalues - 1.0).max() > 1e-3
+
+
+def test_a_hinged_rod_is_pulled_straight(device):
+    """One hinge lets a rod turn, not go away: the equilibrium exists, along the load, longer by F L / EA."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    rod = scene.add_rod(straight(5), section=ddg.Stiffness(EA=1e3, EI1=1.0, GJ=1.0))
+    scene.fix(rod, [0])
+    scene.add_force(rod, -1, (0.0, 1.0, 0.0))
+    state = solve(scene.build(device, "float64"))
+    np.testing.assert_allclose(state.points()[-1], (0.0, 1.0 + 1.0 / 1e3, 0.0), atol=1e-8)
+
+
+def test_spectrum_of_free_rods(device):
+    """A free rod has no equilibrium under its weight, but it has modes of vibration: six rigid ones and its spin."""
+    scene = ddg.Scene()
+    for nodes in (7, 5):
+        scene.add_rod(straight(nodes), section=SECTION)
+    model = scene.build(device, "float64")
+    assert spectrum(model, model.state(), 14).eigenvalues[:12] == pytest.approx(np.zeros(12), abs=1e-6)

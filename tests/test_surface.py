@@ -209,11 +209,11 @@ def test_a_moebius_band_is_refused():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: meshes.rectangle(3, 3, pattern="hexagonal"), "no pattern 'hexagonal'"),
+        (lambda: meshes.rectangle(3, 3, pattern="hexagonal"), "pattern is 'hexagonal'"),
         (lambda: meshes.rectangle(0, 3), "nx = 0"),
         (lambda: meshes.torus(5, 4, 2.0, 1.0, "alternating"), "even number"),
         (lambda: meshes.cylinder(2, 4, 1.0, 1.0), "at least 3"),
-        (lambda: meshes.jittered_rectangle(3, 3, jitter=0.5), "jitter = 0.5"),
+        (lambda: meshes.jittered_rectangle(3, 3, jitter=0.5), "jitter is 0.5"),
         (lambda: meshes.disc(0), "rings = 0"),
     ],
 )

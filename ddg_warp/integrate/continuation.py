@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.optimize import brentq
 
+from ddg_warp import arguments, validate
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.integrate.corrector import ContinuationOptions, Corrector, Failed
 from ddg_warp.integrate.path import BIFURCATION, LIMIT_POINT, Displacement, Path, Point, Stop
@@ -38,6 +39,9 @@ class Continuation:
     """
 
     def __init__(self, model, watch: Mapping[str, Displacement] | None = None, **options):
+        for name, displacement in (watch or {}).items():
+            if not isinstance(displacement, Displacement):
+                raise SceneError(f"watch[{name!r}] is {displacement!r}; give Displacement.of(row, axis)")
         self.model, self.options = model, ContinuationOptions(**options)
         self.corrector = Corrector(model, watch or {}, self.options)
         self.tangent, self.watched = self.corrector.tangent, self.corrector.watched
@@ -62,10 +66,27 @@ class Continuation:
             SolverError: `no_start`, `singular_start` or `step_too_small`; carries the last good state, and the path so far as its
                 `path`.
         """
-        first = self.corrector.start(state or self.model.state(), start)
+        if direction not in (1, -1):
+            raise SceneError(f"direction = {direction!r}; it is 1, with the load growing at first, or -1")
+        first = self._start(state, start)
+        stop = self._stop(stop)
         if direction * first.direction[-1] < 0.0:
             first.direction = -first.direction
-        return self._follow(Path([first]), stop or Stop())
+        return self._follow(Path([first]), stop)
+
+    def _start(self, state: State | None, start: float) -> Point:
+        """The first point of a path, near `state`."""
+        if state is not None:
+            validate.check_state("continuation", self.model, state)
+        return self.corrector.start(state or self.model.state(), arguments.number("continuation: start", start))
+
+    def _stop(self, stop: Stop | None) -> Stop:
+        """Where a path ends, checked."""
+        if stop is not None and not isinstance(stop, Stop):
+            raise SceneError(f"stop is {stop!r}; give Stop(...)")
+        if stop is not None and stop.displacement is not None and stop.displacement[0] not in self.watched:
+            raise SceneError(f"stop at {stop.displacement[0]!r}: it is not watched; there is {list(self.watched)}")
+        return stop or Stop()
 
     def switch(self, bifurcation: Point, *, side: int = 1, step: float | None = None, stop: Stop | None = None) -> Path:
         """Leave a bifurcation along its critical mode, and follow the other path.
@@ -80,6 +101,10 @@ class Continuation:
             SolverError: `no_branch`: no equilibrium beside the path was found; try another step.
             ValueError: the point is no bifurcation.
         """
+        if not isinstance(bifurcation, Point):
+            raise ValueError(f"switch: {bifurcation!r} is no point of a path; give one of path.bifurcations")
+        if side not in (1, -1):
+            raise SceneError(f"side = {side!r}; it is 1 or -1, the sense of the mode")
         if bifurcation.kind != BIFURCATION:
             raise ValueError(f"the point is a {bifurcation.kind}; a path branches at a bifurcation")
         across = np.append(bifurcation.mode, 0.0)
@@ -101,7 +126,7 @@ class Continuation:
         if self.corrector.dot(point.direction, across) < 0.0:
             point.direction = -point.direction
         point.arclength = bifurcation.arclength + distance
-        return self._follow(Path([bifurcation, point]), stop or Stop())
+        return self._follow(Path([bifurcation, point]), self._stop(stop))
 
     def control(
         self,
@@ -129,7 +154,8 @@ class Continuation:
                 f"no displacement {displacement!r} is watched; give watch={{{displacement!r}: Displacement...}}"
             )
         row = np.append(self.watched[displacement], 0.0)
-        here, path = self.corrector.start(state or self.model.state(), start), Path()
+        values = arguments.broadcast("control: values", values, np.shape(values) or (1,))
+        here, path = self._start(state, start), Path()
         for value in values:
             reached, cuts = here.values[displacement], 0
             increment = value - reached

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from ddg_warp import stability
+from ddg_warp import stability, validate
 from ddg_warp.errors import SceneError, SolverError, check_options
 from ddg_warp.integrate.path import REGULAR, Displacement, Point
 from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
@@ -66,6 +66,7 @@ class Corrector:
     """
 
     def __init__(self, model, watch: Mapping[str, Displacement], options: ContinuationOptions):
+        validate.check_model("continuation", model)
         if model.worlds != 1:
             raise SceneError(f"a path is followed in one world; the model has {model.worlds}")
         self.options = options
@@ -76,7 +77,7 @@ class Corrector:
         self.rest = tangent.dofs(model.state())
         self.free = np.flatnonzero(tangent.free)
         position = tangent.point_dofs()
-        size = np.linalg.norm(np.ptp(np.where(position >= 0, self.rest[position], 0.0), axis=0))
+        size = np.linalg.norm(np.ptp(model.state().points(), axis=0))
         lengths = np.where(tangent.angle, tangent.edge_length(), 1.0) / size
         weights = np.append(lengths**2 / len(position), self.options.load_scale**-2)
         self.metric = np.where(np.append(tangent.free, True), weights, 0.0)

@@ -3,12 +3,12 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays, geometry
+from ddg_warp import arguments, arrays, geometry, validate
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.graphs import Graphs
 from ddg_warp.integrate.buffers import Buffer
 from ddg_warp.integrate.net_step import NetStep
-from ddg_warp.integrate.prescribed import PrescribedMotion, TimedLoads
+from ddg_warp.integrate.prescribed import PrescribedMotion, TimedLoads, jump_between
 from ddg_warp.kernels import element, outcome, step
 from ddg_warp.linear.choice import automatic
 from ddg_warp.linear.partitioned import PartitionedNewton
@@ -21,6 +21,7 @@ from ddg_warp.threads import launches
 SOLVERS = ("newton", "projective")
 SCHEMES = ("implicit_euler", "implicit_midpoint")
 DIRECT = {"sweep": ChainNewton, "partitioned": PartitionedNewton}  # solvers of open rods by their name
+NET_ONLY = ("multilevel", "chain_multilevel")  # preconditioners of nets
 FOLDED = 1e-5  # how close to opposite [rad] edges that meet are called folded, in messages
 
 
@@ -69,15 +70,16 @@ class Integrator:
         check_every: int | None = None,
         **options,
     ):
-        if scheme not in SCHEMES:
-            raise SceneError(f"scheme {scheme!r}: it is one of {', '.join(SCHEMES)}")
-        if solver not in SOLVERS:
-            raise SceneError(f"solver {solver!r}: it is one of {', '.join(SOLVERS)}")
+        validate.check_model("Integrator", model)
+        arguments.choice("scheme", scheme, SCHEMES)
+        arguments.choice("solver", solver, SOLVERS)
+        if model.net is None and linear in NET_ONLY:
+            raise SceneError(f"linear = {linear!r} is of nets; rods on their own take 'auto', or see `Integrator`")
+        if check_every is not None:
+            arguments.count("check_every", check_every)
         self.model, self.scheme, self.solver, self.linear = model, scheme, solver, linear
         self.options = NewtonOptions(**options)
-        if not (isinstance(retry_limit, int) and retry_limit >= 0):
-            raise SceneError(f"retry_limit = {retry_limit!r}; it is a whole number, 0 for no retry")
-        self.retry_limit = retry_limit
+        self.retry_limit = arguments.count("retry_limit (0 for no retry)", retry_limit, 0)
         self.check_every = check_every or (32 if model.wp_device.is_cuda else 1)
         _require_mass(model)
         _refuse_curved_membranes(model)
@@ -97,8 +99,8 @@ class Integrator:
             SolverError: a rod could not be stepped within the retries, or float32 would lose its motion in rounding; the message
                 names rod and outcome.
         """
-        if not (np.isfinite(dt) and dt > 0.0):
-            raise SceneError(f"dt = {dt}; a time step is positive and finite")
+        dt = arguments.number("dt", dt, "a time step that is positive and finite [s]", lambda v: v > 0.0)
+        validate.check_state("step", self.model, state)
         source = self._own(state)
         self._vacate(1 - source)
         target = self._buffers[1 - source].state
@@ -179,8 +181,6 @@ class Integrator:
         for i, buffer in enumerate(self._buffers):
             if state is buffer.state:
                 return i
-        if state.model is not self.model:
-            raise SceneError("the state is of another model; step states that this integrator's model made")
         self._vacate(0)
         self._buffers[0].state.assign(state)
         return 0
@@ -205,7 +205,7 @@ class Integrator:
 
 def _newton(model, group, integrator: Integrator, precision) -> ChainNewton:
     """The solver of a group that the integrator's `linear` asks for."""
-    linear = automatic(group) if integrator.linear in ("auto", "multilevel", "chain_multilevel") else integrator.linear
+    linear = automatic(group) if integrator.linear in ("auto", *NET_ONLY) else integrator.linear
     given = (model, group, integrator.options)
     last = (precision, integrator.scheme == "implicit_midpoint")
     if integrator.solver == "projective":
@@ -393,4 +393,6 @@ class _ChainStep:
                     f"edges {k} and {after} fold back by 180 degrees in the last good state, where curvature is infinite; "
                     f"move node {after} of the state it starts from, or take a smaller dt if it folded on the way"
                 )
-        return "take a smaller dt, a looser rtol, or check its loads and supports"
+        dt = self.integrator._dt_host
+        jump = jump_between(self.model, state.time - dt, state.time)
+        return jump or "take a smaller dt, a looser rtol, or check its loads and supports"

@@ -3,6 +3,8 @@
 import numpy as np
 import warp as wp
 
+from ddg_warp.chains import pose_starts
+from ddg_warp.integrate.prescribed import poses
 from ddg_warp.kernels import motion
 from ddg_warp.kernels.net import loads
 from ddg_warp.kernels.net.motion import motion_kernels
@@ -19,7 +21,8 @@ class NetMotion:
     def __init__(self, model, midpoint: bool):
         net, host, device, real = model.net, model.net.host, model.wp_device, model.types.real
         self.model, self.net = model, net
-        self.pose = wp.zeros((len(model.motions), motion.POSE), dtype=real, device=device)
+        start = pose_starts(model.motions)
+        self.pose = wp.zeros((start[-1], motion.POSE), dtype=real, device=device)
         self._nodes, self._angles, self._normals, self._turn = motion_kernels(real, midpoint)
 
         def put(values):
@@ -29,15 +32,19 @@ class NetMotion:
             return wp.array(np.ascontiguousarray(values), dtype=net.vector, device=device)
 
         motions = np.full((host.blocks, 3), -1)
-        for blocks, index, components in host.moving:
-            motions[blocks] = np.where(components, index, motions[blocks])
+        for blocks, index, components, rows in host.moving:
+            motions[blocks] = np.where(components, start[index] + rows[:, None], motions[blocks])
         blocks = np.flatnonzero((motions >= 0).any(1))
         self.nodes = put(np.column_stack([blocks, motions[blocks]]))
         self.rest = vectors(host.rest)
-        edges = [np.column_stack([b - host.nodes, np.full(len(b), index)]) for b, index in host.turning]
+        edges = [np.column_stack([b - host.nodes, np.full(len(b), start[index])]) for b, index in host.turning]
         edges = np.concatenate([np.zeros((0, 2), int), *edges])
         self.edges, self.edge_rest = put(edges), vectors(host.frame[:3, edges[:, 0]].T)
-        self.normals = {i: (put(net.sets[i].turning), vectors(net.sets[i].turning_rest)) for i in net.turning_data()}
+        self.normals = {}
+        for i in net.turning_data():
+            element, row, index = net.sets[i].turning.T
+            where = put(np.column_stack([element, row, start[index]]))
+            self.normals[i] = (where, vectors(net.sets[i].turning_rest))
         self.data = net.turning_data()  # with the normals that a solve is about
 
     @property
@@ -48,7 +55,7 @@ class NetMotion:
 
     def upload(self, t0: float, t1: float) -> None:
         """Poses of all motions between t0 and t1."""
-        self.pose.assign(np.array([motion.pose(t0, t1) for motion in self.model.motions]))
+        self.pose.assign(poses(self.model, t0, t1))
 
     def apply(self, progress: wp.array, portion: wp.array, q: wp.array, frame: wp.array) -> None:
         """Put held blocks and normals where a solve of `portion` after the `progress` made has them; `frame` are lagged."""
@@ -86,10 +93,11 @@ class NetLoads:
         def put(values, dtype=int):
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
-        press, squeeze, twist, self._spread = loads.follower_kernels(real)
+        press, squeeze, twist, bend, self._spread = loads.follower_kernels(real)
         kinds = [(press, load, load.pressure, real) for load in host.pressures]
         kinds += [(squeeze, load, load.pressure, real) for load in host.bands]
         kinds += [(twist, load, np.tile(load.couple, (len(load.places), 1)), net.vector) for load in host.couples]
+        kinds += [(bend, load, load.values, net.vector) for load in host.edge_couples]
         for kernel, load, values, dtype in kinds:
             self._followers.append((kernel, load, values, put(load.places.astype(np.int32)), put(values, dtype)))
         places = np.concatenate([load.places.ravel() for load in host.followers])

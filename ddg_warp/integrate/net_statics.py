@@ -73,6 +73,8 @@ class StaticNewton(NetNewton):
         if self._whole:
             return
         self.measure_turns()
+        if self.planes:
+            self.planes.into(self.direction, self.wanted)
         wp.launch(
             self._far, self.worlds, [self.turn, FAR * self.options.rotation_cap], [self.wanted], device=self.device
         )
@@ -157,6 +159,6 @@ class NetEquilibrium:
         tangent, part = self.tangent, self.tangent.parts[-1]
         q = tangent.dofs(state)
         outer, gradient = tangent.loads(at, q), tangent.gradient(state)
-        self.newton.begin(q, part.dead_loads(at), at, self.owner.load_scale(outer, gradient))
+        self.newton.begin(tangent.back(q), part.dead_loads(at), at, self.owner.load_scale(outer, gradient))
         for name, array in self._start.arrays().items():
             wp.copy(array, state.net.arrays()[name])

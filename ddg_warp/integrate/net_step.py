@@ -8,6 +8,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.integrate.net_prescribed import NetLoads, NetMotion
+from ddg_warp.integrate.prescribed import jump_between
 from ddg_warp.kernels import outcome, step
 from ddg_warp.kernels.net import elements, frames, newton
 from ddg_warp.linear.choice import net_preconditioner
@@ -84,7 +85,7 @@ class NetStep:
             [
                 before.q,
                 before.v,
-                solver.fixed,
+                solver.held,
                 solver.mass,
                 self.integrator._dt,
                 self.damping,
@@ -170,12 +171,13 @@ class NetStep:
         world = int(failed[0])
         name = outcome.NAMES[int(self.reason.numpy()[world])]
         sizes = np.abs(self.newton.right.numpy().reshape(self.model.worlds, -1))[world]
-        part = Tangent(self.model).parts[-1]
+        part, dt = Tangent(self.model).parts[-1], self.integrator._dt_host
+        jump = jump_between(self.model, state.time - dt, state.time)
         worst = int(np.argmax(np.where(np.isfinite(sizes), sizes, np.inf)))
         raise SolverError(
             f"the net (world {world}) could not be stepped to t = {state.time:g} s: {name} after "
             f"{self.integrator.retry_limit} retries, largest residual {sizes[worst]:.3g} N at {part.where(worst)}; "
-            "take a smaller dt, a looser rtol, or check its loads and supports",
+            f"{jump or 'take a smaller dt, a looser rtol, or check its loads and supports'}",
             state=state,
             outcome=name,
         )

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 
 REGULAR, LIMIT_POINT, BIFURCATION = "regular", "limit point", "bifurcation"
@@ -19,6 +20,14 @@ class Displacement:
     """
 
     terms: tuple[tuple[int, str, float], ...]
+
+    def __post_init__(self):
+        for term in self.terms if np.iterable(self.terms) else [self.terms]:
+            if not isinstance(term, tuple | list) or len(term) != 3:
+                raise SceneError(f"Displacement: {term!r} is no term; give (row of the points, axis, weight) each")
+            arguments.index("Displacement: point", term[0])
+            arguments.choice("Displacement: axis", term[1], ("x", "y", "z"))
+            arguments.number("Displacement: weight", term[2])
 
     @classmethod
     def of(cls, row: int, axis: str, weight: float = 1.0) -> "Displacement":
@@ -41,7 +50,7 @@ class Displacement:
             if dof < 0:
                 raise SceneError(f"displacement of point {row} along {axis!r}: the scene is planar")
             result[dof] += weight
-        return result
+        return tangent.into(result)
 
 
 @dataclass(eq=False)
@@ -153,3 +162,14 @@ class Stop:
     load: tuple[float, float] = (-np.inf, np.inf)
     displacement: tuple[str, float, float] | None = None
     limit_points: int | None = None
+
+    def __post_init__(self):
+        arguments.count("Stop: steps", self.steps)
+        if self.limit_points is not None:
+            arguments.count("Stop: limit_points", self.limit_points)
+        bounds = {"load": self.load, "displacement": self.displacement and self.displacement[1:]}
+        for name, bound in bounds.items():
+            if bound is None:
+                continue
+            if np.shape(bound) != (2,) or not np.asarray(bound, float)[0] < np.asarray(bound, float)[1]:
+                raise SceneError(f"Stop: {name} is {getattr(self, name)!r}; its lowest value comes before a higher one")

@@ -14,10 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from ddg_warp import stability
+from ddg_warp import arguments, stability, validate
 from ddg_warp.errors import SceneError, SolverError, check_options
 from ddg_warp.integrate import mixed
 from ddg_warp.integrate.net_statics import NetEquilibrium
+from ddg_warp.integrate.prescribed import jump_between
 from ddg_warp.linear.choice import static_solver, why_not_pcg
 from ddg_warp.linear.direct import Factorisation, SingularError
 from ddg_warp.precision import lost_in_rounding
@@ -89,6 +90,12 @@ def solve(
         SolverError: no equilibrium was found, or in mode "minimise" none that is stable; carries the last good state.
         SceneError: nothing holds the rods.
     """
+    validate.check_model("statics", model)
+    if state is not None:
+        validate.check_state("statics", model, state)
+    for name, value in (("start", start), ("end", end)):
+        arguments.number(f"statics: {name}", value)
+    load_steps = arguments.count("load_steps", load_steps)
     return Equilibrium(model, StaticsOptions(**options)).load(state or model.state(), load_steps, start, end)
 
 
@@ -111,6 +118,7 @@ class Equilibrium:
         self.tangent = Tangent(model)
         require_supports(model)
         lost_in_rounding(model)
+        validate.warn_of_massless(model)
         self.net = NetEquilibrium(self) if self._solver() == "pcg" else None
         self.mixed = self.tangent.shells_alone and self.net is None
         self.iterations, self.shift = 0, 0.0
@@ -132,8 +140,6 @@ class Equilibrium:
 
     def load(self, state: State, load_steps: int, start: float = 0.0, end: float = 1.0) -> State:
         """Load stepping; see `solve`."""
-        if not (isinstance(load_steps, int) and load_steps >= 1):
-            raise SceneError(f"load_steps = {load_steps!r}; it is a whole number of at least 1")
         if start == end:
             return self.solve(state, start, end)
         at, whole, cuts = start, (end - start) / load_steps, 0
@@ -146,9 +152,12 @@ class Equilibrium:
                 at, cuts = target, max(0, cuts - 1)  # what was too much before may do now
             except SolverError as error:
                 cuts += 1
+                if error.outcome == arguments.PRESCRIBED:
+                    raise
                 if cuts > self.options.max_cuts:
+                    advice = jump_between(self.model, at, target)
                     raise SolverError(
-                        f"{error} (load parameter {at:g} of {end:g} reached, {cuts - 1} increments halved)",
+                        f"{advice and advice + '; '}{error} (load parameter {at:g} of {end:g} reached, {cuts - 1} increments halved)",
                         state=state,
                         outcome=error.outcome,
                     ) from None
@@ -423,7 +432,7 @@ def require_supports(model) -> None:
                     "scene.clamp_ring(...)"
                 )
         spatial = np.setdiff1d(np.arange(host.nodes), [node for shell in host.meridians for node in shell.nodes])
-        loose = np.flatnonzero(~host.fixed[spatial].any(0)) if spatial.size else spatial
+        loose = np.flatnonzero(~host.holds[spatial].any(0)) if spatial.size else spatial
         if loose.size:
             raise SceneError(
                 f"no node of the shells and joined rods is held along {'xyz'[loose[0]]}: a static solve needs supports; "

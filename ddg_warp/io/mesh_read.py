@@ -17,7 +17,7 @@ from ddg_warp.io import MeshError, existing
 USD_SUFFIXES = {".usd", ".usda", ".usdc", ".usdz"}
 
 
-def read_mesh(path, prim: str | None = None) -> tuple[np.ndarray, np.ndarray, str]:
+def read_mesh(path, prim: str | None = None, weld: float | None = None) -> tuple[np.ndarray, np.ndarray, str]:
     """The mesh of an OBJ or USD file: (points (P, 3) [m], triangles (T, 3), name).
 
     Polygons are cut into fans from their first corner, which suits convex ones. `Surface` checks what comes back.
@@ -25,11 +25,20 @@ def read_mesh(path, prim: str | None = None) -> tuple[np.ndarray, np.ndarray, st
     Args:
         path: A .obj, .usd, .usda, .usdc or .usdz file.
         prim: For USD, path of the Mesh prim, or of one above it; needed where the file has several meshes.
+        weld: Vertices within this distance [m] of each other become one, as seams of exported files need; None keeps all.
 
     Raises:
         MeshError: the file cannot be read; names the file, the line or prim, and the remedy.
     """
-    path = existing(path)
+    points, triangles, name = _read(existing(path), prim)
+    if weld is None:
+        return points, triangles, name
+    from ddg_warp import meshes
+
+    return *meshes.weld(points, triangles, weld), name
+
+
+def _read(path: Path, prim: str | None) -> tuple[np.ndarray, np.ndarray, str]:
     if path.suffix.lower() in USD_SUFFIXES:
         from ddg_warp.io.usd_read import read_mesh_prim
 

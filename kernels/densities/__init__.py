@@ -3,6 +3,24 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
+VALID = {  # which values of a parameter have a meaning, by its name without the number of its strain
+    "measure": ("positive", lambda v: v > 0.0),
+    "stiffness": ("positive", lambda v: v > 0.0),
+    "viscosity": ("not negative", lambda v: v >= 0.0),
+    "poisson": ("between -1 and 1", lambda v: abs(v) < 1.0),
+    "metric_11": ("positive", lambda v: v > 0.0),
+    "metric_22": ("positive", lambda v: v > 0.0),
+    "metric_12": ("finite", np.isfinite),
+    "rest": ("finite", np.isfinite),
+}
+
+
+def valid(parameter: str) -> tuple[str, Callable]:
+    """Which values a parameter may have, in words and as a function of arrays."""
+    return VALID.get(parameter) or VALID[parameter.rpartition("_")[0] or parameter]
+
 
 @dataclass(frozen=True)
 class Density:

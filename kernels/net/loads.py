@@ -12,7 +12,7 @@ import warp as wp
 
 @cache
 def follower_kernels(real):
-    """press(...) of triangles, squeeze(...) of meridian edges, twist(...) of couples on rod edges, and spread(...)."""
+    """press(...) of triangles, squeeze(...) of meridian edges, couples: twist(...) of rod, bend(...) of mesh edges; spread(...)."""
     V = wp.types.vector(3, real)
     third = wp.constant(real(np.pi / 3.0))
 
@@ -77,6 +77,30 @@ def follower_kernels(real):
             force_out[at + 2] = V(wp.dot(couple[k], e) / wp.length(e), real(0.0), real(0.0))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def bend(
+        q: wp.array(dtype=V),
+        places: wp.array2d(dtype=int),
+        moment: wp.array(dtype=V),
+        blocks: int,
+        first: int,
+        total: int,
+        force_out: wp.array(dtype=V),
+    ):
+        """Forces on the ends and the corner opposite, moment on the angle; see `ddg_warp.net_loads.NetEdgeCouple`."""
+        k, w = wp.tid()
+        x = q[places[k, 0] + w * blocks]
+        e = q[places[k, 1] + w * blocks] - x
+        a = q[places[k, 2] + w * blocks] - x
+        n = wp.cross(e, a)
+        lift = n * (moment[k][0] * wp.length(e) / wp.length_sq(n))
+        s = wp.dot(a, e) / wp.length_sq(e)
+        at = first + 4 * k + w * total
+        force_out[at] = lift * (s - real(1.0))
+        force_out[at + 1] = -lift * s
+        force_out[at + 2] = lift
+        force_out[at + 3] = V(moment[k][1], real(0.0), real(0.0))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def spread(
         constant: wp.array(dtype=V),
         force: wp.array(dtype=V),
@@ -95,4 +119,4 @@ def follower_kernels(real):
             f += force[items[at] + w * total]
         load_out[i] = f
 
-    return press, squeeze, twist, spread
+    return press, squeeze, twist, bend, spread

@@ -24,20 +24,22 @@ class Problem:
     def __init__(self, name, device, precision="float64", noise=0.15, inertia=2.0, seed=11, **options):
         given = {"dimension": 3, "twist": True, "bend": True} | KINDS[name]
         random = np.random.default_rng(seed)
-        self.scene = scene = ddg.Scene(gravity=(0.3, -0.5, -2.0), dimension=given.pop("dimension"))
+        dimension = given.pop("dimension")
+        across = 1.0 if dimension == 3 else 0.0
+        self.scene = scene = ddg.Scene(gravity=(0.3, -0.5 * across, -2.0), dimension=dimension)
         section = ddg.Stiffness(EA=9.0, EI1=0.6, EI2=0.9, GJ=0.5, mass_per_length=0.7, rotary_inertia=0.2)
         if name != "full":
             section = ddg.Stiffness(EA=9.0, EI1=0.6, GJ=0.5, mass_per_length=0.7)
         for nodes in (7, 6):
             points = np.cumsum(np.array([1.0, 0.0, 0.2]) + 0.3 * random.normal(size=(nodes, 3)), axis=0)
-            points[:, 1] *= scene.dimension == 3
+            points[:, 1] *= across
             scene.add_rod(points, section=section, natural="straight", **given)
         scene.fix(0, [0])
         scene.fix(0, [3, 6], components="z")
         scene.fix(1, [2], components="xy")
         scene.fix(1, [3], components="x")
-        scene.add_force(0, 5, (0.4, 0.2, -0.6))
-        scene.add_force(1, 0, (-0.7, 0.1, 0.3))
+        scene.add_force(0, 5, (0.4, 0.2 * across, -0.6))
+        scene.add_force(1, 0, (-0.7, 0.1 * across, 0.3))
         if name == "full":
             scene.fix_twist(0, [0, 4])
             scene.fix_twist(1, [2])

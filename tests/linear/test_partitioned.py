@@ -23,15 +23,17 @@ STEEL = ddg.Material(young=2e11, poisson=0.3, density=7800.0)
 def scene_of(name, counts=COUNTS, held=True) -> ddg.Scene:
     """Rough rods of these numbers of nodes, with loads, and with supports anywhere."""
     given = {"dimension": 3} | KINDS[name]
-    random, scene = np.random.default_rng(5), ddg.Scene(gravity=(0.3, -0.5, -2.0), dimension=given.pop("dimension"))
+    dimension = given.pop("dimension")
+    across = 1.0 if dimension == 3 else 0.0
+    random, scene = np.random.default_rng(5), ddg.Scene(gravity=(0.3, -0.5 * across, -2.0), dimension=dimension)
     extra = {"EI2": 0.9, "rotary_inertia": 0.2} if name == "twist" else {}
     section = ddg.Stiffness(EA=9.0, EI1=0.6, GJ=0.5, mass_per_length=0.7, **extra)
     for nodes in counts:
         points = np.cumsum(np.array([1.0, 0.0, 0.2]) + 0.2 * random.normal(size=(nodes, 3)), axis=0)
-        points[:, 1] *= scene.dimension == 3
+        points[:, 1] *= across
         bend = {} if nodes > 2 else {"bend": False, "twist": False}
         rod = scene.add_rod(points, section=section, natural="straight", **(given | bend))
-        scene.add_force(rod, nodes // 2, (0.4, 0.2, -0.6))
+        scene.add_force(rod, nodes // 2, (0.4, 0.2 * across, -0.6))
         if held and nodes > 3:
             scene.fix(rod, [nodes // 3])
             scene.fix(rod, [nodes - 2], components="z")

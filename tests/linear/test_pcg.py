@@ -24,17 +24,19 @@ def section(name) -> ddg.Stiffness:
 def scene_of(name, closed, counts=(7, 6)) -> ddg.Scene:
     """Rods of 7 and 6 nodes on rough polygons, with supports and loads."""
     given = {"dimension": 3} | KINDS[name]
-    random, scene = np.random.default_rng(5), ddg.Scene(gravity=(0.3, -0.5, -2.0), dimension=given.pop("dimension"))
+    dimension = given.pop("dimension")
+    across = 1.0 if dimension == 3 else 0.0
+    random, scene = np.random.default_rng(5), ddg.Scene(gravity=(0.3, -0.5 * across, -2.0), dimension=dimension)
     for nodes in counts:
         s = 2.0 * np.pi * np.arange(nodes) / nodes
         points = np.stack([np.cos(s), 0.3 * np.cos(2.0 * s), np.sin(s)], -1) if closed else np.outer(s, [1.0, 0.0, 0.2])
         points += 0.1 * random.normal(size=points.shape)
-        points[:, 1] *= scene.dimension == 3
+        points[:, 1] *= across
         scene.add_rod(points, section=section(name), natural="straight", closed=closed, **given)
     scene.fix(0, [0])
     scene.fix(0, [3], components="z")
     scene.fix(1, [2], components="x")
-    scene.add_force(0, 5, (0.4, 0.2, -0.6))
+    scene.add_force(0, 5, (0.4, 0.2 * across, -0.6))
     if name == "twist":
         scene.fix_twist(0, [0, 4])
         scene.add_twisting_moment(1, 4, 0.3)

@@ -1,0 +1,174 @@
+"""Bad inputs to what reads and writes: recorder, readers of meshes and rods, simulate, and the command line."""
+
+# fmt: off
+import contextlib
+import io
+import tempfile
+from pathlib import Path
+
+from bad_inputs import DEVICE, INF, NAN, each, held_rods, model, refuse
+
+import ddg_warp as ddg
+from ddg_warp.catalog import InputError
+from ddg_warp.cli import main
+from ddg_warp.io import read
+from ddg_warp.io.mesh_read import read_mesh
+from ddg_warp.simulate import simulate
+
+
+def recorder(**options):
+    """A recorder in a directory that is gone afterwards."""
+    with tempfile.TemporaryDirectory() as directory:
+        return ddg.Recorder(options.pop("model", None) or model(), directory, **({"usd": False, "hdf5": False} | options))
+
+
+def record(state):
+    """Record something in a directory that is gone afterwards."""
+    with tempfile.TemporaryDirectory() as directory, ddg.Recorder(model(), directory, usd=False, hdf5=False) as made:
+        made.record(state)
+
+
+each("recorder", "model", [3, "rods"], lambda v: recorder(model=v), "Recorder", "scene.build()")
+refuse("recorder", {"a scene": (lambda: recorder(model=held_rods()), "Recorder", "Scene", "scene.build()")})
+each("recorder", "every", [0, -1, 1.5, "second", None, True], lambda v: recorder(every=v), "every", "whole number")
+each("recorder", "block", [0, -1, 2.5, None], lambda v: recorder(block=v), "block", "whole number")
+each("recorder", "fps", [0.0, -24.0, NAN, "film"], lambda v: recorder(fps=v), "fps", "positive")
+each("recorder", "color_by", ["strain", 3, ("strain", 0.0)], lambda v: recorder(color_by=v), "color_by", "low end")
+each("recorder", "color_by", [("strain", 0.0, 1.0), ("hue", 0.0, 1.0)], lambda v: recorder(color_by=v), "color_by", "surfaces")
+each("recorder", "state", [None, 3, "now"], record, "record", "no state")
+refuse("recorder", {
+    "state of another model": (lambda: record(model("net").state()), "record", "this model"),
+    "resume without a trajectory": (lambda: recorder(resume=True), "resumes from its trajectory.h5"),
+})
+
+
+def file(name: str, text: str, reader, **options):
+    """Read a file with this text."""
+    with tempfile.TemporaryDirectory() as directory:
+        path = Path(directory) / name
+        path.write_text(text)
+        return reader(path, **options)
+
+
+SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n"
+refuse("meshes read", {
+    "no file": (lambda: read_mesh("nowhere.obj"), "nowhere.obj", "no such file"),
+    "another format": (lambda: file("a.stl", "solid", read_mesh), "a.stl", ".obj"),
+    "no faces": (lambda: file("a.obj", "v 0 0 0\n", read_mesh), "a.obj", "not a single face"),
+    "empty": (lambda: file("a.obj", "", read_mesh), "a.obj", "not a single face"),
+    "vertex of letters": (lambda: file("a.obj", "v a b c\n", read_mesh), "a.obj:1", "three numbers"),
+    "vertex of two": (lambda: file("a.obj", "v 0 0\n", read_mesh), "a.obj:1", "three numbers"),
+    "vertex not finite": (lambda: file("a.obj", SQUARE.replace("1 1 0", "1 nan 0"), read_mesh), "a.obj", "vertex 2", "not finite"),
+    "vertex 0": (lambda: file("a.obj", SQUARE + "f 0 1 2\n", read_mesh), "a.obj:6", "counts from 1"),
+    "vertex that is not": (lambda: file("a.obj", SQUARE + "f 1 2 9\n", read_mesh), "a.obj:6", "does not exist"),
+    "corner of letters": (lambda: file("a.obj", SQUARE + "f a b c\n", read_mesh), "a.obj:6", "v/vt"),
+    "face of two": (lambda: file("a.obj", SQUARE + "f 1 2\n", read_mesh), "a.obj:6", "at least 3"),
+    "prim of an OBJ": (lambda: file("a.obj", SQUARE, read_mesh, prim="/a"), "a.obj", "no prims"),
+    "broken USD": (lambda: file("a.usda", "nonsense", read_mesh), "a.usda"),
+    "USD without meshes": (lambda: file("a.usda", "#usda 1.0\n", read_mesh), "a.usda", "0 meshes"),
+})
+each(
+    "meshes read",
+    "weld",
+    [0.0, -1.0, NAN, "tight", True],
+    lambda v: file("a.obj", SQUARE, read_mesh, weld=v),
+    "tolerance",
+    "positive",
+)
+refuse("rods read", {
+    "no file": (lambda: read("nowhere.txt"), "nowhere.txt", "no such file"),
+    "another format": (lambda: file("a.csv", "0,0,0", read), "a.csv", "DisMech"),
+    "no nodes": (lambda: file("a.txt", "*Nodes\n", read), "a.txt", "no nodes"),
+    "a node of two": (lambda: file("a.txt", "*Nodes\n0, 0\n", read), "a.txt"),
+    "a node of letters": (lambda: file("a.txt", "*Nodes\na, b, c\n", read), "a.txt"),
+    "a fork": (lambda: file("a.txt", "*Nodes\n0,0,0\n1,0,0\n2,0,0\n3,0,0\n*Edges\n0,1\n0,2\n0,3\n", read), "a.txt", "node"),
+    "a shell": (lambda: file("a.txt", "*Nodes\n0,0,0\n1,0,0\n1,1,0\n*Triangles\n0,1,2\n", read), "a.txt", "shell"),
+    "an unknown section": (lambda: file("a.txt", "*Springs\n0,0,0\n", read), "a.txt"),
+    "USD without curves": (lambda: file("a.usda", "#usda 1.0\n", read), "a.usda", "BasisCurves"),
+})
+
+
+# --- simulate ---
+def run(**options):
+    """Run held rods, or what `analysis` says."""
+    scene = held_rods()
+    scene.analysis = options.pop("analysis", ddg.Dynamics(0.01, 0.02))
+    return simulate(scene, device=DEVICE, progress=False, **options)
+
+
+each("simulate", "dt", [0.0, -1.0, NAN], lambda v: run(dt=v), "dt =", "positive")
+each("simulate", "duration", [0.0, -1.0], lambda v: run(duration=v), "duration =", "positive")
+each("simulate", "text", ["0.01", None], lambda v: run(dt="0.01", duration=v), "dt")
+each("simulate", "endless", [INF], lambda v: run(duration=v), "duration")
+refuse("simulate", {
+    "part of a step": (lambda: run(dt=0.015), "no whole number of steps"),
+    "dt of statics": (lambda: run(analysis=ddg.Statics(), dt=0.01), "static", "no dt"),
+    "option": (lambda: run(options={"rtol": -1.0}), "rtol", "positive"),
+})
+
+# --- command line ---
+SCENE = '''"""A rod that falls."""
+import numpy as np
+import ddg_warp as ddg
+
+
+def build(n: int = 4, label: str = "rod") -> ddg.Scene:
+    """A rod along x."""
+    scene = ddg.Scene(analysis=ddg.Dynamics(dt=0.01, duration=0.05))
+    points = np.linspace([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], n)
+    scene.add_rod(points, section=ddg.Circle(0.01), material=ddg.Material(1e6), name=label)
+    return scene
+'''
+
+
+def command(*arguments: str, code: str = SCENE) -> None:
+    """Give a command, in a directory with the scene `fall.py`; raises what it says of a mistake."""
+    said = io.StringIO()
+    with (tempfile.TemporaryDirectory() as directory, contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO())):
+        (Path(directory) / "fall.py").write_text(code)
+        result = main([a.replace("fall.py", f"{directory}/fall.py").replace("OUT", f"{directory}/out") for a in arguments])
+    if result == 2:
+        raise InputError(said.getvalue())
+    raise AssertionError(f"exit code {result}")
+
+
+FALL = ("run", "fall.py", "--device", "cpu", "--out", "OUT")
+refuse("command line", {
+    "no command": (command, "required: COMMAND"),
+    "command": (lambda: command("walk"), "invalid choice: 'walk'"),
+    "no scene": (lambda: command("run"), "required: SCENE"),
+    "parameter": (lambda: command(*FALL, "--m", "3"), "unrecognized arguments: --m 3"),
+    "abbreviation": (lambda: command(*FALL, "--dura", "3"), "unrecognized arguments"),
+    "value": (lambda: command(*FALL, "--n", "few"), "invalid int value: 'few'"),
+    "fraction": (lambda: command(*FALL, "--n", "3.5"), "invalid int value: '3.5'"),
+    "without value": (lambda: command(*FALL, "--n"), "expected one argument"),
+    "scene": (lambda: command("run", "cantileve"), "did you mean cantilever?"),
+    "file": (lambda: command("run", "nowhere.py"), "no scene file nowhere.py"),
+    "points": (lambda: command(*FALL, "--n", "1"), "rod 0", "1 nodes"),
+    "device": (lambda: command("run", "fall.py", "--device", "cuda:99"), "no device 'cuda:99'"),
+    "precision": (lambda: command(*FALL, "--precision", "half"), "invalid choice: 'half'"),
+    "steps": (lambda: command(*FALL, "--dt", "0.03"), "no whole number of steps"),
+    "step": (lambda: command(*FALL, "--dt", "-1"), "must be positive"),
+    "step zero": (lambda: command(*FALL, "--dt", "0"), "must be positive"),
+    "step nan": (lambda: command(*FALL, "--dt", "nan"), "must be positive"),
+    "step text": (lambda: command(*FALL, "--dt", "short"), "invalid float value: 'short'"),
+    "duration": (lambda: command(*FALL, "--duration", "-1"), "must be positive"),
+    "duration text": (lambda: command(*FALL, "--duration", "long"), "invalid float value: 'long'"),
+    "worlds": (lambda: command(*FALL, "--worlds", "0"), "at least one"),
+    "worlds text": (lambda: command(*FALL, "--worlds", "two"), "invalid int value: 'two'"),
+    "nothing to resume": (lambda: command("run", "fall.py", "--resume", "nowhere"), "no run to resume in nowhere"),
+    "both directories": (lambda: command("run", "fall.py", "--resume", "a", "--out", "b"), "--resume or --out"),
+    "scene of a type": (lambda: command(*FALL, code="def build(n: list = ()):\n    pass\n"), "type of int, float, str or bool"),
+    "scene without default": (lambda: command(*FALL, code="def build(n):\n    pass\n"), "needs a default"),
+    "scene without build": (lambda: command(*FALL, code="def make():\n    pass\n"), "has no build"),
+    "scene with an option's name": (lambda: command(*FALL, code="def build(device: str = ''):\n    pass\n"), "name of an option"),
+    "scene that returns nothing": (lambda: command(*FALL, code="def build():\n    pass\n"), "build", "Scene"),
+    "term": (lambda: command("check", "spring"), "no term 'spring'"),
+    "term's precision": (lambda: command("check", "--precision", "mixed"), "invalid choice: 'mixed'"),
+    "term's device": (lambda: command("check", "rod_stretch", "--device", "gpu"), "no device 'gpu'"),
+    "benchmark": (lambda: command("bench", "spring"), "no scene 'spring'"),
+    "export": (lambda: command("export", "nowhere"), "no run in nowhere"),
+    "export nothing": (lambda: command("export"), "required: DIR"),
+    "info of something": (lambda: command("info", "cpu"), "unrecognized arguments: cpu"),
+    "list of something": (lambda: command("list", "all"), "unrecognized arguments: all"),
+})

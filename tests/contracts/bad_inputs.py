@@ -1,0 +1,127 @@
+"""Bad inputs as data: what is done, and words that the refusal holds. `python tests/contracts/bad_inputs.py` counts them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+
+import numpy as np
+
+import ddg_warp as ddg
+from ddg_warp import meshes
+
+DEVICE = "cpu"  # refusals come from the host
+NAN, INF = float("nan"), float("inf")
+STIFFNESS = ddg.Stiffness(EA=1e3, EI1=1.0, GJ=1.0, mass_per_length=1.0, rotary_inertia=0.01)
+RUBBER = ddg.Material(young=1e7, poisson=0.3, density=1000.0)
+RING = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+DOME = np.column_stack([np.sin(np.linspace(0.0, 1.0, 6)), np.cos(np.linspace(0.0, 1.0, 6))])
+TUBE = np.column_stack([np.ones(6), np.linspace(0.0, 1.0, 6)])
+
+
+@dataclass(frozen=True)
+class Case:
+    """Something that must be refused: `action()` raises, and the message holds the words."""
+
+    group: str
+    name: str
+    action: Callable[[], object]
+    words: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{self.group}: {self.name}"
+
+
+CASES: list[Case] = []
+
+
+def refuse(group: str, table: dict[str, tuple]) -> None:
+    """Add cases: name -> (action, *words)."""
+    CASES.extend(Case(group, name, action, words) for name, (action, *words) in table.items())
+
+
+def each(group: str, name: str, values, action, *words: str) -> None:
+    """Add a case for each of some values of one argument."""
+    refuse(group, {f"{name} {value!r:.40}": (lambda value=value: action(value), *words) for value in values})
+
+
+def line(nodes: int = 5, **moved) -> np.ndarray:
+    """A straight rod along x; `n3=(1, 2, 3)` moves node 3."""
+    points = np.zeros((nodes, 3))
+    points[:, 0] = np.linspace(0.0, 1.0, nodes)
+    for name, value in moved.items():
+        points[int(name[1:])] = value
+    return points
+
+
+def rods(points=None, scene: ddg.Scene | None = None, **options) -> ddg.Scene:
+    """A good rod 0 of 7 nodes, and rod 1, called 'odd', of 5 unless given otherwise."""
+    scene = scene or ddg.Scene()
+    scene.add_rod(line(7), section=STIFFNESS)
+    scene.add_rod(line() if points is None else points, **({"section": STIFFNESS, "name": "odd"} | options))
+    return scene
+
+
+def sheet(cells: int = 3, scene: ddg.Scene | None = None, **options) -> ddg.Scene:
+    """A square sheet, shell 0, of (cells + 1)^2 vertices: (i, j) is i + (cells + 1) j."""
+    scene = scene or ddg.Scene()
+    settings = {"thickness": 0.01, "material": RUBBER, "name": "sheet"} | options
+    scene.add_shell(*meshes.rectangle(cells, cells), **settings)
+    return scene
+
+
+def dome(points=DOME, **options) -> ddg.Scene:
+    """A shell of revolution, 0, of 6 nodes, the first at the pole."""
+    scene = ddg.Scene()
+    scene.add_axisymmetric_shell(points, **({"thickness": 0.01, "material": RUBBER, "name": "dome"} | options))
+    return scene
+
+
+def held_rods() -> ddg.Scene:
+    """`rods` with both clamped at their first edge."""
+    scene = rods()
+    scene.clamp([0, 1])
+    return scene
+
+
+@cache
+def model(kind: str = "rods", worlds: int = 1):
+    """A good model, made once: of "rods", "sheet" (held, with hinges) or "net" (two rods joined)."""
+    if kind == "rods":
+        scene = held_rods()
+    elif kind == "net":
+        scene = held_rods()
+        scene.join([(0, 0), (1, 0)])
+    else:
+        scene = sheet(2, bending=kind)
+        scene.clamp_boundary(0, [0, 1, 2])
+    return scene.build(DEVICE, "float64", worlds=worlds)
+
+
+@cache
+def integrator(kind: str = "rods"):
+    """An integrator of a good model, made once."""
+    return ddg.Integrator(model(kind))
+
+
+def built(scene: ddg.Scene, *changes: Callable[[ddg.Scene], object]):
+    """Do something to a scene, and build it."""
+    for change in changes:
+        change(scene)
+    return scene.build(DEVICE, "float64")
+
+
+def counts() -> Counter:
+    """Number of cases by group, of all modules."""
+    for name in ("scenes", "shells", "questions", "equilibria", "files"):
+        import_module(f"bad_input_{name}")
+    return Counter(case.group for case in import_module("bad_inputs").CASES)
+
+
+if __name__ == "__main__":
+    found = counts()
+    print("\n".join(f"{number:4}  {group}" for group, number in found.items()))
+    print(f"{sum(found.values()):4}  in all")
