@@ -86,6 +86,7 @@ def simulate(
     dt: float | None = None,
     duration: float | None = None,
     resume: str | Path | None = None,
+    force: bool = False,
     observe: Callable[[Any, Any], Mapping[str, float]] | None = None,
     provenance: Mapping | None = None,
     options: Mapping | None = None,
@@ -101,8 +102,9 @@ def simulate(
         worlds: Independent copies.
         out: Directory for trajectory.h5 and scene.usdc; None records nothing.
         dt: Time step [s] instead of the scene's.
-        duration: End of the run [s] instead of the scene's.
+        duration: End of the run [s] instead of the scene's, or instead of that of the run to resume.
         resume: Directory of an earlier run, which this one continues.
+        force: Whether to replace a run that `out` holds already.
         observe: (model, state) -> values by name, taken at the start and after every step.
         provenance: Attributes of the trajectory: scene, parameters, command.
         options: Keyword arguments of the `Integrator`, or of `StaticsOptions`: rtol and others.
@@ -125,8 +127,7 @@ def simulate(
         raise InputError("this scene is static: it takes no dt, no duration and nothing to resume")
     if dynamic:
         dt = analysis.dt if dt is None else dt
-        duration = analysis.duration if duration is None else duration
-    if dynamic:
+        duration = recorded_duration(resume, analysis.duration) if duration is None else duration
         run, steps = advance, step_count(dt, duration)
     elif isinstance(analysis, Statics):
         run, steps = equilibrate, analysis.load_steps
@@ -143,7 +144,8 @@ def simulate(
         recorder = None
         if out is not None or resume is not None:
             attributes = {**(provenance or {}), "dt": dt or 0.0, "precision": model.precision, "worlds": worlds}
-            recorder = stack.enter_context(open_recorder(model, out, resume, dt, attributes))
+            attributes |= {"duration": duration} if dynamic else {}
+            recorder = stack.enter_context(open_recorder(model, out, resume, dt, attributes, force))
         if recorder is not None and dynamic:
             options.setdefault("check_every", 1)  # recording waits for every step as it is
         done = max(0, len(result.times) - 1)
@@ -258,6 +260,16 @@ def step_count(dt: float, duration: float) -> int:
     return steps
 
 
+def recorded_duration(resume: str | Path | None, scene: float) -> float:
+    """End of the run to resume [s]; that of the scene where there is none to resume, or it does not say."""
+    from ddg_warp.io.hdf5 import TrajectoryReader
+
+    if resume is None:
+        return scene
+    with TrajectoryReader(Path(resume) / "trajectory.h5") as reader:
+        return reader.provenance.get("duration", scene)
+
+
 def continue_from(result: Result, directory: Path) -> None:
     """Put the checkpoint of the run in `directory`, and what was observed up to it, into a new result."""
     from ddg_warp.io.hdf5 import TrajectoryReader
@@ -269,12 +281,15 @@ def continue_from(result: Result, directory: Path) -> None:
         result.series = {name: values[:frames].tolist() for name, values in reader.series.items()}
 
 
-def open_recorder(model, out, resume, dt, provenance):
+def open_recorder(model, out, resume, dt, provenance, force):
     """The recorder of a run in `out`, or of the run that it resumes."""
     from ddg_warp.record import Recorder
 
     fps = round(1.0 / dt, 6) if dt else None  # one time code a step
-    return Recorder(model, Path(resume or out), fps=fps, resume=resume is not None, provenance=provenance)
+    directory, again = Path(resume or out), resume is not None
+    if again:  # where it comes from stays what it was
+        provenance = {name: provenance[name] for name in provenance.keys() & {"duration"}}
+    return Recorder(model, directory, fps=fps, resume=again, force=force, provenance=provenance)
 
 
 def wall_clock(device: str) -> Callable[[], float]:
