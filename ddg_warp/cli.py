@@ -122,8 +122,7 @@ def run_scene(chosen: argparse.Namespace) -> int:
     from ddg_warp.simulate import simulate
     from ddg_warp.summary import summary, write_json
 
-    with refused(f"scene '{name}': "):
-        scene = module.build(**settings)
+    scene = built(module, name, settings)
     directory = chosen.resume or chosen.out or Path("out") / name
     with refused():
         result = simulate(
@@ -135,7 +134,6 @@ def run_scene(chosen: argparse.Namespace) -> int:
             force=chosen.force,
             observe=getattr(module, "observe", None),
             provenance={"scene": name, "parameters": settings, "command": shlex.join(["ddg-warp", *sys.argv[1:]])},
-            progress=sys.stderr.isatty(),
             **run_settings,
         )
     checks = judged(module, result)
@@ -144,7 +142,20 @@ def run_scene(chosen: argparse.Namespace) -> int:
         write_json(path, content)
     draw(directory, one_liner(Path(module.__file__)), result.path)
     say(result, content, checks, directory)
-    return DONE if not result.failure and all(check.passed for check in checks) else FAILED
+    return FAILED if result.failure or any(check.failed for check in checks) else DONE
+
+
+def built(module, name: str, settings: dict):
+    """The scene of these parameters; whatever a scene of the package meets on its way comes of those given."""
+    changed = settings.items() - parameters(module, {}).items()
+    given = ", ".join(f"{key} = {value!r}" for key, value in sorted(changed))
+    with refused(f"scene '{name}'{given and f' with {given}'}: "):
+        try:
+            return module.build(**settings)
+        except (ArithmeticError, LookupError, TypeError) as error:
+            if not (changed and module.__name__.startswith("ddg_warp.")):
+                raise  # a mistake in the scene, which wants its traceback
+            raise InputError(f"scene '{name}' cannot be built with {given} ({error}); change that") from error
 
 
 def judged(module, result) -> list:

@@ -1,5 +1,6 @@
 """Run a scene's analysis and record it. The loop is short on purpose: copy it where you need another one."""
 
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -11,6 +12,8 @@ from typing import Any
 from ddg_warp.catalog import InputError
 from ddg_warp.errors import SolverError
 from ddg_warp.scene import Dynamics, Scene, Statics
+
+LINE_EVERY = 10.0  # s between two lines about the progress of a run whose output is no terminal
 
 
 @dataclass
@@ -109,7 +112,7 @@ def simulate(
         provenance: Attributes of the trajectory: scene, parameters, command.
         options: Keyword arguments of the `Integrator`, or of `StaticsOptions`: rtol and others.
         clock: Clock of `step_times` [s]; by default wall time, of finished work on CUDA.
-        progress: Whether to show a progress bar.
+        progress: Whether to say how far the run is: a bar on a terminal, a line every ten seconds elsewhere.
 
     Returns:
         The result; `failure` says why where the run ended early.
@@ -118,8 +121,6 @@ def simulate(
         SceneError: The scene cannot be built.
         InputError: The duration is no whole number of steps, or a static scene is to move.
     """
-    from tqdm import tqdm
-
     began = time.perf_counter()
     analysis = scene.analysis
     dynamic = isinstance(analysis, Dynamics)
@@ -149,13 +150,12 @@ def simulate(
         if recorder is not None and dynamic:
             options.setdefault("check_every", 1)  # recording waits for every step as it is
         done = max(0, len(result.times) - 1)
-        text = "compiling, once"
-        bar = stack.enter_context(tqdm(total=steps, initial=done, desc=text, unit="step", disable=not progress))
+        bar = stack.enter_context(progress_bar(steps, done, progress))
 
         def keep(state, **observed) -> None:
             if len(result.step_times) == 1:
                 result.compile_time = time.perf_counter() - began
-                bar.set_description()
+                bar.set_description(refresh=False)
             result.state = state
             result.times.append(float(state.time))
             observed |= {} if observe is None else observe(model, state)
@@ -290,6 +290,33 @@ def open_recorder(model, out, resume, dt, provenance, force):
     if again:  # where it comes from stays what it was
         provenance = {name: provenance[name] for name in provenance.keys() & {"duration"}}
     return Recorder(model, directory, fps=fps, resume=again, force=force, provenance=provenance)
+
+
+class Lines:
+    """A text stream in which what would overwrite a line begins a new one."""
+
+    def __init__(self, stream):
+        self._stream = stream
+
+    def write(self, text: str) -> None:
+        line = text.strip("\r\n ")
+        if line:
+            self._stream.write(line + "\n")
+
+    def flush(self) -> None:
+        self._stream.flush()
+
+
+def progress_bar(steps: int, done: int, shown: bool):
+    """Steps done, time elapsed and time remaining, on stderr: redrawn on a terminal, a line at a time in a file or pipe."""
+    from tqdm import tqdm
+
+    style = {"total": steps, "initial": done, "desc": "compiling, once", "unit": "step", "disable": not shown}
+    if not sys.stderr.isatty():
+        form = "{desc}{n_fmt} of {total_fmt} steps, {elapsed} elapsed, {remaining} remaining"
+        seldom = {"mininterval": LINE_EVERY, "maxinterval": 2.0 * LINE_EVERY, "delay": LINE_EVERY, "miniters": 1}
+        style |= {"file": Lines(sys.stderr), "bar_format": form, **seldom}
+    return tqdm(**style)
 
 
 def wall_clock(device: str) -> Callable[[], float]:

@@ -229,6 +229,22 @@ def test_a_check_that_fails_to_solve_fails_the_run(tmp_path, monkeypatch, capsys
     assert "a check could not be computed: no equilibrium" in capsys.readouterr().err
 
 
+def test_progress_of_a_piped_run(fall, capsys, monkeypatch):
+    """Where stderr is no terminal: whole lines with steps, time and time left, at most one in an interval; none of short runs."""
+    import ddg_warp.simulate
+
+    assert fall("run") == 0
+    assert "steps" not in capsys.readouterr().err
+    monkeypatch.setattr(ddg_warp.simulate, "LINE_EVERY", 1e-9)
+    assert fall("run", "--force") == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if "steps" in line]
+    assert 3 <= len(lines) <= 7
+    assert lines[-1].startswith("5 of 5 steps, 00:0") and lines[-1].endswith("elapsed, 00:00 remaining")
+    monkeypatch.setattr(ddg_warp.simulate, "LINE_EVERY", 1e9)
+    assert fall("run", "--force") == 0
+    assert "steps" not in capsys.readouterr().err
+
+
 def test_static_scene_records_every_load_step(tmp_path, monkeypatch, device):
     monkeypatch.chdir(tmp_path)
     code = SCENE.replace("ddg.Dynamics(dt=0.01, duration=0.05)", "ddg.Statics(load_steps=3)")

@@ -13,7 +13,6 @@ from ddg_warp.io.colors import on_scale
 from ddg_warp.io.tube import SIDES, tube_faces, tube_points
 from ddg_warp.operators import vertex_normals
 
-
 HEADER = 64  # bytes at most that a value takes in a file beside its numbers
 
 
