@@ -6,17 +6,30 @@ import importlib
 import importlib.util
 import inspect
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from types import ModuleType
 
 RUN_SETTINGS = ("dt", "precision", "worlds")  # what a resumed run cannot change, beside the scene's parameters
-RESERVED = ("command", "scene", "device", "out", "resume", "json", "help", *RUN_SETTINGS)
+RESERVED = ("command", "scene", "device", "out", "resume", "json", "force", "help", *RUN_SETTINGS)
 SHARED = ("dt", "duration")  # flags of `run` that a scene's build may take too, to fit its motions to them
 
 
 class InputError(ValueError):
     """A mistake in what the user asked for; the message says in one line what to do."""
+
+
+@contextmanager
+def refused(where: str = "") -> Iterator[None]:
+    """Turns what the package says of a bad scene, file or option into an InputError that begins with `where`."""
+    try:
+        yield
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"{where}{error}") from error
 
 
 def scene_files() -> dict[str, Path]:
@@ -114,9 +127,11 @@ def stored_settings(directory: Path, scene: str, given: dict) -> dict:
     path = Path(directory) / "trajectory.h5"
     if not path.is_file():
         raise InputError(f"there is no run to resume in {directory}: {path} is missing")
-    with TrajectoryReader(path) as reader:
+    with refused(), TrajectoryReader(path) as reader:
         provenance = reader.provenance
-    if provenance.get("scene") != scene:
+    if not {"scene", "parameters", *RUN_SETTINGS} <= provenance.keys():
+        raise InputError(f"{path} is not of `ddg-warp run`: resume it where it was made, with Recorder(resume=True)")
+    if provenance["scene"] != scene:
         raise InputError(f"{directory} holds a run of '{provenance.get('scene')}', not of '{scene}'")
     stored = provenance["parameters"] | {name: provenance[name] for name in RUN_SETTINGS}
     for name, value in given.items():

@@ -1,7 +1,9 @@
 """A check: a measured number against its reference, within a tolerance. Every scene ends in some."""
 
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import ClassVar
 
 
 @dataclass(frozen=True)
@@ -15,7 +17,11 @@ class Check:
         tolerance: Largest error that passes, in the unit of the value, or relative to the reference.
         source: Where the reference comes from: a formula, a publication, another program.
         relative: Whether the error is divided by |reference|.
+        skipped: Why there is nothing to compare, such as "needs 2 s"; empty where there is.
     """
+
+    COARSEST: ClassVar[float] = 0.05
+    """Largest relative error that a coarse mesh excuses: tolerances that grow with its cells end here."""
 
     name: str
     measured: float
@@ -23,6 +29,12 @@ class Check:
     tolerance: float
     source: str = ""
     relative: bool = False
+    skipped: str = ""
+
+    @classmethod
+    def skip(cls, name: str, why: str) -> "Check":
+        """A check that this run cannot make; it neither passes nor fails."""
+        return cls(name, math.nan, math.nan, math.nan, skipped=why)
 
     @property
     def error(self) -> float:
@@ -37,6 +49,11 @@ class Check:
         """Whether the error is within the tolerance; NaN never is."""
         return bool(self.error <= self.tolerance)
 
+    @property
+    def failed(self) -> bool:
+        """Whether it was made and did not pass."""
+        return not (self.passed or self.skipped)
+
     def as_dict(self) -> dict:
         """The entry of `checks` in summary.json."""
         return {
@@ -47,4 +64,19 @@ class Check:
             "tolerance": float(self.tolerance),
             "passed": self.passed,
             "source": self.source,
-        }
+        } | ({"skipped": self.skipped} if self.skipped else {})
+
+
+def once_reached(result, t: float, names: Iterable[str], make: Callable[[], list[Check]]) -> list[Check]:
+    """The checks that `make` returns, where the run got to time t; else each of them by name, skipped.
+
+    Args:
+        result: The run.
+        t: Time that the checks need [s], or the load parameter in statics.
+        names: What the checks are called.
+        make: Makes them; not called where the run is shorter.
+    """
+    if result.times and result.times[-1] >= t - 1e-3 * (result.dt or 1e-6):
+        return make()
+    unit = "s" if result.dt else "of the load"
+    return [Check.skip(name, f"needs {t:g} {unit}") for name in names]

@@ -4,6 +4,7 @@ Exit codes: 0 done; 1 a check or the solver failed; 2 a mistake in what was aske
 """
 
 import argparse
+import errno
 import os
 import shlex
 import sys
@@ -16,12 +17,14 @@ from ddg_warp.catalog import (
     load_scene,
     one_liner,
     parameters,
+    refused,
     scene_files,
     scene_name,
     stored_settings,
 )
 
 DONE, FAILED, MISTAKE, INTERRUPTED, UNREAD = 0, 1, 2, 130, 141
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # what a disk may come to while a run writes to it
 PRECISIONS = ("float64", "mixed", "float32")
 
 
@@ -48,7 +51,7 @@ def main(arguments: list[str] | None = None) -> int:
         return UNREAD
     except (InputError, OSError) as error:
         print(f"ddg-warp: {error}", file=sys.stderr)
-        return MISTAKE
+        return FAILED if getattr(error, "errno", None) in FULL else MISTAKE
     except KeyboardInterrupt:
         print("\nddg-warp: interrupted; what was recorded is kept", file=sys.stderr)
         return INTERRUPTED
@@ -64,10 +67,13 @@ def parser(arguments: list[str]) -> Parser:
     run.add_argument("scene", metavar="SCENE", help="a scene of `ddg-warp list`, or a Python file; comes first")
     add_settings(run)
     run.add_argument("--dt", type=float, metavar="S", help="time step [s] (default: the scene's)")
-    run.add_argument("--duration", type=float, metavar="S", help="end of the run [s] (default: the scene's)")
+    run.add_argument(
+        "--duration", type=float, metavar="S", help="end of the run [s] (default: the scene's, or the resumed run's)"
+    )
     run.add_argument("--worlds", type=int, metavar="N", help="independent copies (default: 1)")
     run.add_argument("--out", type=Path, metavar="DIR", help="where results go (default: out/SCENE)")
     run.add_argument("--resume", type=Path, metavar="DIR", help="continue the run recorded in DIR")
+    run.add_argument("--force", action="store_true", help="replace a run that is there already")
     run.add_argument("--json", type=Path, metavar="FILE", help="write the summary to FILE too")
     if arguments[:1] == ["run"] and len(arguments) > 1 and not arguments[1].startswith("-"):
         add_parameters(run.add_argument_group(f"parameters of {arguments[1]}"), load_scene(arguments[1]))
@@ -114,37 +120,56 @@ def run_scene(chosen: argparse.Namespace) -> int:
     settings, run_settings = settings_of(chosen, module, name)
     require_device(chosen.device)
 
-    from ddg_warp.errors import SceneError
-    from ddg_warp.io.hdf5 import TrajectoryError
     from ddg_warp.simulate import simulate
     from ddg_warp.summary import summary, write_json
 
-    try:
-        scene = module.build(**settings)
-    except ValueError as error:
-        raise InputError(f"scene '{name}': {error}") from error
+    scene = built(module, name, settings)
     directory = chosen.resume or chosen.out or Path("out") / name
-    try:
+    with refused():
         result = simulate(
             scene,
             device=chosen.device,
             out=directory,
             duration=chosen.duration,
             resume=chosen.resume,
+            force=chosen.force,
             observe=getattr(module, "observe", None),
             provenance={"scene": name, "parameters": settings, "command": shlex.join(["ddg-warp", *sys.argv[1:]])},
-            progress=sys.stderr.isatty(),
             **run_settings,
         )
-    except (SceneError, TrajectoryError) as error:
-        raise InputError(str(error)) from error
-    checks = module.check(result) if hasattr(module, "check") and not result.failure else []
+    checks = judged(module, result)
     content = summary(name, settings, result, checks)
     for path in filter(None, (directory / "summary.json", chosen.json)):
         write_json(path, content)
     draw(directory, one_liner(Path(module.__file__)), result.path)
     say(result, content, checks, directory)
-    return DONE if not result.failure and all(check.passed for check in checks) else FAILED
+    return FAILED if result.failure or any(check.failed for check in checks) else DONE
+
+
+def built(module, name: str, settings: dict):
+    """The scene of these parameters; whatever a scene of the package meets on its way comes of those given."""
+    changed = settings.items() - parameters(module, {}).items()
+    given = ", ".join(f"{key} = {value!r}" for key, value in sorted(changed))
+    with refused(f"scene '{name}'{given and f' with {given}'}: "):
+        try:
+            return module.build(**settings)
+        except (ArithmeticError, LookupError, TypeError) as error:
+            if not (changed and module.__name__.startswith("ddg_warp.")):
+                raise  # a mistake in the scene, which wants its traceback
+            raise InputError(f"scene '{name}' cannot be built with {given} ({error}); change that") from error
+
+
+def judged(module, result) -> list:
+    """The checks of a scene; a check whose own solves fail fails the run."""
+    from ddg_warp.errors import SolverError
+
+    if not hasattr(module, "check") or result.failure:
+        return []
+    try:
+        return module.check(result)
+    except SolverError as error:
+        result.failure = f"a check could not be computed: {error}"
+        return []
 
 
 def settings_of(chosen: argparse.Namespace, module, name: str) -> tuple[dict, dict]:
@@ -275,7 +300,8 @@ def export_run(chosen: argparse.Namespace) -> int:
     target.parent.mkdir(parents=True, exist_ok=True)
     if chosen.revolve and chosen.revolve < 3:
         raise InputError(f"--revolve {chosen.revolve}: a surface of revolution has 3 sides at least")
-    export_usd(source, target, tube=chosen.tube, revolve=chosen.revolve)
+    with refused():
+        export_usd(source, target, tube=chosen.tube, revolve=chosen.revolve)
     print(f"wrote {target}")
     return DONE
 

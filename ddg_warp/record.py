@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -11,15 +13,22 @@ from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 from ddg_warp.io import Shapes
 
-TRAJECTORY, SCENE = "trajectory.h5", "scene.usdc"
+TRAJECTORY, SCENE, LOCK = "trajectory.h5", "scene.usdc", "run.lock"
 DEFAULT_FPS = 24.0
 COLORS = ("strain", "curvature", "energy")
+
+
+class RecordError(OSError):
+    """A run could not be written to its disk; what was complete is kept."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
 
 
 class Recorder:
     """Writes DIR/trajectory.h5 and DIR/scene.usdc, a block of frames at a time.
 
-    A process killed at any time leaves both files readable, up to a complete block.
+    A process killed at any time, or a disk that is full, leaves both files readable, up to a complete block.
 
     Args:
         model: The model whose states are recorded.
@@ -37,6 +46,12 @@ class Recorder:
         provenance: Attributes of the trajectory, beside version, date and machine.
         control: How the run is driven, stored in the trajectory.
         resume: Whether to go on after the last complete block of DIR/trajectory.h5; the scene is written anew from it.
+        force: Whether to replace a run that DIR holds already.
+
+    Raises:
+        ValueError: An option is no such option.
+        FileExistsError: DIR holds a run, or another process writes to it.
+        RecordError: The disk is full, or fails; also from `record` and `close`.
     """
 
     def __init__(
@@ -56,6 +71,7 @@ class Recorder:
         provenance: Mapping | None = None,
         control: Mapping | None = None,
         resume: bool = False,
+        force: bool = False,
     ):
         if not hasattr(model, "curves"):
             raise SceneError(f"Recorder: the model is {type(model).__name__}; give what scene.build() returns")
@@ -65,7 +81,6 @@ class Recorder:
         if resume and not hdf5:
             raise ValueError("a run resumes from its trajectory.h5: leave hdf5=True, or start again with resume=False")
         self.directory = Path(directory)
-        self.directory.mkdir(parents=True, exist_ok=True)
         self._model, self._every = model, every
         self._calls, self._last = 0, None
         self._velocities, self._color_by = velocities, color_by
@@ -75,24 +90,34 @@ class Recorder:
             raise ValueError(
                 f"color_by {color_by[0]!r}: surfaces, if there are any, are colored by {', '.join(COLORS)}"
             )
-        self._trajectory = self._scene = None
+        self._trajectory = self._scene = self._lock = None
+        try:
+            self.directory.mkdir(parents=True, exist_ok=True)
+            self._lock = _locked(self.directory)
+            if not (resume or force):
+                _refuse_to_replace(self.directory)
+            wanted = {"velocities": velocities, "directors": directors, "provenance": provenance, "control": control}
+            self._open(model, hdf5, usd, resume, block, fps or _fps_of(model, every), tube, wanted)
+        except BaseException as error:
+            self._abandon()
+            raise self._told(error) from error
+
+    def _open(self, model, hdf5: bool, usd: bool, resume: bool, block: int, fps: float, tube: bool, wanted) -> None:
+        """Begins both files, or goes on with them."""
         if hdf5:
             from ddg_warp.io.hdf5 import TrajectoryWriter
 
+            path = self.directory / TRAJECTORY
             if resume:
-                self._trajectory = TrajectoryWriter.resume(self.directory / TRAJECTORY, model, block=block)
+                self._trajectory = TrajectoryWriter.resume(path, model, block=block, provenance=wanted["provenance"])
             else:
-                wanted = {"velocities": velocities, "directors": directors}
-                self._trajectory = TrajectoryWriter(
-                    self.directory / TRAJECTORY, model, block=block, provenance=provenance, control=control, **wanted
-                )
+                self._trajectory = TrajectoryWriter(path, model, block=block, **wanted)
         if usd:
             from ddg_warp.io.usd import CurvesWriter
 
             shapes = Shapes.of(model.curves, model.surfaces, model.worlds)
-            fps = fps or _fps_of(model, every)
             self._scene = CurvesWriter(
-                self.directory / SCENE, shapes, fps=fps, tube=tube, block=block, color_by=color_by
+                self.directory / SCENE, shapes, fps=fps, tube=tube, block=block, color_by=self._color_by
             )
         if resume:
             self._replay()
@@ -100,7 +125,9 @@ class Recorder:
     def __enter__(self) -> Recorder:
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, kind, error, _) -> None:
+        if isinstance(error, RecordError):
+            return  # closed already
         self.close()
 
     def record(self, state, observed: Mapping[str, float] | None = None) -> None:
@@ -111,9 +138,20 @@ class Recorder:
         Args:
             state: The state; it is only read.
             observed: Numbers measured of it, by name; the same names at every call.
+
+        Raises:
+            ValueError: The recorder is closed, or the state is of another model.
+            RecordError: The disk is full, or fails; the recorder is closed then.
         """
+        if self._lock is None:
+            raise ValueError(
+                f"the recorder of {self.directory} is closed: record before close(), or open another with resume=True"
+            )
         if not hasattr(state, "points") or getattr(state, "model", self._model) is not self._model:
-            raise SceneError(f"record: {state!r} is no state of the recorded model; give one that this model made")
+            raise SceneError(
+                f"record: {state!r} is no state of the recorded model; give one that this model made, or make a Recorder for "
+                "its model, in a directory of its own"
+            )
         if self._last is not None and state.time <= self._last:
             return
         due = self._calls % self._every == 0
@@ -121,18 +159,47 @@ class Recorder:
         if not due:
             return
         self._last = state.time
-        if self._trajectory is not None:
-            self._trajectory.append(state, observed)
-        if self._scene is not None:
-            self._show(
-                state.time, state.points(), state.velocities() if self._velocities else None, self._fields(state)
-            )
+        try:
+            if self._trajectory is not None:
+                self._trajectory.append(state, observed)
+            if self._scene is not None:
+                velocities = state.velocities() if self._velocities else None
+                self._show(state.time, state.points(), velocities, self._fields(state))
+        except OSError as error:
+            self._abandon()
+            raise self._told(error) from error
 
     def close(self) -> None:
-        """Writes what is left and closes the files."""
-        for writer in (self._trajectory, self._scene):
-            if writer is not None:
-                writer.close()
+        """Writes what is left and closes the files; a second call does nothing."""
+        try:
+            for writer in (self._trajectory, self._scene):
+                if writer is not None:
+                    writer.close()
+        except OSError as error:
+            raise self._told(error) from error
+        finally:
+            self._abandon()
+
+    def _abandon(self) -> None:
+        """Lets go of the files as they are."""
+        if self._scene is not None:
+            self._scene.abandon()
+        self._trajectory = self._scene = None
+        if self._lock is not None:
+            (self.directory / LOCK).unlink(missing_ok=True)
+            os.close(self._lock)  # which unlocks it
+            self._lock = None
+
+    def _told(self, error: BaseException) -> BaseException:
+        """The error, or for one of the disk what is lost, what is kept and what to do."""
+        if not isinstance(error, OSError) or isinstance(error, FileExistsError | RecordError) or error.errno is None:
+            return error
+        told = RecordError(
+            f"{self.directory}: {error.strerror}: the run cannot be recorded any further. Its complete blocks of frames are "
+            "kept: free some space and resume it, or write to another disk"
+        )
+        told.errno = error.errno
+        return told
 
     def _replay(self) -> None:
         """Brings scene and counters to where the trajectory ends."""
@@ -187,6 +254,54 @@ def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False
             for time, points in zip(reader.time, reader.points, strict=True):
                 points = points.reshape(-1, 3)
                 writer.write(time, turned.points(points[:count]) if turned else points)
+
+
+def _locked(directory: Path) -> int:
+    """Descriptor of the lock of a directory, held until it is closed: a process that ends, however it does, holds none.
+
+    Raises:
+        FileExistsError: Another process, or another recorder of this one, holds it.
+    """
+    path = directory / LOCK
+    while True:
+        lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if path.exists() and os.path.samestat(os.fstat(lock), os.stat(path)):
+                os.truncate(lock, 0)
+                os.pwrite(lock, str(os.getpid()).encode(), 0)
+                return lock
+        except BlockingIOError:
+            owner = os.pread(lock, 20, 0).decode() or "unknown"
+            os.close(lock)
+            raise FileExistsError(
+                f"{directory}: process {owner} is recording a run there; wait for its end, or give another directory"
+            ) from None
+        except OSError:
+            path.unlink(missing_ok=True)
+            os.close(lock)
+            raise
+        os.close(lock)  # its owner has just removed the file that was opened
+
+
+def _refuse_to_replace(directory: Path) -> None:
+    """Raises a FileExistsError where a directory holds frames of a run."""
+    from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader
+
+    path = directory / TRAJECTORY
+    if path.exists():
+        try:
+            with TrajectoryReader(path) as reader:
+                frames = f"{len(reader)} frames up to {reader.time[-1]:g} s" if len(reader) else ""
+        except TrajectoryError:
+            frames = "a run that cannot be read"
+    else:
+        frames = SCENE if (directory / SCENE).exists() else ""
+    if frames:
+        raise FileExistsError(
+            f"{directory} holds {frames}: force (--force) replaces them, another directory (--out DIR) keeps them, "
+            "and resume (--resume DIR) goes on with them"
+        )
 
 
 def _fps_of(model, every: int) -> float:

@@ -1,5 +1,6 @@
 """Run a scene's analysis and record it. The loop is short on purpose: copy it where you need another one."""
 
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -13,6 +14,8 @@ from ddg_warp.catalog import InputError
 from ddg_warp.descriptions import Dynamics, Statics
 from ddg_warp.errors import SolverError
 from ddg_warp.scene import Scene
+
+LINE_EVERY = 10.0  # s between two lines about the progress of a run whose output is no terminal
 
 
 @dataclass(repr=False)
@@ -94,6 +97,7 @@ def simulate(
     dt: float | None = None,
     duration: float | None = None,
     resume: str | Path | None = None,
+    force: bool = False,
     observe: Callable[[Any, Any], Mapping[str, float]] | None = None,
     provenance: Mapping | None = None,
     options: Mapping | None = None,
@@ -109,13 +113,14 @@ def simulate(
         worlds: Independent copies.
         out: Directory for trajectory.h5 and scene.usdc; None records nothing.
         dt: Time step [s] instead of the scene's.
-        duration: End of the run [s] instead of the scene's.
+        duration: End of the run [s] instead of the scene's, or instead of that of the run to resume.
         resume: Directory of an earlier run, which this one continues.
+        force: Whether to replace a run that `out` holds already.
         observe: (model, state) -> values by name, taken at the start and after every step.
         provenance: Attributes of the trajectory: scene, parameters, command.
         options: Keyword arguments of the `Integrator`, or of `StaticsOptions`: rtol and others.
         clock: Clock of `step_times` [s]; by default wall time, of finished work on CUDA.
-        progress: Whether to show a progress bar.
+        progress: Whether to say how far the run is: a bar on a terminal, a line every ten seconds elsewhere.
 
     Returns:
         The result; `failure` says why where the run ended early.
@@ -124,8 +129,6 @@ def simulate(
         SceneError: The scene cannot be built.
         InputError: The duration is no whole number of steps, or a static scene is to move.
     """
-    from tqdm import tqdm
-
     began = time.perf_counter()
     if not isinstance(scene, Scene):
         raise InputError(f"the scene is {type(scene).__name__}; `build` returns a Scene")
@@ -135,8 +138,7 @@ def simulate(
         raise InputError("this scene is static: it takes no dt, no duration and nothing to resume")
     if dynamic:
         dt = analysis.dt if dt is None else dt
-        duration = analysis.duration if duration is None else duration
-    if dynamic:
+        duration = recorded_duration(resume, analysis.duration) if duration is None else duration
         run, steps = advance, step_count(dt, duration)
     elif isinstance(analysis, Statics):
         run, steps = equilibrate, analysis.load_steps
@@ -153,17 +155,17 @@ def simulate(
         recorder = None
         if out is not None or resume is not None:
             attributes = {**(provenance or {}), "dt": dt or 0.0, "precision": model.precision, "worlds": worlds}
-            recorder = stack.enter_context(open_recorder(model, out, resume, dt, attributes))
+            attributes |= {"duration": duration} if dynamic else {}
+            recorder = stack.enter_context(open_recorder(model, out, resume, dt, attributes, force))
         if recorder is not None and dynamic:
             options.setdefault("check_every", 1)  # recording waits for every step as it is
         done = max(0, len(result.times) - 1)
-        text = "compiling, once"
-        bar = stack.enter_context(tqdm(total=steps, initial=done, desc=text, unit="step", disable=not progress))
+        bar = stack.enter_context(progress_bar(steps, done, progress))
 
         def keep(state, **observed) -> None:
             if len(result.step_times) == 1:
                 result.compile_time = time.perf_counter() - began
-                bar.set_description()
+                bar.set_description(refresh=False)
             result.state = state
             result.times.append(float(state.time))
             observed |= {} if observe is None else observe(model, state)
@@ -271,6 +273,16 @@ def step_count(dt: float, duration: float) -> int:
     return steps
 
 
+def recorded_duration(resume: str | Path | None, scene: float) -> float:
+    """End of the run to resume [s]; that of the scene where there is none to resume, or it does not say."""
+    from ddg_warp.io.hdf5 import TrajectoryReader
+
+    if resume is None:
+        return scene
+    with TrajectoryReader(Path(resume) / "trajectory.h5") as reader:
+        return reader.provenance.get("duration", scene)
+
+
 def continue_from(result: Result, directory: Path) -> None:
     """Put the checkpoint of the run in `directory`, and what was observed up to it, into a new result."""
     from ddg_warp.io.hdf5 import TrajectoryReader
@@ -282,12 +294,42 @@ def continue_from(result: Result, directory: Path) -> None:
         result.series = {name: values[:frames].tolist() for name, values in reader.series.items()}
 
 
-def open_recorder(model, out, resume, dt, provenance):
+def open_recorder(model, out, resume, dt, provenance, force):
     """The recorder of a run in `out`, or of the run that it resumes."""
     from ddg_warp.record import Recorder
 
     fps = round(1.0 / dt, 6) if dt else None  # one time code a step
-    return Recorder(model, Path(resume or out), fps=fps, resume=resume is not None, provenance=provenance)
+    directory, again = Path(resume or out), resume is not None
+    if again:  # where it comes from stays what it was
+        provenance = {name: provenance[name] for name in provenance.keys() & {"duration"}}
+    return Recorder(model, directory, fps=fps, resume=again, force=force, provenance=provenance)
+
+
+class Lines:
+    """A text stream in which what would overwrite a line begins a new one."""
+
+    def __init__(self, stream):
+        self._stream = stream
+
+    def write(self, text: str) -> None:
+        line = text.strip("\r\n ")
+        if line:
+            self._stream.write(line + "\n")
+
+    def flush(self) -> None:
+        self._stream.flush()
+
+
+def progress_bar(steps: int, done: int, shown: bool):
+    """Steps done, time elapsed and time remaining, on stderr: redrawn on a terminal, a line at a time in a file or pipe."""
+    from tqdm import tqdm
+
+    style = {"total": steps, "initial": done, "desc": "compiling, once", "unit": "step", "disable": not shown}
+    if not sys.stderr.isatty():
+        form = "{desc}{n_fmt} of {total_fmt} steps, {elapsed} elapsed, {remaining} remaining"
+        seldom = {"mininterval": LINE_EVERY, "maxinterval": 2.0 * LINE_EVERY, "delay": LINE_EVERY, "miniters": 1}
+        style |= {"file": Lines(sys.stderr), "bar_format": form, **seldom}
+    return tqdm(**style)
 
 
 def wall_clock(device: str) -> Callable[[], float]:

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+BLANK = ("measured", "reference", "error", "tolerance")
 PACKAGES = ("ddg-warp", "warp-lang", "numpy", "scipy", "h5py", "usd-core", "matplotlib", "torch")
 
 
@@ -92,6 +93,8 @@ def checks_table(checks: Iterable) -> str:
                 "tolerance": f"{check.tolerance:g}" + (" relative" if check.relative else ""),
                 "result": "passed" if check.passed else "FAILED",
             }
+            if not check.skipped
+            else {"check": check.name, **dict.fromkeys(BLANK, ""), "result": f"skipped: {check.skipped}"}
             for check in checks
         ]
     )

@@ -61,11 +61,12 @@ def check(result) -> list[ddg.Check]:
     """Both limit loads, to what edges of this length can resolve."""
     dome = result.scene.axisymmetric_shells[0]
     limits = LIMITS[dome.name.rpartition(" ")[2], round(float(dome.points[-1, 0]) / UNIT)]
-    tolerance = 2e-3 * max(1.0, (80.0 / (len(dome.points) - 1)) ** 2)
+    tolerance = min(ddg.Check.COARSEST, 2e-3 * max(1.0, (80.0 / (len(dome.points) - 1)) ** 2))
     names = ("largest load", "smallest load")
+    loads = [*(point.load for point in result.path.limit_points), np.nan, np.nan]  # a limit that was not met fails
     return [
-        ddg.Check(name, point.load, limit, tolerance, SOURCE, relative=True)
-        for name, point, limit in zip(names, result.path.limit_points, limits, strict=True)
+        ddg.Check(name, load, limit, tolerance, SOURCE, relative=True)
+        for name, load, limit in zip(names, loads, limits, strict=False)
     ]
 
 

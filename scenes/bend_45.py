@@ -66,10 +66,12 @@ def check(result) -> list[ddg.Check]:
     section = scene.batches[0].section
     torsion = next(name for name, GJ in TORSION.items() if section.GJ == GJ)
     tip = TIP.get((torsion, bool(section.EA == EA[True])), {}).get(scene.loads[0].force[2], ())
-    tolerance = 1e-3 * max(1.0, (32.0 / (result.model.curves.counts[0] - 1)) ** 2)
+    if not tip:
+        return [ddg.Check.skip("tip [in]", "there are reference numbers for loads of 300, 450 (inextensible) and 600")]
+    tolerance = min(ddg.Check.COARSEST, 1e-3 * max(1.0, (32.0 / (result.model.curves.counts[0] - 1)) ** 2))
     return [
         ddg.Check(f"tip {axis} [in]", measured, reference, tolerance, SOURCE, relative=True)
-        for axis, measured, reference in zip("xyz", result.state.points()[-1] if tip else (), tip, strict=True)
+        for axis, measured, reference in zip("xyz", result.state.points()[-1], tip, strict=True)
     ]
 
 

@@ -92,7 +92,13 @@ def check(result) -> list[ddg.Check]:
     n = result.model.curves.counts[0] - 1
     turn = np.arccos(first @ second / np.linalg.norm(first) ** 2)
     flips = FLIPS.get(float(np.round(turn * n, 6)), ())
-    branch = PlanarBranch(turn * n, n, result.model.device) if flips else None
+    if not flips:
+        return [
+            ddg.Check.skip(
+                "critical weight [B/L^3]", f"there are reference numbers for {', '.join(map('{:g}'.format, FLIPS))}"
+            )
+        ]
+    branch = PlanarBranch(turn * n, n, result.model.device)
     return [
         ddg.Check(f"critical weight {i} [B/L^3]", branch.flip(0.8 * G, 1.2 * G), G, 0.02, SOURCE, relative=True)
         for i, G in enumerate(flips, 1)

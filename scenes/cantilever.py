@@ -7,6 +7,7 @@ swings down past the vertical. Implicit Euler damps it: the published numbers ho
 import numpy as np
 
 import ddg_warp as ddg
+from ddg_warp.check import once_reached
 
 LENGTH = 1.0  # m
 DT = 0.01  # s
@@ -47,12 +48,20 @@ def observe(model, state) -> dict[str, float]:
 def check(result) -> list[ddg.Check]:
     """The tip where the published comparison has it, at those of its times that were run."""
     reference = TIP.get(result.model.curves.counts[0], {}) if result.dt == DT else {}
-    return [
-        ddg.Check(f"tip {axis} at {t} s [m]", result.at(t, f"tip_{axis}"), value, 1.0e-5, SOURCE)
-        for t, tip in reference.items()
-        if result.reached(t)
-        for axis, value in zip("xz", tip, strict=True)
-    ]
+    if not reference:
+        return [ddg.Check.skip("tip [m]", f"there are published numbers for 50 and 100 nodes and dt = {DT} s")]
+    checks = []
+    for t, tip in reference.items():
+        wanted = {f"tip {axis} at {t} s [m]": (f"tip_{axis}", value) for axis, value in zip("xz", tip, strict=True)}
+        checks += once_reached(
+            result,
+            t,
+            wanted,
+            lambda t=t, wanted=wanted: [
+                ddg.Check(name, result.at(t, series), value, 1.0e-5, SOURCE) for name, (series, value) in wanted.items()
+            ],
+        )
+    return checks
 
 
 def benchmark() -> ddg.bench.Study:

@@ -50,11 +50,12 @@ def exact(load: float) -> tuple[float, float]:
 def check(result) -> list[ddg.Check]:
     """Displacements at half and all of the load, to 0.3 % of the length at 32 cells."""
     cells = len(np.unique(result.scene.shells[0].points[:, 0].round(9)))
-    tolerance = 0.003 * LENGTH * max(1.0, (64.0 / cells) ** 2)
+    tolerance = LENGTH * min(ddg.Check.COARSEST, 0.003 * max(1.0, (64.0 / cells) ** 2))
     return [
         ddg.Check(f"displacement {name} at {load:g} P [m]", result.at(load, name), reference, tolerance, SOURCE)
-        for load in (0.5, 1.0)
         if result.reached(load)
+        else ddg.Check.skip(f"displacement {name} at {load:g} P [m]", "needs a load step there")
+        for load in (0.5, 1.0)
         for name, reference in zip(("inwards", "along"), exact(load), strict=True)
     ]
 

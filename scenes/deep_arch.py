@@ -25,6 +25,8 @@ def build(n: int = 240) -> ddg.Scene:
     Args:
         n: edges of the arch, an even number
     """
+    if n < 4 or n % 2:
+        raise ValueError(f"n = {n}; it is an even number, 4 at least: the crown is a node")
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2)
     angle = np.radians(ANGLE) * np.linspace(-0.5, 0.5, n + 1)
     points = RADIUS * np.stack([np.sin(angle), 0.0 * angle, np.cos(angle)], axis=1)
@@ -39,12 +41,14 @@ def build(n: int = 240) -> ddg.Scene:
 
 def check(result) -> list[ddg.Check]:
     """The limit load, and where the crown is there, to what edges of this length can resolve."""
-    limit = result.path.limit_points[0]
-    finer = max(1.0, (240.0 / (result.model.curves.counts[0] - 1)) ** 2)
+    limit = next(iter(result.path.limit_points), None)
+    if limit is None:
+        return [ddg.Check("critical load [N]", np.nan, CRITICAL, 0.0, SOURCE)]  # the path ended before it
+    tolerance = min(ddg.Check.COARSEST, 2e-3 * max(1.0, (240.0 / (result.model.curves.counts[0] - 1)) ** 2))
     return [
-        ddg.Check("critical load [N]", LOAD * limit.load, CRITICAL, 2e-3 * finer, SOURCE, relative=True),
-        ddg.Check("drop of the crown [m]", limit.values["drop"], DROP, 2e-3 * finer, SOURCE, relative=True),
-        ddg.Check("shift of the crown [m]", limit.values["shift"], SHIFT, 2e-3 * finer, SOURCE, relative=True),
+        ddg.Check("critical load [N]", LOAD * limit.load, CRITICAL, tolerance, SOURCE, relative=True),
+        ddg.Check("drop of the crown [m]", limit.values["drop"], DROP, tolerance, SOURCE, relative=True),
+        ddg.Check("shift of the crown [m]", limit.values["shift"], SHIFT, tolerance, SOURCE, relative=True),
     ]
 
 

@@ -9,6 +9,7 @@ square of the step; like others without a bound on the energy it is unstable her
 import numpy as np
 
 import ddg_warp as ddg
+from ddg_warp.check import once_reached
 
 FIRST, LAST = (6.0, 0.0), (0.0, 8.0)  # ends in the plane of x and z [m]
 LENGTH = 10.0  # m
@@ -87,8 +88,12 @@ def moment_of_load(times, end_z) -> float:
 
 def check(result) -> list[ddg.Check]:
     """Momentum and angular momentum once unloaded, and the energy from then on."""
-    if not result.reached(UNLOADED):
-        return []
+    names = ("momentum once unloaded [N s]", "angular momentum once unloaded [N m s]", "drift of the energy, unloaded")
+    return once_reached(result, UNLOADED, names, lambda: unloaded(result))
+
+
+def unloaded(result) -> list[ddg.Check]:
+    """The checks of a run that got beyond the load."""
     series = {name: np.array(values) for name, values in result.series.items()}
     begin = int(np.argmin(np.abs(np.array(result.times) - UNLOADED)))
     after = slice(begin, None)

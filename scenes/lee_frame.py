@@ -25,6 +25,10 @@ def build(n: int = 60, stretch: float = EA) -> ddg.Scene:
         n: edges of each of the two, a multiple of five
         stretch: stretching stiffness [t]
     """
+    if n < 5 or n % 5:
+        raise ValueError(
+            f"n = {n}; it is a multiple of five, 5 at least: the loaded point, a fifth along the beam, is a node"
+        )
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2)
     t = np.linspace(0.0, LEG, n + 1)[:, None]
     section = ddg.Stiffness(EA=stretch, EI1=EI, radius=1.0)
@@ -43,12 +47,12 @@ def build(n: int = 60, stretch: float = EA) -> ddg.Scene:
 
 def check(result) -> list[ddg.Check]:
     """Both limit points, to what edges of this length can resolve."""
-    tolerance = 5e-3 * max(1.0, (60.0 / (result.model.curves.counts[0] - 1)) ** 2)
+    tolerance = min(ddg.Check.COARSEST, 5e-3 * max(1.0, (60.0 / (result.model.curves.counts[0] - 1)) ** 2))
     checks = []
-    for name, point, reference in zip(("first", "second"), result.path.limit_points, LIMITS, strict=True):
-        for what, measured, exact in zip(
-            ("load [t]", "v [cm]", "u [cm]"), (point.load, point.values["v"], point.values["u"]), reference, strict=True
-        ):
+    met = [(point.load, point.values["v"], point.values["u"]) for point in result.path.limit_points]
+    met += [(np.nan,) * 3] * 2  # a limit that was not met fails
+    for name, values, reference in zip(("first", "second"), met, LIMITS, strict=False):
+        for what, measured, exact in zip(("load [t]", "v [cm]", "u [cm]"), values, reference, strict=True):
             checks.append(ddg.Check(f"{name} limit, {what}", measured, exact, tolerance, SOURCE, relative=True))
     return checks
 

@@ -23,6 +23,8 @@ def build(twist: float = 0.95, ratio: float = 1.0, n: int = 200) -> ddg.Scene:
         ratio: twisting over bending stiffness, C / B
         n: edges of the ring, a multiple of four
     """
+    if n < 8 or n % 4:
+        raise ValueError(f"n = {n}; it is a multiple of four, 8 at least: supports stand at the quarters of the ring")
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), analysis=ddg.Statics(load_steps=1))
     angle = 2.0 * np.pi * np.arange(n) / n
     points = RADIUS * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
@@ -65,7 +67,11 @@ def check(result) -> list[ddg.Check]:
     n = result.model.curves.counts[0]
     ratio = section.GJ / section.EI1
     measured = critical_twist(ratio, n, result.model.device)
-    return [ddg.Check("critical twist [rad]", measured, exact(ratio), 40.0 / n**2, SOURCE, relative=True)]
+    return [
+        ddg.Check(
+            "critical twist [rad]", measured, exact(ratio), min(ddg.Check.COARSEST, 40.0 / n**2), SOURCE, relative=True
+        )
+    ]
 
 
 def benchmark() -> ddg.bench.Study:

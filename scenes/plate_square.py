@@ -39,6 +39,12 @@ def build(
     if (edges, load) not in COEFFICIENTS:
         raise ValueError(f"edges = {edges!r}, load = {load!r}: supported or clamped, pressure or force")
     points, triangles = plate_mesh(mesh, cells)
+    off = float(np.linalg.norm(points[centre(points), :2] - 0.5 * SIDE))
+    if cells % 2 or (mesh != "jittered" and off > 1e-9 * SIDE):
+        raise ValueError(
+            f"cells = {cells}, mesh = {mesh!r}: no vertex is at the centre, where the plate is loaded and measured; take an even "
+            "number, of equilateral cells one with a row of vertices half way up, such as 8 or 32"
+        )
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), analysis=ddg.Statics(load_steps=1))
     young = 12.0 * (1.0 - POISSON**2) * STIFFNESS / THICKNESS**3
     plate = scene.add_shell(
@@ -79,7 +85,7 @@ def check(result) -> list[ddg.Check]:
     """The deflection against the closed form, to what cells of this size resolve: second order, the force up to a logarithm."""
     scene = result.model.scene
     cells = np.sqrt(0.25 * len(scene.shells[0].triangles))  # of four triangles
-    tolerance = (25.0 if scene.shell_loads else 12.0) / cells**2
+    tolerance = min(ddg.Check.COARSEST, (25.0 if scene.shell_loads else 12.0) / cells**2)
     return [ddg.Check("deflection over exact", deflection(result.state), 1.0, tolerance, SOURCE, relative=True)]
 
 

@@ -22,6 +22,8 @@ def build(shortening: float = 0.3, axial: float = 1.0e8, n: int = 100) -> ddg.Sc
         axial: EA L^2 / EI; the reference is inextensible, and P over it adds to the shortening
         n: edges of the rod, an even number
     """
+    if n < 4 or n % 2:
+        raise ValueError(f"n = {n}; it is an even number, 4 at least: the middle of the arc is a node")
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2, analysis=ddg.Statics(load_steps=1))
     section = ddg.Stiffness(EA=axial * EI / LENGTH**2, EI1=EI, radius=0.01)
     rod = scene.add_rod(arc(shortening, n), section=section, natural="straight", name="strip")
@@ -68,7 +70,7 @@ def check(result) -> list[ddg.Check]:
     """Reaction, amplitude and angle against elliptic integrals."""
     points = result.state.points()
     shortening = 1.0 - (points[-1, 0] - points[0, 0]) / LENGTH
-    tolerance = 1e-3 * max(1.0, (100.0 / (len(points) - 1)) ** 2)
+    tolerance = min(ddg.Check.COARSEST, 1e-3 * max(1.0, (100.0 / (len(points) - 1)) ** 2))
     names = ("axial load [N]", "amplitude [m]", "angle of the ends [rad]")
     values = zip(names, measure(result.model, result.state), exact(shortening), strict=True)
     return [ddg.Check(name, measured, reference, tolerance, SOURCE, True) for name, measured, reference in values]

@@ -31,6 +31,8 @@ def build(
         turns: turns that the run lasts
         scheme: of time integration
     """
+    if not 0.0 < k < np.pi:
+        raise ValueError(f"k = {k}; it lies between 0 and pi, at which the rod would be stretched without bound")
     turn = 2.0 * np.pi / rate(k)  # s
     scene = ddg.Scene(
         gravity=(0.0, 0.0, 0.0),

@@ -8,6 +8,7 @@ precision, show here first. Implicit Euler at 0.01 s, as in the published compar
 import numpy as np
 
 import ddg_warp as ddg
+from ddg_warp.check import once_reached
 
 LENGTH = 1.0  # m
 RADIUS = 2.0e-3  # m
@@ -49,10 +50,15 @@ def check(result) -> list[ddg.Check]:
     """The tip where the published comparison has it, and a wire as long as it was."""
     reference = TIP.get(result.model.curves.counts[0], {}) if result.dt == DT else {}
     tips = [
-        ddg.Check(f"tip z at {t} s [m]", result.at(t, "tip_z"), value, 1.0e-5, SOURCE)
+        check
         for t, value in reference.items()
-        if result.reached(t)
-    ]
+        for check in once_reached(
+            result,
+            t,
+            [f"tip z at {t} s [m]"],
+            lambda t=t, value=value: [ddg.Check(f"tip z at {t} s [m]", result.at(t, "tip_z"), value, 1.0e-5, SOURCE)],
+        )
+    ] or [ddg.Check.skip("tip z [m]", f"there are published numbers for 100 nodes and dt = {DT} s")]
     # A wire of 7800 kg/m^3 strains by rho g L / E = 4e-7 under its own weight; inertia adds a few times that.
     strain = max(result.series["strain"])
     return [*tips, ddg.Check("largest strain of an edge", strain, 0.0, 1e-6, "weight and inertia over EA")]

@@ -65,7 +65,7 @@ def observe(model, state) -> dict[str, float]:
 def check(result) -> list[ddg.Check]:
     """The tip against elliptic integrals."""
     load = -result.model.scene.loads[0].force[2] * LENGTH**2 / EI
-    tolerance = 1e-4 * max(1.0, (100.0 / (result.model.curves.counts[0] - 1)) ** 2)
+    tolerance = min(ddg.Check.COARSEST, 1e-4 * max(1.0, (100.0 / (result.model.curves.counts[0] - 1)) ** 2))
     values = zip(("tip x [m]", "tip z [m]", "tip angle [rad]"), tip(result.state), exact(load), strict=True)
     return [ddg.Check(name, measured, reference, tolerance, SOURCE) for name, measured, reference in values]
 

@@ -32,6 +32,8 @@ def build(
     """
     if start not in ("bowed", "riding") or (start == "riding" and not speed < 1.0):
         raise ValueError(f"start {start!r} at speed {speed}: it is 'bowed', or 'riding' below the critical speed 1")
+    if n < 4 or n % 2:
+        raise ValueError(f"n = {n}; it is an even number, 4 at least: the middle of the shaft is a node")
     critical = CRITICAL["pinned-pinned"] * bending_rate()
     rate = speed * critical  # rad/s
     dt = 2.0 * np.pi / (max(1.0, speed) * critical * steps)
@@ -138,7 +140,7 @@ def check(result) -> list[ddg.Check]:
     ]
     for support, value in CRITICAL.items():
         # Second order in the edges within a wave length.
-        space = 1e-3 * max(1.0, (50.0 / edges) ** 2) * max(1.0, value / 10.0)
+        space = min(ddg.Check.COARSEST, 1e-3 * max(1.0, (50.0 / edges) ** 2) * max(1.0, value / 10.0))
         measured = critical_rate(support, edges, device=model.device)
         checks.append(ddg.Check(f"critical rate, {support}", measured, value, space, SOURCE, True))
     return checks

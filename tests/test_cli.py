@@ -134,10 +134,115 @@ def test_resumed_equals_straight(fall):
     settings = ("--n", "5", "--dt", "0.005", "--worlds", "2")
     assert fall("run", *settings, "--out", "straight") == 0
     assert fall("run", *settings, "--out", "parts", "--duration", "0.02") == 0
-    assert fall("run", "--resume", "parts") == 0
+    assert fall("run", "--resume", "parts", "--duration", "0.05") == 0
     np.testing.assert_array_equal(points("parts"), points("straight"))
     assert summary("parts")["parameters"] == summary("straight")["parameters"]
     assert summary("parts")["steps"] == 10
+
+
+def test_resumed_runs_end_where_they_were_to_end(fall, monkeypatch):
+    """The duration given to a run that was killed holds when it is resumed, and another one for the next time."""
+    from ddg_warp.record import Recorder
+
+    record = Recorder.record
+
+    def killed(self, state, observed=None):
+        if state.time > 0.015:
+            raise KeyboardInterrupt
+        record(self, state, observed)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Recorder, "record", killed)
+        assert fall("run", "--duration", "0.03", "--out", "o") == 130
+    assert len(points("o")) == 2
+    assert fall("run", "--resume", "o") == 0
+    assert len(points("o")) == 4
+    assert fall("run", "--resume", "o", "--duration", "0.04") == 0
+    assert fall("run", "--resume", "o") == 0
+    assert len(points("o")) == 5
+
+
+def test_a_run_is_kept_unless_forced(fall, capsys):
+    """A second run of the same name: the message says how to replace the first and how to keep it."""
+    assert fall("run", "--duration", "0.02") == 0
+    assert fall("run") == 2
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert all(word in told for word in ("out/fall holds 3 frames", "--force", "--out", "--resume"))
+    assert len(points("out/fall")) == 3
+    assert fall("run", "--force") == 0
+    assert len(points("out/fall")) == 6
+
+
+def test_a_run_in_progress_is_left_alone(fall, capsys):
+    """Another process records there: it is named, whatever was asked for."""
+    import ddg_warp as ddg
+    from ddg_warp.record import Recorder
+
+    scene = ddg.Scene()
+    scene.add_rod(np.eye(3), section=ddg.Stiffness(EA=1.0, EI1=1.0, GJ=1.0, mass_per_length=1.0, radius=0.1))
+    with Recorder(scene.build("cpu"), "out/fall", usd=False):
+        for flags in ([], ["--force"]):
+            assert fall("run", *flags) == 2
+            assert f"process {os.getpid()} is recording a run there" in capsys.readouterr().err
+
+
+def test_a_full_disk_ends_a_run_in_one_line(fall, capfd):
+    """Code 1, what is complete is kept, and the run goes on once there is room."""
+    import resource
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, before[1]))
+        assert fall("run", "--n", "40", "--duration", "3", "--dt", "0.005") == 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    (told,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("ddg-warp: ")]
+    assert "out/fall: File too large" in told and "free some space and resume" in told
+    kept = len(points("out/fall"))
+    assert kept and kept % 64 == 0
+    assert fall("run", "--resume", "out/fall") == 0
+    assert len(points("out/fall")) == 601
+
+
+def test_damaged_files_are_told_in_one_line(fall, tmp_path, capfd):
+    """Resumed, exported, or read by a scene: the file, what is wrong, and the remedy."""
+    assert fall("run") == 0
+    path = tmp_path / "out/fall/trajectory.h5"
+    path.write_bytes(path.read_bytes()[:1000])
+    (tmp_path / "groom.usdc").write_bytes((tmp_path / "out/fall/scene.usdc").read_bytes()[:500])
+    for arguments in (
+        ["run", "fall.py", "--resume", "out/fall"],
+        ["export", "out/fall"],
+        ["run", "strands", "--path", "groom.usdc"],
+    ):
+        capfd.readouterr()
+        assert main(arguments) == 2
+        (told,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("ddg-warp: ")]
+        assert "cut short or damaged" in told
+
+
+def test_a_check_that_fails_to_solve_fails_the_run(tmp_path, monkeypatch, capsys, device):
+    monkeypatch.chdir(tmp_path)
+    code = SCENE.partition("def check")[0] + "def check(result):\n    raise ddg.SolverError('no equilibrium')\n"
+    (tmp_path / "fall.py").write_text(code)
+    assert main(["run", "fall.py", "--device", device]) == 1
+    assert "a check could not be computed: no equilibrium" in capsys.readouterr().err
+
+
+def test_progress_of_a_piped_run(fall, capsys, monkeypatch):
+    """Where stderr is no terminal: whole lines with steps, time and time left, at most one in an interval; none of short runs."""
+    import ddg_warp.simulate
+
+    assert fall("run") == 0
+    assert "steps" not in capsys.readouterr().err
+    monkeypatch.setattr(ddg_warp.simulate, "LINE_EVERY", 1e-9)
+    assert fall("run", "--force") == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if "steps" in line]
+    assert 3 <= len(lines) <= 7
+    assert lines[-1].startswith("5 of 5 steps, 00:0") and lines[-1].endswith("elapsed, 00:00 remaining")
+    monkeypatch.setattr(ddg_warp.simulate, "LINE_EVERY", 1e9)
+    assert fall("run", "--force") == 0
+    assert "steps" not in capsys.readouterr().err
 
 
 def test_static_scene_records_every_load_step(tmp_path, monkeypatch, device):

@@ -19,7 +19,8 @@ import datetime
 import json
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -27,7 +28,7 @@ import h5py
 import numpy as np
 
 from ddg_warp.io import Shapes, existing
-from ddg_warp.io.hdf5_read import CURVE_FIELDS, SURFACE_FIELDS, TrajectoryError, TrajectoryReader, read_rods
+from ddg_warp.io.hdf5_read import CURVE_FIELDS, SURFACE_FIELDS, TrajectoryError, TrajectoryReader, read_rods, undamaged
 from ddg_warp.io.journal import recover, transaction
 from ddg_warp.io.vtkhdf import write_view
 
@@ -65,7 +66,7 @@ class TrajectoryWriter:
         names = ["points"] + ["velocities"] * velocities + ["directors"] * directors
         self._prepare(path, model, block, names)
         partial = self.path.with_name(self.path.name + ".partial")
-        with h5py.File(partial, "w") as file:
+        with _removed_on_failure(partial), transaction(partial, new=True) as file:
             _write_attributes(file, _origin() | dict(provenance or {}))
             _write_model(file.create_group("model"), model)
             _write_control(file.create_group("control"), control or {})
@@ -77,9 +78,19 @@ class TrajectoryWriter:
         os.replace(partial, self.path)
 
     @classmethod
-    def resume(cls, path, model, *, block: int = 64) -> TrajectoryWriter:
-        """Continues a trajectory after the frame of its checkpoint; later frames are cut off."""
+    def resume(cls, path, model, *, block: int = 64, provenance: Mapping | None = None) -> TrajectoryWriter:
+        """Continues a trajectory after the frame of its checkpoint; later frames are cut off.
+
+        Args:
+            path, model, block: See the class.
+            provenance: Attributes of the file that are other than at the start, such as a later end.
+        """
         path = existing(path)
+        with undamaged(path):
+            return cls._resumed(path, model, block, provenance or {})
+
+    @classmethod
+    def _resumed(cls, path: Path, model, block: int, provenance: Mapping) -> TrajectoryWriter:
         recover(path)
         with TrajectoryReader(path) as reader:
             frame, slot, names = reader.checkpoint_frame, reader.checkpoint_slot, reader.recorded
@@ -93,8 +104,7 @@ class TrajectoryWriter:
         writer = cls.__new__(cls)
         writer._prepare(path, model, block, names)
         writer._slot = OTHER_SLOT[slot]
-        if frame < writer.frame_count:
-            writer._cut(frame)
+        writer._cut(frame, provenance)
         return writer
 
     def __enter__(self) -> TrajectoryWriter:
@@ -122,7 +132,11 @@ class TrajectoryWriter:
             self.flush()
 
     def flush(self) -> None:
-        """Writes the frames held in memory, with the checkpoint of the last one, as one transaction."""
+        """Writes the frames held in memory, with the checkpoint of the last one, as one transaction.
+
+        Raises:
+            OSError: The disk is full, or fails; the file stays as it was.
+        """
         if not self._frames:
             return
         slot = self._slot
@@ -170,13 +184,26 @@ class TrajectoryWriter:
             values = np.array([frame["series"][name] for frame in self._frames], dtype=np.float64)
             _extend(group, name, values, self._block)
 
-    def _cut(self, frame: int) -> None:
-        """Drops the frames from `frame` on."""
+    def _cut(self, frame: int, provenance: Mapping) -> None:
+        """Drops the frames from `frame` on, and brings the attributes up to date."""
         with transaction(self.path) as file:
+            _write_attributes(file, provenance)
             trajectory = file["trajectory"]
+            if len(trajectory["time"]) == frame:
+                return
             for name in ("time", *self._names, *(f"series/{name}" for name in trajectory.get("series", ()))):
                 trajectory[name].resize(frame, axis=0)
             write_view(file, self._shapes)
+
+
+@contextmanager
+def _removed_on_failure(path: Path) -> Iterator[None]:
+    """Leaves no file behind that could not be completed."""
+    try:
+        yield
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
 
 
 def _origin() -> dict[str, str]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import h5py
@@ -16,7 +18,37 @@ SURFACE_FIELDS = ("triangles", "first", "names", "thickness")
 
 
 class TrajectoryError(ValueError):
-    """A trajectory cannot be read or continued."""
+    """A trajectory cannot be read or continued; the message names the file, what is wrong with it and the remedy."""
+
+
+@contextmanager
+def undamaged(path: Path) -> Iterator[None]:
+    """What HDF5 says, in errors of many kinds, of a damaged file becomes a TrajectoryError; errors of the disk stay."""
+    try:
+        yield
+    except (TrajectoryError, CurveError):
+        raise
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise
+        raise TrajectoryError(
+            f"{path}: the file is cut short or damaged ({' '.join(str(error).split())}); take a copy of it, or record the run anew"
+        ) from error
+
+
+class Frames:
+    """A field of all frames, read when indexed; `shape`, `ndim` and `len` as of an array."""
+
+    def __init__(self, dataset: h5py.Dataset, path: Path):
+        self._dataset, self._path = dataset, path
+        self.shape, self.ndim = dataset.shape, dataset.ndim
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, frames) -> np.ndarray:
+        with undamaged(self._path):
+            return self._dataset[frames]
 
 
 class TrajectoryReader:
@@ -37,21 +69,31 @@ class TrajectoryReader:
 
     def __init__(self, path):
         self.path = existing(path)
-        self._file = open_to_read(self.path)
-        if "trajectory" not in self._file:
+        with undamaged(self.path):
+            self._file = open_to_read(self.path)
+        try:
+            with undamaged(self.path):
+                self._read()
+        except BaseException:
             self._file.close()
-            raise TrajectoryError(f"{path}: there is no group /trajectory; is it a trajectory.h5?")
+            raise
+
+    def _read(self) -> None:
+        """Everything but the fields of the frames."""
+        if "trajectory" not in self._file:
+            raise TrajectoryError(f"{self.path}: there is no group /trajectory; is it a trajectory.h5?")
         trajectory, model = self._file["trajectory"], self._file["model"]
         self.time = trajectory["time"][:]
-        self.points = trajectory["points"]
-        self.velocities = trajectory.get("velocities")
-        self.directors = trajectory.get("directors")
         self.recorded = [name for name in ("points", "velocities", "directors") if name in trajectory]
+        fields = {name: Frames(trajectory[name], self.path) for name in self.recorded}
+        self.points, self.velocities = fields["points"], fields.get("velocities")
+        self.directors = fields.get("directors")
         self.series = {name: values[:] for name, values in trajectory.get("series", {}).items()}
         self.curves = Curves(**{name: _array(model["curves"][name]) for name in CURVE_FIELDS})
         self.surfaces = None
         if "surfaces" in model:
             self.surfaces = Surfaces(**{name: _array(model["surfaces"][name]) for name in SURFACE_FIELDS})
+        _refuse_misfits(self.curves, self.surfaces, self.points.shape[-2])
         self.parameters = _all_arrays(model["parameters"])
         self.provenance = {name: _plain(value) for name, value in self._file.attrs.items()}
 
@@ -89,14 +131,16 @@ class TrajectoryReader:
     @property
     def checkpoint_frame(self) -> int:
         """Number of frames up to and with the checkpoint's."""
-        return int(self._file["checkpoint"][self.checkpoint_slot].attrs["frame"])
+        slot = self.checkpoint_slot
+        return int(self._file["checkpoint"][slot].attrs["frame"])
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """The last complete state, for `model.restore`."""
         frame = self.checkpoint_frame
         if frame > len(self):
             raise TrajectoryError(f"{self.path}: the checkpoint is of frame {frame}, but there are {len(self)}")
-        return _all_arrays(self._file["checkpoint"][self.checkpoint_slot])
+        with undamaged(self.path):
+            return _all_arrays(self._file["checkpoint"][self.checkpoint_slot])
 
     def close(self) -> None:
         """Closes the file; arrays already read stay."""
@@ -111,7 +155,7 @@ def read_rods(path, frame: int = -1, world: int = 0) -> list[CurveSet]:
     `closed`, one flag or (R,), and `radius`, one value or (P,) [m].
     """
     path = existing(path)
-    with open_to_read(path) as file:
+    with undamaged(path), open_to_read(path) as file:
         if "points" in file:
             return [_read_plain(file, path)]
     with TrajectoryReader(path) as reader:
@@ -143,6 +187,19 @@ def _by_batch(curves: Curves, points: np.ndarray, path: Path) -> list[CurveSet]:
         radius = curves.radius[mine]
         sets.append(checked_curves(points[mine], curves.counts[rods], curves.closed[rods], radius, name, str(path)))
     return sets
+
+
+def _refuse_misfits(curves: Curves, surfaces: Surfaces | None, point_count: int) -> None:
+    """Raises a ValueError where rods or surfaces are not among the points."""
+    rods, total = len(curves.counts), int(np.sum(curves.counts))
+    fits = (curves.counts >= 0).all() and len(curves.radius) == total <= point_count
+    fits = fits and {len(curves.closed), len(curves.names), len(curves.batch)} == {rods}
+    if surfaces is not None:
+        triangles, first = surfaces.triangles, surfaces.first
+        fits = fits and 0 <= triangles.min() and triangles.max() < point_count and len(first) == len(surfaces.names)
+        fits = fits and 0 == first[0] and first[-1] <= len(triangles) == len(surfaces.thickness)
+    if not fits:
+        raise ValueError(f"rods and surfaces do not fit the {point_count} points of a frame")
 
 
 def _array(dataset: h5py.Dataset) -> np.ndarray:

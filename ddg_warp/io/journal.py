@@ -8,6 +8,9 @@ with a checksum, and only then to the file. A process killed
     after it                          leaves a journal from which a reader, or the next writer, has the new content.
 This is redo logging as databases do it; appended data are written once, only the few changed pages twice.
 
+HDF5 does not survive a write that fails: objects that it could not flush crash the process when they are closed. So a write
+for which the disk has no room ends in memory, as if all were well, and the transaction fails once HDF5 has let go of the file.
+
 A program that knows no journals sees the file inconsistent only while its changed pages are being written, some ten
 microseconds a transaction. To keep it so short, large data that are replaced, such as checkpoints, alternate between
 two places: the one not in use is declared `scratch` and written straight to the file.
@@ -18,6 +21,7 @@ from __future__ import annotations
 import io
 import os
 import struct
+import sys
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -52,6 +56,8 @@ class PagedFile(io.RawIOBase):
         self._position = 0
         self.scratch: list[tuple[int, int]] = []
         """Ranges (start, stop) of old bytes whose content nobody needs: writes inside go straight to the file."""
+        self.failure: OSError | None = None
+        """Why bytes are missing in the file: the first write that failed."""
 
     def readable(self) -> bool:
         return True
@@ -92,8 +98,14 @@ class PagedFile(io.RawIOBase):
             if page in self.pages:
                 self.pages[page][low - page * PAGE : high - page * PAGE] = data[low - start : high - start]
         position = start if straight else max(start, self._limit)
-        while position < stop:
-            position += os.pwrite(self._file.fileno(), data[position - start :], position)
+        try:
+            while position < stop:
+                position += os.pwrite(self._file.fileno(), data[position - start :], position)
+        except OSError as error:
+            self.failure = error
+            self._limit, self.scratch = sys.maxsize, []  # from here on, all goes to memory
+            self._position = position
+            return position - start + self.write(data[position - start :])
         self._position = stop
         self.size = max(self.size, stop)
         return len(data)
@@ -104,7 +116,13 @@ class PagedFile(io.RawIOBase):
         return self.size
 
     def sync(self) -> None:
-        """Waits until the appended bytes are on the disk."""
+        """Waits until the appended bytes are on the disk.
+
+        Raises:
+            OSError: Some of them are not, because the disk is full or fails.
+        """
+        if self.failure is not None:
+            raise self.failure
         os.fsync(self._file.fileno())
 
     def close(self) -> None:
@@ -124,31 +142,39 @@ class PagedFile(io.RawIOBase):
 
 
 @contextmanager
-def transaction(path, scratch: str = "") -> Iterator[h5py.File]:
-    """Opens an existing HDF5 file for changes that become part of it together, at the end, or not at all.
+def transaction(path, scratch: str = "", new: bool = False) -> Iterator[h5py.File]:
+    """Opens an HDF5 file for changes that become part of it together, at the end, or not at all.
 
     Args:
         path: The file.
         scratch: A group whose datasets nobody reads until this transaction is through; what is written to them stays
             written even if it is not.
+        new: Whether to begin with an empty file, whatever was there.
+
+    Raises:
+        OSError: The disk is full, or fails; the file is as it was.
     """
     import h5py
 
     path = Path(path)
+    if new:
+        path.write_bytes(b"")
+        _journal_of(path).unlink(missing_ok=True)
     recover(path)
     old_size = path.stat().st_size
     raw = PagedFile(path, "r+b")
     try:
-        with h5py.File(raw, "r+") as file:
+        with h5py.File(raw, "w" if new else "r+") as file:
             if scratch in file:
                 raw.scratch = _places(file[scratch])
             yield file
         raw.sync()
+        _write_journal(_journal_of(path), raw.size, raw.pages)
     except BaseException:
         raw.close()
+        _journal_of(path).unlink(missing_ok=True)
         os.truncate(path, old_size)
         raise
-    _write_journal(_journal_of(path), raw.size, raw.pages)
     raw.close()
     recover(path)
 

@@ -5,6 +5,7 @@ curves or drop their materials. Every surface is a Mesh of its own. z is up, len
 times timeCodesPerSecond.
 USD saves a file in place, over its old table of contents, so that a process killed meanwhile leaves it unreadable.
 The stage therefore lives in a file `NAME.partial.usdc`; after each save a copy of it takes the final name in one step.
+USD does not survive a full disk either. Before each save the room is taken that it can need at most, and given back.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from pxr import Tf, Usd, UsdGeom
+from pxr import Tf, Usd, UsdGeom, Vt
 
 from ddg_warp.io import CurveError, Curves, Shapes
 from ddg_warp.io.colors import PALETTE
@@ -25,6 +26,9 @@ from ddg_warp.io.usd_read import read_curves
 
 __all__ = ["CurvesWriter", "read_curves", "validate"]
 
+ROOM = 2**16  # bytes that a save can need beside what it has to write
+TABLE = 256  # bytes at most that the table of contents has for a frame of a prim
+TEXT = 4  # bytes of text for a byte of numbers, at most
 GROWTH = 8  # saves are at least an eighth of the recording apart, which bounds what their copies cost
 
 
@@ -57,6 +61,7 @@ class CurvesWriter:
         self._partial.unlink(missing_ok=True)
         self._fps, self._block = fps, block
         self._frames = self._saved = 0
+        _take_room(self.path, ROOM)
         self._stage = Usd.Stage.CreateNew(str(self._partial))
         self._describe_stage()
         shapes = curves if isinstance(curves, Shapes) else _drawable(curves)
@@ -66,6 +71,7 @@ class CurvesWriter:
             self._prims += _define_rods(self._stage, shapes, colors, color_by, TubesPrim if tube else CurvesPrim)
         if shapes.surfaces is not None:
             self._prims += _define_surfaces(self._stage, shapes, color_by)
+        self._unsaved = _size_of_defaults(self._stage)
 
     def __enter__(self) -> CurvesWriter:
         return self
@@ -102,19 +108,47 @@ class CurvesWriter:
             self.save()
 
     def save(self) -> None:
-        """Gives the final file all frames so far."""
-        self._stage.GetRootLayer().Save()
+        """Gives the final file all frames so far.
+
+        Raises:
+            OSError: The disk is full; the final file stays as it was.
+        """
+        self._save_stage(copies=1)
         copy = self.path.with_name(f"{self.path.stem}.copy{self.path.suffix}")
-        shutil.copyfile(self._partial, copy)
-        os.replace(copy, self.path)
+        try:
+            shutil.copyfile(self._partial, copy)
+            os.replace(copy, self.path)
+        except OSError:
+            copy.unlink(missing_ok=True)
+            raise
         self._saved = self._frames
 
     def close(self) -> None:
         """Saves what is left and lets go of the stage."""
         if self._stage is not None:
-            self._stage.GetRootLayer().Save()
+            self._save_stage(copies=0)
             self._prims, self._stage = [], None
             os.replace(self._partial, self.path)
+
+    def abandon(self) -> None:
+        """Lets go of the stage; the final file keeps the frames saved last."""
+        self._prims, self._stage = [], None
+        self._partial.unlink(missing_ok=True)
+
+    def _save_stage(self, copies: int) -> None:
+        """Saves the stage to its own file, once there is room for it and for copies of it.
+
+        USD appends new values and writes its tables anew.
+        """
+        unsaved = self._unsaved + sum(prim.unsaved for prim in self._prims)
+        growth = ROOM + unsaved + TABLE * self._frames * len(self._prims)
+        if self._partial.suffix == ".usda":
+            growth *= TEXT
+        _take_room(self.path, (1 + copies) * growth + copies * self._partial.stat().st_size)
+        self._stage.GetRootLayer().Save()
+        self._unsaved = 0
+        for prim in self._prims:
+            prim.unsaved = 0
 
     def _describe_stage(self) -> None:
         UsdGeom.SetStageUpAxis(self._stage, UsdGeom.Tokens.z)
@@ -122,6 +156,24 @@ class CurvesWriter:
         self._stage.SetTimeCodesPerSecond(self._fps)
         self._stage.SetFramesPerSecond(self._fps)
         self._stage.SetDefaultPrim(UsdGeom.Xform.Define(self._stage, "/World").GetPrim())
+
+
+def _size_of_defaults(stage: Usd.Stage) -> int:
+    """Bytes of the arrays that do not change with time."""
+    values = (attribute.Get() for prim in stage.Traverse() for attribute in prim.GetAuthoredAttributes())
+    return sum(
+        memoryview(value).nbytes for value in values if isinstance(value, Vt.FloatArray | Vt.IntArray | Vt.Vec3fArray)
+    )
+
+
+def _take_room(path: Path, size: int) -> None:
+    """Raises an OSError where no file of so many bytes fits beside `path`."""
+    trial = path.with_name(f"{path.stem}.room{path.suffix}")
+    try:
+        with open(trial, "wb") as file:
+            os.posix_fallocate(file.fileno(), 0, size)
+    finally:
+        trial.unlink(missing_ok=True)
 
 
 def _drawable(curves) -> Shapes:

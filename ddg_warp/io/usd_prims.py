@@ -13,6 +13,8 @@ from ddg_warp.io.colors import on_scale
 from ddg_warp.io.tube import SIDES, tube_faces, tube_points
 from ddg_warp.operators import vertex_normals
 
+HEADER = 64  # bytes at most that a value takes in a file beside its numbers
+
 
 @dataclass(frozen=True)
 class ColorBy:
@@ -45,6 +47,8 @@ class PointsPrim:
 
     def __init__(self, prim: UsdGeom.PointBased, rows: np.ndarray, color: np.ndarray, color_by: ColorBy | None):
         self._prim, self._rows, self._color_by = prim, rows, color_by
+        self.unsaved = 0
+        """Bytes of values that no save has written yet, at most."""
         self._primvars = UsdGeom.PrimvarsAPI(prim)
         uniform = color.ndim == 1
         kind = UsdGeom.Tokens.constant if uniform else UsdGeom.Tokens.vertex
@@ -54,20 +58,27 @@ class PointsPrim:
     def write(self, code: Usd.TimeCode, frame: Frame) -> None:
         """Sets the samples of one frame."""
         shown = _vectors(self._vertices(np.asarray(frame.points, dtype=np.float64)[self._rows]))
-        self._prim.GetPointsAttr().Set(shown, code)
-        self._prim.GetExtentAttr().Set(self._extent(shown), code)
+        self._sample(self._prim.GetPointsAttr(), shown, code)
+        self._sample(self._prim.GetExtentAttr(), self._extent(shown), code)
         if frame.velocities is not None:
             velocities = self._at_vertices(np.asarray(frame.velocities)[self._rows])
-            self._prim.GetVelocitiesAttr().Set(_vectors(velocities), code)
+            self._sample(self._prim.GetVelocitiesAttr(), _vectors(velocities), code)
         for name, values in frame.at_points.items():
             self._write_scalar(code, name, self._at_vertices(np.asarray(values)[self._rows]), UsdGeom.Tokens.vertex)
 
     def _write_scalar(self, code: Usd.TimeCode, name: str, values: np.ndarray, kind: str) -> None:
-        self._primvars.CreatePrimvar(name, Sdf.ValueTypeNames.FloatArray, kind).Set(_floats(values), code)
+        primvar = self._primvars.CreatePrimvar(name, Sdf.ValueTypeNames.FloatArray, kind)
+        self._sample(primvar.GetAttr(), _floats(values), code)
         if self._color_by is not None and name == self._color_by.name:
             self._color.GetAttr().ClearDefault()  # the samples are at other places than the one color was
             self._color.SetInterpolation(kind)
-            self._color.Set(_vectors(on_scale(values, self._color_by.low, self._color_by.high)), code)
+            colors = on_scale(values, self._color_by.low, self._color_by.high)
+            self._sample(self._color.GetAttr(), _vectors(colors), code)
+
+    def _sample(self, attribute: Usd.Attribute, value, code: Usd.TimeCode) -> None:
+        """Sets the value of an attribute at a time."""
+        attribute.Set(value, code)
+        self.unsaved += memoryview(value).nbytes + HEADER
 
     def _vertices(self, points: np.ndarray) -> np.ndarray:
         return points
@@ -156,7 +167,7 @@ class SurfacePrim(PointsPrim):
     def write(self, code: Usd.TimeCode, frame: Frame) -> None:
         super().write(code, frame)
         points = np.asarray(frame.points, dtype=np.float64)[self._rows]
-        self._prim.GetNormalsAttr().Set(_vectors(vertex_normals(self, points)), code)
+        self._sample(self._prim.GetNormalsAttr(), _vectors(vertex_normals(self, points)), code)
         for name, values in frame.at_triangles.items():
             self._write_scalar(code, name, np.asarray(values)[self._part], UsdGeom.Tokens.uniform)
 

@@ -9,6 +9,8 @@ resample it more finely before if that is too coarse.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -30,13 +32,13 @@ def read_curves(path, prim: str | None = None) -> list[CurveSet]:
         prim: Path of the prim to read, with all below it; by default the whole file.
     """
     path = existing(path)
-    stage = _opened(path, CurveError)
-    curves = _shapes(stage, path, prim, UsdGeom.BasisCurves, CurveError)
-    if not curves:
-        raise CurveError(
-            f"{path}: there are no BasisCurves{f' below {prim}' if prim else ''}; export curves, not meshes"
-        )
-    return [_read_prim(each, path) for each in curves]
+    with _opened(path, CurveError) as stage:
+        curves = _shapes(stage, path, prim, UsdGeom.BasisCurves, CurveError)
+        if not curves:
+            raise CurveError(
+                f"{path}: there are no BasisCurves{f' below {prim}' if prim else ''}; export curves, not meshes"
+            )
+        return [_read_prim(each, path) for each in curves]
 
 
 def read_mesh_prim(path, prim: str | None = None) -> tuple[np.ndarray, np.ndarray, str]:
@@ -50,32 +52,34 @@ def read_mesh_prim(path, prim: str | None = None) -> tuple[np.ndarray, np.ndarra
         prim: Path of the Mesh prim, or of one above it; needed where the file has several meshes.
     """
     path = existing(path)
-    stage = _opened(path, MeshError)
-    meshes = _shapes(stage, path, prim, UsdGeom.Mesh, MeshError)
-    if len(meshes) != 1:
-        listed = ", ".join(str(mesh.GetPath()) for mesh in meshes[:MESHES_LISTED]) or "none"
-        raise MeshError(f"{path}: there are {len(meshes)} meshes to read ({listed}); give prim= the path of one")
-    (mesh,) = meshes
-    where = f"{path}, {mesh.GetPath()}"
-    points, time = _points(mesh, where, MeshError)
-    counts = np.array(_value(mesh.GetFaceVertexCountsAttr(), time) or [], dtype=int)
-    indices = np.array(_value(mesh.GetFaceVertexIndicesAttr(), time) or [], dtype=int)
-    holes = np.array(_value(mesh.GetHoleIndicesAttr(), time) or [], dtype=int)
-    triangles, face = triangulated(points, counts, indices, where)
-    triangles = triangles[~np.isin(face, holes)]
-    to_world, _ = _placement(mesh, time)
-    left_handed = mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
-    if left_handed != (np.linalg.det(to_world[:3, :3]) < 0.0):
-        triangles = triangles[:, [0, 2, 1]]
-    return points @ to_world[:3, :3] + to_world[3, :3], triangles, mesh.GetPrim().GetName()
+    with _opened(path, MeshError) as stage:
+        meshes = _shapes(stage, path, prim, UsdGeom.Mesh, MeshError)
+        if len(meshes) != 1:
+            listed = ", ".join(str(mesh.GetPath()) for mesh in meshes[:MESHES_LISTED]) or "none"
+            raise MeshError(f"{path}: there are {len(meshes)} meshes to read ({listed}); give prim= the path of one")
+        (mesh,) = meshes
+        where = f"{path}, {mesh.GetPath()}"
+        points, time = _points(mesh, where, MeshError)
+        counts = np.array(_value(mesh.GetFaceVertexCountsAttr(), time) or [], dtype=int)
+        indices = np.array(_value(mesh.GetFaceVertexIndicesAttr(), time) or [], dtype=int)
+        holes = np.array(_value(mesh.GetHoleIndicesAttr(), time) or [], dtype=int)
+        triangles, face = triangulated(points, counts, indices, where)
+        triangles = triangles[~np.isin(face, holes)]
+        to_world, _ = _placement(mesh, time)
+        left_handed = mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
+        if left_handed != (np.linalg.det(to_world[:3, :3]) < 0.0):
+            triangles = triangles[:, [0, 2, 1]]
+        return points @ to_world[:3, :3] + to_world[3, :3], triangles, mesh.GetPrim().GetName()
 
 
-def _opened(path: Path, error: type[ValueError]) -> Usd.Stage:
-    """The stage of a file; its prims live no longer than it."""
+@contextmanager
+def _opened(path: Path, error: type[ValueError]) -> Iterator[Usd.Stage]:
+    """The stage of a file, whose prims live no longer than it; what USD says of a damaged one becomes an `error`."""
     try:
-        return Usd.Stage.Open(str(path))
+        yield Usd.Stage.Open(str(path))
     except Tf.ErrorException as reason:
-        raise error(f"{path}: this is not a USD file that can be read ({reason}); export it again") from reason
+        said = " ".join(str(reason).split()).rpartition(" : ")[2].strip("'")
+        raise error(f"{path}: this is no USD file, or it is cut short or damaged ({said}); export it again") from reason
 
 
 def _shapes(stage: Usd.Stage, path: Path, prim: str | None, kind: type, error: type[ValueError]) -> list:

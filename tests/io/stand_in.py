@@ -54,6 +54,7 @@ class State:
 
     time: float
     q: np.ndarray
+    model: object = None
 
     def points(self) -> np.ndarray:
         return self.q
@@ -84,12 +85,12 @@ class Model:
         points = rest_points()
         if self.surfaces is not None:
             points = np.concatenate([points, surface_points()])
-        return State(0.0, points if self.worlds == 1 else np.stack([points + k for k in range(self.worlds)]))
+        return State(0.0, points if self.worlds == 1 else np.stack([points + k for k in range(self.worlds)]), self)
 
     def restore(self, snapshot: dict[str, np.ndarray]) -> State:
-        return State(float(snapshot["time"]), snapshot["0/q"].copy())
+        return State(float(snapshot["time"]), snapshot["0/q"].copy(), self)
 
 
 def step(state: State, dt: float = 0.01) -> State:
     """The next state; the map is chaotic enough that only a bitwise equal state continues alike."""
-    return State(state.time + dt, np.sin(3.0 * state.q + state.time))
+    return State(state.time + dt, np.sin(3.0 * state.q + state.time), state.model)

@@ -19,10 +19,11 @@ from ddg_warp.io.journal import open_to_read, transaction
 from ddg_warp.record import SCENE, TRAJECTORY, Recorder, export_usd
 
 BLOCK = 4
+MODEL = Model()
 
 
 def states(count, model=None):
-    state = (model or Model()).state()
+    state = (model or MODEL).state()
     for _ in range(count):
         yield state
         state = step(state)
@@ -34,7 +35,7 @@ def observed(state):
 
 def recorded(directory, count, **options):
     """Records `count` frames without the scene."""
-    with Recorder(Model(), directory, usd=False, block=BLOCK, **options) as recorder:
+    with Recorder(MODEL, directory, usd=False, block=BLOCK, **options) as recorder:
         for state in states(count):
             recorder.record(state, observed(state))
     return directory / TRAJECTORY
@@ -116,8 +117,8 @@ def test_resumed_equals_straight(tmp_path):
     straight = recorded(tmp_path / "straight", 13)
     recorded(tmp_path / "resumed", 6)
     with TrajectoryReader(tmp_path / "resumed" / TRAJECTORY) as reader:
-        state = Model().restore(reader.checkpoint())
-    with Recorder(Model(), tmp_path / "resumed", usd=False, block=BLOCK, resume=True) as recorder:
+        state = MODEL.restore(reader.checkpoint())
+    with Recorder(MODEL, tmp_path / "resumed", usd=False, block=BLOCK, resume=True) as recorder:
         while recorder_frames(recorder) < 13:
             recorder.record(state, observed(state))
             state = step(state)
@@ -134,12 +135,12 @@ def recorder_frames(recorder):
 
 
 def test_every_counts_on_after_a_resume(tmp_path):
-    with Recorder(Model(), tmp_path, usd=False, every=3) as recorder:
+    with Recorder(MODEL, tmp_path, usd=False, every=3) as recorder:
         for state in states(8):
             recorder.record(state)  # records steps 0, 3, 6
     with TrajectoryReader(tmp_path / TRAJECTORY) as reader:
-        state = Model().restore(reader.checkpoint())
-    with Recorder(Model(), tmp_path, usd=False, every=3, resume=True) as recorder:
+        state = MODEL.restore(reader.checkpoint())
+    with Recorder(MODEL, tmp_path, usd=False, every=3, resume=True) as recorder:
         for _ in range(4):
             recorder.record(state)  # step 6 again, 7, 8, 9
             state = step(state)
@@ -169,10 +170,10 @@ def test_resume_refuses_other_rods(tmp_path):
 def test_resumed_scene_shows_all_frames(tmp_path):
     from pxr import Usd, UsdGeom
 
-    with Recorder(Model(), tmp_path, block=BLOCK) as recorder:
+    with Recorder(MODEL, tmp_path, block=BLOCK) as recorder:
         for state in states(6):
             recorder.record(state)
-    with Recorder(Model(), tmp_path, block=BLOCK, resume=True) as recorder:
+    with Recorder(MODEL, tmp_path, block=BLOCK, resume=True) as recorder:
         recorder.record(step(state))
     export_usd(tmp_path / TRAJECTORY, tmp_path / "export.usdc", tube=True)
     for name, kind in ((SCENE, UsdGeom.BasisCurves), ("export.usdc", UsdGeom.Mesh)):

@@ -129,7 +129,7 @@ def test_bad_files_are_named(tmp_path):
     with pytest.raises(MissingFileError, match="no such file"):
         read_curves(tmp_path / "none.usda")
     (tmp_path / "text.usda").write_text("not USD")
-    with pytest.raises(CurveError, match="not a USD file"):
+    with pytest.raises(CurveError, match="no USD file"):
         read_curves(tmp_path / "text.usda")
     stage = Usd.Stage.CreateNew(str(tmp_path / "empty.usda"))
     with pytest.raises(CurveError, match="no BasisCurves"):

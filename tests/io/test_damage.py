@@ -1,0 +1,179 @@
+"""Disks that fill up and files that are cut short: one named error, nothing that was complete is lost, no crash."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stand_in import Model, step, surfaces
+
+from ddg_warp.io import CurveError, MeshError, read
+from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader
+from ddg_warp.io.mesh_read import read_mesh
+from ddg_warp.io.usd import validate
+from ddg_warp.record import LOCK, SCENE, TRAJECTORY, Recorder, export_usd
+
+BLOCK = 4
+FULL = """
+import resource, sys
+from stand_in import Model, step, surfaces
+from ddg_warp.record import Recorder, RecordError
+
+model = Model(surfaces=surfaces())
+for size in map(int, sys.argv[2:]):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+    state = model.state()
+    try:
+        with Recorder(model, f"{sys.argv[1]}/{size}", block=4, velocities=True) as recorder:
+            for _ in range(200):
+                recorder.record(state, {"tip": float(state.q.flat[0])})
+                state = step(state)
+        raise SystemExit("there was room")
+    except RecordError as error:
+        print(size, str(error).replace("\\n", "|"), flush=True)
+"""
+SIZES = (0, 1000, 20_000, 40_000, 80_000, 150_000, 250_000, 400_000)
+
+
+def child(code: str, *arguments) -> subprocess.CompletedProcess:
+    """Runs code in a process of its own, so that a crash, also one at its exit, is seen."""
+    root = Path(__file__).resolve().parents[2]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), str(Path(__file__).parent)])}
+    return subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)], env=environment, capture_output=True, text=True, check=False
+    )
+
+
+def test_a_full_disk_costs_no_complete_block(tmp_path):
+    """Files that may not grow beyond a size, as on a full disk: the error says so, frames and scene up to a block are there."""
+    run = child(FULL, tmp_path, *SIZES)
+    assert (run.returncode, run.stderr) == (0, "")
+    assert len(run.stdout.splitlines()) == len(SIZES)
+    frames = []
+    for size, line in zip(SIZES, run.stdout.splitlines(), strict=True):
+        assert line.startswith(f"{size} {tmp_path}/{size}") and "File too large" in line and "free" in line
+        trajectory, scene = tmp_path / str(size) / TRAJECTORY, tmp_path / str(size) / SCENE
+        frames.append(0)
+        if trajectory.exists():
+            with TrajectoryReader(trajectory) as reader:
+                frames[-1] = len(reader)
+                state = Model().state()
+                for points in reader.points[:]:
+                    np.testing.assert_array_equal(points[:16], state.q)
+                    state = step(state)
+                assert not frames[-1] or reader.checkpoint_frame == frames[-1]
+        assert frames[-1] % BLOCK == 0
+        if scene.exists():
+            assert validate(scene) == []
+        assert {path.name for path in trajectory.parent.iterdir()} <= {TRAJECTORY, SCENE}
+    assert frames == sorted(frames) and frames[0] == 0 and frames[-1] > 0
+
+
+@pytest.fixture
+def run(tmp_path) -> Path:
+    """A directory with a run of ten frames."""
+    model = Model(surfaces=surfaces())
+    with Recorder(model, tmp_path / "run", block=BLOCK) as recorder:
+        state = model.state()
+        for _ in range(10):
+            recorder.record(state)
+            state = step(state)
+    return tmp_path / "run"
+
+
+def resumed(path: Path) -> None:
+    with Recorder(Model(surfaces=surfaces()), path.parent, usd=False, resume=True):
+        pass
+
+
+def exported(path: Path) -> None:
+    export_usd(path, path.with_name("export.usdc"))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.03, 0.5, 0.99])
+@pytest.mark.parametrize(
+    ("name", "read_it", "error"),
+    [
+        (TRAJECTORY, read, TrajectoryError),
+        (TRAJECTORY, exported, TrajectoryError),
+        (TRAJECTORY, resumed, TrajectoryError),
+        (SCENE, read, CurveError),
+        (SCENE, lambda path: read_mesh(path, "/World/sail"), MeshError),
+    ],
+)
+def test_a_file_cut_short_is_named(run, name, read_it, error, share):
+    """What copying that was broken off leaves: the file, what is wrong with it, and what to do."""
+    path = run / name
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    with pytest.raises(error, match=rf"{path}.*cut short or damaged.*(export it again|record the run anew)") as caught:
+        read_it(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_damage_inside_is_named(run):
+    """Bytes overwritten at random: what is read is either whole or refused by name; nothing else escapes."""
+    path, refused = run / TRAJECTORY, 0
+    content = path.read_bytes()
+    for seed in range(30):
+        random = np.random.default_rng(seed)
+        damaged = bytearray(content)
+        for place in random.integers(0, len(content), 20):
+            damaged[place] = random.integers(256)
+        path.write_bytes(damaged)
+        for read_it in (read, exported, resumed):
+            try:
+                with np.errstate(over="ignore", invalid="ignore"):  # numbers may have become any others
+                    read_it(path)
+            except (TrajectoryError, CurveError) as error:
+                assert str(path) in str(error)
+                refused += 1
+            path.write_bytes(damaged)
+    assert refused > 10
+
+
+def test_a_run_without_a_block_is_started_again(tmp_path):
+    """Killed before its first block: it cannot be resumed, says so, and is no run that a new one would destroy."""
+    model = Model()
+    recorder = Recorder(model, tmp_path, usd=False)
+    recorder.record(model.state())
+    recorder._abandon()  # as a kill does, that writes nothing
+    with pytest.raises(TrajectoryError, match="ended before its first block was written; start it again"):
+        Recorder(model, tmp_path, usd=False, resume=True)
+    Recorder(model, tmp_path, usd=False).close()
+
+
+def test_a_run_is_not_replaced_unasked(run):
+    """The message names both ways out; with the one the frames are gone, with neither they are untouched."""
+    before = (run / TRAJECTORY).read_bytes()
+    with pytest.raises(FileExistsError, match=r"10 frames up to 0.09 s: force \(--force\).*another directory"):
+        Recorder(Model(), run)
+    assert (run / TRAJECTORY).read_bytes() == before
+    Recorder(Model(), run, force=True).close()
+    with TrajectoryReader(run / TRAJECTORY) as reader:
+        assert len(reader) == 0
+
+
+def test_one_recorder_a_directory(tmp_path):
+    """The second is told of the process of the first; a lock that a killed process left behind holds nobody up."""
+    (tmp_path / LOCK).write_text("1")
+    with Recorder(Model(), tmp_path, usd=False):
+        for options in ({"force": True}, {"resume": True}):
+            with pytest.raises(FileExistsError, match=f"process {os.getpid()} is recording a run there; wait"):
+                Recorder(Model(), tmp_path, usd=False, **options)
+    assert not (tmp_path / LOCK).exists()
+    Recorder(Model(), tmp_path, usd=False).close()
+
+
+def test_mistakes_in_recording_are_named(tmp_path):
+    model = Model()
+    for option, value in {"every": 0, "block": -1, "fps": 0.0}.items():
+        with pytest.raises(ValueError, match=f"{option} = {value}"):
+            Recorder(model, tmp_path, **{option: value})
+    with Recorder(model, tmp_path, usd=False) as recorder:
+        with pytest.raises(ValueError, match="another model than the recorder"):
+            recorder.record(Model().state())
+        recorder.record(model.state())
+    with pytest.raises(ValueError, match=r"is closed: record before close\(\), or open another with resume=True"):
+        recorder.record(step(model.state()))
