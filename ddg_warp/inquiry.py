@@ -313,7 +313,7 @@ def total_twist(model, state, rod: int = 0) -> float | np.ndarray:
         ValueError: there is no such rod, or it has no twist.
     """
     if not 0 <= rod < model.scene.rod_count:
-        raise ValueError(f"rod {rod} does not exist; the scene has {model.scene.rod_count}")
+        raise ValueError(f"total_twist: rod {rod} does not exist; the scene has {model.scene.rod_count} rods")
     turns, found = np.zeros(model.worlds), False
     for group, data in zip(model.groups, state.groups, strict=True):
         (column,) = np.nonzero(group.host.rods == rod)

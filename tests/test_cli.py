@@ -380,7 +380,11 @@ def test_bench_gives_error_and_time_together(fall, tmp_path):
     # Implicit Euler falls too far by g h T / 2.
     assert [row["error"] for row in rows] == pytest.approx([9.81 * dt * 0.02 / 2 for dt in (0.01, 0.005)], rel=1e-6)
     assert all(row["ms_per_step"] > 0 for row in rows)
-    assert (tmp_path / "out/bench/fall.csv").read_text().startswith("dt,precision,error,ms_per_step")
+    assert (
+        (tmp_path / "out/bench/fall.csv")
+        .read_text()
+        .startswith("dt,precision,error,relative_error,ms_per_step,seconds")
+    )
     assert (tmp_path / "out/bench/fall.png").is_file()
 
 
