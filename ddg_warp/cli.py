@@ -228,11 +228,11 @@ def draw(directory: Path, title: str, path=None, shapes: int = 6) -> None:
 
 def list_all(chosen: argparse.Namespace) -> int:
     """`list`: scenes and terms with what they are, in one line each."""
-    from ddg_warp.kernels.terms import ALL, AXISYMMETRIC
+    from ddg_warp.kernels.terms import ALL
 
     listed = {
         "scenes": {name: one_liner(path) for name, path in scene_files().items()},
-        "terms": {name: term.text for name, term in (ALL | AXISYMMETRIC).items()},
+        "terms": {name: term.text for name, term in ALL.items()},
     }
     for title, entries in listed.items():
         width = max(map(len, entries), default=0)
