@@ -74,6 +74,9 @@ def parser(arguments: list[str]) -> Parser:
     run.add_argument("--out", type=Path, metavar="DIR", help="where results go (default: out/SCENE)")
     run.add_argument("--resume", type=Path, metavar="DIR", help="continue the run recorded in DIR")
     run.add_argument("--force", action="store_true", help="replace a run that is there already")
+    run.add_argument(
+        "--fields", metavar="NAME,...", help="record these too, such as axial_force,curvature_1,shell_energy"
+    )
     run.add_argument("--json", type=Path, metavar="FILE", help="write the summary to FILE too")
     if arguments[:1] == ["run"] and len(arguments) > 1 and not arguments[1].startswith("-"):
         add_parameters(run.add_argument_group(f"parameters of {arguments[1]}"), load_scene(arguments[1]))
@@ -132,6 +135,7 @@ def run_scene(chosen: argparse.Namespace) -> int:
             duration=chosen.duration,
             resume=chosen.resume,
             force=chosen.force,
+            fields=[name for name in (chosen.fields or "").split(",") if name],
             observe=getattr(module, "observe", None),
             provenance={"scene": name, "parameters": settings, "command": shlex.join(["ddg-warp", *sys.argv[1:]])},
             **run_settings,

@@ -1,4 +1,5 @@
-"""The derivative table of the terms of nets: shells, shells of revolution and the rigid joint. See `ddg_warp.derivatives` for what the checks mean.
+"""The derivative table of the terms of nets: shells, shells of revolution and the rigid joint. `ddg_warp.derivatives` says what the
+checks mean.
 
 Every element of the sample has blocks of its own, so that a change of one block is seen by one element alone:
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from ddg_warp.fields import CELL_FIELDS, POINT_FIELDS, check_fields
 from ddg_warp.io import Shapes
 
 TRAJECTORY, SCENE, LOCK = "trajectory.h5", "scene.usdc", "run.lock"
@@ -41,6 +42,7 @@ class Recorder:
             and its values at the two ends of the scale. Frames replayed from a trajectory, at a resume, stay plain.
         velocities: Whether to record velocities.
         directors: Whether to record the first material directors.
+        fields: Names of numbers along rods and over surfaces to record, see `ddg_warp.fields`; a resumed run goes on with its own.
         provenance: Attributes of the trajectory, beside version, date and machine.
         control: How the run is driven, stored in the trajectory.
         resume: Whether to go on after the last complete block of DIR/trajectory.h5; the scene is written anew from it.
@@ -66,6 +68,7 @@ class Recorder:
         color_by: tuple[str, float, float] | None = None,
         velocities: bool = False,
         directors: bool = False,
+        fields: Sequence[str] = (),
         provenance: Mapping | None = None,
         control: Mapping | None = None,
         resume: bool = False,
@@ -82,6 +85,9 @@ class Recorder:
         self._model, self._every = model, every
         self._calls, self._last = 0, None
         self._velocities, self._color_by = velocities, color_by
+        self._wanted = check_fields(fields)
+        if set(self._wanted) & set(CELL_FIELDS) and model.surfaces is None:
+            raise ValueError(f"fields = {fields!r}: the model has no surfaces; leave out {', '.join(CELL_FIELDS)}")
         if color_by is not None and (color_by[0] not in COLORS or model.surfaces is None):
             raise ValueError(
                 f"color_by {color_by[0]!r}: surfaces, if there are any, are colored by {', '.join(COLORS)}"
@@ -93,6 +99,8 @@ class Recorder:
             if not (resume or force):
                 _refuse_to_replace(self.directory)
             wanted = {"velocities": velocities, "directors": directors, "provenance": provenance, "control": control}
+            wanted["at_points"] = [name for name in self._wanted if name in POINT_FIELDS]
+            wanted["at_cells"] = [name for name in self._wanted if name in CELL_FIELDS]
             self._open(model, hdf5, usd, resume, block, fps or _fps_of(model, every), tube, wanted)
         except BaseException as error:
             self._abandon()
@@ -106,6 +114,7 @@ class Recorder:
             path = self.directory / TRAJECTORY
             if resume:
                 self._trajectory = TrajectoryWriter.resume(path, model, block=block, provenance=wanted["provenance"])
+                self._wanted = tuple(self._trajectory.fields)
             else:
                 self._trajectory = TrajectoryWriter(path, model, block=block, **wanted)
         if usd:
@@ -156,11 +165,12 @@ class Recorder:
             return
         self._last = state.time
         try:
+            fields = self._fields_of(state)
             if self._trajectory is not None:
-                self._trajectory.append(state, observed)
+                self._trajectory.append(state, observed, fields)
             if self._scene is not None:
                 velocities = state.velocities() if self._velocities else None
-                self._show(state.time, state.points(), velocities, self._fields(state))
+                self._show(state.time, state.points(), velocities, fields | self._colors(state))
         except OSError as error:
             self._abandon()
             raise self._told(error) from error
@@ -204,24 +214,43 @@ class Recorder:
         with TrajectoryReader(self.directory / TRAJECTORY) as reader:
             self._calls, self._last = 1, reader.time[-1]  # the checkpoint's state was the first call of a period
             for frame in range(len(reader) if self._scene is not None else 0):
-                show_velocities = self._velocities and reader.velocities is not None
-                self._show(
-                    reader.time[frame], reader.points[frame], reader.velocities[frame] if show_velocities else None
-                )
+                velocities = reader.velocities[frame] if self._velocities and reader.velocities is not None else None
+                fields = {name: values[frame] for name, values in reader.fields.items()}
+                fields |= {
+                    name: fields[name][len(reader.counts) * self._model.worlds :]
+                    for name in fields.keys() & CELL_FIELDS
+                }
+                self._show(reader.time[frame], reader.points[frame], velocities, fields)
 
-    def _fields(self, state) -> dict[str, np.ndarray] | None:
+    def _fields_of(self, state) -> dict[str, np.ndarray]:
+        """The fields of a state by name, (worlds, points) or (worlds, triangles)."""
+        if not self._wanted:
+            return {}
+        from ddg_warp.fields import cell_fields, point_fields
+
+        return point_fields(state.model, state, [name for name in self._wanted if name in POINT_FIELDS]) | cell_fields(
+            state.model, state, [name for name in self._wanted if name in CELL_FIELDS]
+        )
+
+    def _colors(self, state) -> dict[str, np.ndarray]:
         """What surfaces are colored by, world after world."""
         if self._color_by is None:
-            return None
+            return {}
         from ddg_warp.inquiry import triangle_fields
 
         name = self._color_by[0]
         return {name: triangle_fields(state.model, state)[name].ravel()}
 
-    def _show(self, time: float, points: np.ndarray, velocities: np.ndarray | None, fields=None) -> None:
-        """Adds a frame of all worlds to the scene."""
+    def _show(
+        self, time: float, points: np.ndarray, velocities: np.ndarray | None, fields: Mapping | None = None
+    ) -> None:
+        """Adds a frame of all worlds to the scene; fields that a point has not are 0 there."""
         velocities = None if velocities is None else np.reshape(velocities, (-1, 3))
-        self._scene.write(time, np.reshape(points, (-1, 3)), velocities=velocities, triangle_scalars=fields)
+        fields = {name: np.nan_to_num(np.ravel(values)) for name, values in (fields or {}).items()}
+        at_points = {name: fields.pop(name) for name in POINT_FIELDS if name in fields}
+        self._scene.write(
+            time, np.reshape(points, (-1, 3)), velocities=velocities, scalars=at_points, triangle_scalars=fields
+        )
 
 
 def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False, revolve: int = 0) -> None:
