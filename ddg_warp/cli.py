@@ -75,7 +75,7 @@ def parser(arguments: list[str]) -> Parser:
     run.add_argument("--resume", type=Path, metavar="DIR", help="continue the run recorded in DIR")
     run.add_argument("--force", action="store_true", help="replace a run that is there already")
     run.add_argument(
-        "--fields", metavar="NAME,...", help="record these too, such as axial_force,curvature_1,shell_energy"
+        "--fields", metavar="NAME,...", help="record these too, such as velocities,directors,axial_force,shell_energy"
     )
     run.add_argument("--json", type=Path, metavar="FILE", help="write the summary to FILE too")
     if arguments[:1] == ["run"] and len(arguments) > 1 and not arguments[1].startswith("-"):

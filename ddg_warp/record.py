@@ -43,6 +43,7 @@ class Recorder:
         velocities: Whether to record velocities.
         directors: Whether to record the first material directors.
         fields: Names of numbers along rods and over surfaces to record, see `ddg_warp.fields`; a resumed run goes on with its own.
+        attributes: Values of each rod by name, shape (R,), such as the `attributes` of curves that were read: ids, groups.
         provenance: Attributes of the trajectory, beside version, date and machine.
         control: How the run is driven, stored in the trajectory.
         resume: Whether to go on after the last complete block of DIR/trajectory.h5; the scene is written anew from it.
@@ -69,6 +70,7 @@ class Recorder:
         velocities: bool = False,
         directors: bool = False,
         fields: Sequence[str] = (),
+        attributes: Mapping[str, np.ndarray] | None = None,
         provenance: Mapping | None = None,
         control: Mapping | None = None,
         resume: bool = False,
@@ -84,7 +86,7 @@ class Recorder:
         self.directory = Path(directory)
         self._model, self._every = model, every
         self._calls, self._last = 0, None
-        self._velocities, self._color_by = velocities, color_by
+        self._velocities, self._directors, self._color_by = velocities, directors, color_by
         self._wanted = check_fields(fields)
         if set(self._wanted) & set(CELL_FIELDS) and model.surfaces is None:
             raise ValueError(f"fields = {fields!r}: the model has no surfaces; leave out {', '.join(CELL_FIELDS)}")
@@ -99,6 +101,7 @@ class Recorder:
             if not (resume or force):
                 _refuse_to_replace(self.directory)
             wanted = {"velocities": velocities, "directors": directors, "provenance": provenance, "control": control}
+            wanted["attributes"] = attributes
             wanted["at_points"] = [name for name in self._wanted if name in POINT_FIELDS]
             wanted["at_cells"] = [name for name in self._wanted if name in CELL_FIELDS]
             self._open(model, hdf5, usd, resume, block, fps or _fps_of(model, every), tube, wanted)
@@ -109,12 +112,14 @@ class Recorder:
     def _open(self, model, hdf5: bool, usd: bool, resume: bool, block: int, fps: float, tube: bool, wanted) -> None:
         """Begins both files, or goes on with them."""
         if hdf5:
-            from ddg_warp.io.hdf5 import TrajectoryWriter
+            from ddg_warp.io.hdf5 import TrajectoryReader, TrajectoryWriter
 
             path = self.directory / TRAJECTORY
             if resume:
                 self._trajectory = TrajectoryWriter.resume(path, model, block=block, provenance=wanted["provenance"])
                 self._wanted = tuple(self._trajectory.fields)
+                with TrajectoryReader(path) as reader:
+                    wanted["attributes"] = reader.attributes
             else:
                 self._trajectory = TrajectoryWriter(path, model, block=block, **wanted)
         if usd:
@@ -122,7 +127,13 @@ class Recorder:
 
             shapes = Shapes.of(model.curves, model.surfaces, model.worlds)
             self._scene = CurvesWriter(
-                self.directory / SCENE, shapes, fps=fps, tube=tube, block=block, color_by=self._color_by
+                self.directory / SCENE,
+                shapes,
+                fps=fps,
+                tube=tube,
+                block=block,
+                color_by=self._color_by,
+                attributes=wanted["attributes"],
             )
         if resume:
             self._replay()
@@ -170,6 +181,9 @@ class Recorder:
                 self._trajectory.append(state, observed, fields)
             if self._scene is not None:
                 velocities = state.velocities() if self._velocities else None
+                if self._directors:
+                    shape = (self._model.worlds, np.shape(state.points())[-2])
+                    fields = fields | {"director": at_nodes(self._model.curves, state.directors(), shape)}
                 self._show(state.time, state.points(), velocities, fields | self._colors(state))
         except OSError as error:
             self._abandon()
@@ -220,6 +234,9 @@ class Recorder:
                     name: fields[name][len(reader.counts) * self._model.worlds :]
                     for name in fields.keys() & CELL_FIELDS
                 }
+                if self._directors and reader.directors is not None:
+                    shape = (self._model.worlds, reader.points.shape[-2])
+                    fields["director"] = at_nodes(reader.curves, reader.directors[frame], shape)
                 self._show(reader.time[frame], reader.points[frame], velocities, fields)
 
     def _fields_of(self, state) -> dict[str, np.ndarray]:
@@ -246,8 +263,10 @@ class Recorder:
     ) -> None:
         """Adds a frame of all worlds to the scene; fields that a point has not are 0 there."""
         velocities = None if velocities is None else np.reshape(velocities, (-1, 3))
-        fields = {name: np.nan_to_num(np.ravel(values)) for name, values in (fields or {}).items()}
-        at_points = {name: fields.pop(name) for name in POINT_FIELDS if name in fields}
+        fields = dict(fields or {})
+        directors = {"director": fields.pop("director")} if "director" in fields else {}
+        fields = {name: np.nan_to_num(np.ravel(values)) for name, values in fields.items()}
+        at_points = {name: fields.pop(name) for name in POINT_FIELDS if name in fields} | directors
         self._scene.write(
             time, np.reshape(points, (-1, 3)), velocities=velocities, scalars=at_points, triangle_scalars=fields
         )
@@ -275,10 +294,33 @@ def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False
         first = reader.points[0].reshape(-1, 3)[:count]
         turned = Revolution(reader.curves, first, revolve) if revolve else None
         shapes = turned.shapes if turned else shapes
-        with CurvesWriter(path, shapes, fps=fps or round(1.0 / spacing, 6), tube=tube) as writer:
-            for time, points in zip(reader.time, reader.points, strict=True):
-                points = points.reshape(-1, 3)
-                writer.write(time, turned.points(points[:count]) if turned else points)
+        kept = {} if turned else reader.attributes
+        with CurvesWriter(path, shapes, fps=fps or round(1.0 / spacing, 6), tube=tube, attributes=kept) as writer:
+            shape = (worlds, reader.points.shape[-2])
+            for frame, time in enumerate(reader.time):
+                points = reader.points[frame].reshape(-1, 3)
+                if turned:
+                    writer.write(time, turned.points(points[:count]))
+                    continue
+                velocities = None if reader.velocities is None else reader.velocities[frame].reshape(-1, 3)
+                directors = (
+                    {}
+                    if reader.directors is None
+                    else {"director": at_nodes(reader.curves, reader.directors[frame], shape)}
+                )
+                writer.write(time, points, velocities=velocities, scalars=directors)
+
+
+def at_nodes(curves, directors: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Directors of edges, (worlds, edges, 3), at the points of frames of shape (worlds, P): (worlds P, 3), of the edge that begins
+    there; the last point of an open rod has that of its last edge, points of surfaces have none, 0."""
+    edges = curves.counts - ~curves.closed
+    starts = np.repeat(np.cumsum(edges) - edges, curves.counts)
+    along = np.arange(curves.counts.sum()) - np.repeat(np.cumsum(curves.counts) - curves.counts, curves.counts)
+    at = starts + np.minimum(along, np.repeat(edges, curves.counts) - 1)
+    out = np.zeros((*shape, 3))
+    out[:, : len(at)] = directors.reshape(shape[0], -1, 3)[:, at]
+    return out.reshape(-1, 3)
 
 
 def _locked(directory: Path) -> int:

@@ -109,7 +109,7 @@ def simulate(
         duration: End of the run [s] instead of the scene's, or instead of that of the run to resume.
         resume: Directory of an earlier run, which this one continues.
         force: Whether to replace a run that `out` holds already.
-        fields: What to record beside positions, see `ddg_warp.fields`.
+        fields: What to record beside positions: "velocities", "directors" and the names of `ddg_warp.fields`.
         observe: (model, state) -> values by name, taken at the start and after every step.
         provenance: Attributes of the trajectory: scene, parameters, command.
         options: Keyword arguments of the `Integrator`, or of `StaticsOptions`: rtol and others.
@@ -291,7 +291,11 @@ def open_recorder(model, out, resume, dt, provenance, force, fields):
     directory, again = Path(resume or out), resume is not None
     if again:  # where it comes from stays what it was
         provenance = {name: provenance[name] for name in provenance.keys() & {"duration"}}
-    return Recorder(model, directory, fps=fps, resume=again, force=force, fields=fields, provenance=provenance)
+    vectors = {name: name in fields for name in ("velocities", "directors")}
+    fields = [name for name in fields if name not in vectors]
+    return Recorder(
+        model, directory, fps=fps, resume=again, force=force, fields=fields, provenance=provenance, **vectors
+    )
 
 
 class Lines:

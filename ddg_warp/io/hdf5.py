@@ -5,7 +5,7 @@
                   at_points/NAME (F, B P) and at_cells/NAME (F, B (R + T)), the rods of all worlds, which have none, then
                   their triangles: fields if wanted, of all worlds
     /model        curves/{counts, closed, radius, names, batch}, surfaces/{triangles, first, names, thickness} if there are
-                  any, parameters/NAME
+                  any, parameters/NAME, attributes/NAME of rods
     /control      how the run was driven
     /checkpoint   a and b, in turn the state at the last frame, at full precision; the attribute current says which
     /VTKHDF       the same points for ParaView, see `vtkhdf`
@@ -56,6 +56,7 @@ class TrajectoryWriter:
         control: How the run is driven, stored in /control: names and numbers, texts or arrays.
         at_points: Names of fields at the points.
         at_cells: Names of fields of the triangles.
+        attributes: Values of each rod by name, shape (R,), stored in /model/attributes.
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class TrajectoryWriter:
         control: Mapping | None = None,
         at_points: Sequence[str] = (),
         at_cells: Sequence[str] = (),
+        attributes: Mapping[str, np.ndarray] | None = None,
     ):
         names = ["points"] + ["velocities"] * velocities + ["directors"] * directors
         names += [f"at_points/{name}" for name in at_points] + [f"at_cells/{name}" for name in at_cells]
@@ -78,6 +80,8 @@ class TrajectoryWriter:
         with _removed_on_failure(partial), transaction(partial, new=True) as file:
             _write_attributes(file, _origin() | dict(provenance or {}))
             _write_model(file.create_group("model"), model)
+            for name, values in (attributes or {}).items():
+                _overwrite(file.require_group("model/attributes"), name, np.asarray(values))
             _write_control(file.create_group("control"), control or {})
             trajectory = file.create_group("trajectory")
             _extend(trajectory, "time", np.zeros(0), block)

@@ -64,6 +64,7 @@ class TrajectoryReader:
         curves: How the points are joined to rods.
         surfaces: How the points are joined to triangles, or None.
         parameters: The model's parameters by name.
+        attributes: Values of each rod by name that a groom came with.
         provenance: The attributes of the file.
         recorded: Names of the recorded fields.
     """
@@ -98,6 +99,7 @@ class TrajectoryReader:
             self.surfaces = Surfaces(**{name: _array(model["surfaces"][name]) for name in SURFACE_FIELDS})
         _refuse_misfits(self.curves, self.surfaces, self.points.shape[-2])
         self.parameters = _all_arrays(model["parameters"])
+        self.attributes = _all_arrays(model["attributes"]) if "attributes" in model else {}
         self.provenance = {name: _plain(value) for name, value in self._file.attrs.items()}
 
     def __enter__(self) -> TrajectoryReader:
