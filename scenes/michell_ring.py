@@ -8,6 +8,7 @@ would have when free.
 import numpy as np
 
 import ddg_warp as ddg
+from ddg_warp.buckled import buckled_points
 
 RADIUS = 1.0  # m
 B = 1.0  # bending stiffness [N m^2]
@@ -72,3 +73,9 @@ def check(result) -> list[ddg.Check]:
             "critical twist [rad]", measured, exact(ratio), min(ddg.Check.COARSEST, 40.0 / n**2), SOURCE, relative=True
         )
     ]
+
+
+def picture(result, frames) -> dict:
+    """The mode in which the ring leaves its plane, beside the ring."""
+    shapes = {0.0: result.state.points(), 1.0: buckled_points(result.model, result.state, 0.3 * RADIUS)}
+    return {"points_by_time": shapes, "label": "amplitude of the buckling mode"}

@@ -8,9 +8,11 @@ second variation of Kirchhoff rods that are rigid in the plane, by a spectral Ri
 import numpy as np
 
 import ddg_warp as ddg
+from ddg_warp.buckled import buckled_points
 
 LEG, WIDTH, THICKNESS = 240.0, 30.0, 0.6  # mm
 E, NU = 71240.0, 0.31  # N/mm^2
+LENGTH_UNIT = "mm"
 SOURCE = "second variation of Kirchhoff rods, spectral Ritz; 1.088 (Argyris 1979, Simo & Vu-Quoc 1986)"
 
 # Lateral buckling load [N]: pulling and pressing the clamped leg.
@@ -51,3 +53,12 @@ def check(result) -> list[ddg.Check]:
     (force,) = (load.force[0] for load in result.scene.loads)
     loads = [*(point.load for point in result.path.bifurcations), np.nan]  # a path without a branch fails
     return [ddg.Check("lateral buckling load [N]", force * loads[0], CRITICAL[int(force)], 1e-2, SOURCE, relative=True)]
+
+
+def picture(result, frames) -> dict:
+    """The mode of the branch, out of the plane, beside the frame at the same load."""
+    if not result.path.bifurcations:
+        return {}
+    branch = result.path.bifurcations[0].state
+    shapes = {0.0: branch.points(), 1.0: buckled_points(result.model, branch, 0.25 * LEG)}
+    return {"points_by_time": shapes, "label": "amplitude of the buckling mode"}
