@@ -3,7 +3,7 @@
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from numbers import Real
@@ -98,6 +98,7 @@ def simulate(
     duration: float | None = None,
     resume: str | Path | None = None,
     force: bool = False,
+    fields: Sequence[str] = (),
     observe: Callable[[Any, Any], Mapping[str, float]] | None = None,
     provenance: Mapping | None = None,
     options: Mapping | None = None,
@@ -116,6 +117,7 @@ def simulate(
         duration: End of the run [s] instead of the scene's, or instead of that of the run to resume.
         resume: Directory of an earlier run, which this one continues.
         force: Whether to replace a run that `out` holds already.
+        fields: What to record beside positions: "velocities", "directors" and the names of `ddg_warp.fields`.
         observe: (model, state) -> values by name, taken at the start and after every step.
         provenance: Attributes of the trajectory: scene, parameters, command.
         options: Keyword arguments of the `Integrator`, or of `StaticsOptions`: rtol and others.
@@ -156,7 +158,7 @@ def simulate(
         if out is not None or resume is not None:
             attributes = {**(provenance or {}), "dt": dt or 0.0, "precision": model.precision, "worlds": worlds}
             attributes |= {"duration": duration} if dynamic else {}
-            recorder = stack.enter_context(open_recorder(model, out, resume, dt, attributes, force))
+            recorder = stack.enter_context(open_recorder(model, out, resume, dt, attributes, force, fields))
         if recorder is not None and dynamic:
             options.setdefault("check_every", 1)  # recording waits for every step as it is
         done = max(0, len(result.times) - 1)
@@ -294,7 +296,7 @@ def continue_from(result: Result, directory: Path) -> None:
         result.series = {name: values[:frames].tolist() for name, values in reader.series.items()}
 
 
-def open_recorder(model, out, resume, dt, provenance, force):
+def open_recorder(model, out, resume, dt, provenance, force, fields):
     """The recorder of a run in `out`, or of the run that it resumes."""
     from ddg_warp.record import Recorder
 
@@ -302,7 +304,11 @@ def open_recorder(model, out, resume, dt, provenance, force):
     directory, again = Path(resume or out), resume is not None
     if again:  # where it comes from stays what it was
         provenance = {name: provenance[name] for name in provenance.keys() & {"duration"}}
-    return Recorder(model, directory, fps=fps, resume=again, force=force, provenance=provenance)
+    vectors = {name: name in fields for name in ("velocities", "directors")}
+    fields = [name for name in fields if name not in vectors]
+    return Recorder(
+        model, directory, fps=fps, resume=again, force=force, fields=fields, provenance=provenance, **vectors
+    )
 
 
 class Lines:

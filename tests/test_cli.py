@@ -89,7 +89,7 @@ def test_run_writes_everything(fall, tmp_path, capsys):
     assert set(content["energy"]) == {"start", "end"}
     assert [check["passed"] for check in content["checks"]] == [True]
     files = {path.name for path in (tmp_path / "out/fall").iterdir()}
-    assert files == {"scene.usdc", "trajectory.h5", "summary.json", "picture.png"}
+    assert files == {"scene.usdc", "trajectory.h5", "trajectory.vtkhdf", "summary.json", "picture.png"}
     assert "fall [m]" in capsys.readouterr().out
 
 

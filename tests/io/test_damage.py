@@ -67,7 +67,7 @@ def test_a_full_disk_costs_no_complete_block(tmp_path):
         assert frames[-1] % BLOCK == 0
         if scene.exists():
             assert validate(scene) == []
-        assert {path.name for path in trajectory.parent.iterdir()} <= {TRAJECTORY, SCENE}
+        assert {path.name for path in trajectory.parent.iterdir()} <= {TRAJECTORY, SCENE, "trajectory.vtkhdf"}
     assert frames == sorted(frames) and frames[0] == 0 and frames[-1] > 0
 
 
