@@ -13,7 +13,8 @@ from ddg_warp.io import CurveError, MeshError, read
 from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader
 from ddg_warp.io.mesh_read import read_mesh
 from ddg_warp.io.usd import validate
-from ddg_warp.record import LOCK, SCENE, TRAJECTORY, Recorder, export_usd
+from ddg_warp.record import SCENE, TRAJECTORY, Recorder, export_usd
+from ddg_warp.run_directory import LOCK
 
 BLOCK = 4
 FULL = """

@@ -1,4 +1,5 @@
-"""Every derivative of the terms of shells, shells of revolution and the rigid joint, in both precisions, against something else that computes it."""
+"""Every derivative of the terms of shells, shells of revolution and the rigid joint, in both precisions, against something else
+that computes it."""
 
 from functools import cache
 
