@@ -145,7 +145,8 @@ def run_scene(chosen: argparse.Namespace) -> int:
     content = summary(name, settings, result, checks)
     for path in filter(None, (directory / "summary.json", chosen.json)):
         write_json(path, content)
-    draw(directory, module, result)
+    if result.times:
+        draw(directory, module, result)
     say(result, content, checks, directory)
     return FAILED if result.failure or any(check.failed for check in checks) else DONE
 
@@ -166,12 +167,13 @@ def built(module, name: str, settings: dict):
 def judged(module, result) -> list:
     """The checks of a scene; a check whose own solves fail fails the run."""
     from ddg_warp.errors import SolverError
+    from ddg_warp.linear.direct import SingularError
 
     if not hasattr(module, "check") or result.failure:
         return []
     try:
         return module.check(result)
-    except SolverError as error:
+    except (SolverError, SingularError) as error:
         result.failure = f"a check could not be computed: {error}"
         return []
 

@@ -146,3 +146,15 @@ def _fill_along_rods(model, values: np.ndarray) -> None:
         if 0 < len(known) < last - first:
             nearest = known[np.abs(np.arange(last - first)[:, None] - known).argmin(1)]
             rod[:] = rod[:, nearest]
+
+
+def directors_at_points(curves, directors: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Directors of edges, (worlds, edges, 3), at the points of frames of shape (worlds, P): (worlds P, 3), of the edge that begins
+    there; the last point of an open rod has that of its last edge, points of surfaces have none, 0."""
+    edges = curves.counts - ~curves.closed
+    starts = np.repeat(np.cumsum(edges) - edges, curves.counts)
+    along = np.arange(curves.counts.sum()) - np.repeat(np.cumsum(curves.counts) - curves.counts, curves.counts)
+    at = starts + np.minimum(along, np.repeat(edges, curves.counts) - 1)
+    out = np.zeros((*shape, 3))
+    out[:, : len(at)] = directors.reshape(shape[0], -1, 3)[:, at]
+    return out.reshape(-1, 3)

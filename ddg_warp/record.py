@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,10 +10,10 @@ import numpy as np
 
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError
-from ddg_warp.fields import CELL_FIELDS, POINT_FIELDS, check_fields
+from ddg_warp.fields import CELL_FIELDS, POINT_FIELDS, check_fields, directors_at_points
 from ddg_warp.io import Shapes
+from ddg_warp.run_directory import LOCK, SCENE, TRAJECTORY, lock_directory, refuse_to_replace
 
-TRAJECTORY, SCENE, LOCK = "trajectory.h5", "scene.usdc", "run.lock"
 DEFAULT_FPS = 24.0
 COLORS = ("strain", "curvature", "energy")
 
@@ -101,9 +100,9 @@ class Recorder:
         self._trajectory = self._scene = self._lock = None
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
-            self._lock = _locked(self.directory)
+            self._lock = lock_directory(self.directory)
             if not (resume or force):
-                _refuse_to_replace(self.directory)
+                refuse_to_replace(self.directory)
             wanted = {"velocities": velocities, "directors": directors, "provenance": provenance, "control": control}
             wanted["attributes"] = attributes
             wanted["at_points"] = [name for name in self._wanted if name in POINT_FIELDS]
@@ -187,7 +186,7 @@ class Recorder:
                 velocities = state.velocities() if self._velocities else None
                 if self._directors:
                     shape = (self._model.worlds, np.shape(state.points())[-2])
-                    fields = fields | {"director": at_nodes(self._model.curves, state.directors(), shape)}
+                    fields = fields | {"director": directors_at_points(self._model.curves, state.directors(), shape)}
                 self._show(state.time, state.points(), velocities, fields | self._colors(state))
         except OSError as error:
             self._abandon()
@@ -240,7 +239,7 @@ class Recorder:
                 }
                 if self._directors and reader.directors is not None:
                     shape = (self._model.worlds, reader.points.shape[-2])
-                    fields["director"] = at_nodes(reader.curves, reader.directors[frame], shape)
+                    fields["director"] = directors_at_points(reader.curves, reader.directors[frame], shape)
                 self._show(reader.time[frame], reader.points[frame], velocities, fields)
 
     def _fields_of(self, state) -> dict[str, np.ndarray]:
@@ -310,69 +309,9 @@ def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False
                 directors = (
                     {}
                     if reader.directors is None
-                    else {"director": at_nodes(reader.curves, reader.directors[frame], shape)}
+                    else {"director": directors_at_points(reader.curves, reader.directors[frame], shape)}
                 )
                 writer.write(time, points, velocities=velocities, scalars=directors)
-
-
-def at_nodes(curves, directors: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Directors of edges, (worlds, edges, 3), at the points of frames of shape (worlds, P): (worlds P, 3), of the edge that begins
-    there; the last point of an open rod has that of its last edge, points of surfaces have none, 0."""
-    edges = curves.counts - ~curves.closed
-    starts = np.repeat(np.cumsum(edges) - edges, curves.counts)
-    along = np.arange(curves.counts.sum()) - np.repeat(np.cumsum(curves.counts) - curves.counts, curves.counts)
-    at = starts + np.minimum(along, np.repeat(edges, curves.counts) - 1)
-    out = np.zeros((*shape, 3))
-    out[:, : len(at)] = directors.reshape(shape[0], -1, 3)[:, at]
-    return out.reshape(-1, 3)
-
-
-def _locked(directory: Path) -> int:
-    """Descriptor of the lock of a directory, held until it is closed: a process that ends, however it does, holds none.
-
-    Raises:
-        FileExistsError: Another process, or another recorder of this one, holds it.
-    """
-    path = directory / LOCK
-    while True:
-        lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if path.exists() and os.path.samestat(os.fstat(lock), os.stat(path)):
-                os.truncate(lock, 0)
-                os.pwrite(lock, str(os.getpid()).encode(), 0)
-                return lock
-        except BlockingIOError:
-            owner = os.pread(lock, 20, 0).decode() or "unknown"
-            os.close(lock)
-            raise FileExistsError(
-                f"{directory}: process {owner} is recording a run there; wait for its end, or give another directory"
-            ) from None
-        except OSError:
-            path.unlink(missing_ok=True)
-            os.close(lock)
-            raise
-        os.close(lock)  # its owner has just removed the file that was opened
-
-
-def _refuse_to_replace(directory: Path) -> None:
-    """Raises a FileExistsError where a directory holds frames of a run."""
-    from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader
-
-    path = directory / TRAJECTORY
-    if path.exists():
-        try:
-            with TrajectoryReader(path) as reader:
-                frames = f"{len(reader)} frames up to {reader.time[-1]:g} s" if len(reader) else ""
-        except TrajectoryError:
-            frames = "a run that cannot be read"
-    else:
-        frames = SCENE if (directory / SCENE).exists() else ""
-    if frames:
-        raise FileExistsError(
-            f"{directory} holds {frames}: force (--force) replaces them, another directory (--out DIR) keeps them, "
-            "and resume (--resume DIR) goes on with them"
-        )
 
 
 def _fps_of(model, every: int) -> float:

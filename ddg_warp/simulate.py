@@ -1,6 +1,5 @@
 """Run a scene's analysis and record it. The loop is short on purpose: copy it where you need another one."""
 
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -13,9 +12,8 @@ from typing import Any
 from ddg_warp.catalog import InputError
 from ddg_warp.descriptions import Dynamics, Statics
 from ddg_warp.errors import SolverError
+from ddg_warp.progress import progress_bar
 from ddg_warp.scene import Scene
-
-LINE_EVERY = 10.0  # s between two lines about the progress of a run whose output is no terminal
 
 
 @dataclass(repr=False)
@@ -148,7 +146,10 @@ def simulate(
         run, steps = follow, analysis.stop.steps
 
     model = scene.build(device=device, precision=precision, worlds=worlds)
-    result = Result(scene, model, scene.initial(model) if scene.initial else model.state(), dt=dt)
+    try:
+        result = Result(scene, model, scene.initial(model) if scene.initial else model.state(), dt=dt)
+    except SolverError as error:
+        return Result(scene, model, model.state(), dt=dt, failure=f"the first state could not be found: {error}")
     if resume is not None:
         continue_from(result, Path(resume))
     result.energies["start"] = energies(model, result.state)
@@ -309,33 +310,6 @@ def open_recorder(model, out, resume, dt, provenance, force, fields):
     return Recorder(
         model, directory, fps=fps, resume=again, force=force, fields=fields, provenance=provenance, **vectors
     )
-
-
-class Lines:
-    """A text stream in which what would overwrite a line begins a new one."""
-
-    def __init__(self, stream):
-        self._stream = stream
-
-    def write(self, text: str) -> None:
-        line = text.strip("\r\n ")
-        if line:
-            self._stream.write(line + "\n")
-
-    def flush(self) -> None:
-        self._stream.flush()
-
-
-def progress_bar(steps: int, done: int, shown: bool):
-    """Steps done, time elapsed and time remaining, on stderr: redrawn on a terminal, a line at a time in a file or pipe."""
-    from tqdm import tqdm
-
-    style = {"total": steps, "initial": done, "desc": "compiling, once", "unit": "step", "disable": not shown}
-    if not sys.stderr.isatty():
-        form = "{desc}{n_fmt} of {total_fmt} steps, {elapsed} elapsed, {remaining} remaining"
-        seldom = {"mininterval": LINE_EVERY, "maxinterval": 2.0 * LINE_EVERY, "delay": LINE_EVERY, "miniters": 1}
-        style |= {"file": Lines(sys.stderr), "bar_format": form, **seldom}
-    return tqdm(**style)
 
 
 def wall_clock(device: str) -> Callable[[], float]:

@@ -1,5 +1,5 @@
-"""Derivatives of every term of nets: shell elements, shells of revolution, rods of nets and rigid joints, in both precisions, against
-something else that computes them."""
+"""Every derivative of the terms of shells, shells of revolution and the rigid joint, in both precisions, against something else
+that computes it."""
 
 from functools import cache
 
