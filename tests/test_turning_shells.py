@@ -51,7 +51,7 @@ def normals(state) -> np.ndarray:
     return np.concatenate(found)
 
 
-@TURNED
+@pytest.mark.parametrize("model", ["midedge_dof", "midedge", "hinge", pytest.param("curved", marks=pytest.mark.slow)])
 def test_a_sheet_is_carried_through_three_turns(device, model):
     """In statics: it is where the motion of its clamp has it, without energy, and so are the normals."""
     scene = strip((3, 2), (1.0, 0.6), model)

@@ -132,6 +132,7 @@ def test_ring_is_braziers_at_small_curvature():
         assert flattening / c**2 == pytest.approx(1.0, abs=3.0 * c**2)
 
 
+@pytest.mark.slow
 def test_collapse(device):
     """R / h = 50: largest moment within 5 % of Brazier's and 0.1 % of the ring's; order 2 or more in the length of cells."""
     exact, flattening = collapse(ring)

@@ -52,6 +52,7 @@ def test_central_force(device, edges, cells):
     assert order(cells, errors) == pytest.approx(1.78, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("edges", "load", "error"),
     [

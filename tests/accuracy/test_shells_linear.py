@@ -31,6 +31,7 @@ def test_sphere_indentation(device, slenderness):
     assert abs(errors[-1] + fine / (2.0**1.7 - 1.0)) < 0.012
 
 
+@pytest.mark.slow
 def test_sphere_indentation_on_coarse_meshes(device):
     errors = [stiffness(device, 1000.0, rings, 2.0) for rings in (16, 32)]
     assert abs(errors[0]) < 0.03

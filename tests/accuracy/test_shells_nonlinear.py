@@ -35,6 +35,7 @@ def test_cantilever_plate_shear(device, membrane):
     assert order(cells, errors) == pytest.approx(2.0, abs=0.15)
 
 
+@pytest.mark.slow
 def test_slit_annulus_does_not_lock(device):
     """Six cells across, thirty around: with facets the lip rises 4 to 6 % too little, with the arcs over their sides 1.5 %."""
     inner, outer = slit_annulus.TABLE[1.0]
