@@ -123,7 +123,7 @@ def folded(gap: float) -> np.ndarray:
 def test_folded_back_by_half_a_turn(device, gap, precision):
     """Curvature is infinite there: the error says so, names the edges and what to do, and keeps the state."""
     scene = cantilever(21, ddg.Circle(0.02), RUBBER)
-    result = run(scene, device, 0.01, 1, start=folded(gap), precision=precision, may_fail=True)
+    result = run(scene, device, 0.01, 1, start=folded(gap), precision=precision, fails=("non_finite",))
     for words in ("edges 9 and 10", "fold back by 180 degrees", "curvature is infinite", "move node 10"):
         assert words in str(result.error)
     assert result.error.outcome == "non_finite"
@@ -162,17 +162,28 @@ def test_wound_up(device, nodes, turns):
     assert 0.02 * straight_energy < result.energy[-1] < 1.01 * straight_energy
 
 
+LONG = (
+    "max_iterations",
+)  # steps in which every edge turns over and over: a sixteenth of them, after 8 retries, is still too long
+
+
 @pytest.mark.parametrize(
-    ("amplitude", "nodes", "steps"),
-    [(0.1, 64, 50), (0.5, 16, 2), (1.0, 16, 2), (0.5, 64, 1), (1.0, 64, 1), pytest.param(0.5, 32, 20, marks=slow)],
+    ("amplitude", "nodes", "dt", "steps", "fails"),
+    [
+        (0.1, 64, 0.01, 50, ()),
+        *((0.5, 16, 0.01, 2, ()), (1.0, 16, 0.01, 2, ())),
+        *((0.5, 64, 0.01, 1, LONG), (1.0, 64, 0.01, 1, LONG)),
+        *((0.5, 64, 1e-4, 2, ()), (1.0, 64, 1e-4, 2, ())),
+        pytest.param(0.5, 32, 0.01, 20, LONG, marks=slow),
+    ],
 )
-def test_random_start(device, amplitude, nodes, steps):
-    """From anywhere: converges, or fails by name; from a tenth of the length it converges and becomes a rod again."""
+def test_random_start(device, amplitude, nodes, dt, steps, fails):
+    """From anywhere: short steps converge, long ones do or fail by name; from a tenth of the length it becomes a rod again."""
     start = straight(nodes)
     start[2:] += amplitude * np.random.default_rng(0).normal(size=(nodes - 2, 3))
     scene = ddg.Scene()
     scene.clamp(scene.add_rod(straight(nodes), section=ddg.Circle(0.01), material=RUBBER))
-    result = run(scene, device, 0.01, steps, start=start, may_fail=amplitude > 0.1, retry_limit=8)
+    result = run(scene, device, dt, steps, start=start, fails=fails, retry_limit=8)
     assert_no_energy_is_made(result)
     if amplitude == 0.1:
         assert result.stretch() < 0.05
@@ -201,17 +212,21 @@ def test_mass_ratio_of_a_million(device):
 
 @pytest.mark.parametrize(
     ("turns", "nodes", "dt", "steps"),
-    [(5, 51, 1e-3, 30), (5, 51, 1e-4, 100), (20, 201, 1e-3, 1), pytest.param(20, 401, 1e-4, 200, marks=slow)],
+    [
+        *((5, 51, 1e-3, 30), (5, 51, 1e-4, 100), (20, 201, 1e-3, 1), (20, 201, 1e-5, 5)),
+        pytest.param(20, 401, 1e-4, 200, marks=slow),
+    ],
 )
 def test_curls_up(device, turns, nodes, dt, steps):
-    """Straightened from a helix of many turns and let go: 5 turns converge, 20 do or fail by name; no energy is made.
+    """Straightened from a helix of many turns and let go: 5 turns converge, 20 do in short steps or fail by name; no energy is made.
 
     A step as long as 1 ms, over which the rod coils up, has several solutions. Gauss-Newton goes downhill to a near one; the exact
     Hessian may find another (see the next test).
     """
     natural = (2.0 * np.pi * turns, 0.0, 6.0 * np.pi)
     scene = cantilever(nodes, ddg.Circle(2e-3), ddg.Material(1e9, 0.5, 1000.0), natural=natural)
-    result = run(scene, device, dt, steps, may_fail=turns > 5, retry_limit=8, psd="gauss_newton")
+    long = ("max_iterations", "line_search_failed") if turns > 5 and dt > 1e-5 else ()  # coils close within such a step
+    result = run(scene, device, dt, steps, fails=long, retry_limit=8, psd="gauss_newton")
     assert_no_energy_is_made(result)
     assert result.stretch() < 0.02
     if turns == 5:
@@ -282,9 +297,7 @@ SOFT = {
     "fold": lambda device, p: run(
         cantilever(21, ddg.Circle(0.02), RUBBER), device, 0.01, 30, start=folded(0.05), precision=p
     ),
-    "pulled": lambda device, p: run(
-        gripped(RUBBER, lambda t: (2.0 * t, 0.0, 0.3 * t)), device, 0.01, 30, precision=p, may_fail=True
-    ),
+    "pulled": lambda device, p: run(gripped(RUBBER, lambda t: (2.0 * t, 0.0, 0.3 * t)), device, 0.01, 30, precision=p),
 }
 
 
@@ -292,8 +305,7 @@ SOFT = {
 @pytest.mark.parametrize(("precision", "tolerance"), [("mixed", 1e-5), ("float32", 5e-3)])
 def test_less_precision(device, name, precision, tolerance):
     result, exact = SOFT[name](device, precision), SOFT[name](device, "float64")
-    if result.error is None:
-        np.testing.assert_allclose(result.points, exact.points, atol=tolerance)
+    np.testing.assert_allclose(result.points, exact.points, atol=tolerance)
 
 
 @pytest.mark.parametrize("precision", ["mixed", "float32"])
@@ -302,7 +314,10 @@ def test_random_start_with_less_precision(device, precision, amplitude):
     start = straight(16)
     start[2:] += amplitude * np.random.default_rng(0).normal(size=(14, 3))
     scene = cantilever(16, ddg.Circle(0.01), RUBBER)
-    run(scene, device, 0.01, 5, start=start, precision=precision, may_fail=True, retry_limit=8)
+    # as long as the rod, it snaps through several shapes in a step; the search tells them apart only in shorter ones
+    fails = ("line_search_failed", "max_iterations") if amplitude == 1.0 else ()
+    run(scene, device, 0.01, 5, start=start, precision=precision, fails=fails, retry_limit=8)
+    run(scene, device, 1e-4, 5, start=start, precision=precision)
 
 
 @pytest.mark.filterwarnings("ignore:.*precision 'float32' leaves")
@@ -310,7 +325,7 @@ def test_random_start_with_less_precision(device, precision, amplitude):
 def test_stiff_with_less_precision(device, precision):
     """Steel at r / L = 1e-4: nothing stretches, nothing gains energy; mixed falls as float64 does."""
     scene = cantilever(64, ddg.Circle(1e-4), STEEL)
-    result = run(scene, device, 0.01, 20, precision=precision, may_fail=True, lossy=True)
+    result = run(scene, device, 0.01, 20, precision=precision, lossy=True)
     assert result.stretch() < 1e-3
     if precision == "mixed":
         np.testing.assert_allclose(result.tip, run(scene, device, 0.01, 20).tip, atol=1e-5)

@@ -153,9 +153,9 @@ def test_turned_over_neighbours_are_refused(device):
 
 @pytest.mark.parametrize("bending", BENDING)
 def test_collapsed_to_a_point(device, bending):
-    """All vertices at one place, where no direction exists: solved, or given up with a name; never a silent NaN."""
+    """All vertices at one place, where no direction exists: given up with a name, as there is nothing to converge to."""
     scene = sheet(3, bending)
-    run(scene, device, 0.01, 3, np.zeros((16, 3)), may_fail=True)
+    run(scene, device, 0.01, 3, np.zeros((16, 3)), fails=("non_finite",))
 
 
 def test_crumpled_between_moving_supports(device):
