@@ -279,7 +279,8 @@ def best(study: Study, rows: list[dict]) -> list[dict]:
 def orders(study: Study, rows: list[dict]) -> dict[str, float]:
     """Observed orders in the settings that refine: the median of log(error) over log(setting) between neighbouring cases.
 
-    Of a number of edges, cells or steps the order is that in their size. What else is set is as in the case of least error.
+    Of a number of edges, cells or steps the order is that in their size. What else is set is as in the case of least error; where
+    that keeps the error from falling with every refinement, there is no order.
     """
     result = {}
     good = [row for row in rows if row["error"] > 0.0]
@@ -290,8 +291,9 @@ def orders(study: Study, rows: list[dict]) -> dict[str, float]:
         line = {row[name]: row["error"] for row in good if all(row[other] == finest[other] for other in others)}
         if len(line) > 1:
             values, errors = np.log(np.array(sorted(line.items()))).T
-            slope = float(np.median(np.diff(errors) / np.diff(values)))
-            result[name] = slope if isinstance(next(iter(line)), float) else -slope
+            slopes = np.diff(errors) / np.diff(values) * (1.0 if isinstance(next(iter(line)), float) else -1.0)
+            if (slopes > 0.1).all():
+                result[name] = float(np.median(slopes))
     return result
 
 

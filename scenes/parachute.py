@@ -120,7 +120,7 @@ def benchmark() -> ddg.bench.Study:
         {"dt": (0.04, 0.02, 0.01), "rings": (3, 6), "rtol": (1e-4, 1e-8)},
         lambda result: [result.series[name][-1] for name in ("payload", "canopy")],
         {"dt": 0.005, "rings": 12, "rtol": 1e-8},
-        fixed={"duration": 2.0},
+        fixed={"lines": 6, "duration": 2.0},
         series=("rings", "rtol"),
         unit="m/s",
     )
