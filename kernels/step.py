@@ -326,7 +326,8 @@ def advance_kernel(real):
         else:
             wp.atomic_add(work, 3, wp.int64(1))
             retries[r] = retries[r] + 1
-            if cautious[r] == 0:
+            # another start would lead to the same step, and its energy
+            if cautious[r] == 0 and result != wp.static(outcome.ENERGY_DRIFT):
                 cautious[r] = 1
             else:
                 cautious[r] = 0
