@@ -6,8 +6,8 @@ import warp as wp
 from ddg_warp import arguments, arrays, geometry, validate
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.graphs import Graphs
+from ddg_warp.integrate import energy
 from ddg_warp.integrate.buffers import Buffer
-from ddg_warp.integrate.energy import ChainEnergy
 from ddg_warp.integrate.net_step import NetStep
 from ddg_warp.integrate.prescribed import PrescribedMotion, TimedLoads, jump_between
 from ddg_warp.kernels import element, outcome, step
@@ -142,7 +142,11 @@ class Integrator:
             part.raise_failures(state)
 
     def statistics(self) -> dict:
-        """Counts since the integrator was made: Newton iterations of a solve, retries, lost pivots, outcomes."""
+        """Counts since the integrator was made: Newton iterations of a solve, retries, lost pivots, outcomes.
+
+        Under "energy", where it is watched, what the midpoint rule has made and what damping took [J] over all rods and worlds since
+        the state that the integrator was given, and of them the largest fraction made; see `energy_bound`.
+        """
         tally = sum(part.tally.numpy() for part in self._parts)
         work = np.array([part.work.numpy() for part in self._parts])
         solves = max(1, int(work[:, 2].sum()))
@@ -153,7 +157,7 @@ class Integrator:
             "lost_pivots": int(work[:, 4].sum()),
             "linear": [part.newton.linear.__name__ for part in self._parts],
             "outcomes": {name: int(tally[code]) for code, name in outcome.NAMES.items() if tally[code]},
-        }
+        } | ({} if self.energy_bound is None else {"energy": energy.summary([part.energy for part in self._parts])})
 
     def _bound(self, given: float | None) -> float | None:
         """The bound of the energy, None where it is not watched."""
@@ -301,7 +305,7 @@ class _ChainStep:
             self.tally, self.work = counts_of.tally, counts_of.work
             self.newton.status = counts_of.newton.status
             self.reason = counts_of.reason
-        self.energy = ChainEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
+        self.energy = energy.ChainEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
         self.moving = PrescribedMotion(model, group, midpoint) if group.moving else None
         self.loads = TimedLoads(model, group, midpoint) if group.host.timed_loads else None
@@ -353,7 +357,12 @@ class _ChainStep:
             [after.x, after.v, after.theta, after.omega],
         )
         if group.kind.twist:
-            self._launch("frames", group.element_threads, [after.x, newton.frame, group.count], [after.frame])
+            self._launch(
+                "frames",
+                group.element_threads,
+                [after.x, newton.frame, before.frame, group.count, newton.status, self.progress],
+                [after.frame],
+            )
         if group.kind.viscous:
             self.model.strains(group, after, after.last)
         self.remaining.zero_()

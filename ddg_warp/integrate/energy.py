@@ -11,6 +11,14 @@ from ddg_warp.kernels.net import krylov
 from ddg_warp.net_system import Sums
 
 
+def summary(parts: list["_Energy"]) -> dict[str, float]:
+    """What the rule has made and damping has taken [J] of all rods and worlds, and the largest fraction of one that was made."""
+    account = np.concatenate([part.account.numpy() for part in parts], axis=1).astype(float)
+    made, _, held, dissipated = account
+    fraction = np.abs(made) / np.maximum(held + dissipated, np.finfo(float).tiny)
+    return {"made": float(made.sum()), "dissipated": float(dissipated.sum()), "fraction": float(fraction.max())}
+
+
 class _Energy:
     """Watches the energy of the steps of a part; see `kernels.energy`.
 
@@ -47,11 +55,6 @@ class _Energy:
             [step.newton.status, self.account, self.failed],
             device=self.device,
         )
-
-    def drift(self) -> np.ndarray:
-        """What was made of the energy so far, over what was held and dissipated (count,)."""
-        made, _, held, dissipated = np.abs(self.account.numpy()).astype(float)
-        return made / np.maximum(held + dissipated, np.finfo(float).tiny)
 
     def failure(self, index: int) -> str:
         """What to tell of a rod or world that was given up."""
