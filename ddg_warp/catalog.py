@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 
 RUN_SETTINGS = ("dt", "precision", "worlds")  # what a resumed run cannot change, beside the scene's parameters
-RESERVED = ("command", "scene", "device", "out", "resume", "json", "force", "help", *RUN_SETTINGS)
+RESERVED = ("command", "scene", "device", "out", "resume", "json", "force", "fields", "help", *RUN_SETTINGS)
 SHARED = ("dt", "duration")  # flags of `run` that a scene's build may take too, to fit its motions to them
 
 

@@ -24,7 +24,7 @@ class ChainTangent:
         self.model, self.group, self.offset = model, group, offset
         kind, real, device = group.kind, model.types.real, model.wp_device
         shape = (group.nodes, group.columns)
-        self.size, self.bodies = group.columns * group.nodes * kind.block, group.columns
+        self.size, self.body_count = group.columns * group.nodes * kind.block, group.columns
         self.incidence = _incidence(group)
         self.free, self.angle, self.mass = _free(group), _angle(group), _mass(group)
         self._windows = arrays.allocate((kind.window, *shape), real, device)

@@ -74,6 +74,9 @@ def parser(arguments: list[str]) -> Parser:
     run.add_argument("--out", type=Path, metavar="DIR", help="where results go (default: out/SCENE)")
     run.add_argument("--resume", type=Path, metavar="DIR", help="continue the run recorded in DIR")
     run.add_argument("--force", action="store_true", help="replace a run that is there already")
+    run.add_argument(
+        "--fields", metavar="NAME,...", help="record these too, such as velocities,directors,axial_force,shell_energy"
+    )
     run.add_argument("--json", type=Path, metavar="FILE", help="write the summary to FILE too")
     if arguments[:1] == ["run"] and len(arguments) > 1 and not arguments[1].startswith("-"):
         add_parameters(run.add_argument_group(f"parameters of {arguments[1]}"), load_scene(arguments[1]))
@@ -133,6 +136,7 @@ def run_scene(chosen: argparse.Namespace) -> int:
             duration=chosen.duration,
             resume=chosen.resume,
             force=chosen.force,
+            fields=[name for name in (chosen.fields or "").split(",") if name],
             observe=getattr(module, "observe", None),
             provenance={"scene": name, "parameters": settings, "command": shlex.join(["ddg-warp", *sys.argv[1:]])},
             **run_settings,
@@ -141,7 +145,8 @@ def run_scene(chosen: argparse.Namespace) -> int:
     content = summary(name, settings, result, checks)
     for path in filter(None, (directory / "summary.json", chosen.json)):
         write_json(path, content)
-    draw(directory, one_liner(Path(module.__file__)), result.path)
+    if result.times:
+        draw(directory, module, result)
     say(result, content, checks, directory)
     return FAILED if result.failure or any(check.failed for check in checks) else DONE
 
@@ -162,12 +167,13 @@ def built(module, name: str, settings: dict):
 def judged(module, result) -> list:
     """The checks of a scene; a check whose own solves fail fails the run."""
     from ddg_warp.errors import SolverError
+    from ddg_warp.linear.direct import SingularError
 
     if not hasattr(module, "check") or result.failure:
         return []
     try:
         return module.check(result)
-    except SolverError as error:
+    except (SolverError, SingularError) as error:
         result.failure = f"a check could not be computed: {error}"
         return []
 
@@ -213,10 +219,12 @@ def say(result, content: dict, checks: list, directory: Path) -> None:
         print(f"ddg-warp: the solver failed: {result.failure}", file=sys.stderr)
 
 
-def draw(directory: Path, title: str, path=None, shapes: int = 6) -> None:
+def draw(directory: Path, module, result, shapes: int = 6) -> None:
     """Draw the rods and surfaces of the first world at a few times into DIR/picture.png, where matplotlib is installed.
 
-    A path of equilibria goes to DIR/path.png, load over displacements.
+    Statics and paths have the load parameter instead of the time; a path of equilibria goes to DIR/path.png, too, load over
+    displacements. A scene may declare `LENGTH_UNIT`, and `picture(result, frames)`, which returns what `figure.rods_picture` is to
+    draw instead of the frames, points by time: `points_by_time` and other arguments of it.
     """
     try:
         from ddg_warp.figure import path_plot, rods_picture
@@ -225,22 +233,29 @@ def draw(directory: Path, title: str, path=None, shapes: int = 6) -> None:
         return
     from ddg_warp.io.hdf5 import TrajectoryReader
 
+    title, unit = one_liner(Path(module.__file__)), getattr(module, "LENGTH_UNIT", "m")
     with TrajectoryReader(directory / "trajectory.h5") as reader:
-        frames = {round((len(reader) - 1) * k / (shapes - 1)) for k in range(shapes)}
+        chosen = sorted({round((len(reader) - 1) * k / (shapes - 1)) for k in range(shapes)})
         count = reader.points.shape[-2]
-        points = {float(reader.time[frame]): reader.points[frame].reshape(-1, 3)[:count] for frame in frames}
-        rods_picture(reader, points, directory / "picture.png", title)
-    if path is not None:
-        path_plot(path, directory / "path.png", title)
+        at = reader.series["load"] if result.path is not None else reader.time
+        frames = [(float(at[frame]), reader.points[frame].reshape(-1, 3)[:count]) for frame in chosen]
+        options = {"points_by_time": frames, "unit": unit}
+        if result.dt is None:
+            options["label"] = "load parameter"
+        if hasattr(module, "picture") and not result.failure:
+            options |= module.picture(result, dict(frames))
+        rods_picture(reader, path=directory / "picture.png", title=title, **options)
+    if result.path is not None:
+        path_plot(result.path, directory / "path.png", title, unit)
 
 
 def list_all(chosen: argparse.Namespace) -> int:
     """`list`: scenes and terms with what they are, in one line each."""
-    from ddg_warp.kernels.terms import ALL, AXISYMMETRIC
+    from ddg_warp.kernels.terms import ALL
 
     listed = {
         "scenes": {name: one_liner(path) for name, path in scene_files().items()},
-        "terms": {name: term.text for name, term in (ALL | AXISYMMETRIC).items()},
+        "terms": {name: term.text for name, term in ALL.items()},
     }
     for title, entries in listed.items():
         width = max(map(len, entries), default=0)

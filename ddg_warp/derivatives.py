@@ -57,6 +57,8 @@ def _rest_scene(term: Term, kind: ChainKind) -> Scene:
     points = np.concatenate([np.cos(angle), np.sin(angle), np.sin(angle)], -1) + 0.1 * random.normal(size=(6, 3))
     if any(map(is_vector, kind.terms)):
         points = np.cumsum(random.uniform(0.5, 1.5, size=(6, 1)), axis=0) * random.normal(size=3)
+    if kind.dim == 2:
+        points[:, 1] = 0.0
     bending = 0.7 if kind.twist else 0.9
     viscosity = 0.4 if term.density.lagged else 0.0
     section = Stiffness(EA=2.0, EI1=0.9, EI2=bending, GJ=0.8, mass_per_length=1.0, viscosity=viscosity)

@@ -12,6 +12,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 from ddg_warp.io import Shapes
@@ -22,6 +23,11 @@ FLAT = 1e-3  # thickness over size below which rods are drawn in their plane
 ELEVATION, AZIMUTH = 18.0, -58.0  # of the eye on solid scenes [degrees]
 MARGIN = 0.06  # of the size, around the rods
 GREY = "0.35"
+LIGHT_GREY = (0.78, 0.78, 0.78, 1.0)
+CLOSE = 1.5  # how much larger a solid scene is drawn without its axes
+TITLE = 11  # letters of a title in an inch
+STABILITY = {"stable": (False, "-"), "unstable": (True, "--")}
+SPECIAL = {"limit point": "o", "bifurcation": "D"}
 LIGHT = np.array([-0.37, -0.56, 0.74])  # unit vector from the surfaces to the light
 DARKEST = 0.55  # brightness of what the light grazes
 TIME_COLORS = LinearSegmentedColormap.from_list("time", SCALE)
@@ -29,18 +35,35 @@ MARKERS = "osD^vP"
 
 
 def rods_picture(
-    rods, points_by_time: Mapping[float, np.ndarray] | Iterable[tuple[float, np.ndarray]], path, title: str = ""
+    rods,
+    points_by_time: Mapping[float, np.ndarray] | Iterable[tuple[float, np.ndarray]],
+    path,
+    title: str = "",
+    *,
+    label: str = "time [s]",
+    unit: str = "m",
+    values: np.ndarray | None = None,
+    colors: np.ndarray | None = None,
+    bodies: Mapping[float, tuple[np.ndarray, np.ndarray]] | None = None,
+    side_by_side: bool = False,
 ) -> None:
-    """Draws rods and surfaces at a few times, the latest on top; flat where they stay in a coordinate plane.
+    """Draws rods and surfaces at a few times, the last on top; flat where they stay in a coordinate plane.
 
     Args:
         rods: A model, a `TrajectoryReader`, the curves of either, or a `CurveSet`.
-        points_by_time: Time [s] and positions [m], (P, 3) or (worlds, P, 3), of each shape to draw.
+        points_by_time: Time [s], or what `label` says, and positions, (P, 3) or (worlds, P, 3), of each shape to draw:
+            a mapping, drawn in the order of time, or pairs, drawn in theirs.
         path: The picture to write; its suffix is the format.
         title: A line above.
+        label: What tells the shapes apart, with its unit.
+        unit: That of lengths.
+        values: A number at each point, shape (P,) of all worlds, which colors the latest shape; `label` is then its name.
+        colors: RGB of each rod, shape (R, 3), instead of a color a time.
+        bodies: What else stands there at each time: points (n, 3) and triangles (t, 3).
+        side_by_side: Whether every shape has a panel of its own.
     """
     curves = getattr(rods, "curves", rods)
-    frames = sorted(dict(points_by_time).items())
+    frames = sorted(points_by_time.items()) if isinstance(points_by_time, Mapping) else list(points_by_time)
     if not frames:
         raise ValueError("there is no shape to draw: give the points of at least one time")
     times = np.array([time for time, _ in frames])
@@ -48,21 +71,44 @@ def rods_picture(
     surfaces = getattr(rods, "surfaces", None)
     worlds = points.shape[1] // Shapes.of(curves, surfaces).point_count
     shapes = Shapes.of(curves, surfaces, worlds)
-    low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
+    extents = np.concatenate([points.reshape(-1, 3), *(body for body, _ in (bodies or {}).values())])
+    low, high = extents.min(axis=0), extents.max(axis=0)
     flat = np.flatnonzero(high - low <= FLAT * np.max(high - low))
     axes = [k for k in range(3) if k != (flat[0] if len(flat) else None)]
-    norm = Normalize(times[0], times[-1] if len(times) > 1 else times[0] + 1.0)
-    figure = Figure(figsize=(7.0, 5.2), layout="constrained")
-    plot = _flat_axes(figure, axes, low, high) if len(flat) else _solid_axes(figure, low, high)
-    for time, shape in zip(times, points, strict=True):
-        latest = time == times[-1]
+    norm = Normalize(times.min(), times.max() if np.ptp(times) > 0.0 else times[0] + 1.0)
+    if values is not None:
+        norm = Normalize(np.nanmin(values), np.nanmax(values))
+    panels = len(times) if side_by_side else 1
+    figure = Figure(figsize=(7.0 if panels == 1 else 3.2 * panels, 5.2 if panels == 1 else 3.6), layout="constrained")
+    plots = [
+        (_flat_axes if len(flat) else _solid_axes)(figure, axes, low, high, unit, (1, panels, k + 1))
+        for k in range(panels)
+    ]
+    for number, (time, shape) in enumerate(zip(times, points, strict=True)):
+        plot, latest = plots[number % panels], side_by_side or number == len(times) - 1
         color = TIME_COLORS(norm(time)) if len(times) > 1 else TIME_COLORS(0.5)
+        if values is not None:
+            color = TIME_COLORS(norm(values)) if latest else LIGHT_GREY
+        if time in (bodies or {}):
+            body, triangles = bodies[time]
+            _draw_triangles(plot, body[triangles][..., axes], LIGHT_GREY)
         if surfaces is not None:
-            _draw_triangles(plot, shape[shapes.surfaces.triangles][..., axes], color)
+            faces = shapes.surfaces.triangles
+            shade = color[faces].mean(axis=1) if np.ndim(color) == 2 else color
+            _draw_triangles(plot, shape[faces][..., axes], shade)
         if len(curves.counts):
-            _draw_rods(plot, shape[shapes.rows][:, axes], shapes.curves, color, latest)
-    _explain_times(figure, plot, times, norm)
-    plot.figure.suptitle(textwrap.fill(title, 80), x=0.03, ha="left", fontsize=11)
+            shade = color[shapes.rows] if np.ndim(color) == 2 else color
+            _draw_rods(plot, shape[shapes.rows][:, axes], shapes.curves, shade if colors is None else colors, latest)
+        if side_by_side:
+            plot.set_axis_off()
+            if not len(flat):
+                plot.set_box_aspect(high - low, zoom=CLOSE)
+            plot.set_title(
+                f"{label.partition(' [')[0]} {time:.3g} {label.partition('[')[2].rstrip(']')}", fontsize=9, color=GREY
+            )
+    if not side_by_side:
+        _explain_times(figure, plots[0], times, norm, label, values)
+    figure.suptitle(textwrap.fill(title, round(TITLE * figure.get_figwidth())), x=0.03, ha="left", fontsize=11)
     _save(figure, path)
 
 
@@ -128,44 +174,65 @@ def levels_plot(path, names: list[str], marks: Mapping[str, list], usual: list[f
     _save(figure, path)
 
 
-def path_plot(path, file, title: str = "") -> None:
+def path_plot(path, file, title: str = "", unit: str = "m") -> None:
     """Draws the load parameter over every watched displacement: full where stable, broken where not, special points marked.
 
     Args:
         path: A `ddg_warp.integrate.path.Path`.
         file: The picture to write; its suffix is the format.
         title: A line above.
+        unit: That of displacements.
     """
     figure = Figure(figsize=(6.0, 4.4), layout="constrained")
     plot = figure.add_subplot()
     names, load = list(path.points[0].values), path.load
-    unstable = (path.negative[:-1] > 0) & (path.negative[1:] > 0)
+    unstable = _unstable(path)
+    kinds = {kind: marker for kind, marker in SPECIAL.items() if path.of_kind(kind)}
     for k, name in enumerate(names):
         color, values = TIME_COLORS(0.3 + 0.7 * k / max(1, len(names))), path.values(name)
-        for broken, style in ((False, "-"), (True, "--")):
+        for broken, style in STABILITY.values():
             kept = np.flatnonzero(unstable == broken)
             runs = np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1) if len(kept) else []
             segments = [np.column_stack([a[i[0] : i[-1] + 2] for a in (values, load)]) for i in runs]
-            plot.add_collection(LineCollection(segments, colors=[color], linestyles=style, linewidths=1.4))
+            plot.add_collection(LineCollection(segments, colors=[color], linestyles=style, linewidths=1.6))
         plot.plot([], [], color=color, label=name)
-        for kind, marker in (("limit point", "o"), ("bifurcation", "D")):
+        for kind, marker in kinds.items():
             special = path.of_kind(kind)
             plot.plot([p.values[name] for p in special], [p.load for p in special], marker, color=color, markersize=5)
+    for text, (broken, style) in STABILITY.items():
+        if (unstable == broken).any():
+            plot.plot([], [], color=GREY, linestyle=style, label=text)
+    for kind, marker in kinds.items():
+        plot.plot([], [], marker, color=GREY, markersize=5, label=kind)
     plot.autoscale()
-    plot.set(xlabel="displacement [m]", ylabel="load parameter")
-    plot.set_title(textwrap.fill(title, 80), loc="left", fontsize=11)
+    plot.ticklabel_format(useOffset=False)
+    plot.set(xlabel=f"displacement [{unit}]", ylabel="load parameter")
+    plot.set_title(textwrap.fill(title, round(TITLE * figure.get_figwidth())), loc="left", fontsize=11)
     plot.grid(color="0.9", linewidth=0.6)
     plot.spines[["top", "right"]].set_visible(False)
-    if names:
-        plot.legend(frameon=False, fontsize=9)
+    plot.legend(frameon=False, fontsize=9)
     _save(figure, file)
+
+
+def _unstable(path) -> np.ndarray:
+    """Whether each piece between neighbouring points of a path is unstable; special points, where that changes, have no say."""
+    regular = np.array([point.kind not in SPECIAL for point in path.points])
+    negative = np.asarray(path.negative) > 0
+    either = (negative & regular)[:-1] | (negative & regular)[1:]
+    return np.where(regular[:-1] | regular[1:], either, negative[:-1] & negative[1:])
 
 
 def _draw_rods(plot, points: np.ndarray, curves, color, latest: bool) -> None:
     """Adds polylines, in two or three dimensions."""
     kind = LineCollection if points.shape[-1] == 2 else Line3DCollection
     polylines = _polylines(points, curves.counts, curves.closed)
-    lines = kind(polylines, colors=[color], linewidths=_line_width(len(curves.counts), latest))
+    if len(color) == len(points) and np.ndim(color) == 2:  # a color at every point: an edge by itself
+        shades = _polylines(np.asarray(color), curves.counts, curves.closed)
+        color = np.concatenate([0.5 * (shade[1:] + shade[:-1]) for shade in shades])
+        polylines = [edge for line in polylines for edge in np.stack([line[:-1], line[1:]], axis=1)]
+    lines = kind(
+        polylines, colors=color if np.ndim(color) == 2 else [color], linewidths=_line_width(len(curves.counts), latest)
+    )
     lines.set(capstyle="round", joinstyle="round")
     plot.add_collection(lines)
 
@@ -173,11 +240,12 @@ def _draw_rods(plot, points: np.ndarray, curves, color, latest: bool) -> None:
 def _draw_triangles(plot, corners: np.ndarray, color) -> None:
     """Adds triangles, corners (T, 3, 2), or shaded ones, corners (T, 3, 3); thin lines close the gaps between them."""
     if corners.shape[-1] == 2:
-        plot.add_collection(PolyCollection(corners, facecolors=[color], edgecolors=[color], linewidths=0.2))
+        each = color if np.ndim(color) == 2 else [color]
+        plot.add_collection(PolyCollection(corners, facecolors=each, edgecolors=each, linewidths=0.2))
         return
     vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     facing = np.abs(vectors @ LIGHT) / np.maximum(np.linalg.norm(vectors, axis=1), np.finfo(float).tiny)
-    shaded = np.tile(color, (len(corners), 1))
+    shaded = np.array(np.broadcast_to(color, (len(corners), 4)))
     shaded[:, :3] *= (DARKEST + (1.0 - DARKEST) * facing)[:, None]  # both sides alike
     plot.add_collection(Poly3DCollection(corners, facecolors=shaded, edgecolors=shaded, linewidths=0.2))
 
@@ -194,20 +262,21 @@ def _line_width(rod_count: int, latest: bool) -> float:
     return few if latest else 0.7 * few
 
 
-def _flat_axes(figure: Figure, axes: list[int], low: np.ndarray, high: np.ndarray):
-    plot = figure.add_subplot(aspect="equal")
+def _flat_axes(figure: Figure, axes: list[int], low: np.ndarray, high: np.ndarray, unit: str, place):
+    plot = figure.add_subplot(*place, aspect="equal")
     margin = MARGIN * np.max(high - low)
     limits = [(low[k] - margin, high[k] + margin) for k in axes]
-    names = [f"{'xyz'[k]} [m]" for k in axes]
+    names = [f"{'xyz'[k]} [{unit}]" for k in axes]
     plot.set(xlim=limits[0], ylim=limits[1], xlabel=names[0], ylabel=names[1])
+    plot.ticklabel_format(useOffset=False)
     plot.grid(color="0.92", linewidth=0.6)
     plot.set_axisbelow(True)
     plot.spines[["top", "right"]].set_visible(False)
     return plot
 
 
-def _solid_axes(figure: Figure, low: np.ndarray, high: np.ndarray):
-    plot = figure.add_subplot(projection="3d", computed_zorder=False)
+def _solid_axes(figure: Figure, axes: list[int], low: np.ndarray, high: np.ndarray, unit: str, place):
+    plot = figure.add_subplot(*place, projection="3d", computed_zorder=False)
     plot.set_proj_type("ortho")
     plot.view_init(elev=ELEVATION, azim=AZIMUTH)
     margin = MARGIN * np.max(high - low)
@@ -215,10 +284,12 @@ def _solid_axes(figure: Figure, low: np.ndarray, high: np.ndarray):
     plot.set(xlim=limits[0], ylim=limits[1], zlim=limits[2])
     sides = limits[:, 1] - limits[:, 0]
     plot.set_box_aspect(sides, zoom=min(1.0, _seen_height(np.ones(3)) / _seen_height(sides)))
-    for axis, name in zip((plot.xaxis, plot.yaxis, plot.zaxis), "xyz", strict=True):
+    shares = sides / sides.max()
+    for axis, name, share in zip((plot.xaxis, plot.yaxis, plot.zaxis), "xyz", shares, strict=True):
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
-        axis.set_label_text(f"{name} [m]", fontsize=9)
-        axis.set_major_locator(_few_ticks())
+        axis.set_label_text(f"{name} [{unit}]", fontsize=9)
+        axis.get_major_formatter().set_useOffset(False)
+        axis.set_major_locator(MaxNLocator(nbins=max(2, round(4.0 * share))))  # labels of short axes do not overlap
         axis._axinfo["grid"].update(color="0.9", linewidth=0.5)
     plot.tick_params(labelsize=8, colors=GREY)
     return plot
@@ -231,20 +302,15 @@ def _seen_height(sides: np.ndarray) -> float:
     return float(seen @ sides / np.linalg.norm(sides))
 
 
-def _few_ticks():
-    from matplotlib.ticker import MaxNLocator
-
-    return MaxNLocator(nbins=4)
-
-
-def _explain_times(figure: Figure, plot, times: np.ndarray, norm: Normalize) -> None:
-    """A color bar with a tick at each time drawn."""
-    if len(times) == 1:
+def _explain_times(figure: Figure, plot, times: np.ndarray, norm: Normalize, label: str, values) -> None:
+    """A color bar with a tick at each time drawn, or over the values that color the latest shape."""
+    if len(times) == 1 and values is None:
         return
     gap = 0.10 if plot.name == "3d" else 0.03  # room for the label of the z axis
     bar = figure.colorbar(ScalarMappable(norm, TIME_COLORS), ax=plot, shrink=0.6, aspect=28, pad=gap)
-    bar.set_label("time [s]", fontsize=9)
-    bar.set_ticks(times, labels=[f"{time:.3g}" for time in times])
+    bar.set_label(label, fontsize=9)
+    if values is None:
+        bar.set_ticks(times, labels=[f"{time:.3g}" for time in times])
     bar.ax.tick_params(labelsize=8)
     bar.outline.set_visible(False)
 

@@ -182,7 +182,7 @@ def stresses(model, state) -> dict[str, list[np.ndarray]]:
     """
     result: dict[str, list] = {}
     for group, data in zip(model.groups, state.groups, strict=True):
-        values = _group_strains(model, group, data)[1]
+        values = group_strains(model, group, data)[1]
         for term, place in zip(group.kind.terms, group.kind.places(), strict=True):
             rows = slice(place[3], place[3] + len(term.measure.strains))
             missing = 0 if group.kind.closed else term.measure.span
@@ -197,7 +197,7 @@ def stresses(model, state) -> dict[str, list[np.ndarray]]:
     return result
 
 
-def _group_strains(model, group, data) -> tuple[np.ndarray, np.ndarray]:
+def group_strains(model, group, data) -> tuple[np.ndarray, np.ndarray]:
     """Strains and stresses of a group's elements (strains, nodes, worlds, rods)."""
     shape = (group.kind.strain_rows, group.nodes, group.columns)
     strain, stress = (arrays.allocate(shape, model.types.real, model.wp_device) for _ in range(2))
@@ -206,7 +206,7 @@ def _group_strains(model, group, data) -> tuple[np.ndarray, np.ndarray]:
     return arrays.download(strain).reshape(split), arrays.download(stress).reshape(split)
 
 
-def _net_strains(net, state, index: int) -> tuple[np.ndarray, np.ndarray]:
+def net_strains(net, state, index: int) -> tuple[np.ndarray, np.ndarray]:
     """Strains and stresses of a set of the net (strains, worlds, elements)."""
     part = net.sets[index]
     shape = (len(part.term.measure.strains), net.worlds * part.elements)
@@ -231,7 +231,7 @@ def triangle_fields(model, state) -> dict[str, np.ndarray]:
         if not (part.term.name.startswith("shell") and part.term.density.coupled):
             continue
         E, W = part.elements, net.worlds
-        values, slope = _net_strains(net, state, index)
+        values, slope = net_strains(net, state, index)
         change = np.moveaxis(values - np.stack([np.broadcast_to(p, (W, E)) for p in part.parameters[6:9]]), 0, -1)
         metric = [np.broadcast_to(p, (W, E)).ravel() for p in part.parameters[3:6]]
         principal = _principal(change.reshape(-1, 3), metric).reshape(W, E)
@@ -255,7 +255,7 @@ def _add_net_stresses(model, state, index: int, result: dict[str, list]) -> None
     """Stresses of a set of the net, rod by rod or shell by shell."""
     net, part, scene = model.net, model.net.sets[index], model.scene
     term, E = part.term, part.elements
-    values = _net_strains(net, state, index)[1]
+    values = net_strains(net, state, index)[1]
     if term.measure.angles and term.name not in SHELLS:
         end_moments.of_net(net, state.net, index, values)
     values = np.moveaxis(values, 0, -1)
@@ -313,14 +313,14 @@ def total_twist(model, state, rod: int = 0) -> float | np.ndarray:
         ValueError: there is no such rod, or it has no twist.
     """
     if not 0 <= rod < model.scene.rod_count:
-        raise ValueError(f"rod {rod} does not exist; the scene has {model.scene.rod_count}")
+        raise ValueError(f"total_twist: rod {rod} does not exist; the scene has {model.scene.rod_count} rods")
     turns, found = np.zeros(model.worlds), False
     for group, data in zip(model.groups, state.groups, strict=True):
         (column,) = np.nonzero(group.host.rods == rod)
         if column.size and group.kind.twist:
             index, column = next(i for i, term in enumerate(group.kind.terms) if term.measure.angles), column[0]
             parameter, _, _, row = group.kind.places()[index]
-            values = _group_strains(model, group, data)[0][row + TWIST, :, :, column]
+            values = group_strains(model, group, data)[0][row + TWIST, :, :, column]
             weight = np.broadcast_to(group.parameter(parameter), (group.nodes, group.columns))[:, column :: group.rods]
             vertices = group.host.count[column] - (0 if group.kind.closed else 2)
             turns += (values * weight)[:vertices].sum(0)
@@ -329,7 +329,7 @@ def total_twist(model, state, rod: int = 0) -> float | np.ndarray:
         of_rod = part.host.owner[0] == rod
         if part.term.measure.angles and part.term.name not in SHELLS and of_rod.any():
             weight = np.broadcast_to(part.parameters[0], (model.worlds, part.elements))
-            turns += (_net_strains(model.net, state, index)[0][TWIST] * weight)[:, of_rod].sum(1)
+            turns += (net_strains(model.net, state, index)[0][TWIST] * weight)[:, of_rod].sum(1)
             found = True
     if not found or model.scene.dimension == 2:
         raise ValueError(f"rod {rod} has no twist")

@@ -96,7 +96,7 @@ class Model:
             closed=np.concatenate([*(np.full(b.rods, b.closed) for b in batches), single == 0]),
             radius=np.concatenate(radius),
             names=np.array([*(b.name for b in batches for _ in range(b.rods)), *(s.name for s in shells)], object),
-            batch=np.repeat(np.arange(len(batches) + len(shells)), [*(b.rods for b in batches), *single]),
+            batch=np.repeat(_alike([*batches, *shells]), [*(b.rods for b in batches), *single]),
         )
 
     @cached_property
@@ -486,6 +486,20 @@ def _node_radius(batch) -> np.ndarray:
     if radius.ndim == 0 or radius.shape[-1] == 1:
         return radius
     return 0.5 * (np.concatenate([radius[..., :1], radius], -1) + np.concatenate([radius, radius[..., -1:]], -1))
+
+
+def _alike(parts) -> list[int]:
+    """Number of the first part with the same name and stiffness; of shells of revolution their own."""
+    seen: dict = {}
+    keys = [(part.name, _hashable(part.section)) if hasattr(part, "section") else id(part) for part in parts]
+    return [seen.setdefault(key, len(seen)) for key in keys]
+
+
+def _hashable(section) -> tuple:
+    """The numbers of a section, to be compared."""
+    return tuple(
+        np.asarray(value, dtype=object if value is None else float).tobytes() for value in vars(section).values()
+    )
 
 
 def _user_index(group: Group, own: np.ndarray, start: np.ndarray):

@@ -1,10 +1,11 @@
-"""The derivative table of the terms of nets: shells and the rigid joint. See `ddg_warp.derivatives` for what the checks mean.
+"""The derivative table of the terms of nets: shells, shells of revolution and the rigid joint. `ddg_warp.derivatives` says what the
+checks mean.
 
 Every element of the sample has blocks of its own, so that a change of one block is seen by one element alone:
 
     hessian      B^T H B with H the local Hessian and B from blocks to local dofs = differences of the gradient
     factor       F^T F + C = w (de/dq)^T (ds/dq) + the positive part of the geometric stiffness, derivatives by differences
-    invariance   a rotation of blocks, frames and prescribed normals keeps the energy
+    invariance   a rotation of blocks, frames and prescribed normals keeps the energy; of shells of revolution, a shift along the axis
 """
 
 from dataclasses import dataclass
@@ -15,14 +16,14 @@ import warp as wp
 
 from ddg_warp.geometry import unit
 from ddg_warp.kernels.net import elements as net_elements
-from ddg_warp.kernels.terms import JOINT, SHELLS, Term
+from ddg_warp.kernels.terms import AXISYMMETRIC, JOINT, SHELLS, Term
 from ddg_warp.precision import PRECISIONS
 from ddg_warp.samples import rotation
 
 ELEMENTS = 8
 TRAP = 2.0**-30
 INPUTS = ("q", "frame", "lag", "last", "rate", "buffer")
-TERMS = {**SHELLS, JOINT.name: JOINT}
+TERMS = {**SHELLS, **AXISYMMETRIC, JOINT.name: JOINT}
 KINDS = np.array([[0, 1, 2], [1, 2, 3], [2, 3, 0], [3, 0, 1], [1, 1, 1], [0, 1, 1], [1, 3, 1], [1, 2, 0]])  # of edges
 
 
@@ -132,13 +133,22 @@ class NetSample:
             matrix[first + i, 3 * (measure.nodes + i)] = 1.0
         for i in range(3 * measure.spins):
             matrix[first + measure.angles + i, 3 * (measure.nodes + measure.angles) + i] = 1.0
+        for i in range(3 * measure.points):
+            matrix[first + measure.angles + 3 * measure.spins + i, i] = 1.0
         return matrix
+
+    @property
+    def revolved(self) -> bool:
+        """Whether the element is of a meridian, whose place across the axis is a strain."""
+        return self.measure.name.startswith("axisymmetric")
 
     def felt(self) -> np.ndarray:
         """Which dofs the energy depends on (slots, E, 3)."""
         measure = self.measure
         used = np.ones((measure.slots, ELEMENTS, 3), bool)
         used[measure.nodes : measure.nodes + measure.angles, :, 1:] = False
+        if self.revolved:
+            used[..., 1] = False  # y of a meridian
         if measure.name.startswith("midedge"):
             kinds = self.data["constants"][:3]
             used[3:6] = (kinds == 1)[..., None]  # a corner behind an edge is read if it is a neighbour's
@@ -147,8 +157,11 @@ class NetSample:
         return used
 
     def turned(self, turn: np.ndarray) -> dict[str, np.ndarray]:
-        """All inputs after a rotation."""
+        """All inputs after a rotation, or of a meridian after a shift along the axis."""
         measure, data = self.measure, {name: values.copy() for name, values in self.data.items()}
+        if self.revolved:
+            data["q"][:, 1:] += 0.4
+            return data
         vectors = [slice(0, self.angle_start)]
         if measure.spins:
             vectors.append(slice(self.angle_start + measure.angles * ELEMENTS, None))
@@ -206,6 +219,8 @@ def _random_state(sample: NetSample) -> dict[str, np.ndarray]:
     )
     if measure.name in ("hinge_angle", "isometric_bending"):
         corners = corners[[0, 1, 2, 5]]
+    if sample.revolved:
+        corners = np.array([[2.0, 0.1, 0.5], [3.0, 0.4, -0.2], [3.8, 0.6, 0.7]])
     q = 0.4 * random.normal(size=(sample.slots.size, 3))
     place = np.repeat(corners[: measure.nodes], ELEMENTS, axis=0)
     q[: sample.angle_start] = place + 0.05 * random.normal(size=place.shape)
@@ -219,6 +234,9 @@ def _random_state(sample: NetSample) -> dict[str, np.ndarray]:
         normals = np.where((KINDS.T == 3)[..., None], unit(normals[..., [2, 0, 1]]), normals)
         constants[:12] = np.concatenate([KINDS.T, normals.transpose(0, 2, 1).reshape(9, ELEMENTS)])
         constants[12:] = np.sign(random.normal(size=constants[12:].shape))
+    if measure.name == "axisymmetric_rim":
+        angle = random.uniform(0.0, 0.3, ELEMENTS)
+        constants[[0, 2]] = np.cos(angle), np.sin(angle)
     if measure.name == "edge_tilt":
         constants[0] = np.where(np.arange(ELEMENTS) % 2, 3, 2)
         constants[1:] = np.where(constants[0] == 3, normals[0][:, [2, 0, 1]].T, normals[0].T)
@@ -339,6 +357,8 @@ def factor(case: NetCase) -> float:
     )
     w, (_, stress) = sample.data["buffer"][0], sample.strains()
     expected = w * np.einsum("mae,mbe->abe", strain_rate, stress_rate)
+    if measure.tensions == 1:
+        expected += _on_edges(sample, (w * np.maximum(stress[0], 0.0))[:, None, None])
     if measure.tensions == 3:
         blocks = w * np.array([[stress[0], 0.5 * stress[1]], [0.5 * stress[1], stress[2]]])
         values, vectors = np.linalg.eigh(blocks.transpose(2, 0, 1))
@@ -423,6 +443,8 @@ def _gauss_newton(case: NetCase) -> np.ndarray:
     """F^T F + C (3 slots, 3 slots, E) of what the evaluate kernel writes."""
     rows, tension, _, _ = case.sample.evaluate(case.real)
     result = np.einsum("mae,mbe->abe", rows, rows)
+    if len(tension) == 1:
+        result += _on_edges(case.sample, tension[0][:, None, None])
     if len(tension) == 3:
         blocks = np.array([[tension[0], tension[1]], [tension[1], tension[2]]]).transpose(2, 0, 1)
         result += _on_edges(case.sample, blocks)
@@ -430,8 +452,8 @@ def _gauss_newton(case: NetCase) -> np.ndarray:
 
 
 def _on_edges(sample: NetSample, blocks: np.ndarray) -> np.ndarray:
-    """Geometric stiffness (E, 2, 2) between the first two edge vectors, in the blocks of an element."""
-    incidence = sample.incidence[:6]
+    """Geometric stiffness (E, n, n) between the first n edge vectors, in the blocks of an element."""
+    incidence = sample.incidence[: 3 * blocks.shape[1]]
     return np.einsum("ia,eij,jb->abe", incidence, np.kron(blocks, np.eye(3)), incidence)
 
 

@@ -19,7 +19,7 @@ class NetTangent:
     def __init__(self, model, offset: int):
         self.model, self.net, self.host, self.offset = model, model.net, model.net.host, offset
         worlds, host = self.net.worlds, self.host
-        self.size, self.bodies = 3 * host.blocks * worlds, host.bodies.count * worlds
+        self.size, self.body_count = 3 * host.blocks * worlds, host.bodies.count * worlds
         kind = np.zeros((host.blocks, 3), bool)
         kind[host.nodes :] = True
         self.free, self.angle, self.mass = (

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError
+from ddg_warp.fields import CELL_FIELDS, POINT_FIELDS, check_fields, directors_at_points
 from ddg_warp.io import Shapes
+from ddg_warp.run_directory import LOCK, SCENE, TRAJECTORY, lock_directory, refuse_to_replace
 
-TRAJECTORY, SCENE, LOCK = "trajectory.h5", "scene.usdc", "run.lock"
 DEFAULT_FPS = 24.0
 COLORS = ("strain", "curvature", "energy")
 
@@ -43,6 +43,8 @@ class Recorder:
             and its values at the two ends of the scale. Frames replayed from a trajectory, at a resume, stay plain.
         velocities: Whether to record velocities.
         directors: Whether to record the first material directors.
+        fields: Names of numbers along rods and over surfaces to record, see `ddg_warp.fields`; a resumed run goes on with its own.
+        attributes: Values of each rod by name, shape (R,), such as the `attributes` of curves that were read: ids, groups.
         provenance: Attributes of the trajectory, beside version, date and machine.
         control: How the run is driven, stored in the trajectory.
         resume: Whether to go on after the last complete block of DIR/trajectory.h5; the scene is written anew from it.
@@ -68,6 +70,8 @@ class Recorder:
         color_by: tuple[str, float, float] | None = None,
         velocities: bool = False,
         directors: bool = False,
+        fields: Sequence[str] = (),
+        attributes: Mapping[str, np.ndarray] | None = None,
         provenance: Mapping | None = None,
         control: Mapping | None = None,
         resume: bool = False,
@@ -83,7 +87,10 @@ class Recorder:
         self.directory = Path(directory)
         self._model, self._every = model, every
         self._calls, self._last = 0, None
-        self._velocities, self._color_by = velocities, color_by
+        self._velocities, self._directors, self._color_by = velocities, directors, color_by
+        self._wanted = check_fields(fields)
+        if set(self._wanted) & set(CELL_FIELDS) and model.surfaces is None:
+            raise ValueError(f"fields = {fields!r}: the model has no surfaces; leave out {', '.join(CELL_FIELDS)}")
         if color_by is not None and (not isinstance(color_by, tuple | list) or len(color_by) != 3):
             raise ValueError(f"color_by is {color_by!r}; give (name, value at the low end, value at the high end)")
         if color_by is not None and (color_by[0] not in COLORS or model.surfaces is None):
@@ -93,10 +100,13 @@ class Recorder:
         self._trajectory = self._scene = self._lock = None
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
-            self._lock = _locked(self.directory)
+            self._lock = lock_directory(self.directory)
             if not (resume or force):
-                _refuse_to_replace(self.directory)
+                refuse_to_replace(self.directory)
             wanted = {"velocities": velocities, "directors": directors, "provenance": provenance, "control": control}
+            wanted["attributes"] = attributes
+            wanted["at_points"] = [name for name in self._wanted if name in POINT_FIELDS]
+            wanted["at_cells"] = [name for name in self._wanted if name in CELL_FIELDS]
             self._open(model, hdf5, usd, resume, block, fps or _fps_of(model, every), tube, wanted)
         except BaseException as error:
             self._abandon()
@@ -105,11 +115,14 @@ class Recorder:
     def _open(self, model, hdf5: bool, usd: bool, resume: bool, block: int, fps: float, tube: bool, wanted) -> None:
         """Begins both files, or goes on with them."""
         if hdf5:
-            from ddg_warp.io.hdf5 import TrajectoryWriter
+            from ddg_warp.io.hdf5 import TrajectoryReader, TrajectoryWriter
 
             path = self.directory / TRAJECTORY
             if resume:
                 self._trajectory = TrajectoryWriter.resume(path, model, block=block, provenance=wanted["provenance"])
+                self._wanted = tuple(self._trajectory.fields)
+                with TrajectoryReader(path) as reader:
+                    wanted["attributes"] = reader.attributes
             else:
                 self._trajectory = TrajectoryWriter(path, model, block=block, **wanted)
         if usd:
@@ -117,7 +130,13 @@ class Recorder:
 
             shapes = Shapes.of(model.curves, model.surfaces, model.worlds)
             self._scene = CurvesWriter(
-                self.directory / SCENE, shapes, fps=fps, tube=tube, block=block, color_by=self._color_by
+                self.directory / SCENE,
+                shapes,
+                fps=fps,
+                tube=tube,
+                block=block,
+                color_by=self._color_by,
+                attributes=wanted["attributes"],
             )
         if resume:
             self._replay()
@@ -160,11 +179,15 @@ class Recorder:
             return
         self._last = state.time
         try:
+            fields = self._fields_of(state)
             if self._trajectory is not None:
-                self._trajectory.append(state, observed)
+                self._trajectory.append(state, observed, fields)
             if self._scene is not None:
                 velocities = state.velocities() if self._velocities else None
-                self._show(state.time, state.points(), velocities, self._fields(state))
+                if self._directors:
+                    shape = (self._model.worlds, np.shape(state.points())[-2])
+                    fields = fields | {"director": directors_at_points(self._model.curves, state.directors(), shape)}
+                self._show(state.time, state.points(), velocities, fields | self._colors(state))
         except OSError as error:
             self._abandon()
             raise self._told(error) from error
@@ -208,24 +231,48 @@ class Recorder:
         with TrajectoryReader(self.directory / TRAJECTORY) as reader:
             self._calls, self._last = 1, reader.time[-1]  # the checkpoint's state was the first call of a period
             for frame in range(len(reader) if self._scene is not None else 0):
-                show_velocities = self._velocities and reader.velocities is not None
-                self._show(
-                    reader.time[frame], reader.points[frame], reader.velocities[frame] if show_velocities else None
-                )
+                velocities = reader.velocities[frame] if self._velocities and reader.velocities is not None else None
+                fields = {name: values[frame] for name, values in reader.fields.items()}
+                fields |= {
+                    name: fields[name][len(reader.counts) * self._model.worlds :]
+                    for name in fields.keys() & CELL_FIELDS
+                }
+                if self._directors and reader.directors is not None:
+                    shape = (self._model.worlds, reader.points.shape[-2])
+                    fields["director"] = directors_at_points(reader.curves, reader.directors[frame], shape)
+                self._show(reader.time[frame], reader.points[frame], velocities, fields)
 
-    def _fields(self, state) -> dict[str, np.ndarray] | None:
+    def _fields_of(self, state) -> dict[str, np.ndarray]:
+        """The fields of a state by name, (worlds, points) or (worlds, triangles)."""
+        if not self._wanted:
+            return {}
+        from ddg_warp.fields import cell_fields, point_fields
+
+        return point_fields(state.model, state, [name for name in self._wanted if name in POINT_FIELDS]) | cell_fields(
+            state.model, state, [name for name in self._wanted if name in CELL_FIELDS]
+        )
+
+    def _colors(self, state) -> dict[str, np.ndarray]:
         """What surfaces are colored by, world after world."""
         if self._color_by is None:
-            return None
+            return {}
         from ddg_warp.inquiry import triangle_fields
 
         name = self._color_by[0]
         return {name: triangle_fields(state.model, state)[name].ravel()}
 
-    def _show(self, time: float, points: np.ndarray, velocities: np.ndarray | None, fields=None) -> None:
-        """Adds a frame of all worlds to the scene."""
+    def _show(
+        self, time: float, points: np.ndarray, velocities: np.ndarray | None, fields: Mapping | None = None
+    ) -> None:
+        """Adds a frame of all worlds to the scene; fields that a point has not are 0 there."""
         velocities = None if velocities is None else np.reshape(velocities, (-1, 3))
-        self._scene.write(time, np.reshape(points, (-1, 3)), velocities=velocities, triangle_scalars=fields)
+        fields = dict(fields or {})
+        directors = {"director": fields.pop("director")} if "director" in fields else {}
+        fields = {name: np.nan_to_num(np.ravel(values)) for name, values in fields.items()}
+        at_points = {name: fields.pop(name) for name in POINT_FIELDS if name in fields} | directors
+        self._scene.write(
+            time, np.reshape(points, (-1, 3)), velocities=velocities, scalars=at_points, triangle_scalars=fields
+        )
 
 
 def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False, revolve: int = 0) -> None:
@@ -250,58 +297,21 @@ def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False
         first = reader.points[0].reshape(-1, 3)[:count]
         turned = Revolution(reader.curves, first, revolve) if revolve else None
         shapes = turned.shapes if turned else shapes
-        with CurvesWriter(path, shapes, fps=fps or round(1.0 / spacing, 6), tube=tube) as writer:
-            for time, points in zip(reader.time, reader.points, strict=True):
-                points = points.reshape(-1, 3)
-                writer.write(time, turned.points(points[:count]) if turned else points)
-
-
-def _locked(directory: Path) -> int:
-    """Descriptor of the lock of a directory, held until it is closed: a process that ends, however it does, holds none.
-
-    Raises:
-        FileExistsError: Another process, or another recorder of this one, holds it.
-    """
-    path = directory / LOCK
-    while True:
-        lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if path.exists() and os.path.samestat(os.fstat(lock), os.stat(path)):
-                os.truncate(lock, 0)
-                os.pwrite(lock, str(os.getpid()).encode(), 0)
-                return lock
-        except BlockingIOError:
-            owner = os.pread(lock, 20, 0).decode() or "unknown"
-            os.close(lock)
-            raise FileExistsError(
-                f"{directory}: process {owner} is recording a run there; wait for its end, or give another directory"
-            ) from None
-        except OSError:
-            path.unlink(missing_ok=True)
-            os.close(lock)
-            raise
-        os.close(lock)  # its owner has just removed the file that was opened
-
-
-def _refuse_to_replace(directory: Path) -> None:
-    """Raises a FileExistsError where a directory holds frames of a run."""
-    from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader
-
-    path = directory / TRAJECTORY
-    if path.exists():
-        try:
-            with TrajectoryReader(path) as reader:
-                frames = f"{len(reader)} frames up to {reader.time[-1]:g} s" if len(reader) else ""
-        except TrajectoryError:
-            frames = "a run that cannot be read"
-    else:
-        frames = SCENE if (directory / SCENE).exists() else ""
-    if frames:
-        raise FileExistsError(
-            f"{directory} holds {frames}: force (--force) replaces them, another directory (--out DIR) keeps them, "
-            "and resume (--resume DIR) goes on with them"
-        )
+        kept = {} if turned else reader.attributes
+        with CurvesWriter(path, shapes, fps=fps or round(1.0 / spacing, 6), tube=tube, attributes=kept) as writer:
+            shape = (worlds, reader.points.shape[-2])
+            for frame, time in enumerate(reader.time):
+                points = reader.points[frame].reshape(-1, 3)
+                if turned:
+                    writer.write(time, turned.points(points[:count]))
+                    continue
+                velocities = None if reader.velocities is None else reader.velocities[frame].reshape(-1, 3)
+                directors = (
+                    {}
+                    if reader.directors is None
+                    else {"director": directors_at_points(reader.curves, reader.directors[frame], shape)}
+                )
+                writer.write(time, points, velocities=velocities, scalars=directors)
 
 
 def _fps_of(model, every: int) -> float:

@@ -1,9 +1,8 @@
 """Run a scene's analysis and record it. The loop is short on purpose: copy it where you need another one."""
 
-import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from numbers import Real
@@ -13,9 +12,8 @@ from typing import Any
 from ddg_warp.catalog import InputError
 from ddg_warp.descriptions import Dynamics, Statics
 from ddg_warp.errors import SolverError
+from ddg_warp.progress import progress_bar
 from ddg_warp.scene import Scene
-
-LINE_EVERY = 10.0  # s between two lines about the progress of a run whose output is no terminal
 
 
 @dataclass(repr=False)
@@ -98,6 +96,7 @@ def simulate(
     duration: float | None = None,
     resume: str | Path | None = None,
     force: bool = False,
+    fields: Sequence[str] = (),
     observe: Callable[[Any, Any], Mapping[str, float]] | None = None,
     provenance: Mapping | None = None,
     options: Mapping | None = None,
@@ -116,6 +115,7 @@ def simulate(
         duration: End of the run [s] instead of the scene's, or instead of that of the run to resume.
         resume: Directory of an earlier run, which this one continues.
         force: Whether to replace a run that `out` holds already.
+        fields: What to record beside positions: "velocities", "directors" and the names of `ddg_warp.fields`.
         observe: (model, state) -> values by name, taken at the start and after every step.
         provenance: Attributes of the trajectory: scene, parameters, command.
         options: Keyword arguments of the `Integrator`, or of `StaticsOptions`: rtol and others.
@@ -146,7 +146,10 @@ def simulate(
         run, steps = follow, analysis.stop.steps
 
     model = scene.build(device=device, precision=precision, worlds=worlds)
-    result = Result(scene, model, scene.initial(model) if scene.initial else model.state(), dt=dt)
+    try:
+        result = Result(scene, model, scene.initial(model) if scene.initial else model.state(), dt=dt)
+    except SolverError as error:
+        return Result(scene, model, model.state(), dt=dt, failure=f"the first state could not be found: {error}")
     if resume is not None:
         continue_from(result, Path(resume))
     result.energies["start"] = energies(model, result.state)
@@ -156,7 +159,7 @@ def simulate(
         if out is not None or resume is not None:
             attributes = {**(provenance or {}), "dt": dt or 0.0, "precision": model.precision, "worlds": worlds}
             attributes |= {"duration": duration} if dynamic else {}
-            recorder = stack.enter_context(open_recorder(model, out, resume, dt, attributes, force))
+            recorder = stack.enter_context(open_recorder(model, out, resume, dt, attributes, force, fields))
         if recorder is not None and dynamic:
             options.setdefault("check_every", 1)  # recording waits for every step as it is
         done = max(0, len(result.times) - 1)
@@ -294,7 +297,7 @@ def continue_from(result: Result, directory: Path) -> None:
         result.series = {name: values[:frames].tolist() for name, values in reader.series.items()}
 
 
-def open_recorder(model, out, resume, dt, provenance, force):
+def open_recorder(model, out, resume, dt, provenance, force, fields):
     """The recorder of a run in `out`, or of the run that it resumes."""
     from ddg_warp.record import Recorder
 
@@ -302,34 +305,11 @@ def open_recorder(model, out, resume, dt, provenance, force):
     directory, again = Path(resume or out), resume is not None
     if again:  # where it comes from stays what it was
         provenance = {name: provenance[name] for name in provenance.keys() & {"duration"}}
-    return Recorder(model, directory, fps=fps, resume=again, force=force, provenance=provenance)
-
-
-class Lines:
-    """A text stream in which what would overwrite a line begins a new one."""
-
-    def __init__(self, stream):
-        self._stream = stream
-
-    def write(self, text: str) -> None:
-        line = text.strip("\r\n ")
-        if line:
-            self._stream.write(line + "\n")
-
-    def flush(self) -> None:
-        self._stream.flush()
-
-
-def progress_bar(steps: int, done: int, shown: bool):
-    """Steps done, time elapsed and time remaining, on stderr: redrawn on a terminal, a line at a time in a file or pipe."""
-    from tqdm import tqdm
-
-    style = {"total": steps, "initial": done, "desc": "compiling, once", "unit": "step", "disable": not shown}
-    if not sys.stderr.isatty():
-        form = "{desc}{n_fmt} of {total_fmt} steps, {elapsed} elapsed, {remaining} remaining"
-        seldom = {"mininterval": LINE_EVERY, "maxinterval": 2.0 * LINE_EVERY, "delay": LINE_EVERY, "miniters": 1}
-        style |= {"file": Lines(sys.stderr), "bar_format": form, **seldom}
-    return tqdm(**style)
+    vectors = {name: name in fields for name in ("velocities", "directors")}
+    fields = [name for name in fields if name not in vectors]
+    return Recorder(
+        model, directory, fps=fps, resume=again, force=force, fields=fields, provenance=provenance, **vectors
+    )
 
 
 def wall_clock(device: str) -> Callable[[], float]:

@@ -103,13 +103,17 @@ class Structures(Meridians):
         self._need_edges("clamp_boundary", shell, vertices, np.arange(len(surface.edges)), "mesh edge", "hold")
         self._hold("clamp_boundary", shell, vertices, components, edges="clamp", motion=motion)
 
-    def symmetry(self, shell: int, vertices, axis) -> None:
+    def symmetry(self, shell: int, vertices, axis, motion: Motion | None = None) -> None:
         """Put vertices on a symmetry plane, which the surface meets at a right angle.
 
         Args:
             shell: index.
             vertices: at the boundary, in one plane.
             axis: of space that the plane is across, "x", "y" or "z"; or the plane's normal (3,), of any length.
+            motion: a translation that moves the plane along an axis of space.
+
+        Raises:
+            SceneError: the vertices are in no plane, not at the boundary, or the plane can not be moved like that.
         """
         if isinstance(axis, str):
             normal = np.eye(3)["xyz".index(arguments.choice("symmetry: axis", axis, ("x", "y", "z")))]
@@ -131,7 +135,11 @@ class Structures(Meridians):
                 f"{axis or 'with this normal at'} = {np.median(height):g} m of the others; choose the vertices of one plane"
             )
         self._need_edges("symmetry", shell, vertices, surface.boundary_edges, "boundary edge", "hold")
-        self._hold("symmetry", shell, vertices, axis, edges="symmetry", normal=tuple(normal.tolist()))
+        if motion is not None and (not axis or getattr(motion, "turns", False)):
+            raise SceneError(
+                "symmetry: a plane that moves is across an axis of space and does not turn; give 'x', 'y' or 'z' and a translation"
+            )
+        self._hold("symmetry", shell, vertices, axis, edges="symmetry", normal=tuple(normal.tolist()), motion=motion)
 
     def add_vertex_force(self, shell: int, vertices, force, amplitude: Callable[[float], float] | None = None) -> None:
         """Dead force [N] on each of some vertices, (3,) or (V, 3). In statics it grows with the load parameter."""

@@ -52,6 +52,8 @@ def check_scene(scene) -> None:
         (np.nanmax(np.ptp(o.points.reshape(-1, o.points.shape[-1]), axis=0)) for o in objects if o.points.size),
         default=1.0,
     )
+    if scene.initial is not None or not isinstance(scene.analysis, Dynamics):
+        return  # a state may start elsewhere, and equilibria have no time before the first
     for support in (*scene.supports, *scene.shell_supports, *scene.ring_supports):
         motion = support.motion
         if motion is None:
@@ -63,7 +65,7 @@ def check_scene(scene) -> None:
             raise SceneError(
                 f"{support.call}: the motion's translation at t = 0 is {tuple(shift[row].tolist())} m along "
                 f"{support.components}; supports start where they are "
-                "at rest, so subtract its value at 0, or move the points"
+                "at rest, so subtract its value at 0, move the points, or give Scene(initial=...) a state that is there"
             )
         if abs(angle) > STARTS:
             raise SceneError(

@@ -90,4 +90,4 @@ AXISYMMETRIC = {
 
 JOINT = Term("rigid_joint", joint_curvature_twist, quadratic, "bending and twist of half cells at rigid joints")
 
-ALL = {**REGISTRY, **SHELLS, JOINT.name: JOINT}
+ALL = {**REGISTRY, **SHELLS, **AXISYMMETRIC, JOINT.name: JOINT}

@@ -15,6 +15,7 @@ RADIUS = 100.0  # in
 EI = 1.0e7 / 12.0  # lbf in^2
 TORSION = {"polar": EI, "st_venant": 0.5e7 * 0.140577}  # GJ [lbf in^2]
 EA = {True: 1.0e7, False: 1.0e11}  # lbf; of an extensible rod, and so stiff that it counts as inextensible
+LENGTH_UNIT = "in"
 SOURCE = "Kirchhoff rod as a boundary value problem, shooting against collocation to 1e-10"
 
 # (torsion, extensible) -> load [lbf] -> tip [in].

@@ -9,6 +9,7 @@ and clamped ends give (Greenhill 1883; van der Heijden & Thompson, Nonlinear Dyn
 import numpy as np
 
 import ddg_warp as ddg
+from ddg_warp.buckled import buckled_points
 
 LENGTH = 1.0  # m
 B, C = 1.0, 1.0  # bending and twisting stiffness [N m^2]; C only sets how far the end must turn
@@ -97,3 +98,9 @@ def check(result) -> list[ddg.Check]:
 def benchmark() -> ddg.bench.Study:
     """The critical moment over the nodes of the shaft."""
     return ddg.bench.Study({"n": (50, 100, 200, 400)}, "critical moment")
+
+
+def picture(result, frames) -> dict:
+    """The mode in which the rod buckles, beside the straight rod."""
+    shapes = {0.0: result.state.points(), 1.0: buckled_points(result.model, result.state, 0.1 * LENGTH)}
+    return {"points_by_time": shapes, "label": "amplitude of the buckling mode"}

@@ -13,6 +13,7 @@ from ddg_warp.scenes import _sze
 RADIUS, HALF_LENGTH, HALF_ANGLE = 2540.0, 254.0, 0.1  # mm, mm, rad
 YOUNG, POISSON = 3102.75, 0.3  # N/mm^2, 1
 LIMIT = {12.7: 2226.3, 6.35: 585.9}  # thickness [mm] -> first limit load [N]
+LENGTH_UNIT = "mm"
 
 
 def build(

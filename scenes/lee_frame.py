@@ -12,6 +12,7 @@ import ddg_warp as ddg
 LEG = 120.0  # cm
 EI = 1440.0  # t cm^2
 EA = 4.32e6  # t; a thousand times that of the section, so that the frame counts as inextensible
+LENGTH_UNIT = "cm"
 SOURCE = "inextensible elastica, collocation"
 
 # Load [t] at its stationary values, and how far the loaded point is then down and to the right [cm].

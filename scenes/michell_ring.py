@@ -8,6 +8,7 @@ would have when free.
 import numpy as np
 
 import ddg_warp as ddg
+from ddg_warp.buckled import buckled_points
 
 RADIUS = 1.0  # m
 B = 1.0  # bending stiffness [N m^2]
@@ -77,3 +78,9 @@ def check(result) -> list[ddg.Check]:
 def benchmark() -> ddg.bench.Study:
     """The critical twist over the nodes of the ring."""
     return ddg.bench.Study({"n": (50, 100, 200)}, "critical twist")
+
+
+def picture(result, frames) -> dict:
+    """The mode in which the ring leaves its plane, beside the ring."""
+    shapes = {0.0: result.state.points(), 1.0: buckled_points(result.model, result.state, 0.3 * RADIUS)}
+    return {"points_by_time": shapes, "label": "amplitude of the buckling mode"}

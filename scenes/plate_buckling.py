@@ -9,6 +9,7 @@ of the free and the loaded plate, is singular.
 import numpy as np
 
 import ddg_warp as ddg
+from ddg_warp.buckled import buckled_points
 from ddg_warp.scenes.plate_square import SIDE, plate_mesh
 
 THICKNESS = 1e-3  # m
@@ -101,3 +102,11 @@ def benchmark() -> ddg.bench.Study:
         "critical load",
         series=("bending",),
     )
+
+
+def picture(result, frames) -> dict:
+    """The mode in which the plate buckles, as shape and color."""
+    flat = result.state.points()
+    size = 0.15 * np.ptp(flat[:, 1])
+    shown = buckled_points(result.model, result.state, size)
+    return {"points_by_time": {1.0: shown}, "values": shown[:, 2] / size, "label": "deflection over its largest"}

@@ -8,9 +8,11 @@ second variation of Kirchhoff rods that are rigid in the plane, by a spectral Ri
 import numpy as np
 
 import ddg_warp as ddg
+from ddg_warp.buckled import buckled_points
 
 LEG, WIDTH, THICKNESS = 240.0, 30.0, 0.6  # mm
 E, NU = 71240.0, 0.31  # N/mm^2
+LENGTH_UNIT = "mm"
 SOURCE = "second variation of Kirchhoff rods, spectral Ritz; 1.088 (Argyris 1979, Simo & Vu-Quoc 1986)"
 
 # Lateral buckling load [N]: pulling and pressing the clamped leg.
@@ -56,3 +58,12 @@ def check(result) -> list[ddg.Check]:
 def benchmark() -> ddg.bench.Study:
     """The buckling load over the edges of each leg."""
     return ddg.bench.Study({"n": (5, 10, 20, 40)}, "lateral buckling load")
+
+
+def picture(result, frames) -> dict:
+    """The mode of the branch, out of the plane, beside the frame at the same load."""
+    if not result.path.bifurcations:
+        return {}
+    branch = result.path.bifurcations[0].state
+    shapes = {0.0: branch.points(), 1.0: buckled_points(result.model, branch, 0.25 * LEG)}
+    return {"points_by_time": shapes, "label": "amplitude of the buckling mode"}

@@ -11,12 +11,16 @@ from pathlib import Path
 import numpy as np
 
 import ddg_warp as ddg
+from ddg_warp import meshes
 
 GROOM = Path(__file__).resolve().parent / "data" / "strands.usdc"
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # rad
 PERIOD = 1.0  # s, of the head's motion
 REST = 2.0  # s; the head has come to rest by then
 TURN = 0.9  # rad
+HAIR = np.array([0.36, 0.21, 0.11])  # RGB
+HEAD = 0.97  # radius of the head that is drawn over that of the roots
+PANELS = 3  # of the picture
 SOURCE = "the prescribed motion"
 
 
@@ -156,3 +160,17 @@ def benchmark() -> ddg.bench.Study:
         series=("scheme", "precision", "rtol"),
         unit="m",
     )
+
+
+def picture(result, frames) -> dict:
+    """A few times side by side, in the colors of hair, with the head that the roots stand on."""
+    batch, motion = result.model.scene.batches[0], result.model.scene.supports[0].motion
+    roots = batch.points[:, 0]
+    # The sphere through the roots: |x|^2 = 2 c . x + (r^2 - |c|^2), in least squares.
+    found, *_ = np.linalg.lstsq(np.column_stack([2.0 * roots, np.ones(len(roots))]), (roots**2).sum(1), rcond=None)
+    radius = np.sqrt(found[3] + found[:3] @ found[:3])
+    ball, triangles = meshes.sphere(4)
+    shown = {t: frames[t] for t in list(frames)[:: max(1, (len(frames) - 1) // (PANELS - 1))]}
+    heads = {t: (placed(motion, found[:3] + HEAD * radius * ball, t), triangles) for t in shown}
+    brown = np.random.default_rng(1).uniform(0.6, 1.3, (len(roots), 1)) * HAIR
+    return {"points_by_time": shown, "bodies": heads, "colors": brown, "side_by_side": True}

@@ -89,7 +89,7 @@ def test_run_writes_everything(fall, tmp_path, capsys):
     assert set(content["energy"]) == {"start", "end"}
     assert [check["passed"] for check in content["checks"]] == [True]
     files = {path.name for path in (tmp_path / "out/fall").iterdir()}
-    assert files == {"scene.usdc", "trajectory.h5", "summary.json", "picture.png"}
+    assert files == {"scene.usdc", "trajectory.h5", "trajectory.vtkhdf", "summary.json", "picture.png"}
     assert "fall [m]" in capsys.readouterr().out
 
 
@@ -231,18 +231,42 @@ def test_a_check_that_fails_to_solve_fails_the_run(tmp_path, monkeypatch, capsys
 
 def test_progress_of_a_piped_run(fall, capsys, monkeypatch):
     """Where stderr is no terminal: whole lines with steps, time and time left, at most one in an interval; none of short runs."""
-    import ddg_warp.simulate
+    import ddg_warp.progress
 
     assert fall("run") == 0
     assert "steps" not in capsys.readouterr().err
-    monkeypatch.setattr(ddg_warp.simulate, "LINE_EVERY", 1e-9)
+    monkeypatch.setattr(ddg_warp.progress, "LINE_EVERY", 1e-9)
     assert fall("run", "--force") == 0
     lines = [line for line in capsys.readouterr().err.splitlines() if "steps" in line]
     assert 3 <= len(lines) <= 7
     assert lines[-1].startswith("5 of 5 steps, 00:0") and lines[-1].endswith("elapsed, 00:00 remaining")
-    monkeypatch.setattr(ddg_warp.simulate, "LINE_EVERY", 1e9)
+    monkeypatch.setattr(ddg_warp.progress, "LINE_EVERY", 1e9)
     assert fall("run", "--force") == 0
     assert "steps" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("place", ["initial", "first point"])
+def test_a_run_that_fails_before_its_first_state_says_so(place, tmp_path, monkeypatch, capsys, device):
+    """Nothing is recorded or drawn; one line, code 1, and a summary."""
+    monkeypatch.chdir(tmp_path)
+    code = SCENE.replace("    build.shift = shift", "    scene.initial = lost")
+    code = code.replace("def build", "def lost(model):\n    raise ddg.SolverError('no equilibrium')\n\n\ndef build", 1)
+    if place == "first point":
+        from ddg_warp.integrate import continuation
+
+        def lost(self, state, stop):
+            raise SolverError("no equilibrium", state=state)
+
+        monkeypatch.setattr(continuation.Continuation, "trace", lost)
+        trace = "ddg.Trace({'u': ddg.Displacement.of(-1, 'y')}, ddg.Stop(steps=3))"
+        code = SCENE.replace("ddg.Dynamics(dt=0.01, duration=0.05)", trace).replace(
+            "    build.shift = shift", "    scene.clamp(0)"
+        )
+    (tmp_path / "fall.py").write_text(code)
+    assert main(["run", "fall.py", "--device", device]) == 1
+    (told,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("ddg-warp: ")]
+    assert "no equilibrium" in told
+    assert "no equilibrium" in summary()["failure"]
 
 
 def test_static_scene_records_every_load_step(tmp_path, monkeypatch, device):
@@ -380,7 +404,11 @@ def test_bench_gives_error_and_time_together(fall, tmp_path):
     # Implicit Euler falls too far by g h T / 2.
     assert [row["error"] for row in rows] == pytest.approx([9.81 * dt * 0.02 / 2 for dt in (0.01, 0.005)], rel=1e-6)
     assert all(row["ms_per_step"] > 0 for row in rows)
-    assert (tmp_path / "out/bench/fall.csv").read_text().startswith("dt,precision,error,ms_per_step")
+    assert (
+        (tmp_path / "out/bench/fall.csv")
+        .read_text()
+        .startswith("dt,precision,error,relative_error,ms_per_step,seconds")
+    )
     assert (tmp_path / "out/bench/fall.png").is_file()
 
 

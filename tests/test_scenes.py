@@ -12,7 +12,7 @@ SMALL = {
     "bilayer_strip": {"cells": 4},
     "cable_gripped_at_both_ends": {"n": 40},
     "cantilever": {},
-    "cantilever_plate_shear": {"n": 16, "steps": 5},
+    "cantilever_plate_shear": {"n": 16, "steps": 4},
     "deep_arch": {},
     "flying_beam": {"n": 20},
     "greenhill": {"n": 100},

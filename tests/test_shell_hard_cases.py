@@ -107,13 +107,13 @@ def test_slivers(device):
         points, triangles, _ = moved(shift)
         scene = ddg.Scene(gravity=(0.0, 0.0, -1.0))
         material = ddg.Material(1e6, 0.3, density=1.0)
-        sheet = scene.add_shell(points, triangles, thickness=1e-2, material=material)
-        scene.clamp_boundary(sheet, np.flatnonzero(points[:, 0] < 1e-9))
         if shift > 1.0 - 1e-9:
             with pytest.raises(ddg.SceneError, match=r"triangle \d+ is degenerate"):
-                scene.build(device, "float64")
-        else:
-            heights.append(found(scene, device)[1].points()[:, 2].min())
+                scene.add_shell(points, triangles, thickness=1e-2, material=material)
+            continue
+        sheet = scene.add_shell(points, triangles, thickness=1e-2, material=material)
+        scene.clamp_boundary(sheet, np.flatnonzero(points[:, 0] < 1e-9))
+        heights.append(found(scene, device)[1].points()[:, 2].min())
     assert heights == pytest.approx([heights[0]] * 3, rel=0.03)
 
 
@@ -238,7 +238,8 @@ def test_two_motions_of_a_point(device, both):
     for axis, components in enumerate("xy"):
         motion = ddg.Motion(translation=lambda t, axis=axis: tuple(0.1 * t * np.eye(3)[axis]))
         scene.hold(sheet, np.flatnonzero(points[:, axis] > 1.0 - 1e-9), "xy" if both else components, motion=motion)
-        scene.hold(sheet, np.flatnonzero(points[:, axis] < 1e-9), components)
+        if not both:
+            scene.hold(sheet, np.flatnonzero(points[:, axis] < 1e-9), components)
     if both:
         with pytest.raises(ddg.SceneError, match=r"point at \(1, 1, 0\) m has two motions along x.*give it one"):
             scene.build(device, "float64")

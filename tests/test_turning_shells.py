@@ -219,7 +219,7 @@ def test_reactions_are_the_work_of_a_turn(device, model):
 def test_a_path_with_a_clamp_that_turns(device):
     """Arc length or load steps lead to the same equilibrium; the rate of the normals is in the tangent of the path."""
     model, _ = twisted(device, 0.4, cells=8, across=2)
-    path = Continuation(model, step=0.05, max_step=0.4).trace(stop=Stop(load=(1.0,)))
+    path = Continuation(model, step=0.05, max_step=0.4).trace(stop=Stop(load=(-1.0, 1.0)))
     np.testing.assert_allclose(path.points[-1].state.points(), solve(model).points(), atol=1e-9)
     assert max(point.iterations for point in path.points[1:]) < 7
 

@@ -68,9 +68,9 @@ def test_elements_have_their_own_rest_strain(device):
 @pytest.mark.parametrize(
     ("term", "parameter", "values", "words"),
     [
-        ("rod_bend", "stiffness_1", 1.0, "no rod has the term"),
+        ("rod_bend", "stiffness_1", 1.0, "no rod or shell has the term"),
         ("rod_stretch", "EA", 1.0, "no parameter 'EA'"),
-        ("rod_stretch", "stiffness", np.nan, "not finite"),
+        ("rod_stretch", "stiffness", np.nan, "is nan; it is finite"),
         ("rod_stretch", "stiffness", np.ones(7), r"shape \(7,\)"),
     ],
 )

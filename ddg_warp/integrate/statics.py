@@ -355,8 +355,8 @@ class Equilibrium:
         """The parts of the tangent, each with the scales of its bodies."""
         at = 0
         for part in self.tangent.parts:
-            yield part, scale[at : at + part.bodies]
-            at += part.bodies
+            yield part, scale[at : at + part.body_count]
+            at += part.body_count
 
     def _scaled(self, residual: np.ndarray) -> np.ndarray:
         """Moments over an edge length, so that they compare with forces."""

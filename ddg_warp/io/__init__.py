@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +36,7 @@ class Curves:
         closed: Whether a rod's last point is joined to its first, shape (R,), bool.
         radius: Radius at each point [m], shape (P,), float64.
         names: Name of each rod, shape (R,), str.
-        batch: Batch of each rod, shape (R,), int; the rods of a batch share a material.
+        batch: Batch of each rod, shape (R,), int; the rods of a batch share name and material.
     """
 
     counts: np.ndarray
@@ -48,7 +48,7 @@ class Curves:
     @classmethod
     def tiled(cls, curves, worlds: int) -> Curves:
         """`worlds` copies of a model's curves, one after the other."""
-        return cls(**{field.name: np.tile(getattr(curves, field.name), worlds) for field in fields(cls)})
+        return cls(**{each.name: np.tile(getattr(curves, each.name), worlds) for each in fields(cls)})
 
 
 @dataclass(frozen=True)
@@ -125,6 +125,7 @@ class CurveSet:
         closed: Whether a rod's last point is joined to its first, shape (R,), bool.
         radius: Radius at each point [m], shape (P,), float64; None where the file gives none.
         path: Where the curves stood in the file: a USD prim path, an HDF5 dataset, a section.
+        attributes: Further values of each rod by name, shape (R,), such as the ids and groups of a groom; a `Recorder` keeps them.
     """
 
     points: np.ndarray
@@ -132,6 +133,7 @@ class CurveSet:
     closed: np.ndarray
     radius: np.ndarray | None
     path: str
+    attributes: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def names(self) -> np.ndarray:

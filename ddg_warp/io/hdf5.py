@@ -1,9 +1,11 @@
 """trajectory.h5: what a run recorded, what it was made of, and where it can go on.
 
     /trajectory   time (F,) [s], points (F, P, 3) [m], velocities (F, P, 3) [m/s] and directors (F, E, 3) if wanted,
-                  series/NAME (F,); with several worlds (F, B, P, 3) and (F, B, E, 3)
+                  series/NAME (F,); with several worlds (F, B, P, 3) and (F, B, E, 3);
+                  at_points/NAME (F, B P) and at_cells/NAME (F, B (R + T)), the rods of all worlds, which have none, then
+                  their triangles: fields if wanted, of all worlds
     /model        curves/{counts, closed, radius, names, batch}, surfaces/{triangles, first, names, thickness} if there are
-                  any, parameters/NAME
+                  any, parameters/NAME, attributes/NAME of rods
     /control      how the run was driven
     /checkpoint   a and b, in turn the state at the last frame, at full precision; the attribute current says which
     /VTKHDF       the same points for ParaView, see `vtkhdf`
@@ -11,6 +13,8 @@
 
 Frames are appended a block at a time, each block with its checkpoint in one transaction (see `journal`): a process
 killed at any time leaves a file that ends with a complete block, from which the run resumes.
+
+ParaView and VTK's reader know the format by the suffix .vtkhdf: a link of that name stands beside the file.
 """
 
 from __future__ import annotations
@@ -19,8 +23,8 @@ import datetime
 import json
 import os
 import platform
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -50,6 +54,9 @@ class TrajectoryWriter:
         directors: Whether to record the first material director of every edge.
         provenance: Attributes of the file; what is neither text nor a number is stored as JSON.
         control: How the run is driven, stored in /control: names and numbers, texts or arrays.
+        at_points: Names of fields at the points.
+        at_cells: Names of fields of the triangles.
+        attributes: Values of each rod by name, shape (R,), stored in /model/attributes.
     """
 
     def __init__(
@@ -62,13 +69,19 @@ class TrajectoryWriter:
         directors: bool = False,
         provenance: Mapping | None = None,
         control: Mapping | None = None,
+        at_points: Sequence[str] = (),
+        at_cells: Sequence[str] = (),
+        attributes: Mapping[str, np.ndarray] | None = None,
     ):
         names = ["points"] + ["velocities"] * velocities + ["directors"] * directors
+        names += [f"at_points/{name}" for name in at_points] + [f"at_cells/{name}" for name in at_cells]
         self._prepare(path, model, block, names)
         partial = self.path.with_name(self.path.name + ".partial")
         with _removed_on_failure(partial), transaction(partial, new=True) as file:
             _write_attributes(file, _origin() | dict(provenance or {}))
             _write_model(file.create_group("model"), model)
+            for name, values in (attributes or {}).items():
+                _overwrite(file.require_group("model/attributes"), name, np.asarray(values))
             _write_control(file.create_group("control"), control or {})
             trajectory = file.create_group("trajectory")
             _extend(trajectory, "time", np.zeros(0), block)
@@ -76,6 +89,7 @@ class TrajectoryWriter:
                 _extend(trajectory, name, np.zeros((0, *self._shape(name))), block)
         self.path.with_name(self.path.name + ".journal").unlink(missing_ok=True)
         os.replace(partial, self.path)
+        _link(self.path)
 
     @classmethod
     def resume(cls, path, model, *, block: int = 64, provenance: Mapping | None = None) -> TrajectoryWriter:
@@ -119,13 +133,27 @@ class TrajectoryWriter:
         with TrajectoryReader(self.path) as reader:
             return len(reader)
 
-    def append(self, state, observed: Mapping[str, float] | None = None) -> None:
-        """Adds the frame of a state and what was observed of it; every frame observes the same names."""
+    @property
+    def fields(self) -> list[str]:
+        """Names of the fields that frames come with."""
+        return [name.rpartition("/")[2] for name in self._names if "/" in name]
+
+    def append(self, state, observed: Mapping[str, float] | None = None, fields: Mapping | None = None) -> None:
+        """Adds the frame of a state and what was observed of it; every frame observes the same names.
+
+        Args:
+            state: The state.
+            observed: Numbers by name.
+            fields: Fields by name: of points (worlds, P), of triangles (worlds, T).
+        """
         observed = dict(observed or {})
         if self._frames and observed.keys() != self._frames[0]["series"].keys():
             raise TrajectoryError(f"observed {sorted(observed)}, before {sorted(self._frames[0]['series'])}")
-        fields = {name: np.array(getattr(state, name)()) for name in self._names}
-        self._frames.append({"time": state.time, "series": observed, **fields})
+        frame = {name: np.array(getattr(state, name)()) for name in self._names if "/" not in name}
+        for name in (name for name in self._names if "/" in name):
+            values = np.ravel((fields or {})[name.rpartition("/")[2]])
+            frame[name] = np.concatenate([np.full(self._shape(name)[0] - len(values), np.nan), values])
+        self._frames.append({"time": state.time, "series": observed, **frame})
         # The solver may reuse the state's buffers before the block is written: keep a copy now.
         self._snapshot = {name: np.array(value) for name, value in state.snapshot().items()}
         if len(self._frames) == self._block:
@@ -172,6 +200,11 @@ class TrajectoryWriter:
     def _shape(self, name: str) -> tuple[int, ...]:
         """Shape of one frame of a field."""
         curves, worlds, rows = self._model.curves, self._model.worlds, self._shapes.point_count
+        if "/" in name:
+            of_a_world = (
+                rows if name.startswith("at_points") else len(curves.counts) + len(_triangles(self._model.surfaces))
+            )
+            return (worlds * of_a_world,)
         if name == "directors":
             rows = int(np.sum(curves.counts)) - np.count_nonzero(~np.asarray(curves.closed))
         return (rows, 3) if worlds == 1 else (worlds, rows, 3)
@@ -204,6 +237,14 @@ def _removed_on_failure(path: Path) -> Iterator[None]:
     except BaseException:
         path.unlink(missing_ok=True)
         raise
+
+
+def _link(path: Path) -> None:
+    """Gives a file a second name by which ParaView knows its format, where the disk has links."""
+    name = path.with_suffix(".vtkhdf")
+    with suppress(OSError, NotImplementedError):
+        name.unlink(missing_ok=True)
+        name.symlink_to(path.name)
 
 
 def _origin() -> dict[str, str]:

@@ -59,10 +59,12 @@ class TrajectoryReader:
         points: Positions [m], shape (F, P, 3) or (F, B, P, 3), read when indexed: `reader.points[f]`.
         velocities: Velocities [m/s], like `points`, or None.
         directors: First material directors, shape (F, E, 3) or (F, B, E, 3), read when indexed, or None.
+        fields: Fields by name, read when indexed: of points (F, B P), of cells (F, B (R + T)), the rods, which have none, first.
         series: Observed values by name, each of shape (F,).
         curves: How the points are joined to rods.
         surfaces: How the points are joined to triangles, or None.
         parameters: The model's parameters by name.
+        attributes: Values of each rod by name that a groom came with.
         provenance: The attributes of the file.
         recorded: Names of the recorded fields.
     """
@@ -85,9 +87,11 @@ class TrajectoryReader:
         trajectory, model = self._file["trajectory"], self._file["model"]
         self.time = trajectory["time"][:]
         self.recorded = [name for name in ("points", "velocities", "directors") if name in trajectory]
+        self.recorded += [f"{at}/{name}" for at in ("at_points", "at_cells") for name in trajectory.get(at, ())]
         fields = {name: Frames(trajectory[name], self.path) for name in self.recorded}
         self.points, self.velocities = fields["points"], fields.get("velocities")
         self.directors = fields.get("directors")
+        self.fields = {name.rpartition("/")[2]: frames for name, frames in fields.items() if "/" in name}
         self.series = {name: values[:] for name, values in trajectory.get("series", {}).items()}
         self.curves = Curves(**{name: _array(model["curves"][name]) for name in CURVE_FIELDS})
         self.surfaces = None
@@ -95,6 +99,7 @@ class TrajectoryReader:
             self.surfaces = Surfaces(**{name: _array(model["surfaces"][name]) for name in SURFACE_FIELDS})
         _refuse_misfits(self.curves, self.surfaces, self.points.shape[-2])
         self.parameters = _all_arrays(model["parameters"])
+        self.attributes = _all_arrays(model["attributes"]) if "attributes" in model else {}
         self.provenance = {name: _plain(value) for name, value in self._file.attrs.items()}
 
     def __enter__(self) -> TrajectoryReader:

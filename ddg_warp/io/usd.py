@@ -1,6 +1,7 @@
 """USD: recorded rods and surfaces out. `read_curves` and `validate` are here too, for one import.
 
-All rods of a batch stand in one prim below /World: a linear BasisCurves, or a Mesh of tubes for programs that draw no
+All rods of a batch (of one name and one material) stand in one prim below /World, with a preview surface of its own: a linear
+BasisCurves, or a Mesh of tubes for programs that draw no
 curves or drop their materials. Every surface is a Mesh of its own. z is up, lengths are in metres, times in seconds
 times timeCodesPerSecond.
 USD saves a file in place, over its old table of contents, so that a process killed meanwhile leaves it unreadable.
@@ -42,6 +43,7 @@ class CurvesWriter:
         colors: RGB of each rod, shape (R, 3), or of each of their points; by default one color a batch.
         color_by: Name of a scalar that gives the color instead, and its values at the two ends of the scale.
         tube: Whether to write tubes instead of curves.
+        attributes: Values of each rod by name, shape (R,), of a world: numbers or texts, such as the ids and groups of a groom.
         block: Frames between two saves, at least; a killed process leaves the frames saved last.
     """
 
@@ -55,6 +57,7 @@ class CurvesWriter:
         color_by: tuple[str, float, float] | None = None,
         tube: bool = False,
         block: int = 32,
+        attributes: Mapping[str, np.ndarray] | None = None,
     ):
         self.path = Path(path)
         self._partial = self.path.with_name(f"{self.path.stem}.partial{self.path.suffix}")
@@ -67,8 +70,15 @@ class CurvesWriter:
         shapes = curves if isinstance(curves, Shapes) else _drawable(curves)
         color_by = ColorBy(*color_by) if color_by else None
         self._prims: list[PointsPrim] = []
+        kept = {name: np.tile(np.asarray(values), shapes.worlds) for name, values in (attributes or {}).items()}
+        for name, values in kept.items():
+            if values.shape != shapes.curves.counts.shape:
+                rods = len(shapes.curves.counts) // shapes.worlds
+                raise CurveError(
+                    f"attribute {name!r} has {len(values) // shapes.worlds} values for {rods} rods; give one a rod"
+                )
         if len(shapes.curves.counts):
-            self._prims += _define_rods(self._stage, shapes, colors, color_by, TubesPrim if tube else CurvesPrim)
+            self._prims += _define_rods(self._stage, shapes, colors, color_by, TubesPrim if tube else CurvesPrim, kept)
         if shapes.surfaces is not None:
             self._prims += _define_surfaces(self._stage, shapes, color_by)
         self._unsaved = _size_of_defaults(self._stage)
@@ -94,7 +104,7 @@ class CurvesWriter:
             time: Time [s], later than those before.
             points: Positions [m], shape (P, 3).
             velocities: Velocities [m/s], shape (P, 3).
-            scalars: Values at the points by name, each of shape (P,), written unchanged as primvars.
+            scalars: Values at the points by name, each of shape (P,), or vectors (P, 3), written unchanged as primvars.
             triangle_scalars: Values of the triangles of all surfaces by name, each of shape (T,), likewise.
         """
         code = Usd.TimeCode(round(time * self._fps, 6))
@@ -182,7 +192,7 @@ def _drawable(curves) -> Shapes:
     return Shapes.of(curves)
 
 
-def _define_rods(stage: Usd.Stage, shapes: Shapes, colors, color_by, kind: type[CurvesPrim]) -> list[PointsPrim]:
+def _define_rods(stage: Usd.Stage, shapes: Shapes, colors, color_by, kind, attributes: Mapping) -> list[PointsPrim]:
     """One prim for each batch; two where it has open and closed rods, because USD wraps all curves of a prim alike."""
     curves = shapes.curves
     if colors is not None and len(colors) == len(curves.counts):
@@ -198,6 +208,7 @@ def _define_rods(stage: Usd.Stage, shapes: Shapes, colors, color_by, kind: type[
                 color = np.array(PALETTE[batch % len(PALETTE)]) if colors is None else np.asarray(colors)[mine]
                 path = _free_path(stage, str(names[0]))
                 prims.append(kind(stage, path, part, shapes.rows[mine], color, color_by))
+                prims[-1].add_attributes({name: values[rods] for name, values in attributes.items()})
     return prims
 
 

@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom, Vt
+from pxr import Sdf, Tf, Usd, UsdGeom, Vt
 
 from ddg_warp.io import Curves, Surfaces
 from ddg_warp.io.colors import on_scale
 from ddg_warp.io.tube import SIDES, tube_faces, tube_points
+from ddg_warp.io.usd_materials import bind_preview_surface
 from ddg_warp.operators import vertex_normals
 
 HEADER = 64  # bytes at most that a value takes in a file beside its numbers
@@ -54,6 +55,7 @@ class PointsPrim:
         kind = UsdGeom.Tokens.constant if uniform else UsdGeom.Tokens.vertex
         self._color = self._primvars.CreatePrimvar("displayColor", Sdf.ValueTypeNames.Color3fArray, kind)
         self._color.Set(_vectors([color] if uniform else self._at_vertices(color)))
+        bind_preview_surface(prim.GetPrim().GetStage(), prim.GetPrim(), color)
 
     def write(self, code: Usd.TimeCode, frame: Frame) -> None:
         """Sets the samples of one frame."""
@@ -64,7 +66,12 @@ class PointsPrim:
             velocities = self._at_vertices(np.asarray(frame.velocities)[self._rows])
             self._sample(self._prim.GetVelocitiesAttr(), _vectors(velocities), code)
         for name, values in frame.at_points.items():
-            self._write_scalar(code, name, self._at_vertices(np.asarray(values)[self._rows]), UsdGeom.Tokens.vertex)
+            mine = self._at_vertices(np.asarray(values)[self._rows])
+            if mine.ndim == 1:
+                self._write_scalar(code, name, mine, UsdGeom.Tokens.vertex)
+            else:
+                primvar = self._primvars.CreatePrimvar(name, Sdf.ValueTypeNames.Vector3fArray, UsdGeom.Tokens.vertex)
+                self._sample(primvar.GetAttr(), _vectors(mine), code)
 
     def _write_scalar(self, code: Usd.TimeCode, name: str, values: np.ndarray, kind: str) -> None:
         primvar = self._primvars.CreatePrimvar(name, Sdf.ValueTypeNames.FloatArray, kind)
@@ -107,6 +114,17 @@ class CurvesPrim(PointsPrim):
         radius = _floats(self._at_vertices(curves.radius))
         self._primvars.CreatePrimvar("radius", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex).Set(radius)
 
+    def add_attributes(self, attributes: Mapping[str, np.ndarray]) -> None:
+        """Keeps values of each rod, (R,), numbers or texts, as uniform primvars."""
+        for name, values in attributes.items():
+            kind, make = KINDS[values.dtype.kind if values.dtype.kind in KINDS else "U"]
+            primvar = self._primvars.CreatePrimvar(Tf.MakeValidIdentifier(name), kind, UsdGeom.Tokens.uniform)
+            primvar.Set(make(self._at_faces(values)))
+
+    def _at_faces(self, values: np.ndarray) -> np.ndarray:
+        """Values of the rods, as values of what the prim calls uniform: curves."""
+        return values
+
     def _define(self, stage: Usd.Stage, path: str) -> UsdGeom.PointBased:
         curves = UsdGeom.BasisCurves.Define(stage, path)
         curves.CreateTypeAttr(UsdGeom.Tokens.linear)
@@ -129,6 +147,11 @@ class TubesPrim(CurvesPrim):
     def _define(self, stage: Usd.Stage, path: str) -> UsdGeom.PointBased:
         sizes, indices = tube_faces(self._curves.counts, self._curves.closed)
         return _define_mesh(stage, path, sizes, indices, double_sided=False)
+
+    def _at_faces(self, values: np.ndarray) -> np.ndarray:
+        sizes, indices = tube_faces(self._curves.counts, self._curves.closed)
+        first = indices[np.cumsum(sizes) - sizes] // SIDES  # point whose ring the face begins at
+        return values[np.repeat(np.arange(len(values)), self._curves.counts)[first]]
 
     def _vertices(self, points: np.ndarray) -> np.ndarray:
         return tube_points(points, self._curves.counts, self._curves.closed, self._curves.radius)
@@ -191,3 +214,16 @@ def _floats(values) -> Vt.FloatArray:
 
 def _ints(values) -> Vt.IntArray:
     return Vt.IntArray.FromNumpy(np.ascontiguousarray(values, dtype=np.int32))
+
+
+def _texts(values) -> Vt.StringArray:
+    return Vt.StringArray([str(value) for value in values])
+
+
+KINDS = {
+    "i": (Sdf.ValueTypeNames.IntArray, _ints),
+    "u": (Sdf.ValueTypeNames.IntArray, _ints),
+    "f": (Sdf.ValueTypeNames.FloatArray, _floats),
+    "U": (Sdf.ValueTypeNames.StringArray, _texts),
+}
+"""Type of a primvar for a kind of NumPy array; texts for what is neither a whole number nor a real one."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from ddg_warp.io.mesh_read import triangulated
 Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 BEZIER_STEP = 3
 MESHES_LISTED = 5
+DRAWN = ("displayColor", "displayOpacity", "widths", "normals", "radius")
 
 
 def read_curves(path, prim: str | None = None) -> list[CurveSet]:
@@ -113,7 +115,25 @@ def _read_prim(curves: UsdGeom.BasisCurves, path: Path) -> CurveSet:
     to_world, scale = _placement(curves, time)
     points = np.concatenate([_blend(each, points) for each in knots]) @ to_world[:3, :3] + to_world[3, :3]
     radius = None if widths is None else 0.5 * scale * widths
-    return checked_curves(points, knot_counts, closed, radius, name, str(path))
+    return replace(
+        checked_curves(points, knot_counts, closed, radius, name, str(path)),
+        attributes=_attributes(curves, time, len(counts)),
+    )
+
+
+def _attributes(curves: UsdGeom.BasisCurves, time: Usd.TimeCode, count: int) -> dict[str, np.ndarray]:
+    """Primvars with one value a curve, or one for all, by name: numbers and texts; what is drawn is left out."""
+    found = {}
+    for primvar in UsdGeom.PrimvarsAPI(curves).GetPrimvarsWithValues():
+        name, value = primvar.GetPrimvarName(), primvar.ComputeFlattened(time)
+        if name in DRAWN or value is None:
+            continue
+        values = np.array(value).reshape(-1) if np.ndim(value) < 2 else np.zeros(0)
+        if primvar.GetInterpolation() == UsdGeom.Tokens.constant and len(values) == 1:
+            values = np.repeat(values, count)
+        if primvar.GetInterpolation() in (UsdGeom.Tokens.uniform, UsdGeom.Tokens.constant) and len(values) == count:
+            found[name] = values
+    return found
 
 
 def _value(attribute: Usd.Attribute, time: Usd.TimeCode):

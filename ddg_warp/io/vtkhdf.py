@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 VERSION = (2, 0)
 CELL_KINDS = ("Vertices", "Lines", "Polygons", "Strips")
+DATA = {"PointData": "at_points", "CellData": "at_cells"}
 STEP_CHUNK = 64
 STATIC_OFFSETS = {"PartOffsets": (), "CellOffsets": (len(CELL_KINDS),), "ConnectivityIdOffsets": (len(CELL_KINDS),)}
 
@@ -37,6 +38,9 @@ def write_view(file: h5py.File, shapes: Shapes) -> None:
     _flatten(view, "Points", trajectory["points"])
     if "velocities" in trajectory:
         _flatten(view["PointData"], "velocity", trajectory["velocities"])
+    for data, source in DATA.items():
+        for name in trajectory.get(source, ()):
+            _flatten(view.require_group(data), name, trajectory[source][name])
 
 
 def _write_topology(view: h5py.Group, shapes: Shapes) -> None:
@@ -87,6 +91,10 @@ def _write_steps(view: h5py.Group, trajectory: h5py.Group, point_count: int) -> 
         moving.append(_resize(steps["PointDataOffsets"], "velocity", frame_count))
     for dataset, known in moving:
         dataset[known:] = point_count * np.arange(known, frame_count)
+    for data, source in DATA.items():
+        for name in trajectory.get(source, ()):
+            dataset, known = _resize(steps.require_group(f"{data}Offsets"), name, frame_count)
+            dataset[known:] = trajectory[source][name].shape[1] * np.arange(known, frame_count)
 
 
 def _resize(group: h5py.Group, name: str, length: int, shape: tuple[int, ...] = (), fill: int = 0):
@@ -101,11 +109,12 @@ def _resize(group: h5py.Group, name: str, length: int, shape: tuple[int, ...] = 
 
 
 def _flatten(group: h5py.Group, name: str, source: h5py.Dataset) -> None:
-    """Shows `source`, shape (F, ..., 3), as a virtual dataset of shape (all points of all frames, 3)."""
+    """Shows `source` as a virtual dataset: vectors (F, ..., 3) as (all points of all frames, 3), numbers (F, n) as (F n,)."""
     import h5py
 
     if name in group:
         del group[name]
-    layout = h5py.VirtualLayout((source.size // 3, 3), dtype=source.dtype)
+    shape = (source.size // 3, 3) if source.shape[-1] == 3 and source.ndim > 2 else (source.size,)
+    layout = h5py.VirtualLayout(shape, dtype=source.dtype)
     layout[...] = h5py.VirtualSource(".", source.name, shape=source.shape, dtype=source.dtype)
     group.create_virtual_dataset(name, layout)

@@ -7,7 +7,7 @@ import numpy as np
 
 VALID = {  # which values of a parameter have a meaning, by its name without the number of its strain
     "measure": ("positive", lambda v: v > 0.0),
-    "stiffness": ("positive", lambda v: v > 0.0),
+    "stiffness": ("not negative", lambda v: v >= 0.0),
     "viscosity": ("not negative", lambda v: v >= 0.0),
     "poisson": ("between -1 and 1", lambda v: abs(v) < 1.0),
     "metric_11": ("positive", lambda v: v > 0.0),

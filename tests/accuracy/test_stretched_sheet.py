@@ -42,12 +42,11 @@ def critical(device, thickness: float, width: float, along: int, across: int) ->
     end, side = x > 1.0 - 1e-9, y > 1.0 - 1e-9
     scene.symmetry(sheet, np.flatnonzero(x < 1e-9), "x")
     scene.symmetry(sheet, np.flatnonzero(y < 1e-9), "y")
-    scene.symmetry(sheet, np.flatnonzero(side), "y")
     scene.hold(sheet, np.flatnonzero(end), "z")
-    for where, axes in ((end & ~side, "x"), (side & ~end, "y"), (end & side, "xy")):
-        size = np.array([0.5 * LENGTH * ("x" in axes), width * ("y" in axes)])
-        motion = ddg.Motion(translation=lambda t, size=size: (*(size * displacement(t)), 0.0))
-        scene.hold(sheet, np.flatnonzero(where), axes, motion=motion)
+    pull = ddg.Motion(translation=lambda t: (0.5 * LENGTH * displacement(t)[0], 0.0, 0.0))
+    press = ddg.Motion(translation=lambda t: (0.0, width * displacement(t)[1], 0.0))
+    scene.hold(sheet, np.flatnonzero(end), "x", motion=pull)
+    scene.symmetry(sheet, np.flatnonzero(side), "y", motion=press)
     model = scene.build(device, "float64")
     solver = Equilibrium(model)
     stretched = solver.load(model.state(), 1, 0.0, 1.0)

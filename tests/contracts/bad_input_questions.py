@@ -174,7 +174,7 @@ for kind, term in TERMS.items():
     def change(v, kind=kind, term=term):
         return model(kind).set_parameter(term, "stiffness", v)
 
-    each("parameters", f"{kind}, stiffness", [-1.0, 0.0, NAN, INF], change, term, "stiffness", "positive")
+    each("parameters", f"{kind}, stiffness", [-1.0, NAN, INF], change, term, "stiffness", "not negative")
     each("parameters", f"{kind}, stiffness", ["stiff", None], change, term, "stiffness")
     each(
         "parameters",

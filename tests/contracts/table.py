@@ -42,6 +42,11 @@ REFUSED = {
     "couple": dict.fromkeys((*SHELLS, "shell of revolution", "shells of both kinds"), ("rod 0", "does not exist")),
     "continuation": {"rod without bending": ("singular_start", "hold what can move without any stiffness")},
 }
+for _question in (
+    *("turned clamp", "load", "pressure", "mass damping", "strain rate damping"),
+    *("implicit euler", "implicit midpoint", "record", "export", "failure"),
+):
+    REFUSED.setdefault(_question, {})["shell, curved membrane"] = ("shell 0", "'curved'", "statics", "membrane='flat'")
 MANY = {"continuation": ("one world",)}  # what several worlds are refused
 
 

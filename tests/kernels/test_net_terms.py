@@ -1,4 +1,5 @@
-"""Every derivative of the terms of shells and of the rigid joint, in both precisions, against something else that computes it."""
+"""Every derivative of the terms of shells, shells of revolution and the rigid joint, in both precisions, against something else
+that computes it."""
 
 from functools import cache
 
@@ -6,6 +7,7 @@ import numpy as np
 import pytest
 
 from ddg_warp import derivatives, net_derivatives
+from ddg_warp.kernels.terms import ALL, REGISTRY
 from ddg_warp.net_derivatives import TERMS
 
 
@@ -34,6 +36,12 @@ def test_nothing_is_left_out():
     """Terms of nets meet the checks of chains but `rigid`, of which `invariance` is the whole, and `exact`, of rods' vertices."""
     assert set(derivatives.CHECKS) - set(net_derivatives.CHECKS) == {"rigid", "exact"}
     assert set(net_derivatives.CHECKS) < set(derivatives.CHECKS)
+
+
+def test_every_listed_term_has_a_table():
+    """What `ddg-warp list` shows, `ddg-warp check` checks."""
+    assert set(ALL) == {*REGISTRY, *TERMS}
+    assert {name for name in ALL if name.startswith("axisymmetric")} <= TERMS.keys()
 
 
 def test_table_has_chains_and_nets(device):

@@ -1,0 +1,130 @@
+"""Pictures say what they show: buckled modes, units, the load parameter, stability, titles that fit."""
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp import figure
+from ddg_warp.catalog import load_scene, one_liner, scene_files
+from ddg_warp.cli import main
+from ddg_warp.simulate import simulate
+
+
+@pytest.fixture
+def drawn(monkeypatch) -> list:
+    """The figures that are drawn instead of written."""
+    figures = []
+    monkeypatch.setattr(figure, "_save", lambda figure, path: figures.append(figure))
+    return figures
+
+
+def labels(figure) -> list[str]:
+    """All labels of all axes."""
+    return [text for plot in figure.axes for text in (plot.get_xlabel(), plot.get_ylabel()) if text]
+
+
+# Scene, parameters, how large its mode is drawn, and the direction in which it moves.
+MODES = {
+    "greenhill": ({"n": 24}, 0.1, (0.0, 1.0, 1.0)),
+    "michell_ring": ({"n": 24}, 0.3, (1.0, 1.0, 1.0)),
+    "right_angle_frame": ({"n": 6}, 60.0, (0.0, 1.0, 0.0)),
+    "plate_buckling": ({"cells": 4}, 0.15, (0.0, 0.0, 1.0)),
+}
+
+
+@pytest.mark.parametrize("name", MODES)
+def test_scenes_that_buckle_show_the_mode(name):
+    """The lowest mode leaves the straight rod, the plane of ring and frame, the plane of the plate, by the size given."""
+    parameters, size, across = MODES[name]
+    module = load_scene(name)
+    result = simulate(module.build(**parameters), device="cpu", progress=False)
+    options = module.picture(result, {})
+    shown = options["points_by_time"]
+    start = shown.get(0.0, result.state.points())
+    moved = np.linalg.norm((shown[1.0] - start) * across, axis=1)
+    assert moved.max() == pytest.approx(size, rel=1e-3)
+    aside = np.linalg.norm((shown[1.0] - start) * (1.0 - np.array(across)), axis=1)
+    assert aside.max() < 1e-3 * size
+    if name == "michell_ring":  # out of the plane in two waves around: cos 2 phi
+        waves = np.abs(np.fft.rfft(shown[1.0][:, 2]))
+        assert waves[2:].argmax() == 0
+    if "values" in options:
+        assert np.abs(options["values"]).max() == pytest.approx(1.0, rel=1e-3)
+
+
+def test_the_plate_shows_its_deflection():
+    module = load_scene("plate_square")
+    result = simulate(module.build(cells=4), device="cpu", progress=False)
+    options = module.picture(result, {})
+    deflection = result.state.points()[:, 2]
+    np.testing.assert_allclose(options["values"], 1e6 * deflection)
+    shown = options["points_by_time"][1.0]
+    np.testing.assert_allclose(
+        shown[:, 2] / np.abs(shown[:, 2]).max(), deflection / np.abs(deflection).max(), rtol=1e-12
+    )
+    assert np.abs(shown[:, 2]).max() == pytest.approx(0.15)
+
+
+def test_paths_and_statics_have_a_load_and_their_units(drawn, tmp_path):
+    """The frame in millimetres; branches told apart in the legend; nothing is a time."""
+    assert main(["run", "right_angle_frame", "--n", "4", "--device", "cpu", "--out", str(tmp_path)]) == 0
+    picture, path = drawn
+    assert labels(picture)[0] == "x [mm]" and "amplitude of the buckling mode" in labels(picture)
+    assert labels(path) == ["displacement [mm]", "load parameter"]
+    told = [text.get_text() for text in path.axes[0].get_legend().get_texts()]
+    assert told == ["deflection", "stable", "unstable", "bifurcation"]
+    styles = {tuple(map(str, each.get_linestyle())) for each in path.axes[0].collections if len(each.get_segments())}
+    assert len(styles) == 2
+    assert main(["run", "tip_load", "--n", "10", "--device", "cpu", "--out", str(tmp_path / "b")]) == 0
+    assert "load parameter" in labels(drawn[-1]) and "time [s]" not in labels(drawn[-1])
+
+
+def test_axes_are_equal_and_without_offsets(drawn):
+    """A rod far from the origin: numbers of the axes are whole, both directions have one scale."""
+    points = np.array([[1e4, 0.0, 0.0], [1e4 + 1e-3, 0.0, 0.0], [1e4 + 2e-3, 0.0, 1e-3]])
+    scene = ddg.Scene()
+    scene.add_rod(points, section=ddg.Stiffness(EA=1.0, EI1=1.0, GJ=1.0, mass_per_length=1.0, radius=1e-4))
+    figure.rods_picture(scene.build("cpu"), {0.0: points}, "unused.png")
+    (plot,) = drawn[0].axes
+    assert plot.get_aspect() == 1.0
+    figure.FigureCanvasAgg(drawn[0]).draw()
+    assert plot.xaxis.get_offset_text().get_text() == plot.yaxis.get_offset_text().get_text() == ""
+
+
+def test_shapes_of_a_path_keep_their_order(drawn):
+    """The last point of a path is on top, also where its load is not the largest, and points of equal load are all drawn."""
+    points = np.eye(3)
+    scene = ddg.Scene()
+    scene.add_rod(points, section=ddg.Stiffness(EA=1.0, EI1=1.0, GJ=1.0, mass_per_length=1.0, radius=1e-4))
+    figure.rods_picture(scene.build("cpu"), [(0.0, points), (2.0, points + 1.0), (0.0, points + 2.0)], "unused.png")
+    widths = [each.get_linewidth()[0] for each in drawn[0].axes[0].collections]
+    assert len(widths) == 3 and widths[2] > widths[0] == widths[1]
+
+
+def test_hair_is_shown_with_its_head_side_by_side(drawn):
+    module = load_scene("strands")
+    scene = module.build(count=8)
+    result = simulate(scene, device="cpu", duration=1.0 / 60.0, observe=module.observe, progress=False)
+    points = result.state.points()
+    options = module.picture(result, {0.0: points, 0.5: points, 1.0: points})
+    assert options["colors"].shape == (8, 3) and len(options["bodies"]) == 3
+    head, _ = options["bodies"][0.0]
+    roots = scene.batches[0].points[:, 0]
+    centre = 0.5 * (head.min(axis=0) + head.max(axis=0))
+    radius = 0.5 * np.ptp(head, axis=0).max() / module.HEAD
+    np.testing.assert_allclose(np.linalg.norm(roots - centre, axis=1), radius, rtol=0.05)
+    figure.rods_picture(result.model, path="unused.png", **options)
+    assert len(drawn[0].axes) == 3
+
+
+def test_titles_fit(drawn):
+    """Of every scene, in both kinds of pictures."""
+    points = np.eye(3)
+    scene = ddg.Scene()
+    scene.add_rod(points, section=ddg.Stiffness(EA=1.0, EI1=1.0, GJ=1.0, mass_per_length=1.0, radius=1e-4))
+    model = scene.build("cpu")
+    for path in scene_files().values():
+        figure.rods_picture(model, {0.0: points}, "unused.png", one_liner(path))
+        canvas = figure.FigureCanvasAgg(drawn[-1])
+        title = drawn[-1].get_suptitle() and drawn[-1]._suptitle.get_window_extent(canvas.get_renderer())
+        assert title.x1 < drawn[-1].bbox.x1, path
