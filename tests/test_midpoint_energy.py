@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 
 import ddg_warp as ddg
 from ddg_warp.scenes import flying_beam
@@ -213,6 +214,22 @@ def test_watching_changes_nothing_that_is_kept(device, name):
     (first, one, _), (second, other, _) = (advance(model, state, 0.5 / RATE, 12) for _ in range(2))
     np.testing.assert_array_equal(first, second)
     np.testing.assert_array_equal(one.points(), other.points())
+
+
+def test_sums_over_ranges(device):
+    """Summed over ranges of nodes, as on CUDA, the account is the same to rounding, and a run over its bound is stopped alike."""
+    model, state = free("rod", device)
+    accounts = []
+    for ranges in (1, 3):
+        integrator, there = ddg.Integrator(model, "implicit_midpoint"), state
+        watch = integrator._chains[0].energy
+        watch.ranges, watch.sums = ranges, wp.zeros((ranges, 4, 1), dtype=wp.float64, device=device)
+        watch.rows = watch.sums.transpose((1, 0, 2))
+        for _ in range(5):
+            there = integrator.step(there, 0.3 / RATE)
+        accounts.append(watch.account.numpy())
+    np.testing.assert_allclose(accounts[1], accounts[0], rtol=1e-9)
+    assert accounts[0][0, 0] > 1e-2
 
 
 def test_another_state_begins_another_account(device):

@@ -58,10 +58,10 @@ class Integrator:
         energy_bound: what the midpoint rule may make of the energy, or lose, of every lone rod, and of the net in every world: a
             fraction of the largest kinetic and elastic energy that it has had, and of what damping took, or None for anything.
             Loads and supports may do any work. A step that would leave the bound is tried again in halves, and then fails by the
-            outcome `energy_drift`. Counted from the state that the integrator was first given, and anew from one that it has not
-            made; below rounding nothing counts. Where steps resolve the motion the rule keeps the energy to some 1e-3, and where
-            it is unstable the energy grows to its multiple within some steps: a tenth lies between. Implicit Euler, which only
-            takes energy out of what a step does not resolve, is not watched.
+            outcome `energy_drift`. Counted from a state that the integrator has not made itself (a run that is resumed counts
+            anew); what rounding may make does not count. Where steps resolve the motion the rule keeps the energy to some 1e-3,
+            and where it is unstable the energy grows to a multiple within some steps: a tenth lies between. Implicit Euler takes
+            energy out of what steps do not resolve and is not watched. See `kernels.energy`.
         check_every: steps between readings of the outcomes; by default 1 on the CPU and 32 on CUDA.
 
     Raises:
@@ -405,7 +405,7 @@ class _ChainStep:
             node, size = self._worst_node(column)
             what = f"residual {size:.3g} N at node {node}; {self._remedy(state, column)}"
         raise SolverError(
-            f"rod {rod} ('{self.model.curves.names[rod]}') could not be stepped to t = {state.time:g} s: {name} after "
+            f"rod {rod} ('{self.model.curves.names[rod]}') could not be stepped to t = {state.time:g} s: {name} within "
             f"{self.integrator.retry_limit} retries, {what}",
             state=state,
             outcome=name,

@@ -185,7 +185,7 @@ class NetStep:
             what = f"largest residual {sizes[worst]:.3g} N at {part.where(worst)}; "
             what += jump or "take a smaller dt, a looser rtol, or check its loads and supports"
         raise SolverError(
-            f"the net (world {world}) could not be stepped to t = {state.time:g} s: {name} after "
+            f"the net (world {world}) could not be stepped to t = {state.time:g} s: {name} within "
             f"{self.integrator.retry_limit} retries, {what}",
             state=state,
             outcome=name,
