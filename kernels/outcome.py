@@ -11,6 +11,7 @@ GIVEN_UP = 7  # an earlier step failed for good; the rod rests at its last good 
 LOST_IN_ROUNDING = (
     8  # counted instead of CONVERGED_TO_ROUNDING where rounding decides the motion, and the user allowed that
 )
+ENERGY_DRIFT = 9  # the midpoint rule would have made or lost more energy than it may; see `kernels.energy`
 
 NAMES = {
     CONVERGED: "converged",
@@ -21,4 +22,5 @@ NAMES = {
     INDEFINITE: "indefinite",
     GIVEN_UP: "given_up",
     LOST_IN_ROUNDING: "lost_in_rounding",
+    ENERGY_DRIFT: "energy_drift",
 }

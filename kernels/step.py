@@ -238,7 +238,10 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
 
 @cache
 def finish_frames_kernel(kind: ChainKind, real):
-    """Reference frames transported to the tangents of the new state, orthonormalised, and the reference twist between them."""
+    """Reference frames transported to the tangents of the new state, orthonormalised, and the reference twist between them.
+
+    Rods that did not move keep theirs: frames that a failed solve has carried along its iterates have turned on the way.
+    """
     V, X = wp.types.vector(kind.dim, real), wp.types.vector(3, real)
     along, *_ = gather_functions(kind, real)
     until = until_function(kind)
@@ -258,12 +261,20 @@ def finish_frames_kernel(kind: ChainKind, real):
     def finish(
         x: wp.array2d(dtype=V),
         frame: wp.array3d(dtype=real),
+        frame0: wp.array3d(dtype=real),
         count: wp.array(dtype=int),
+        status: wp.array(dtype=int),
+        progress: wp.array(dtype=real),
         frame_out: wp.array3d(dtype=real),
     ):
         start, r = wp.tid()
         n = count[r]
         if start >= n - wp.static(0 if closed else 1):
+            return
+        if progress[r] >= real(1.0) or status[r] > wp.static(outcome.CONVERGED_TO_ROUNDING):
+            for k in range(start, until(start, n - wp.static(0 if closed else 1))):
+                for c in range(7):
+                    frame_out[c, k, r] = frame0[c, k, r]
             return
         for k in range(start, until(start, n - wp.static(0 if closed else 1))):
             u, t = carried(x, frame, k, n, r)
@@ -326,7 +337,8 @@ def advance_kernel(real):
         else:
             wp.atomic_add(work, 3, wp.int64(1))
             retries[r] = retries[r] + 1
-            if cautious[r] == 0:
+            # another start would lead to the same step, and its energy
+            if cautious[r] == 0 and result != wp.static(outcome.ENERGY_DRIFT):
                 cautious[r] = 1
             else:
                 cautious[r] = 0

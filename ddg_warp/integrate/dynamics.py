@@ -6,6 +6,7 @@ import warp as wp
 from ddg_warp import arguments, arrays, geometry, validate
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.graphs import Graphs
+from ddg_warp.integrate import energy
 from ddg_warp.integrate.buffers import Buffer
 from ddg_warp.integrate.net_step import NetStep
 from ddg_warp.integrate.prescribed import PrescribedMotion, TimedLoads, jump_between
@@ -22,6 +23,7 @@ SOLVERS = ("newton", "projective")
 SCHEMES = ("implicit_euler", "implicit_midpoint")
 DIRECT = {"sweep": ChainNewton, "partitioned": PartitionedNewton}  # solvers of open rods by their name
 NET_ONLY = ("multilevel", "chain_multilevel")  # preconditioners of nets
+ENERGY_BOUND = 0.1
 FOLDED = 1e-5  # how close to opposite [rad] edges that meet are called folded, in messages
 
 
@@ -53,10 +55,17 @@ class Integrator:
         rtol, max_iterations, ...: see `NewtonOptions`.
         retry_limit: how often in a row a rod's failed step is tried again: first from the last state instead of the predictor,
             then in halves, and so on, down to 2^-(retry_limit / 2) of the step.
+        energy_bound: what the midpoint rule may make of the energy, or lose, of every lone rod, and of the net in every world: a
+            fraction of the largest kinetic and elastic energy that it has had, and of what damping took, or None for anything.
+            Loads and supports may do any work. A step that would leave the bound is tried again in halves, and then fails by the
+            outcome `energy_drift`. Counted from a state that the integrator has not made itself (a run that is resumed counts
+            anew); what rounding may make does not count. Where steps resolve the motion the rule keeps the energy to some 1e-3,
+            and where it is unstable the energy grows to a multiple within some steps: a tenth lies between. Implicit Euler takes
+            energy out of what steps do not resolve and is not watched. See `kernels.energy`.
         check_every: steps between readings of the outcomes; by default 1 on the CPU and 32 on CUDA.
 
     Raises:
-        SceneError: a free node has no mass, or the scheme does not exist.
+        SceneError: a free node has no mass, the scheme does not exist, or implicit Euler is given a bound.
     """
 
     def __init__(
@@ -67,6 +76,7 @@ class Integrator:
         solver: str = "newton",
         linear: str = "auto",
         retry_limit: int = 20,
+        energy_bound: float | None = ENERGY_BOUND,
         check_every: int | None = None,
         **options,
     ):
@@ -80,6 +90,7 @@ class Integrator:
         self.model, self.scheme, self.solver, self.linear = model, scheme, solver, linear
         self.options = NewtonOptions(**options)
         self.retry_limit = arguments.count("retry_limit (0 for no retry)", retry_limit, 0)
+        self.energy_bound = self._bound(energy_bound)
         self.check_every = check_every or (32 if model.wp_device.is_cuda else 1)
         _require_mass(model)
         _refuse_curved_membranes(model)
@@ -131,7 +142,11 @@ class Integrator:
             part.raise_failures(state)
 
     def statistics(self) -> dict:
-        """Counts since the integrator was made: Newton iterations of a solve, retries, lost pivots, outcomes."""
+        """Counts since the integrator was made: Newton iterations of a solve, retries, lost pivots, outcomes.
+
+        Under "energy", where it is watched, what the midpoint rule has made and what damping took [J] over all rods and worlds since
+        the state that the integrator was given, and of them the largest fraction made; see `energy_bound`.
+        """
         tally = sum(part.tally.numpy() for part in self._parts)
         work = np.array([part.work.numpy() for part in self._parts])
         solves = max(1, int(work[:, 2].sum()))
@@ -142,7 +157,21 @@ class Integrator:
             "lost_pivots": int(work[:, 4].sum()),
             "linear": [part.newton.linear.__name__ for part in self._parts],
             "outcomes": {name: int(tally[code]) for code, name in outcome.NAMES.items() if tally[code]},
-        }
+        } | ({} if self.energy_bound is None else {"energy": energy.summary([part.energy for part in self._parts])})
+
+    def _bound(self, given: float | None) -> float | None:
+        """The bound of the energy, None where it is not watched."""
+        if given is not None:
+            given = arguments.number(
+                "energy_bound", given, "a fraction between 0 and 1, or None", lambda v: 0.0 < v < 1.0
+            )
+        if self.scheme == "implicit_midpoint":
+            return given
+        if given not in (None, ENERGY_BOUND):
+            raise SceneError(
+                f"energy_bound = {given:g} is of the implicit midpoint rule; {self.scheme} takes energy out"
+            )
+        return None
 
     @property
     def _parts(self) -> list:
@@ -183,6 +212,9 @@ class Integrator:
                 return i
         self._vacate(0)
         self._buffers[0].state.assign(state)
+        for part in self._parts:
+            if part.energy:
+                part.energy.account.zero_()
         return 0
 
     def _vacate(self, index: int) -> None:
@@ -273,6 +305,7 @@ class _ChainStep:
             self.tally, self.work = counts_of.tally, counts_of.work
             self.newton.status = counts_of.newton.status
             self.reason = counts_of.reason
+        self.energy = energy.ChainEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
         self.moving = PrescribedMotion(model, group, midpoint) if group.moving else None
         self.loads = TimedLoads(model, group, midpoint) if group.host.timed_loads else None
@@ -312,8 +345,10 @@ class _ChainStep:
         if self.moving:
             self.moving.apply(self.progress, self.portion, newton.x, newton.frame, newton.theta)
         if self.loads:
-            self.loads.apply(newton.x)
+            self.loads.apply(newton.x, group.load, group.load_angle)
         newton.solve(before.last)
+        if self.energy:
+            self.energy.judge(before)
         self._launch(
             "nodes",
             group.node_threads,
@@ -322,7 +357,12 @@ class _ChainStep:
             [after.x, after.v, after.theta, after.omega],
         )
         if group.kind.twist:
-            self._launch("frames", group.element_threads, [after.x, newton.frame, group.count], [after.frame])
+            self._launch(
+                "frames",
+                group.element_threads,
+                [after.x, newton.frame, before.frame, group.count, newton.status, self.progress],
+                [after.frame],
+            )
         if group.kind.viscous:
             self.model.strains(group, after, after.last)
         self.remaining.zero_()
@@ -343,7 +383,7 @@ class _ChainStep:
         kernels = [*self.kernels.values(), *self.newton.kernels]
         if self.group.kind.viscous:
             kernels.append(element.strain_kernel(self.group.kind, self.model.types.real))
-        for part in (self.moving, self.loads):
+        for part in (self.moving, self.loads, self.energy):
             kernels += part.kernels if part else ()
         arrays.load_kernels(kernels, self.model.wp_device)
 
@@ -359,10 +399,14 @@ class _ChainStep:
         column = int(failed[0])
         rod = int(host.rods[column % self.group.rods])
         name = outcome.NAMES[int(self.reason.numpy()[column])]
-        node, size = self._worst_node(column)
+        if self.energy and name == "energy_drift":
+            what = self.energy.failure(column)
+        else:
+            node, size = self._worst_node(column)
+            what = f"residual {size:.3g} N at node {node}; {self._remedy(state, column)}"
         raise SolverError(
-            f"rod {rod} ('{self.model.curves.names[rod]}') could not be stepped to t = {state.time:g} s: {name} after "
-            f"{self.integrator.retry_limit} retries, residual {size:.3g} N at node {node}; {self._remedy(state, column)}",
+            f"rod {rod} ('{self.model.curves.names[rod]}') could not be stepped to t = {state.time:g} s: {name} within "
+            f"{self.integrator.retry_limit} retries, {what}",
             state=state,
             outcome=name,
             rods=[int(host.rods[c % self.group.rods]) for c in failed],

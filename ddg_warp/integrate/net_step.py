@@ -7,6 +7,7 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.integrate.energy import NetEnergy
 from ddg_warp.integrate.net_prescribed import NetLoads, NetMotion
 from ddg_warp.integrate.prescribed import jump_between
 from ddg_warp.kernels import outcome, step
@@ -55,6 +56,7 @@ class NetStep:
         if counts_of is not None:
             self.tally, self.work, self.reason = counts_of.tally, counts_of.work, counts_of.reason
             self.newton.status, self.newton.pcg_work = counts_of.newton.status, counts_of.newton.pcg_work
+        self.energy = NetEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
         self.motion = NetMotion(model, self.midpoint) if host.moving else None
         self.loads = NetLoads(model, self.midpoint)
@@ -109,6 +111,8 @@ class NetStep:
             self.motion.apply(self.progress, self.portion, solver.q, start.frame)
         self.loads.apply(solver.q, solver.load)
         solver.solve(start)
+        if self.energy:
+            self.energy.judge(before, start)
         self._launch(
             self._finish,
             solver.all,
@@ -151,6 +155,7 @@ class NetStep:
         real, device = self.model.types.real, self.model.wp_device
         kernels = [self._begin, self._finish, self._start, self._advance, *self.newton.kernels]
         kernels += [*(self.motion.kernels if self.motion else []), *self.loads.kernels]
+        kernels += self.energy.kernels if self.energy else []
         kernels += [frames.edge_kernel(real)] if self.net.edges else []
         kernels += [frames.reset_kernel(real)] if self.net.host.spins else []
         for part in self.net.sets:
@@ -170,14 +175,18 @@ class NetStep:
             return
         world = int(failed[0])
         name = outcome.NAMES[int(self.reason.numpy()[world])]
-        sizes = np.abs(self.newton.right.numpy().reshape(self.model.worlds, -1))[world]
-        part, dt = Tangent(self.model).parts[-1], self.integrator._dt_host
-        jump = jump_between(self.model, state.time - dt, state.time)
-        worst = int(np.argmax(np.where(np.isfinite(sizes), sizes, np.inf)))
+        if self.energy and name == "energy_drift":
+            what = self.energy.failure(world)
+        else:
+            sizes = np.abs(self.newton.right.numpy().reshape(self.model.worlds, -1))[world]
+            part, dt = Tangent(self.model).parts[-1], self.integrator._dt_host
+            jump = jump_between(self.model, state.time - dt, state.time)
+            worst = int(np.argmax(np.where(np.isfinite(sizes), sizes, np.inf)))
+            what = f"largest residual {sizes[worst]:.3g} N at {part.where(worst)}; "
+            what += jump or "take a smaller dt, a looser rtol, or check its loads and supports"
         raise SolverError(
-            f"the net (world {world}) could not be stepped to t = {state.time:g} s: {name} after "
-            f"{self.integrator.retry_limit} retries, largest residual {sizes[worst]:.3g} N at {part.where(worst)}; "
-            f"{jump or 'take a smaller dt, a looser rtol, or check its loads and supports'}",
+            f"the net (world {world}) could not be stepped to t = {state.time:g} s: {name} within "
+            f"{self.integrator.retry_limit} retries, {what}",
             state=state,
             outcome=name,
         )

@@ -107,9 +107,9 @@ class TimedLoads:
             row *= load.at(at, 1.0)
         self.values.assign(np.tile(table[self._load_of], (self.group.worlds, 1)))
 
-    def apply(self, x: wp.array) -> None:
-        """Constant loads plus these, on edges of nodes x."""
+    def apply(self, x: wp.array, load: wp.array, load_angle: wp.array) -> None:
+        """Write constant loads plus these, on edges of nodes x, where such loads were before."""
         reset, add = self.kernels
-        out = [self.group.load, self.group.load_angle]
+        out = [load, load_angle]
         wp.launch(reset, self.touched.shape[0], [self.touched, self.base], out, device=self.device)
         wp.launch(add, self.where.shape[0], [self.where, self.values, x], out, device=self.device)

@@ -40,6 +40,14 @@ each(
     "retry_limit",
     "0 for no",
 )
+each(
+    "Integrator",
+    "energy_bound",
+    [0.0, -0.1, 1.0, NAN, "small", True],
+    lambda v: ddg.Integrator(model(), "implicit_midpoint", energy_bound=v),
+    "energy_bound",
+    "between 0 and 1",
+)
 each("Integrator", "check_every", [0, -1, 1.5, "often"], lambda v: ddg.Integrator(model(), check_every=v), "check_every", "whole")
 each("Integrator", "psd", ["exact", None], lambda v: ddg.Integrator(model(), psd=v), "psd", "gauss_newton", "progressive")
 for name in ("rtol", "floor_factor", "rotation_cap", "linear_rtol"):

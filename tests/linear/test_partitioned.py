@@ -247,7 +247,8 @@ SCENES = {
 def test_steps_are_those_of_the_sweep(device, name, scheme):
     """Asked for all digits, the solvers agree to rounding; neither retries."""
     build, given = SCENES[name]
-    given = {"rtol": 1e-13, "scheme": scheme} | given
+    # the midpoint rule makes energy in the stiff scene, and is to do so alike
+    given = {"rtol": 1e-13, "scheme": scheme, "energy_bound": None} | given
     swept, exact = moved(build(), device, "sweep", **given)
     state, found = moved(build(), device, "partitioned", **given)
     start = build().build(device).state().points()
