@@ -77,7 +77,7 @@ def check(result) -> list[ddg.Check]:
 
 def benchmark() -> ddg.bench.Study:
     """The critical twist over the nodes of the ring."""
-    return ddg.bench.Study({"n": (50, 100, 200)}, "critical twist")
+    return ddg.bench.Study({"n": (52, 100, 200)}, "critical twist")
 
 
 def picture(result, frames) -> dict:
