@@ -8,6 +8,7 @@ from ddg_warp import meshes, stability
 from ddg_warp.integrate.statics import solve
 from ddg_warp.linear import lowest
 from ddg_warp.linear.direct import Factorisation
+from ddg_warp.linear.lowest import Lowest
 from ddg_warp.rigid import rigid_modes
 from ddg_warp.stability import spectrum
 from ddg_warp.tangent import Tangent
@@ -294,3 +295,18 @@ def test_mistakes(device):
         spectrum(model, model.state(), metric="foo")
     with pytest.raises(ddg.SceneError, match="count = 0"):
         spectrum(model, model.state(), 0)
+
+
+def test_a_count_that_rounding_makes_too_large_ends_the_search(device, monkeypatch):
+    """Pivots that claim one eigenvalue more than there is: a search for it finds none, and the spectrum is as without."""
+    scene = still()
+    scene.clamp(scene.add_rod(line(), section=SECTION))
+    model = scene.build(device, "float64")
+    monkeypatch.setattr(stability, "DENSE", 0)
+    exact = spectrum(model, model.state(), 3)
+    searches, inertia, nearest = [], Lowest.inertia, Lowest.nearest
+    monkeypatch.setattr(Lowest, "inertia", lambda self, at: inertia(self, at) + 1)
+    monkeypatch.setattr(Lowest, "nearest", lambda self, *given: searches.append(1) or nearest(self, *given))
+    found = spectrum(model, model.state(), 3)
+    np.testing.assert_allclose(found.eigenvalues, exact.eigenvalues, rtol=1e-9)
+    assert len(searches) < 5

@@ -46,7 +46,7 @@ class Shifted:
         """The `count` lowest eigenvalues, and all under the shift, across orthonormal vectors; with orthonormal eigenvectors."""
         count = min(max(count, self.below), self.size - 1)
         wanted, last = self.below + self.near, min(count + GUARD, self.size - 1)
-        values, vectors = np.zeros(0), without[:, :0]
+        values, vectors, under = np.zeros(0), without[:, :0], np.inf
         while True:
             found = int((values < self.shift).sum())
             wanted = last if len(values) >= wanted else wanted
@@ -56,20 +56,22 @@ class Shifted:
             values, vectors = np.append(values, more)[order], np.hstack([vectors, others])[:, order]
             if len(values) < self.size - 1 and ((values < self.shift).sum() < self.below or len(values) < last):
                 continue
-            missing = self._missing(values, count)
-            if not missing or len(values) >= self.size - 1:
+            missing, at = self._missing(values, count)
+            # where a search without those found turns up none of what pivots counted, rounding made their signs
+            if not missing or len(values) >= self.size - 1 or (under < np.inf and (more > under).all()):
                 return values[:count], vectors[:, :count]
-            last = min(len(values) + missing, self.size - 1)
+            last, under = min(len(values) + missing, self.size - 1), at
 
-    def _missing(self, values: np.ndarray, count: int) -> int:
-        """How many of the `count` lowest, and of what lies in a cluster with the last of them, have not been found."""
+    def _missing(self, values: np.ndarray, count: int) -> tuple[int, float]:
+        """How many of the `count` lowest, and of what lies in a cluster with the last of them, have not been found; and under what."""
         gaps = np.diff(values[count - 1 :]) / np.maximum(np.abs(values[count:]), 1e-300)
         wide = np.flatnonzero(gaps > GAP)
         if not wide.size:
-            return GUARD  # they end in a cluster: go on to its end
+            return GUARD, np.inf  # they end in a cluster: go on to its end
         between = count - 1 + int(wide[0])
-        under = self.inertia(0.5 * (values[between] + values[between + 1]))
-        return 0 if under is None else max(0, under - (between + 1))
+        at = 0.5 * (values[between] + values[between + 1])
+        under = self.inertia(at)
+        return 0 if under is None else max(0, under - (between + 1)), at
 
 
 class Lowest(Shifted):
