@@ -4,8 +4,10 @@ python tests/contracts/table.py [--device cuda:0]     # prints the table with it
 """
 
 import argparse
+import io
 import itertools
 import sys
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -53,7 +55,7 @@ MANY = {"continuation": ("one world",)}  # what several worlds are refused
 def answer(name: str, question: str, variant: Variant) -> str:
     """The sentence by which a cell is refused, empty where it works; anything else is raised."""
     try:
-        with np.errstate(over="raise", invalid="raise", divide="raise"):
+        with np.errstate(over="raise", invalid="raise", divide="raise"), redirect_stdout(io.StringIO()):
             QUESTIONS[question](OBJECTS[name], variant)
     except (ddg.SceneError, ddg.SolverError, ValueError) as error:
         return str(error) or repr(error)
