@@ -400,6 +400,9 @@ def test_bench_gives_error_and_time_together(fall, tmp_path):
     assert fall("bench") == 0
     with open("out/bench/fall.json") as file:
         rows = json.load(file)["rows"]
+    rows = [
+        row for row in rows if row["precision"] == "float64"
+    ]  # on CUDA the defaults are a case of their own, in mixed
     assert [row["dt"] for row in rows] == [0.01, 0.005]
     # Implicit Euler falls too far by g h T / 2.
     assert [row["error"] for row in rows] == pytest.approx([9.81 * dt * 0.02 / 2 for dt in (0.01, 0.005)], rel=1e-6)
