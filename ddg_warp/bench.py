@@ -137,6 +137,7 @@ def measure(module, study: Study, *, device: str | None = None, precision: str |
     cases = study.cases()
     if not any(_alike(case, usual) for case in cases):
         cases.append(usual)
+    clock = clock_of(device) or time.perf_counter
     references: dict[tuple, Result] = {}
     loaded: set[tuple] = set()
     rows, unit = [], study.unit
@@ -146,7 +147,7 @@ def measure(module, study: Study, *, device: str | None = None, precision: str |
         if kernels not in loaded:  # once for the kernels, whose loading is no part of what is measured
             run(module, settings, device)
             loaded.add(kernels)
-        began = (clock_of(device) or time.perf_counter)()
+        began = clock()
         result = run(module, settings, device)
         failure, error, scale = result.failure, np.nan, 1.0
         if isinstance(study.measure, str):
@@ -171,7 +172,7 @@ def measure(module, study: Study, *, device: str | None = None, precision: str |
         seconds_per_step = float(np.mean(steady)) if steady else 0.0
         seconds = seconds_per_step * len(result.step_times)
         if study.whole or not isinstance(result.scene.analysis, Dynamics):
-            seconds = (clock_of(device) or time.perf_counter)() - began
+            seconds = clock() - began
         rows.append(
             case
             | {

@@ -7,7 +7,7 @@ from those about the directors at the node, which are given here.
 
 import numpy as np
 
-from ddg_warp import arrays
+from ddg_warp import arrays, geometry
 
 
 def of_group(group, data, moments: np.ndarray) -> None:
@@ -15,7 +15,7 @@ def of_group(group, data, moments: np.ndarray) -> None:
     host = group.host
     frame = arrays.download(data.frame).astype(np.float64)
     u, t = (np.moveaxis(frame[rows], 0, -1) for rows in (slice(0, 3), slice(3, 6)))
-    first = _directors(u, t, arrays.download(data.theta))
+    first = geometry.material_directors(u, t, arrays.download(data.theta).astype(np.float64))
     after = host.count - host.own - host.first
     for clamped, vertex, ghost, edge in (
         (host.first == 1, 0 * host.count, 0, 1),
@@ -35,11 +35,10 @@ def of_net(net, state, index: int, moments: np.ndarray) -> None:
     frame = state.frame.numpy().astype(np.float64).reshape(6, worlds, -1)
     angle = state.q.numpy().astype(np.float64).reshape(worlds, -1, 3)[:, host.nodes :][:, : host.rod_edges, 0]
     u, t = (np.moveaxis(frame[rows], 0, -1) for rows in (slice(0, 3), slice(3, 6)))
-    first = _directors(u, t, angle)
+    first = geometry.material_directors(u, t, angle)
     edges = slots[measure.nodes : measure.nodes + measure.angles] - host.nodes
-    if (
-        measure.spins
-    ):  # seen from the joint outwards: tangents of edges that end there point back, and the second curvature with them
+    if measure.spins:
+        # seen from the joint outwards: tangents of edges that end there point back, and the second curvature with them
         sign = part.host.data[0][:, None]
         lag = np.moveaxis(state.lag[index].numpy().astype(np.float64).reshape(-1, worlds, part.elements), 0, -1)
         for world in range(worlds):
@@ -63,19 +62,12 @@ def of_net(net, state, index: int, moments: np.ndarray) -> None:
             moments[:, world, clamped] = _about(moments[:, world, clamped], at_node, inside)
 
 
-def _directors(u: np.ndarray, t: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """First material directors of edges with frames u, t (..., 3) and angles (...)."""
-    angle = angle.astype(np.float64)[..., None]
-    return u * np.cos(angle) + np.cross(t, u) * np.sin(angle)
-
-
 def _about(moments: np.ndarray, node: tuple, edge: tuple) -> np.ndarray:
     """Moments (3, n) about the mean directors of two edges, each given by director and tangent (n, 3), about those of the first."""
     (u0, t0), (u1, t1) = node, edge
     v0, v1 = np.cross(t0, u0), np.cross(t1, u1)
-    along = (t0 + t1) / (
-        1.0 + np.sum(t0 * t1, -1, keepdims=True)
-    )  # what twist turns about (Bergou et al. 2008, tilde t)
+    # what twist turns about, tilde t of Bergou et al. 2008
+    along = (t0 + t1) / (1.0 + np.sum(t0 * t1, -1, keepdims=True))
     first, second, twist = moments[..., None]
     vector = 0.5 * first * (v0 + v1) - 0.5 * second * (u0 + u1) + twist * along
     return np.stack([np.sum(vector * v0, -1), -np.sum(vector * u0, -1), np.sum(vector * t0, -1)])

@@ -29,6 +29,11 @@ def signed_angle(a: np.ndarray, b: np.ndarray, axis: np.ndarray) -> np.ndarray:
     return np.arctan2(np.sum(np.cross(a, b) * axis, -1), np.sum(a * b, -1))
 
 
+def material_directors(u: np.ndarray, t: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """First material directors of edges: reference directors u, turned about tangents t (..., 3) by angles (...)."""
+    return u * np.cos(angle)[..., None] + np.cross(t, u) * np.sin(angle)[..., None]
+
+
 def directors(tangents: np.ndarray, given: np.ndarray | None) -> np.ndarray:
     """First directors of all edges (R, edges, 3), perpendicular to the tangents.
 
@@ -63,9 +68,8 @@ def frames_at_nodes(first: tuple, second: tuple, beyond, tangents: np.ndarray | 
     share = (beyond * l1 / (l0 + l1))[..., None]
     if tangents is None:
         tangents = unit(t1 + share * (t1 - t0))
-    angle = share * signed_angle(transport(u0, t0, t1), u1, t1)[..., None]
-    u = transport(u1, t1, tangents)
-    return tangents, u * np.cos(angle) + np.cross(tangents, u) * np.sin(angle)
+    angle = share[..., 0] * signed_angle(transport(u0, t0, t1), u1, t1)
+    return tangents, material_directors(transport(u1, t1, tangents), tangents, angle)
 
 
 def ahead(values: np.ndarray, closed: bool) -> tuple[np.ndarray, np.ndarray]:

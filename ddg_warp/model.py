@@ -5,7 +5,7 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays, axisymmetric, validate
+from ddg_warp import arrays, axisymmetric, geometry, validate
 from ddg_warp.chains import compile_chains, scene_motions
 from ddg_warp.errors import SceneError
 from ddg_warp.group import Group
@@ -449,14 +449,14 @@ class Model:
             frame = np.moveaxis(state.net.frame.numpy().reshape(6, self.worlds, -1), 0, -1)
             angle = state.net.q.numpy().reshape(self.worlds, -1, 3)[:, self.net.angle_start :][:, : self.net.edges, 0]
             u, t = frame[..., :3], frame[..., 3:]
-            net = u * np.cos(angle)[..., None] + np.cross(t, u) * np.sin(angle)[..., None]
+            net = geometry.material_directors(u, t, angle)
         for group, data in zip(self.groups, state.groups, strict=True):
             if not group.kind.twist:
                 values.append(np.zeros(0))
                 continue
             frame, theta = arrays.download(data.frame), arrays.download(data.theta)
             u, t = np.moveaxis(frame[0:3], 0, -1), np.moveaxis(frame[3:6], 0, -1)
-            values.append(u * np.cos(theta)[..., None] + np.cross(t, u) * np.sin(theta)[..., None])
+            values.append(geometry.material_directors(u, t, theta))
         return self._gather_edges(values, net, 3)
 
 
