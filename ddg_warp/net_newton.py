@@ -16,9 +16,7 @@ from ddg_warp.newton import NewtonOptions
 from ddg_warp.tolerance import outer_forces
 
 PRECONDITIONERS = ("block_jacobi", "chain", "multilevel", "chain_multilevel")
-# Of the tolerance, what the residual of a linear solve may make up. Block Jacobi's norm, in which it is measured, hardly sees smooth
-# residuals, which displace most (tools/results/tolerance_cpu.csv).
-SPARE = {"block_jacobi": 0.05, "chain": 0.5, "multilevel": 0.5, "chain_multilevel": 0.5}
+SPARE = 0.5  # of the tolerance, what the last linear solve of a step may leave
 LOOSEST = 0.1  # largest reduction of the residual that a direction is solved to (Eisenstat and Walker's forcing term)
 
 
@@ -35,7 +33,7 @@ class NetNewton:
         if preconditioner not in PRECONDITIONERS:
             raise SceneError(f"preconditioner {preconditioner!r}: of a net it is one of {', '.join(PRECONDITIONERS)}")
         net = model.net
-        self.net, self.options, self.device, self.spare = net, options, net.device, SPARE[preconditioner]
+        self.net, self.options, self.device = net, options, net.device
         self.real, self.linear = model.types.real, linear or model.types.linear
         self.eps = model.types.eps
         worlds, blocks, host, device = net.worlds, net.blocks, net.host, net.device
@@ -76,7 +74,8 @@ class NetNewton:
         (self.stalled,), (self.best,) = flags(), scalars()
         self.coefficient, self.rate, self.step_length, self.decrement, self.merit = scalars(5)
         self.load_scale, self.residual, self.sum_change, self.sum_noise, self.sum_square = scalars(5)
-        self.decrease, self.turn, self.worst = scalars(3)
+        self.decrease, self.turn, self.worst, self.goal = scalars(4)
+        self.goal.fill_(math.inf)
         self.forcing, self.rho, self.rho_first, self.total, self.curvature = scalars(5, self.linear)
         self.active, self.busy = make(1, int), make(1, int)
         self.pcg_work = make(1, wp.int64)
@@ -98,7 +97,9 @@ class NetNewton:
         self._assembly = Assembly(net, self.system, self.parts, self.real, self.linear)
         self._judge, self._measure, self._rotate, self._take, self._move = newton.search_kernels(self.real, self.linear)
         self._invert, self._start, self._begin, *self._cycle = krylov.solver_kernels(self.linear)
+        self._compare, self._confirm = krylov.confirm_kernels(self.real, self.linear)
         self.allowed = Allowed(net, self.real, self.linear)
+        self._unread = flags(2)
         outer = outer_forces(host, gravity)
         self.outer = self.allowed.assign(self.allowed.bodies.loads(outer)[None])
         self._worst = Sums(worlds, self.allowed.ratio.shape[1], self.real, device, largest=True)
@@ -123,7 +124,7 @@ class NetNewton:
         """Kernels to load before a capture."""
         own = [self._outer, self._collect, self._settle, self._judge, self._measure, self._rotate, self._take]
         own += self.allowed.kernels
-        cycle = [self._move, self._invert, self._start, self._begin, *self._cycle]
+        cycle = [self._move, self._invert, self._start, self._begin, *self._cycle, self._compare, self._confirm]
         parts = [k for part in (self.chains, self.levels, self.planes) if part for k in part.kernels]
         evaluate = [(kernel, 128) for kernel in self._evaluate]
         sums = (self._sum, self._sum_linear, self._largest, self._worst)
@@ -214,10 +215,10 @@ class NetNewton:
             self.worlds,
             [self.sum_change, self.sum_noise, self.sum_square, self.worst, options.rtol]
             + [options.floor_factor * self.eps]
-            + [options.max_iterations, options.max_halvings, LOOSEST, options.linear_rtol, self.spare]
+            + [options.max_iterations, options.max_halvings, LOOSEST, options.linear_rtol, SPARE]
             + [self.status, self.unbalanced, self.drowned, self.slot, self.iteration, self.halvings]
             + [self.step_length, self.decrement, self.merit, self.load_scale, self.residual, self.turned]
-            + [self.best, self.stalled, self.forcing, self.wanted, self.todo, self.active],
+            + [self.best, self.stalled, self.forcing, self.goal, self.wanted, self.todo, self.active],
             device=self.device,
         )
 
@@ -254,7 +255,23 @@ class NetNewton:
             [self.wanted, self.rho, self.rho_first, self.iterations, self.projected, self.busy],
             device=self.device,
         )
+        wp.capture_while(self.busy, self.reduce)
+
+    def reduce(self) -> None:
+        """Iterate until the residual is small in the norm of the preconditioner, and go on where the tolerance says that it is not."""
         wp.capture_while(self.busy, self.cycle)
+        self._launch(
+            self._compare, [self.rest, self.allowed.blocks, self.wanted, self.net.blocks], [self.allowed.ratio]
+        )
+        self.allowed.sum_up(self.rest, self.options.rtol, self.load_scale, self.status, *self._unread)
+        self._worst(self.allowed.ratio, self.worst)
+        wp.launch(
+            self._confirm,
+            self.worlds,
+            [self.worst, self.goal, self.options.linear_rtol],
+            [self.forcing, self.wanted, self.busy],
+            device=self.device,
+        )
 
     def precondition(self, z: wp.array) -> None:
         """What chains and levels make of z, which holds the residual times the inverses of the diagonal blocks."""

@@ -2,10 +2,11 @@
 
 Every rod, shell and meridian is a *body* with the sum W of its own outer forces, as if nothing else were there. A residual is what
 inner forces fail to carry. In a rod or meridian, |sum of r| <= rtol W over every part, single nodes included, bounds the error of the
-axial force by rtol W. In a shell inner forces are per length: over a part with share a of its area, |sum of r| <= rtol W sqrt(a). Both
-are independent of refinement and of what else is in the net: a smooth residual, which displaces most, is caught by its sum
-over the whole, a rough one, which stiff edges carry, node by node. Moments are compared over the length L of the body (of a shell,
-the root of its area). Parts are the nodes, eight of them, eight of these, and so on, along a rod, or along a curve that fills a shell.
+axial force by rtol W. In a shell inner forces are per length: over a part with share a of its area, |sum of r| <= rtol W sqrt(a), but
+large parts, whose residuals move the whole and add up from step to step, are held to a tenth of W. Both are independent of refinement
+and of what else is in the net: a smooth residual, which displaces most, is caught by its sum over the whole, a rough one, which stiff
+edges carry, node by node. Moments are compared over the length L of the body (of a shell, the root of its area). Parts are the nodes,
+eight of them, eight of these, and so on, along a rod, or along a curve that fills a shell.
 
 A body with less load than the mean of those it is connected with is given that mean, since it may carry theirs.
 """
@@ -15,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 FAN = 8  # parts that a larger part is made of
+SMOOTH = 0.1  # what residuals of large parts of a shell may add up to, over rtol W
 
 
 @dataclass
@@ -74,7 +76,7 @@ class Bodies:
         self._blocks, self._body = blocks, body
         self._line = np.concatenate([np.zeros(0, int), *(nodes for nodes, *_ in lines)])
         self._line_body = np.repeat(np.arange(len(lines)), [len(nodes) for nodes, *_ in lines])
-        self._weight = np.where(is_shell, np.sqrt(share), 1.0) * arm
+        self._weight = _weight(is_shell, share) * arm
         self.owner, self.arm = np.zeros(host.blocks, int), np.ones(host.blocks)
         self.owner[blocks[::-1]], self.arm[blocks[::-1]] = body[::-1], arm[::-1]
         self._spins(lines)
@@ -172,6 +174,11 @@ def support_forces(force: np.ndarray, body: np.ndarray, count: int) -> np.ndarra
     return result
 
 
+def _weight(is_shell: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """What residuals of parts may add up to, over rtol W, of parts of a shell by their share of its area."""
+    return np.where(is_shell, np.minimum(np.sqrt(share), SMOOTH), 1.0)
+
+
 def _areas(surface) -> np.ndarray:
     a, b, c = surface.points[surface.triangles].transpose(1, 0, 2)
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -196,7 +203,7 @@ def _levels(blocks, family, body, share, arm, is_shell) -> list[Level]:
         starts = np.flatnonzero(place % FAN == 0)
         share = np.add.reduceat(share, starts)
         family, body, arm, is_shell = family[starts], body[starts], arm[starts], is_shell[starts]
-        weight = np.where(is_shell, np.sqrt(np.minimum(share, 1.0)), 1.0) * arm
+        weight = _weight(is_shell, share) * arm
         levels.append(Level(np.append(starts, len(items)), items, weight, body))
         items = np.arange(len(starts))
     return levels

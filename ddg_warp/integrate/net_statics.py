@@ -6,6 +6,8 @@ matrix, which costs iterations and no accuracy. No pivot is seen, so that a sadd
 minimum: `ddg_warp.stability` tells.
 """
 
+import math
+
 import numpy as np
 import warp as wp
 
@@ -126,6 +128,7 @@ class NetEquilibrium:
         self._step.assign(step.reshape(-1, 3))
         self.newton.wanted.fill_(1)
         self.newton.forcing.fill_(FORCING)
+        self.newton.goal.fill_(math.inf)
         self._graphs.replay("follow", lambda: self.newton.follow(self._start, self._step))
         direction = self.newton.direction.numpy().astype(np.float64).ravel()
         return direction if np.isfinite(direction).all() else None

@@ -1,7 +1,8 @@
 """Preconditioned conjugate gradients on a net, every world for itself: block Jacobi, scalars on the device.
 
 What `chains` or `levels` make of z follows the kernels that begin a solve and advance it, before r . z is summed.
-`wanted` is 1 while a world iterates, 2 once it is done; sums over blocks come in one order (tiles, then a tile of tiles).
+`wanted` is 1 while a world iterates, 2 once it is done, 3 if it can not go on; sums over blocks come in one order (tiles, then a
+tile of tiles).
 """
 
 from functools import cache
@@ -166,7 +167,7 @@ def solver_kernels(linear):
         if total[w] > linear(0.0):
             busy_out[0] = 1
         else:
-            wanted[w] = 2
+            wanted[w] = 3
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def product(
@@ -261,9 +262,49 @@ def solver_kernels(linear):
             projected[w] = 1
         lost = ends(curvature[w], rho[w])
         rho[w] = total[w]
-        if not lost and total[w] > forcing[w] * forcing[w] * first[w] and iterations[w] < limit:
+        if lost or iterations[w] >= limit:
+            wanted[w] = 3
+        elif total[w] > forcing[w] * forcing[w] * first[w]:
             busy_out[0] = 1
         else:
             wanted[w] = 2
 
     return invert, start, begin, product, advance, turn, test
+
+
+@cache
+def confirm_kernels(real, linear):
+    """compare(...) of what a solve leaves in every block with what it may be; confirm(...) that it is little enough."""
+    H = wp.types.vector(3, linear)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def compare(
+        residual: wp.array(dtype=H),
+        allowed: wp.array(dtype=real),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        ratio_out: wp.array2d(dtype=real),
+    ):
+        i = wp.tid()
+        w = i / blocks
+        if wanted[w] == 2:
+            ratio_out[w, i - w * blocks] = real(wp.max(wp.abs(residual[i]))) / allowed[i]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def confirm(
+        worst: wp.array(dtype=real),
+        goal: wp.array(dtype=real),
+        tightest: real,
+        forcing: wp.array(dtype=linear),
+        wanted: wp.array(dtype=int),
+        busy_out: wp.array(dtype=int),
+    ):
+        """Sends worlds on whose largest ratio is above their goal, to a residual smaller by as much in the preconditioner's norm."""
+        w = wp.tid()
+        if wanted[w] != 2 or worst[w] <= goal[w] or real(forcing[w]) <= tightest:
+            return
+        forcing[w] = forcing[w] * linear(wp.clamp(goal[w] / worst[w], real(0.1), real(0.8)))
+        wanted[w] = 1
+        busy_out[0] = 1
+
+    return compare, confirm

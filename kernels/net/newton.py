@@ -1,5 +1,6 @@
 """Newton's method on a net: what becomes of an iterate and of a direction, a thread a world, and the moves, a thread a block."""
 
+import math
 from functools import cache
 
 import warp as wp
@@ -45,15 +46,17 @@ def search_kernels(real, linear):
         best: wp.array(dtype=real),
         stalled: wp.array(dtype=int),
         forcing: wp.array(dtype=linear),
+        goal: wp.array(dtype=real),
         wanted: wp.array(dtype=int),
         todo: wp.array(dtype=int),
         active: wp.array(dtype=int),
     ):
         """Decides by the sums over all blocks; `worst` is the largest residual over what it may be at rtol = 1.
 
-        How exactly the next direction is solved follows Eisenstat and Walker (1996), but no more exactly than to a fraction `spare`
-        of the tolerance. A world whose expected decrease of energy drowns in rounding, and whose residual has not halved in
-        `STALLED` iterations, has converged to rounding: on bad meshes rounding leaves more than the estimate block by block.
+        How exactly the next direction is solved follows Eisenstat and Walker (1996). Where that leaves less than a fraction `spare`
+        of the tolerance, this fraction is its `goal`. A world whose expected decrease of energy drowns in rounding, and whose
+        residual has not halved in `STALLED` iterations, has converged to rounding: on bad meshes rounding leaves more than the
+        estimate block by block.
         """
         w = wp.tid()
         wanted[w] = 0
@@ -103,7 +106,9 @@ def search_kernels(real, linear):
             eta = loosest
             if not first and before > real(0.0):
                 eta = wp.clamp(real(0.9) * square[w] / before, tightest, loosest)
-            eta = wp.clamp(spare * rtol * load_scale[w] / worst[w], eta, loosest)
+            enough = rtol * load_scale[w] / worst[w]
+            goal[w] = wp.where(spare * enough >= eta, spare * rtol * load_scale[w], real(wp.static(math.inf)))
+            eta = wp.clamp(enough, eta, loosest)
             if polish:
                 eta = wp.min(eta, real(wp.static(POLISH)))
             forcing[w] = linear(eta)
@@ -340,6 +345,6 @@ def static_kernels(real, linear):
         """Ends the solves of worlds whose direction turns something by more than the cap already."""
         w = wp.tid()
         if wanted[w] == 1 and turn[w] > rotation_cap * rotation_cap:
-            wanted[w] = 2
+            wanted[w] = 3
 
     return follow, less, far
