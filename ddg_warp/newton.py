@@ -37,7 +37,7 @@ class NewtonOptions:
             gradients meet negative curvature.
     """
 
-    rtol: float = 1e-8
+    rtol: float = 1e-6
     floor_factor: float = 4.0
     max_iterations: int = 100
     max_halvings: int = 20

@@ -24,7 +24,7 @@ POISSON = 0.3
 SOURCE = "Timoshenko 1925 and Ashwell 1950"
 
 
-def build(mismatch: float = 4e-3, width: float = 0.1, cells: int = 8, mesh: str = "right") -> ddg.Scene:
+def build(mismatch: float = 4e-3, width: float = 0.1, cells: int = 8, mesh: str = "crossed") -> ddg.Scene:
     """The strip along x, drawn as it would roll up if it were narrow, and let go.
 
     Args:

@@ -21,7 +21,7 @@ def build(
     load: float = 1.0,
     grading: float = 4.0,
     pattern: str = "crossed",
-    membrane: str = "curved",
+    membrane: str = "flat",
     steps: int = 40,
 ) -> ddg.Scene:
     """An eighth of the cylinder about z, pressed along x.
@@ -31,7 +31,7 @@ def build(
         load: fraction of the load
         grading: how much wider than the mean the cells would be without it, under the force; 1 for an even mesh
         pattern: how cells become triangles: right, alternating, crossed or jittered
-        membrane: flat or curved, see Scene.add_shell
+        membrane: flat or curved, see Scene.add_shell; here, where a dimple bends the wall, flat ones are twice as exact
         steps: load steps
     """
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), analysis=ddg.Statics(load_steps=steps))
@@ -62,9 +62,9 @@ def compliance(model) -> float:
 
 
 def check(result) -> list[ddg.Check]:
-    """Compliance at rest, to 7 % at 12 cells: the error of a point force falls with the size of the cells under it."""
+    """Compliance at rest, to 4 % at 12 cells: the error of a point force falls with the size of the cells under it."""
     name = "w E h / P at rest"
-    return [ddg.Check(name, compliance(result.model), LINEAR, 0.07, SOURCE, relative=True)]
+    return [ddg.Check(name, compliance(result.model), LINEAR, 0.04, SOURCE, relative=True)]
 
 
 def benchmark() -> ddg.bench.Study:

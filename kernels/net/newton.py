@@ -108,7 +108,7 @@ def search_kernels(real, linear):
                 eta = wp.clamp(real(0.9) * square[w] / before, tightest, loosest)
             enough = rtol * load_scale[w] / worst[w]
             goal[w] = wp.where(spare * enough >= eta, spare * rtol * load_scale[w], real(wp.static(math.inf)))
-            eta = wp.clamp(enough, eta, loosest)
+            eta = wp.max(eta, wp.min(enough, real(0.5)))
             if polish:
                 eta = wp.min(eta, real(wp.static(POLISH)))
             forcing[w] = linear(eta)
