@@ -192,18 +192,18 @@ def element_sets(shell: NetMeridian) -> list[ElementSet]:
     n, material = len(shell.points), shell.material
     k, R = np.arange(n), shell.node_radius
     nu = material.poisson
-    viscosity = [np.array(material.viscosity)] if material.viscosity > 0.0 else []
-    damped = "_damped" if viscosity else ""
+    viscosity = {"viscosity": material.viscosity} if material.viscosity > 0.0 else {}
     stretch = material.young * shell.thickness / (1.0 - nu**2)
     bend = stretch * shell.thickness**2 / 12.0
 
     def law(area, stiffness, poisson, metric, rest):
         zero = np.zeros(len(area))
-        return [area, stiffness, poisson + zero, metric[0], zero, metric[1], rest[0], zero, rest[1], *viscosity]
+        shape = {"metric": [metric[0], zero, metric[1]], "rest": [rest[0], zero, rest[1]]}
+        return {"measure": area, "stiffness": stiffness, "poisson": poisson + zero, **shape, **viscosity}
 
     def make(name, nodes, data, parameters, *normals):
-        none = np.zeros((len(nodes), 0), int)
-        return ElementSet(AXISYMMETRIC[name + damped], nodes, none, data, parameters, *normals)
+        term, none = AXISYMMETRIC[name].damped(bool(viscosity)), np.zeros((len(nodes), 0), int)
+        return ElementSet(term, nodes, none, data, term.bind(**parameters), *normals)
 
     metric = np.stack([shell.length**2, shell.radius**2])
     sets = [

@@ -41,7 +41,7 @@ class ChainTangent:
             self._energies.zero_()
             self._launch(state, i, 0, self._energies)
             values = arrays.download(self._energies).astype(np.float64)
-            yield term.name.removesuffix("_damped"), values.T.reshape(self.group.worlds, -1)
+            yield term.name, values.T.reshape(self.group.worlds, -1)
 
     def gradient(self, state) -> np.ndarray:
         result = np.zeros(self.size)
@@ -224,7 +224,7 @@ class ChainTangent:
         wp.launch(
             kernel,
             grid,
-            [data.x, data.theta, data.frame, data.last, group.still, group.buffer, group.table, group.count],
+            [data.x, data.theta, data.frame, data.last, group.still, *group.parameters.arrays, group.count],
             [out],
             device=self.model.wp_device,
         )

@@ -37,7 +37,7 @@ class Piece:
     mass: np.ndarray
     rotary: np.ndarray
     length: np.ndarray
-    parameters: list[np.ndarray]
+    parameters: dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class ChainGroup:
         fixed: bits of the held components of a node; the bit after the components is the angle (n, R).
         length: of the rod (R,) [m].
         load: force on nodes (n, R, dim) [N]; load_angle: twisting moment on edges (n, R) [N m]; None without constant loads.
-        parameters: rows of all terms, each broadcastable to (n, R).
+        parameters: of all terms, "term.parameter", each broadcastable to (n, R).
         moving_nodes: arrays (., 5) of (node, rod, motion of each of three components, -1 for none); every node in one row.
         moving_edges: arrays (., 3) of (edge, rod, motion).
         timed_loads: loads with an amplitude, and couples.
@@ -92,7 +92,7 @@ class ChainGroup:
     rotary: np.ndarray
     fixed: np.ndarray
     length: np.ndarray
-    parameters: list[np.ndarray]
+    parameters: dict[str, np.ndarray]
     load: np.ndarray
     load_angle: np.ndarray
     loaded: bool = False
@@ -128,7 +128,7 @@ def compile_chains(scene: Scene) -> tuple[list[ChainGroup], list[list[Held]]]:
         )
     ghosts, joined = Ghosts(scene), net_rods(scene)
     pieces = [piece for batch in scene.batches for piece in pieces_of(scene, batch, ghosts, ~joined)]
-    pieces.sort(key=lambda piece: (repr(piece.kind), piece.x.shape[1]))
+    pieces.sort(key=lambda piece: (*piece.kind.key, piece.x.shape[1]))
     groups: list[list[Piece]] = []
     for piece in pieces:
         last = groups[-1] if groups else None
@@ -215,8 +215,8 @@ def _kind(dimension: int, batch: RodBatch) -> ChainKind:
     names = [f"{prefix}_stretch"]
     if batch.bend:
         names.insert(0, f"{prefix}_bend_twist" if batch.twist else f"{prefix}_bend")
-    suffix = "_damped" if np.any(np.asarray(batch.section.viscosity) > 0.0) else ""
-    return ChainKind(dimension, batch.twist, batch.closed, tuple(REGISTRY[name + suffix] for name in names))
+    viscous = bool(np.any(np.asarray(batch.section.viscosity) > 0.0))
+    return ChainKind(dimension, batch.twist, batch.closed, tuple(REGISTRY[name].damped(viscous) for name in names))
 
 
 def _piece(dimension: int, batch: RodBatch, rows: np.ndarray, outside: Ghosts) -> Piece:
@@ -280,7 +280,7 @@ def _piece(dimension: int, batch: RodBatch, rows: np.ndarray, outside: Ghosts) -
         value = on_edges(value)
         return value if value.shape == (1, 1) else 0.5 * sum(geometry.ahead(value, batch.closed))
 
-    parameters = []
+    parameters = {}
     for term in kind.terms:
         stretch = term.measure.span == 1
         if stretch:
@@ -288,9 +288,9 @@ def _piece(dimension: int, batch: RodBatch, rows: np.ndarray, outside: Ghosts) -
         else:
             stiffness = [on_vertices(value) for value in _bending(section, kind)]
             rest, weight, spread = natural, voronoi, on_vertices(section.viscosity)
-        parameters += [_compress(weight), *stiffness, *(_compress(value) for value in rest)]
-        if term.density.lagged:
-            parameters += [value * spread for value in stiffness]
+        viscosity = {"viscosity": spread} if term.density.lagged else {}
+        values = term.bind(measure=weight, stiffness=stiffness, rest=rest, **viscosity)
+        parameters |= {f"{term.name}.{name}": _compress(value) for name, value in values.items()}
     keep = [0, 2] if dimension == 2 else [0, 1, 2]
     return Piece(
         batch,
@@ -413,10 +413,10 @@ def _join(pieces: list[Piece]) -> ChainGroup:
         rotary=stack("rotary"),
         fixed=fixed,
         length=np.concatenate([piece.length for piece in pieces]),
-        parameters=[
-            _join_parameter([piece.parameters[i] for piece in pieces], pieces, n, total)
-            for i in range(len(pieces[0].parameters))
-        ],
+        parameters={
+            name: _join_parameter([piece.parameters[name] for piece in pieces], pieces, n, total)
+            for name in pieces[0].parameters
+        },
         load=np.zeros((n, total, kind.dim)),
         load_angle=np.zeros((n, total)),
     )

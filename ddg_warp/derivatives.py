@@ -41,12 +41,11 @@ TRAP = 2.0**-30
 
 def chain_of(term: Term, closed: bool) -> ChainKind:
     """The chain that a rod with this term is: bending first, then stretch, both damped or neither."""
-    suffix = "_damped" if term.density.lagged else ""
-    bending = term.name.removesuffix(suffix)
+    damped, bending = term.density.lagged, term.name
     if term.measure.span == 1:
         bending = "planar_bend" if term.measure.dim == 2 else "rod_bend_twist"
     stretch = "planar_stretch" if term.measure.dim == 2 else "rod_stretch"
-    terms = REGISTRY[bending + suffix], REGISTRY[stretch + suffix]
+    terms = tuple(REGISTRY[name].damped(damped) for name in (bending, stretch))
     return ChainKind(term.measure.dim, terms[0].measure.angles > 0, closed, terms)
 
 
@@ -213,7 +212,7 @@ def rest(case: Case) -> float:
     wp.launch(
         element.term_kernels(group.kind, group.kind.terms.index(case.term), case.real)[1],
         (group.elements, group.columns),
-        [data.x, data.theta, data.frame, data.last, still, group.buffer, group.table, group.count],
+        [data.x, data.theta, data.frame, data.last, still, *group.parameters.arrays, group.count],
         [out],
         device=case.device,
     )

@@ -16,7 +16,7 @@ class ElementSet:
         nodes: node of each place in the stencil (E, n) int.
         angles: angle of each place (E, a) int, counted by whoever makes the elements; of a surface, its edges.
         data: constant data as the measure's s (E, d) float.
-        parameters: rest measure first, then those of the density in its order, each broadcastable to (E,).
+        parameters: by name, as `Term.bind` gives them, each broadcastable to (E,).
         normals: (element, first of three columns of its data, mesh edge) of every normal among the data that a support of that
             edge gives (n, 3) int.
     """
@@ -25,7 +25,7 @@ class ElementSet:
     nodes: np.ndarray
     angles: np.ndarray
     data: np.ndarray
-    parameters: list[np.ndarray]
+    parameters: dict[str, np.ndarray]
     normals: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), int))
 
     def __post_init__(self):
@@ -35,11 +35,11 @@ class ElementSet:
         for name, size in expected.items():
             if getattr(self, name).shape != (count, size):
                 raise ValueError(f"{self.term.name}: {name} {getattr(self, name).shape}; it takes {(count, size)}")
-        if len(self.parameters) != len(self.term.parameter_names):
+        if tuple(self.parameters) != self.term.parameter_names:
             raise ValueError(
-                f"{self.term.name}: {len(self.parameters)} parameters; it takes {self.term.parameter_names}"
+                f"{self.term.name}: parameters {list(self.parameters)}; it takes {self.term.parameter_names}"
             )
-        for name, values in zip(self.term.parameter_names, self.parameters, strict=True):
+        for name, values in self.parameters.items():
             if np.shape(values) not in ((), (1,), (count,)):
                 raise ValueError(f"{self.term.name}: {name} has shape {np.shape(values)}; one number or {count}")
 

@@ -97,9 +97,8 @@ def _elements(model, state) -> Iterator[tuple]:
         row[k, column] = index
         for term, place in zip(group.kind.terms, group.kind.places(), strict=True):
             n, span = len(term.measure.strains), term.measure.span
-            along = [
-                np.broadcast_to(group.parameter(place[0] + 1 + i), (group.nodes, group.columns)) for i in range(2 * n)
-            ]
+            names = (f"{term.name}.{name}" for name in (*term.stiffness, *term.rest))
+            along = [np.broadcast_to(group.parameters[name], (group.nodes, group.columns)) for name in names]
             law = np.stack(along, -1).reshape(group.nodes, group.worlds, group.rods, 2 * n)
             for rod in range(group.rods):
                 count = int(group.host.count[rod])
@@ -114,7 +113,8 @@ def _elements(model, state) -> Iterator[tuple]:
             continue
         n, span = len(term.measure.strains), term.measure.span
         strain, stress = (np.moveaxis(values, 0, -1) for values in net_strains(model.net, state, index))
-        law = np.stack([np.broadcast_to(p, strain.shape[:2]) for p in part.parameters[1 : 2 * n + 1]], -1)
+        law = [np.broadcast_to(part.parameters[name], strain.shape[:2]) for name in (*term.stiffness, *term.rest)]
+        law = np.stack(law, -1)
         rods = {rod.rod: rod for rod in model.net.host.rods}
         owner, k = part.host.owner
         first, own, every = (

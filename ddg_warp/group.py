@@ -7,10 +7,14 @@ import warp as wp
 
 from ddg_warp import arrays, precision
 from ddg_warp.chains import ChainGroup
+from ddg_warp.parameters import ParameterTable
 
 
 class Group:
-    """Constant device arrays of one group of rods, all worlds side by side (columns world * R + rod)."""
+    """Constant device arrays of one group of rods, all worlds side by side (columns world * R + rod).
+
+    `parameters` are "term.parameter" of all terms, broadcastable to (node, column).
+    """
 
     def __init__(self, host: ChainGroup, scene, worlds: int, device, real):
         kind = replace(host.kind, serial=wp.get_device(device).is_cpu)
@@ -44,21 +48,11 @@ class Group:
         self.gravity = wp.array(self.gravity_host[None], dtype=vector, device=device)
         self.outer = put(_outer_forces(host, self.gravity_host), real)
         self.moving = Moving(host, worlds, self.rods, device, real) if host.moving_nodes or host.moving_edges else None
-        self._parameters = [np.tile(p, (1, worlds)) if p.shape[1] > 1 else p for p in host.parameters]
-        self.upload_parameters(real)
+        tiled = {name: np.tile(p, (1, worlds)) if p.shape[1] > 1 else p for name, p in host.parameters.items()}
+        self.parameters = ParameterTable(tiled, 0, real, device)
 
-    def upload_parameters(self, real) -> None:
-        """One buffer with all parameters, and the table (offset, stride along the rod, stride across rods) of its rows."""
-        offset, table = 0, []
-        for values in self._parameters:
-            along, across = values.shape
-            table.append((offset, across if along > 1 else 0, 1 if across > 1 else 0))
-            offset += values.size
-        self.buffer = wp.array(np.concatenate([p.ravel() for p in self._parameters]), dtype=real, device=self.device)
-        self.table = wp.array(np.array(table, np.int32), dtype=int, device=self.device)
-
-    def set_parameter(self, row: int, values: np.ndarray, name: str) -> None:
-        """Replace a row by values of shape (), (worlds,), (elements,) or (worlds, elements)."""
+    def set_parameter(self, name: str, values: np.ndarray) -> None:
+        """Replace "term.parameter" by values of shape (), (worlds,), (elements,) or (worlds, elements)."""
         elements = self.nodes
         if values.ndim == 0:
             new = values.reshape(1, 1)
@@ -77,17 +71,13 @@ class Group:
                 )
             along = np.pad(along, ((0, 0), (0, elements - along.shape[1])), mode="edge")
             new = np.repeat(np.broadcast_to(along, (self.worlds, elements)), self.rods, axis=0).T
-        self._parameters[row] = np.ascontiguousarray(new)
-        self.upload_parameters(self.buffer.dtype)
+        self.parameters.set(**{name: new})
 
     def float32_errors(self, s: float) -> np.ndarray:
         """What float32 makes of every rod over a step of s [s]; see `precision.float32_errors`."""
-        host, rows = self.host, [row[:, : self.rods] for row in self._parameters]
-        return precision.float32_errors(self.kind, host.mass.sum(0) / host.count, host.length, rows, s)
-
-    def parameter(self, row: int) -> np.ndarray:
-        """Row of the parameter table on the host, broadcastable to (node, column)."""
-        return self._parameters[row]
+        host = self.host
+        values = {name: array[:, : self.rods] for name, array in self.parameters.values.items()}
+        return precision.float32_errors(self.kind, host.mass.sum(0) / host.count, host.length, values, s)
 
 
 class Moving:

@@ -186,7 +186,7 @@ def stresses(model, state) -> dict[str, list[np.ndarray]]:
         for term, place in zip(group.kind.terms, group.kind.places(), strict=True):
             rows = slice(place[3], place[3] + len(term.measure.strains))
             missing = 0 if group.kind.closed else term.measure.span
-            rods = result.setdefault(term.name.removesuffix("_damped"), [None] * model.scene.rod_count)
+            rods = result.setdefault(term.name, [None] * model.scene.rod_count)
             if term.measure.angles:
                 end_moments.of_group(group, data, values[rows])
             for column, rod in enumerate(group.host.rods):
@@ -232,13 +232,21 @@ def triangle_fields(model, state) -> dict[str, np.ndarray]:
             continue
         E, W = part.elements, net.worlds
         values, slope = net_strains(net, state, index)
-        change = np.moveaxis(values - np.stack([np.broadcast_to(p, (W, E)) for p in part.parameters[6:9]]), 0, -1)
-        metric = [np.broadcast_to(p, (W, E)).ravel() for p in part.parameters[3:6]]
+        change = np.moveaxis(
+            values - np.stack([np.broadcast_to(part.parameters[name], (W, E)) for name in part.term.rest]), 0, -1
+        )
+        metric = _metric(part, W)
         principal = _principal(change.reshape(-1, 3), metric).reshape(W, E)
         row = surfaces.first[part.host.owner[0]] + part.host.owner[1]
         fields["strain" if part.term.measure.tensions else "curvature"][:, row] = principal
         fields["energy"][:, row] += 0.5 * np.einsum("cwe,wec->we", slope, change)  # quadratic laws
     return fields
+
+
+def _metric(part, worlds: int) -> list[np.ndarray]:
+    """Components (11, 12, 22) of the rest metric of a set's elements, of all worlds one after the other."""
+    names = [parameter.name for parameter in part.term.parameters if parameter.family == "metric"]
+    return [np.broadcast_to(part.parameters[name], (worlds, part.elements)).ravel() for name in names]
 
 
 def _principal(covariant: np.ndarray, metric) -> np.ndarray:
@@ -254,19 +262,19 @@ def _principal(covariant: np.ndarray, metric) -> np.ndarray:
 def _add_net_stresses(model, state, index: int, result: dict[str, list]) -> None:
     """Stresses of a set of the net, rod by rod or shell by shell."""
     net, part, scene = model.net, model.net.sets[index], model.scene
-    term, E = part.term, part.elements
+    term = part.term
     values = net_strains(net, state, index)[1]
     if term.measure.angles and term.name not in SHELLS:
         end_moments.of_net(net, state.net, index, values)
     values = np.moveaxis(values, 0, -1)
     if term.density.coupled:
-        metric = [np.broadcast_to(p, (net.worlds, E)).ravel() for p in part.parameters[3:6]]
+        metric = _metric(part, net.worlds)
         values = _resultants(values.reshape(-1, values.shape[-1]), metric).reshape(values.shape)
     of_shells = (
         scene.shells if term.name in SHELLS else scene.axisymmetric_shells if term.name in AXISYMMETRIC else None
     )
     count = scene.rod_count if of_shells is None else len(of_shells)
-    owners = result.setdefault(term.name.removesuffix("_damped"), [None] * count)
+    owners = result.setdefault(term.name, [None] * count)
     for owner in np.unique(part.host.owner[0]):
         owners[owner] = _each_world(values[:, part.host.owner[0] == owner])
 
@@ -319,16 +327,16 @@ def total_twist(model, state, rod: int = 0) -> float | np.ndarray:
         (column,) = np.nonzero(group.host.rods == rod)
         if column.size and group.kind.twist:
             index, column = next(i for i, term in enumerate(group.kind.terms) if term.measure.angles), column[0]
-            parameter, _, _, row = group.kind.places()[index]
+            row, measure = group.kind.places()[index][3], group.parameters[f"{group.kind.terms[index].name}.measure"]
             values = group_strains(model, group, data)[0][row + TWIST, :, :, column]
-            weight = np.broadcast_to(group.parameter(parameter), (group.nodes, group.columns))[:, column :: group.rods]
+            weight = np.broadcast_to(measure, (group.nodes, group.columns))[:, column :: group.rods]
             vertices = group.host.count[column] - (0 if group.kind.closed else 2)
             turns += (values * weight)[:vertices].sum(0)
             found = True
     for index, part in enumerate(model.net.sets if model.net is not None else ()):
         of_rod = part.host.owner[0] == rod
         if part.term.measure.angles and part.term.name not in SHELLS and of_rod.any():
-            weight = np.broadcast_to(part.parameters[0], (model.worlds, part.elements))
+            weight = np.broadcast_to(part.parameters["measure"], (model.worlds, part.elements))
             turns += (net_strains(model.net, state, index)[0][TWIST] * weight)[:, of_rod].sum(1)
             found = True
     if not found or model.scene.dimension == 2:

@@ -11,7 +11,6 @@ from ddg_warp.errors import SceneError
 from ddg_warp.group import Group
 from ddg_warp.io import Curves, Surfaces
 from ddg_warp.kernels import element, outcome, step
-from ddg_warp.kernels.densities import valid
 from ddg_warp.precision import choose, warn_of_rounding
 from ddg_warp.state import GroupState, State
 from ddg_warp.threads import launches
@@ -177,16 +176,18 @@ class Model:
         Raises:
             ValueError: nothing has the term, the term has no such parameter, or the shape or a value is wrong; nothing is changed.
         """
-        terms = {t.name: t for group in self.groups for t in group.kind.terms}
-        terms |= {part.term.name: part.term for part in (self.net.sets if self.net is not None else ())}
+        parts = self.net.sets if self.net is not None else ()
+        terms: dict[str, dict] = {}
+        for own in (*(t for group in self.groups for t in group.kind.terms), *(part.term for part in parts)):
+            terms.setdefault(own.name, {}).update({known.name: known for known in own.parameters})
         if not isinstance(term, str) or term not in terms:
             raise ValueError(
                 f"set_parameter: no rod or shell has the term {term!r}; this model has {', '.join(sorted(terms))}"
             )
-        names = terms[term].parameter_names
-        if not isinstance(parameter, str) or parameter not in names:
-            raise ValueError(f"set_parameter: {term} has no parameter {parameter!r}; it has {', '.join(names)}")
-        row, name, (rule, holds) = names.index(parameter), f"{term}.{parameter}", valid(parameter)
+        known = terms[term]
+        if not isinstance(parameter, str) or parameter not in known:
+            raise ValueError(f"set_parameter: {term} has no parameter {parameter!r}; it has {', '.join(known)}")
+        name, (rule, holds) = f"{term}.{parameter}", known[parameter].valid
         try:
             values = np.array(values, float)
         except (TypeError, ValueError):
@@ -195,12 +196,11 @@ class Model:
         if bad.size:
             raise ValueError(f"{name}: value {bad[0]} is {values.ravel()[bad[0]]:g}; it is finite and {rule}")
         for group in self.groups:
-            for candidate, place in zip(group.kind.terms, group.kind.places(), strict=True):
-                if candidate.name == term:
-                    group.set_parameter(place[0] + row, values, name)
-        for part in self.net.sets if self.net is not None else ():
-            if part.term.name == term:
-                part.set_parameter(row, values, name)
+            if name in group.parameters.values:
+                group.set_parameter(name, values)
+        for part in parts:
+            if part.term.name == term and parameter in part.parameters.values:
+                part.set_parameter(parameter, values)
         self.version += 1
 
     def set_rest(self, shell: int, *, points=None, metric=None, curvature=None, angle=None) -> None:
@@ -227,12 +227,11 @@ class Model:
         """Parameters of all terms by name, `group/term/parameter`, broadcastable to (node, column of the group)."""
         result = {}
         for i, group in enumerate(self.groups):
-            for term, place in zip(group.kind.terms, group.kind.places(), strict=True):
-                for j, name in enumerate(term.parameter_names):
-                    result[f"{i}/{term.name}/{name}"] = group.parameter(place[0] + j)
+            for name, values in group.parameters.values.items():
+                result[f"{i}/{name.replace('.', '/')}"] = values
             result |= {f"{i}/mass": group.host.mass, f"{i}/rotary_inertia": group.host.rotary}
         for part in self.net.sets if self.net is not None else ():
-            for name, values in zip(part.term.parameter_names, part.parameters, strict=True):
+            for name, values in part.parameters.values.items():
                 result[f"net/{part.term.name}/{name}"] = values
         return result
 
@@ -397,7 +396,7 @@ class Model:
         wp.launch(
             element.strain_kernel(group.kind, self.types.real),
             (group.elements, group.columns),
-            [data.x, data.theta, data.frame, data.last, group.still, group.buffer, group.table, group.count]
+            [data.x, data.theta, data.frame, data.last, group.still, *group.parameters.arrays, group.count]
             + [int(stress is not None)],
             [out, out if stress is None else stress],
             device=self.wp_device,

@@ -58,7 +58,7 @@ class NetSet:
     slots: np.ndarray
     lag: np.ndarray
     data: np.ndarray
-    parameters: list[np.ndarray]
+    parameters: dict[str, np.ndarray]
     owner: np.ndarray
     normals: np.ndarray = field(default_factory=lambda: np.zeros((3, 0), int))
 
@@ -155,7 +155,7 @@ class Net:
         """What float32 makes of every rod over a step of s [s] (rods,); see `precision.float32_errors`."""
         pieces = {id(rod.piece): rod.piece for rod in self.rods}
         errors = {
-            key: float32_errors(p.kind, p.mass.mean(1), p.length, [v.T for v in p.parameters], s)
+            key: float32_errors(p.kind, p.mass.mean(1), p.length, {name: v.T for name, v in p.parameters.items()}, s)
             for key, p in pieces.items()
         }
         return np.array([errors[id(rod.piece)][rod.row] for rod in self.rods])

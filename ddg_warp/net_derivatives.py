@@ -182,11 +182,11 @@ class NetSample:
         if self.measure.name != "isometric_bending":
             return self
         buffer = self.data["buffer"].copy()
-        for row, name in enumerate(self.term.parameter_names):
-            if name.startswith("rest"):
+        for row, parameter in enumerate(self.term.parameters):
+            if parameter.family == "rest":
                 buffer[row] = 0.0
-            elif name != "measure":
-                buffer[row] = buffer[self.term.parameter_names.index(name[:-1] + "1")]
+            elif parameter.number:
+                buffer[row] = buffer[self.term.parameter_names.index(f"{parameter.family}_1")]
         return NetSample(self.term, self.device, self.exact_in_float32, {**self.data, "buffer": buffer})
 
     def _inputs(self, real, requires_grad: bool = False, **changed) -> list:
@@ -253,15 +253,12 @@ def _random_state(sample: NetSample) -> dict[str, np.ndarray]:
         data["frame"] = frames[0]
         data["lag"] = np.concatenate([frames[1], 6.0 * random.normal(size=(1, ELEMENTS))])
     data["constants"] = constants
-    names = sample.term.parameter_names
-    rows = {name: random.uniform(0.6, 1.4, size=ELEMENTS) for name in names}
-    for name in names:
-        if name.startswith("rest"):
-            rows[name] = 0.4 * random.normal(size=ELEMENTS)
-        if name == "poisson":
-            rows[name] = random.uniform(0.1, 0.4, size=ELEMENTS)
-        if name == "metric_12":
-            rows[name] = random.uniform(0.1, 0.3, size=ELEMENTS)
+    rows = {name: random.uniform(0.6, 1.4, size=ELEMENTS) for name in sample.term.parameter_names}
+    for name in sample.term.rest:
+        rows[name] = 0.4 * random.normal(size=ELEMENTS)
+    for name, low, high in (("poisson", 0.1, 0.4), ("metric_12", 0.1, 0.3)):
+        if name in rows:
+            rows[name] = random.uniform(low, high, size=ELEMENTS)
     data["buffer"] = np.array(list(rows.values()))
     if sample.term.density.lagged:
         data["last"] = 0.4 * random.normal(size=(len(measure.strains), ELEMENTS))
@@ -373,11 +370,10 @@ def definite(case: NetCase) -> float:
 
 
 def rest(case: NetCase) -> float:
-    sample, names = case.sample, case.term.parameter_names
+    sample = case.sample
     strain = sample.strains()[0]
     buffer = sample.data["buffer"].copy()
-    first = min(row for row, name in enumerate(names) if name.startswith("rest"))
-    buffer[first : first + len(strain)] = strain
+    buffer[[case.term.parameter_names.index(name) for name in case.term.rest]] = strain
     last = strain if case.term.density.lagged else sample.data["last"]
     size = np.abs(sample.gradient()).max()
     return float(np.abs(sample.gradient(case.real, buffer=buffer, last=last)).max() / size)

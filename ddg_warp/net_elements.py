@@ -49,16 +49,15 @@ def _rod_sets(net: Net, joints) -> list[NetSet]:
     for rod in net.rods:
         piece, row = rod.piece, rod.row
         kind, nodes, n = piece.kind, rod.all_nodes, len(rod.all_nodes)
-        at = 0
         for term in kind.terms:
-            span, size = term.measure.span, len(term.parameter_names)
+            span = term.measure.span
             count = n if kind.closed else n - span
             k = np.arange(count)
-            values = [_row(p, row, count) for p in piece.parameters[at : at + size]]
-            at += size
             if span == 2:
-                keep = np.array([(rod.rod, nodes[(i + 1) % n]) not in skipped for i in k], bool)
-                k, values = k[keep], [value[keep] for value in values]
+                k = k[np.array([(rod.rod, nodes[(i + 1) % n]) not in skipped for i in k], bool)]
+            values = {
+                name: _row(piece.parameters[f"{term.name}.{name}"], row, count)[k] for name in term.parameter_names
+            }
             slots = [nodes[(k + i) % n] for i in range(span + 1)]
             lag = np.zeros((0, len(k)))
             if term.measure.angles:
@@ -107,7 +106,7 @@ def _joint_sets(net: Net, joints) -> list[NetSet]:
             else:
                 rest = _natural_at(piece, row, k if sign > 0 else k + 1) * [1.0, sign, 1.0]
             lag = np.concatenate([director, sign * tangent, [twist]])[:, None]
-            parameters = [np.array([value]) for value in (half, *stiffness, *rest)]
+            parameters = JOINT.bind(measure=[[half]], stiffness=[[v] for v in stiffness], rest=[[v] for v in rest])
             slots = np.array([[node], [other], [rod.all_edges[k]], [spin]])
             sets.append(NetSet(JOINT, slots, lag, np.array([[sign]]), parameters, np.array([[rod.rod], [k]])))
     return sets
@@ -115,16 +114,12 @@ def _joint_sets(net: Net, joints) -> list[NetSet]:
 
 def _natural_at(piece: Piece, row: int, node: int) -> np.ndarray:
     """Natural curvatures and twist of the rod's bending term at a node, at an end those of the vertex next to it [1/m]."""
-    at = 0
     for term in piece.kind.terms:
-        names = term.parameter_names
         if term.measure.angles:
-            values = piece.parameters[at : at + len(names)]
-            rest = [value for name, value in zip(names, values, strict=True) if name.startswith("rest")]
+            rest = [piece.parameters[f"{term.name}.{name}"] for name in term.rest]
             vertices = len(piece.x[row]) - (0 if piece.kind.closed else 2)
             vertex = (node - 1) % vertices if piece.kind.closed else min(max(node - 1, 0), vertices - 1)
             return np.array([_row(value, row, vertices)[vertex] for value in rest])
-        at += len(names)
     raise AssertionError("a rod of a rigid joint has a bending term")
 
 
@@ -166,19 +161,26 @@ def _meridian_sets(net: Net, scene) -> list[NetSet]:
 def _bound(elements: ElementSet, nodes: np.ndarray, edges: np.ndarray, index: int) -> NetSet:
     count = len(elements.nodes)
     slots = np.concatenate([nodes[elements.nodes], edges[elements.angles]], axis=1).T
-    parameters = [np.broadcast_to(np.asarray(p, float), (count,)) for p in elements.parameters]
+    parameters = {name: np.broadcast_to(p, (count,)) for name, p in elements.parameters.items()}
     owner = np.array([np.full(count, index), np.arange(count)])
     return NetSet(elements.term, slots, np.zeros((0, count)), elements.data.T, parameters, owner)
 
 
 def _gather_sets(sets: list[NetSet]) -> list[NetSet]:
-    """One set a term."""
+    """One set a term; damped where one of its parts is."""
     result = []
     for name in dict.fromkeys(s.term.name for s in sets if len(s)):
         same = [s for s in sets if s.term.name == name and len(s)]
+        term = next((s.term for s in same if s.term.density.lagged), same[0].term)
         join = [np.concatenate([getattr(s, what) for s in same], axis=1) for what in ("slots", "lag", "data", "owner")]
-        parameters = [np.concatenate(values) for values in zip(*(s.parameters for s in same), strict=True)]
+        still = [np.zeros(len(s)) for s in same]
+        parameters = {
+            known.name: np.concatenate(
+                [s.parameters.get(known.name, zero) for s, zero in zip(same, still, strict=True)]
+            )
+            for known in term.parameters
+        }
         first = np.cumsum([0] + [len(s) for s in same])
         normals = [s.normals + [[at], [0], [0]] for s, at in zip(same, first, strict=False)]
-        result.append(NetSet(same[0].term, *join[:3], parameters, join[3], np.concatenate(normals, axis=1)))
+        result.append(NetSet(term, *join[:3], parameters, join[3], np.concatenate(normals, axis=1)))
     return result

@@ -7,6 +7,7 @@ import warp as wp
 
 from ddg_warp.kernels.net import elements, frames
 from ddg_warp.net import Net
+from ddg_warp.parameters import ParameterTable
 
 
 @dataclass
@@ -48,8 +49,8 @@ class DeviceSet:
         self.slots = wp.array(np.ascontiguousarray(host.slots, np.int32), dtype=int, device=device)
         data = host.data if host.data.size else np.zeros((1, 1))
         self.data = wp.array(np.ascontiguousarray(data), dtype=real, device=device)
-        self.parameters = [_short(np.asarray(p, float))[None] for p in host.parameters]
-        self.upload(real)
+        short = {name: _short(np.asarray(p, float))[None] for name, p in host.parameters.items()}
+        self.parameters, self._real = ParameterTable(short, 1, real, device), real
         self.turning = np.array([*host.normals[:2], motions[host.normals[2]]]).T
         self.turning = self.turning[self.turning[:, 2] >= 0]
         element, row, _ = self.turning.T
@@ -57,20 +58,10 @@ class DeviceSet:
 
     def own_data(self) -> wp.array:
         """Data of every world (rows, W E) at rest."""
-        return wp.array(np.tile(self.host.data, (1, self.worlds)), dtype=self.buffer.dtype, device=self.device)
+        return wp.array(np.tile(self.host.data, (1, self.worlds)), dtype=self._real, device=self.device)
 
-    def upload(self, real) -> None:
-        """Parameters (1 or worlds, 1 or elements) to one buffer with its table."""
-        offset, table = 0, []
-        for values in self.parameters:
-            across, along = values.shape
-            table.append((offset, 1 if along > 1 else 0, along if across > 1 else 0))
-            offset += values.size
-        self.buffer = wp.array(np.concatenate([p.ravel() for p in self.parameters]), dtype=real, device=self.device)
-        self.table = wp.array(np.array(table, np.int32), dtype=int, device=self.device)
-
-    def set_parameter(self, row: int, values: np.ndarray, name: str) -> None:
-        """Replace a row by values of shape (), (worlds,), (elements,) or (worlds, elements)."""
+    def set_parameter(self, name: str, values: np.ndarray) -> None:
+        """Replace a parameter by values of shape (), (worlds,), (elements,) or (worlds, elements)."""
         if values.ndim == 0:
             new = values.reshape(1, 1)
         elif values.shape == (self.worlds,) and self.worlds > 1:
@@ -79,27 +70,25 @@ class DeviceSet:
             new = np.atleast_2d(values)
         else:
             raise ValueError(
-                f"{name} has shape {values.shape}; give one number, ({self.worlds},), ({self.elements},) or "
+                f"{self.term.name}.{name} has shape {values.shape}; give one number, ({self.worlds},), ({self.elements},) or "
                 f"({self.worlds}, {self.elements})"
             )
-        self.parameters[row] = np.ascontiguousarray(new)
-        self.upload(self.buffer.dtype)
+        self.parameters.set(**{name: new})
 
-    def set_rest(self, first: int, parameters: list) -> None:
-        """Replace the rest measure, metric and strains of the elements from `first` on, in every world; stiffness stays.
+    def set_rest(self, first: int, parameters: dict[str, np.ndarray]) -> None:
+        """Replace what of the elements from `first` on belongs to their rest shape, in every world; stiffness stays.
 
         Args:
             first: element.
-            parameters: all parameters of the term in their order, each one number or one an element.
+            parameters: all parameters of the term by name, each one number or one an element.
         """
-        count = max(np.size(values) for values in parameters)
-        for row, (name, values) in enumerate(zip(self.term.parameter_names, parameters, strict=True)):
-            if not name.startswith(("measure", "metric", "rest")):
-                continue
-            full = np.repeat(self.parameters[row], self.elements // self.parameters[row].shape[1], axis=1)
-            full[:, first : first + count] = values
-            self.parameters[row] = full if len(full) > 1 else _short(full[0])[None]
-        self.upload(self.buffer.dtype)
+        count, changed = max(np.size(values) for values in parameters.values()), {}
+        for name in (parameter.name for parameter in self.term.parameters if parameter.rest):
+            now = self.parameters[name]
+            full = np.repeat(now, self.elements // now.shape[1], axis=1)
+            full[:, first : first + count] = parameters[name]
+            changed[name] = full if len(full) > 1 else _short(full[0])[None]
+        self.parameters.set(**changed)
 
 
 class DeviceNet:
@@ -156,8 +145,7 @@ class DeviceNet:
             state.lag[index],
             state.last[index],
             self.still if rate is None else rate,
-            part.buffer,
-            part.table,
+            *part.parameters.arrays,
             part.slots,
             state.data.get(index, part.data),
             self.blocks,

@@ -51,7 +51,7 @@ class NetTangent:
             out = wp.zeros(part.elements * self.net.worlds, dtype=self.net.real, device=self.net.device)
             self._launch(state, i, 0, out, ())
             values = out.numpy().astype(np.float64)
-            yield part.term.name.removesuffix("_damped"), values.reshape(self.net.worlds, -1)
+            yield part.term.name, values.reshape(self.net.worlds, -1)
 
     def gradient(self, state) -> np.ndarray:
         result = np.zeros((self.size // 3, 3))

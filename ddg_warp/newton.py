@@ -122,10 +122,9 @@ class ChainNewton:
 
     def automatic_psd(self) -> str:
         """The mode of `NewtonOptions.psd` that suits the rods: Gauss-Newton lacks what a natural curvature does to their roll."""
-        places = zip(self.group.kind.terms, self.group.kind.places(), strict=True)
-        bending = [(term, at[0]) for term, at in places if term.measure.span == 2]
-        names = [(at + i) for term, at in bending for i, name in enumerate(term.parameter_names) if "rest" in name]
-        return "progressive" if any(self.group.parameter(row).any() for row in names) else "gauss_newton"
+        group = self.group
+        rest = [f"{term.name}.{name}" for term in group.kind.terms if term.measure.span == 2 for name in term.rest]
+        return "progressive" if any(group.parameters[name].any() for name in rest) else "gauss_newton"
 
     @property
     def kernels(self) -> list:
@@ -167,7 +166,7 @@ class ChainNewton:
         wp.launch(
             self._evaluate,
             group.element_threads,
-            [self.x, self.theta, self.frame, last, self.rate, group.buffer, group.table, group.count]
+            [self.x, self.theta, self.frame, last, self.rate, *group.parameters.arrays, group.count]
             + [self.status, self.slot, self.without_compression, self.iteration, int(self.reuse)],
             [self.factor, self.geometric, self.gradient, self.energy, self.stiffness, self.turned, self.active],
             device=self.device,

@@ -48,7 +48,7 @@ FLOAT32_LIMIT = (
 FLOAT32_LOST = 0.1  # and beyond this one its motion is that of its rounding, not of the scene
 
 
-def float32_errors(kind, mass: np.ndarray, length: np.ndarray, parameters: list[np.ndarray], s: float) -> np.ndarray:
+def float32_errors(kind, mass: np.ndarray, length: np.ndarray, parameters: dict, s: float) -> np.ndarray:
     """Estimate of the relative error that a float32 solution makes in the direction of rods of one kind (R,).
 
     The rounding unit times the ratio of the stiffest to the softest mode: stretching of an edge against inertia over the step
@@ -58,11 +58,12 @@ def float32_errors(kind, mass: np.ndarray, length: np.ndarray, parameters: list[
     Args:
         kind: `ChainKind` of the rods.
         mass: mean of their nodes (R,) [kg]; length: (R,) [m].
-        parameters: rows of all terms, each broadcastable to (n, R).
+        parameters: of all terms, "term.parameter", each broadcastable to (n, R).
     """
     softest = mass / s**2
-    for term, place in zip(kind.terms, kind.places(), strict=True):
-        measure, stiffness = parameters[place[0] : place[0] + 2]
+    for term in kind.terms:
+        measure = parameters[f"{term.name}.measure"]
+        stiffness = parameters[f"{term.name}.{term.stiffness[0]}"]
         if term.measure.span == 1:
             stiffest = (stiffness / measure).max(0)
         else:

@@ -154,9 +154,11 @@ class Sample:
         buffer = self.data["buffer"].copy()
         for term, (first, *_) in zip(self.kind.terms, self.kind.places(), strict=True):
             if is_vector(term):
-                rows = buffer[first + 1 : first + len(term.parameter_names)].reshape(-1, 3, *self.shape)
-                rows[:] = rows[:, :1]
-                rows[1] = 0.0
+                stiffness, rest = (
+                    [first + term.parameter_names.index(name) for name in names]
+                    for names in (term.stiffness, term.rest)
+                )
+                buffer[stiffness], buffer[rest] = buffer[stiffness[0]], 0.0
         data = {**self.data, "buffer": buffer}
         return Sample(self.kind, self.device, self.exact_in_float32, data)
 
@@ -246,9 +248,9 @@ def _random_state(sample: Sample) -> dict[str, np.ndarray]:
     rows, last = [], []
     for term in kind.terms:
         about = 1.0 if term.measure.span == 1 else 0.0  # a stretch is 1 at rest
-        for name in term.parameter_names:
+        for parameter in term.parameters:
             value = random.uniform(0.6, 1.4, size=(n, rods))
-            rows.append(about + 0.4 * random.normal(size=(n, rods)) if name.startswith("rest") else value)
+            rows.append(about + 0.4 * random.normal(size=(n, rods)) if parameter.family == "rest" else value)
         last += [about + 0.4 * random.normal(size=(n, rods)) for _ in term.measure.strains]
     return {
         "x": x,

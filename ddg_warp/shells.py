@@ -145,17 +145,18 @@ def _refuse_folds(surface, angle: np.ndarray) -> None:
 def membrane(surface, plate: Plate) -> ElementSet:
     """Membrane of all triangles."""
     none = np.zeros((len(surface.triangles), 0))
-    law = _law(plate, plate.membrane_stiffness, 0.5 * plate.abar)
-    return ElementSet(_term("shell_stretch", plate), surface.triangles, none.astype(int), none, law)
+    term = _term("shell_stretch", plate)
+    law = _law(term, plate, plate.membrane_stiffness, 0.5 * plate.abar)
+    return ElementSet(term, surface.triangles, none.astype(int), none, law)
 
 
 def curved_membrane(surface, plate: Plate, kinds: EdgeKinds) -> ElementSet:
     """Membrane of all triangles with the lengths of arcs over their sides, by the mid-edge normals that turn."""
     b11, b12, b22 = plate.bbar.T
     squares = np.stack([b11**2, 0.5 * (b11**2 + b22**2 - (b11 + b22 - 2.0 * b12) ** 2), b22**2], -1)
-    law = _law(plate, plate.membrane_stiffness, 0.5 * (plate.abar + squares / 12.0))
-    bending = mid_edge_bending(surface, plate, kinds, True)
     term = _term("shell_stretch_curved", plate)
+    law = _law(term, plate, plate.membrane_stiffness, 0.5 * (plate.abar + squares / 12.0))
+    bending = mid_edge_bending(surface, plate, kinds, True)
     return ElementSet(term, bending.nodes, bending.angles, bending.data, law, bending.normals)
 
 
@@ -164,12 +165,13 @@ def mid_edge_bending(surface, plate: Plate, kinds: EdgeKinds, angles: bool) -> E
     kind, vector = kinds.of_triangles(surface)
     data = [kind, vector.reshape(-1, 9)] + ([surface.triangle_signs] if angles else [])
     supported, side = np.nonzero(kind >= CLAMPED)
+    term = _term("shell_bend_dof" if angles else "shell_bend", plate)
     return ElementSet(
-        _term("shell_bend_dof" if angles else "shell_bend", plate),
+        term,
         mid_edge_nodes(surface),
         surface.triangle_edges if angles else np.zeros((len(kind), 0), int),
         np.concatenate(data, axis=1).astype(float),
-        _law(plate, plate.bending_stiffness, plate.bbar),
+        _law(term, plate, plate.bending_stiffness, plate.bbar),
         np.column_stack([supported, 3 + 3 * side, surface.triangle_edges[supported, side]]),
     )
 
@@ -181,9 +183,9 @@ def hinge_bending(surface, plate: Plate, kinds: EdgeKinds) -> list[ElementSet]:
     edges, nodes = _hinges(surface, kinds)
     sides = surface.edge_triangles[edges]
     lengths = 0.5 * sum(_length_squared(surface, plate, edges, sides[:, i]) for i in range(2))
-    law = [lengths / (plate.area[sides].sum(1) / 3.0), *_quadratic(plate, sides, plate.angle[edges, 0], 1)]
-    none = np.zeros((len(edges), 0))
-    hinges = ElementSet(_term("shell_hinge", plate), nodes, none.astype(int), none, law)
+    term, none = _term("shell_hinge", plate), np.zeros((len(edges), 0))
+    law = _quadratic(term, lengths / (plate.area[sides].sum(1) / 3.0), plate, sides, plate.angle[edges, 0])
+    hinges = ElementSet(term, nodes, none.astype(int), none, law)
     supported = np.flatnonzero(kinds.kind >= CLAMPED)
     sets = [hinges]
     pairs = [(edge, side) for edge in supported for side in range(2) if surface.edge_triangles[edge, side] >= 0]
@@ -193,11 +195,12 @@ def hinge_bending(surface, plate: Plate, kinds: EdgeKinds) -> list[ElementSet]:
         ends = np.where(side[:, None] == 0, surface.edges[edges], surface.edges[edges, ::-1])
         nodes = np.concatenate([ends, surface.edge_opposite[edges, side][:, None]], axis=1)
         weight = _length_squared(surface, plate, edges, triangles) / (plate.area[triangles] / 3.0)
-        law = [weight, *_quadratic(plate, triangles[:, None], plate.angle[edges, side], 1)]
+        term = _term("shell_tilt", plate)
+        law = _quadratic(term, weight, plate, triangles[:, None], plate.angle[edges, side])
         data = np.concatenate([kinds.kind[edges, None], kinds.vector[edges]], axis=1)
         normals = np.column_stack([np.arange(len(edges)), np.ones(len(edges), int), edges])
         none = np.zeros((len(edges), 0), int)
-        sets.append(ElementSet(_term("shell_tilt", plate), nodes, none, data, law, normals))
+        sets.append(ElementSet(term, nodes, none, data, law, normals))
     return sets
 
 
@@ -214,8 +217,9 @@ def isometric_bending(surface, plate: Plate, kinds: EdgeKinds) -> ElementSet:
     at = [[_at(surface.triangles, sides[:, i], nodes[:, j], cotangent) for i in range(2)] for j in range(2)]
     K1 = at[0][0] + at[0][1]
     data = np.stack([K1, -at[0][0] - at[1][0], -at[0][1] - at[1][1]], -1)
-    law = [3.0 / plate.area[sides].sum(1), *_quadratic(plate, sides, np.zeros(len(edges)), 3)]
-    return ElementSet(_term("shell_isometric", plate), nodes, np.zeros((len(edges), 0), int), data, law)
+    term = _term("shell_isometric", plate)
+    law = _quadratic(term, 3.0 / plate.area[sides].sum(1), plate, sides, np.zeros(len(edges)))
+    return ElementSet(term, nodes, np.zeros((len(edges), 0), int), data, law)
 
 
 def shell_elements(
@@ -264,21 +268,25 @@ def _at(table: np.ndarray, triangles: np.ndarray, entry: np.ndarray, values: np.
     return np.sum(np.where(table[triangles] == entry[:, None], values[triangles], 0.0), -1)
 
 
-def _law(plate: Plate, stiffness: np.ndarray, rest: np.ndarray) -> list[np.ndarray]:
-    """Rest area and parameters of St. Venant and Kirchhoff's law."""
-    viscosity = [] if plate.viscosity is None else [plate.viscosity]
-    return [plate.area, stiffness, plate.poisson, *plate.abar.T, *rest.T, *viscosity]
-
-
-def _quadratic(plate: Plate, sides: np.ndarray, rest: np.ndarray, strains: int) -> list[np.ndarray]:
-    """Parameters of the quadratic law of hinges between the triangles `sides` (., 1 or 2), k = D / 3."""
-    stiffness = plate.bending_stiffness[sides].mean(1) / 3.0
-    viscosity = [] if plate.viscosity is None else [(plate.bending_stiffness * plate.viscosity)[sides].mean(1) / 3.0]
-    return [values for values in (stiffness, rest, *viscosity) for _ in range(strains)]
-
-
 def _term(name: str, plate: Plate):
-    return SHELLS[name if plate.viscosity is None else name + "_damped"]
+    return SHELLS[name].damped(plate.viscosity is not None)
+
+
+def _law(term, plate: Plate, stiffness: np.ndarray, rest: np.ndarray) -> dict[str, np.ndarray]:
+    """Parameters of St. Venant and Kirchhoff's law by name."""
+    shape = {"metric": [*plate.abar.T], "rest": [*rest.T]}
+    viscosity = {} if plate.viscosity is None else {"viscosity": plate.viscosity}
+    return term.bind(measure=plate.area, stiffness=stiffness, poisson=plate.poisson, **shape, **viscosity)
+
+
+def _quadratic(term, measure: np.ndarray, plate: Plate, sides: np.ndarray, rest: np.ndarray) -> dict[str, np.ndarray]:
+    """Parameters of the quadratic law of hinges between the triangles `sides` (., 1 or 2), k = D / 3, by name."""
+    D, n = plate.bending_stiffness, len(term.measure.strains)
+    stiffness = D[sides].mean(1) / 3.0
+    viscosity = {}
+    if plate.viscosity is not None:
+        viscosity["viscosity"] = (D * plate.viscosity)[sides].mean(1) / 3.0 / stiffness
+    return term.bind(measure=measure, stiffness=[stiffness] * n, rest=[rest] * n, **viscosity)
 
 
 def _by_triangle(name: str, values, count: int, valid, text: str) -> np.ndarray:

@@ -36,6 +36,11 @@ class ChainKind:
     serial: bool = False  # whether a thread takes all nodes of its rod; see `until_function`
 
     @property
+    def key(self) -> tuple:
+        """By what kinds are put in order."""
+        return self.dim, self.twist, self.closed, [term.key for term in self.terms]
+
+    @property
     def span(self) -> int:
         """Edges of the window."""
         return max(term.measure.span for term in self.terms)

@@ -1,10 +1,13 @@
 """The registries: a term is a measure times a density, one line each. Rods run along chains, shells on any elements."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from ddg_warp.kernels.densities import Density
-from ddg_warp.kernels.densities.quadratic import kelvin_voigt, quadratic
-from ddg_warp.kernels.densities.st_venant_kirchhoff import st_venant_kirchhoff, st_venant_kirchhoff_damped
+import numpy as np
+
+from ddg_warp.kernels.densities import POSITIVE, Density, Parameter
+from ddg_warp.kernels.densities.damping import damped
+from ddg_warp.kernels.densities.quadratic import quadratic
+from ddg_warp.kernels.densities.st_venant_kirchhoff import st_venant_kirchhoff
 from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.measures.axisymmetric_curvature import axisymmetric_curvature, axisymmetric_rim
 from ddg_warp.kernels.measures.axisymmetric_metric import axisymmetric_metric
@@ -20,10 +23,12 @@ from ddg_warp.kernels.measures.planar_curvature import planar_curvature
 from ddg_warp.kernels.measures.rod_curvature_twist import rod_curvature_twist
 from ddg_warp.kernels.measures.triangle_metric import triangle_metric
 
+MEASURE = Parameter("measure", "m or m^2", POSITIVE, rest=True)
+
 
 @dataclass(frozen=True)
 class Term:
-    """An elastic energy: `name` is what users see, `damped` its law with strain-rate damping."""
+    """An elastic energy: `name` is what users see, whether it is damped or not."""
 
     name: str
     measure: Measure
@@ -31,63 +36,86 @@ class Term:
     text: str
 
     @property
+    def key(self) -> str:
+        """Name in the registries, which hold each term with and without strain-rate damping."""
+        return self.name + ("_damped" if self.density.lagged else "")
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """All parameters, the rest measure first."""
+        return (MEASURE, *self.density.parameters(len(self.measure.strains)))
+
+    @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of the parameters, the rest measure first."""
-        return ("measure", *self.density.parameters(len(self.measure.strains)))
+        """Their names."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    @property
+    def stiffness(self) -> tuple[str, ...]:
+        """Names of its stiffnesses."""
+        return tuple(parameter.name for parameter in self.parameters if parameter.family == "stiffness")
+
+    @property
+    def rest(self) -> tuple[str, ...]:
+        """Names of its rest strains."""
+        return tuple(parameter.name for parameter in self.parameters if parameter.family == "rest")
+
+    def damped(self, wanted: bool = True) -> "Term":
+        """This term with strain-rate damping, if `wanted`."""
+        return replace(self, density=damped(self.density), text=self.text + ", damped") if wanted else self
+
+    def bind(self, **given) -> dict[str, np.ndarray]:
+        """Values of all parameters by name, in their order, from those of each family: one array, or a list with one a number.
+
+        Raises:
+            TypeError: a family is missing that has no default, has more or fewer values than parameters, or is not of this law.
+        """
+        result, used = {}, {}
+        for parameter in self.parameters:
+            family, at = parameter.family, used.setdefault(parameter.family, 0)
+            used[family] += 1
+            if family not in given and parameter.default is None:
+                raise TypeError(f"{self.name}: {family} is missing")
+            values = given.get(family, parameter.default)
+            several = isinstance(values, list | tuple)
+            if several and at >= len(values):
+                raise TypeError(f"{self.name}: {family} has {len(values)} values; it takes more")
+            result[parameter.name] = np.asarray(values[at] if several else values, float)
+        wrong = [f for f, v in given.items() if f not in used or (isinstance(v, list | tuple) and len(v) != used[f])]
+        if wrong:
+            raise TypeError(f"{self.name}: {wrong[0]} does not fit; it takes {', '.join(self.parameter_names)}")
+        return result
 
 
-REGISTRY = {
-    term.name: term
-    for term in (
-        Term("rod_stretch", edge_stretch, quadratic, "axial stretch of rod edges, EA"),
-        Term("rod_stretch_damped", edge_stretch, kelvin_voigt, "axial stretch with strain-rate damping"),
-        Term("rod_bend_twist", rod_curvature_twist, quadratic, "anisotropic bending and twist, EI1, EI2, GJ"),
-        Term("rod_bend_twist_damped", rod_curvature_twist, kelvin_voigt, "bending and twist with strain-rate damping"),
-        Term("rod_bend", curvature_binormal, quadratic, "isotropic bending without twist, EI"),
-        Term("rod_bend_damped", curvature_binormal, kelvin_voigt, "isotropic bending with strain-rate damping"),
-        Term("planar_stretch", edge_stretch_2d, quadratic, "axial stretch in the plane, EA"),
-        Term("planar_stretch_damped", edge_stretch_2d, kelvin_voigt, "planar stretch with strain-rate damping"),
-        Term("planar_bend", planar_curvature, quadratic, "bending in the plane, EI"),
-        Term("planar_bend_damped", planar_curvature, kelvin_voigt, "planar bending with strain-rate damping"),
-    )
-}
+def _registry(*terms: Term) -> dict[str, Term]:
+    """Terms by key, each with and without damping."""
+    return {each.key: each for term in terms for each in (term, term.damped())}
 
-SHELLS = {
-    term.name: term
-    for term in (
-        Term("shell_stretch", triangle_metric, st_venant_kirchhoff, "membrane of a triangle, E h"),
-        Term("shell_stretch_damped", triangle_metric, st_venant_kirchhoff_damped, "membrane with strain-rate damping"),
-        Term("shell_stretch_curved", midedge_metric, st_venant_kirchhoff, "membrane of a curved triangle, E h"),
-        Term("shell_stretch_curved_damped", midedge_metric, st_venant_kirchhoff_damped, "the same, damped"),
-        Term("shell_bend", midedge_curvature, st_venant_kirchhoff, "bending by mid-edge normals, E h^3"),
-        Term("shell_bend_damped", midedge_curvature, st_venant_kirchhoff_damped, "the same with strain-rate damping"),
-        Term(
-            "shell_bend_dof", midedge_curvature_dof, st_venant_kirchhoff, "bending by mid-edge normals that turn, E h^3"
-        ),
-        Term("shell_bend_dof_damped", midedge_curvature_dof, st_venant_kirchhoff_damped, "the same, damped"),
-        Term("shell_hinge", hinge_angle, quadratic, "bending by dihedral angles"),
-        Term("shell_hinge_damped", hinge_angle, kelvin_voigt, "dihedral angles with strain-rate damping"),
-        Term("shell_tilt", edge_tilt, quadratic, "hinge at a clamped edge or a symmetry plane"),
-        Term("shell_tilt_damped", edge_tilt, kelvin_voigt, "the same with strain-rate damping"),
-        Term("shell_isometric", isometric_bending, quadratic, "quadratic bending of flat, inextensible sheets"),
-        Term("shell_isometric_damped", isometric_bending, kelvin_voigt, "the same with strain-rate damping"),
-    )
-}
 
-AXISYMMETRIC = {
-    term.name: term
-    for term in (
-        Term(
-            "axisymmetric_stretch", axisymmetric_metric, st_venant_kirchhoff, "membrane of a shell of revolution, E h"
-        ),
-        Term("axisymmetric_stretch_damped", axisymmetric_metric, st_venant_kirchhoff_damped, "the same, damped"),
-        Term("axisymmetric_bend", axisymmetric_curvature, st_venant_kirchhoff, "its bending, E h^3"),
-        Term("axisymmetric_bend_damped", axisymmetric_curvature, st_venant_kirchhoff_damped, "the same, damped"),
-        Term("axisymmetric_rim", axisymmetric_rim, st_venant_kirchhoff, "its bending at poles and rims, E h^3"),
-        Term("axisymmetric_rim_damped", axisymmetric_rim, st_venant_kirchhoff_damped, "the same, damped"),
-    )
-}
+REGISTRY = _registry(
+    Term("rod_stretch", edge_stretch, quadratic, "axial stretch of rod edges, EA"),
+    Term("rod_bend_twist", rod_curvature_twist, quadratic, "anisotropic bending and twist, EI1, EI2, GJ"),
+    Term("rod_bend", curvature_binormal, quadratic, "isotropic bending without twist, EI"),
+    Term("planar_stretch", edge_stretch_2d, quadratic, "axial stretch in the plane, EA"),
+    Term("planar_bend", planar_curvature, quadratic, "bending in the plane, EI"),
+)
+
+SHELLS = _registry(
+    Term("shell_stretch", triangle_metric, st_venant_kirchhoff, "membrane of a triangle, E h"),
+    Term("shell_stretch_curved", midedge_metric, st_venant_kirchhoff, "membrane of a curved triangle, E h"),
+    Term("shell_bend", midedge_curvature, st_venant_kirchhoff, "bending by mid-edge normals, E h^3"),
+    Term("shell_bend_dof", midedge_curvature_dof, st_venant_kirchhoff, "bending by mid-edge normals that turn, E h^3"),
+    Term("shell_hinge", hinge_angle, quadratic, "bending by dihedral angles"),
+    Term("shell_tilt", edge_tilt, quadratic, "hinge at a clamped edge or a symmetry plane"),
+    Term("shell_isometric", isometric_bending, quadratic, "quadratic bending of flat, inextensible sheets"),
+)
+
+AXISYMMETRIC = _registry(
+    Term("axisymmetric_stretch", axisymmetric_metric, st_venant_kirchhoff, "membrane of a shell of revolution, E h"),
+    Term("axisymmetric_bend", axisymmetric_curvature, st_venant_kirchhoff, "its bending, E h^3"),
+    Term("axisymmetric_rim", axisymmetric_rim, st_venant_kirchhoff, "its bending at poles and rims, E h^3"),
+)
 
 JOINT = Term("rigid_joint", joint_curvature_twist, quadratic, "bending and twist of half cells at rigid joints")
 
-ALL = {**REGISTRY, **SHELLS, **AXISYMMETRIC, JOINT.name: JOINT}
+ALL = {**REGISTRY, **SHELLS, **AXISYMMETRIC, JOINT.key: JOINT}

@@ -275,9 +275,7 @@ def test_worlds_are_bitwise_single_builds(device):
     scene, *_ = stiffened(4)
     model = scene.build(device, "float64", worlds=3)
     factors = np.array([0.5, 1.0, 30.0])
-    stiffness = float(
-        model.net.sets[[part.term.name for part in model.net.sets].index("shell_stretch")].parameters[1].flat[0]
-    )
+    stiffness = float(model.parameters()["net/shell_stretch/stiffness"].flat[0])
     model.set_parameter("shell_stretch", "stiffness", factors * stiffness)
     together = steps(model, 8, 0.02)[0].points()
     assert np.ptp(together[:, -1, 2]) > 1e-6

@@ -51,8 +51,8 @@ def simulate(model, steps=5):
 def set_parameters(model, change):
     """Replace every row of the parameter table by change(row, nodes, rods)."""
     for group in model.groups:
-        group._parameters = [change(values, group.nodes, group.columns) for values in group._parameters]
-        group.upload_parameters(model.types.real)
+        values = group.parameters.values
+        group.parameters.set(**{name: change(v, group.nodes, group.columns) for name, v in values.items()})
     return model
 
 
@@ -78,8 +78,8 @@ def test_every_stride_reads_the_same(device, form, viscosity):
     model = set_parameters(build(device, viscosity=viscosity), in_form)
     expanded = expand(set_parameters(build(device, viscosity=viscosity), in_form))
     (group,), (full,) = model.groups, expanded.groups
-    assert (group.table.numpy()[:, 1:] == STRIDES[form]).all()
-    assert (full.table.numpy()[:, 1:] == STRIDES["each"]).all()
+    assert (group.parameters.table.numpy()[:, 1:] == STRIDES[form]).all()
+    assert (full.parameters.table.numpy()[:, 1:] == STRIDES["each"]).all()
     assert_same(simulate(model), simulate(expanded))
 
 

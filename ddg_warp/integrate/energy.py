@@ -92,7 +92,7 @@ class ChainEnergy(_Energy):
             self._measure,
             (self.ranges, group.columns),
             [before.x, before.v, before.theta, before.omega, before.frame, newton.x, newton.theta, newton.frame]
-            + [before.last, newton.rate, group.buffer, group.table, group.count, group.mass, group.rotary]
+            + [before.last, newton.rate, *group.parameters.arrays, group.count, group.mass, group.rotary]
             + [
                 *self._loads,
                 group.load,

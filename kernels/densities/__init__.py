@@ -1,25 +1,43 @@
-"""Densities: the constitutive laws. A density gives the energy per rest measure of n strains, psi(e; p)."""
+"""Densities: the constitutive laws. A density gives the energy per rest measure of n strains, psi(e; p).
+
+A law says its parameters once: their names, units, defaults and the values that have a meaning. Whoever binds values to a term
+(`kernels.terms.Term.bind`), changes them or reports them goes by these.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-VALID = {  # which values of a parameter have a meaning, by its name without the number of its strain
-    "measure": ("positive", lambda v: v > 0.0),
-    "stiffness": ("not negative", lambda v: v >= 0.0),
-    "viscosity": ("not negative", lambda v: v >= 0.0),
-    "poisson": ("between -1 and 1", lambda v: abs(v) < 1.0),
-    "metric_11": ("positive", lambda v: v > 0.0),
-    "metric_22": ("positive", lambda v: v > 0.0),
-    "metric_12": ("finite", np.isfinite),
-    "rest": ("finite", np.isfinite),
-}
+POSITIVE = "positive", lambda v: v > 0.0
+NOT_NEGATIVE = "not negative", lambda v: v >= 0.0
+FINITE = "finite", np.isfinite
 
 
-def valid(parameter: str) -> tuple[str, Callable]:
-    """Which values a parameter may have, in words and as a function of arrays."""
-    return VALID.get(parameter) or VALID[parameter.rpartition("_")[0] or parameter]
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of a law.
+
+    Attributes:
+        family: what it is; there is one, or one a strain.
+        unit: its unit.
+        valid: which values have a meaning, in words and as a function of arrays.
+        number: of its strain or component where there are several, counted as in its name: "1", "12"; else empty.
+        rest: whether it belongs to the rest shape, as rest strains do.
+        default: value where none is given; None if one has to be.
+    """
+
+    family: str
+    unit: str
+    valid: tuple[str, Callable]
+    number: str = ""
+    rest: bool = False
+    default: float | None = None
+
+    @property
+    def name(self) -> str:
+        """Name that users know it by."""
+        return f"{self.family}_{self.number}" if self.number else self.family
 
 
 @dataclass(frozen=True)
@@ -28,20 +46,40 @@ class Density:
 
     Attributes:
         name: field's name of the law.
-        parameters: n -> names of the parameters, in the order of p.
+        parameters: n -> its parameters, in the order of p.
+        laws: (real, n) -> (energy(e, p), slope(e, p), curvature(e, p)) = (psi, psi', psi''); the last is a matrix (n x n) of a
+            coupled law, else its diagonal as a vector.
         lagged: whether p ends with the strains of the last step (n) and the reciprocal of the time step (1).
         coupled: whether psi'' is a full matrix.
-        functions: (real, n) -> (energy(e, p), slope(e, p), root(e, p, shift)), where root is the square root of the diagonal
-            of psi'' + diag(shift), made positive semi-definite, as a vector. Of a coupled law it is the matrix R (n x n) with
-            R^T R = psi'', and shift is ignored.
+        quadratic: whether psi'' depends on no strain.
+        own_root: (real, n) -> root(e, p, shift) as in `functions`, where it has a closed form; else it is found.
     """
 
     name: str
     parameters: Callable
-    functions: Callable
+    laws: Callable
     lagged: bool = False
     coupled: bool = False
+    quadratic: bool = False
+    own_root: Callable | None = None
 
     def parameter_size(self, strains: int) -> int:
         """Reals in p, those of the last step included."""
         return len(self.parameters(strains)) + (strains + 1 if self.lagged else 0)
+
+    def functions(self, real, strains: int):
+        """(energy, slope, root): root(e, p, shift) is the square root of psi'' + diag(shift), made positive semi-definite.
+
+        It is a vector, of a coupled law the matrix R (n x n) with R^T R = psi''; laws with a root of their own may leave out `shift`.
+        """
+        from ddg_warp.kernels.densities.definite import root_function
+
+        energy, slope, _ = self.laws(real, strains)
+        own = self.own_root(real, strains) if self.own_root else root_function(self, real, strains)
+        return energy, slope, own
+
+
+def each(strains: int, family: str, unit: str, valid, **options) -> tuple[Parameter, ...]:
+    """One parameter a strain."""
+    numbers = [str(i + 1) for i in range(strains)] if strains > 1 else [""]
+    return tuple(Parameter(family, unit, valid, number, **options) for number in numbers)

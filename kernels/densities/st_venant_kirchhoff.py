@@ -1,4 +1,4 @@
-"""St. Venant and Kirchhoff's law of a plane tensor, per rest area, and the same with strain-rate damping.
+"""St. Venant and Kirchhoff's law of a plane tensor, per rest area.
 
 With the covariant components e = (e11, e12, e22), the rest metric abar and M = abar^-1 (e - e0), a mixed 2 x 2 tensor,
 
@@ -10,15 +10,15 @@ y, z (11, 12, 22), linear in e - e0, and
 
     psi = K/2 [(x + nu z)^2 + (1 - nu^2) z^2 + 2 (1 - nu) y^2],
 
-which gives the root of psi'': positive definite for -1 < nu < 1. The damped law adds the dissipation potential of a step of length h,
-(viscosity / 2h) psi''(e - e^n, e - e^n), with e^n the strains at the start of the step and the viscosity a time [s] (Kelvin and Voigt).
+which gives the root of psi'': positive definite for -1 < nu < 1.
 """
 
+from dataclasses import replace
 from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.densities import Density
+from ddg_warp.kernels.densities import FINITE, NOT_NEGATIVE, POSITIVE, Density, Parameter
 
 
 @cache
@@ -65,7 +65,7 @@ def _tensor(real):
 
 
 @cache
-def _st_venant_kirchhoff(real, n):
+def _laws(real, n):
     E, P, B = (wp.types.vector(size, real) for size in (n, 8, 5))
     energy_of, slope_of, root_of = _tensor(real)
 
@@ -86,47 +86,33 @@ def _st_venant_kirchhoff(real, n):
         return slope_of(strain(e, p), law(p))
 
     @wp.func
-    def root(e: E, p: P, shift: E):
-        return root_of(law(p))
+    def curvature(e: E, p: P):
+        r = root_of(law(p))
+        return wp.transpose(r) * r
 
-    return energy, slope, root
+    return energy, slope, curvature
 
 
 @cache
-def _damped(real, n):
-    E, P, B = (wp.types.vector(size, real) for size in (n, 13, 5))
-    energy_of, slope_of, root_of = _tensor(real)
-
-    @wp.func
-    def law(p: P):
-        return B(p[0], p[1], p[2], p[3], p[4])
-
-    @wp.func
-    def strain(e: E, p: P):
-        return E(e[0] - p[5], e[1] - p[6], e[2] - p[7])
-
-    @wp.func
-    def change(e: E, p: P):
-        return E(e[0] - p[9], e[1] - p[10], e[2] - p[11])
-
-    @wp.func
-    def energy(e: E, p: P):
-        return energy_of(strain(e, p), law(p)) + p[8] * p[12] * energy_of(change(e, p), law(p))
-
-    @wp.func
-    def slope(e: E, p: P):
-        return slope_of(strain(e, p) + change(e, p) * (p[8] * p[12]), law(p))
+def _root(real, n):
+    E, P, B = (wp.types.vector(size, real) for size in (n, 8, 5))
+    _, _, root_of = _tensor(real)
 
     @wp.func
     def root(e: E, p: P, shift: E):
-        return root_of(law(p)) * wp.sqrt(real(1.0) + p[8] * p[12])
+        return root_of(B(p[0], p[1], p[2], p[3], p[4]))
 
-    return energy, slope, root
+    return root
 
 
-_NAMES = ("stiffness", "poisson", "metric_11", "metric_12", "metric_22", "rest_11", "rest_12", "rest_22")
+def _parameters(n):
+    metric, rest = (
+        [Parameter(family, "that of the tensor", FINITE, number, rest=True) for number in ("11", "12", "22")]
+        for family in ("metric", "rest")
+    )
+    metric[0], metric[2] = replace(metric[0], valid=POSITIVE), replace(metric[2], valid=POSITIVE)
+    poisson = Parameter("poisson", "1", ("between -1 and 1", lambda v: abs(v) < 1.0))
+    return Parameter("stiffness", "J per rest measure", NOT_NEGATIVE), poisson, *metric, *rest
 
-st_venant_kirchhoff = Density("st_venant_kirchhoff", lambda n: _NAMES, _st_venant_kirchhoff, coupled=True)
-st_venant_kirchhoff_damped = Density(
-    "st_venant_kirchhoff_damped", lambda n: (*_NAMES, "viscosity"), _damped, lagged=True, coupled=True
-)
+
+st_venant_kirchhoff = Density("st_venant_kirchhoff", _parameters, _laws, coupled=True, quadratic=True, own_root=_root)

@@ -176,8 +176,8 @@ def gather(elements, positions, angles=None) -> Elements:
     if measure.angles:
         q.append(np.zeros((count, measure.angles)) if angles is None else angles[elements.angles])
     s = elements.data if measure.data_size else np.zeros((count, 1))
-    w, *p = (np.broadcast_to(values, (count,)) for values in elements.parameters)
-    return Elements(elements.term.name, np.concatenate(q, axis=1), s, w, np.stack(p, axis=1))
+    w, *p = (np.broadcast_to(values, (count,)) for values in elements.parameters.values())
+    return Elements(elements.term.key, np.concatenate(q, axis=1), s, w, np.stack(p, axis=1))
 
 
 def factor(elements, local: Elements, points: int, edges: int, device) -> sparse.csr_matrix:

@@ -28,9 +28,7 @@ def sample(name: str) -> Elements:
         s[:, 0], s[:, 2] = np.cos(angle), np.sin(angle)
     p = random.uniform(0.6, 1.4, size=(COUNT, term.density.parameter_size(3)))
     for i, parameter in enumerate(term.density.parameters(3)):
-        p[:, i] *= {"poisson": 0.3, "metric_12": 0.3, "rest_11": 0.4, "rest_12": 0.4, "rest_22": 0.4}.get(
-            parameter, 1.0
-        )
+        p[:, i] *= 0.4 if parameter.family == "rest" else {"poisson": 0.3, "metric_12": 0.3}.get(parameter.name, 1.0)
     w = random.uniform(0.6, 1.4, size=COUNT)
     q, s, w, p = (values.astype(np.float32).astype(float) for values in (q, s, w, p))
     if measure.name == "axisymmetric_rim":

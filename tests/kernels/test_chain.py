@@ -151,7 +151,7 @@ class Problem:
             wp.launch(
                 element.term_kernels(kind, i, real)[0],
                 (group.elements, group.columns),
-                [newton.x, newton.theta, newton.frame, self.last, newton.rate, group.buffer, group.table, group.count],
+                [newton.x, newton.theta, newton.frame, self.last, newton.rate, *group.parameters.arrays, group.count],
                 [out],
                 device=self.device,
             )

@@ -31,12 +31,10 @@ def sample(name: str) -> Elements:
     if measure.name == "edge_tilt":
         s[:, 0], s[:, 1:] = 2 + np.arange(COUNT) % 2, unit(s[:, 1:] + [0.0, 0.0, 3.0])
     p = random.uniform(0.6, 1.4, size=(COUNT, term.density.parameter_size(n)))
-    names = term.density.parameters(n)
-    for i, parameter in enumerate(names):
-        p[:, i] *= {"rest": 0.4, "poisson": 0.3, "metric_12": 0.3}.get(
-            parameter if parameter in ("poisson", "metric_12") else parameter[:4], 1.0
-        )
-    p[:, len(names) : len(names) + n] *= 0.3  # strains of the last step
+    known = term.density.parameters(n)
+    for i, parameter in enumerate(known):
+        p[:, i] *= 0.4 if parameter.family == "rest" else {"poisson": 0.3, "metric_12": 0.3}.get(parameter.name, 1.0)
+    p[:, len(known) : len(known) + n] *= 0.3  # strains of the last step
     w = random.uniform(0.6, 1.4, size=COUNT)
     return Elements(name, *(values.astype(np.float32).astype(float) for values in (q, s, w, p)))
 

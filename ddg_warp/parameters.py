@@ -1,0 +1,44 @@
+"""Parameters of terms by name, and their one buffer on a device."""
+
+import numpy as np
+import warp as wp
+
+
+class ParameterTable:
+    """Parameters of elements, in one buffer: row i of `table` is (offset, stride along the elements, stride across) of the i-th.
+
+    One number, one an element, one a rod or world, or one each are read by the same code.
+
+    Attributes:
+        values: arrays of two dimensions by name, of size 1 along what they do not depend on; `set` changes them.
+    """
+
+    def __init__(self, values: dict[str, np.ndarray], along: int, real, device):
+        """`along` is the dimension of the elements: 0 or 1."""
+        self.values, self._along, self._real, self._device = dict(values), along, real, device
+        self.upload()
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self.values[name]
+
+    @property
+    def arrays(self) -> tuple[wp.array, wp.array]:
+        """Buffer and table, as kernels take them."""
+        return self.buffer, self.table
+
+    def set(self, **values: np.ndarray) -> None:
+        """Replace parameters."""
+        self.values |= {name: np.ascontiguousarray(new) for name, new in values.items()}
+        self.upload()
+
+    def upload(self) -> None:
+        """Bring what `values` holds to the device."""
+        offset, table = 0, []
+        for values in self.values.values():
+            first = values.shape[1] if values.shape[0] > 1 else 0
+            strides = first, int(values.shape[1] > 1)
+            table.append((offset, *(strides if self._along == 0 else strides[::-1])))
+            offset += values.size
+        flat = np.concatenate([np.ravel(values) for values in self.values.values()])
+        self.buffer = wp.array(flat, dtype=self._real, device=self._device)
+        self.table = wp.array(np.array(table, np.int32), dtype=int, device=self._device)
