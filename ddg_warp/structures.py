@@ -233,13 +233,32 @@ class Structures(Meridians):
             raise SceneError(f"join: {pairs}; a joint has two different members at least, (rod, node) each")
         self.joints.append(Joint(tuple(pairs), arguments.flag("join: rigid", rigid)))
 
-    def attach(self, rod: int, nodes, shell: int, vertices) -> None:
-        """Make nodes of a rod and vertices of a shell one: a stiffener, a line, a rim. They are at the same points at rest."""
+    def attach(self, rod: int, nodes, shell: int, vertices, spin: str = "glued") -> None:
+        """Make nodes of a rod and vertices of a shell one: a stiffener, a rim, a post. They are at the same points at rest.
+
+        Args:
+            rod: index.
+            nodes: of the rod.
+            shell: index.
+            vertices: as many.
+            spin: "glued", the cross-section of every rod edge between two of these nodes that lies on a mesh edge turns about that
+                edge with the surface, by the angle to it at rest: two triangles turn it by their mean, so that folds across the rod
+                are as easy as without. "free": nothing holds the spin of the rod about its own tangent, as on a seam of thread.
+
+        What is glued is the turn about the edge alone: a rod whose edges are not along mesh edges (a post, a line from one vertex)
+        stands on a ball joint and spins either way, and a rod without twist has no spin. Directors keep their angle to the surface,
+        so that they say how a section stands on it. With bending "midedge_dof" the edge's own normal is what turns the rod, on any
+        mesh; without it the mean of the triangles is, which is right where the mesh is alike along the rod.
+
+        Raises:
+            SceneError: other than two values of `spin`, indices out of range; at `build`, points that are apart.
+        """
         (rod,), nodes = self._on_rods("attach", arguments.index("attach: rod", rod), "node", nodes)
         vertices = self._vertices(shell, vertices)
         if len(nodes) != len(vertices):
             raise SceneError(f"attach: {len(nodes)} nodes of rod {rod} and {len(vertices)} vertices; give as many")
-        self.attachments.append(Attachment(int(rod), np.array(nodes), shell, vertices))
+        glued = arguments.choice("attach: spin", spin, ("glued", "free")) == "glued"
+        self.attachments.append(Attachment(int(rod), np.array(nodes), shell, vertices, glued))
 
     def _hold(self, call: str, shell, vertices, components, **options) -> None:
         if options.get("edges") != "symmetry":  # an oblique plane has none
