@@ -241,17 +241,17 @@ class Structures(Meridians):
             nodes: of the rod.
             shell: index.
             vertices: as many.
-            spin: "glued", the cross-section of every rod edge between two of these nodes that lies on a mesh edge turns about that
-                edge with the surface, by the angle to it at rest: two triangles turn it by their mean, so that folds across the rod
-                are as easy as without. "free": nothing holds the spin of the rod about its own tangent, as on a seam of thread.
+            spin: "glued": every rod edge between two of these nodes that lies on a mesh edge turns about it with the surface and
+                keeps the angle to it that its directors have at rest; of two triangles their mean turns it, so that a fold along
+                the rod costs what it did. "free": nothing holds the rod's spin about its own axis.
 
-        What is glued is the turn about the edge alone: a rod whose edges are not along mesh edges (a post, a line from one vertex)
-        stands on a ball joint and spins either way, and a rod without twist has no spin. Directors keep their angle to the surface,
-        so that they say how a section stands on it. With bending "midedge_dof" the edge's own normal is what turns the rod, on any
-        mesh; without it the mean of the triangles is, which is right where the mesh is alike along the rod.
+        Glue holds the turn about the edge alone. A rod whose edges are not mesh edges (a post, a line from a vertex) stands on a ball
+        joint and may spin; one without twist has no spin. With bending "midedge_dof" the surface's own normal at the edge turns the
+        rod, on any mesh; without it that of the triangles does, which is right where the mesh is alike along the rod. Edges on a
+        symmetry plane do not turn.
 
         Raises:
-            SceneError: other than two values of `spin`, indices out of range; at `build`, points that are apart.
+            SceneError: an index out of range, not as many vertices as nodes, another `spin`; at `build`, points that lie apart.
         """
         (rod,), nodes = self._on_rods("attach", arguments.index("attach: rod", rod), "node", nodes)
         vertices = self._vertices(shell, vertices)
