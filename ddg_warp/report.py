@@ -1,7 +1,7 @@
 """The report of a model: terms, elements, dofs, solver, kernels, memory, and what the scene does without."""
 
 from ddg_warp.kernels import cyclic_reduction
-from ddg_warp.kernels.terms import JOINT, REGISTRY, SHELLS
+from ddg_warp.kernels.terms import GLUE, JOINT, REGISTRY, SHELLS
 from ddg_warp.linear.choice import automatic, net_preconditioner
 from ddg_warp.net_system import NetSystem
 
@@ -33,7 +33,7 @@ def report(model) -> str:
     if model.net is not None:
         lines += net_lines(model)
         present |= {part.term.name for part in model.net.sets}
-    absent = sorted(name for name in (*REGISTRY, *SHELLS, JOINT.name) if name not in present)
+    absent = sorted(name for name in (*REGISTRY, *SHELLS, JOINT.name, GLUE.name) if name not in present)
     lines.append("not in this scene: " + ", ".join(absent))
     if not any(group.kind.twist for group in model.groups) and (model.net is None or not model.net.edges):
         lines.append("no angles, no frames, no rotary inertia")

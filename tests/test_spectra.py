@@ -156,8 +156,8 @@ def test_supports_leave_some_rigid_modes(device):
     np.testing.assert_allclose(found.eigenvalues[1:3], 1.5 * 9.81, rtol=2e-3)
 
 
-def test_stiffener_spins_on_its_line(device):
-    """Attached by its nodes alone, a straight stiffener is held by nothing against a turn about its own axis: a named rigid mode."""
+def stiffened(device, spin: str, hold_twist: bool = False):
+    """The spectrum of a clamped plate with a rod along its middle, which is attached by its nodes, or glued."""
     points, triangles = meshes.rectangle(4, 4)
     scene = still()
     plate = scene.add_shell(points, triangles, thickness=0.01, material=STEEL)
@@ -165,18 +165,25 @@ def test_stiffener_spins_on_its_line(device):
     line_of = np.flatnonzero(np.abs(points[:, 1] - 0.5) < 1e-9)
     line_of = line_of[np.argsort(points[line_of, 0])]
     rod = scene.add_rod(points[line_of], section=SECTION)
-    scene.attach(rod, range(len(line_of)), plate, line_of)
+    scene.attach(rod, range(len(line_of)), plate, line_of, spin=spin)
+    if hold_twist:
+        scene.fix_twist(rod, [0])
     model = scene.build(device, "float64")
-    found = spectrum(model, model.state(), 4)
+    return spectrum(model, model.state(), 4)
+
+
+def test_stiffener_spins_on_its_line(device):
+    """By its nodes alone, a straight stiffener is held by nothing against a turn about its axis: a named rigid mode. Glue holds it."""
+    found = stiffened(device, "free")
     assert (found.rigid, found.stable) == (1, True)
     assert found.eigenvalues[0] == 0.0 < found.eigenvalues[1]
-    assert (
-        np.abs(found.displacements[0]).max() < 1e-9 * np.abs(found.displacements[1]).max()
-    )  # nothing moves, the stiffener turns
+    moved = np.abs(found.displacements).max((1, 2))
+    assert moved[0] < 1e-9 * moved[1]  # nothing moves, the stiffener turns
     assert np.isfinite(found.frequencies).all()
-    scene.fix_twist(rod, [0])
-    model = scene.build(device, "float64")
-    assert spectrum(model, model.state(), 4).rigid == 0
+    assert stiffened(device, "free", hold_twist=True).rigid == 0
+    glued = stiffened(device, "glued")
+    assert (glued.rigid, glued.stable) == (0, True)
+    assert (glued.eigenvalues > 0.0).all()
 
 
 def test_an_instability_is_no_rigid_mode(device):
