@@ -317,3 +317,17 @@ def test_a_count_that_rounding_makes_too_large_ends_the_search(device, monkeypat
     found = spectrum(model, model.state(), 3)
     np.testing.assert_allclose(found.eigenvalues, exact.eigenvalues, rtol=1e-9)
     assert len(searches) < 5
+
+
+def test_massless_angles_may_be_what_is_unstable(device):
+    """A tall strip is held on an arc in its stiff plane: it would turn into the soft one, though its angles have no inertia."""
+    scene, angle = still(), np.linspace(0.0, 1.0, 9)
+    arc = np.stack([np.sin(angle), np.cos(angle), 0.0 * angle], -1)
+    section = ddg.Stiffness(EA=1e4, EI1=4.0, EI2=0.1, GJ=0.05, mass_per_length=1.0)
+    director = np.stack([-np.sin(angle), -np.cos(angle), 0.0 * angle], -1)[4]
+    rod = scene.add_rod(arc, section=section, director=director, natural="straight")
+    scene.fix(rod, range(1, 9))
+    model = scene.build(device, "float64")
+    found = [spectrum(model, model.state(), 3, metric) for metric in ("mass", "unit")]
+    assert found[0].negative == found[1].negative > 0
+    assert not found[0].stable and (found[0].eigenvalues > 0.0).all()
