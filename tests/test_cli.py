@@ -415,6 +415,17 @@ def test_bench_gives_error_and_time_together(fall, tmp_path):
     assert (tmp_path / "out/bench/fall.png").is_file()
 
 
+def test_bench_at_another_size(fall, tmp_path, capsys):
+    """Parameters of the scene go to every case, and into the names of the files; what the study varies is its own."""
+    assert fall("bench", "--n", "9", "--label", "long") == 0
+    with open("out/bench/fall_n_9_label_long.json") as file:
+        content = json.load(file)
+    assert content["fixed"] == {"duration": 0.02, "n": 9, "label": "long"}
+    assert "--n 9 --label long" in content["command"]
+    assert main(["bench", "cantilever", "--n", "9"]) == 2
+    assert "the study of cantilever varies it" in capsys.readouterr().err
+
+
 def test_cantilever_swings_as_published(tmp_path, device):
     assert main(["run", "cantilever", "--device", device, "--out", str(tmp_path)]) == 0
     assert len(summary(tmp_path)["checks"]) == 6
