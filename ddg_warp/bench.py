@@ -87,7 +87,14 @@ def study_of(module) -> Study:
     raise InputError(f"{module.__name__} has no check(), observe() or benchmark(): there is nothing to measure by")
 
 
-def benchmark(name: str, out: str | Path, *, device: str | None = None, precision: str | None = None) -> bool:
+def benchmark(
+    name: str,
+    out: str | Path,
+    *,
+    device: str | None = None,
+    precision: str | None = None,
+    given: Mapping[str, Any] | None = None,
+) -> bool:
     """Run a scene's study; write NAME.csv, NAME.json and NAME.png into `out`.
 
     Args:
@@ -95,22 +102,31 @@ def benchmark(name: str, out: str | Path, *, device: str | None = None, precisio
         out: Directory for the results.
         device: Warp device.
         precision: Precision of the cases that set none.
+        given: Parameters of the scene in all cases and references, such as its size; they stand in the names of the files.
 
     Returns:
         Whether every run reached its end.
 
     Raises:
-        InputError: The scene has nothing to measure by.
+        InputError: The scene has nothing to measure by, or the study varies what is given.
     """
     from ddg_warp.summary import machine, table, write_table
 
     module = load_scene(name)
-    study = study_of(module)
+    study, given = study_of(module), dict(given or {})
+    varied = [
+        key for key in given if key in study.grid or (isinstance(study.reference, Mapping) and key in study.reference)
+    ]
+    if varied:
+        raise InputError(f"--{varied[0]} {given[varied[0]]}: the study of {scene_name(name)} varies it")
+    study = replace(study, fixed={**study.fixed, **given})
     rows, unit = measure(module, study, device=device, precision=precision)
-    stem = Path(out) / scene_name(name)
+    stem = Path(out) / "_".join([scene_name(name), *(f"{key}_{value}" for key, value in given.items())])
+    flags = [*((f"--{key.replace('_', '-')}", str(value)) for key, value in given.items())]
+    flags += [("--device", device)] if device else []
     origin = {
         "scene": name,
-        "command": f"ddg-warp bench {name}" + (f" --device {device}" if device else ""),
+        "command": " ".join(["ddg-warp", "bench", name, *(word for flag in flags for word in flag)]),
         "machine": machine(),
         "measure": study.measure if isinstance(study.measure, str) else "",
         "unit": unit,

@@ -58,7 +58,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def parser(arguments: list[str]) -> Parser:
-    """The parser of these arguments; `run SCENE` adds the flags of the scene."""
+    """The parser of these arguments; `run SCENE` and `bench SCENE` add the flags of the scene."""
     top = Parser(prog="ddg-warp", description="Simulate flexible slender structures on NVIDIA Warp.")
     commands = top.add_subparsers(metavar="COMMAND", required=True)
 
@@ -96,6 +96,8 @@ def parser(arguments: list[str]) -> Parser:
     bench.add_argument("--all", action="store_true", help="every scene in turn, and an overview of them")
     add_settings(bench)
     bench.add_argument("--out", type=Path, default=Path("out/bench"), metavar="DIR", help="default: out/bench")
+    if arguments[:1] == ["bench"] and len(arguments) > 1 and not arguments[1].startswith("-"):
+        add_parameters(bench.add_argument_group(f"parameters of {arguments[1]}"), load_scene(arguments[1]))
 
     export = commands.add_parser("export", help="write a recorded run as USD")
     export.set_defaults(command=export_run)
@@ -296,7 +298,9 @@ def bench_scene(chosen: argparse.Namespace) -> int:
     done = True
     for name in scene_files() if chosen.all else [chosen.scene]:
         print(f"== {name}", flush=True)
-        done &= benchmark(name, chosen.out, device=chosen.device, precision=chosen.precision)
+        known = () if chosen.all else parameters(load_scene(name), {})
+        given = {key: value for key, value in vars(chosen).items() if key in known}
+        done &= benchmark(name, chosen.out, device=chosen.device, precision=chosen.precision, given=given)
     if chosen.all:
         print(table(overview(chosen.out)))
     return DONE if done else FAILED

@@ -202,9 +202,10 @@ class Joint:
 
 @dataclass(frozen=True)
 class Attachment:
-    """Nodes of a rod that are vertices of a shell."""
+    """Nodes of a rod that are vertices of a shell; whether edges between them that lie on mesh edges turn with the shell."""
 
     rod: int
     nodes: np.ndarray
     shell: int
     vertices: np.ndarray
+    glued: bool

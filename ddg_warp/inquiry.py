@@ -174,11 +174,12 @@ def stresses(model, state) -> dict[str, list[np.ndarray]]:
 
     Of rods: axial force [N] of edges, moments [N m] of vertices about the directors there: means of those of both edges, and at
     clamped ends, which are included, the directors that the clamp holds. Those beside rigid joints are in "rigid_joint", about
-    the directors of the rod at the joint. Of shells: forces per length [N/m] ("shell_stretch") and moments per
-    length [N] ("shell_bend", "shell_bend_dof") of triangles, components (11, 22, 12) along the first edge at rest and across it,
-    second Piola and Kirchhoff's; a moment is positive where it raises the second fundamental form. Hinges have moments per
-    their weight. Of shells of revolution: the same along and around (11, 22, 12), forces of edges ("axisymmetric_stretch"),
-    moments of inner nodes ("axisymmetric_bend") and of both ends ("axisymmetric_rim"). What a rod or shell has not is None.
+    the directors of the rod at the joint. What edges glued to a shell turn it with, a moment per length [N], is in "glued_edge". Of
+    shells: forces per length [N/m] ("shell_stretch") and moments per length [N] ("shell_bend", "shell_bend_dof") of triangles,
+    components (11, 22, 12) along the first edge at rest and across it, second Piola and Kirchhoff's; a moment is positive where it
+    raises the second fundamental form. Hinges have moments per their weight. Of shells of revolution: the same along and around
+    (11, 22, 12), forces of edges ("axisymmetric_stretch"), moments of inner nodes ("axisymmetric_bend") and of both ends
+    ("axisymmetric_rim"). What a rod or shell has not is None.
     """
     result: dict[str, list] = {}
     for group, data in zip(model.groups, state.groups, strict=True):
@@ -264,7 +265,7 @@ def _add_net_stresses(model, state, index: int, result: dict[str, list]) -> None
     net, part, scene = model.net, model.net.sets[index], model.scene
     term = part.term
     values = net_strains(net, state, index)[1]
-    if term.measure.angles and term.name not in SHELLS:
+    if term.measure.twists:
         end_moments.of_net(net, state.net, index, values)
     values = np.moveaxis(values, 0, -1)
     if term.density.coupled:
@@ -335,7 +336,7 @@ def total_twist(model, state, rod: int = 0) -> float | np.ndarray:
             found = True
     for index, part in enumerate(model.net.sets if model.net is not None else ()):
         of_rod = part.host.owner[0] == rod
-        if part.term.measure.angles and part.term.name not in SHELLS and of_rod.any():
+        if part.term.measure.twists and of_rod.any():
             weight = np.broadcast_to(part.parameters["measure"], (model.worlds, part.elements))
             turns += (net_strains(model.net, state, index)[0][TWIST] * weight)[:, of_rod].sum(1)
             found = True

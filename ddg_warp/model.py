@@ -5,7 +5,7 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays, axisymmetric, geometry, validate
+from ddg_warp import arrays, axisymmetric, geometry, net_glue, validate
 from ddg_warp.chains import compile_chains, scene_motions
 from ddg_warp.errors import SceneError
 from ddg_warp.group import Group
@@ -240,9 +240,10 @@ class Model:
 
         Args:
             points: positions (P, 3) or (worlds, P, 3) [m] in the order of `curves`. Reference frames are carried from rest to
-                these positions; ghost nodes of clamped ends stay.
+                these positions, and edges glued to a shell turn with it; ghost nodes of clamped ends stay.
             velocities: (P, 3) or (worlds, P, 3) [m/s].
-            spins: rate of the edges' angles (edges,) or (worlds, edges) [rad/s].
+            spins: rate of the edges' angles (edges,) or (worlds, edges) [rad/s]; without, zero, but as the shell turns where they
+                are glued.
 
         Raises:
             ValueError: a shape does not fit, or a value is not finite.
@@ -276,6 +277,10 @@ class Model:
                 state.net.v.assign(rates.reshape(-1, 3))
         if points is not None:
             self.carry_frames(state)
+        if self.net is not None:
+            net_glue.follow(
+                self.net, state.net, angles=points is not None, rates=velocities is not None and spins is None
+            )
         self.update_strains(state)
         return state
 

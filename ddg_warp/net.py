@@ -31,6 +31,14 @@ class NetRod:
     all_nodes: np.ndarray  # with ghosts
     all_edges: np.ndarray
 
+    def stiffness(self, edges) -> np.ndarray:
+        """EI1, EI2 and GJ of the section (3, ...) on edges, counted with ghosts, which have those of the edge beside them."""
+        batch, (before, _) = self.piece.batch, self.piece.ghosts
+        edges = np.clip(np.asarray(edges) - before, 0, batch.edges - 1)
+        values = (batch.section.EI1, batch.section.EI2, batch.section.GJ)
+        shape, rod = (batch.rods, batch.edges), self.rod - batch.first
+        return np.array([np.broadcast_to(np.asarray(value, float), shape)[rod, edges] for value in values])
+
 
 @dataclass
 class NetShell:

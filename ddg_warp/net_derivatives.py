@@ -1,5 +1,5 @@
-"""The derivative table of the terms of nets: shells, shells of revolution and the rigid joint. `ddg_warp.derivatives` says what the
-checks mean.
+"""The derivative table of the terms of nets: shells, shells of revolution, rigid joints and glued edges. `ddg_warp.derivatives`
+says what the checks mean.
 
 Every element of the sample has blocks of its own, so that a change of one block is seen by one element alone:
 
@@ -14,16 +14,16 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from ddg_warp.geometry import unit
+from ddg_warp.geometry import signed_angle, transport, unit
 from ddg_warp.kernels.net import elements as net_elements
-from ddg_warp.kernels.terms import AXISYMMETRIC, JOINT, SHELLS, Term
+from ddg_warp.kernels.terms import AXISYMMETRIC, GLUE, JOINT, SHELLS, Term
 from ddg_warp.precision import PRECISIONS
 from ddg_warp.samples import rotation
 
 ELEMENTS = 8
 TRAP = 2.0**-30
 INPUTS = ("q", "frame", "lag", "last", "rate", "buffer")
-TERMS = {**SHELLS, **AXISYMMETRIC, JOINT.name: JOINT}
+TERMS = {**SHELLS, **AXISYMMETRIC, JOINT.name: JOINT, GLUE.name: GLUE}
 KINDS = np.array([[0, 1, 2], [1, 2, 3], [2, 3, 0], [3, 0, 1], [1, 1, 1], [0, 1, 1], [1, 3, 1], [1, 2, 0]])  # of edges
 
 
@@ -154,6 +154,9 @@ class NetSample:
             used[3:6] = (kinds == 1)[..., None]  # a corner behind an edge is read if it is a neighbour's
             if measure.angles:
                 used[6:9, :, 0] = kinds <= 1
+        if measure.name == "rod_surface_angle":
+            share, sign = self.data["constants"]
+            used[3], used[5, :, 0] = (share > 0.0)[:, None], sign != 0.0
         return used
 
     def turned(self, turn: np.ndarray) -> dict[str, np.ndarray]:
@@ -217,7 +220,7 @@ def _random_state(sample: NetSample) -> dict[str, np.ndarray]:
     corners = np.array(
         [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.4, 0.9, 0.0], [1.3, 1.1, 0.3], [-0.7, 0.6, 0.3], [0.5, -0.8, 0.3]]
     )
-    if measure.name in ("hinge_angle", "isometric_bending"):
+    if measure.name in ("hinge_angle", "isometric_bending", "rod_surface_angle"):
         corners = corners[[0, 1, 2, 5]]
     if sample.revolved:
         corners = np.array([[2.0, 0.1, 0.5], [3.0, 0.4, -0.2], [3.8, 0.6, 0.7]])
@@ -240,6 +243,17 @@ def _random_state(sample: NetSample) -> dict[str, np.ndarray]:
     if measure.name == "edge_tilt":
         constants[0] = np.where(np.arange(ELEMENTS) % 2, 3, 2)
         constants[1:] = np.where(constants[0] == 3, normals[0][:, [2, 0, 1]].T, normals[0].T)
+    if measure.name == "rod_surface_angle":
+        constants[:] = random.uniform(0.2, 0.8, ELEMENTS), np.arange(ELEMENTS) % 3 - 1.0
+        constants[0, ELEMENTS // 2] = 0.0  # one triangle
+        x = q[sample.slots[:4]]
+        e, sides = x[1] - x[0], x[2:] - x[0]
+        t0 = unit(unit(e) + 0.3 * random.normal(size=e.shape))
+        u0 = unit(np.cross(t0, random.normal(size=e.shape)))
+        u = np.broadcast_to(transport(u0, t0, unit(e)), sides.shape)
+        data["frame"] = np.concatenate([u0, t0], axis=1).T
+        turns = 2.0 * np.pi * random.integers(-2, 3, size=(2, ELEMENTS))
+        data["lag"] = signed_angle(u, sides, unit(e)) + turns + 0.3 * random.normal(size=turns.shape)
     if measure.spins:
         constants[0] = np.where(np.arange(ELEMENTS) % 2, 1.0, -1.0)
         tangent = unit(q[sample.slots[1]] - q[sample.slots[0]])
@@ -322,7 +336,8 @@ def parameters(case: NetCase) -> float:
 
 
 def lagged(case: NetCase) -> float:
-    names = [name for name in ("frame", "lag") if case.term.measure.spins]
+    measure = case.term.measure
+    names = ["frame"] * (measure.frames > 0) + ["lag"] * measure.spins  # of glue those only say which turn it is
     names += ["last"] if case.term.density.lagged else []
     errors = []
     for name in names:

@@ -11,14 +11,14 @@ from ddg_warp.elements import ElementSet
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.terms import JOINT
 from ddg_warp.net import Net, NetSet
+from ddg_warp.net_glue import glue_sets
 
 
 def element_sets(scene, net: Net) -> list[NetSet]:
     """Elements of a net by term; marks the dofs that none of them has."""
     joints = _joint_places(scene, net)
-    return _gather_sets(
-        [*_rod_sets(net, joints), *_joint_sets(net, joints), *_shell_sets(net, scene), *_meridian_sets(net, scene)]
-    )
+    rods = [*_rod_sets(net, joints), *_joint_sets(net, joints), *glue_sets(scene, net)]
+    return _gather_sets([*rods, *_shell_sets(net, scene), *_meridian_sets(net, scene)])
 
 
 def _joint_places(scene, net: Net) -> list[tuple[int, int, list]]:
@@ -99,14 +99,13 @@ def _joint_sets(net: Net, joints) -> list[NetSet]:
             half = 0.5 * lengths[k]
             pair = [np.array([[sign * tangent, sign * tangents[k]]]), np.array([[director, frames[k]]])]
             twist = geometry.reference_twist(*pair, False)[0, 0]
-            section = piece.batch.section
-            stiffness = [_edge_value(value, piece, row, k) for value in (section.EI1, section.EI2, section.GJ)]
             if isinstance(piece.batch.natural, str) and piece.batch.natural == "shape":
                 rest = np.array([*(value[0, 0] for value in geometry.curvatures(*pair, False)), twist]) / half
             else:
                 rest = _natural_at(piece, row, k if sign > 0 else k + 1) * [1.0, sign, 1.0]
             lag = np.concatenate([director, sign * tangent, [twist]])[:, None]
-            parameters = JOINT.bind(measure=[[half]], stiffness=[[v] for v in stiffness], rest=[[v] for v in rest])
+            stiffness = rod.stiffness(k)[:, None]
+            parameters = JOINT.bind(measure=[[half]], stiffness=[*stiffness], rest=[[value] for value in rest])
             slots = np.array([[node], [other], [rod.all_edges[k]], [spin]])
             sets.append(NetSet(JOINT, slots, lag, np.array([[sign]]), parameters, np.array([[rod.rod], [k]])))
     return sets
@@ -121,13 +120,6 @@ def _natural_at(piece: Piece, row: int, node: int) -> np.ndarray:
             vertex = (node - 1) % vertices if piece.kind.closed else min(max(node - 1, 0), vertices - 1)
             return np.array([_row(value, row, vertices)[vertex] for value in rest])
     raise AssertionError("a rod of a rigid joint has a bending term")
-
-
-def _edge_value(value, piece: Piece, row: int, edge: int) -> float:
-    """A stiffness of the section on an edge with ghosts."""
-    batch, (before, _) = piece.batch, piece.ghosts
-    full = np.broadcast_to(np.asarray(value, float), (batch.rods, batch.edges))
-    return float(full[piece.rods[row] - batch.first, np.clip(edge - before, 0, batch.edges - 1)])
 
 
 def _shell_sets(net: Net, scene) -> list[NetSet]:

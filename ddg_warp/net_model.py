@@ -194,12 +194,9 @@ class DeviceNet:
         )
         for part, same, old, new in zip(self.sets, kept.lag, before.lag, after.lag, strict=True):
             measure, dim = part.term.measure, self.worlds * part.elements
-            if measure.spins:
+            if measure.frames:
                 inputs = [after.q, after.frame, part.slots, part.data, self.blocks, self.angle_start, self.edges]
-                launch(frames.joint_kernel(real), dim, [*inputs, moved, same, old], [new])
-            elif measure.frames:
-                inputs = [after.frame, part.slots, measure.nodes, self.angle_start, self.edges]
-                launch(frames.vertex_kernel(real), dim, [*inputs, moved, same, old], [new])
+                launch(frames.lag_kernel(measure, real), dim, [*inputs, moved, same, old], [new])
         self.reset_spins(after.q)
 
     def reset_spins(self, blocks: wp.array) -> None:

@@ -27,7 +27,8 @@ class Spectrum:
         eigenvalues: in ascending order, exactly zero for rigid modes; with the mass as metric they are squared angular frequencies
             [1/s^2]. Loads that follow and are not conservative may make them complex: then the equilibrium flutters.
         modes: (dofs, number), normalised in the metric; zero at held dofs.
-        negative: number of eigenvalues that are negative (inertia), of complex ones in their real part; without rigid modes.
+        negative: number of eigenvalues that are negative (inertia), of complex ones in their real part; without rigid modes, with
+            those of dofs without mass, which have no frequency and are not among the eigenvalues.
         rigid: number of rigid modes that the supports leave: translations, rotations, mechanisms of hinges, spins of rods about
             their own axes. They come first among eigenvalues that are not negative.
         displacements: of the modes by node (number, P, 3) in the order of `State.points`, (number, worlds, P, 3) of several worlds.
@@ -106,6 +107,8 @@ def spectrum(
         values, modes = values.real, modes.real
     negative = int((values.real < 0.0).sum())
     values, modes = np.insert(values, negative, np.zeros(zero)), np.insert(modes, [negative] * zero, rigid, axis=1)
+    if (weights == 0.0).any() and is_symmetric(matrix):
+        negative = max(negative, instabilities(tangent, state, stiffness))
     full = np.zeros((tangent.size, min(count, len(values))), modes.dtype)
     full[free] = modes[:, :count]
     displacements = np.array([tangent.at_points(mode) for mode in full.T])

@@ -233,13 +233,32 @@ class Structures(Meridians):
             raise SceneError(f"join: {pairs}; a joint has two different members at least, (rod, node) each")
         self.joints.append(Joint(tuple(pairs), arguments.flag("join: rigid", rigid)))
 
-    def attach(self, rod: int, nodes, shell: int, vertices) -> None:
-        """Make nodes of a rod and vertices of a shell one: a stiffener, a line, a rim. They are at the same points at rest."""
+    def attach(self, rod: int, nodes, shell: int, vertices, spin: str = "glued") -> None:
+        """Make nodes of a rod and vertices of a shell one: a stiffener, a rim, a post. They are at the same points at rest.
+
+        Args:
+            rod: index.
+            nodes: of the rod.
+            shell: index.
+            vertices: as many.
+            spin: "glued": every rod edge between two of these nodes that lies on a mesh edge turns about it with the surface and
+                keeps the angle to it that its directors have at rest; of two triangles their mean turns it, so that a fold along
+                the rod costs what it did. "free": nothing holds the rod's spin about its own axis.
+
+        Glue holds the turn about the edge alone. A rod whose edges are not mesh edges (a post, a line from a vertex) stands on a ball
+        joint and may spin; one without twist has no spin. With bending "midedge_dof" the surface's own normal at the edge turns the
+        rod, on any mesh; without it that of the triangles does, which is right where the mesh is alike along the rod. Edges on a
+        symmetry plane do not turn.
+
+        Raises:
+            SceneError: an index out of range, not as many vertices as nodes, another `spin`; at `build`, points that lie apart.
+        """
         (rod,), nodes = self._on_rods("attach", arguments.index("attach: rod", rod), "node", nodes)
         vertices = self._vertices(shell, vertices)
         if len(nodes) != len(vertices):
             raise SceneError(f"attach: {len(nodes)} nodes of rod {rod} and {len(vertices)} vertices; give as many")
-        self.attachments.append(Attachment(int(rod), np.array(nodes), shell, vertices))
+        glued = arguments.choice("attach: spin", spin, ("glued", "free")) == "glued"
+        self.attachments.append(Attachment(int(rod), np.array(nodes), shell, vertices, glued))
 
     def _hold(self, call: str, shell, vertices, components, **options) -> None:
         if options.get("edges") != "symmetry":  # an oblique plane has none

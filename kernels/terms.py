@@ -21,6 +21,7 @@ from ddg_warp.kernels.measures.midedge_curvature import midedge_curvature, mided
 from ddg_warp.kernels.measures.midedge_metric import midedge_metric
 from ddg_warp.kernels.measures.planar_curvature import planar_curvature
 from ddg_warp.kernels.measures.rod_curvature_twist import rod_curvature_twist
+from ddg_warp.kernels.measures.rod_surface_angle import rod_surface_angle
 from ddg_warp.kernels.measures.triangle_metric import triangle_metric
 
 MEASURE = Parameter("measure", "m or m^2", POSITIVE, rest=True)
@@ -117,5 +118,6 @@ AXISYMMETRIC = _registry(
 )
 
 JOINT = Term("rigid_joint", joint_curvature_twist, quadratic, "bending and twist of half cells at rigid joints")
+GLUE = Term("glued_edge", rod_surface_angle, quadratic, "what turns the edges of an attached rod with the shell")
 
-ALL = {**REGISTRY, **SHELLS, **AXISYMMETRIC, JOINT.key: JOINT}
+ALL = {**REGISTRY, **SHELLS, **AXISYMMETRIC, JOINT.name: JOINT, GLUE.name: GLUE}

@@ -156,8 +156,8 @@ def test_supports_leave_some_rigid_modes(device):
     np.testing.assert_allclose(found.eigenvalues[1:3], 1.5 * 9.81, rtol=2e-3)
 
 
-def test_stiffener_spins_on_its_line(device):
-    """Attached by its nodes alone, a straight stiffener is held by nothing against a turn about its own axis: a named rigid mode."""
+def stiffened(device, spin: str, hold_twist: bool = False):
+    """The spectrum of a clamped plate with a rod along its middle, which is attached by its nodes, or glued."""
     points, triangles = meshes.rectangle(4, 4)
     scene = still()
     plate = scene.add_shell(points, triangles, thickness=0.01, material=STEEL)
@@ -165,18 +165,25 @@ def test_stiffener_spins_on_its_line(device):
     line_of = np.flatnonzero(np.abs(points[:, 1] - 0.5) < 1e-9)
     line_of = line_of[np.argsort(points[line_of, 0])]
     rod = scene.add_rod(points[line_of], section=SECTION)
-    scene.attach(rod, range(len(line_of)), plate, line_of)
+    scene.attach(rod, range(len(line_of)), plate, line_of, spin=spin)
+    if hold_twist:
+        scene.fix_twist(rod, [0])
     model = scene.build(device, "float64")
-    found = spectrum(model, model.state(), 4)
+    return spectrum(model, model.state(), 4)
+
+
+def test_stiffener_spins_on_its_line(device):
+    """By its nodes alone, a straight stiffener is held by nothing against a turn about its axis: a named rigid mode. Glue holds it."""
+    found = stiffened(device, "free")
     assert (found.rigid, found.stable) == (1, True)
     assert found.eigenvalues[0] == 0.0 < found.eigenvalues[1]
-    assert (
-        np.abs(found.displacements[0]).max() < 1e-9 * np.abs(found.displacements[1]).max()
-    )  # nothing moves, the stiffener turns
+    moved = np.abs(found.displacements).max((1, 2))
+    assert moved[0] < 1e-9 * moved[1]  # nothing moves, the stiffener turns
     assert np.isfinite(found.frequencies).all()
-    scene.fix_twist(rod, [0])
-    model = scene.build(device, "float64")
-    assert spectrum(model, model.state(), 4).rigid == 0
+    assert stiffened(device, "free", hold_twist=True).rigid == 0
+    glued = stiffened(device, "glued")
+    assert (glued.rigid, glued.stable) == (0, True)
+    assert (glued.eigenvalues > 0.0).all()
 
 
 def test_an_instability_is_no_rigid_mode(device):
@@ -310,3 +317,17 @@ def test_a_count_that_rounding_makes_too_large_ends_the_search(device, monkeypat
     found = spectrum(model, model.state(), 3)
     np.testing.assert_allclose(found.eigenvalues, exact.eigenvalues, rtol=1e-9)
     assert len(searches) < 5
+
+
+def test_massless_angles_may_be_what_is_unstable(device):
+    """A tall strip is held on an arc in its stiff plane: it would turn into the soft one, though its angles have no inertia."""
+    scene, angle = still(), np.linspace(0.0, 1.0, 9)
+    arc = np.stack([np.sin(angle), np.cos(angle), 0.0 * angle], -1)
+    section = ddg.Stiffness(EA=1e4, EI1=4.0, EI2=0.1, GJ=0.05, mass_per_length=1.0)
+    director = np.stack([-np.sin(angle), -np.cos(angle), 0.0 * angle], -1)[4]
+    rod = scene.add_rod(arc, section=section, director=director, natural="straight")
+    scene.fix(rod, range(1, 9))
+    model = scene.build(device, "float64")
+    found = [spectrum(model, model.state(), 3, metric) for metric in ("mass", "unit")]
+    assert found[0].negative == found[1].negative > 0
+    assert not found[0].stable and (found[0].eigenvalues > 0.0).all()

@@ -161,7 +161,7 @@ class NetStep:
         for part in self.net.sets:
             measure = part.term.measure
             if measure.frames:
-                kernels.append((frames.joint_kernel if measure.spins else frames.vertex_kernel)(real))
+                kernels.append(frames.lag_kernel(measure, real))
             if part.term.density.lagged:
                 kernels.append(elements.term_kernels(part.term, real)[3])
         arrays.load_kernels(kernels, device)

@@ -67,6 +67,11 @@ class Measure:
         return self.nodes + self.angles + self.spins
 
     @property
+    def twists(self) -> bool:
+        """Whether the strains are the curvatures and the twist between two edges of a rod."""
+        return self.strains[-1].startswith("twist")
+
+    @property
     def span(self) -> int:
         """Edges of a chain stencil: 1 for an edge, 2 for a vertex."""
         return len(self.edges)

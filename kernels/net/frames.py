@@ -1,4 +1,4 @@
-"""Lagged data of a net: frames of rod edges, reference twist of their vertices, ghosts and rotation of rigid joints.
+"""Lagged data of a net: frames of rod edges, reference twist of vertices, ghosts of rigid joints, angles of glued triangles.
 
 Worlds whose flag `moved` is zero take over what is `kept`, untouched.
 """
@@ -62,16 +62,29 @@ def edge_kernel(real):
 
 
 @cache
+def lag_kernel(measure, real):
+    """Own lagged rows of elements of a measure with frames, which are up to date, as the positions are."""
+    return {
+        "rod_curvature_twist": vertex_kernel,
+        "joint_curvature_twist": joint_kernel,
+        "rod_surface_angle": surface_kernel,
+    }[measure.name](real)
+
+
+@cache
 def vertex_kernel(real):
-    """Reference twist of rod vertices between frames that are up to date; `angles` are the blocks of both edges' angles."""
+    """Reference twist of rod vertices, whose slots are three nodes and the angles of both edges."""
+    V = wp.types.vector(3, real)
     row, _ = functions(real)
     _, reference_twist, _ = frames.functions(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def vertices(
+        q: wp.array(dtype=V),
         frame: wp.array2d(dtype=real),
         slots: wp.array2d(dtype=int),
-        first_angle: int,
+        data: wp.array2d(dtype=real),
+        blocks: int,
         angle_start: int,
         edges: int,
         moved: wp.array(dtype=int),
@@ -86,8 +99,8 @@ def vertex_kernel(real):
             lag_out[0, tid] = kept[0, tid]
             return
         e = tid - world * count
-        a = slots[first_angle, e] - angle_start + world * edges
-        b = slots[first_angle + 1, e] - angle_start + world * edges
+        a = slots[3, e] - angle_start + world * edges
+        b = slots[4, e] - angle_start + world * edges
         lag_out[0, tid] = reference_twist(
             row(frame, 0, a), row(frame, 0, b), row(frame, 3, a), row(frame, 3, b), lag[0, tid]
         )
@@ -135,6 +148,45 @@ def joint_kernel(real):
         lag_out[6, tid] = reference_twist(u, row(frame, 0, f), t, row(frame, 3, f) * data[0, e], lag[6, tid])
 
     return joints
+
+
+@cache
+def surface_kernel(real):
+    """Angles of the two triangles beside a glued rod edge in the edge's frame."""
+    V = wp.types.vector(3, real)
+    row, _ = functions(real)
+    _, angle_between, _ = frames.functions(real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def surfaces(
+        q: wp.array(dtype=V),
+        frame: wp.array2d(dtype=real),
+        slots: wp.array2d(dtype=int),
+        data: wp.array2d(dtype=real),
+        blocks: int,
+        angle_start: int,
+        edges: int,
+        moved: wp.array(dtype=int),
+        kept: wp.array2d(dtype=real),
+        lag: wp.array2d(dtype=real),
+        lag_out: wp.array2d(dtype=real),
+    ):
+        tid = wp.tid()
+        count = slots.shape[1]
+        world = tid / count
+        if moved[world] == 0:
+            for side in range(2):
+                lag_out[side, tid] = kept[side, tid]
+            return
+        e = tid - world * count
+        f = slots[4, e] - angle_start + world * edges
+        u = row(frame, 0, f)
+        t = row(frame, 3, f)
+        for side in range(2):
+            a = q[slots[2 + side, e] + world * blocks] - q[slots[0, e] + world * blocks]
+            lag_out[side, tid] = angle_between(u, a, t, t, lag[side, tid])
+
+    return surfaces
 
 
 @cache

@@ -149,6 +149,7 @@ refuse("joints", {
     "attach no vertex": (lambda: both().attach(1, [0], 0, [16]), "vertex 16", "16 vertices"),
     "attach others": (lambda: both().attach(1, [0, 1], 0, [0]), "2 nodes", "1 vertices", "as many"),
     "attach nothing": (lambda: both().attach(1, [], 0, []), "nothing is chosen"),
+    "attach spin": (lambda: both().attach(1, [0], 0, [0], spin="stuck"), "attach: spin", "'stuck'", "'glued' or 'free'"),
     "attach apart": (lambda: built(both(), lambda s: s.attach(1, [0], 0, [5])), "node 0 of rod 1", "vertex 5", "apart"),
 })
 

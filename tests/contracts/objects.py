@@ -146,15 +146,9 @@ def _stiffened(scene, material) -> Added:
     added = _of_sheet(scene, shell, points)
     edge = np.flatnonzero(points[:, 1] <= points[:, 1].min() + 1e-9)
     edge = edge[np.argsort(points[edge, 0])]
-    rod = scene.add_rod(points[edge], section=ddg.Circle(0.01), material=material)
-    scene.attach(rod, range(len(edge)), shell, edge)
-    sheet = added.hold
-
-    def hold(scene, motion=None):
-        sheet(scene, motion)
-        scene.clamp(rod, edges=[0], motion=motion)
-
-    return Added(hold, added.load, rods=[rod], shells=[shell])
+    rod = scene.add_rod(points[edge], section=ddg.Rectangle(0.02, 0.01), material=material, director=Z)
+    scene.attach(rod, range(len(edge)), shell, edge)  # glued, so that what holds the sheet holds the rod's spin
+    return Added(added.hold, added.load, rods=[rod], shells=[shell])
 
 
 def _dome(scene, material) -> Added:

@@ -1,5 +1,5 @@
-"""Every derivative of the terms of shells, shells of revolution and the rigid joint, in both precisions, against something else
-that computes it."""
+"""Every derivative of the terms of shells, shells of revolution, rigid joints and glued edges, in both precisions, against
+something else that computes it."""
 
 from functools import cache
 
@@ -65,3 +65,6 @@ def test_sample_is_general():
     age = np.degrees(np.arccos(np.sum(t * edge, -1) / np.linalg.norm(edge, axis=-1)))
     assert 5.0 < age.min() and age.max() < 60.0
     assert np.abs(joint.data["lag"][6]).max() > 2.0 * np.pi
+    glue = net_derivatives.NetCase(TERMS["glued_edge"], "float64", "cpu").sample
+    assert set(glue.data["constants"][1]) == {-1.0, 0.0, 1.0}
+    assert 0.0 in glue.data["constants"][0] and np.abs(glue.data["lag"]).max() > 2.0 * np.pi

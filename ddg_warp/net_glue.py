@@ -1,0 +1,120 @@
+"""What turns attached rods with the shells that they lie on: elements at rod edges that are mesh edges.
+
+Glue gives way as a short piece of what it joins would: against a turn over the surface, a length of it is as stiff as
+
+    k = GLUE / (l^2 / S + 1 / (D_a / h_a + D_b / h_b)) ,
+
+l the length of the edge, S the largest stiffness of the rod's section, D and h the bending stiffness and height of the triangles on
+either side: a GLUE-th of the edge twisted or bent and of the triangles bent, one after the other. A torque m per length turns the rod
+over the surface by m / k. The rod, which needs it to twist, keeps it of second order in l, and the plate, whose moments jump by it, of
+first order in h with a factor of 1 / GLUE; and where one of them is much softer than the other, glue is no stiffer than that.
+"""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import geometry
+from ddg_warp import shells as shell_terms
+from ddg_warp.kernels.net.elements import term_kernels
+from ddg_warp.kernels.terms import GLUE as TERM
+from ddg_warp.net import Net, NetRod, NetSet, NetShell
+from ddg_warp.shell_geometry import SYMMETRY
+
+GLUE = 10.0
+"""Stiffness of the glue over that of an edge of the rod and the triangles beside it, which twist or bend one after the other."""
+
+
+def glue_sets(scene, net: Net) -> list[NetSet]:
+    """Elements of the rods that are glued to shells; edges on a symmetry plane, which keeps them from turning, are held."""
+    rods, sets = {rod.rod: rod for rod in net.rods}, []
+    for (index, at), vertices in _attached(scene, rods).items():
+        rod, shell = rods[index], net.shells[at]
+        edges, mesh_edges = _shared_edges(rod, shell, vertices)
+        mirrored = shell.kinds.kind[mesh_edges] == SYMMETRY
+        net.fixed[rod.edges[edges[mirrored]], 0] = True
+        if not mirrored.all():
+            sets.append(_elements(net, rod, edges[~mirrored], shell, mesh_edges[~mirrored], scene.shells[at].bending))
+    return sets
+
+
+def _attached(scene, rods: dict[int, NetRod]) -> dict[tuple[int, int], np.ndarray]:
+    """Of every rod with angles and shell that it is glued to: the vertex of each node of the rod, -1 without."""
+    result = {}
+    for link in scene.attachments:
+        rod = rods[link.rod]
+        if link.glued and rod.edges.size:
+            vertices = result.setdefault((link.rod, link.shell), np.full(len(rod.nodes), -1))
+            vertices[link.nodes] = link.vertices
+    return result
+
+
+def _shared_edges(rod: NetRod, shell: NetShell, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Edges of a rod, without ghosts, that are edges of a mesh, and these."""
+    surface = shell.surface
+    first, second = vertices[: len(rod.edges)], np.roll(vertices, -1)[: len(rod.edges)]
+    keys = surface.edges @ [len(surface.points), 1]
+    wanted = np.minimum(first, second) * len(surface.points) + np.maximum(first, second)
+    found = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    edges = np.flatnonzero((first >= 0) & (second >= 0) & (keys[found] == wanted))
+    return edges, found[edges]
+
+
+def _elements(net: Net, rod: NetRod, edges, shell: NetShell, mesh_edges, bending: str) -> NetSet:
+    surface, piece = shell.surface, rod.piece
+    ends = np.stack([rod.nodes[edges], np.roll(rod.nodes, -1)[edges]])
+    corners = surface.edge_opposite[mesh_edges].T
+    lone = corners.min(0) < 0
+    opposite = shell.nodes[np.where(lone, corners.max(0), corners)]
+    vertices = net.rest[ends[0]], net.rest[ends[1]]
+    e = vertices[1] - vertices[0]
+    sides = net.rest[opposite] - vertices[0]
+    length = np.linalg.norm(e, axis=1)
+    heights = np.linalg.norm(np.cross(e, sides), axis=2) / length
+    turns = shell_terms.turning(shell.kinds, bending)[mesh_edges]
+    share = np.where(lone, 0.0, np.where(turns, 0.5, heights[0] / heights.sum(0)))
+    along = np.where(shell.nodes[surface.edges[mesh_edges, 0]] == ends[0], 1.0, -1.0)
+    k = edges + rod.first
+    frame, tangent = piece.director[rod.row][k], piece.tangent[rod.row][k]
+    angle = np.stack([geometry.signed_angle(np.broadcast_to(frame, e.shape), side, tangent) for side in sides])
+    rest = -(1.0 - share) * angle[0] - share * angle[1]
+    stiffness = GLUE / (length**2 / rod.stiffness(k).max(axis=0) + 1.0 / _bending(shell, mesh_edges, heights))
+    angles = rod.edges[edges], np.where(turns, shell.edges[mesh_edges], rod.edges[edges])
+    owner = np.array([np.full(len(edges), rod.rod), k])
+    data = np.stack([share, np.where(turns, along, 0.0)])
+    law = TERM.bind(measure=length, stiffness=stiffness, rest=rest)
+    return NetSet(TERM, np.stack([*ends, *opposite, *angles]), angle, data, law, owner)
+
+
+def _bending(shell: NetShell, mesh_edges, heights) -> np.ndarray:
+    """D / h of the triangles beside mesh edges, added up [N]."""
+    plate, sides = shell.plate, shell.surface.edge_triangles[mesh_edges].T
+    rigidity = plate.young * plate.thickness**3 / (12.0 * (1.0 - plate.poisson**2))
+    return np.where(sides < 0, 0.0, rigidity[sides] / heights).sum(0)
+
+
+def follow(net, state, angles: bool, rates: bool) -> None:
+    """Turn glued edges that are free with the surface as its nodes are (angles) and move (rates), in place."""
+    for index, part in enumerate(net.sets):
+        if part.term.name != TERM.name:
+            continue
+        shape = (net.worlds, part.elements)
+        edges = part.host.slots[4] + net.blocks * np.arange(net.worlds)[:, None]
+        free = ~net.host.fixed[part.host.slots[4], 0]
+        strain, stress, next_stress = (wp.zeros((1, edges.size), dtype=net.real, device=net.device) for _ in range(3))
+        stiffness, rest = (np.broadcast_to(part.parameters[name], shape) for name in ("stiffness", "rest"))
+        if angles:
+            net.strains(state, index, strain)
+            _turn(state.q, edges, np.where(free, rest - strain.numpy().reshape(shape), 0.0))
+        if rates:
+            net.strains(state, index, strain, stress)
+            inputs = [*net.inputs(part, state, index), state.v]
+            wp.launch(term_kernels(TERM, net.real)[4], edges.size, inputs, [next_stress], device=net.device)
+            slip = (next_stress.numpy() - stress.numpy()).reshape(shape) / np.where(stiffness > 0.0, stiffness, 1.0)
+            _turn(state.v, edges, np.where(free, -slip, 0.0))
+
+
+def _turn(blocks: wp.array, places: np.ndarray, by: np.ndarray) -> None:
+    """Add to the first of the three reals of blocks; where one is named twice the last counts."""
+    values = blocks.numpy()
+    values[places, 0] += by
+    blocks.assign(values)

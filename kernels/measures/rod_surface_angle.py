@@ -1,0 +1,86 @@
+"""Angle from a surface to the directors of a rod edge that lies on a mesh edge, about that edge [rad].
+
+The triangles beside the edge are at the angles beta_a and beta_b in the edge's reference frame (u, v = t x u), which is the lagged one
+transported to the current tangent t: beta = atan2(a . v, a . u), a from the edge to the corner opposite, continued past pi from its
+lagged value. Normals turn as the triangles do. Of the surface's turn it is the mean, shared out by m, that counts, and where the
+normal at the middle of the edge has an angle xi of its own (`midedge_curvature_dof`), that is added:
+
+    psi = theta - (1 - m) beta_a - m beta_b - r xi .
+
+A symmetric fold about the edge leaves psi as it is, so that what is glued by it adds no bending across. With m = h_a / (h_a + h_b), h
+the heights of the triangles at rest, neither does a uniform curvature across; with xi, m = 1/2 as in the definition of that normal.
+
+With h the distance of a from the edge's line, n = (e x a) / |e x a| the direction in which beta grows, and z = (t0 x t) / (1 + t0 . t)
+the spin of the frame, which is transported in time (see `rod_curvature_twist`),
+
+    d beta / da = n / h,   d beta / de = -n (a . t) / (h |e|) + z / |e| .
+
+Singular where a triangle has no area, or the edge turns by 180 degrees from its lagged tangent.
+
+Nodes: 0, 1 on the edge as the rod runs it, 2 and 3 opposite; of an edge with one triangle 3 is 2, and m = 0. Angles: theta, xi.
+Lagged data: frame (u, t) of the edge; beta_a, beta_b. Data: m; r, +1 where the rod runs the edge as the mesh stores it, -1 where it
+runs it backwards, 0 without xi, which may then be any angle.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels import frames
+from ddg_warp.kernels.measures import Measure
+
+
+@cache
+def _functions(real):
+    Q, S, E, M = rod_surface_angle.types(real)
+    V = wp.types.vector(3, real)
+    transport, angle_between, _ = frames.functions(real)
+
+    @wp.func
+    def angle(q: Q, s: S):
+        t = wp.normalize(V(q[0], q[1], q[2]))
+        u = transport(V(s[0], s[1], s[2]), V(s[3], s[4], s[5]), t)
+        first = angle_between(u, V(q[3], q[4], q[5]), t, t, s[6])
+        second = angle_between(u, V(q[6], q[7], q[8]), t, t, s[7])
+        return q[9] - (real(1.0) - s[8]) * first - s[8] * second - s[9] * q[10]
+
+    @wp.func
+    def by_height(e: V, a: V):
+        """n / h of a triangle with the sides e and a."""
+        n = wp.cross(e, a)
+        return n * (wp.length(e) / wp.max(wp.dot(n, n), real(1.0e-30)))
+
+    @wp.func
+    def strains(q: Q, s: S, w: real):
+        return E(angle(q, s))
+
+    @wp.func
+    def jacobian(q: Q, s: S, w: real):
+        e = V(q[0], q[1], q[2])
+        a = V(q[3], q[4], q[5])
+        b = V(q[6], q[7], q[8])
+        t0 = V(s[3], s[4], s[5])
+        inverse = real(1.0) / wp.length(e)
+        t = e * inverse
+        z = wp.cross(t0, t) / (real(1.0) + wp.dot(t0, t))
+        da = by_height(e, a) * (s[8] - real(1.0))
+        db = by_height(e, b) * -s[8]
+        de = (da * wp.dot(a, t) + db * wp.dot(b, t) + z) * -inverse
+        return E(angle(q, s)), wp.matrix_from_rows(
+            Q(de[0], de[1], de[2], da[0], da[1], da[2], db[0], db[1], db[2], real(1.0), -s[9])
+        )
+
+    return strains, jacobian, None, None
+
+
+rod_surface_angle = Measure(
+    "rod_surface_angle",
+    3,
+    ((0, 1), (0, 2), (0, 3)),
+    ("angle [rad]",),
+    _functions,
+    angles=2,
+    frames=1,
+    lag_size=8,
+    data_size=2,
+)
