@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:  # what editors and type checkers read; at run time see `_HOME`
     from ddg_warp import inquiry, io, meshes, rest_shapes, stability
     from ddg_warp.check import Check
-    from ddg_warp.descriptions import Dynamics, Statics, Trace
+    from ddg_warp.descriptions import Dynamics, Law, Statics, Trace
     from ddg_warp.errors import SceneError, SceneWarning, SolverError
     from ddg_warp.integrate import continuation, statics
     from ddg_warp.integrate.dynamics import Integrator
@@ -34,6 +34,7 @@ __all__ = [
     "Dynamics",
     "Ellipse",
     "Integrator",
+    "Law",
     "Material",
     "Model",
     "Motion",
@@ -64,6 +65,7 @@ _HOME = {
     "Dynamics": "descriptions",
     "Ellipse": "material",
     "Integrator": "integrate.dynamics",
+    "Law": "descriptions",
     "Material": "material",
     "Model": "model",
     "Motion": "motion",

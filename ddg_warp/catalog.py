@@ -8,6 +8,7 @@ import inspect
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
 from types import ModuleType
@@ -52,15 +53,7 @@ def load_scene(name: str) -> ModuleType:
         InputError: There is no such scene, or it has no `build`.
     """
     if name.endswith(".py"):
-        path = Path(name)
-        if not path.is_file():
-            raise InputError(f"there is no scene file {name}")
-        folder = str(path.resolve().parent)
-        if folder not in sys.path:
-            sys.path.insert(0, folder)  # files beside the scene can be imported, as beside a script
-        spec = importlib.util.spec_from_file_location(path.stem, path)
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
+        module = load_file(name)
     else:
         scenes = scene_files()
         if name not in scenes:
@@ -71,6 +64,46 @@ def load_scene(name: str) -> ModuleType:
     if not hasattr(module, "build"):
         raise InputError(f"scene '{name}' has no build(**parameters) -> Scene")
     return module
+
+
+def load_file(name: str, what: str = "scene") -> ModuleType:
+    """The module of a Python file.
+
+    Raises:
+        InputError: There is no such file.
+    """
+    path = Path(name)
+    if not path.is_file():
+        raise InputError(f"there is no {what} file {name}")
+    folder = str(path.resolve().parent)
+    if folder not in sys.path:
+        sys.path.insert(0, folder)  # files beside it can be imported, as beside a script
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def own_term(file: str, name: str):
+    """A user's term from his file, or a law of his, as that of the term of rods whose strains it fits.
+
+    Raises:
+        InputError: There is no such file or name, or it is something else.
+    """
+    from ddg_warp.kernels.densities import Density
+    from ddg_warp.kernels.terms import REGISTRY, Term
+
+    found = getattr(load_file(file, "law's"), name, None)
+    if isinstance(found, Term):
+        return found
+    if not isinstance(found, Density):
+        raise InputError(f"{file} has no term or law {name!r}; give the name of a Term or a Density")
+    for term in ("rod_bend_twist", "rod_stretch"):
+        if found.strains in (None, len(REGISTRY[term].measure.strains)):
+            return replace(REGISTRY[term], density=found)
+    raise InputError(
+        f"{file}:{name} is of {found.strains} strains, rods have 3 of bending and 1 of stretch; give a Term"
+    )
 
 
 def scene_name(name: str) -> str:

@@ -14,7 +14,7 @@ from ddg_warp import arguments, geometry
 from ddg_warp.descriptions import RodBatch, Support
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.element import ChainKind
-from ddg_warp.kernels.terms import REGISTRY
+from ddg_warp.kernels.terms import REGISTRY, Term
 from ddg_warp.scene import Scene
 from ddg_warp.validate import check_batch, check_index
 
@@ -215,8 +215,14 @@ def _kind(dimension: int, batch: RodBatch) -> ChainKind:
     names = [f"{prefix}_stretch"]
     if batch.bend:
         names.insert(0, f"{prefix}_bend_twist" if batch.twist else f"{prefix}_bend")
+    for term in batch.laws:
+        if term not in names:
+            raise SceneError(
+                f"rod {batch.first} ('{batch.name}'): it has no term {term!r} to give a law; it has {', '.join(names)}"
+            )
     viscous = bool(np.any(np.asarray(batch.section.viscosity) > 0.0))
-    return ChainKind(dimension, batch.twist, batch.closed, tuple(REGISTRY[name].damped(viscous) for name in names))
+    terms = tuple(REGISTRY[name].of(batch.laws).damped(viscous) for name in names)
+    return ChainKind(dimension, batch.twist, batch.closed, terms)
 
 
 def _piece(dimension: int, batch: RodBatch, rows: np.ndarray, outside: Ghosts) -> Piece:
@@ -288,9 +294,9 @@ def _piece(dimension: int, batch: RodBatch, rows: np.ndarray, outside: Ghosts) -
         else:
             stiffness = [on_vertices(value) for value in _bending(section, kind)]
             rest, weight, spread = natural, voronoi, on_vertices(section.viscosity)
-        viscosity = {"viscosity": spread} if term.density.lagged else {}
-        values = term.bind(measure=weight, stiffness=stiffness, rest=rest, **viscosity)
-        parameters |= {f"{term.name}.{name}": _compress(value) for name, value in values.items()}
+        given = {"measure": weight, "stiffness": stiffness, "rest": rest, "viscosity": spread}
+        values = _bound(batch, term, given, on_edges if stretch else on_vertices)
+        parameters |= {f"{term.name}.{name}": _compress(np.atleast_2d(v)) for name, v in values.items()}
     keep = [0, 2] if dimension == 2 else [0, 1, 2]
     return Piece(
         batch,
@@ -306,6 +312,33 @@ def _piece(dimension: int, batch: RodBatch, rows: np.ndarray, outside: Ghosts) -
         own.sum(1),
         parameters,
     )
+
+
+def _bound(batch: RodBatch, term: Term, given: dict, along) -> dict[str, np.ndarray]:
+    """Parameters of a term by name, from what the rod gives and what its law says; `along` puts values where the term has them."""
+    where, families = f"rod {batch.first} ('{batch.name}'), {term.name}", {known.family for known in term.parameters}
+    law = batch.laws.get(term.name)
+    unstrained = 1.0 if term.measure.span == 1 else 0.0
+    bent = [np.abs((value - unstrained) * given["measure"]).max() > 1e-9 for value in given["rest"]]
+    if law is not None and "rest" not in families and any(bent):
+        raise SceneError(f"{where}: the law {term.density.name!r} has no strains at rest; give natural='straight'")
+    given = {family: value for family, value in given.items() if family in families}
+    for family, value in law.values.items() if law else ():
+        try:
+            given[family] = [along(v) for v in value] if isinstance(value, list | tuple) else along(value)
+        except (TypeError, ValueError):
+            raise SceneError(
+                f"{where}: {family} = {value!r}; give numbers that broadcast to the {batch.rods} rods and {batch.edges} edges"
+            ) from None
+    try:
+        values = term.bind(**given)
+    except TypeError as error:
+        raise SceneError(f"{where}: law {term.density.name!r}: {error}; give it with Law(density, ...)") from None
+    for known in term.parameters if law else ():
+        rule, holds = known.valid
+        if not np.all(np.isfinite(values[known.name]) & holds(values[known.name])):
+            raise SceneError(f"{where}: {known.name} = {values[known.name]}; it is finite and {rule}")
+    return values
 
 
 def _ghost(points: np.ndarray, end: int, neighbour: int, given: np.ndarray) -> np.ndarray:

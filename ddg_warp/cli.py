@@ -16,6 +16,7 @@ from ddg_warp.catalog import (
     add_parameters,
     load_scene,
     one_liner,
+    own_term,
     parameters,
     refused,
     scene_files,
@@ -86,7 +87,9 @@ def parser(arguments: list[str]) -> Parser:
 
     check = commands.add_parser("check", help="compare the derivatives of terms with automatic differentiation")
     check.set_defaults(command=check_terms)
-    check.add_argument("term", nargs="?", metavar="TERM", help="one term (default: all)")
+    check.add_argument(
+        "term", nargs="?", metavar="TERM", help="one term, or FILE.py:NAME of a term or law of your own (default: all)"
+    )
     check.add_argument("--precision", choices=("float64", "float32"), default="float64", help="default: float64")
     check.add_argument("--device", default="cpu", help="Warp device (default: cpu)")
 
@@ -272,13 +275,16 @@ def check_terms(chosen: argparse.Namespace) -> int:
     from ddg_warp.kernels.terms import ALL
     from ddg_warp.summary import table
 
-    if chosen.term is not None and chosen.term not in ALL:
-        raise InputError(f"there is no term '{chosen.term}'; there are {', '.join(ALL)}")
+    term = chosen.term
+    if term is not None and ".py:" in term:
+        term = own_term(*term.rsplit(":", 1))
+    elif term is not None and term not in ALL:
+        raise InputError(f"there is no term '{term}'; there are {', '.join(ALL)}; or give FILE.py:NAME of your own")
 
     require_device(chosen.device)
     from ddg_warp import derivatives
 
-    rows = derivatives.table(chosen.term, chosen.precision, chosen.device)
+    rows = derivatives.table(term, chosen.precision, chosen.device)
     print(table([{**row, "passed": "passed" if row["passed"] else "FAILED"} for row in rows]))
     return DONE if all(row["passed"] for row in rows) else FAILED
 

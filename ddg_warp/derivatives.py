@@ -28,9 +28,10 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
+from ddg_warp.descriptions import Law
 from ddg_warp.kernels import element
 from ddg_warp.kernels.element import ChainKind
-from ddg_warp.kernels.terms import REGISTRY, Term
+from ddg_warp.kernels.terms import ALL, REGISTRY, Term
 from ddg_warp.material import Stiffness
 from ddg_warp.precision import PRECISIONS
 from ddg_warp.samples import Sample, is_vector, rotation
@@ -41,20 +42,18 @@ TRAP = 2.0**-30
 
 def chain_of(term: Term, closed: bool) -> ChainKind:
     """The chain that a rod with this term is: bending first, then stretch, both damped or neither."""
-    damped, bending = term.density.lagged, term.name
-    if term.measure.span == 1:
-        bending = "planar_bend" if term.measure.dim == 2 else "rod_bend_twist"
-    stretch = "planar_stretch" if term.measure.dim == 2 else "rod_stretch"
-    terms = tuple(REGISTRY[name].damped(damped) for name in (bending, stretch))
+    known = ("planar_bend", "planar_stretch") if term.measure.dim == 2 else ("rod_bend_twist", "rod_stretch")
+    bending, stretch = (REGISTRY[name].damped(term.density.lagged) for name in known)
+    terms = (term, stretch) if term.measure.span == 2 else (bending, term)
     return ChainKind(term.measure.dim, terms[0].measure.angles > 0, closed, terms)
 
 
 def _rest_scene(term: Term, kind: ChainKind) -> Scene:
-    """A rod of that kind, at rest in a random shape; straight where the measure knows no other."""
+    """A rod of that kind, at rest in a random shape; straight where the measure, or the law, knows no other."""
     random = np.random.default_rng(5)
     angle = np.linspace(0.0, 2.0 * np.pi, 7)[:-1, None]
     points = np.concatenate([np.cos(angle), np.sin(angle), np.sin(angle)], -1) + 0.1 * random.normal(size=(6, 3))
-    if any(map(is_vector, kind.terms)):
+    if any(map(is_vector, kind.terms)) or not term.rest:
         points = np.cumsum(random.uniform(0.5, 1.5, size=(6, 1)), axis=0) * random.normal(size=3)
     if kind.dim == 2:
         points[:, 1] = 0.0
@@ -62,7 +61,12 @@ def _rest_scene(term: Term, kind: ChainKind) -> Scene:
     viscosity = 0.4 if term.density.lagged else 0.0
     section = Stiffness(EA=2.0, EI1=0.9, EI2=bending, GJ=0.8, mass_per_length=1.0, viscosity=viscosity)
     scene = Scene(dimension=kind.dim)
-    scene.add_rod(points, section=section, closed=kind.closed, natural="shape", twist=kind.twist)
+    brought = {"stiffness", *(known.family for known in term.parameters if known.rest or known.default is not None)}
+    own = term.density.undamped or term.density
+    values = {known.family: 0.5 for known in term.parameters if known.family not in brought}
+    laws = {term.name: Law(own, **values)}
+    natural = "shape" if term.rest else "straight"
+    scene.add_rod(points, section=section, closed=kind.closed, natural=natural, twist=kind.twist, laws=laws)
     return scene
 
 
@@ -294,7 +298,7 @@ CHECKS = {
 
 def checks_of(term: Term, closed: bool, precision: str) -> list[str]:
     """Checks that make sense: a rod that is straight at rest has no rest shape when closed."""
-    straight = term.measure.name == "curvature_binormal"
+    straight = term.measure.name == "curvature_binormal" or not term.rest
     return [
         name
         for name, (_, _, single) in CHECKS.items()
@@ -302,27 +306,34 @@ def checks_of(term: Term, closed: bool, precision: str) -> list[str]:
     ]
 
 
-def table(term: str | None = None, precision: str = "float64", device: str = "cpu") -> list[dict]:
+def table(term: str | Term | None = None, precision: str = "float64", device: str = "cpu") -> list[dict]:
     """Rows of the derivative table: term, chain, check, error, tolerance, passed.
 
     Args:
-        term: name of one term of chains or nets; all of them by default.
+        term: a term of chains or nets, one's own or one of `kernels.terms.ALL` by key; all of these by default.
         precision: "float64" or "float32", that of the kernels under test.
         device: Warp device.
     """
     from ddg_warp import net_derivatives
 
     rows = []
-    for name in [term] if term else [*REGISTRY, *net_derivatives.TERMS]:
-        if name in net_derivatives.TERMS:
-            case = net_derivatives.NetCase(net_derivatives.TERMS[name], precision, device)
-            rows += [_row(name, "net", check, one(case), precision) for check, one in net_derivatives.CHECKS.items()]
+    for one in [ALL[term] if isinstance(term, str) else term] if term else ALL.values():
+        if not on_chains(one):
+            case = net_derivatives.NetCase(one, precision, device)
+            rows += [
+                _row(one.key, "net", name, error(case), precision) for name, error in net_derivatives.CHECKS.items()
+            ]
             continue
         for closed in (False, True):
-            case = Case(REGISTRY[name], chain_of(REGISTRY[name], closed), precision, device)
-            for check in checks_of(case.term, closed, precision):
-                rows.append(_row(name, "closed" if closed else "open", check, CHECKS[check][0](case), precision))
+            case = Case(one, chain_of(one, closed), precision, device)
+            for check in checks_of(one, closed, precision):
+                rows.append(_row(one.key, "closed" if closed else "open", check, CHECKS[check][0](case), precision))
     return [row for row in rows if row["tolerance"] is not None]
+
+
+def on_chains(term: Term) -> bool:
+    """Whether a term runs along rods of their own."""
+    return term.measure.name in {known.measure.name for known in REGISTRY.values()}
 
 
 def _row(term: str, chain: str, check: str, error: float, precision: str) -> dict:

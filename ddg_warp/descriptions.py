@@ -1,6 +1,7 @@
 """What a scene is told, entry by entry: analyses, rods and shells, and what holds, loads and joins them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -64,7 +65,41 @@ class Trace:
             )
 
 
-@dataclass
+@dataclass(frozen=True, init=False)
+class Law:
+    """A constitutive law for a term of rods, instead of the quadratic one.
+
+    Attributes:
+        density: a `ddg_warp.kernels.densities.Density`, of the package or one's own.
+        values: of its parameters by family: a number, or an array that broadcasts to (rods, edges), or a list with one for each
+            strain; at vertices it is the mean of both edges. What is not given comes from the rod: stiffnesses of its section,
+            strains at rest, viscosity.
+    """
+
+    density: object
+    values: dict
+
+    def __init__(self, density, **values):
+        object.__setattr__(self, "density", density)
+        object.__setattr__(self, "values", deepcopy(values))
+
+
+def laws_of(what: str, section, material, laws) -> dict[str, Law]:
+    """Laws by term: those that a section brings, and those given.
+
+    Raises:
+        SceneError: something else is given.
+    """
+    brought = section.laws(material) if hasattr(section, "laws") else {}
+    if laws is not None and not isinstance(laws, Mapping):
+        raise SceneError(f"{what}: laws = {laws!r}; give a dictionary from terms to Law(density, ...)")
+    for term, law in (laws or {}).items():
+        if not isinstance(law, Law) or not hasattr(law.density, "parameters"):
+            raise SceneError(f"{what}: the law of {term!r} is {law!r}; give Law(density, ...)")
+    return {**brought, **(laws or {})}
+
+
+@dataclass(frozen=True)
 class RodBatch:
     """Rods of one `add_rods` call: same node count and closedness; section, shape and rest shape may differ."""
 
@@ -77,6 +112,7 @@ class RodBatch:
     bend: bool
     name: str
     first: int  # index of its first rod
+    laws: Mapping[str, Law] = field(default_factory=dict)  # by term
 
     @property
     def rods(self) -> int:

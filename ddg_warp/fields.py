@@ -41,6 +41,8 @@ def point_fields(model, state, names: Sequence[str]) -> dict[str, np.ndarray]:
     sums = {name: np.zeros((model.worlds, model.points_count)) for name in POINT_FIELDS}
     counts = {name: np.zeros((model.worlds, model.points_count)) for name in POINT_FIELDS}
     energies = [np.full((model.worlds, model.points_count), np.nan) for _ in range(2)]
+    if "energy_density" in names:
+        _need_quadratic(model)
     for term, strains, stresses, energy, rows in _elements(model, state):
         values = {"axial_force": stresses[..., 0]} if term.measure.span == 1 else _curvatures(term, strains)
         values["energy_density"] = energy
@@ -97,24 +99,26 @@ def _elements(model, state) -> Iterator[tuple]:
         row[k, column] = index
         for term, place in zip(group.kind.terms, group.kind.places(), strict=True):
             n, span = len(term.measure.strains), term.measure.span
-            names = (f"{term.name}.{name}" for name in (*term.stiffness, *term.rest))
-            along = [np.broadcast_to(group.parameters[name], (group.nodes, group.columns)) for name in names]
-            law = np.stack(along, -1).reshape(group.nodes, group.worlds, group.rods, 2 * n)
+            rest = np.zeros((group.nodes, group.columns, n))
+            for i, name in enumerate(term.rest):
+                rest[..., i] = group.parameters[f"{term.name}.{name}"]
+            rest = rest.reshape(group.nodes, group.worlds, group.rods, n)
             for rod in range(group.rods):
                 count = int(group.host.count[rod])
                 k = np.arange(count if group.kind.closed else count - span)
                 at = [row[(k + shift) % count, rod] for shift in ((0, 1) if span == 1 else (1,))]
                 cut = (k, slice(None), rod, slice(place[3], place[3] + n))
                 strain, stress = (np.moveaxis(values[cut], 0, 1) for values in (strains, stresses))
-                yield term, strain, stress, _energy(strain, np.moveaxis(law[k, :, rod], 0, 1)), at
+                yield term, strain, stress, _energy(strain, stress, np.moveaxis(rest[k, :, rod], 0, 1)), at
     for index, part in enumerate(model.net.sets if model.net is not None else ()):
         term = part.term
         if not term.measure.name.startswith(ROD_MEASURES):
             continue
         n, span = len(term.measure.strains), term.measure.span
         strain, stress = (np.moveaxis(values, 0, -1) for values in net_strains(model.net, state, index))
-        law = [np.broadcast_to(part.parameters[name], strain.shape[:2]) for name in (*term.stiffness, *term.rest)]
-        law = np.stack(law, -1)
+        rest = np.zeros_like(strain)
+        for i, name in enumerate(term.rest):
+            rest[..., i] = part.parameters[name]
         rods = {rod.rod: rod for rod in model.net.host.rods}
         owner, k = part.host.owner
         first, own, every = (
@@ -125,16 +129,24 @@ def _elements(model, state) -> Iterator[tuple]:
         for shift in (0, 1) if span == 1 else (1,):
             place = (k + shift) % every - first
             at.append(np.where((place >= 0) & (place < own), start[owner] + place, -1))
-        yield term, strain, stress, _energy(strain, law), at
+        yield term, strain, stress, _energy(strain, stress, rest), at
 
 
 ROD_MEASURES = ("edge_stretch", "rod_curvature", "curvature_binormal", "planar_curvature")
 
 
-def _energy(strain: np.ndarray, law: np.ndarray) -> np.ndarray:
-    """Elastic energy per length of stiffnesses and rest strains (..., 2 n): damping is not in it."""
-    n = strain.shape[-1]
-    return 0.5 * (law[..., :n] * (strain - law[..., n:]) ** 2).sum(-1)
+def _need_quadratic(model) -> None:
+    for batch in model.scene.batches:
+        for term, law in batch.laws.items():
+            raise ValueError(
+                f"energy_density: {term} of rod {batch.first} ('{batch.name}') has the law {law.density.name!r}, and the field knows "
+                "the quadratic one; inquiry.energies tells"
+            )
+
+
+def _energy(strain: np.ndarray, stress: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Elastic energy per length of a quadratic law."""
+    return 0.5 * (stress * (strain - rest)).sum(-1)
 
 
 def _fill_along_rods(model, values: np.ndarray) -> None:

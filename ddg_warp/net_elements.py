@@ -31,6 +31,11 @@ def _joint_places(scene, net: Net) -> list[tuple[int, int, list]]:
             rod = by_rod[index]
             if not rod.edges.size:
                 raise SceneError(f"rigid joint {number}: rod {index} has no twist; join it with rigid=False")
+            if "rod_bend_twist" in rod.piece.batch.laws:
+                raise SceneError(
+                    f"rigid joint {number}: rod {index} bends by a law of its own, and half cells at joints know the quadratic one; "
+                    "join it with rigid=False"
+                )
             k = rod.first + (at if at >= 0 else len(rod.nodes) + at)
             node = rod.all_nodes[k]
             count, closed = len(rod.all_nodes), rod.piece.kind.closed
@@ -161,8 +166,8 @@ def _bound(elements: ElementSet, nodes: np.ndarray, edges: np.ndarray, index: in
 def _gather_sets(sets: list[NetSet]) -> list[NetSet]:
     """One set a term; damped where one of its parts is."""
     result = []
-    for name in dict.fromkeys(s.term.name for s in sets if len(s)):
-        same = [s for s in sets if s.term.name == name and len(s)]
+    for law in dict.fromkeys(s.term.law for s in sets if len(s)):
+        same = [s for s in sets if s.term.law == law and len(s)]
         term = next((s.term for s in same if s.term.density.lagged), same[0].term)
         join = [np.concatenate([getattr(s, what) for s in same], axis=1) for what in ("slots", "lag", "data", "owner")]
         still = [np.zeros(len(s)) for s in same]

@@ -1,14 +1,14 @@
 """The description of a simulation: rods, supports, loads. NumPy only; nothing here knows a device."""
 
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import copy, deepcopy
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from ddg_warp import arguments, validate
-from ddg_warp.descriptions import Dynamics, Load, RodBatch, Statics, Support, Trace
+from ddg_warp.descriptions import Dynamics, Law, Load, RodBatch, Statics, Support, Trace, laws_of
 from ddg_warp.errors import SceneError
 from ddg_warp.material import Material, Stiffness
 from ddg_warp.motion import Motion
@@ -81,11 +81,13 @@ class Scene(Structures):
         twist: bool = True,
         bend: bool = True,
         name: str = "rod",
+        laws: Mapping[str, Law] | None = None,
     ) -> int:
         """Add one rod with points (n, 3); arguments as in `add_rods`, without R: a director (3,) or (edges, 3). Returns its index."""
         if np.ndim(director) == 2 and len(director) > 1:
             director = [director]
         options = {"closed": closed, "natural": natural, "twist": twist, "bend": bend, "name": name}
+        options["laws"] = laws
         return self.add_rods([points], section=section, material=material, director=director, **options)[0]
 
     def add_rods(
@@ -100,6 +102,7 @@ class Scene(Structures):
         twist: bool = True,
         bend: bool = True,
         name: str = "rod",
+        laws: Mapping[str, Law] | None = None,
     ) -> range:
         """Add rods of equal node count.
 
@@ -118,6 +121,7 @@ class Scene(Structures):
             twist: False leaves twist out: 3 dofs a node, for isotropic rods that are straight at rest.
             bend: False leaves bending and twist out: a chain of springs.
             name: shown in reports and output.
+            laws: a `Law` for terms by name, such as "rod_bend_twist", instead of the quadratic one with the section's stiffness.
 
         Returns:
             Indices of the rods.
@@ -155,6 +159,7 @@ class Scene(Structures):
             bend,
             name,
             self.rod_count,
+            laws_of(f"rods '{name}'", section, material, laws),
         )
         self.batches.append(batch)
         return range(batch.first, batch.first + batch.rods)

@@ -370,6 +370,37 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool):
     dofs = [*range(dim * term.measure.span), *(dim * kind.span + i for i in range(term.measure.angles))]
     places = tuple(packed_index(kind.window, dofs[i], dofs[j]) for i in range(size) for j in range(i, size))
 
+    if term.density.coupled:
+        R, J = wp.types.matrix((n, n), real), wp.types.matrix((n, size), real)
+
+        @wp.func
+        def row_of(root: R, jacobian: J, m: int, i: int):
+            total = real(0.0)
+            for j in range(wp.static(n)):
+                total += root[m, j] * jacobian[j, i]
+            return total
+
+        edge_of = row_of
+
+        @wp.func
+        def scale_of(root: R, m: int):
+            return real(1.0)
+
+    else:
+        J = wp.types.matrix((n, size), real)
+
+        @wp.func
+        def row_of(root: E, jacobian: J, m: int, i: int):
+            return root[m] * jacobian[m, i]
+
+        @wp.func
+        def edge_of(root: E, jacobian: J, m: int, i: int):
+            return jacobian[m, i]
+
+        @wp.func
+        def scale_of(root: E, m: int):
+            return root[m] * root[m]
+
     @wp.func
     def evaluate_at(
         window: W,
@@ -402,7 +433,7 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool):
         if not frozen:
             for m in range(wp.static(n)):
                 for i in range(wp.static(size)):
-                    factor[wp.static(row) + m * wp.static(size) + i, k, r] = linear(root[m] * jacobian[m, i])
+                    factor[wp.static(row) + m * wp.static(size) + i, k, r] = linear(row_of(root, jacobian, m, i))
         if wp.static(bends):
             if exact:
                 second = curvature_of(q, short(s), w, slope)
@@ -412,8 +443,9 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool):
         for m in range(wp.static(n)):
             edge = real(0.0)
             for i in range(wp.static(dim)):
-                edge += jacobian[m, i] * jacobian[m, i]
-            stiffness = wp.max(stiffness, root[m] * root[m] * edge)
+                part = edge_of(root, jacobian, m, i)
+                edge += part * part
+            stiffness = wp.max(stiffness, scale_of(root, m) * edge)
         return w * energy_of(e, p), spread((slope * w) * jacobian), stiffness
 
     return evaluate_at

@@ -1,5 +1,6 @@
 """The registries: a term is a measure times a density, one line each. Rods run along chains, shells on any elements."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -61,9 +62,18 @@ class Term:
         """Names of its rest strains."""
         return tuple(parameter.name for parameter in self.parameters if parameter.family == "rest")
 
+    @property
+    def law(self) -> tuple:
+        """What elements of one set have in common: name, and law but for its damping."""
+        return self.name, self.density.undamped or self.density
+
     def damped(self, wanted: bool = True) -> "Term":
         """This term with strain-rate damping, if `wanted`."""
         return replace(self, density=damped(self.density), text=self.text + ", damped") if wanted else self
+
+    def of(self, laws: Mapping) -> "Term":
+        """This term with another law (`Law`), if there is one for its name."""
+        return replace(self, density=laws[self.name].density) if self.name in laws else self
 
     def bind(self, **given) -> dict[str, np.ndarray]:
         """Values of all parameters by name, in their order, from those of each family: one array, or a list with one a number.

@@ -49,6 +49,7 @@ class Density:
         parameters: n -> its parameters, in the order of p.
         laws: (real, n) -> (energy(e, p), slope(e, p), curvature(e, p)) = (psi, psi', psi''); the last is a matrix (n x n) of a
             coupled law, else its diagonal as a vector.
+        strains: of how many it is; None where of any number.
         lagged: whether p ends with the strains of the last step (n) and the reciprocal of the time step (1).
         coupled: whether psi'' is a full matrix.
         quadratic: whether psi'' depends on no strain.
@@ -58,10 +59,12 @@ class Density:
     name: str
     parameters: Callable
     laws: Callable
+    strains: int | None = None
     lagged: bool = False
     coupled: bool = False
     quadratic: bool = False
     own_root: Callable | None = None
+    undamped: "Density | None" = None  # the law that this is with strain-rate damping
 
     def parameter_size(self, strains: int) -> int:
         """Reals in p, those of the last step included."""

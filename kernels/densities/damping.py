@@ -1,9 +1,9 @@
 """Strain-rate damping of any law (Kelvin and Voigt): the dissipation potential of a step of length h is added to it,
 
-    psi(e) + (tau / 2h) (e - e^n) . psi''(e^n) (e - e^n) ,
+    psi(e) + (tau / 2h) (e - e^n) . psi''(e0) (e - e^n) ,
 
-with e^n the strains at the start of the step and the retardation time tau [s]: the viscous analogy of Bergou et al. (2010) over one
-step. psi'' is that of the law where it depends on no strain, else its positive semi-definite part at e^n.
+with e^n the strains at the start of the step, e0 those at rest, and the retardation time tau [s]: the viscous analogy of Bergou et al.
+(2010) over one step. At rest psi'' is positive, so that damping takes energy whatever the law does elsewhere.
 """
 
 from functools import cache
@@ -31,16 +31,20 @@ def damped(density: Density) -> Density:
         f"{density.name} with damping",
         lambda n: (*density.parameters(n), VISCOSITY),
         laws,
+        strains=density.strains,
         lagged=True,
         coupled=density.coupled,
         quadratic=density.quadratic,
         own_root=root if density.quadratic and density.own_root else None,
+        undamped=density,
     )
 
 
 def _split(density: Density, real, n: int):
-    """own(p) -> parameters of the law itself; ratio(p) -> tau / h; before(p) -> strains of the last step."""
+    """own(p) -> parameters of the law itself; ratio(p) -> tau / h; before(p), rest(p) -> strains of the last step, and at rest."""
     size = len(density.parameters(n))
+    at = [i for i, known in enumerate(density.parameters(n)) if known.family == "rest"]
+    first = at[0] if at else -1
     E, P, O = (wp.types.vector(s, real) for s in (n, size + n + 2, size))
 
     @wp.func
@@ -61,26 +65,26 @@ def _split(density: Density, real, n: int):
             e[i] = p[wp.static(size + 1) + i]
         return e
 
-    return own, ratio, before, E, P
+    @wp.func
+    def rest(p: P):
+        e = E()
+        if wp.static(first >= 0):
+            for i in range(wp.static(n)):
+                e[i] = p[wp.static(first) + i]
+        return e
+
+    return own, ratio, before, rest, E, P
 
 
 def _laws(density: Density, real, n: int):
     energy_of, slope_of, curvature_of = density.laws(real, n)
-    *_, root_of = density.functions(real, n)
-    own, ratio, before, E, P = _split(density, real, n)
-    coupled, quadratic = density.coupled, density.quadratic
+    own, ratio, before, rest, E, P = _split(density, real, n)
+    coupled = density.coupled
 
     @wp.func
     def viscous(p: P):
         """psi'' of the dissipation, but for tau / h."""
-        if wp.static(quadratic):
-            return curvature_of(before(p), own(p))
-        else:
-            r = root_of(before(p), own(p), E())
-            if wp.static(coupled):
-                return wp.transpose(r) * r
-            else:
-                return wp.cw_mul(r, r)
+        return curvature_of(rest(p), own(p))
 
     @wp.func
     def drag(e: E, p: P):
@@ -106,7 +110,7 @@ def _laws(density: Density, real, n: int):
 
 def _root(density: Density, real, n: int):
     """Of a quadratic law with a root of its own: that, larger by the root of 1 + tau / h."""
-    own, ratio, _, E, P = _split(density, real, n)
+    own, ratio, _, _, E, P = _split(density, real, n)
     root_of = density.own_root(real, n)
 
     @wp.func

@@ -115,4 +115,6 @@ def _parameters(n):
     return Parameter("stiffness", "J per rest measure", NOT_NEGATIVE), poisson, *metric, *rest
 
 
-st_venant_kirchhoff = Density("st_venant_kirchhoff", _parameters, _laws, coupled=True, quadratic=True, own_root=_root)
+st_venant_kirchhoff = Density(
+    "st_venant_kirchhoff", _parameters, _laws, strains=3, coupled=True, quadratic=True, own_root=_root
+)

@@ -1,0 +1,168 @@
+"""Laws: parameters by name, damping of any law, and laws of one's own in scenes and in the derivative table."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from own_law import saturating
+
+import ddg_warp as ddg
+from ddg_warp import derivatives
+from ddg_warp.cli import main
+from ddg_warp.integrate.statics import solve
+from ddg_warp.kernels.densities.quadratic import quadratic
+from ddg_warp.kernels.terms import ALL, REGISTRY
+
+K, LIMIT = 2.0, 3.0
+LAW = {"rod_bend_twist": ddg.Law(saturating, modulus=K, limit=LIMIT)}
+SECTION = ddg.Stiffness(EA=1e5, EI1=2.0, EI2=2.0, GJ=2.0, mass_per_length=0.4, rotary_inertia=1e-3)
+
+
+def line(nodes: int, end=(1.0, 0.0, 0.0)) -> np.ndarray:
+    return np.linspace((0.0, 0.0, 0.0), end, nodes)
+
+
+def cantilever(laws=None, viscosity: float = 0.0, gravity=(0.0, -1.0, -3.0), **options) -> ddg.Scene:
+    scene = ddg.Scene(gravity=gravity)
+    rod = scene.add_rod(line(13), section=replace(SECTION, viscosity=viscosity), laws=laws, **options)
+    scene.clamp(rod)
+    return scene
+
+
+def moved(scene: ddg.Scene, device, precision: str = "float64", **options) -> tuple[np.ndarray, ddg.Integrator]:
+    """Points after 20 steps of 20 ms."""
+    model = scene.build(device, precision)
+    integrator, state = ddg.Integrator(model, rtol=1e-10, **options), model.state()
+    for _ in range(20):
+        state = integrator.step(state, 0.02)
+    integrator.check(state)
+    return state.points(), integrator
+
+
+@pytest.mark.parametrize("couple", [1.0, 4.0, 5.9])
+def test_a_law_of_ones_own_bends_to_its_own_circle(device, couple):
+    """Under an end couple M the curvature k is uniform, and work says M d phi = l m(k) dk, with k = 2 tan(phi / 2) / l of edges l.
+
+    So M = m(k) (1 + (k l / 2)^2), m = K k / sqrt(1 + (k / c)^2), which cannot exceed K c = 6.
+    """
+    scene, length = cantilever(LAW, gravity=(0.0, 0.0, 0.0)), 1.0 / 12.0
+    scene.add_couple(0, -1, (0.0, couple, 0.0))
+    model = scene.build(device, "float64")
+    state = solve(model, load_steps=8)
+    tangents = np.diff(state.points(), axis=0) / length
+    turned = np.arccos(np.clip((tangents[:-1] * tangents[1:]).sum(1), -1.0, 1.0))
+    k = 2.0 * np.tan(turned / 2.0) / length
+    moment = K * k / np.sqrt(1.0 + (k / LIMIT) ** 2)
+    assert moment * (1.0 + (0.5 * k * length) ** 2) == pytest.approx(couple, rel=1e-7)
+    assert np.linalg.norm(model.stresses(state)["rod_bend_twist"][0], axis=1) == pytest.approx(moment, rel=1e-6)
+
+
+@pytest.mark.parametrize("viscosity", [0.0, 0.05])
+@pytest.mark.parametrize("psd", ["gauss_newton", "progressive"])
+def test_the_quadratic_law_given_by_hand_is_the_usual_one(device, viscosity, psd):
+    usual, _ = moved(cantilever(None, viscosity), device, psd=psd)
+    by_hand, _ = moved(
+        cantilever({"rod_bend_twist": ddg.Law(quadratic, stiffness=[2.0, 2.0, 2.0])}, viscosity), device, psd=psd
+    )
+    np.testing.assert_array_equal(by_hand, usual)
+    assert np.abs(usual[-1] - [1.0, 0.0, 0.0]).max() > 0.05
+
+
+@pytest.mark.parametrize("viscosity", [0.0, 0.05])
+def test_far_from_its_limit_the_law_is_linear(device, viscosity):
+    """Strains of 1e-2 of the limit: the answers differ by their square."""
+    usual, _ = moved(cantilever(None, viscosity), device)
+    law = {"rod_bend_twist": ddg.Law(saturating, modulus=K, limit=300.0)}
+    found, _ = moved(cantilever(law, viscosity), device)
+    assert 1e-9 < np.abs(found - usual).max() < 1e-4
+    near, _ = moved(cantilever({"rod_bend_twist": ddg.Law(saturating, modulus=K, limit=1.0)}, viscosity), device)
+    assert np.abs(near - usual).max() > 1e-3
+
+
+def test_damping_takes_energy_and_nothing_else(device):
+    """A damped law comes to rest where it would rest without: the hanging shape is that of statics."""
+    scene = cantilever(LAW, viscosity=0.3)
+    rest = solve(cantilever(LAW).build(device, "float64"), load_steps=4).points()
+    model = scene.build(device, "float64")
+    integrator, state = ddg.Integrator(model, rtol=1e-8), model.state()
+    for _ in range(400):
+        state = integrator.step(state, 0.05)
+    np.testing.assert_allclose(state.points(), rest, atol=1e-5)
+
+
+def test_a_joined_rod_keeps_its_law(device):
+    """Joined to a stub by a hinge that carries no moment it moves as alone; the stub keeps the quadratic law."""
+    alone, _ = moved(cantilever(LAW), device)
+    scene = cantilever(LAW)
+    stub = scene.add_rod(line(4, (0.0, 0.3, 0.0)), section=SECTION)
+    scene.clamp(stub, edges=[0, 1, 2])
+    scene.join([(0, 0), (stub, 0)], rigid=False)
+    model = scene.build(device, "float64")
+    assert len([part for part in model.net.sets if part.term.name == "rod_bend_twist"]) == 2
+    joined, _ = moved(scene, device)
+    np.testing.assert_allclose(joined[:13], alone, atol=1e-8)
+
+
+@pytest.mark.parametrize("damped", [False, True])
+def test_derivatives_of_a_law_of_ones_own(device, damped):
+    term = replace(REGISTRY["rod_bend_twist"], density=saturating).damped(damped)
+    for row in derivatives.table(term, "float64", device):
+        assert row["passed"], row
+
+
+def test_the_command_line_checks_a_law_in_a_file(device, capsys):
+    file = str(Path(__file__).parent / "own_law.py")
+    assert main(["check", f"{file}:saturating", "--device", device]) == 0
+    assert "rod_bend_twist" in capsys.readouterr().out
+    assert main(["check", f"{file}:nothing"]) == 2
+    assert "no term or law 'nothing'" in capsys.readouterr().err
+
+
+def test_every_law_says_its_parameters():
+    for term in ALL.values():
+        names = term.parameter_names
+        assert len(set(names)) == len(names) and names[0] == "measure"
+        assert all(known.unit and known.valid[0] for known in term.parameters)
+        assert len(term.rest) == len(term.measure.strains)
+        assert ("viscosity" in names) == term.density.lagged
+
+
+WRONG = {
+    "term": ({"rod_bend": LAW["rod_bend_twist"]}, {}, "no term 'rod_bend'"),
+    "missing": ({"rod_bend_twist": ddg.Law(saturating, modulus=K)}, {}, "limit is missing"),
+    "unknown": ({"rod_bend_twist": ddg.Law(quadratic, stiff=1.0)}, {}, "stiff does not fit"),
+    "value": ({"rod_bend_twist": ddg.Law(saturating, modulus=K, limit=-1.0)}, {}, "limit = .* positive"),
+    "shape": ({"rod_bend_twist": ddg.Law(saturating, modulus=np.ones(5), limit=1.0)}, {}, "broadcast to the 1 rods"),
+    "curved": (LAW, {"natural": (1.0, 0.0, 0.0)}, "no strains at rest"),
+    "no law": ({"rod_bend_twist": 3.0}, {}, r"give Law\(density"),
+    "no dictionary": ("soft", {}, "dictionary"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_does_not_fit_is_refused(device, name):
+    laws, options, words = WRONG[name]
+    with pytest.raises(ddg.SceneError, match=words):
+        cantilever(laws, **options).build(device)
+
+
+def test_rigid_joints_refuse_other_laws(device):
+    scene = cantilever(LAW)
+    other = scene.add_rod(line(4, (0.0, 0.3, 0.0)), section=SECTION)
+    scene.join([(0, 0), (other, 0)])
+    with pytest.raises(ddg.SceneError, match="law of its own"):
+        scene.build(device)
+
+
+def test_parameters_of_a_law_change_by_name(device):
+    model = cantilever(LAW).build(device, "float64")
+    assert float(model.parameters()["0/rod_bend_twist/limit"].flat[0]) == LIMIT
+    model.set_parameter("rod_bend_twist", "limit", 300.0)
+    with pytest.raises(ValueError, match="positive"):
+        model.set_parameter("rod_bend_twist", "limit", 0.0)
+    integrator, state = ddg.Integrator(model, rtol=1e-10), model.state()
+    for _ in range(20):
+        state = integrator.step(state, 0.02)
+    expected, _ = moved(cantilever({"rod_bend_twist": ddg.Law(saturating, modulus=K, limit=300.0)}), device)
+    np.testing.assert_allclose(state.points(), expected, atol=1e-10)
