@@ -224,7 +224,7 @@ def fly(n: int, dt: float, duration: float, device: str, scheme: str = "implicit
     """Times and observed series of the flying beam."""
     scene = flying_beam.build(n, scheme)
     model = scene.build(device=device, precision="float64")
-    integrator, state = ddg.Integrator(model, scheme), model.state()
+    integrator, state = ddg.Integrator(model, scheme, rtol=1e-8), model.state()
     times, rows = [0.0], [flying_beam.observe(model, state)]
     for _ in range(round(duration / dt)):
         state = integrator.step(state, dt)
