@@ -30,7 +30,7 @@ SMALL = {
     "plate_buckling": {"cells": 12},
     "plate_square": {"cells": 16},
     "post_buckling": {"n": 50},
-    "pullout_cylinder": {"n": 8},
+    "pullout_cylinder": {"n": 12},
     "right_angle_frame": {},
     "roll_up": {"n": 100},
     "slit_annulus": {},
