@@ -211,7 +211,7 @@ def rest(case: Case) -> float:
     out = arrays.allocate((group.kind.window, group.nodes, group.columns), case.real, case.device)
     still = wp.full(group.columns, 1.0, dtype=case.real, device=case.device)
     wp.launch(
-        element.term_kernels(group.kind, group.kind.terms.index(case.term), case.real)[1],
+        element.term_kernels(group.kind, group.kind.terms.index(case.term), case.real, reverse=True)[1],
         (group.elements, group.columns),
         [data.x, data.theta, data.frame, data.last, still, group.buffer, group.table, group.count],
         [out],

@@ -252,8 +252,11 @@ def term_functions(kind: ChainKind, index: int, real):
 
 
 @cache
-def term_kernels(kind: ChainKind, index: int, real):
-    """Kernels of one term: its energy, its gradient on the window (both with reverse mode), its Hessian on the window."""
+def term_kernels(kind: ChainKind, index: int, real, reverse: bool = False):
+    """Kernels of one term: its energy, its gradient on the window, its Hessian on the window.
+
+    With `reverse` the first two have an adjoint, which doubles the time that they take to compile.
+    """
     term = kind.terms[index]
     V, W = wp.types.vector(kind.dim, real), wp.types.vector(kind.window, real)
     S13 = wp.types.vector(13, real)
@@ -274,7 +277,7 @@ def term_kernels(kind: ChainKind, index: int, real):
     def along(q: W, s: S13, w: real, p: P, v: W):
         return wp.dot(gradient_at(q, s, w, p), v)
 
-    @wp.kernel(module="unique", enable_backward=True)
+    @wp.kernel(module="unique", enable_backward=reverse)
     def energy(
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
@@ -294,7 +297,7 @@ def term_kernels(kind: ChainKind, index: int, real):
             q = local(window(x, theta, k, n, whole, r))
             energy_out[k, r] = w * energy_of(strains_of(q, short(lagged(frame, k, n, whole, r)), w), p)
 
-    @wp.kernel(module="unique", enable_backward=True)
+    @wp.kernel(module="unique", enable_backward=reverse)
     def gradient(
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),

@@ -126,8 +126,11 @@ def functions(term: Term, real):
 
 
 @cache
-def term_kernels(term: Term, real):
-    """Kernels of one term: energy, gradient (slots, elements), Hessian (elements, size, size), strains, linear stresses."""
+def term_kernels(term: Term, real, reverse: bool = False):
+    """Kernels of one term: energy, gradient (slots, elements), Hessian (elements, size, size), strains, linear stresses.
+
+    With `reverse` the first two have an adjoint, which doubles the time that they take to compile.
+    """
     measure, density = term.measure, term.density
     V = wp.types.vector(3, real)
     Q, S, E, _ = measure.types(real)
@@ -148,7 +151,7 @@ def term_kernels(term: Term, real):
         e, jacobian = jacobian_of(q, s, w)
         return wp.dot(((slope_of(e, p) + extra) * w) * jacobian, v)
 
-    @wp.kernel(module="unique", enable_backward=True)
+    @wp.kernel(module="unique", enable_backward=reverse)
     def energy(
         q: wp.array(dtype=V),
         frame: wp.array2d(dtype=real),
@@ -168,7 +171,7 @@ def term_kernels(term: Term, real):
         x, s, w, p = gather(q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, e)
         energy_out[e] = w * energy_of(strains_of(x, s, w), p)
 
-    @wp.kernel(module="unique", enable_backward=True)
+    @wp.kernel(module="unique", enable_backward=reverse)
     def gradient(
         q: wp.array(dtype=V),
         frame: wp.array2d(dtype=real),
