@@ -54,7 +54,8 @@ def advance(model, state, dt: float, steps: int, **options):
 
 
 CASES = [(name, "float64") for name in (*ALONE, *JOINED, *SHELLS)]
-CASES += [(name, "mixed") for name in ("rod", "rods joined rigidly", "shell, midedge_dof")]
+CASES += [("rod", "mixed")]
+CASES += [pytest.param(name, "mixed", marks=pytest.mark.slow) for name in ("rods joined rigidly", "shell, midedge_dof")]
 
 
 @pytest.mark.parametrize(("name", "precision"), CASES)

@@ -420,6 +420,7 @@ def test_oblique_symmetry_is_axis_aligned_symmetry_turned(device, bending):
     assert found[0][0][0, 2] < -1e-3  # the middle sags
 
 
+@pytest.mark.slow
 def test_oblique_symmetry_in_worlds_precisions_and_paths(device):
     """Three worlds are alike; mixed and float32 agree within their rounding; frequencies and the end of a path are as aligned."""
     from ddg_warp.integrate.continuation import Continuation

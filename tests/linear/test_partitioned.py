@@ -82,10 +82,10 @@ def dense(newton, column: int) -> tuple[np.ndarray, np.ndarray]:
     [
         ("float64", 1e-11, "twist"),
         ("float64", 1e-11, "stretch"),
-        ("mixed", 1e-3, "stretch"),
+        pytest.param("mixed", 1e-3, "stretch", marks=pytest.mark.slow),
         pytest.param("float64", 1e-11, "untwisted", marks=pytest.mark.slow),
         pytest.param("float64", 1e-11, "planar", marks=pytest.mark.slow),
-        pytest.param("mixed", 1e-3, "twist", marks=pytest.mark.slow),
+        ("mixed", 1e-3, "twist"),
         pytest.param("mixed", 1e-3, "untwisted", marks=pytest.mark.slow),
         pytest.param("mixed", 1e-3, "planar", marks=pytest.mark.slow),
     ],
