@@ -211,7 +211,7 @@ def rest(case: Case) -> float:
     out = arrays.allocate((group.kind.window, group.nodes, group.columns), case.real, case.device)
     still = wp.full(group.columns, 1.0, dtype=case.real, device=case.device)
     wp.launch(
-        element.term_kernels(group.kind, group.kind.terms.index(case.term), case.real)[1],
+        element.term_kernels(group.kind, group.kind.terms.index(case.term), case.real, reverse=True)[1],
         (group.elements, group.columns),
         [data.x, data.theta, data.frame, data.last, still, group.buffer, group.table, group.count],
         [out],
@@ -303,13 +303,16 @@ def checks_of(term: Term, closed: bool, precision: str) -> list[str]:
     ]
 
 
-def table(term: str | None = None, precision: str = "float64", device: str = "cpu") -> list[dict]:
+def table(
+    term: str | None = None, precision: str = "float64", device: str = "cpu", chains: tuple[bool, ...] = (False, True)
+) -> list[dict]:
     """Rows of the derivative table: term, chain, check, error, tolerance, passed.
 
     Args:
         term: name of one term of chains or nets; all of them by default.
         precision: "float64" or "float32", that of the kernels under test.
         device: Warp device.
+        chains: of terms of chains, which are tried: open ones (False), closed ones (True), or both.
     """
     from ddg_warp import net_derivatives
 
@@ -319,7 +322,7 @@ def table(term: str | None = None, precision: str = "float64", device: str = "cp
             case = net_derivatives.NetCase(net_derivatives.TERMS[name], precision, device)
             rows += [_row(name, "net", check, one(case), precision) for check, one in net_derivatives.CHECKS.items()]
             continue
-        for closed in (False, True):
+        for closed in chains:
             case = Case(REGISTRY[name], chain_of(REGISTRY[name], closed), precision, device)
             for check in checks_of(case.term, closed, precision):
                 rows.append(_row(name, "closed" if closed else "open", check, CHECKS[check][0](case), precision))

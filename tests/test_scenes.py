@@ -43,7 +43,16 @@ SMALL = {
     "vibration": {"n": 25},
     "whirling": {},
 }
-LONG = ("cable_gripped_at_both_ends", "hanging_sheet", "parachute", "pullout_cylinder", "slit_annulus", "hinged_roof")
+LONG = (
+    "cable_gripped_at_both_ends",
+    "hanging_sheet",
+    "parachute",
+    "pullout_cylinder",
+    "slit_annulus",
+    "hinged_roof",
+    "lee_frame",
+    "localized_helix",
+)
 
 
 def checked(name: str, device: str, **given) -> None:
