@@ -456,54 +456,6 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool):
 
 
 @cache
-def evaluate_until(kind: ChainKind, index: int, real, linear, curved: bool):
-    """evaluate_all of the terms 0 to `index`: the sums of their energies and derivatives, and the largest of their stiffnesses.
-
-    It calls itself for those before the last. A loop over a tuple of functions would do, but Warp resolves what depends on a loop
-    variable, wp.static(each[i]), by generating all code of a kernel whenever it is defined, compiled before or not: 0.3 s each.
-    """
-    W, S13 = wp.types.vector(kind.window, real), wp.types.vector(13, real)
-    evaluate_last = evaluate_functions(kind, index, real, linear, curved)
-    evaluate_first = evaluate_until(kind, index - 1, real, linear, curved) if index else None
-    everywhere = kind.terms[index].measure.span == 1
-
-    @wp.func
-    def evaluate_all(
-        q: W,
-        s: S13,
-        buffer: wp.array(dtype=real),
-        table: wp.array2d(dtype=int),
-        last: wp.array3d(dtype=real),
-        rate: real,
-        clamped: int,
-        frozen: bool,
-        exact: bool,
-        whole: bool,
-        factor: wp.array3d(dtype=linear),
-        geometric: wp.array3d(dtype=linear),
-        k: int,
-        r: int,
-    ):
-        energy = real(0.0)
-        f = W()
-        stiffest = real(0.0)
-        if wp.static(index > 0):
-            energy, f, stiffest = evaluate_first(
-                q, s, buffer, table, last, rate, clamped, frozen, exact, whole, factor, geometric, k, r
-            )
-        if whole or wp.static(everywhere):
-            own, part, stiff = evaluate_last(
-                q, s, buffer, table, last, rate, clamped, frozen, exact, factor, geometric, k, r
-            )
-            energy += own
-            f += part
-            stiffest = wp.max(stiffest, stiff)
-        return energy, f, stiffest
-
-    return evaluate_all
-
-
-@cache
 def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None):
     """The fused kernel of a Newton iteration: energy, gradient on the window and Gauss-Newton factor of all terms.
 
@@ -520,7 +472,11 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
     until = until_function(kind)
     _, window, lagged, _ = gather_functions(kind, real)
     curved, begin = exact_from is not None, exact_from or 0
-    evaluate_all = evaluate_until(kind, len(kind.terms) - 1, real, linear, curved)
+    # Not a loop over the terms: what depends on a loop variable, wp.static(each[i]), Warp resolves by generating all code of a kernel
+    # whenever it is defined, compiled before or not, 0.3 s each. A function that calls itself costs a step on the CPU 5 %.
+    terms, everywhere = len(kind.terms), kind.terms[0].measure.span == 1
+    W = wp.types.vector(kind.window, real)
+    evaluate_first, evaluate_last = (evaluate_functions(kind, at, real, linear, curved) for at in (0, -1))
     options = CPU_OPTIONS | {"max_unroll": kind.geometric_rows} if curved else CPU_OPTIONS
     X = wp.types.vector(3, real)
     transport, reference_twist, _ = frames.functions(real)
@@ -564,9 +520,23 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
             whole = wp.static(closed) or k < n - 2
             q = window(x, theta, k, n, whole, r)
             s = lagged(frame, k, n, whole, r)
-            energy, f, stiffest = evaluate_all(
-                q, s, buffer, table, last, rate[r], clamped[r], frozen, exact, whole, factor_out, geometric_out, k, r
-            )
+            energy = real(0.0)
+            f = W()
+            stiffest = real(0.0)
+            if whole or wp.static(everywhere):
+                own, part, stiff = evaluate_first(
+                    q, s, buffer, table, last, rate[r], clamped[r], frozen, exact, factor_out, geometric_out, k, r
+                )
+                energy += own
+                f += part
+                stiffest = wp.max(stiffest, stiff)
+            if wp.static(terms > 1):
+                own_too, part_too, stiff_too = evaluate_last(
+                    q, s, buffer, table, last, rate[r], clamped[r], frozen, exact, factor_out, geometric_out, k, r
+                )
+                energy += own_too
+                f += part_too
+                stiffest = wp.max(stiffest, stiff_too)
             energy_out[1 - slot[r], k, r] = energy
             stiffness_out[k, r] = linear(stiffest)
             for i in range(wp.static(size)):
