@@ -600,7 +600,7 @@ def strain_kernel(kind: ChainKind, real):
 
 @cache
 def _strain_functions(kind: ChainKind, index: int, real):
-    """strains_at of the terms 0 to `index`: it calls itself for those before the last, as a loop would generate code at every import."""
+    """strains_at of the terms 0 to `index`, by calling itself for those before the last; see `evaluate_kernel` on loops."""
     term = kind.terms[index]
     everywhere = term.measure.span == 1
     strains_before = _strain_functions(kind, index - 1, real) if index else None

@@ -62,7 +62,7 @@ def balance_function(term: Term, real):
 def window_function(kind: ChainKind, index: int, real):
     """at(window0, lagged0, window, lagged, ...) of the terms 0 to `index` of a chain: the sum of their rows of element k of rod r.
 
-    It calls itself for those before the last; `element.evaluate_until` says why.
+    It calls itself for those before the last: a loop over functions would generate all code whenever the kernel is defined.
     """
     term = kind.terms[index]
     everywhere = term.measure.span == 1
