@@ -2,7 +2,9 @@
 
 While Warp captures on the CPU device, it records the launches and copies of every thread of the process (Warp 1.19). So a capture,
 and whatever compiles or loads kernels, waits until no other thread is inside of this package, and keeps them out meanwhile; all else
-runs side by side. Launches that a user makes in threads of his own are his to keep apart.
+runs side by side. On CUDA all threads share the current stream of a device, which Warp replaces while it reads an array: two that
+read at once can leave it replaced for good ("unknown stream"). So where there is CUDA every call is alone; what it launches runs on.
+Launches that a user makes in threads of his own are his to keep apart.
 """
 
 import threading
@@ -18,13 +20,16 @@ class _Turns:
         self._changed = threading.Condition()
         self._inside, self._capturing = 0, False
         self._own = threading.local()
+        self.shared: bool | None = None  # whether threads share a stream; found out by the first call
 
     @contextmanager
     def launching(self) -> Iterator[None]:
         depth = getattr(self._own, "depth", 0)
         if not depth:
             with self._changed:
-                self._changed.wait_for(lambda: not self._capturing)
+                if self.shared is None:
+                    self.shared = _cuda()
+                self._changed.wait_for(lambda: not self._capturing and not (self.shared and self._inside))
                 self._inside += 1
         self._own.depth = depth + 1
         try:
@@ -56,6 +61,12 @@ class _Turns:
                 self._capturing = False
                 self._inside += depth > 0
                 self._changed.notify_all()
+
+
+def _cuda() -> bool:
+    import warp as wp
+
+    return wp.is_cuda_available()
 
 
 _turns = _Turns()

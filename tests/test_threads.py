@@ -5,10 +5,12 @@ import sys
 import threading
 
 import numpy as np
+import pytest
 
 SCRIPT = """
 import sys, threading
 import numpy as np
+import pytest
 import ddg_warp as ddg
 from ddg_warp import meshes
 from ddg_warp.integrate import statics
@@ -82,3 +84,31 @@ def test_capture_waits_for_those_who_launch():
         raise ZeroDivisionError
     launch()  # what failed inside left nothing locked
     capture()
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_calls_are_alone_where_threads_share_a_stream(monkeypatch, shared):
+    """Of two threads that launch the second waits for the first there, and meets it elsewhere."""
+    from ddg_warp import threads
+
+    monkeypatch.setattr(threads._turns, "shared", shared)
+    inside, met, release = threading.Event(), threading.Event(), threading.Event()
+
+    @threads.launches
+    def first():
+        inside.set()
+        release.wait()
+
+    @threads.launches
+    def second():
+        met.set()
+
+    both = [threading.Thread(target=first), threading.Thread(target=second)]
+    both[0].start()
+    inside.wait()
+    both[1].start()
+    assert met.wait(None if not shared else 0.2) is not shared
+    release.set()
+    for thread in both:
+        thread.join()
+    assert met.is_set()
