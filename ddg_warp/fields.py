@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from ddg_warp.threads import launches
+
 POINT_FIELDS = {
     "axial_force": "axial force of rods, positive in tension [N]",
     "curvature_1": "curvature of rods about their first director [1/m]; of rods without twist its size",
@@ -32,6 +34,7 @@ def check_fields(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
+@launches
 def point_fields(model, state, names: Sequence[str]) -> dict[str, np.ndarray]:
     """Fields of POINT_FIELDS by name, each (worlds, P) in the order of `State.points`; NaN where a point has none.
 
@@ -67,6 +70,7 @@ def point_fields(model, state, names: Sequence[str]) -> dict[str, np.ndarray]:
     return {name: result[name] for name in names}
 
 
+@launches
 def cell_fields(model, state, names: Sequence[str]) -> dict[str, np.ndarray]:
     """Fields of CELL_FIELDS by name, each (worlds, triangles) in the order of `model.surfaces`."""
     if not names:
