@@ -88,6 +88,7 @@ def test_unknown_setting_is_told(cantilever, device):
         bench.run(cantilever, {"color": 1}, device)
 
 
+@pytest.mark.slow
 def test_many_rods(tmp_path):
     command = [sys.executable, str(ROOT / "tools/bench_rods.py"), "--cpu", "--quick", "--out", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -119,7 +119,7 @@ def folded(gap: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("gap", [0.0, 1e-12])
-@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("precision", ["float64", pytest.param("float32", marks=slow)])
 def test_folded_back_by_half_a_turn(device, gap, precision):
     """Curvature is infinite there: the error says so, names the edges and what to do, and keeps the state."""
     scene = cantilever(21, ddg.Circle(0.02), RUBBER)
@@ -302,13 +302,13 @@ SOFT = {
 
 
 @pytest.mark.parametrize("name", SOFT)
-@pytest.mark.parametrize(("precision", "tolerance"), [("mixed", 1e-5), ("float32", 5e-3)])
+@pytest.mark.parametrize(("precision", "tolerance"), [("mixed", 1e-5), pytest.param("float32", 5e-3, marks=slow)])
 def test_less_precision(device, name, precision, tolerance):
     result, exact = SOFT[name](device, precision), SOFT[name](device, "float64")
     np.testing.assert_allclose(result.points, exact.points, atol=tolerance)
 
 
-@pytest.mark.parametrize("precision", ["mixed", "float32"])
+@pytest.mark.parametrize("precision", ["mixed", pytest.param("float32", marks=slow)])
 @pytest.mark.parametrize("amplitude", [0.1, 1.0])
 def test_random_start_with_less_precision(device, precision, amplitude):
     start = straight(16)
@@ -321,7 +321,7 @@ def test_random_start_with_less_precision(device, precision, amplitude):
 
 
 @pytest.mark.filterwarnings("ignore:.*precision 'float32' leaves")
-@pytest.mark.parametrize("precision", ["mixed", "float32"])
+@pytest.mark.parametrize("precision", ["mixed", pytest.param("float32", marks=slow)])
 def test_stiff_with_less_precision(device, precision):
     """Steel at r / L = 1e-4: nothing stretches, nothing gains energy; mixed falls as float64 does."""
     scene = cantilever(64, ddg.Circle(1e-4), STEEL)

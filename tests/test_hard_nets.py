@@ -52,7 +52,7 @@ def test_random_perturbation(device, bending, size):
     assert edge_strain(scene, state) < 0.5
 
 
-@pytest.mark.parametrize("thickness", [1e-3, 1e-4])
+@pytest.mark.parametrize("thickness", [1e-3, pytest.param(1e-4, marks=pytest.mark.slow)])
 def test_random_perturbation_in_long_steps(device, thickness):
     """144 cells with triangles inverted, thin, in steps of 0.1 s: no step fails, and after ten of them little energy is left."""
     scene = sheet(12, thickness=thickness)

@@ -375,7 +375,7 @@ def test_balloon(device):
     assert np.abs(state.velocities()).max() < 1e-3
 
 
-@pytest.mark.parametrize("kind", ["mass", "viscous"])
+@pytest.mark.parametrize("kind", ["mass", pytest.param("viscous", marks=slow)])
 def test_damping_of_a_mode(device, kind):
     """The lowest mode decays by exp(-alpha t / 2) (mass damping), exp(-eta w^2 t / 2) (strain rate); midpoint, small amplitude."""
     thickness, ratio = 0.02, 0.02

@@ -45,6 +45,10 @@ THINGS = {
     "net": (joined, "rod . \\('half'\\)"),
     "shell": (foil, "shell 0 \\('foil'\\)"),
 }
+# The rod stands for all every day: nets and shells take kernels of their own in each precision.
+DAILY_THE_ROD = pytest.mark.parametrize(
+    "name", ["rod", *(pytest.param(name, marks=pytest.mark.slow) for name in THINGS if name != "rod")]
+)
 
 
 def scene_of(build, dt=0.01, **options) -> ddg.Scene:
@@ -60,7 +64,7 @@ def fall(model, dt: float, steps: int):
     return state, integrator.statistics()["outcomes"]
 
 
-@pytest.mark.parametrize("name", THINGS)
+@DAILY_THE_ROD
 def test_what_rounding_decides_is_refused(device, name):
     """The error names object, outcome and remedies; a warning came at build; other precisions and short steps go."""
     build, where = THINGS[name]
@@ -86,7 +90,7 @@ def test_what_rounding_decides_is_refused(device, name):
         integrator.step(integrator.step(state, short), 0.01)
 
 
-@pytest.mark.parametrize("name", THINGS)
+@DAILY_THE_ROD
 def test_allowed_rounding_is_counted_by_its_name(device, name):
     """Who asks for it gets it, under its name and not as converged to rounding; and it is indeed not the motion."""
     build, _ = THINGS[name]
@@ -99,6 +103,7 @@ def test_allowed_rounding_is_counted_by_its_name(device, name):
         assert np.abs(state.points() - exact.points()).max() > 0.05 * moved
 
 
+@pytest.mark.slow
 def test_soft_things_go_on_in_silence(device):
     """A rod and a sheet of rubber: errors below the bound say nothing, and the motion is that of float64 to its share."""
     for build in (wire_of_rubber, lambda scene: foil(scene, RUBBER)):

@@ -52,6 +52,8 @@ LONG = (
     "hinged_roof",
     "lee_frame",
     "localized_helix",
+    "deep_arch",
+    "leaf",
 )
 
 

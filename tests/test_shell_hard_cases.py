@@ -39,7 +39,7 @@ def pressed_plate(device, thickness: float, pressure: float = 1.0, bending: str 
 
 # Square membrane of half side a: p = 1.994 (1 - 0.271 nu) / (1 - nu) E h w^3 / a^4 (Maier-Schneider, Maibach and Obermeier, J. MEMS 4,
 # 1995), so w = 0.2880 (p / (E h))^(1/3) with nu = 0.3 and a = 1/2.
-@pytest.mark.parametrize("bending", ["midedge_dof", "hinge"])
+@pytest.mark.parametrize("bending", [pytest.param("midedge_dof", marks=pytest.mark.slow), "hinge"])
 @pytest.mark.parametrize("thickness", [pytest.param(1e-4, marks=pytest.mark.slow), 1e-5])
 def test_very_thin_plate_is_a_membrane(device, thickness, bending):
     """A deflection of 60 and 1300 thicknesses at once, from a flat state whose tangent is that of bending alone.
@@ -79,12 +79,13 @@ def needles(device, aspect: float, gravity: float):
     return -found(scene, device)[1].points()[:, 2].min() / beam
 
 
-@pytest.mark.parametrize("aspect", [30.0, 1000.0])
+@pytest.mark.parametrize("aspect", [30.0, pytest.param(1000.0, marks=pytest.mark.slow)])
 def test_needles(device, aspect):
     """Triangles a thousand times as long as wide bend like a beam, as those of a few times do: 1.5 % soft at 8 cells."""
     assert needles(device, aspect, 0.01) == pytest.approx(1.0156, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_loads_lost_in_rounding_are_named(device):
     """Ten times longer ones are so stiff across that rounding of their forces exceeds the weight: no state is called equilibrium."""
     with pytest.raises(ddg.SolverError, match=r"lost_in_rounding.*better shaped") as caught:
@@ -212,7 +213,9 @@ def test_crease_at_once_is_named(device):
     assert np.isfinite(caught.value.state.points()).all()
 
 
-@pytest.mark.parametrize("bending", ["midedge_dof", "midedge", "hinge"])
+@pytest.mark.parametrize(
+    "bending", [*(pytest.param(name, marks=pytest.mark.slow) for name in ("midedge_dof", "midedge")), "hinge"]
+)
 @pytest.mark.parametrize("size", [pytest.param(0.3, marks=pytest.mark.slow), 0.6])
 def test_crumpled_sheet_becomes_flat(device, bending, size):
     """Every vertex but those of one clamped side moved at random by up to `size` edge lengths: back to rest, without energy."""

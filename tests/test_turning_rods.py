@@ -113,9 +113,9 @@ def test_rod_without_twist_moves_as_alone(device, scheme, action, case):
 @pytest.mark.parametrize(
     ("action", "case"),
     [
-        (turned_end, "spatial"),
         (coupled, "planar"),
-        (coupled, "no twist"),
+        pytest.param(turned_end, "spatial", marks=pytest.mark.slow),
+        pytest.param(coupled, "no twist", marks=pytest.mark.slow),
         pytest.param(turned_end, "planar", marks=pytest.mark.slow),
         pytest.param(turned_end, "no twist", marks=pytest.mark.slow),
         pytest.param(coupled, "spatial", marks=pytest.mark.slow),

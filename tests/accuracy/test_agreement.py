@@ -41,7 +41,9 @@ def largest_error(found: dict, reference: dict) -> float:
 LOOKS = {50: 0.1, 100: 0.3}  # m
 
 
-@pytest.mark.parametrize("precision", ["float64", "mixed", pytest.param("float32", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "precision", ["float64", *(pytest.param(precision, marks=pytest.mark.slow) for precision in ("mixed", "float32"))]
+)
 @pytest.mark.parametrize("n", sorted(cantilever.TIP))
 def test_cantilever_by_implicit_euler(n, precision, device):
     found = tips(cantilever.build(n), device, precision, cantilever.TIP[n])
@@ -52,7 +54,11 @@ def test_cantilever_by_implicit_euler(n, precision, device):
 
 @pytest.mark.parametrize(
     ("precision", "tolerance"),
-    [("float64", DIGITS), ("mixed", DIGITS), pytest.param("float32", 1.0e-3, marks=pytest.mark.slow)],
+    [
+        ("float64", DIGITS),
+        pytest.param("mixed", DIGITS, marks=pytest.mark.slow),
+        pytest.param("float32", 1.0e-3, marks=pytest.mark.slow),
+    ],
 )
 def test_cantilever_by_implicit_midpoint(precision, tolerance, device):
     found = tips(cantilever.build(50), device, precision, MIDPOINT, "implicit_midpoint")
@@ -69,7 +75,9 @@ def test_cantilever_at_rest(n, device):
     assert np.abs(tip - STATIC[n]).max() <= 1.0e-7  # printed to seven digits
 
 
-@pytest.mark.parametrize(("precision", "tolerance"), [("float64", DIGITS), ("mixed", DIGITS)])
+@pytest.mark.parametrize(
+    ("precision", "tolerance"), [("float64", DIGITS), pytest.param("mixed", DIGITS, marks=pytest.mark.slow)]
+)
 def test_steel_wire(precision, tolerance, device):
     found = tips(steel_wire.build(100), device, precision, steel_wire.TIP[100])
     error = largest_error(found, steel_wire.TIP[100])

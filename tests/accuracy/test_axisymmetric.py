@@ -156,13 +156,8 @@ def test_sphere_buckles(device):
     assert differences_order(edges, loads) == pytest.approx(2.0, abs=0.1)
 
 
-@pytest.mark.parametrize(
-    ("load", "shallowness"),
-    [
-        case if case == ("force", 5) else pytest.param(*case, marks=pytest.mark.slow)
-        for case in axisymmetric_dome.LIMITS
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("load", "shallowness"), list(axisymmetric_dome.LIMITS))
 def test_cap_snaps(device, load, shallowness):
     """Limit loads of shallow caps, clamped under pressure, or sliding under a force on the crown."""
     edges, loads = (40, 80, 160), []
@@ -304,6 +299,7 @@ def test_plate_vibrates(device):
     assert order(REGULAR, errors) == pytest.approx(2.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_dynamics_of_a_plate(device):
     """Let go from its shape under a pressure, a plate is near the mirrored one after half a period, with the energy kept."""
     h, n = 1e-2, 20

@@ -234,7 +234,7 @@ def fly(n: int, dt: float, duration: float, device: str, scheme: str = "implicit
     return np.array(times), {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
-@pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
+@pytest.mark.parametrize("scheme", [pytest.param("implicit_euler", marks=pytest.mark.slow), "implicit_midpoint"])
 def test_flying_beam_leaves_with_the_impulse_of_its_load(scheme, device):
     _, series = fly(20, 0.01, 5.0, device, scheme)
     print(f"{scheme}: momentum {series['momentum_x'][-1]}, {series['momentum_z'][-1]}")
@@ -290,6 +290,7 @@ def test_critical_whirling_rates(support, device):
     assert abs(errors[-1]) < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.5, 1.0])
 def test_bowed_shaft_swings_out(speed, device):
     periods = 4.0
@@ -338,7 +339,9 @@ def ribbon(dt: float, scheme: str, device: str, duration: float = DURATION) -> n
     return np.concatenate([state.points().ravel(), 0.1 * state.directors().ravel()])
 
 
-@pytest.mark.parametrize(("scheme", "order"), [("implicit_euler", 1), ("implicit_midpoint", 2)])
+@pytest.mark.parametrize(
+    ("scheme", "order"), [pytest.param("implicit_euler", 1, marks=pytest.mark.slow), ("implicit_midpoint", 2)]
+)
 def test_order_in_time(scheme, order, device):
     steps = DURATION / np.array([800, 1600, 3200] if order == 1 else [100, 200, 400])
     reference = ribbon(DURATION / 6400, "implicit_midpoint", device)

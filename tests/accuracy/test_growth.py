@@ -31,6 +31,7 @@ def test_narrow_strip_bends_as_timoshenko_says(device, mesh, cells):
     assert curvature(device, 0.02, cells, mesh) == pytest.approx(KAPPA, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_strip_between_narrow_and_wide(device):
     """kappa W^2 / h = 3.75: the cross-section flattens where it is stretched, and the strip bends by less than kappa."""
     cells, reference = (4, 8), bilayer_strip.exact(4e-3, 0.1)

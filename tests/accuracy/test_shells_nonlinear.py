@@ -23,7 +23,8 @@ def path(module, device, steps, **parameters):
     return values, solver
 
 
-@pytest.mark.parametrize("membrane", ["flat", pytest.param("curved", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("membrane", ["flat", "curved"])
 def test_cantilever_plate_shear(device, membrane):
     """Elastica of P L^2 / EI = 4: order 2 in the length of the cells, and 0.02 % of the length at 64."""
     cells, errors = (16, 32, 64), []
@@ -68,7 +69,8 @@ def test_slit_annulus_unstructured(device):
     assert values[1.0]["outer"] == pytest.approx(outer, rel=0.02)
 
 
-@pytest.mark.parametrize(("n", "tolerance"), [(8, 0.015), pytest.param(24, 0.006, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("n", "tolerance"), [(8, 0.015), (24, 0.006)])
 def test_pullout_cylinder(device, n, tolerance):
     values, _ = path(pullout_cylinder, device, 20, n=n)
     for load, (radial,) in pullout_cylinder.TABLE.items():
@@ -113,6 +115,7 @@ def test_hinged_roof(device, thickness, cells, tolerance):
     assert (4.0 * loads[2] - loads[1]) / 3.0 == pytest.approx(hinged_roof.LIMIT[thickness], rel=3e-3)
 
 
+@pytest.mark.slow
 def test_stresses_of_their_own_save_iterations(device):
     """A plate that turns by 13 degrees a step takes at most five iterations; displacements alone take fifteen in the mean."""
     scene = cantilever_plate_shear.build(16, membrane="flat")

@@ -59,6 +59,7 @@ def test_lee_frame(device):
 
 
 # The same on the way: load [t] and u [cm] where v has a value [cm]; residual 5e-12.
+@pytest.mark.slow
 def test_lee_frame_under_displacement_control(device):
     edges, found = (20, 40, 80), []
     for n in edges:
@@ -78,7 +79,7 @@ def test_lee_frame_under_displacement_control(device):
 
 # Second variation of Kirchhoff rods that are rigid in the plane, by a spectral Ritz method; with torsion b t^3 G / 3 [N].
 # 1.088 in Argyris et al. 1979, Simo & Vu-Quoc 1986.
-@pytest.mark.parametrize(("sense", "load"), [(1, 1.086757492), (-1, 0.6802353021)])
+@pytest.mark.parametrize(("sense", "load"), [pytest.param(1, 1.086757492, marks=pytest.mark.slow), (-1, 0.6802353021)])
 def test_right_angle_frame(device, sense, load):
     edges, errors = (10, 20, 40), []
     for n in edges:

@@ -63,7 +63,7 @@ def test_helical_spring_at_rest_is_free(device):
     [
         (0.9, -0.0116067984, 9.989317053),
         pytest.param(1.1, 0.01178717583, 10.00961374, marks=pytest.mark.slow),
-        (1.5, 0.06110862628, 10.03665349),
+        pytest.param(1.5, 0.06110862628, 10.03665349, marks=pytest.mark.slow),
         pytest.param(2.0, 0.1292421346, 10.04082803, marks=pytest.mark.slow),
         pytest.param(3.0, 0.3009346629, 9.90534787, marks=pytest.mark.slow),
     ],

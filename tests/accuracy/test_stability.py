@@ -12,7 +12,7 @@ from ddg_warp.scenes import bend_twist, greenhill, localized_helix, michell_ring
 @pytest.mark.parametrize(
     ("tension", "edges", "moment"),
     [
-        (-20.0, (40, 80, 160), 5.771135703),
+        pytest.param(-20.0, (40, 80, 160), 5.771135703, marks=pytest.mark.slow),
         (0.0, (40, 80, 160), 8.986818916),
         pytest.param(10.0, (60, 120, 240), 10.42885644, marks=pytest.mark.slow),
         pytest.param(50.0, (80, 160, 320), 15.58932393, marks=pytest.mark.slow),
@@ -29,12 +29,13 @@ def test_greenhill(device, tension, edges, moment):
 
 
 # Critical twist [rad], 2 pi sqrt(3) B / C (Michell 1889, Zajac 1962). EA R^2 / B = 1e7.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ratio", "twist"),
     [
         (1.0, 10.88279619),
-        pytest.param(2.0 / 3.0, 16.32419428, marks=pytest.mark.slow),
-        pytest.param(10.0 / 13.0, 14.14763505, marks=pytest.mark.slow),
+        (2.0 / 3.0, 16.32419428),
+        (10.0 / 13.0, 14.14763505),
     ],
 )
 def test_michell_ring(device, ratio, twist):
@@ -46,14 +47,15 @@ def test_michell_ring(device, ratio, twist):
 
 # Weight G [B/L^3] at which the planar equilibrium of an arc loses or regains stability: second variation of the Kirchhoff rod,
 # spectral against determinant to 6e-8. EA L^2 / B = 1e7.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("curvature", "weight", "loses"),
     [
-        pytest.param(6.0, 11.86875074, True, marks=pytest.mark.slow),
-        pytest.param(6.0, 37.76390898, False, marks=pytest.mark.slow),
+        (6.0, 11.86875074, True),
+        (6.0, 37.76390898, False),
         (7.0, 14.53972482, True),
-        pytest.param(8.0, 19.24842318, True, marks=pytest.mark.slow),
-        pytest.param(10.0, 28.7697064, True, marks=pytest.mark.slow),
+        (8.0, 19.24842318, True),
+        (10.0, 28.7697064, True),
     ],
 )
 def test_bend_twist(device, curvature, weight, loses):
@@ -101,6 +103,7 @@ def test_localized_helix_reference():
     assert localized_helix.exact(27.0, 0.3) == pytest.approx(HELIX, rel=1e-8)
 
 
+@pytest.mark.slow
 def test_localized_helix_at_coarse_edges(device):
     """EA L^2 / B = 1e6."""
     errors = np.array(localized_helix.measure(*wound(device, 400))) / HELIX - 1.0

@@ -76,6 +76,7 @@ def test_wavelength_and_exponent(device):
     assert exponent == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.slow
 def test_converges(device):
     """Twice as many cells both ways: half of the error or less, and the load of the plate, D (k^2 + q^2)^2 + T q^2 over k^2."""
     coarse, fine = (measured(device, 4e-4, n * 10, n * 3) for n in (2, 4))
@@ -83,3 +84,12 @@ def test_converges(device):
     assert abs(fine[0] - 1.0) < 0.5 * abs(coarse[0] - 1.0)
     plate = 1.0 + (0.5 * wavelength(4e-4) / LENGTH) ** 2
     assert fine[1] == pytest.approx(plate, rel=0.03)
+
+
+def test_load_of_the_wave(device):
+    """The wave of Cerda and Mahadevan's length, on the finer of those meshes, buckles at the load of the plate (above).
+
+    Where D k^4 = T q^2 that is 1 + (q / k)^2 + (q / k)^4 / 2 of 2 q sqrt(D T), with the width pi / k and the length pi / q.
+    """
+    width = 0.5 * wavelength(4e-4)
+    assert critical(device, 4e-4, width, 40, 12) == pytest.approx(1.0 + (width / LENGTH) ** 2, rel=0.03)

@@ -80,7 +80,7 @@ def strip(turn: float, bending: str, n: int = 32, **options) -> ddg.Scene:
     return scene
 
 
-@pytest.mark.parametrize("bending", ["midedge_dof", "midedge_boundary"])
+@pytest.mark.parametrize("bending", [pytest.param("midedge_dof", marks=pytest.mark.slow), "midedge_boundary"])
 def test_an_edge_couple_bends_a_strip_into_an_arc(device, bending):
     """M = E h^3 / 12 kappa, kappa L = pi: the tip is at L (sin pi, cos pi - 1) / pi, convex above; the error falls with n^2."""
     errors = []
@@ -108,6 +108,7 @@ def test_derivative_of_edge_couples(device):
     np.testing.assert_allclose(-tangent.load_stiffness(1.0, q) @ step, difference, atol=1e-8 * np.abs(difference).max())
 
 
+@pytest.mark.slow
 def test_edge_couples_are_the_same_on_the_device(device):
     """Conjugate gradients, which take the loads from the device, and factors find the same arc; in 3 worlds alike."""
     scene = strip(0.6, "midedge_dof", 8)
@@ -374,7 +375,7 @@ ddg.Integrator(model).step(model.state(), 0.01)
 """
 
 
-@pytest.mark.parametrize("verbose", ["", "1"])
+@pytest.mark.parametrize("verbose", ["", pytest.param("1", marks=pytest.mark.slow)])
 def test_scripts_print_no_module_loads(verbose):
     """Importing loads nothing heavy; a run prints nothing of Warp's, or with DDG_WARP_VERBOSE=1 what it always did."""
     environment = os.environ | {"DDG_WARP_VERBOSE": verbose}
@@ -401,7 +402,7 @@ def quarter(turn: float = 0.0, bending: str = "midedge_dof", axes: bool = False,
 TURN = np.pi / 6.0
 
 
-@pytest.mark.parametrize("bending", ["midedge_dof", pytest.param("hinge", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("bending", [pytest.param("midedge_dof", marks=pytest.mark.slow), "hinge"])
 def test_oblique_symmetry_is_axis_aligned_symmetry_turned(device, bending):
     """Statics by factors and by conjugate gradients, and steps of both schemes: turned by 30 degrees, all is turned, nothing else."""
     found = []

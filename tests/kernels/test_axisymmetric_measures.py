@@ -14,12 +14,12 @@ PRECISIONS = {"float64": 1e-13, "float32": 2e-5}
 COUNT = 8
 STATIC = [name for name in AXISYMMETRIC if "damped" not in name]
 FIRST = first_of_their_kind(AXISYMMETRIC)
-# Each has kernels of its own in each precision: every day those of every measure and density, and one of them in float32.
+# Each has kernels of its own in each precision: every day those of every measure and density in float64.
 EVERY_TERM = pytest.mark.parametrize(
     ("name", "precision"),
     [
-        pytest.param(name, precision, marks=() if name in daily else pytest.mark.slow)
-        for precision, daily in (("float64", FIRST), ("float32", ("axisymmetric_stretch",)))
+        pytest.param(name, precision, marks=() if precision == "float64" and name in FIRST else pytest.mark.slow)
+        for precision in PRECISIONS
         for name in AXISYMMETRIC
     ],
 )

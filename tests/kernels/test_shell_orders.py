@@ -105,7 +105,7 @@ def test_facets_one_behind_the_other(device):
 
 
 @pytest.mark.parametrize("shape", ["cylinder 20", "cylinder 45", "sphere", "saddle 45"])
-@pytest.mark.parametrize("mesh", ["jittered", "delaunay"])
+@pytest.mark.parametrize("mesh", ["jittered", pytest.param("delaunay", marks=pytest.mark.slow)])
 def test_turning_normals_converge_on_irregular_meshes(device, mesh, shape):
     """Random meshes have no smooth error, but all of it is below that of their longest facets."""
     for n in (12, 24):

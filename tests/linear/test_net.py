@@ -34,7 +34,7 @@ def test_projected_matrix_leaves_out_compression(device):
     assert lowest[1] > -1e-12
 
 
-@pytest.mark.parametrize("precision", ["float64", "mixed"])
+@pytest.mark.parametrize("precision", ["float64", pytest.param("mixed", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("bending", ["midedge_dof", "hinge"])
 def test_directions_against_a_dense_solve(device, bending, precision):
     problem = Problem(frame_and_sheet(bending), device, 1.02, precision)
@@ -91,7 +91,7 @@ def test_negative_curvature_ends_the_solve_and_projects(device, preconditioner):
     assert np.isfinite(direction).all()
 
 
-@pytest.mark.parametrize("precision", ["float64", "mixed"])
+@pytest.mark.parametrize("precision", ["float64", pytest.param("mixed", marks=pytest.mark.slow)])
 def test_multilevel_takes_fewer_iterations_to_the_same_step(device, precision):
     """Groups of 8, 64 and 512 nodes carry what block Jacobi passes on edge by edge; both stop at the same residual of the step."""
     points, triangles = meshes.rectangle(24, 24, (1.0, 1.0), "alternating")

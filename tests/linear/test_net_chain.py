@@ -12,6 +12,7 @@ from ddg_warp.linear.choice import net_preconditioner
 from ddg_warp.scenes import gridshell_dome
 
 STEEL = ddg.Material(young=2.1e11, poisson=0.3, density=7850.0)
+DAILY_IN_FLOAT64 = pytest.mark.parametrize("precision", ["float64", pytest.param("mixed", marks=pytest.mark.slow)])
 
 
 def applied(problem: Problem, vectors: np.ndarray) -> np.ndarray:
@@ -162,7 +163,7 @@ def rod_on_a_held_sheet() -> ddg.Scene:
     return scene
 
 
-@pytest.mark.parametrize("precision", ["float64", "mixed"])
+@DAILY_IN_FLOAT64
 @pytest.mark.parametrize("scene", [bent_frame, star, rod_on_a_held_sheet])
 def test_nets_with_one_joint_at_most_are_solved_at_once(device, scene, precision):
     problem = Problem(scene(), device, 1.02, precision, "chain")
@@ -170,7 +171,7 @@ def test_nets_with_one_joint_at_most_are_solved_at_once(device, scene, precision
 
 
 @pytest.mark.parametrize("rigid", [True, False])
-@pytest.mark.parametrize("precision", ["float64", "mixed"])
+@DAILY_IN_FLOAT64
 def test_iterations_do_not_grow_with_the_nodes_of_a_rod(device, rigid, precision):
     """5 or 6 of them at 5 and at 15 edges between crossings, where block Jacobi takes 55 and 250."""
     iterations = {}
@@ -195,7 +196,7 @@ def trajectory(scene, device, linear: str, dt: float, precision="float64", world
     return state.points(), statistics["pcg_iterations"] / statistics["newton_iterations"]["mean"]
 
 
-@pytest.mark.parametrize("precision", ["float64", "mixed"])
+@DAILY_IN_FLOAT64
 def test_same_steps_of_a_gridshell(device, precision):
     scene = gridshell_dome.build(3, 8)
     expected, many = trajectory(scene, device, "block_jacobi", 1.0 / 60.0, precision)
@@ -223,6 +224,7 @@ def stiffened(spin: str, cells: int = 16) -> ddg.Scene:
     return scene
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("spin", "most"), [("free", (0.25, 0.25)), ("glued", (0.25, 0.35))])
 def test_composes_with_levels_on_a_stiffened_sheet(device, spin, most):
     """Chains know the ribs' own bending and twist; what glue couples to the sheet is left to the iterations."""

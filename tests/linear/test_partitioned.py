@@ -14,7 +14,9 @@ from ddg_warp.linear.partitioned import PartitionedNewton
 from ddg_warp.newton import NewtonOptions
 
 KINDS = {"twist": {}, "untwisted": {"twist": False}, "planar": {"dimension": 2}, "stretch": {"bend": False}}
-EVERY_KIND = pytest.mark.parametrize("name", KINDS)
+EVERY_KIND = pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name == "twist" else pytest.mark.slow) for name in KINDS]
+)  # each has kernels of its own: every day the one that has them all
 COUNTS = (2, 3, 4, 5, 17, 20, 64, 79, 100, 123)  # groups of one rod or of two of different lengths
 RUBBER = ddg.Material(young=1e7, poisson=0.5, density=1000.0)
 STEEL = ddg.Material(young=2e11, poisson=0.3, density=7800.0)
@@ -81,11 +83,11 @@ def dense(newton, column: int) -> tuple[np.ndarray, np.ndarray]:
     ("precision", "tolerance", "name"),
     [
         ("float64", 1e-11, "twist"),
-        ("float64", 1e-11, "stretch"),
+        pytest.param("float64", 1e-11, "stretch", marks=pytest.mark.slow),
         pytest.param("mixed", 1e-3, "stretch", marks=pytest.mark.slow),
         pytest.param("float64", 1e-11, "untwisted", marks=pytest.mark.slow),
         pytest.param("float64", 1e-11, "planar", marks=pytest.mark.slow),
-        ("mixed", 1e-3, "twist"),
+        pytest.param("mixed", 1e-3, "twist", marks=pytest.mark.slow),
         pytest.param("mixed", 1e-3, "untwisted", marks=pytest.mark.slow),
         pytest.param("mixed", 1e-3, "planar", marks=pytest.mark.slow),
     ],
@@ -115,6 +117,7 @@ def test_direction_is_a_dense_solve(device, name, precision, tolerance):
     assert found == 2 * len(COUNTS)
 
 
+@pytest.mark.slow
 def test_pivots_are_lost_where_the_matrix_is_indefinite(device):
     """Compression makes some of the matrices so; those rods stay, to be tried without it, and the others move."""
     seen = set()
@@ -277,7 +280,7 @@ def test_as_many_iterations_as_the_sweep(device, name):
     assert found["outcomes"] == swept["outcomes"]
 
 
-@pytest.mark.parametrize("precision", ["float64", "mixed"])
+@pytest.mark.parametrize("precision", ["float64", pytest.param("mixed", marks=pytest.mark.slow)])
 def test_repeats_bit_by_bit(device, precision):
     first, second = (moved(stiff(), device, "partitioned", precision=precision, steps=6)[0] for _ in range(2))
     np.testing.assert_array_equal(first.points(), second.points())

@@ -152,7 +152,7 @@ def test_fewer_iterations_on_a_curl(device, precision):
 
 
 @pytest.mark.parametrize("closed", [False, True])
-@pytest.mark.parametrize("psd", ["project", "progressive", "none"])
+@pytest.mark.parametrize("psd", [pytest.param("project", marks=pytest.mark.slow), "progressive", "none"])
 def test_every_mode_has_the_same_solution(device, psd, closed):
     """Residuals stop at rtol of the load, which leaves distances far below a thousandth of the radius."""
     scene = helix(24, 1.5, closed, young=1e8)
