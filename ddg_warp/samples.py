@@ -250,6 +250,8 @@ def _random_state(sample: Sample) -> dict[str, np.ndarray]:
         about = 1.0 if term.measure.span == 1 else 0.0  # a stretch is 1 at rest
         for parameter in term.parameters:
             value = random.uniform(0.6, 1.4, size=(n, rods))
+            if not parameter.valid[1](value).all():
+                value = 0.5 * value  # a Poisson's ratio
             rows.append(about + 0.4 * random.normal(size=(n, rods)) if parameter.family == "rest" else value)
         last += [about + 0.4 * random.normal(size=(n, rods)) for _ in term.measure.strains]
     return {
