@@ -117,7 +117,9 @@ def _compliance(name: str, real):
     def elastic(k: real, crossover: real):
         a = real(180.0) / (crossover * crossover)
         f = phi(a * k * k)
-        return V(f[0], real(2.0) * a * k * f[1], real(2.0) * a * (f[1] + real(2.0) * a * k * k * f[2])) * (real(2.0) * a)
+        return V(f[0], real(2.0) * a * k * f[1], real(2.0) * a * (f[1] + real(2.0) * a * k * k * f[2])) * (
+            real(2.0) * a
+        )
 
     return elastic if name == "audoly_neukirch" else rational
 
