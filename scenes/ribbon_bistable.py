@@ -2,10 +2,10 @@
 
 A strip is bent to an arch by clamps brought together by a quarter of its length; then they are moved apart across the strip, the first
 by -y / 2, the last by y / 2. The arch goes on looking the same from both of its ends up to a pitchfork at some y, from which on it
-leans towards either (Yu and Hanna, Extreme Mech. Lett. 34, 2020, "Bifurcations of buckled, clamped anisotropic rods and thin bands under
-lateral end translations"; Huang, Wang, Hao and Jawed, J. Mech. Phys. Solids 145, 2020, from narrow to wide bands). Kirchhoff's rod of
-the same section does so at nearly the same y however wide it is, 6 % late at the largest width here; a strip of plate the sooner the
-wider it is, and so does a ribbon, 2 to 3 % late. Of plates, not of ribbons, clamps also hinder the warping near the ends.
+leans towards either: Yu and Hanna, Extreme Mech. Lett. 34 (2020), "Bifurcations of buckled, clamped anisotropic rods and thin bands
+under lateral end translations"; Huang, Wang, Li and Jawed, J. Mech. Phys. Solids 145 (2020), from narrow to wide bands. Kirchhoff's rod
+of the same section does so at nearly the same y however wide it is, 6 % late at the largest width here; a strip of plate the sooner
+the wider it is, and so does a ribbon, 2 to 3 % late. Of plates, not of ribbons, clamps also hinder the warping near the ends.
 """
 
 import numpy as np
