@@ -223,7 +223,7 @@ def rest(case: Case) -> float:
     out = arrays.allocate((group.kind.window, group.nodes, group.columns), case.real, case.device)
     still = wp.full(group.columns, 1.0, dtype=case.real, device=case.device)
     wp.launch(
-        element.term_kernels(group.kind, group.kind.terms.index(case.term), case.real)[1],
+        element.term_kernels(group.kind, group.kind.terms.index(case.term), case.real, reverse=True)[1],
         (group.elements, group.columns),
         [data.x, data.theta, data.frame, data.last, still, *group.parameters.arrays, group.count],
         [out],
@@ -315,13 +315,19 @@ def checks_of(term: Term, closed: bool, precision: str) -> list[str]:
     ]
 
 
-def table(term: str | Term | None = None, precision: str = "float64", device: str = "cpu") -> list[dict]:
+def table(
+    term: str | Term | None = None,
+    precision: str = "float64",
+    device: str = "cpu",
+    chains: tuple[bool, ...] = (False, True),
+) -> list[dict]:
     """Rows of the derivative table: term, chain, check, error, tolerance, passed.
 
     Args:
         term: a term of chains or nets, one's own or one of `kernels.terms.ALL` by key; all of these by default.
         precision: "float64" or "float32", that of the kernels under test.
         device: Warp device.
+        chains: of terms of chains, which are tried: open ones (False), closed ones (True), or both.
     """
     from ddg_warp import net_derivatives
 
@@ -333,7 +339,7 @@ def table(term: str | Term | None = None, precision: str = "float64", device: st
                 _row(one.key, "net", name, error(case), precision) for name, error in net_derivatives.CHECKS.items()
             ]
             continue
-        for closed in (False, True):
+        for closed in chains:
             case = Case(one, chain_of(one, closed), precision, device)
             for check in checks_of(one, closed, precision):
                 rows.append(_row(one.key, "closed" if closed else "open", check, CHECKS[check][0](case), precision))

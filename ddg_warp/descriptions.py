@@ -99,7 +99,7 @@ def laws_of(what: str, section, material, laws) -> dict[str, Law]:
     return {**brought, **(laws or {})}
 
 
-@dataclass(frozen=True)
+@dataclass
 class RodBatch:
     """Rods of one `add_rods` call: same node count and closedness; section, shape and rest shape may differ."""
 

@@ -94,7 +94,7 @@ class NetSample:
         dtype = wp.types.vector(3, real) if which else real
         seeds = wp.array(np.ascontiguousarray(seed), dtype=dtype, device=self.device)
         wp.launch(
-            net_elements.term_kernels(self.term, real)[which],
+            net_elements.term_kernels(self.term, real, reverse=True)[which],
             ELEMENTS,
             inputs,
             [wp.zeros_like(seeds, requires_grad=True)],
@@ -209,7 +209,7 @@ class NetSample:
     def _launch(self, which: int, real, shapes, vectors=False, columns=(), extra=(), **changed) -> list[np.ndarray]:
         dtype = wp.types.vector(3, real) if vectors else real
         out = [wp.zeros(shape, dtype=dtype, device=self.device) for shape in shapes]
-        kernel = net_elements.term_kernels(self.term, real)[which]
+        kernel = net_elements.term_kernels(self.term, real, reverse=True)[which]
         wp.launch(kernel, (ELEMENTS, *columns), [*self._inputs(real, **changed), *extra], out, device=self.device)
         return [array.numpy().astype(float) for array in out]
 

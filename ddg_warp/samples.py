@@ -200,7 +200,7 @@ class Sample:
         return [slice(row, row + 3) for term, (*_, row) in places if is_vector(term)]
 
     def _kernels(self, index: int, real):
-        return element.term_kernels(self.kind, index, real)
+        return element.term_kernels(self.kind, index, real, reverse=True)
 
     def _inputs(self, real, **changed) -> list[wp.array]:
         data = {**self.data, **changed}

@@ -257,8 +257,11 @@ def term_functions(kind: ChainKind, index: int, real):
 
 
 @cache
-def term_kernels(kind: ChainKind, index: int, real):
-    """Kernels of one term: its energy, its gradient on the window (both with reverse mode), its Hessian on the window."""
+def term_kernels(kind: ChainKind, index: int, real, reverse: bool = False):
+    """Kernels of one term: its energy, its gradient on the window, its Hessian on the window.
+
+    With `reverse` the first two have an adjoint, which doubles the time that they take to compile.
+    """
     term = kind.terms[index]
     V, W = wp.types.vector(kind.dim, real), wp.types.vector(kind.window, real)
     S13 = wp.types.vector(13, real)
@@ -279,7 +282,7 @@ def term_kernels(kind: ChainKind, index: int, real):
     def along(q: W, s: S13, w: real, p: P, v: W):
         return wp.dot(gradient_at(q, s, w, p), v)
 
-    @wp.kernel(module="unique", enable_backward=True)
+    @wp.kernel(module="unique", enable_backward=reverse)
     def energy(
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
@@ -299,7 +302,7 @@ def term_kernels(kind: ChainKind, index: int, real):
             q = local(window(x, theta, k, n, whole, r))
             energy_out[k, r] = w * energy_of(strains_of(q, short(lagged(frame, k, n, whole, r)), w), p)
 
-    @wp.kernel(module="unique", enable_backward=True)
+    @wp.kernel(module="unique", enable_backward=reverse)
     def gradient(
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
@@ -367,11 +370,10 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool):
     E, P = wp.types.vector(n, real), wp.types.vector(term.density.parameter_size(n), real)
     has_tension, dim = term.measure.tensions > 0, kind.dim
     bends = curved and term.measure.span == 2
-    softens = (
-        term.density.coupled and not term.density.quadratic
-    )  # so that the root leaves out what is negative of psi''
+    softens = term.density.coupled and not term.density.quadratic  # the root leaves out what is negative of psi''
     dofs = [*range(dim * term.measure.span), *(dim * kind.span + i for i in range(term.measure.angles))]
     places = tuple(packed_index(kind.window, dofs[i], dofs[j]) for i in range(size) for j in range(i, size))
+    where = wp.types.vector(len(places), int)(*places)
 
     if term.density.coupled:
         R, J = wp.types.matrix((n, n), real), wp.types.matrix((n, size), real)
@@ -455,7 +457,7 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool):
                 if wp.static(softens):
                     second = second + left_out(root, e, p, w, jacobian)
                 for i in range(wp.static(len(places))):
-                    geometric[wp.static(places[i]), k, r] = linear(second[i])
+                    geometric[where[i], k, r] = linear(second[i])
         stiffness = real(0.0)
         for m in range(wp.static(n)):
             edge = real(0.0)
@@ -481,16 +483,19 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
     reference twist nears a jump. `stiffness` is the largest a term has against moving its first edge [N/m]. Thread (0, 0) clears
     `active`, which the sweep then raises.
     """
-    V, W = wp.types.vector(kind.dim, real), wp.types.vector(kind.window, real)
+    V = wp.types.vector(kind.dim, real)
     until = until_function(kind)
     _, window, lagged, _ = gather_functions(kind, real)
     curved, begin = exact_from is not None, exact_from or 0
-    each = tuple(evaluate_functions(kind, i, real, linear, curved) for i in range(len(kind.terms)))
+    # Not a loop over the terms: what depends on a loop variable, wp.static(each[i]), Warp resolves by generating all code of a kernel
+    # whenever it is defined, compiled before or not, 0.3 s each. A function that calls itself costs a step on the CPU 5 %.
+    terms, everywhere = len(kind.terms), kind.terms[0].measure.span == 1
+    W = wp.types.vector(kind.window, real)
+    evaluate_first, evaluate_last = (evaluate_functions(kind, at, real, linear, curved) for at in (0, -1))
     options = CPU_OPTIONS | {"max_unroll": kind.geometric_rows} if curved else CPU_OPTIONS
     X = wp.types.vector(3, real)
     transport, reference_twist, _ = frames.functions(real)
-    spans = tuple(term.measure.span for term in kind.terms)
-    terms, size, twist, closed = len(kind.terms), kind.window, kind.twist, kind.closed
+    size, twist, closed = kind.window, kind.twist, kind.closed
 
     # three blocks a multiprocessor: 168 registers instead of 170 are worth 30 % at 100,000 rods on an H200
     @wp.kernel(
@@ -530,18 +535,24 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
             whole = wp.static(closed) or k < n - 2
             q = window(x, theta, k, n, whole, r)
             s = lagged(frame, k, n, whole, r)
-            total = real(0.0)
-            stiffest = real(0.0)
+            energy = real(0.0)
             f = W()
-            for i in range(wp.static(terms)):
-                if whole or wp.static(spans[i]) == 1:
-                    energy, part, stiff = wp.static(each[i])(
-                        q, s, buffer, table, last, rate[r], clamped[r], frozen, exact, factor_out, geometric_out, k, r
-                    )
-                    total += energy
-                    f += part
-                    stiffest = wp.max(stiffest, stiff)
-            energy_out[1 - slot[r], k, r] = total
+            stiffest = real(0.0)
+            if whole or wp.static(everywhere):
+                own, part, stiff = evaluate_first(
+                    q, s, buffer, table, last, rate[r], clamped[r], frozen, exact, factor_out, geometric_out, k, r
+                )
+                energy += own
+                f += part
+                stiffest = wp.max(stiffest, stiff)
+            if wp.static(terms > 1):
+                own_too, part_too, stiff_too = evaluate_last(
+                    q, s, buffer, table, last, rate[r], clamped[r], frozen, exact, factor_out, geometric_out, k, r
+                )
+                energy += own_too
+                f += part_too
+                stiffest = wp.max(stiffest, stiff_too)
+            energy_out[1 - slot[r], k, r] = energy
             stiffness_out[k, r] = linear(stiffest)
             for i in range(wp.static(size)):
                 gradient_out[i, k, r] = f[i]
@@ -573,8 +584,8 @@ def strain_kernel(kind: ChainKind, real):
     """Strains of all terms, and their conjugate stresses (force, moments) if asked for."""
     V = wp.types.vector(kind.dim, real)
     _, window, lagged, _ = gather_functions(kind, real)
-    each = tuple(_strain_functions(kind, i, real) for i in range(len(kind.terms)))
-    spans, closed = tuple(term.measure.span for term in kind.terms), kind.closed
+    strains_of_all = _strain_functions(kind, len(kind.terms) - 1, real)
+    closed = kind.closed
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def strains(
@@ -597,16 +608,17 @@ def strain_kernel(kind: ChainKind, real):
         whole = wp.static(closed) or k < n - 2
         q = window(x, theta, k, n, whole, r)
         s = lagged(frame, k, n, whole, r)
-        for i in range(wp.static(len(spans))):
-            if whole or wp.static(spans[i]) == 1:
-                wp.static(each[i])(q, s, buffer, table, last, rate[r], stressed, strain_out, stress_out, k, r)
+        strains_of_all(q, s, buffer, table, last, rate[r], whole, stressed, strain_out, stress_out, k, r)
 
     return strains
 
 
 @cache
 def _strain_functions(kind: ChainKind, index: int, real):
+    """strains_at of the terms 0 to `index`: it calls itself for those before the last, as a loop would generate code at every import."""
     term = kind.terms[index]
+    everywhere = term.measure.span == 1
+    strains_before = _strain_functions(kind, index - 1, real) if index else None
     W, S13 = wp.types.vector(kind.window, real), wp.types.vector(13, real)
     n = len(term.measure.strains)
     strains_of, *_ = term.measure.functions(real)
@@ -622,18 +634,22 @@ def _strain_functions(kind: ChainKind, index: int, real):
         table: wp.array2d(dtype=int),
         last: wp.array3d(dtype=real),
         rate: real,
+        whole: bool,
         stressed: int,
         strain_out: wp.array3d(dtype=real),
         stress_out: wp.array3d(dtype=real),
         k: int,
         r: int,
     ):
-        w, p = load(buffer, table, last, rate, k, r)
-        e = strains_of(local(window), short(s), w)
-        stress = slope_of(e, p)
-        for m in range(wp.static(n)):
-            strain_out[wp.static(row) + m, k, r] = e[m]
-            if stressed != 0:
-                stress_out[wp.static(row) + m, k, r] = stress[m]
+        if wp.static(index > 0):
+            strains_before(window, s, buffer, table, last, rate, whole, stressed, strain_out, stress_out, k, r)
+        if whole or wp.static(everywhere):
+            w, p = load(buffer, table, last, rate, k, r)
+            e = strains_of(local(window), short(s), w)
+            stress = slope_of(e, p)
+            for m in range(wp.static(n)):
+                strain_out[wp.static(row) + m, k, r] = e[m]
+                if stressed != 0:
+                    stress_out[wp.static(row) + m, k, r] = stress[m]
 
     return strains_at

@@ -60,11 +60,16 @@ def balance_function(term: Term, real):
 
 @cache
 def window_function(kind: ChainKind, index: int, real):
-    """at(window0, lagged0, window, lagged, ...) of term `index` of a chain: its rows of element k of rod r."""
+    """at(window0, lagged0, window, lagged, ...) of the terms 0 to `index` of a chain: the sum of their rows of element k of rod r.
+
+    It calls itself for those before the last; `element.evaluate_until` says why.
+    """
     term = kind.terms[index]
+    everywhere = term.measure.span == 1
+    before = window_function(kind, index - 1, real) if index else None
     load, local, short, _ = term_functions(kind, index, real)
     balance = balance_function(term, real)
-    W, S = wp.types.vector(kind.window, real), wp.types.vector(13, real)
+    W, S, B = wp.types.vector(kind.window, real), wp.types.vector(13, real), wp.types.vector(ROWS, real)
 
     @wp.func
     def at(
@@ -76,13 +81,19 @@ def window_function(kind: ChainKind, index: int, real):
         table: wp.array2d(dtype=int),
         last: wp.array3d(dtype=real),
         rate: real,
+        whole: bool,
         reach: real,
         floor: real,
         k: int,
         r: int,
     ):
-        w, p = load(buffer, table, last, rate, k, r)
-        return balance(local(window0), short(lagged0), local(window), short(lagged), w, p, reach, floor)
+        rows = B()
+        if wp.static(index > 0):
+            rows += before(window0, lagged0, window, lagged, buffer, table, last, rate, whole, reach, floor, k, r)
+        if whole or wp.static(everywhere):
+            w, p = load(buffer, table, last, rate, k, r)
+            rows += balance(local(window0), short(lagged0), local(window), short(lagged), w, p, reach, floor)
+        return rows
 
     return at
 
@@ -92,9 +103,8 @@ def chain_kernel(kind: ChainKind, real, linear):
     """Rows of a step of every rod, summed over ranges: range i holds the nodes i, i + ranges, ... (see `kernels.parallel_search`)."""
     V, B = wp.types.vector(kind.dim, real), wp.types.vector(ROWS, real)
     _, window, lagged, _ = gather_functions(kind, real)
-    each = tuple(window_function(kind, i, real) for i in range(len(kind.terms)))
-    spans = tuple(term.measure.span for term in kind.terms)
-    terms, twist, closed = len(kind.terms), kind.twist, kind.closed
+    rows_of_all = window_function(kind, len(kind.terms) - 1, real)
+    twist, closed = kind.twist, kind.closed
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def measure(
@@ -160,9 +170,7 @@ def chain_kernel(kind: ChainKind, real, linear):
                 q = window(x, theta, k, n, whole, r)
                 s0 = lagged(frame0, k, n, whole, r)
                 s = lagged(frame, k, n, whole, r)
-                for i in range(wp.static(terms)):
-                    if whole or wp.static(spans[i]) == 1:
-                        total += wp.static(each[i])(q0, s0, q, s, buffer, table, last, rate[r], reach, floor, k, r)
+                total += rows_of_all(q0, s0, q, s, buffer, table, last, rate[r], whole, reach, floor, k, r)
                 least = floor * reach
                 total[wp.static(ROUNDING)] = total[wp.static(ROUNDING)] + real(stiffness[k, r]) * least * least
         for i in range(wp.static(ROWS)):

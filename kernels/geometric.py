@@ -9,7 +9,6 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.element import ChainKind, gather_functions
-from ddg_warp.kernels.measures.turning import packed_index
 
 SWEEPS = 12  # of Jacobi's method; 8 x 8 matrices take 5 or 6
 
@@ -122,8 +121,9 @@ def project_kernel(kind: ChainKind, real, linear):
         a = factored(factor, scale, k, n, r)
         for i in range(wp.static(size)):
             for j in range(wp.static(size)):
-                g = real(geometric[wp.static(packed_index(size, min(i, j), max(i, j))), k, r])
-                a[i, j] = a[i, j] + g * scale[i] * scale[j]
+                row = wp.min(i, j)
+                at = row * wp.static(size) - row * (row - 1) // 2 + wp.max(i, j) - row
+                a[i, j] = a[i, j] + real(geometric[at, k, r]) * scale[i] * scale[j]
         up = lifted(a, dofs)
         for i in range(wp.static(size)):
             for j in range(wp.static(size)):

@@ -1,19 +1,24 @@
 """Laws: parameters by name, damping of any law, and laws of one's own in scenes and in the derivative table."""
 
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from own_law import saturating
+from test_readme import BLOCKS
 
 import ddg_warp as ddg
 from ddg_warp import derivatives
+from ddg_warp.catalog import load_file
 from ddg_warp.cli import main
 from ddg_warp.integrate.statics import solve
 from ddg_warp.kernels.densities.quadratic import quadratic
 from ddg_warp.kernels.terms import ALL, REGISTRY
 
+FILE = Path(tempfile.mkdtemp()) / "my_law.py"  # the README's law, in a file, since Warp reads the source of functions
+FILE.write_text(dict(BLOCKS)["my_law.py"])
+saturating = load_file(str(FILE), "law's").saturating
 K, LIMIT = 2.0, 3.0
 LAW = {"rod_bend_twist": ddg.Law(saturating, modulus=K, limit=LIMIT)}
 SECTION = ddg.Stiffness(EA=1e5, EI1=2.0, EI2=2.0, GJ=2.0, mass_per_length=0.4, rotary_inertia=1e-3)
@@ -112,10 +117,9 @@ def test_derivatives_of_a_law_of_ones_own(device, damped):
 
 
 def test_the_command_line_checks_a_law_in_a_file(device, capsys):
-    file = str(Path(__file__).parent / "own_law.py")
-    assert main(["check", f"{file}:saturating", "--device", device]) == 0
+    assert main(["check", f"{FILE}:saturating", "--device", device]) == 0
     assert "rod_bend_twist" in capsys.readouterr().out
-    assert main(["check", f"{file}:nothing"]) == 2
+    assert main(["check", f"{FILE}:nothing"]) == 2
     assert "no term or law 'nothing'" in capsys.readouterr().err
 
 

@@ -33,6 +33,10 @@ FAULTS = {
     "kernel with others": ("enable-backward", "@wp.kernel(module='unique')\ndef k(a: real):\n    pass\n"),
     "literal in a product": ("float-literal", FUNC + "return 0.5 * a\n"),
     "literal as argument": ("float-literal", FUNC + "return wp.max(a, -1.0e-3)\n"),
+    "static of a loop": (
+        "static-variable",
+        FUNC + "for i in range(3):\n        q[wp.static(3 * i)] = a\n    return q\n",
+    ),
 }
 
 SOUND = {
@@ -42,6 +46,7 @@ SOUND = {
     "array added to": KERNEL + "out[0] += a\n",
     "no adjoint": NO_ADJOINT + "q[0] = q[0] * a\n    out[0] = out[0] * a\n",
     "called without adjoint": FUNC + "q[0] = q[0] * a\n    return q\n\n" + NO_ADJOINT + "p = f(q, a)\n",
+    "static in a loop": FUNC + "for i in range(wp.static(n)):\n        q[wp.static(n) + i] = a\n    return q\n",
     "casts": FUNC + "return real(0.5) * a + linear(-1.0) + real(wp.static(0.25 * n))\n",
     "host code": "def host(x):\n    t = x, x\n    return 0.5 * t[0]\n",
 }

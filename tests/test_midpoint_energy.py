@@ -54,7 +54,8 @@ def advance(model, state, dt: float, steps: int, **options):
 
 
 CASES = [(name, "float64") for name in (*ALONE, *JOINED, *SHELLS)]
-CASES += [(name, "mixed") for name in ("rod", "rods joined rigidly", "shell, midedge_dof")]
+CASES += [("rod", "mixed")]
+CASES += [pytest.param(name, "mixed", marks=pytest.mark.slow) for name in ("rods joined rigidly", "shell, midedge_dof")]
 
 
 @pytest.mark.parametrize(("name", "precision"), CASES)
@@ -80,7 +81,14 @@ def test_a_spin_of_half_a_radian_a_step(device, name, precision):
     assert statistics["energy"]["fraction"] <= BOUND * (1.0 + 1e-6)
 
 
-@pytest.mark.parametrize("name", ["rod", "rods joined rigidly", "shell, midedge_dof", "shell of revolution"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "rod",
+        "shell, midedge_dof",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("rods joined rigidly", "shell of revolution")),
+    ],
+)
 def test_what_is_made_is_accounted_for(device, name):
     """K + E - E0 = made - dissipated, whatever viscosity and mass damping take: an identity, up to what the solver leaves."""
     for damping in ({}, {"viscosity": 2e-4, "mass_damping": 2.0}):

@@ -32,7 +32,9 @@ MODES = {
 }
 
 
-@pytest.mark.parametrize("name", MODES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name != "greenhill" else pytest.mark.slow) for name in MODES]
+)
 def test_scenes_that_buckle_show_the_mode(name):
     """The lowest mode leaves the straight rod, the plane of ring and frame, the plane of the plate, by the size given."""
     parameters, size, across = MODES[name]

@@ -30,7 +30,7 @@ SMALL = {
     "plate_buckling": {"cells": 12},
     "plate_square": {"cells": 16},
     "post_buckling": {"n": 50},
-    "pullout_cylinder": {"n": 8, "steps": 10},
+    "pullout_cylinder": {"n": 12},
     "ribbon_bistable": {"n": 40},
     "ribbon_helix": {"n": 50},
     "right_angle_frame": {},
@@ -45,7 +45,16 @@ SMALL = {
     "vibration": {"n": 25},
     "whirling": {},
 }
-LONG = ("cable_gripped_at_both_ends", "hanging_sheet", "parachute", "pullout_cylinder", "slit_annulus", "hinged_roof")
+LONG = (
+    "cable_gripped_at_both_ends",
+    "hanging_sheet",
+    "parachute",
+    "pullout_cylinder",
+    "slit_annulus",
+    "hinged_roof",
+    "lee_frame",
+    "localized_helix",
+)
 
 
 def checked(name: str, device: str, **given) -> None:

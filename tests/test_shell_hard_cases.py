@@ -40,7 +40,7 @@ def pressed_plate(device, thickness: float, pressure: float = 1.0, bending: str 
 # Square membrane of half side a: p = 1.994 (1 - 0.271 nu) / (1 - nu) E h w^3 / a^4 (Maier-Schneider, Maibach and Obermeier, J. MEMS 4,
 # 1995), so w = 0.2880 (p / (E h))^(1/3) with nu = 0.3 and a = 1/2.
 @pytest.mark.parametrize("bending", ["midedge_dof", "hinge"])
-@pytest.mark.parametrize("thickness", [1e-4, 1e-5])
+@pytest.mark.parametrize("thickness", [pytest.param(1e-4, marks=pytest.mark.slow), 1e-5])
 def test_very_thin_plate_is_a_membrane(device, thickness, bending):
     """A deflection of 60 and 1300 thicknesses at once, from a flat state whose tangent is that of bending alone.
 
@@ -100,6 +100,7 @@ def moved(shift: float) -> tuple[np.ndarray, np.ndarray, int]:
     return points, triangles, 12
 
 
+@pytest.mark.slow
 def test_slivers(device):
     """A vertex moved to 1e-3 and 4e-6 cells of the next leaves the deflection of a clamped square within 3 %; nearer is refused."""
     heights = []
@@ -212,7 +213,7 @@ def test_crease_at_once_is_named(device):
 
 
 @pytest.mark.parametrize("bending", ["midedge_dof", "midedge", "hinge"])
-@pytest.mark.parametrize("size", [0.3, 0.6])
+@pytest.mark.parametrize("size", [pytest.param(0.3, marks=pytest.mark.slow), 0.6])
 def test_crumpled_sheet_becomes_flat(device, bending, size):
     """Every vertex but those of one clamped side moved at random by up to `size` edge lengths: back to rest, without energy."""
     points, triangles = meshes.rectangle(8, 8)

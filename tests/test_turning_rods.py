@@ -110,8 +110,17 @@ def test_rod_without_twist_moves_as_alone(device, scheme, action, case):
     np.testing.assert_allclose(found[1], found[0], atol=1e-9)
 
 
-@pytest.mark.parametrize("case", ["spatial", "no twist", "planar"])
-@pytest.mark.parametrize("action", [turned_end, coupled])
+@pytest.mark.parametrize(
+    ("action", "case"),
+    [
+        (turned_end, "spatial"),
+        (coupled, "planar"),
+        (coupled, "no twist"),
+        pytest.param(turned_end, "planar", marks=pytest.mark.slow),
+        pytest.param(turned_end, "no twist", marks=pytest.mark.slow),
+        pytest.param(coupled, "spatial", marks=pytest.mark.slow),
+    ],
+)
 def test_rod_in_a_net_rests_as_alone(device, action, case):
     """Statics with exact derivatives of the couples, in the plane and without twist, too."""
     dimension, found = 2 if case == "planar" else 3, []

@@ -51,7 +51,10 @@ def normals(state) -> np.ndarray:
     return np.concatenate(found)
 
 
-@pytest.mark.parametrize("model", ["midedge_dof", "midedge", "hinge", pytest.param("curved", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "model",
+    ["midedge_dof", *(pytest.param(model, marks=pytest.mark.slow) for model in ("midedge", "hinge", "curved"))],
+)
 def test_a_sheet_is_carried_through_three_turns(device, model):
     """In statics: it is where the motion of its clamp has it, without energy, and so are the normals."""
     scene = strip((3, 2), (1.0, 0.6), model)
@@ -130,7 +133,11 @@ def test_torsion_of_a_strip(device):
 
 @pytest.mark.parametrize(
     ("bending", "angle", "load_steps"),
-    [("midedge_dof", 0.6, 2), ("hinge", 0.6, 2), ("midedge_dof", np.deg2rad(420.0), 12)],
+    [
+        ("midedge_dof", 0.6, 2),
+        ("hinge", 0.6, 2),
+        pytest.param("midedge_dof", np.deg2rad(420.0), 12, marks=pytest.mark.slow),
+    ],
     ids=["twisted", "hinge", "wound"],
 )
 def test_a_slow_motion_ends_in_the_static_solution(device, bending, angle, load_steps):

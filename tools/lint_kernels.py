@@ -9,6 +9,9 @@ self-overwrite    `q[0] = q[0] * a`, or `q[0] += a` on a vector: reverse mode re
 annotations       `from __future__ import annotations` turns the types of kernel arguments into strings.
 enable-backward   Every kernel says whether it has an adjoint, which doubles to quadruples its compile time.
 float-literal     A bare literal is float32: write real(0.5) or linear(0.5).
+static-variable   `wp.static(places[i])` of a loop variable: Warp resolves it by generating the code of the whole kernel each time
+                  it is defined, and hashes a function otherwise once that has happened, so that it is compiled twice. Index a
+                  constant vector, or let a function take the rest by calling itself.
 """
 
 import ast
@@ -120,6 +123,8 @@ def _lint_file(source: Source, differentiated: bool) -> Iterator[Finding]:
             yield find("tuple-index", node, f"{ast.unparse(node)} indexes a returned tuple; unpack it")
         for node in _bare_floats(function):
             yield find("float-literal", node, f"{node.value} is float32 here; write real({node.value})")
+        for node in _late_statics(function):
+            yield find("static-variable", node, f"{ast.unparse(node)} depends on a loop variable")
     for function in source.differentiated() if differentiated else ():
         for node in _overwrites(function):
             yield find("self-overwrite", node, f"`{ast.unparse(node)}` overwrites what it reads; use a new variable")
@@ -136,6 +141,16 @@ def _indexed_tuples(function: ast.FunctionDef, tuple_functions: set[str]) -> Ite
     for node in ast.walk(function):
         if isinstance(node, ast.Subscript):
             if is_tuple(node.value) or (isinstance(node.value, ast.Name) and node.value.id in held):
+                yield node
+
+
+def _late_statics(function: ast.FunctionDef) -> Iterator[ast.Call]:
+    """wp.static of what depends on the variable of a loop."""
+    loops = [node for node in ast.walk(function) if isinstance(node, ast.For)]
+    variables = {name.id for loop in loops for name in ast.walk(loop.target) if isinstance(name, ast.Name)}
+    for node in ast.walk(function):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "wp.static":
+            if variables & {name.id for name in ast.walk(node) if isinstance(name, ast.Name)}:
                 yield node
 
 

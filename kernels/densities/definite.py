@@ -29,8 +29,7 @@ def root_function(density: Density, real, n: int):
         wide = M3()
         for i in range(wp.static(n)):
             for j in range(wp.static(n)):
-                wide[i, j] = c[i, j]
-            wide[i, i] = wide[i, i] + shift[i]
+                wide[i, j] = c[i, j] + wp.where(i == j, shift[i], real(0.0))
         vectors, values = wp.eig3(wide)
         r = M()
         for i in range(wp.static(n)):

@@ -33,9 +33,11 @@ def functions(term: Term, real):
     points = measure.points
     angle_row, spin_row = 3 * len(edges), 3 * len(edges) + angles
     point_row = spin_row + 3 * spins
-    first = tuple(edge[0] for edge in edges)
-    second = tuple(edge[1] for edge in edges)
     edge_count = len(edges)
+    # constants of Warp's, which a loop variable may index: wp.static of one would be resolved only when a kernel is built, and so
+    # make the hash of every kernel depend on what was built before it
+    I = wp.types.vector(max(1, edge_count), int)
+    first, second = (I(*(edge[end] for edge in edges)) for end in (0, 1))
     lagged = density.lagged
 
     @wp.func
@@ -59,26 +61,26 @@ def functions(term: Term, real):
         shift = world * blocks
         local = Q()
         for i in range(wp.static(edge_count)):
-            edge = q[slots[wp.static(second[i]), e] + shift] - q[slots[wp.static(first[i]), e] + shift]
+            edge = q[slots[second[i], e] + shift] - q[slots[first[i], e] + shift]
             for d in range(3):
-                local[wp.static(3 * i) + d] = edge[d]
+                local[3 * i + d] = edge[d]
         for i in range(wp.static(angles)):
-            angle = q[slots[wp.static(nodes + i), e] + shift]
-            local[wp.static(angle_row + i)] = angle[0]
+            angle = q[slots[wp.static(nodes) + i, e] + shift]
+            local[wp.static(angle_row) + i] = angle[0]
         for i in range(wp.static(spins)):
-            spin = q[slots[wp.static(nodes + angles + i), e] + shift]
+            spin = q[slots[wp.static(nodes + angles) + i, e] + shift]
             for d in range(3):
-                local[wp.static(spin_row + 3 * i) + d] = spin[d]
+                local[wp.static(spin_row) + 3 * i + d] = spin[d]
         for i in range(wp.static(points)):
             position = q[slots[i, e] + shift]
             for d in range(3):
-                local[wp.static(point_row + 3 * i) + d] = position[d]
+                local[wp.static(point_row) + 3 * i + d] = position[d]
         s = S()
         for i in range(wp.static(frames)):
             # frames of a world lie behind each other, too
-            f = slots[wp.static(nodes + i), e] - angle_start + world * (frame.shape[1] / rate.shape[0])
+            f = slots[wp.static(nodes) + i, e] - angle_start + world * (frame.shape[1] / rate.shape[0])
             for c in range(wp.static(FRAME)):
-                s[wp.static(FRAME * i) + c] = frame[c, f]
+                s[wp.static(FRAME) * i + c] = frame[c, f]
         for c in range(wp.static(own)):
             s[wp.static(FRAME * frames) + c] = lag[c, tid]
         if wp.static(data_size > 0):
@@ -100,23 +102,23 @@ def functions(term: Term, real):
         """The three reals of a slot; `slot` is a constant where this is unrolled."""
         v = V()
         for i in range(wp.static(edge_count)):
-            if slot == wp.static(first[i]):
-                v -= V(f[wp.static(3 * i)], f[wp.static(3 * i + 1)], f[wp.static(3 * i + 2)])
-            if slot == wp.static(second[i]):
-                v += V(f[wp.static(3 * i)], f[wp.static(3 * i + 1)], f[wp.static(3 * i + 2)])
+            if slot == first[i]:
+                v -= V(f[3 * i], f[3 * i + 1], f[3 * i + 2])
+            if slot == second[i]:
+                v += V(f[3 * i], f[3 * i + 1], f[3 * i + 2])
         for i in range(wp.static(angles)):
-            if slot == wp.static(nodes + i):
-                v[0] = f[wp.static(angle_row + i)]
+            if slot == wp.static(nodes) + i:
+                v[0] = f[wp.static(angle_row) + i]
         for i in range(wp.static(spins)):
-            if slot == wp.static(nodes + angles + i):
+            if slot == wp.static(nodes + angles) + i:
                 for d in range(3):
-                    v[d] = f[wp.static(spin_row + 3 * i) + d]
+                    v[d] = f[wp.static(spin_row) + 3 * i + d]
         for i in range(wp.static(points)):
             if slot == i:
                 v += V(
-                    f[wp.static(point_row + 3 * i)],
-                    f[wp.static(point_row + 3 * i + 1)],
-                    f[wp.static(point_row + 3 * i + 2)],
+                    f[wp.static(point_row) + 3 * i],
+                    f[wp.static(point_row + 1) + 3 * i],
+                    f[wp.static(point_row + 2) + 3 * i],
                 )
         return v
 
@@ -124,8 +126,11 @@ def functions(term: Term, real):
 
 
 @cache
-def term_kernels(term: Term, real):
-    """Kernels of one term: energy, gradient (slots, elements), Hessian (elements, size, size), strains, linear stresses."""
+def term_kernels(term: Term, real, reverse: bool = False):
+    """Kernels of one term: energy, gradient (slots, elements), Hessian (elements, size, size), strains, linear stresses.
+
+    With `reverse` the first two have an adjoint, which doubles the time that they take to compile.
+    """
     measure, density = term.measure, term.density
     V = wp.types.vector(3, real)
     Q, S, E, _ = measure.types(real)
@@ -146,7 +151,7 @@ def term_kernels(term: Term, real):
         e, jacobian = jacobian_of(q, s, w)
         return wp.dot(((slope_of(e, p) + extra) * w) * jacobian, v)
 
-    @wp.kernel(module="unique", enable_backward=True)
+    @wp.kernel(module="unique", enable_backward=reverse)
     def energy(
         q: wp.array(dtype=V),
         frame: wp.array2d(dtype=real),
@@ -166,7 +171,7 @@ def term_kernels(term: Term, real):
         x, s, w, p = gather(q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, e)
         energy_out[e] = w * energy_of(strains_of(x, s, w), p)
 
-    @wp.kernel(module="unique", enable_backward=True)
+    @wp.kernel(module="unique", enable_backward=reverse)
     def gradient(
         q: wp.array(dtype=V),
         frame: wp.array2d(dtype=real),
@@ -370,13 +375,13 @@ def evaluate_kernel(term: Term, real, linear):
                 stiffest = wp.max(stiffest, w * wp.dot(rows[m], rows[m]))
                 for i in range(wp.static(slots_count)):
                     v = spread(rows[m] * weight, i)
-                    factor_out[wp.static(m * slots_count) + i, tid] = F(linear(v[0]), linear(v[1]), linear(v[2]))
+                    factor_out[m * wp.static(slots_count) + i, tid] = F(linear(v[0]), linear(v[1]), linear(v[2]))
         else:
             for m in range(wp.static(n)):
                 stiffest = wp.max(stiffest, w * root[m] * root[m] * wp.dot(jacobian[m], jacobian[m]))
                 for i in range(wp.static(slots_count)):
                     u = spread(jacobian[m] * (root[m] * weight), i)
-                    factor_out[wp.static(m * slots_count) + i, tid] = F(linear(u[0]), linear(u[1]), linear(u[2]))
+                    factor_out[m * wp.static(slots_count) + i, tid] = F(linear(u[0]), linear(u[1]), linear(u[2]))
         stiffness_out[tid] = linear(stiffest)
 
     return evaluate

@@ -41,7 +41,7 @@ def largest_error(found: dict, reference: dict) -> float:
 LOOKS = {50: 0.1, 100: 0.3}  # m
 
 
-@pytest.mark.parametrize("precision", ["float64", "mixed", "float32"])
+@pytest.mark.parametrize("precision", ["float64", "mixed", pytest.param("float32", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("n", sorted(cantilever.TIP))
 def test_cantilever_by_implicit_euler(n, precision, device):
     found = tips(cantilever.build(n), device, precision, cantilever.TIP[n])
@@ -50,7 +50,10 @@ def test_cantilever_by_implicit_euler(n, precision, device):
     assert error <= (LOOKS[n] if precision == "float32" else DIGITS)
 
 
-@pytest.mark.parametrize(("precision", "tolerance"), [("float64", DIGITS), ("mixed", DIGITS), ("float32", 1.0e-3)])
+@pytest.mark.parametrize(
+    ("precision", "tolerance"),
+    [("float64", DIGITS), ("mixed", DIGITS), pytest.param("float32", 1.0e-3, marks=pytest.mark.slow)],
+)
 def test_cantilever_by_implicit_midpoint(precision, tolerance, device):
     found = tips(cantilever.build(50), device, precision, MIDPOINT, "implicit_midpoint")
     error = largest_error(found, MIDPOINT)

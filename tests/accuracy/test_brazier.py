@@ -145,7 +145,10 @@ def test_collapse(device):
     assert np.log2((moments[1] - moments[0]) / (moments[2] - moments[1])) > 2.0
 
 
-@pytest.mark.parametrize(("thickness", "cells"), [(0.02, 64), (0.01, 96), (0.005, 128)])
+@pytest.mark.parametrize(
+    ("thickness", "cells"),
+    [(0.02, 64), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((0.01, 96), (0.005, 128)))],
+)
 def test_thin_tubes_collapse_like_the_ring(device, thickness, cells):
     """R / h = 50, 100, 200: the moment in units of E R h^2 does not depend on the thickness, nor do facets lock."""
     exact, flattening = collapse(ring)

@@ -53,6 +53,7 @@ def energies(device, thickness: float) -> tuple[float, float, float, float]:
     return *(sum(model.energies(s).values()) for s in (state, leaf.flat_state(model))), *leaf.strains(state)
 
 
+@pytest.mark.slow
 def test_leaf_ripples_and_follows_its_metric(device):
     """Flat, the energy is that of stretching, in proportion to h; rippled, it is far below and falls faster."""
     (thick, flat, *_), (thin, flat_thin, strain, rest) = energies(device, 0.01), energies(device, 0.005)

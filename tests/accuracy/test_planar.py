@@ -17,7 +17,7 @@ from ddg_warp.scenes import post_buckling, roll_up, tip_load
         (0.25, (40, 80, 160), 0.6366197724, 0.6366197724),
         (0.5, (60, 120, 240), 0.0, 0.6366197724),
         (1.0, (100, 200, 400), 0.0, 0.0),
-        (2.0, (200, 400, 800), 0.0, 0.0),
+        pytest.param(2.0, (200, 400, 800), 0.0, 0.0, marks=pytest.mark.slow),
     ],
 )
 def test_roll_up(device, turns, edges, x, z):

@@ -23,7 +23,7 @@ def path(module, device, steps, **parameters):
     return values, solver
 
 
-@pytest.mark.parametrize("membrane", ["flat", "curved"])
+@pytest.mark.parametrize("membrane", ["flat", pytest.param("curved", marks=pytest.mark.slow)])
 def test_cantilever_plate_shear(device, membrane):
     """Elastica of P L^2 / EI = 4: order 2 in the length of the cells, and 0.02 % of the length at 64."""
     cells, errors = (16, 32, 64), []
@@ -96,7 +96,7 @@ def test_pinched_cylinder_folds(device):
 @pytest.mark.parametrize(
     ("thickness", "cells", "tolerance"),
     [
-        (12.7, (3, 6, 12), 0.006),
+        pytest.param(12.7, (3, 6, 12), 0.006, marks=pytest.mark.slow),
         pytest.param(12.7, (4, 8, 16), 0.003, marks=pytest.mark.slow),
         pytest.param(6.35, (4, 8, 16), 0.005, marks=pytest.mark.slow),
     ],

@@ -12,13 +12,13 @@ from ddg_warp.scenes import bend_45, helical_spring
 @pytest.mark.parametrize(
     ("torsion", "extensible", "load", "tip"),
     [
-        ("polar", False, 300.0, (22.24503474, 58.77968539, 40.18828384)),
-        ("polar", False, 450.0, (18.50846405, 52.23929842, 48.49798262)),
+        pytest.param("polar", False, 300.0, (22.24503474, 58.77968539, 40.18828384), marks=pytest.mark.slow),
+        pytest.param("polar", False, 450.0, (18.50846405, 52.23929842, 48.49798262), marks=pytest.mark.slow),
         ("polar", False, 600.0, (15.68507816, 47.1512944, 53.46859844)),
         ("st_venant", False, 300.0, (22.11286663, 58.53649165, 40.47666523)),
-        ("st_venant", False, 450.0, (18.36955748, 51.97044992, 48.69985312)),
-        ("st_venant", False, 600.0, (15.55806009, 46.89277135, 53.60111399)),
-        ("polar", True, 300.0, (22.24528854, 58.7802483, 40.18938842)),
+        pytest.param("st_venant", False, 450.0, (18.36955748, 51.97044992, 48.69985312), marks=pytest.mark.slow),
+        pytest.param("st_venant", False, 600.0, (15.55806009, 46.89277135, 53.60111399), marks=pytest.mark.slow),
+        pytest.param("polar", True, 300.0, (22.24528854, 58.7802483, 40.18938842), marks=pytest.mark.slow),
         ("polar", True, 600.0, (15.68535578, 47.15215022, 53.47176295)),
     ],
 )
@@ -62,10 +62,10 @@ def test_helical_spring_at_rest_is_free(device):
     ("stretch", "force", "turns"),
     [
         (0.9, -0.0116067984, 9.989317053),
-        (1.1, 0.01178717583, 10.00961374),
+        pytest.param(1.1, 0.01178717583, 10.00961374, marks=pytest.mark.slow),
         (1.5, 0.06110862628, 10.03665349),
-        (2.0, 0.1292421346, 10.04082803),
-        (3.0, 0.3009346629, 9.90534787),
+        pytest.param(2.0, 0.1292421346, 10.04082803, marks=pytest.mark.slow),
+        pytest.param(3.0, 0.3009346629, 9.90534787, marks=pytest.mark.slow),
     ],
 )
 def test_helical_spring_with_rotation(device, stretch, force, turns):

@@ -14,7 +14,7 @@ from ddg_warp.scenes import bend_twist, greenhill, localized_helix, michell_ring
     [
         (-20.0, (40, 80, 160), 5.771135703),
         (0.0, (40, 80, 160), 8.986818916),
-        (10.0, (60, 120, 240), 10.42885644),
+        pytest.param(10.0, (60, 120, 240), 10.42885644, marks=pytest.mark.slow),
         pytest.param(50.0, (80, 160, 320), 15.58932393, marks=pytest.mark.slow),
         pytest.param(100.0, (120, 240, 480), 20.98350083, marks=pytest.mark.slow),
         pytest.param(400.0, (200, 400, 800), 40.49623334, marks=pytest.mark.slow),
@@ -33,7 +33,7 @@ def test_greenhill(device, tension, edges, moment):
     ("ratio", "twist"),
     [
         (1.0, 10.88279619),
-        (2.0 / 3.0, 16.32419428),
+        pytest.param(2.0 / 3.0, 16.32419428, marks=pytest.mark.slow),
         pytest.param(10.0 / 13.0, 14.14763505, marks=pytest.mark.slow),
     ],
 )
@@ -49,8 +49,8 @@ def test_michell_ring(device, ratio, twist):
 @pytest.mark.parametrize(
     ("curvature", "weight", "loses"),
     [
-        (6.0, 11.86875074, True),
-        (6.0, 37.76390898, False),
+        pytest.param(6.0, 11.86875074, True, marks=pytest.mark.slow),
+        pytest.param(6.0, 37.76390898, False, marks=pytest.mark.slow),
         (7.0, 14.53972482, True),
         pytest.param(8.0, 19.24842318, True, marks=pytest.mark.slow),
         pytest.param(10.0, 28.7697064, True, marks=pytest.mark.slow),

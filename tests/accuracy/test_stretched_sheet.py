@@ -64,6 +64,7 @@ def measured(device, thickness: float, along: int, across: int) -> tuple[float, 
     return float(np.exp(least)), float(curve(least))
 
 
+@pytest.mark.slow
 def test_wavelength_and_exponent(device):
     """15 % in the wavelength and 0.02 in the exponent of (D / T)^(1/4) for a thickness that falls to a quarter, 12 cells a wave."""
     thickness = np.array([4e-4, 2e-4, 1e-4])

@@ -117,7 +117,9 @@ def test_edge_couples_are_the_same_on_the_device(device):
         np.testing.assert_allclose(found, one, atol=1e-7)
 
 
-@PRECISIONS
+@pytest.mark.parametrize(
+    "precision", ["float64", *(pytest.param(precision, marks=pytest.mark.slow) for precision in ("mixed", "float32"))]
+)
 def test_edge_couples_move_what_they_act_on(device, precision):
     """A free square, h rho a^2 = 10 kg: a couple about one side gives it M = I w' about its middle and no momentum."""
     scene = sheet((2, 2))
@@ -399,7 +401,7 @@ def quarter(turn: float = 0.0, bending: str = "midedge_dof", axes: bool = False,
 TURN = np.pi / 6.0
 
 
-@pytest.mark.parametrize("bending", ["midedge_dof", "hinge"])
+@pytest.mark.parametrize("bending", ["midedge_dof", pytest.param("hinge", marks=pytest.mark.slow)])
 def test_oblique_symmetry_is_axis_aligned_symmetry_turned(device, bending):
     """Statics by factors and by conjugate gradients, and steps of both schemes: turned by 30 degrees, all is turned, nothing else."""
     found = []
@@ -418,6 +420,7 @@ def test_oblique_symmetry_is_axis_aligned_symmetry_turned(device, bending):
     assert found[0][0][0, 2] < -1e-3  # the middle sags
 
 
+@pytest.mark.slow
 def test_oblique_symmetry_in_worlds_precisions_and_paths(device):
     """Three worlds are alike; mixed and float32 agree within their rounding; frequencies and the end of a path are as aligned."""
     from ddg_warp.integrate.continuation import Continuation

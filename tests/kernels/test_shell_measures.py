@@ -2,12 +2,26 @@
 
 import numpy as np
 import pytest
+from first_terms import first_of_their_kind
 from shell_cases import Elements, differences, error
 
 from ddg_warp.kernels.terms import SHELLS
 
 PRECISIONS = {"float64": 1e-13, "float32": 2e-5}
 COUNT = 8
+FIRST = first_of_their_kind(SHELLS)
+# Each has kernels of its own in each precision: every day those of every measure and density, and one of them in float32.
+EVERY_TERM = pytest.mark.parametrize(
+    ("name", "precision"),
+    [
+        pytest.param(name, precision, marks=() if name in daily else pytest.mark.slow)
+        for precision, daily in (("float64", FIRST), ("float32", ("shell_stretch", "shell_hinge")))
+        for name in SHELLS
+    ],
+)
+EVERY_TERM_IN_FLOAT64 = pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in FIRST else pytest.mark.slow) for name in SHELLS]
+)
 FLAP = np.array(
     [[0.0, 0.0, 0.0], [1.0, 0.1, 0.2], [0.3, 0.9, -0.1], [1.2, 1.1, 0.4], [-0.7, 0.6, 0.3], [0.5, -0.8, 0.2]]
 )
@@ -79,8 +93,7 @@ def vectors_of(name, s):
     return [] if start is None else [slice(i, i + 3) for i in range(start, start + (9 if start == 3 else 3), 3)]
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("name", SHELLS)
+@EVERY_TERM
 def test_gradient(device, name, precision):
     """w J^T psi' = reverse mode of the energy = central differences, and the energy is the same in both precisions."""
     elements = sample(name)
@@ -92,7 +105,7 @@ def test_gradient(device, name, precision):
     assert error(exact["gradient"], differences(elements, "energy", device)[:, 0]) < 1e-9
 
 
-@pytest.mark.parametrize("name", SHELLS)
+@EVERY_TERM_IN_FLOAT64
 def test_jacobian(device, name):
     """Rows of J = central differences of the strains, strain by strain; no derivative is zero that should not be."""
     elements = sample(name)
@@ -109,8 +122,7 @@ def test_jacobian(device, name):
     assert np.array_equal(size > 1e-6 * size.max(), felt)
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("name", SHELLS)
+@EVERY_TERM
 def test_hessian(device, name, precision):
     """Reverse mode of the gradient = central differences of it, and symmetric."""
     elements = sample(name)
@@ -120,7 +132,10 @@ def test_hessian(device, name, precision):
     assert error(hessian, hessian.swapaxes(1, 2)) < 10.0 * PRECISIONS[precision]
 
 
-@pytest.mark.parametrize("name", [name for name in SHELLS if name not in FLAT])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=() if n in FIRST else pytest.mark.slow) for n in SHELLS if n not in FLAT],
+)
 def test_derivatives_of_folds(device, name):
     """At 90 to 170 degrees: reverse mode, differences and the hand-derived Jacobian agree as at small angles."""
     elements = folded(name)
@@ -156,8 +171,7 @@ def test_curvature_grows_with_the_fold(device, kind):
     np.testing.assert_allclose(strain, np.outer(expected, [0.0, 0.0, 1.0]), atol=1e-14)
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("name", SHELLS)
+@EVERY_TERM
 def test_root(device, name, precision):
     """R^T R = psi'': with J of full row rank, d(slope)/dq = R^T R J."""
     elements = sample(name)
@@ -180,8 +194,15 @@ def test_tension_completes_the_hessian(device, name):
     assert error(whole, elements.hessian(device=device)) < 1e-13
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("name", [name for name in SHELLS if "damped" not in name])
+@pytest.mark.parametrize(
+    ("name", "precision"),
+    [
+        pytest.param(name, precision, marks=() if precision == "float64" or name == "shell_hinge" else pytest.mark.slow)
+        for precision in PRECISIONS
+        for name in SHELLS
+        if "damped" not in name
+    ],
+)
 def test_rigid_motion(device, name, precision):
     """A rotation of the element, its supports with it, keeps the energy and turns the forces."""
     elements = sample(name)
@@ -204,8 +225,7 @@ def test_rigid_motion(device, name, precision):
     assert error(after["gradient"], moved(before["gradient"])) < 2.0 * PRECISIONS[precision]
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("name", SHELLS)
+@EVERY_TERM
 def test_degenerate(device, name, precision):
     """Triangles without area, folded onto each other or inverted give finite values; edges keep their length."""
     elements = sample(name)

@@ -77,8 +77,19 @@ def dense(newton, column: int) -> tuple[np.ndarray, np.ndarray]:
     return H.reshape(n * nb, n * nb), arrays.download(newton.right)[:, :n, column].T.ravel()
 
 
-@EVERY_KIND
-@pytest.mark.parametrize(("precision", "tolerance"), [("float64", 1e-11), ("mixed", 1e-3)])
+@pytest.mark.parametrize(
+    ("precision", "tolerance", "name"),
+    [
+        ("float64", 1e-11, "twist"),
+        ("float64", 1e-11, "stretch"),
+        pytest.param("mixed", 1e-3, "stretch", marks=pytest.mark.slow),
+        pytest.param("float64", 1e-11, "untwisted", marks=pytest.mark.slow),
+        pytest.param("float64", 1e-11, "planar", marks=pytest.mark.slow),
+        ("mixed", 1e-3, "twist"),
+        pytest.param("mixed", 1e-3, "untwisted", marks=pytest.mark.slow),
+        pytest.param("mixed", 1e-3, "planar", marks=pytest.mark.slow),
+    ],
+)
 def test_direction_is_a_dense_solve(device, name, precision, tolerance):
     """And the decrement is r . d, and a rod that wants nothing is left alone."""
     found = 0

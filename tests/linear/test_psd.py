@@ -139,7 +139,7 @@ def run(scene, device, steps, dt, precision="float64", start=None, **options):
     return state.points(), integrator.statistics()
 
 
-@pytest.mark.parametrize("precision", ["float64", "mixed"])
+@pytest.mark.parametrize("precision", ["float64", pytest.param("mixed", marks=pytest.mark.slow)])
 def test_fewer_iterations_on_a_curl(device, precision):
     """A tenth, where Gauss-Newton runs into its limit of 100 and needs shorter steps."""
     _, plain = run(helix(64, 10), device, 60, 1.0 / 120.0, precision, psd="gauss_newton")
