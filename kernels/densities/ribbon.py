@@ -21,8 +21,8 @@ where D e'''' / k^2 + E h e = 0 with e'' = q and e''' = 0 at both edges, a beam 
                       twisted ribbon, E h W^5 t^4 / 1440 (Green, Proc. R. Soc. A 154, 1936).
     sadowsky          N = q^2 + nu e^2 (nu (k - k0)^2 + 2 (t - t0)^2) ,  g = 1 / (k^2 + e^2) , which for k0 = t0 = 0, EI_2 and GJ of a
                       plate is the energy of Sadowsky (1930) with a regularised fraction, B/2 (k^2 + 2 t^2 + t^4 / (k^2 + e^2)):
-                      inextensible. The cutoff e keeps it finite where the ribbon twists without bending; 1 / zeta is the
-                      curvature below which it would stretch instead.
+                      inextensible. The cutoff e, which is its parameter `crossover`, keeps it finite where the ribbon twists
+                      without bending; a `Ribbon` takes 1 / zeta, the curvature below which it would stretch instead.
 
 Where W is small the first two are Kirchhoff's rod; where k >> 1 / zeta the first and third are B/2 (k^2 + t^2)^2 / k^2, and the second
 is that for nu = 0. The third is not convex in (k, t) where |t| > |k|, so that a ribbon that twists more than it bends may wrinkle at
