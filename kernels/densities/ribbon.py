@@ -26,8 +26,8 @@ where D e'''' / k^2 + E h e = 0 with e'' = q and e''' = 0 at both edges, a beam 
 
 Where W is small the first two are Kirchhoff's rod; where k >> 1 / zeta the first and third are B/2 (k^2 + t^2)^2 / k^2, and the second
 is that for nu = 0. The third is not convex in (k, t) where |t| > |k|, so that a ribbon that twists more than it bends may wrinkle at
-the scale of its edges. The first is exact for uniform strains of thin sections; the authors cited give no natural strains but for
-k0 (Dias and Audoly, J. Elasticity 119, 2015, inextensible), which the derivation above agrees with.
+the scale of its edges. The first is exact for uniform strains of thin sections. Natural strains enter all three as in this
+derivation: a strip naturally curved along its length is developable however it is bent back.
 """
 
 from functools import cache
