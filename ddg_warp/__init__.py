@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # what editors and type checkers read; at run time see `_HOME
     from ddg_warp.integrate import continuation, statics
     from ddg_warp.integrate.dynamics import Integrator
     from ddg_warp.integrate.path import Displacement, Stop
-    from ddg_warp.material import Circle, Ellipse, Material, Rectangle, Stiffness
+    from ddg_warp.material import Circle, Ellipse, Material, Rectangle, Ribbon, Stiffness
     from ddg_warp.model import Model
     from ddg_warp.motion import Motion
     from ddg_warp.record import Recorder
@@ -40,6 +40,7 @@ __all__ = [
     "Motion",
     "Recorder",
     "Rectangle",
+    "Ribbon",
     "Scene",
     "SceneError",
     "SceneWarning",
@@ -71,6 +72,7 @@ _HOME = {
     "Motion": "motion",
     "Recorder": "record",
     "Rectangle": "material",
+    "Ribbon": "material",
     "Scene": "scene",
     "SceneError": "errors",
     "SceneWarning": "errors",

@@ -5,6 +5,7 @@ from math import pi
 
 import numpy as np
 
+from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 
 
@@ -74,8 +75,9 @@ def _require(what: str, value, rule: str, holds) -> None:
         raise SceneError(f"{what} = {value!r}; {rule}")
 
 
-def _require_sizes(section) -> None:
-    for what, value in section.__dict__.items():
+def _require_sizes(section, *names: str) -> None:
+    for what in names or section.__dict__:
+        value = section.__dict__[what]
         _require(f"{type(section).__name__}: {what}", value, "it is positive [m]", lambda v: v > 0.0)
 
 
@@ -142,3 +144,40 @@ class Rectangle:
         series = (np.tanh(odd * pi * (long / short)[..., None] / 2.0) / odd**5).sum(-1)
         torsion = long * short**3 / 3.0 * (1.0 - 192.0 / pi**5 * short / long * series)
         return _elastic(material, w * h, h * w**3 / 12.0, w * h**3 / 12.0, torsion)
+
+
+@dataclass(frozen=True)
+class Ribbon:
+    """Thin flat section whose cross-section bends along with bending and twist, as that of a strip of plate does.
+
+    Between a rod (narrow) and an inextensible strip (wide), which bend softly by curvature 2. See `kernels.densities.ribbon`.
+
+    Attributes:
+        width: W along the first director [m]; a number, or an array that broadcasts to (rods, edges).
+        thickness: h along the second director [m], less than the width.
+        law: "audoly_neukirch" (exact in uniform bending and twist), "sano_wada" (a simpler form of it), or "sadowsky"
+            (inextensible).
+    """
+
+    width: float
+    thickness: float
+    law: str = "audoly_neukirch"
+
+    def __post_init__(self):
+        _require_sizes(self, "width", "thickness")
+        if not np.all(np.asarray(self.thickness) < self.width):
+            raise SceneError(f"Ribbon: thickness = {self.thickness!r}; it is less than the width, {self.width!r}")
+        arguments.choice("Ribbon: law", self.law, ("audoly_neukirch", "sano_wada", "sadowsky"))
+
+    def stiffness(self, material: Material) -> Stiffness:
+        """I1 = h W^3 / 12, I2 = W h^3 / 12 and J = W h^3 / 3, that of a strip of plate."""
+        w, h = np.asarray(self.width, float), np.asarray(self.thickness, float)
+        return _elastic(material, w * h, h * w**3 / 12.0, w * h**3 / 12.0, w * h**3 / 3.0)
+
+    def laws(self, material: Material) -> dict:
+        """The law of bending and twist, with the curvature sqrt(60 / (1 - nu^2)) h / W^2 at which its regime changes."""
+        from ddg_warp.descriptions import Law
+        from ddg_warp.kernels.densities.ribbon import LAWS
+
+        crossover = np.sqrt(60.0 / (1.0 - material.poisson**2)) * np.asarray(self.thickness) / np.square(self.width)
+        return {"rod_bend_twist": Law(LAWS[self.law], poisson=material.poisson, crossover=crossover)}

@@ -121,13 +121,13 @@ class Sample:
         return out
 
     def difference(self, function, name: str, where) -> np.ndarray:
-        """Central difference of function(**data) along data[name][where]."""
-        ends = []
-        for h in (1e-5, -1e-5):
+        """Central difference of fourth order of function(**data) along data[name][where]."""
+        h, ends = 1e-4, []
+        for step in (h, -h, 2.0 * h, -2.0 * h):
             values = self.data[name].copy()
-            values[where] += h
+            values[where] += step
             ends.append(function(**{name: values}))
-        return (ends[0] - ends[1]) / 2e-5
+        return (8.0 * (ends[0] - ends[1]) - (ends[2] - ends[3])) / (12.0 * h)
 
     def window_derivative(self, function) -> np.ndarray:
         """Derivative of what function(**data) gives per element (m, n, R), on its window (m, window, n, R).
@@ -250,6 +250,10 @@ def _random_state(sample: Sample) -> dict[str, np.ndarray]:
         about = 1.0 if term.measure.span == 1 else 0.0  # a stretch is 1 at rest
         for parameter in term.parameters:
             value = random.uniform(0.6, 1.4, size=(n, rods))
+            if not parameter.valid[1](value).all():
+                value = 0.5 * value  # a Poisson's ratio
+            if parameter.unit == "1/m":
+                value = 8.0 * value  # strains that mean something to a law are as large as those of the sample
             rows.append(about + 0.4 * random.normal(size=(n, rods)) if parameter.family == "rest" else value)
         last += [about + 0.4 * random.normal(size=(n, rods)) for _ in term.measure.strains]
     return {

@@ -108,7 +108,7 @@ class Scene(Structures):
 
         Args:
             points: nodes at rest (R, n, 3) [m]; their distances are the rest lengths.
-            section: `Circle`, `Ellipse`, `Rectangle` (with a material) or `Stiffness`.
+            section: `Circle`, `Ellipse`, `Rectangle`, `Ribbon` (with a material) or `Stiffness`.
             material: `Material`; not needed with `Stiffness`.
             closed: whether the last node is joined to the first.
             natural: "shape" takes curvature and twist at rest from the points and directors; "straight" sets both to zero; or
@@ -144,7 +144,9 @@ class Scene(Structures):
         closed, twist, bend = (arguments.flag(f"rods '{name}': {what}", value) for what, value in flags.items())
         stiffness = getattr(section, "stiffness", None)
         if stiffness is None:
-            raise SceneError(f"rods '{name}': section {section!r} is none; use Circle, Ellipse, Rectangle or Stiffness")
+            raise SceneError(
+                f"rods '{name}': section {section!r} is none; use Circle, Ellipse, Rectangle, Ribbon or Stiffness"
+            )
         if not isinstance(material, Material) and not isinstance(section, Stiffness):
             raise SceneError(f"rods '{name}': a {type(section).__name__} needs a material; give material=Material(...)")
         planar = self.dimension == 2

@@ -31,6 +31,8 @@ SMALL = {
     "plate_square": {"cells": 16},
     "post_buckling": {"n": 50},
     "pullout_cylinder": {"n": 12},
+    "ribbon_bistable": {"n": 40},
+    "ribbon_helix": {"n": 50},
     "right_angle_frame": {},
     "roll_up": {"n": 100},
     "slit_annulus": {},

@@ -128,6 +128,9 @@ each("materials", "viscosity", [-1.0, NAN], lambda v: ddg.Material(1.0, 0.3, 1.0
 each("sections", "circle's radius", [-0.1, 0.0, NAN, [0.1, 0.0], "thin", None], ddg.Circle, "Circle", "radius", "positive")
 each("sections", "b", [0.0, -1.0, INF], lambda v: ddg.Ellipse(0.1, v), "Ellipse", "b =", "positive")
 each("sections", "width", [0.0, -1.0, NAN], lambda v: ddg.Rectangle(v, 1.0), "Rectangle", "width", "positive")
+each("sections", "thickness", [0.0, NAN, "thin"], lambda v: ddg.Ribbon(1.0, v), "Ribbon", "thickness", "positive")
+each("sections", "thick ribbon", [1.0, 2.0], lambda v: ddg.Ribbon(1.0, v), "Ribbon", "less than the width")
+each("sections", "law", ["kirchhoff", None], lambda v: ddg.Ribbon(1.0, 0.1, v), "Ribbon: law", "sadowsky")
 
 # --- supports of rods. Rod 0 has 7 nodes, rod 1 has 5 ---
 M = ddg.Motion

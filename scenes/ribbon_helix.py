@@ -1,0 +1,121 @@
+"""Ribbon helix: a straight strip wound on a cylinder, which bends like its plane does.
+
+A strip of paper wound at the angle a to the hoops of a cylinder of radius R has the curvature k = cos^2 a / R and the twist
+t = sin a cos a / R. It is a piece of a plane rolled up with the curvature 1 / R, whatever the angle: 2 E / D W L = 1 / R^2, which is
+Sadowsky's energy (k^2 + t^2)^2 / k^2 (Sadowsky 1930). A rod of the same section takes bending and twist one by one and has but 0.58
+of it at 45 degrees and nu = 0.3. The ends are held as on the cylinder; the helix between them is an equilibrium of every law, as its
+strains are uniform and what holds a helix is a force and a moment along its axis.
+"""
+
+import numpy as np
+
+import ddg_warp as ddg
+
+RADIUS = 0.1  # m
+LENGTH = 0.5  # m
+THICKNESS = 1e-4  # m
+YOUNG = 3.0e9  # Pa
+POISSON = 0.3
+SOURCE = "strip of a plane rolled up (Sadowsky 1930)"
+LAWS = ("sadowsky", "audoly_neukirch", "sano_wada", "kirchhoff")
+
+
+def build(angle: float = 45.0, law: str = "sadowsky", width: float = 0.1, n: int = 100) -> ddg.Scene:
+    """The strip around z, drawn on the cylinder and let go between its ends.
+
+    Args:
+        angle: of the strip to the hoops [degrees]
+        law: sadowsky, audoly_neukirch, sano_wada, or kirchhoff: a rod with the strip's section
+        width: of the strip [m]
+        n: edges of the strip
+    """
+    if law not in LAWS:
+        raise ValueError(f"law = {law!r}: one of {', '.join(LAWS)}")
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), analysis=ddg.Statics(load_steps=1))
+    a = np.radians(angle)
+    along = np.linspace(0.0, LENGTH, n + 1)
+    section = ddg.Ribbon(width, THICKNESS, law if law != "kirchhoff" else LAWS[0])
+    material = ddg.Material(YOUNG, POISSON)
+    strip = scene.add_rod(
+        on_cylinder(along, a),
+        section=section.stiffness(material) if law == "kirchhoff" else section,
+        material=material,
+        natural="straight",
+        director=across(0.5 * (along[1:] + along[:-1]), a),
+        name="strip",
+    )
+    scene.clamp(strip, edges=[0, -1])
+    return scene
+
+
+def on_cylinder(along: np.ndarray, a: float) -> np.ndarray:
+    """Points (., 3) [m] of the center line at arc lengths (.,) on the cylinder, at the angle a to its hoops."""
+    turn = along * np.cos(a) / RADIUS
+    return np.stack([RADIUS * np.cos(turn), RADIUS * np.sin(turn), along * np.sin(a)], axis=1)
+
+
+def across(along: np.ndarray, a: float) -> np.ndarray:
+    """Directions (., 3) across the strip, in the cylinder."""
+    turn = along * np.cos(a) / RADIUS
+    return np.stack([np.sin(a) * np.sin(turn), -np.sin(a) * np.cos(turn), np.full_like(turn, np.cos(a))], axis=1)
+
+
+def strains(angle: float) -> tuple[float, float]:
+    """Curvature and twist [1/m] at an angle [degrees]."""
+    a = np.radians(angle)
+    return np.cos(a) ** 2 / RADIUS, np.sin(a) * np.cos(a) / RADIUS
+
+
+def exact(angle: float, law: str, width: float) -> float:
+    """2 E R^2 / D W L of uniform strains: a rod's and, but for a rod, what keeps the section from bending alone."""
+    k, t = strains(angle)
+    rod = (1.0 - POISSON**2) * k**2 + 2.0 * (1.0 - POISSON) * t**2
+    x = (3.0 * (1.0 - POISSON**2)) ** 0.25 * width * np.sqrt(k / THICKNESS)
+    crossover = np.sqrt(60.0 / (1.0 - POISSON**2)) * THICKNESS / width**2
+    kept = {
+        "kirchhoff": 0.0,
+        "sadowsky": (POISSON * k**2 + t**2) ** 2 / k**2,
+        "audoly_neukirch": (POISSON * k**2 + t**2) ** 2
+        / k**2
+        * (1.0 - 2.0 / x * (np.cosh(x) - np.cos(x)) / (np.sinh(x) + np.sin(x))),
+        "sano_wada": t**4 / (k**2 + crossover**2),
+    }
+    return (rod + kept[law]) * RADIUS**2
+
+
+def normalised_energy(model, state) -> float:
+    """2 E R^2 / D W L, of the length that the bending energy of the clamped strip covers: all but half of its end edges."""
+    points = model.scene.batches[0].points[0]
+    length = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    covered = length.sum() - 0.5 * (length[0] + length[-1])
+    stiffness = model.scene.batches[0].section.EI2 / (1.0 - POISSON**2)  # D W
+    return float(2.0 * model.energies(state)["rod_bend_twist"] * RADIUS**2 / (stiffness * covered))
+
+
+def check(result) -> list[ddg.Check]:
+    """Energy against that of the helix, and how far the strip has left the cylinder."""
+    scene, points = result.model.scene, result.state.points()
+    batch = scene.batches[0]
+    law = batch.laws["rod_bend_twist"].density.name if batch.laws else "kirchhoff"
+    width = np.sqrt(12.0 * batch.section.EI1 / batch.section.EA)
+    drawn = batch.points[0]
+    rise = drawn[-1, 2] - drawn[0, 2]
+    angle = np.degrees(np.arcsin(rise / LENGTH))
+    away = np.abs(np.hypot(points[:, 0], points[:, 1]) / RADIUS - 1.0).max()
+    n = len(points) - 1
+    return [
+        ddg.Check(
+            "2 E R^2 / D W L",
+            normalised_energy(result.model, result.state),
+            exact(angle, law, width),
+            min(ddg.Check.COARSEST, 5e-4 + 20.0 / n**2),
+            SOURCE,
+            relative=True,
+        ),
+        ddg.Check("distance from the cylinder [R]", away, 0.0, min(ddg.Check.COARSEST, 10.0 / n**2), SOURCE),
+    ]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The energy over the nodes of the strip."""
+    return ddg.bench.Study({"n": (25, 50, 100, 200)}, "2 E R^2")
