@@ -109,6 +109,7 @@ def test_a_joined_rod_keeps_its_law(device):
     np.testing.assert_allclose(joined[:13], alone, atol=1e-8)
 
 
+@pytest.mark.slow  # the README's command is one of every day
 @pytest.mark.parametrize("damped", [False, True])
 def test_derivatives_of_a_law_of_ones_own(device, damped):
     term = replace(REGISTRY["rod_bend_twist"], density=saturating).damped(damped)
@@ -116,6 +117,7 @@ def test_derivatives_of_a_law_of_ones_own(device, damped):
         assert row["passed"], row
 
 
+@pytest.mark.slow
 def test_the_command_line_checks_a_law_in_a_file(device, capsys):
     assert main(["check", f"{FILE}:saturating", "--device", device]) == 0
     assert "rod_bend_twist" in capsys.readouterr().out

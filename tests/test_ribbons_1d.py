@@ -54,6 +54,7 @@ def energy(name: str, k, t, device, width: float = WIDTH, natural=(0.0, 0.0, 0.0
     return evaluate(name, strains, parameters(width, natural), device)[0].reshape(k.shape)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damped", [False, True])
 @pytest.mark.parametrize("name", NAMES)
 def test_derivatives(device, name, damped):
@@ -246,6 +247,7 @@ def test_a_hinged_ribbon_keeps_its_law(device):
         moved(True, rigid=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ["audoly_neukirch", "sano_wada"])
 def test_the_wider_a_ribbon_the_sooner_its_arch_leans_over(device, law):
     """As that of a plate does, to a few per cent at three widths; Kirchhoff's rod is 6 % late at the largest."""

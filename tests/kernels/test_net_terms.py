@@ -56,6 +56,7 @@ def test_every_listed_term_has_a_table():
     assert {name for name in ALL if name.startswith("axisymmetric")} <= TERMS.keys()
 
 
+@pytest.mark.slow
 def test_table_has_chains_and_nets(device):
     """The same columns for both, so that one table shows them."""
     chain, net = (derivatives.table(name, "float64", device) for name in ("planar_stretch", "shell_tilt"))
