@@ -321,6 +321,7 @@ def test_snapshots_go_on_bit_by_bit(device, scheme):
         np.testing.assert_array_equal(values, other.snapshot()[name], err_msg=name)
 
 
+@pytest.mark.slow
 def test_mixed_agrees_with_float64(device):
     scene, *_ = stiffened(4)
     paths = [steps(scene.build(device, precision), 10, 0.02)[0].points() for precision in ("float64", "mixed")]

@@ -144,7 +144,7 @@ def test_twist_is_exact_on_every_mesh(device, mesh):
         pytest.param("crossed", "midedge", 0.0, marks=pytest.mark.slow),
         # an error of first order in h from the free edges
         pytest.param("right", "midedge", -0.10, marks=pytest.mark.slow),
-        ("jittered", "midedge", -0.39),
+        pytest.param("jittered", "midedge", -0.39, marks=pytest.mark.slow),
     ],
 )
 def test_models_without_poissons_ratio_or_turning_normals_are_no_plates(device, mesh, bending, error):
