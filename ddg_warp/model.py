@@ -224,15 +224,22 @@ class Model:
         set_rest(self, shell, points=points, metric=metric, curvature=curvature, angle=angle)
 
     def parameters(self) -> dict[str, np.ndarray]:
-        """Parameters of all terms by name, `group/term/parameter`, broadcastable to (node, column of the group)."""
+        """Parameters of all terms by name, `group/term/parameter`, broadcastable to (node, column of the group).
+
+        Of the net, `net/term/parameter`, where sets of one term with other laws are numbered from the second on, `net/term 1/...`.
+        """
         result = {}
         for i, group in enumerate(self.groups):
             for name, values in group.parameters.values.items():
                 result[f"{i}/{name.replace('.', '/')}"] = values
             result |= {f"{i}/mass": group.host.mass, f"{i}/rotary_inertia": group.host.rotary}
+        laws: dict[str, list] = {}
         for part in self.net.sets if self.net is not None else ():
-            for name, values in part.parameters.values.items():
-                result[f"net/{part.term.name}/{name}"] = values
+            laws.setdefault(part.term.name, []).append(part)
+        for term, parts in laws.items():
+            for number, part in enumerate(parts):  # rods with laws of their own have sets of their own
+                place = f"net/{term}" + (f" {number}" if number else "")
+                result |= {f"{place}/{name}": values for name, values in part.parameters.values.items()}
         return result
 
     def state(self, points=None, velocities=None, spins=None) -> State:

@@ -50,12 +50,9 @@ def _attached(scene, rods: dict[int, NetRod]) -> dict[tuple[int, int], np.ndarra
 
 def _shared_edges(rod: NetRod, shell: NetShell, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Edges of a rod, without ghosts, that are edges of a mesh, and these."""
-    surface = shell.surface
-    first, second = vertices[: len(rod.edges)], np.roll(vertices, -1)[: len(rod.edges)]
-    keys = surface.edges @ [len(surface.points), 1]
-    wanted = np.minimum(first, second) * len(surface.points) + np.maximum(first, second)
-    found = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    edges = np.flatnonzero((first >= 0) & (second >= 0) & (keys[found] == wanted))
+    count = len(rod.edges)
+    found = shell.surface.find_edges(vertices[:count], np.roll(vertices, -1)[:count])
+    edges = np.flatnonzero(found >= 0)
     return edges, found[edges]
 
 
@@ -87,9 +84,8 @@ def _elements(net: Net, rod: NetRod, edges, shell: NetShell, mesh_edges, bending
 
 def _bending(shell: NetShell, mesh_edges, heights) -> np.ndarray:
     """D / h of the triangles beside mesh edges, added up [N]."""
-    plate, sides = shell.plate, shell.surface.edge_triangles[mesh_edges].T
-    rigidity = plate.young * plate.thickness**3 / (12.0 * (1.0 - plate.poisson**2))
-    return np.where(sides < 0, 0.0, rigidity[sides] / heights).sum(0)
+    sides = shell.surface.edge_triangles[mesh_edges].T
+    return np.where(sides < 0, 0.0, shell.plate.bending_stiffness[sides] / heights).sum(0)
 
 
 def follow(net, state, angles: bool, rates: bool) -> None:

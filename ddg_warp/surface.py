@@ -106,6 +106,14 @@ class Surface:
                 loops.append(np.array(loop))
         return loops
 
+    def find_edges(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Index of the edge between the vertices a and b, in either direction; -1 where there is none."""
+        keys = _keys(self.edges[:, 0], self.edges[:, 1], len(self.points))
+        wanted = _keys(a, b, len(self.points))
+        found = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        out_of_range = (np.minimum(a, b) < 0) | (np.maximum(a, b) >= len(self.points))
+        return np.where(out_of_range | (keys[found] != wanted), -1, found)
+
     def edge_between(self, a, b) -> np.ndarray:
         """Index of the edge between the vertices a and b, in either direction; arrays broadcast.
 
@@ -113,11 +121,8 @@ class Surface:
             SceneError: there is no such edge; names the first pair.
         """
         a, b = np.broadcast_arrays(a, b)
-        keys = _keys(self.edges[:, 0], self.edges[:, 1], len(self.points))
-        wanted = _keys(a, b, len(self.points))
-        found = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-        out_of_range = (np.minimum(a, b) < 0) | (np.maximum(a, b) >= len(self.points))
-        for k in np.flatnonzero(out_of_range | (keys[found] != wanted))[:1]:
+        found = self.find_edges(a, b)
+        for k in np.flatnonzero(found < 0)[:1]:
             raise SceneError(
                 f"{self._name}: there is no edge between the vertices {a.flat[k]} and {b.flat[k]}; "
                 "give two corners of one triangle"

@@ -105,6 +105,8 @@ def test_a_joined_rod_keeps_its_law(device):
     scene.join([(0, 0), (stub, 0)], rigid=False)
     model = scene.build(device, "float64")
     assert len([part for part in model.net.sets if part.term.name == "rod_bend_twist"]) == 2
+    names = model.parameters().keys()
+    assert {"net/rod_bend_twist/limit", "net/rod_bend_twist 1/stiffness_1"} <= names
     joined, _ = moved(scene, device)
     np.testing.assert_allclose(joined[:13], alone, atol=1e-8)
 
