@@ -3,13 +3,15 @@
 While Warp captures on the CPU device, it records the launches and copies of every thread of the process (Warp 1.19). So a capture,
 and whatever compiles or loads kernels, waits until no other thread is inside of this package, and keeps them out meanwhile; all else
 runs side by side. On CUDA all threads share the current stream of a device, which Warp replaces while it reads an array: two that
-read at once can leave it replaced for good ("unknown stream"). So where there is CUDA every call is alone; what it launches runs on.
-Launches that a user makes in threads of his own are his to keep apart.
+read at once can leave it replaced for good ("unknown stream"), and memory or a graph that a thread frees ends the capture of
+another. So where there is CUDA every call is alone, and so is every collection of garbage; what is launched runs on. Launches that a
+user makes in threads of his own are his to keep apart.
 """
 
+import gc
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import wraps
 
 
@@ -19,27 +21,27 @@ class _Turns:
     def __init__(self):
         self._changed = threading.Condition()
         self._inside, self._capturing = 0, False
-        self._own = threading.local()
+        self._own, self._collection = threading.local(), ExitStack()
         self.shared: bool | None = None  # whether threads share a stream; found out by the first call
 
     @contextmanager
     def launching(self) -> Iterator[None]:
         depth = getattr(self._own, "depth", 0)
-        if not depth:
-            with self._changed:
-                if self.shared is None:
-                    self.shared = _cuda()
+        with self._changing():
+            if self.shared is None:
+                self.shared = _cuda()
+                if self.shared:
+                    gc.callbacks.append(self._collecting)
+            if not depth:
                 self._changed.wait_for(lambda: not self._capturing and not (self.shared and self._inside))
                 self._inside += 1
-        self._own.depth = depth + 1
+            self._own.depth = depth + 1
         try:
             yield
         finally:
-            self._own.depth = depth
-            if not depth:
-                with self._changed:
-                    self._inside -= 1
-                    self._changed.notify_all()
+            with self._changing():
+                self._inside -= not depth
+                self._own.depth = depth
 
     @contextmanager
     def capturing(self) -> Iterator[None]:
@@ -47,20 +49,36 @@ class _Turns:
             yield
             return
         depth = getattr(self._own, "depth", 0)
-        with self._changed:
+        with self._changing():
             self._inside -= depth > 0
             self._changed.notify_all()
             self._changed.wait_for(lambda: not self._capturing and not self._inside)
-            self._capturing = True
-        self._own.alone, self._own.depth = True, depth + 1
+            self._capturing = self._own.alone = True
+            self._own.depth = depth + 1
         try:
             yield
         finally:
-            self._own.alone, self._own.depth = False, depth
-            with self._changed:
-                self._capturing = False
+            with self._changing():
+                self._capturing = self._own.alone = False
                 self._inside += depth > 0
+                self._own.depth = depth
+
+    @contextmanager
+    def _changing(self) -> Iterator[None]:
+        self._own.changing = True
+        try:
+            with self._changed:
+                yield
                 self._changed.notify_all()
+        finally:
+            self._own.changing = False
+
+    def _collecting(self, phase: str, _info: dict) -> None:
+        """Collections take their turn, too; but for one that starts while its thread is about to take or leave a turn."""
+        if phase == "stop":
+            self._collection.close()
+        elif not getattr(self._own, "changing", False):
+            self._collection.enter_context(self.launching())
 
 
 def _cuda() -> bool:
@@ -70,19 +88,19 @@ def _cuda() -> bool:
 
 
 _turns = _Turns()
-capturing = _turns.capturing
+launching, capturing = _turns.launching, _turns.capturing
 
 
 def launches(what):
     """Decorate what launches: a function, or a class, whose constructor may load kernels and whose other methods launch."""
     if not isinstance(what, type):
-        return _within(_turns.launching, what)
+        return _within(launching, what)
     for name, member in list(vars(what).items()):
         if callable(member) and not isinstance(member, type | staticmethod | classmethod):
             if name == "__init__":
-                setattr(what, name, _within(_turns.capturing, member))
+                setattr(what, name, _within(capturing, member))
             elif not name.startswith("_"):
-                setattr(what, name, _within(_turns.launching, member))
+                setattr(what, name, _within(launching, member))
     return what
 
 
