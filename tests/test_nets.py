@@ -481,6 +481,7 @@ def test_motion_leaves_other_held_components_alone(device):
     np.testing.assert_allclose(state.points()[8], expected, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_float32_gives_way_where_it_cannot_carry_the_rods(device):
     """Rods of 16 edges between crossings: over 1/60 s stretching is 6e5 times as stiff as all else, over 1/480 s 1e4 times."""
     model = gridshell_dome.build(5, 16).build(device, "mixed")

@@ -64,7 +64,7 @@ def test_derivatives(device, name, damped):
         assert row["passed"], row
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n != NAMES[0] else ()) for n in NAMES])
 def test_the_exact_matrix_holds_where_the_law_is_not_convex(device, name):
     """Twist beyond the crossover softens the ribbon: the factor leaves that out, the exact matrix does not."""
     term = replace(REGISTRY["rod_bend_twist"], density=LAWS[name])
@@ -75,7 +75,7 @@ def test_the_exact_matrix_holds_where_the_law_is_not_convex(device, name):
     assert derivatives.exact(case) < 1e-13
 
 
-@pytest.mark.parametrize("real", [wp.float64, wp.float32])
+@pytest.mark.parametrize("real", [wp.float64, pytest.param(wp.float32, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", NAMES)
 def test_laws_from_the_narrow_to_the_wide_limit(device, name, real):
     """psi' and psi'' against differences, over six decades of bending and at both branches of phi; psi >= 0 and smooth at k = 0."""

@@ -49,6 +49,7 @@ LONG = (
     "cable_gripped_at_both_ends",
     "hanging_sheet",
     "parachute",
+    "ribbon_bistable",
     "pullout_cylinder",
     "slit_annulus",
     "hinged_roof",

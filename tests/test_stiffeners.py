@@ -103,6 +103,7 @@ def test_every_bending_turns_the_rod(device, bending):
     assert 2.0 * added[1] - added[0] == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.slow
 def test_stiffness_of_the_glue_does_not_matter(device):
     """Ten times as much changes the torque by some thousandths, the less the finer the mesh; a tenth by less than a tenth."""
     changes = []
@@ -128,6 +129,7 @@ def arched(device, cells: int, spin: str):
     return model, state, sum(elastic(model, state).values()) / expected
 
 
+@pytest.mark.slow
 def test_tall_section_stands(device):
     """Glued, the rod bends about its strong axis with the strip, which is stable so; one that may spin is not, and lies down."""
     for cells, error in ((10, 2e-4), (20, 5e-5)):
@@ -143,7 +145,7 @@ def test_tall_section_stands(device):
 
 @pytest.mark.parametrize(
     ("precision", "cells"),
-    [("float64", 3), *(pytest.param(p, 6, marks=pytest.mark.slow) for p in ("float64", "mixed"))],
+    [pytest.param(*case, marks=pytest.mark.slow) for case in (("float64", 3), ("float64", 6), ("mixed", 6))],
 )
 def test_rigid_turns_cost_nothing(device, precision, cells):
     """Held along one side, which turns it by one and a half turns about the rod: no energy, and the rod has turned as often."""

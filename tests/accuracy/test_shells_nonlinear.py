@@ -131,6 +131,7 @@ def test_stresses_of_their_own_save_iterations(device):
     assert counts[0][1] == pytest.approx(counts[1][1], abs=1e-7)
 
 
+@pytest.mark.slow
 def test_search_takes_over_where_the_mixed_iteration_fails(device):
     """The jump of stiffness of the cylinder in one step is too long for it; the answer is a minimum all the same."""
     model = pullout_cylinder.build(6, membrane="flat").build(device, "float64")
