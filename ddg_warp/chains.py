@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ddg_warp import arguments, geometry
+from ddg_warp import arguments, drag, geometry
 from ddg_warp.descriptions import RodBatch, Support
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.element import ChainKind
@@ -38,6 +38,7 @@ class Piece:
     rotary: np.ndarray
     length: np.ndarray
     parameters: dict[str, np.ndarray]
+    drag: np.ndarray  # (R, edges, rows), zero without
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,7 @@ class ChainGroup:
         mass: of nodes (n, R) [kg]; rotary: inertia of edges about the tangent (n, R) [kg m^2].
         fixed: bits of the held components of a node; the bit after the components is the angle (n, R).
         length: of the rod (R,) [m].
+        drag: coefficients of the drag on edges (rows, n, R), in the order of `kernels.drag`; None without.
         load: force on nodes (n, R, dim) [N]; load_angle: twisting moment on edges (n, R) [N m]; None without constant loads.
         parameters: of all terms, "term.parameter", each broadcastable to (n, R).
         moving_nodes: arrays (., 5) of (node, rod, motion of each of three components, -1 for none); every node in one row.
@@ -92,6 +94,7 @@ class ChainGroup:
     rotary: np.ndarray
     fixed: np.ndarray
     length: np.ndarray
+    drag: np.ndarray | None
     parameters: dict[str, np.ndarray]
     load: np.ndarray
     load_angle: np.ndarray
@@ -197,20 +200,22 @@ def scene_motions(scene: Scene) -> list:
 
 
 def pieces_of(scene: Scene, batch: RodBatch, ghosts: Ghosts, chosen: np.ndarray) -> list[Piece]:
-    """The chosen rods (R,) of a batch, those with the same ghosts together."""
+    """The chosen rods (R,) of a batch, those with the same ghosts together, and those with drag."""
     check_batch(batch, scene.dimension)
     chosen = chosen[batch.first : batch.first + batch.rods]
     flags = ghosts.count[batch.first : batch.first + batch.rods]
     if batch.closed and flags.any():
         raise SceneError(f"rod {batch.first + int(np.argmax(flags.any(1)))} is closed: it has no end to clamp")
-    result = []
+    dragged = np.isin(batch.first + np.arange(batch.rods), [rod for rods, _ in scene.drags for rod in rods])
+    flags, result = np.column_stack([flags, dragged]), []
+    coefficients = drag.of_batch(scene, batch, np.linalg.norm(geometry.edge_vectors(batch.points, batch.closed), axis=-1))
     for pattern in np.unique(flags[chosen], axis=0):
         rows = np.flatnonzero((flags == pattern).all(1) & chosen)
-        result.append(_piece(scene.dimension, batch, rows, ghosts))
+        result.append(_piece(scene.dimension, batch, rows, ghosts, coefficients[rows], bool(pattern[2])))
     return result
 
 
-def _kind(dimension: int, batch: RodBatch) -> ChainKind:
+def _kind(dimension: int, batch: RodBatch, dragged: bool) -> ChainKind:
     prefix = "planar" if dimension == 2 else "rod"
     names = [f"{prefix}_stretch"]
     if batch.bend:
@@ -222,10 +227,12 @@ def _kind(dimension: int, batch: RodBatch) -> ChainKind:
             )
     viscous = bool(np.any(np.asarray(batch.section.viscosity) > 0.0))
     terms = tuple(REGISTRY[name].of(batch.laws).damped(viscous) for name in names)
-    return ChainKind(dimension, batch.twist, batch.closed, terms)
+    return ChainKind(dimension, batch.twist, batch.closed, terms, drag=dragged)
 
 
-def _piece(dimension: int, batch: RodBatch, rows: np.ndarray, outside: Ghosts) -> Piece:
+def _piece(
+    dimension: int, batch: RodBatch, rows: np.ndarray, outside: Ghosts, coefficients: np.ndarray, dragged: bool
+) -> Piece:
     rods = batch.first + rows
     before, after = ghosts = tuple(int(count) for count in outside.count[rods[0]])
     points = batch.points[rows]
@@ -261,7 +268,7 @@ def _piece(dimension: int, batch: RodBatch, rows: np.ndarray, outside: Ghosts) -
     given = batch.director
     if given is not None and given.ndim > 1:
         given = np.broadcast_to(given, (batch.rods, *given.shape[1:]))[rows]
-    kind = _kind(dimension, batch)
+    kind = _kind(dimension, batch, dragged)
     frames = np.zeros_like(tangents)
     if kind.twist:
         frames[:, real] = geometry.directors(tangents[:, real], given)
@@ -311,6 +318,7 @@ def _piece(dimension: int, batch: RodBatch, rows: np.ndarray, outside: Ghosts) -
         on_edges(section.rotary_inertia) * own,
         own.sum(1),
         parameters,
+        np.pad(coefficients, ((0, 0), ghosts, (0, 0))),
     )
 
 
@@ -446,6 +454,7 @@ def _join(pieces: list[Piece]) -> ChainGroup:
         rotary=stack("rotary"),
         fixed=fixed,
         length=np.concatenate([piece.length for piece in pieces]),
+        drag=np.moveaxis(stack("drag", pieces[0].drag.shape[-1]), -1, 0) if kind.drag else None,
         parameters={
             name: _join_parameter([piece.parameters[name] for piece in pieces], pieces, n, total)
             for name in pieces[0].parameters

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays, precision
+from ddg_warp import arrays, drag, precision
 from ddg_warp.chains import ChainGroup
 from ddg_warp.parameters import ParameterTable
 
@@ -37,6 +37,7 @@ class Group:
         self.still = wp.zeros(self.columns, dtype=real, device=device)
         self.mass = put(host.mass, real)
         self.rotary = put(host.rotary, real)
+        self.drag = put(host.drag, real) if kind.drag else None
         self.fixed = put(host.fixed, wp.uint8)
         load = np.concatenate([host.load] * worlds, axis=1) if host.loaded else np.zeros((1, 1, kind.dim))
         self.load = arrays.upload(load, vector, device)
@@ -77,7 +78,10 @@ class Group:
         """What float32 makes of every rod over a step of s [s]; see `precision.float32_errors`."""
         host = self.host
         values = {name: array[:, : self.rods] for name, array in self.parameters.values.items()}
-        return precision.float32_errors(self.kind, host.mass.sum(0) / host.count, host.length, values, s)
+        mass = host.mass.sum(0) / host.count
+        if self.kind.drag:
+            mass = mass + s * drag.least(host.drag.T) * host.length / host.count
+        return precision.float32_errors(self.kind, mass, host.length, values, s)
 
 
 class Moving:

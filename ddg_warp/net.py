@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ddg_warp import axisymmetric, shell_geometry
+from ddg_warp import axisymmetric, drag, shell_geometry
 from ddg_warp import shells as shell_terms
 from ddg_warp.chains import Piece
 from ddg_warp.net_loads import NetCouple, NetEdgeCouple, NetLoad, NetPressure
@@ -143,6 +143,18 @@ class Net:
         return [*self.pressures, *self.bands, *self.couples, *self.edge_couples]
 
     @cached_property
+    def drag(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Edges that feel drag: their nodes (2, E), block of their angle (E,), -1 without, coefficients (rows, E); None without any."""
+        found = []
+        for rod in self.rods:
+            if rod.piece.kind.drag:
+                coefficients = rod.piece.drag[rod.row]
+                ends = np.stack([rod.all_nodes, np.roll(rod.all_nodes, -1)])[:, : len(coefficients)]
+                angles = rod.all_edges if rod.all_edges.size else np.full(len(coefficients), -1)
+                found.append((ends, angles, coefficients.T))
+        return tuple(np.concatenate(parts, -1) for parts in zip(*found, strict=True)) if found else None
+
+    @cached_property
     def bodies(self) -> Bodies:
         """What its blocks belong to."""
         return Bodies(self)
@@ -161,11 +173,11 @@ class Net:
 
     def rod_errors(self, s: float) -> np.ndarray:
         """What float32 makes of every rod over a step of s [s] (rods,); see `precision.float32_errors`."""
-        pieces = {id(rod.piece): rod.piece for rod in self.rods}
-        errors = {
-            key: float32_errors(p.kind, p.mass.mean(1), p.length, {name: v.T for name, v in p.parameters.items()}, s)
-            for key, p in pieces.items()
-        }
+        errors = {}
+        for p in {id(rod.piece): rod.piece for rod in self.rods}.values():
+            mass = p.mass.mean(1) + s * drag.least(p.drag) * p.length / p.mass.shape[1] if p.kind.drag else p.mass.mean(1)
+            parameters = {name: v.T for name, v in p.parameters.items()}
+            errors[id(p)] = float32_errors(p.kind, mass, p.length, parameters, s)
         return np.array([errors[id(rod.piece)][rod.row] for rod in self.rods])
 
     def shell_errors(self, s: float) -> np.ndarray:

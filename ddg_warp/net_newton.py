@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.errors import SceneError
+from ddg_warp.kernels.drag import block_inertia
 from ddg_warp.kernels.net import elements, krylov, newton, system
 from ddg_warp.linear.multilevel import Multilevel
 from ddg_warp.linear.net_chain import Chains
@@ -27,9 +28,12 @@ class NetNewton:
         preconditioner: of conjugate gradients: "block_jacobi", "chain" (rods between their joints are eliminated, see
             `kernels.net.chains`), "multilevel" (see `kernels.net.levels`), or "chain_multilevel", both.
         linear: scalar type of the linear algebra; that of the model by default.
+        drag: whether a block has more than a mass; see `kernels.drag`.
     """
 
-    def __init__(self, model, options: NewtonOptions, preconditioner: str = "block_jacobi", linear=None):
+    def __init__(
+        self, model, options: NewtonOptions, preconditioner: str = "block_jacobi", linear=None, drag: bool = False
+    ):
         if preconditioner not in PRECONDITIONERS:
             raise SceneError(f"preconditioner {preconditioner!r}: of a net it is one of {', '.join(PRECONDITIONERS)}")
         net = model.net
@@ -55,7 +59,7 @@ class NetNewton:
         self.load = wp.array(np.tile(host.load, (worlds, 1)), dtype=V, device=device)
         self.size, self.stiffness = make(self.all, self.real), make(self.all, self.linear)
         self.change, self.noise, self.square, self.dots = (make((worlds, blocks), self.real) for _ in range(4))
-        self.mass = wp.array(host.mass, dtype=V, device=device)
+        self.mass = make((worlds, blocks), block_inertia(self.real)) if drag else wp.array(host.mass, dtype=V, device=device)
         bits = (host.fixed * [1, 2, 4]).sum(1).astype(np.uint8)
         self.fixed = wp.array(bits, dtype=wp.uint8, device=device)
         self.held = self.fixed  # components in space, for predictors: rates along oblique planes stay in them
@@ -93,8 +97,8 @@ class NetNewton:
         lengths = host.edge_lengths
         self.arm, self.longest = float(lengths.mean()), float(lengths.max())
         self._evaluate = [elements.evaluate_kernel(part.term, self.real, self.linear) for part in net.sets]
-        self._outer, self._collect, self._settle = system.balance_kernels(self.real, self.linear)
-        self._assembly = Assembly(net, self.system, self.parts, self.real, self.linear)
+        self._outer, self._collect, self._settle = system.balance_kernels(self.real, self.linear, drag)
+        self._assembly = Assembly(net, self.system, self.parts, self.real, self.linear, drag)
         self._judge, self._measure, self._rotate, self._take, self._move = newton.search_kernels(self.real, self.linear)
         self._invert, self._start, self._begin, *self._cycle = krylov.solver_kernels(self.linear)
         self._compare, self._confirm = krylov.confirm_kernels(self.real, self.linear)

@@ -86,15 +86,16 @@ class Assembly:
 
     Args:
         written: of each set, the arrays "factor" and "tension".
+        drag: whether blocks have more than a mass.
     """
 
-    def __init__(self, net, table: NetSystem, written: list[dict], real, linear):
+    def __init__(self, net, table: NetSystem, written: list[dict], real, linear, drag: bool):
         self.net, self.table, self.kernels, self._own = net, table, [], []
         Contributions = system.contributions(linear)
         for first in range(0, len(net.sets), system.SETS):
             sets = net.sets[first : first + system.SETS]
             terms = tuple(part.term for part in sets)
-            self.kernels.append(system.assemble_kernel(terms, real, linear, first == 0))
+            self.kernels.append(system.assemble_kernel(terms, real, linear, first == 0, drag and first == 0))
             own = []
             for i in range(first, first + len(sets)):
                 data = Contributions()

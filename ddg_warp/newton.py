@@ -62,6 +62,7 @@ class ChainNewton:
     Attributes:
         x, theta, frame: the iterate and its lagged frames; base: the accepted positions it was reached from.
         target, target_angle, coefficient: the quadratic of inertia, coefficient * m |x - target|^2 / 2.
+        mass, rotary: m; with drag, of which `kernels.drag` makes them at the start of a solve, its own.
         status, iteration, ...: state of every rod's search; see `kernels.chain`.
     """
 
@@ -88,6 +89,10 @@ class ChainNewton:
         self.x, self.base, self.target = (make(*nodes, dtype=vector) for _ in range(3))
         self.theta, self.target_angle = make(*twisted), make(*twisted)
         self.frame = make(7, *twisted)
+        self.mass, self.rotary = group.mass, group.rotary
+        if kind.drag:
+            self.mass = make(*nodes, dtype=element.inertia_type(kind, self.real))
+            self.rotary = make(*twisted)
         self.factor = make(kind.factor_rows, *nodes, dtype=self.linear)
         self.gradient = make(kind.window, *nodes)
         self.energy = make(2, *nodes)
@@ -187,7 +192,7 @@ class ChainNewton:
         wp.launch(
             self._check,
             group.node_threads,
-            [self.gradient, self.energy, self.stiffness, group.count, group.mass, group.rotary, self.coefficient]
+            [self.gradient, self.energy, self.stiffness, group.count, self.mass, self.rotary, self.coefficient]
             + [self.x, self.theta, self.base, self.direction, self.target, self.target_angle]
             + [group.gravity, group.load, group.load_angle, int(group.host.loaded), group.fixed, group.length]
             + [options.rtol, options.floor_factor * self.eps, self.load_scale, self.status]
@@ -203,7 +208,7 @@ class ChainNewton:
             self._sweep,
             group.columns,
             [self.factor, self.geometric, self.right, self.energy_change, self.energy_noise, group.count]
-            + [group.mass, group.rotary, self.coefficient, group.fixed]
+            + [self.mass, self.rotary, self.coefficient, group.fixed]
             + [options.floor_factor * self.eps, options.rotation_cap]
             + [options.max_iterations, options.max_halvings]
             + [self.x, self.theta, self.base, self.elimination, self.direction]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ddg_warp import arguments, validate
+from ddg_warp import arguments, drag, validate
 from ddg_warp.descriptions import Dynamics, Law, Load, RodBatch, Statics, Support, Trace, laws_of
 from ddg_warp.errors import SceneError
 from ddg_warp.material import Material, Stiffness
@@ -26,6 +26,7 @@ class Scene(Structures):
         dimension: 3, or 2 for a scene that stays in a plane y = const: forces, couples, motions and gravity out of it are refused.
         analysis: `Dynamics`, `Statics` or `Trace`: what `ddg-warp run` does with the scene.
         mass_damping: mass-proportional damping alpha [1/s].
+        flow: velocity (3,) [m/s] of the fluid that `drag` is against, everywhere alike; or a function of the time that returns it.
         initial: makes the first state of a run from the model; the rest state by default.
         callbacks: functions of the state, called between steps.
 
@@ -37,12 +38,14 @@ class Scene(Structures):
     dimension: int = 3
     analysis: Dynamics | Statics | Trace = field(default_factory=Dynamics)
     mass_damping: float = 0.0
+    flow: tuple | Callable[[float], tuple] = (0.0, 0.0, 0.0)
     initial: Callable | None = None
     callbacks: list[Callable] = field(default_factory=list)
     batches: list[RodBatch] = field(default_factory=list, init=False)
     supports: list[Support] = field(default_factory=list, init=False)
     loads: list[Load] = field(default_factory=list, init=False)
     masses: list[tuple[np.ndarray, int, float]] = field(default_factory=list, init=False)
+    drags: list[tuple[np.ndarray, object]] = field(default_factory=list, init=False)
 
     def __post_init__(self):
         validate.check_settings(self)
@@ -259,6 +262,40 @@ class Scene(Structures):
         rods, (node,) = self._on_rods("add_mass", rods, "node", arguments.index("add_mass: node", node))
         mass = arguments.positive(f"add_mass: mass at node {node}", mass, "kg")
         self.masses.append((rods, node, mass))
+
+    def drag(self, rods=None, law=None, *, tangential=None, normal=None, rotational: float = 0.0) -> None:
+        """Let a fluid, or sand, resist the motion of rods by resistive force theory: anisotropic drag against `flow`.
+
+        Drag needs motion: it does nothing in statics, continuation and spectra. In a time step it is implicit, with the tangents of the
+        step's start (of the predicted midpoint by the midpoint rule), so that overdamped rods take long steps; rods that drag holds
+        back need no mass. `Model.drag` tells forces and power.
+
+        Args:
+            rods: those in the fluid, all added so far by default.
+            law: `Viscous(viscosity)` or `Granular(...)`; or coefficients instead:
+            tangential, normal: force per length over velocity along and across the rod [N s/m^2].
+            rotational: moment per length over the spin about the tangent [N s].
+
+        Raises:
+            SceneError: a coefficient is none, a rod has drag already, or, without `rods`, there are shells, which feel none.
+        """
+        if rods is None:
+            for kind, shells in (("shell", self.shells), ("shell of revolution", self.axisymmetric_shells)):
+                if shells:
+                    raise SceneError(f"drag: {kind} 0 ('{shells[0].name}') can feel none; name the rods that do")
+            rods = range(self.rod_count)
+        rods = arguments.once("drag: rods", self._rods(rods))
+        if law is None:
+            law = drag.Resistance(tangential, normal, rotational)
+        elif not isinstance(law, drag.Resistance | drag.Viscous | drag.Granular):
+            raise SceneError(f"drag: law is {law!r}; give Viscous(viscosity), Granular(...), or tangential and normal")
+        elif tangential is not None or normal is not None or rotational != 0.0:
+            raise SceneError("drag: a law and coefficients are given; give one of them")
+        for others, _ in self.drags:
+            twice = np.intersect1d(rods, others)
+            if twice.size:
+                raise SceneError(f"drag: rod {twice[0]} has drag already; give one law that has both")
+        self.drags.append((rods, law))
 
     def build(self, device=None, precision: str | None = None, worlds: int = 1, allow_rounding: bool = False):
         """Freeze the scene, as it is now, into a `Model` on a device.

@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 
-from ddg_warp import arguments, geometry
+from ddg_warp import arguments, drag, geometry
 from ddg_warp.descriptions import Dynamics, Statics, Trace
 from ddg_warp.errors import SceneError, SceneWarning
 from ddg_warp.motion import Motion
@@ -25,6 +25,8 @@ def check_settings(scene) -> None:
     arguments.number(
         "mass_damping", scene.mass_damping, "one number, finite and not negative [1/s]", lambda v: v >= 0.0
     )
+    if not callable(scene.flow):
+        arguments.vector("flow", scene.flow)
     if not isinstance(scene.analysis, Dynamics | Statics | Trace):
         raise SceneError(f"analysis is {scene.analysis!r}; give Dynamics(...), Statics(...) or Trace(...)")
     if scene.initial is not None and not callable(scene.initial):
@@ -47,6 +49,8 @@ def check_scene(scene) -> None:
         raise SceneError(
             f"gravity is {tuple(scene.gravity)}; a scene of dimension 2 stays in the plane of x and z, give 0 along y"
         )
+    if scene.drags or callable(scene.flow) or any(scene.flow):
+        drag.check_flow(scene)
     objects = [*scene.batches, *scene.shells, *scene.axisymmetric_shells]
     size = max(
         (np.nanmax(np.ptp(o.points.reshape(-1, o.points.shape[-1]), axis=0)) for o in objects if o.points.size),

@@ -12,7 +12,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, until_function
+from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, inertia_type, until_function
 
 
 @cache
@@ -21,8 +21,8 @@ def node_functions(kind: ChainKind, real):
 
     balance returns the residual force and moment, the size of the element forces that meet, and the elastic part of the moment.
     """
-    dim, twist, span, window, closed = kind.dim, kind.twist, kind.span, kind.window, kind.closed
-    V = wp.types.vector(dim, real)
+    dim, twist, span, window, closed, drag = kind.dim, kind.twist, kind.span, kind.window, kind.closed, kind.drag
+    V, Inertia = wp.types.vector(dim, real), inertia_type(kind, real)
 
     @wp.func
     def force(g: wp.array3d(dtype=real), row: int, k: int, r: int):
@@ -52,7 +52,7 @@ def node_functions(kind: ChainKind, real):
     @wp.func
     def balance(
         g: wp.array3d(dtype=real),
-        mass: wp.array2d(dtype=real),
+        mass: wp.array2d(dtype=Inertia),
         rotary: wp.array2d(dtype=real),
         c: real,
         x: wp.array2d(dtype=V),
@@ -67,8 +67,13 @@ def node_functions(kind: ChainKind, real):
         n: int,
         r: int,
     ):
-        m = mass[k, r]
+        if wp.static(drag):
+            m = mass[k, r].mass
+        else:
+            m = mass[k, r]
         f = gravity[0] * m - (x[k, r] - target[k, r]) * (c * m)
+        if wp.static(drag):
+            f -= mass[k, r].resistance * (x[k, r] - mass[k, r].carried)
         moment = real(0.0)
         if loaded != 0:
             f += load[k, r]
@@ -103,8 +108,8 @@ def check_kernel(kind: ChainKind, real, linear):
     `drowned` is raised where only rounding excuses a residual. Residuals of held dofs are written as zero. `noise` bounds the
     rounding in `change`, which sums the differences of the element energies and the work of inertia and loads along the step.
     """
-    dim, nb, twist, closed = kind.dim, kind.block, kind.twist, kind.closed
-    V = wp.types.vector(dim, real)
+    dim, nb, twist, closed, drag = kind.dim, kind.block, kind.twist, kind.closed, kind.drag
+    V, Inertia = wp.types.vector(dim, real), inertia_type(kind, real)
     _, behind, balance = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
     until = until_function(kind)
@@ -115,7 +120,7 @@ def check_kernel(kind: ChainKind, real, linear):
         energy: wp.array3d(dtype=real),
         stiffness: wp.array2d(dtype=linear),
         count: wp.array(dtype=int),
-        mass: wp.array2d(dtype=real),
+        mass: wp.array2d(dtype=Inertia),
         rotary: wp.array2d(dtype=real),
         coefficient: wp.array(dtype=real),
         x: wp.array2d(dtype=V),
@@ -166,9 +171,14 @@ def check_kernel(kind: ChainKind, real, linear):
             if b >= 0:
                 stiff = wp.max(stiff, real(stiffness[b, r]))
             here = x[k, r]
-            m = mass[k, r]
+            if wp.static(drag):
+                m = mass[k, r].mass
+            else:
+                m = mass[k, r]
             reach = wp.max(wp.abs(here))
             least = floor * ((real(2.0) * stiff + c * m) * reach + size)
+            if wp.static(drag):
+                least += floor * wp.max(wp.get_diag(mass[k, r].resistance)) * reach
             mask = int(fixed[k, r])
             for d in range(wp.static(dim)):
                 held = ((mask >> d) & 1) == 1
@@ -209,6 +219,8 @@ def check_kernel(kind: ChainKind, real, linear):
             if loaded != 0:
                 outer += load[k, r]
             work = wp.dot(u, (here - target[k, r] - u * real(0.5)) * (c * m) - outer)
+            if wp.static(drag):
+                work += wp.dot(u, mass[k, r].resistance * (here - mass[k, r].carried - u * real(0.5)))
             if wp.static(twist):
                 turned = taken * real(direction[wp.static(nb - 1), k, r])
                 work += turned * c * rotary[k, r] * (theta[k, r] - target_angle[k, r] - real(0.5) * turned)

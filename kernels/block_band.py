@@ -11,7 +11,7 @@ import warp as wp
 
 from ddg_warp.kernels import geometric, pivot
 from ddg_warp.kernels.balance import node_functions
-from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions
+from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, inertia_type
 
 
 @cache
@@ -57,6 +57,7 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
     dim, nb, nb2, twist, span, closed = kind.dim, kind.block, kind.block**2, kind.twist, kind.span, kind.closed
     window, vertex_rows, edge_rows, tensions = kind.window, kind.vertex_strains, kind.edge_strains, kind.tensions
     H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
+    drag, Inertia = kind.drag, inertia_type(kind, real)
     edge_row, tension_row = vertex_rows * window, vertex_rows * window + edge_rows * dim
     _, store, _, _ = block_functions(nb, linear)
     _, behind, _ = node_functions(kind, real)
@@ -110,7 +111,7 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
         second: wp.array3d(dtype=linear),
         clamped: wp.array(dtype=int),
         count: wp.array(dtype=int),
-        mass: wp.array2d(dtype=real),
+        mass: wp.array2d(dtype=Inertia),
         rotary: wp.array2d(dtype=real),
         coefficient: wp.array(dtype=real),
         fixed: wp.array2d(dtype=wp.uint8),
@@ -170,8 +171,16 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
             E -= S
         if b >= 0:
             D += edge_block(F, b, r)
+        if wp.static(drag):
+            m = mass[k, r].mass
+            resistance = mass[k, r].resistance
+            for d in range(wp.static(dim)):
+                for i in range(wp.static(dim)):
+                    D[d, i] = D[d, i] + linear(resistance[d, i])
+        else:
+            m = mass[k, r]
         for d in range(wp.static(dim)):
-            D[d, d] = D[d, d] + linear(c * mass[k, r])
+            D[d, d] = D[d, d] + linear(c * m)
         if wp.static(twist):
             D[wp.static(nb - 1), wp.static(nb - 1)] = D[wp.static(nb - 1), wp.static(nb - 1)] + linear(c * rotary[k, r])
         D = wp.cw_mul(D, wp.outer(free, free)) + wp.diag(H(linear(1.0)) - free)

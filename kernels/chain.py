@@ -15,7 +15,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import geometric, outcome, pivot
-from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind
+from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, inertia_type
 from ddg_warp.kernels.search import PLACE, RELAG, TURNED, search_functions
 
 
@@ -27,7 +27,7 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
     with `clamped[r]` raised: without what compression takes away, and, for this iteration, without G; or the solve `fails`.
     """
     dim, nb, twist, span = kind.dim, kind.block, kind.twist, kind.span
-    window, nb2 = kind.window, kind.block**2
+    window, nb2, drag, Inertia = kind.window, kind.block**2, kind.drag, inertia_type(kind, real)
     V, H, M = wp.types.vector(dim, real), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     factor_block, lower, upper, lower_vector, upper_vector, congruence = pivot.functions(nb, linear)
     *_, shorter = search_functions(kind, real, linear)
@@ -89,7 +89,7 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
         energy_noise: wp.array2d(dtype=linear),
         count: wp.array(dtype=int),
         # inertia
-        mass: wp.array2d(dtype=real),
+        mass: wp.array2d(dtype=Inertia),
         rotary: wp.array2d(dtype=real),
         coefficient: wp.array(dtype=real),
         fixed: wp.array2d(dtype=wp.uint8),
@@ -188,7 +188,14 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
                     Waa += T
                     Wab -= T
                     Wbb += T
-            inertia = linear(c * mass[j, r])
+            if wp.static(drag):
+                inertia = linear(c * mass[j, r].mass)
+                resistance = mass[j, r].resistance
+                for d in range(wp.static(dim)):
+                    for i in range(wp.static(dim)):
+                        Waa[d, i] = Waa[d, i] + linear(resistance[d, i])
+            else:
+                inertia = linear(c * mass[j, r])
             for d in range(wp.static(dim)):
                 Waa[d, d] = Waa[d, d] + inertia
             if wp.static(twist):

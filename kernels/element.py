@@ -34,11 +34,12 @@ class ChainKind:
     closed: bool
     terms: tuple[Term, ...]
     serial: bool = False  # whether a thread takes all nodes of its rod; see `until_function`
+    drag: bool = False  # whether a fluid resists its motion; see `kernels.drag`
 
     @property
     def key(self) -> tuple:
         """By what kinds are put in order."""
-        return self.dim, self.twist, self.closed, [term.key for term in self.terms]
+        return self.dim, self.twist, self.closed, self.drag, [term.key for term in self.terms]
 
     @property
     def span(self) -> int:
@@ -112,6 +113,27 @@ class ChainKind:
             parameter += len(term.parameter_names)
             strain += rows
         return result
+
+
+@cache
+def inertia_type(kind: ChainKind, real):
+    """What a node has of inertia: its mass [kg]; with drag, a structure.
+
+    Beside the mass: resistance over a solve of length s, D / s [N/m], where the fluid alone would carry the node, and the resistance to
+    the spin of the edge that starts there, over s [N m].
+    """
+    V, M = wp.types.vector(kind.dim, real), wp.types.matrix((kind.dim, kind.dim), real)
+    if not kind.drag:
+        return real
+
+    @wp.struct
+    class NodeInertia:
+        mass: real
+        resistance: M
+        carried: V
+        spin: real
+
+    return NodeInertia
 
 
 @cache

@@ -13,7 +13,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import outcome
-from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, term_functions
+from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, inertia_type, term_functions
 from ddg_warp.kernels.terms import Term
 
 DRIFT, ROUNDING, HELD, DISSIPATED = range(4)  # rows of a balance
@@ -104,7 +104,7 @@ def chain_kernel(kind: ChainKind, real, linear):
     V, B = wp.types.vector(kind.dim, real), wp.types.vector(ROWS, real)
     _, window, lagged, _ = gather_functions(kind, real)
     rows_of_all = window_function(kind, len(kind.terms) - 1, real)
-    twist, closed = kind.twist, kind.closed
+    twist, closed, drag, Inertia = kind.twist, kind.closed, kind.drag, inertia_type(kind, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def measure(
@@ -121,7 +121,7 @@ def chain_kernel(kind: ChainKind, real, linear):
         buffer: wp.array(dtype=real),
         table: wp.array2d(dtype=int),
         count: wp.array(dtype=int),
-        mass: wp.array2d(dtype=real),
+        mass: wp.array2d(dtype=Inertia),
         rotary: wp.array2d(dtype=real),
         load: wp.array2d(dtype=V),
         load_angle: wp.array2d(dtype=real),
@@ -142,7 +142,10 @@ def chain_kernel(kind: ChainKind, real, linear):
         n = count[r]
         total = B()
         for k in range(start, n, ranges):
-            m = mass[k, r]
+            if wp.static(drag):
+                m = mass[k, r].mass
+            else:
+                m = mass[k, r]
             here = x[k, r]
             moved = here - x0[k, r]
             v = moved * (real(2.0) * rate[r]) - v0[k, r]
@@ -153,6 +156,11 @@ def chain_kernel(kind: ChainKind, real, linear):
                 spin = turned * (real(2.0) * rate[r]) - omega0[k, r]
                 kinetic += real(0.5) * rotary[k, r] * spin * spin
                 damped += real(2.0) * damping[0] * rate[r] * rotary[k, r] * turned * turned
+                if wp.static(drag):
+                    damped += real(2.0) * mass[k, r].spin * turned * turned
+            if wp.static(drag):
+                away = here - mass[k, r].carried
+                damped += real(2.0) * wp.dot(away, mass[k, r].resistance * away)
             made = real(0.0)
             worked = real(0.0)
             if follows != 0:

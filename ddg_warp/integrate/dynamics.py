@@ -3,13 +3,13 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import arguments, arrays, geometry, validate
+from ddg_warp import arguments, arrays, drag, geometry, validate
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.graphs import Graphs
 from ddg_warp.integrate import energy
 from ddg_warp.integrate.buffers import Buffer
 from ddg_warp.integrate.net_step import NetStep
-from ddg_warp.integrate.prescribed import PrescribedMotion, TimedLoads, jump_between
+from ddg_warp.integrate.prescribed import ChainDrag, PrescribedMotion, TimedLoads, jump_between
 from ddg_warp.kernels import element, outcome, step
 from ddg_warp.linear.choice import automatic
 from ddg_warp.linear.partitioned import PartitionedNewton
@@ -267,11 +267,14 @@ def _require_mass(model) -> None:
         k = np.arange(group.nodes)[:, None]
         own = (k >= host.first) & (k < host.first + host.own)
         bad = (host.mass <= 0.0) & ((host.fixed & positions) != positions) & own
+        if kind.drag:
+            held_back = drag.holds(host.drag)  # edges; the last node of an open rod starts none
+            bad &= ~(held_back | np.roll(held_back, 1, axis=0))
         if bad.any():
             k, column = np.argwhere(bad)[0]
             raise SceneError(
                 f"node {k - host.first[column]} of rod {host.rods[column]} is free and has no mass; "
-                "give the material a density, or the section a mass_per_length"
+                "give the material a density, the section a mass_per_length, or the rod drag along and across"
             )
 
 
@@ -309,13 +312,13 @@ class _ChainStep:
         self.damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
         self.moving = PrescribedMotion(model, group, midpoint) if group.moving else None
         self.loads = TimedLoads(model, group, midpoint) if group.host.timed_loads else None
+        self.drag = ChainDrag(model, group, midpoint) if kind.drag else None
 
     def prescribe(self, t0: float, t1: float) -> None:
-        """Hand the device what supports and timed loads do between t0 and t1."""
-        if self.moving:
-            self.moving.upload(t0, t1)
-        if self.loads:
-            self.loads.upload(t0, t1)
+        """Hand the device what supports, timed loads and the flow do between t0 and t1."""
+        for part in (self.moving, self.loads, self.drag):
+            if part:
+                part.upload(t0, t1)
 
     def step(self, before, after) -> None:
         """Launch a whole step from one group state to another; only launches, so that it can be captured."""
@@ -346,6 +349,8 @@ class _ChainStep:
             self.moving.apply(self.progress, self.portion, newton.x, newton.frame, newton.theta)
         if self.loads:
             self.loads.apply(newton.x, group.load, group.load_angle)
+        if self.drag:
+            self.drag.resist(before, newton, self.progress)
         newton.solve(before.last)
         if self.energy:
             self.energy.judge(before)
@@ -356,6 +361,8 @@ class _ChainStep:
             + [group.count, newton.status, self.progress, newton.rate],
             [after.x, after.v, after.theta, after.omega],
         )
+        if self.drag:
+            self.drag.settle(after, newton, self.progress)
         if group.kind.twist:
             self._launch(
                 "frames",
@@ -383,7 +390,7 @@ class _ChainStep:
         kernels = [*self.kernels.values(), *self.newton.kernels]
         if self.group.kind.viscous:
             kernels.append(element.strain_kernel(self.group.kind, self.model.types.real))
-        for part in (self.moving, self.loads, self.energy):
+        for part in (self.moving, self.loads, self.drag, self.energy):
             kernels += part.kernels if part else ()
         arrays.load_kernels(kernels, self.model.wp_device)
 

@@ -92,7 +92,7 @@ class ChainEnergy(_Energy):
             self._measure,
             (self.ranges, group.columns),
             [before.x, before.v, before.theta, before.omega, before.frame, newton.x, newton.theta, newton.frame]
-            + [before.last, newton.rate, *group.parameters.arrays, group.count, group.mass, group.rotary]
+            + [before.last, newton.rate, *group.parameters.arrays, group.count, newton.mass, group.rotary]
             + [
                 *self._loads,
                 group.load,
@@ -123,7 +123,7 @@ class NetEnergy(_Energy):
         self._out = [self.sums[i].flatten() for i in range(len(counts))]
         self._elements = [net_energy.element_kernel(part.term, real, step.newton.linear) for part in net.sets]
         self._load = wp.clone(step.newton.load) if net.host.followers else step.newton.load
-        self._blocks = net_energy.block_kernel(real)
+        self._blocks = net_energy.block_kernel(real, step.drag is not None)
 
     @property
     def kernels(self) -> list:

@@ -4,8 +4,9 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.chains import pose_starts
+from ddg_warp.drag import flow_at
 from ddg_warp.integrate.prescribed import poses
-from ddg_warp.kernels import motion
+from ddg_warp.kernels import drag, motion
 from ddg_warp.kernels.net import loads
 from ddg_warp.kernels.net.motion import motion_kernels
 from ddg_warp.net_model import NetState
@@ -146,3 +147,58 @@ class NetLoads:
             [load],
             device=self.model.wp_device,
         )
+
+
+class NetDrag:
+    """Drag on the rods of a net, against a fluid that flows.
+
+    Attributes:
+        moves: what inertia or drag give a rate, as masses of the dofs of blocks that are positive there.
+    """
+
+    def __init__(self, model, midpoint: bool = False):
+        net, host, device, real = model.net, model.net.host, model.wp_device, model.types.real
+        self.model, self.net, self.midpoint = model, net, midpoint
+        self.kernels = [*drag.net_kernels(real)]
+        ends, angles, coefficients = host.drag
+        places = np.stack([*ends, np.where(angles < 0, host.blocks, angles)], -1).ravel()
+        starts, items = lists(places, host.blocks + 1)
+
+        def put(values, dtype=int):
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+        self.ends, self.starts, self.items = (put(v.astype(np.int32)) for v in (ends.T, starts, items // 3))
+        self.coefficients = put(coefficients, real)
+        self.mass = put(host.mass, net.vector)
+        felt = np.zeros((host.blocks, 3))
+        felt[ends] = 1.0
+        felt[angles[angles >= 0], 0] = 1.0
+        self.moves = put(host.mass + felt, net.vector)
+        self.flow = wp.zeros(1, dtype=net.vector, device=device)
+
+    def upload(self, t0: float, t1: float) -> None:
+        """The flow at the time that the scheme balances forces at."""
+        self.flow.assign(flow_at(self.model.scene, 0.5 * (t0 + t1) if self.midpoint else t1)[None])
+
+    def resist(self, before, solver, progress: wp.array) -> None:
+        """Write inertia and drag of a solve from the state `before`, once its iterate is predicted."""
+        self._launch(
+            self.kernels[0],
+            [before.q, before.v, solver.q if self.midpoint else before.q, solver.q, self.mass, self.ends]
+            + [self.coefficients, self.starts, self.items, self.flow, solver.rate, progress, solver.outer]
+            + [self.net.blocks, self.net.host.nodes],
+            [solver.mass, solver.load_scale],
+        )
+
+    def settle(self, after, solver, progress: wp.array) -> None:
+        """Rates of what has no inertia in the state `after`."""
+        if self.midpoint:
+            self._launch(
+                self.kernels[1],
+                [solver.q, solver.mass, solver.status, progress, solver.rate, self.net.blocks, after.q],
+                [after.v],
+            )
+
+    def _launch(self, kernel, inputs: list, outputs: list) -> None:
+        blocks = self.model.worlds * self.net.blocks
+        wp.launch(kernel, blocks, inputs, outputs, device=self.model.wp_device)

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import arrays, drag
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.integrate.energy import NetEnergy
-from ddg_warp.integrate.net_prescribed import NetLoads, NetMotion
+from ddg_warp.integrate.net_prescribed import NetDrag, NetLoads, NetMotion
 from ddg_warp.integrate.prescribed import jump_between
 from ddg_warp.kernels import outcome, step
 from ddg_warp.kernels.net import elements, frames, newton
@@ -32,15 +32,20 @@ class NetStep:
         ):
             if value not in only:
                 raise SceneError(f"{name} = {value!r} is of rods on their own; with a net it is {' or '.join(only)}")
-        bare = np.flatnonzero(((host.mass <= 0.0) & ~host.fixed)[: host.nodes].any(1))
+        bare = ((host.mass <= 0.0) & ~host.fixed)[: host.nodes].any(1)
+        if host.drag:
+            ends, _, coefficients = host.drag
+            bare[ends[:, drag.holds(coefficients)]] = False
+        bare = np.flatnonzero(bare)
         if bare.size:
             raise SceneError(
                 f"{Tangent(model).parts[-1].where(3 * int(bare[0]))} is free and has no mass; "
-                "give the material a density, or the section a mass_per_length"
+                "give the material a density, the section a mass_per_length, or the rod drag along and across"
             )
         preconditioner = net_preconditioner(model.net) if integrator.linear == "auto" else integrator.linear
-        self.newton = NetNewton(model, options, preconditioner, linear)
+        self.newton = NetNewton(model, options, preconditioner, linear, host.drag is not None)
         self.midpoint = integrator.scheme == "implicit_midpoint"
+        self.drag = NetDrag(model, self.midpoint) if host.drag else None
         self._begin, self._finish = newton.step_kernels(real, self.midpoint)
         self._start, self._advance = step.start_kernel(real), step.advance_kernel(real)
         worlds = model.worlds
@@ -62,10 +67,12 @@ class NetStep:
         self.loads = NetLoads(model, self.midpoint)
 
     def prescribe(self, t0: float, t1: float) -> None:
-        """Hand the device what supports and loads do between t0 and t1."""
+        """Hand the device what supports, loads and the flow do between t0 and t1."""
         if self.motion:
             self.motion.upload(t0, t1)
         self.loads.upload(t0, t1)
+        if self.drag:
+            self.drag.upload(t0, t1)
 
     def step(self, before, after) -> None:
         """Launch a whole step from one state to another; only launches, so that it can be captured."""
@@ -88,7 +95,7 @@ class NetStep:
                 before.q,
                 before.v,
                 solver.held,
-                solver.mass,
+                self.drag.moves if self.drag else solver.mass,
                 self.integrator._dt,
                 self.damping,
                 self.newton.outer,
@@ -110,6 +117,8 @@ class NetStep:
         if self.motion:
             self.motion.apply(self.progress, self.portion, solver.q, start.frame)
         self.loads.apply(solver.q, solver.load)
+        if self.drag:
+            self.drag.resist(before, solver, self.progress)
         solver.solve(start)
         if self.energy:
             self.energy.judge(before, start)
@@ -119,6 +128,8 @@ class NetStep:
             [solver.q, before.q, before.v, solver.status, self.progress, solver.rate, blocks],
             [after.q, after.v, self.moved],
         )
+        if self.drag:
+            self.drag.settle(after, solver, self.progress)
         self.net.carry(start, after, kept=before, moved=self.moved)
         if self.motion:
             self.motion.turn(self.progress, self.portion, self.moved, before, after)
@@ -156,6 +167,7 @@ class NetStep:
         kernels = [self._begin, self._finish, self._start, self._advance, *self.newton.kernels]
         kernels += [*(self.motion.kernels if self.motion else []), *self.loads.kernels]
         kernels += self.energy.kernels if self.energy else []
+        kernels += self.drag.kernels if self.drag else []
         kernels += [frames.edge_kernel(real)] if self.net.edges else []
         kernels += [frames.reset_kernel(real)] if self.net.host.spins else []
         for part in self.net.sets:

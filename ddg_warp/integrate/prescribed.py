@@ -3,10 +3,11 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import arguments
+from ddg_warp import arguments, arrays
 from ddg_warp.chains import pose_starts
+from ddg_warp.drag import flow_at
 from ddg_warp.errors import SolverError
-from ddg_warp.kernels import motion, step
+from ddg_warp.kernels import drag, motion, step
 
 
 def poses(model, t0: float, t1: float) -> np.ndarray:
@@ -113,3 +114,47 @@ class TimedLoads:
         out = [load, load_angle]
         wp.launch(reset, self.touched.shape[0], [self.touched, self.base], out, device=self.device)
         wp.launch(add, self.where.shape[0], [self.where, self.values, x], out, device=self.device)
+
+
+class ChainDrag:
+    """Drag on a group of rods, against a fluid that flows."""
+
+    def __init__(self, model, group, midpoint: bool = False):
+        self.model, self.group, self.midpoint = model, group, midpoint
+        self._resist, self._settle = drag.chain_kernels(group.kind, model.types.real)
+        self.settles = midpoint and bool((group.host.mass <= 0.0).any() or (group.host.rotary <= 0.0).any())
+        self.flow = wp.zeros(1, dtype=wp.types.vector(group.kind.dim, model.types.real), device=model.wp_device)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [self._resist, *([self._settle] if self.settles else [])]
+
+    def upload(self, t0: float, t1: float) -> None:
+        """The flow at the time that the scheme balances forces at."""
+        flow = flow_at(self.model.scene, 0.5 * (t0 + t1) if self.midpoint else t1)
+        self.flow.assign((flow[[0, 2]] if self.group.kind.dim == 2 else flow)[None])
+
+    def resist(self, before, newton, progress: wp.array) -> None:
+        """Write inertia and drag of a solve from the state `before`, once its iterate is predicted."""
+        group = self.group
+        self._launch(
+            self._resist,
+            [before.x, before.v, before.theta, newton.x if self.midpoint else before.x, newton.x, group.drag, self.flow]
+            + [group.mass, group.rotary, group.count, newton.coefficient, newton.rate, progress],
+            [newton.mass, newton.rotary, newton.target_angle, newton.load_scale],
+        )
+
+    def settle(self, after, newton, progress: wp.array) -> None:
+        """Rates of what has no inertia in the state `after`."""
+        group = self.group
+        if self.settles:
+            self._launch(
+                self._settle,
+                [newton.x, newton.theta, group.mass, group.rotary, group.count, newton.status, progress, newton.rate]
+                + [after.x, after.theta],
+                [after.v, after.omega],
+            )
+
+    def _launch(self, kernel, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, self.group.node_threads, inputs, outputs, device=self.model.wp_device)

@@ -40,8 +40,8 @@ class AssembledNewton(ChainNewton):
                 self.geometric,
                 self.clamped,
                 group.count,
-                group.mass,
-                group.rotary,
+                self.mass,
+                self.rotary,
                 self.coefficient,
                 group.fixed,
             ]

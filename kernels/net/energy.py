@@ -7,6 +7,7 @@ import warp as wp
 from ddg_warp.kernels.element import CPU_OPTIONS
 from ddg_warp.kernels.energy import DISSIPATED, DRIFT, HELD, ROUNDING, balance_function
 from ddg_warp.kernels.net.elements import functions
+from ddg_warp.kernels.net.system import mass_type
 from ddg_warp.kernels.terms import Term
 
 
@@ -61,16 +62,16 @@ def element_kernel(term: Term, real, linear):
 
 
 @cache
-def block_kernel(real):
-    """Rows of the blocks of a net: work of loads that follow, kinetic energy at the end of the step, what damping takes in."""
-    V = wp.types.vector(3, real)
+def block_kernel(real, drag: bool = False):
+    """Rows of the blocks of a net: work of loads that follow, kinetic energy at the end of the step, what damping and drag take in."""
+    V, Mass = wp.types.vector(3, real), mass_type(real, drag)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def measure(
         q0: wp.array(dtype=V),
         v0: wp.array(dtype=V),
         q: wp.array(dtype=V),
-        mass: wp.array(dtype=V),
+        mass: Mass,
         rate: wp.array(dtype=real),
         damping: wp.array(dtype=real),
         load: wp.array(dtype=V),
@@ -91,9 +92,15 @@ def block_kernel(real):
         worlds = progress.shape[0]
         rows_out[wp.static(DRIFT) * worlds + w, k] = real(2.0) * wp.dot(load_there[i] - load[i], moved)
         rows_out[wp.static(ROUNDING) * worlds + w, k] = real(2.0) * floor * wp.abs(wp.dot(load[i], moved))
-        rows_out[wp.static(HELD) * worlds + w, k] = real(0.5) * wp.dot(wp.cw_mul(mass[k], v), v)
-        rows_out[wp.static(DISSIPATED) * worlds + w, k] = (
-            real(2.0) * damping[0] * rate[w] * wp.dot(wp.cw_mul(mass[k], moved), moved)
-        )
+        if wp.static(drag):
+            m = mass[w, k].mass
+        else:
+            m = mass[k]
+        damped = damping[0] * rate[w] * wp.dot(wp.cw_mul(m, moved), moved)
+        if wp.static(drag):
+            away = q[i] - mass[w, k].carried
+            damped += wp.dot(away, mass[w, k].resistance * away)
+        rows_out[wp.static(HELD) * worlds + w, k] = real(0.5) * wp.dot(wp.cw_mul(m, v), v)
+        rows_out[wp.static(DISSIPATED) * worlds + w, k] = real(2.0) * damped
 
     return measure

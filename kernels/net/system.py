@@ -9,6 +9,7 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.drag import block_inertia
 from ddg_warp.kernels.element import CPU_OPTIONS
 from ddg_warp.kernels.terms import Term
 
@@ -16,16 +17,22 @@ SLICE = 32  # rows of a slice of H
 
 
 @cache
-def balance_kernels(real, linear):
-    """outer(...): loads and inertia at every block; collect(...): forces of a set; settle(...): residual, and whether it balances."""
-    V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
+def mass_type(real, drag: bool):
+    """Masses of the dofs of blocks, of all worlds; with drag, inertia and drag (worlds, blocks)."""
+    return wp.array2d(dtype=block_inertia(real)) if drag else wp.array(dtype=wp.types.vector(3, real))
+
+
+@cache
+def balance_kernels(real, linear, drag: bool = False):
+    """outer(...): loads, inertia and drag at every block; collect(...): forces of a set; settle(...): residual, and whether it balances."""
+    V, H, Mass = wp.types.vector(3, real), wp.types.vector(3, linear), mass_type(real, drag)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def outer(
         q: wp.array(dtype=V),
         base: wp.array(dtype=V),
         target: wp.array(dtype=V),
-        mass: wp.array(dtype=V),
+        mass: Mass,
         gravity: wp.array(dtype=V),
         load: wp.array(dtype=V),
         coefficient: wp.array(dtype=real),
@@ -45,7 +52,10 @@ def balance_kernels(real, linear):
             return
         k = i - w * blocks
         f = load[i]
-        m = mass[k]
+        if wp.static(drag):
+            m = mass[w, k].mass
+        else:
+            m = mass[k]
         if k < nodes:
             f += wp.cw_mul(m, gravity[0])
         c = coefficient[w]
@@ -53,9 +63,16 @@ def balance_kernels(real, linear):
         inertia = wp.cw_mul(m, away) * c
         u = q[i] - base[i]
         work = wp.dot(u, inertia - wp.cw_mul(m, u) * (real(0.5) * c) - f)
+        if wp.static(drag):
+            resistance = mass[w, k].resistance
+            held_back = resistance * (q[i] - mass[w, k].carried)
+            inertia += held_back
+            work += wp.dot(u, held_back - resistance * u * real(0.5))
         force_out[i] = f - inertia
         size_out[i] = wp.max(wp.abs(f))
         stiffness_out[i] = linear(c * wp.max(m))
+        if wp.static(drag):
+            stiffness_out[i] = linear(c * wp.max(m) + wp.max(wp.get_diag(mass[w, k].resistance)))
         change_out[w, k] = work
         noise_out[w, k] = wp.abs(work)
 
@@ -245,9 +262,9 @@ SETS = 6  # sets that one launch sums
 
 
 @cache
-def assemble_kernel(terms: tuple[Term, ...], real, linear, begins: bool):
-    """H of up to `SETS` sets, a thread a position, with inertia where it `begins`; else it adds to what is there."""
-    V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), linear)
+def assemble_kernel(terms: tuple[Term, ...], real, linear, begins: bool, drag: bool = False):
+    """H of up to `SETS` sets, a thread a position, with inertia and drag where it `begins`; else it adds to what is there."""
+    M, Mass = wp.types.matrix((3, 3), linear), mass_type(real, drag)
     Contributions = contributions(linear)
     sums = tuple(sum_function(term, linear) for term in terms)
     count = len(terms)
@@ -255,7 +272,7 @@ def assemble_kernel(terms: tuple[Term, ...], real, linear, begins: bool):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def assemble(
-        mass: wp.array(dtype=V),
+        mass: Mass,
         coefficient: wp.array(dtype=real),
         rows: wp.array(dtype=int),
         columns: wp.array(dtype=int),
@@ -280,9 +297,17 @@ def assemble_kernel(terms: tuple[Term, ...], real, linear, begins: bool):
         m = M()
         if wp.static(begins):
             if row == columns[at]:
-                inertia = mass[row] * coefficient[w]
+                if wp.static(drag):
+                    inertia = mass[w, row].mass * coefficient[w]
+                else:
+                    inertia = mass[row] * coefficient[w]
                 for d in range(3):
                     m[d, d] = linear(inertia[d])
+                if wp.static(drag):
+                    resistance = mass[w, row].resistance
+                    for i in range(3):
+                        for j in range(3):
+                            m[i, j] = m[i, j] + linear(resistance[i, j])
         else:
             for i in range(3):
                 for j in range(3):

@@ -1,0 +1,264 @@
+"""Drag by resistive force theory: on every piece of a rod, per length, by its own velocity v against the fluid,
+
+    f = -(zeta_t t t^T + zeta_n (I - t t^T)) v ,
+
+and a moment -zeta_r times the spin about its tangent t. Coefficients are constants (Gray and Hancock, J. Exp. Biol. 32, 1955), or
+depend on v as in granular media, where forces depend on the direction of v, not on its size: with the angle psi between v and t,
+
+    f_n = C_S sin(beta) ,  f_t = C_F cos(psi) + C_L (1 - sin(beta)) ,  tan(beta) = sin(psi) / tan(gamma)
+
+(Maladen, Ding, Li and Goldman, Science 325, 2009, 314; J. R. Soc. Interface 8, 2011, 1332), where |v| counts as sqrt(v^2 + v0^2).
+
+Within a time step tangents and coefficients are constant, so that drag has a potential: a node with the resistance D, the sum of the
+halves of its edges, which the fluid alone would carry to a = x_n + s u in a solve of length s, adds (x - a) . D (x - a) / 2 s to the
+energy. It goes where inertia goes. Angles have the same mass-like quadratic: drag and rotary inertia make one, about a mean target.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels import outcome
+from ddg_warp.kernels.balance import node_functions
+from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, inertia_type, until_function
+
+TANGENTIAL, NORMAL, ROTATIONAL, LATERAL, FRICTION, LEADING, SLOPE, SPEED = range(8)  # rows of coefficients; SLOPE is tan(gamma)
+ROWS = 8
+
+
+@cache
+def edge_function(dim: int, real):
+    """half(e, v, p): resistance [N s/m] of half an edge, with coefficients p, that moves at v against the fluid."""
+    V, M, P = wp.types.vector(dim, real), wp.types.matrix((dim, dim), real), wp.types.vector(ROWS, real)
+
+    @wp.func
+    def half(e: V, v: V, p: P):
+        length = wp.length(e)
+        t = wp.normalize(e)
+        tangential = p[wp.static(TANGENTIAL)]
+        normal = p[wp.static(NORMAL)]
+        least = p[wp.static(SPEED)]
+        if least > real(0.0):  # granular
+            along = wp.dot(v, t)
+            speed = wp.sqrt(wp.length_sq(v) + least * least)
+            slope = p[wp.static(SLOPE)]
+            sine = wp.length(v - t * along) / speed
+            root = wp.sqrt(slope * slope + sine * sine)
+            ahead = (real(1.0) - sine / root) / wp.sqrt(along * along + least * least)
+            normal += p[wp.static(LATERAL)] / (root * speed)
+            tangential += wp.max(real(0.0), p[wp.static(FRICTION)] / speed + p[wp.static(LEADING)] * ahead)
+        one = wp.identity(n=wp.static(dim), dtype=real)
+        return (one * normal + wp.outer(t, t) * (tangential - normal)) * (real(0.5) * length)
+
+    return half
+
+
+@cache
+def chain_kernels(kind: ChainKind, real):
+    """resist(...): inertia and drag of every node at the start of a solve; settle(...): rates of what has no inertia after it."""
+    dim, twist, closed = kind.dim, kind.twist, kind.closed
+    V, M, P = wp.types.vector(dim, real), wp.types.matrix((dim, dim), real), wp.types.vector(ROWS, real)
+    Inertia = inertia_type(kind, real)
+    half = edge_function(dim, real)
+    _, behind, _ = node_functions(kind, real)
+    along, *_ = gather_functions(kind, real)
+    until = until_function(kind)
+
+    @wp.func
+    def of_edge(
+        x: wp.array2d(dtype=V),
+        v: wp.array2d(dtype=V),
+        coefficients: wp.array3d(dtype=real),
+        flow: V,
+        k: int,
+        n: int,
+        r: int,
+    ):
+        p = P()
+        for i in range(wp.static(ROWS)):
+            p[i] = coefficients[i, k, r]
+        end = along(k + 1, n)
+        return half(x[end, r] - x[k, r], (v[k, r] + v[end, r]) * real(0.5) - flow, p)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def resist(
+        x0: wp.array2d(dtype=V),
+        v0: wp.array2d(dtype=V),
+        theta0: wp.array2d(dtype=real),
+        tangents: wp.array2d(dtype=V),
+        x: wp.array2d(dtype=V),
+        coefficients: wp.array3d(dtype=real),
+        flow: wp.array(dtype=V),
+        mass: wp.array2d(dtype=real),
+        rotary: wp.array2d(dtype=real),
+        count: wp.array(dtype=int),
+        coefficient: wp.array(dtype=real),
+        rate: wp.array(dtype=real),
+        progress: wp.array(dtype=real),
+        inertia_out: wp.array2d(dtype=Inertia),
+        rotary_out: wp.array2d(dtype=real),
+        target_angle: wp.array2d(dtype=real),
+        load_scale: wp.array(dtype=real),
+    ):
+        """Edges of `tangents` say which way the rod runs. Raises the load scale to the drag on a rod that moves as its fastest node."""
+        start, r = wp.tid()
+        n = count[r]
+        if progress[r] >= real(1.0) or start >= n:
+            return
+        s = real(1.0) / rate[r]
+        u = flow[0]
+        for k in range(start, until(start, n)):
+            D = M()
+            b = behind(k, n)
+            if wp.static(closed) or k < n - 1:
+                D += of_edge(tangents, v0, coefficients, u, k, n, r)
+            if b >= 0:
+                D += of_edge(tangents, v0, coefficients, u, b, n, r)
+            node = Inertia()
+            node.mass = mass[k, r]
+            node.resistance = D * rate[r]
+            node.carried = x0[k, r] + u * s
+            moved = wp.length(x[k, r] - x0[k, r]) + wp.length(u) * s
+            wp.atomic_max(load_scale, r, real(n) * moved * wp.max(wp.get_diag(node.resistance)))
+            if wp.static(twist):
+                spin = real(0.0)
+                if wp.static(closed) or k < n - 1:
+                    end = along(k + 1, n)
+                    length = wp.length(tangents[end, r] - tangents[k, r])
+                    spin = coefficients[wp.static(ROTATIONAL), k, r] * length * rate[r]
+                node.spin = spin
+                share = spin / coefficient[r]
+                both = rotary[k, r] + share
+                rotary_out[k, r] = both
+                if share > real(0.0):
+                    target = target_angle[k, r]
+                    target_angle[k, r] = target + (theta0[k, r] - target) * (share / both)
+            inertia_out[k, r] = node
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def settle(
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        mass: wp.array2d(dtype=real),
+        rotary: wp.array2d(dtype=real),
+        count: wp.array(dtype=int),
+        status: wp.array(dtype=int),
+        progress: wp.array(dtype=real),
+        rate: wp.array(dtype=real),
+        x_end: wp.array2d(dtype=V),
+        theta_end: wp.array2d(dtype=real),
+        v_out: wp.array2d(dtype=V),
+        omega_out: wp.array2d(dtype=real),
+    ):
+        """Rates of what has no inertia are means over the step of the midpoint rule, which would keep them swinging about these."""
+        start, r = wp.tid()
+        n = count[r]
+        if start >= n or progress[r] >= real(1.0) or status[r] > wp.static(outcome.CONVERGED_TO_ROUNDING):
+            return
+        for k in range(start, until(start, n)):
+            if mass[k, r] <= real(0.0):
+                v_out[k, r] = (x_end[k, r] - x[k, r]) * rate[r]
+            if wp.static(twist):
+                if rotary[k, r] <= real(0.0):
+                    omega_out[k, r] = (theta_end[k, r] - theta[k, r]) * rate[r]
+
+    return resist, settle
+
+
+@cache
+def block_inertia(real):
+    """Inertia and drag of a block of a net over a solve: `ddg_warp.kernels.element.inertia_type` with a mass for each of three dofs."""
+    V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
+
+    @wp.struct
+    class BlockInertia:
+        mass: V
+        resistance: M
+        carried: V
+
+    return BlockInertia
+
+
+@cache
+def net_kernels(real):
+    """The same of the blocks of a net."""
+    V, M, P = wp.types.vector(3, real), wp.types.matrix((3, 3), real), wp.types.vector(ROWS, real)
+    Inertia = block_inertia(real)
+    half = edge_function(3, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def resist(
+        q0: wp.array(dtype=V),
+        v0: wp.array(dtype=V),
+        tangents: wp.array(dtype=V),
+        q: wp.array(dtype=V),
+        mass: wp.array(dtype=V),
+        ends: wp.array2d(dtype=int),
+        coefficients: wp.array2d(dtype=real),
+        starts: wp.array(dtype=int),
+        items: wp.array(dtype=int),
+        flow: wp.array(dtype=V),
+        rate: wp.array(dtype=real),
+        progress: wp.array(dtype=real),
+        outer: wp.array(dtype=real),
+        blocks: int,
+        nodes: int,
+        inertia_out: wp.array2d(dtype=Inertia),
+        load_scale: wp.array(dtype=real),
+    ):
+        """Items of a block are edges that meet there, or the one whose angle it is. Where loads give no scale, drag does."""
+        i = wp.tid()
+        w = i / blocks
+        if progress[w] >= real(1.0):
+            return
+        k = i - w * blocks
+        D = M()
+        u = V()
+        if k < nodes:
+            u = flow[0]
+        for at in range(starts[k], starts[k + 1]):
+            edge = items[at]
+            a = ends[edge, 0] + w * blocks
+            b = ends[edge, 1] + w * blocks
+            e = tangents[b] - tangents[a]
+            if k < nodes:
+                p = P()
+                for c in range(wp.static(ROWS)):
+                    p[c] = coefficients[c, edge]
+                D += half(e, (v0[a] + v0[b]) * real(0.5) - u, p)
+            else:
+                D[0, 0] = coefficients[wp.static(ROTATIONAL), edge] * wp.length(e)
+        block = Inertia()
+        block.mass = mass[k]
+        block.resistance = D * rate[w]
+        block.carried = q0[i] + u / rate[w]
+        inertia_out[w, k] = block
+        if k < nodes and outer[w] == real(0.0):
+            moved = wp.length(q[i] - q0[i]) + wp.length(u) / rate[w]
+            wp.atomic_max(load_scale, w, real(nodes) * moved * wp.max(wp.get_diag(block.resistance)))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def settle(
+        q: wp.array(dtype=V),
+        inertia: wp.array2d(dtype=Inertia),
+        status: wp.array(dtype=int),
+        progress: wp.array(dtype=real),
+        rate: wp.array(dtype=real),
+        blocks: int,
+        q_end: wp.array(dtype=V),
+        v_out: wp.array(dtype=V),
+    ):
+        """As of chains, of dofs that feel drag."""
+        i = wp.tid()
+        w = i / blocks
+        if progress[w] >= real(1.0) or status[w] > wp.static(outcome.CONVERGED_TO_ROUNDING):
+            return
+        block = inertia[w, i - w * blocks]
+        v = v_out[i]
+        mean = (q_end[i] - q[i]) * rate[w]
+        for d in range(3):
+            if block.mass[d] <= real(0.0) and block.resistance[d, d] > real(0.0):
+                v[d] = mean[d]
+        v_out[i] = v
+
+    return resist, settle
