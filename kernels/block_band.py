@@ -172,15 +172,14 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
         if b >= 0:
             D += edge_block(F, b, r)
         if wp.static(drag):
-            m = mass[k, r].mass
             resistance = mass[k, r].resistance
             for d in range(wp.static(dim)):
+                D[d, d] = D[d, d] + linear(c * mass[k, r].mass)
                 for i in range(wp.static(dim)):
                     D[d, i] = D[d, i] + linear(resistance[d, i])
         else:
-            m = mass[k, r]
-        for d in range(wp.static(dim)):
-            D[d, d] = D[d, d] + linear(c * m)
+            for d in range(wp.static(dim)):
+                D[d, d] = D[d, d] + linear(c * mass[k, r])
         if wp.static(twist):
             D[wp.static(nb - 1), wp.static(nb - 1)] = D[wp.static(nb - 1), wp.static(nb - 1)] + linear(c * rotary[k, r])
         D = wp.cw_mul(D, wp.outer(free, free)) + wp.diag(H(linear(1.0)) - free)
