@@ -96,11 +96,11 @@ def block_kernel(real, drag: bool = False):
             m = mass[w, k].mass
         else:
             m = mass[k]
-        damped = damping[0] * rate[w] * wp.dot(wp.cw_mul(m, moved), moved)
+        rows_out[wp.static(HELD) * worlds + w, k] = real(0.5) * wp.dot(wp.cw_mul(m, v), v)
+        damped = real(2.0) * damping[0] * rate[w] * wp.dot(wp.cw_mul(m, moved), moved)
         if wp.static(drag):
             away = q[i] - mass[w, k].carried
-            damped += wp.dot(away, mass[w, k].resistance * away)
-        rows_out[wp.static(HELD) * worlds + w, k] = real(0.5) * wp.dot(wp.cw_mul(m, v), v)
-        rows_out[wp.static(DISSIPATED) * worlds + w, k] = real(2.0) * damped
+            damped += real(2.0) * wp.dot(away, mass[w, k].resistance * away)
+        rows_out[wp.static(DISSIPATED) * worlds + w, k] = damped
 
     return measure
