@@ -15,6 +15,7 @@ if TYPE_CHECKING:  # what editors and type checkers read; at run time see `_HOME
     from ddg_warp import inquiry, io, meshes, rest_shapes, stability
     from ddg_warp.check import Check
     from ddg_warp.descriptions import Dynamics, Law, Statics, Trace
+    from ddg_warp.drag import Granular, Viscous
     from ddg_warp.errors import SceneError, SceneWarning, SolverError
     from ddg_warp.integrate import continuation, statics
     from ddg_warp.integrate.dynamics import Integrator
@@ -33,6 +34,7 @@ __all__ = [
     "Displacement",
     "Dynamics",
     "Ellipse",
+    "Granular",
     "Integrator",
     "Law",
     "Material",
@@ -50,6 +52,7 @@ __all__ = [
     "Stiffness",
     "Stop",
     "Trace",
+    "Viscous",
     "continuation",
     "inquiry",
     "io",
@@ -65,6 +68,7 @@ _HOME = {
     "Displacement": "integrate.path",
     "Dynamics": "descriptions",
     "Ellipse": "material",
+    "Granular": "drag",
     "Integrator": "integrate.dynamics",
     "Law": "descriptions",
     "Material": "material",
@@ -82,6 +86,7 @@ _HOME = {
     "Stiffness": "material",
     "Stop": "integrate.path",
     "Trace": "descriptions",
+    "Viscous": "drag",
 }
 _MODULES = {"continuation": "integrate.continuation", "statics": "integrate.statics"}
 

@@ -6,6 +6,8 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays, end_moments
+from ddg_warp.integrate.net_prescribed import NetDrag
+from ddg_warp.integrate.prescribed import ChainDrag
 from ddg_warp.kernels.terms import AXISYMMETRIC, SHELLS
 from ddg_warp.tangent import Tangent
 from ddg_warp.threads import launches
@@ -92,6 +94,55 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
             worlds.append((total, moment, about))
         result.append(Reaction(*(_each_world(np.array(values)) for values in zip(*worlds, strict=True))))
     return result
+
+
+@dataclass(frozen=True)
+class Drag:
+    """What the fluid exerts on rods; see `kernels.drag`.
+
+    Attributes:
+        force: on points (P, 3) [N], in the order of `State.points`; where rods share a node, each has an equal part.
+        moment: about edges (edges,) [N m], in the order of `State.angles`; None if no rod has twist.
+        power: of both on the rods [W]; in a fluid at rest negative, what it takes out of them.
+
+    All with an axis (worlds, ...) in front of several worlds.
+    """
+
+    force: np.ndarray
+    moment: np.ndarray | None
+    power: float | np.ndarray
+
+
+@launches
+def drag(model, state) -> Drag:
+    """Drag at a state, by its velocities and the flow at its time: zero at rest in a fluid at rest.
+
+    Rods without mass move as in the last step; a first state has the velocities that it is given.
+    """
+    forces, moments, power, blocks, turns = [], [], np.zeros(model.worlds), None, None
+    for group, data in zip(model.groups, state.groups, strict=True):
+        v, omega = (arrays.download(array).astype(float) for array in (data.v, data.omega))
+        force, moment = np.zeros_like(v), np.zeros_like(omega)
+        if group.kind.drag:
+            inertia, u = ChainDrag(model, group).at(data, state.time)
+            force = np.einsum("krij,krj->kri", inertia["resistance"], u - v)
+            moment = -inertia["spin"] * omega if group.kind.twist else moment
+        work = (force * v).sum((0, 2)) + (moment * omega).sum(0)
+        power += work.reshape(group.worlds, group.rods).sum(1)
+        forces.append(force)
+        moments.append(moment)
+    if model.net is not None:
+        v = state.net.v.numpy().astype(float).reshape(model.worlds, -1, 3)
+        force = np.zeros_like(v)
+        if model.net.host.drag:
+            inertia, u = NetDrag(model).at(state.net, state.time)
+            force = np.einsum("wkij,wkj->wki", inertia["resistance"], u - v)
+        power += (force * v).sum((1, 2))
+        rows, places = model.net_rows
+        turns = force[:, model.net.angle_start :, 0]
+        blocks = force / np.maximum(1, np.bincount(places, minlength=force.shape[1]))[:, None]
+    force, moment = model.gather_nodes(forces, blocks), model.gather_edges(moments, turns)
+    return Drag(force, moment, power if model.worlds > 1 else float(power[0]))
 
 
 def _each_world(values: np.ndarray) -> np.ndarray:

@@ -158,6 +158,13 @@ class Model:
         validate.check_state("reactions", self, state)
         return reactions(self, state, **options)
 
+    def drag(self, state: State):
+        """Forces and power of the drag on rods, an `inquiry.Drag`; see `ddg_warp.inquiry.drag`."""
+        from ddg_warp.inquiry import drag
+
+        validate.check_state("drag", self, state)
+        return drag(self, state)
+
     def stresses(self, state: State) -> dict:
         """Axial forces and moments along the rods; see `ddg_warp.inquiry.stresses`."""
         from ddg_warp.inquiry import stresses
@@ -415,12 +422,12 @@ class Model:
         )
 
     def gather_nodes(self, values: list[np.ndarray], blocks: wp.array | None = None) -> np.ndarray:
-        """From arrays (node, column, dim) of every group and blocks of the net to the user's order, in three dimensions."""
+        """From arrays (node, column, dim) of every group and blocks of the net (worlds N, 3) to the user's order, in three dimensions."""
         start = np.concatenate([[0], np.cumsum(self.curves.counts)])
         out = np.zeros((self.worlds, self.points_count, 3))
         if blocks is not None:
             rows, places = self.net_rows
-            out[:, rows] = blocks.numpy().reshape(self.worlds, -1, 3)[:, places]
+            out[:, rows] = np.asarray(blocks.numpy() if isinstance(blocks, wp.array) else blocks).reshape(self.worlds, -1, 3)[:, places]
         for group, value in zip(self.groups, values, strict=True):
             axes = [0, 2] if group.kind.dim == 2 else [0, 1, 2]
             k, column, index = _user_index(group, group.host.own, start)
@@ -433,9 +440,9 @@ class Model:
         net = None
         if self.net is not None and self.net.edges:
             net = state.net.q.numpy().reshape(self.worlds, -1, 3)[:, self.net.angle_start :, 0]
-        return self._gather_edges([arrays.download(data.theta) for data in state.groups], net)
+        return self.gather_edges([arrays.download(data.theta) for data in state.groups], net)
 
-    def _gather_edges(self, values: list[np.ndarray], net: np.ndarray | None = None, width: int = 0):
+    def gather_edges(self, values: list[np.ndarray], net: np.ndarray | None = None, width: int = 0):
         """From arrays (node, column) of every group and values of the net's rod edges (worlds, edges) to the user's order."""
         if not any(group.kind.twist for group in self.groups) and net is None:
             return None
@@ -468,7 +475,7 @@ class Model:
             frame, theta = arrays.download(data.frame), arrays.download(data.theta)
             u, t = np.moveaxis(frame[0:3], 0, -1), np.moveaxis(frame[3:6], 0, -1)
             values.append(geometry.material_directors(u, t, theta))
-        return self._gather_edges(values, net, 3)
+        return self.gather_edges(values, net, 3)
 
 
 def _device(name):

@@ -1,5 +1,7 @@
 """What is prescribed of a net from outside: motion of supports, and loads that change or follow what they act on."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import warp as wp
 
@@ -189,6 +191,17 @@ class NetDrag:
             + [self.net.blocks, self.net.host.nodes],
             [solver.mass, solver.load_scale],
         )
+
+    def at(self, state, t: float) -> tuple[np.ndarray, np.ndarray]:
+        """Inertia and drag (world, block) of a net's state at t, with the resistance over a second, and the flow (blocks, 3)."""
+        net, device = self.net, self.model.wp_device
+        one, free = wp.full(net.worlds, 1.0, dtype=net.real, device=device), wp.zeros_like(net.still)
+        mass = wp.zeros((net.worlds, net.blocks), dtype=drag.block_inertia(net.real), device=device)
+        self.upload(t, t)
+        self.resist(state, SimpleNamespace(q=state.q, rate=one, outer=one, mass=mass, load_scale=free), net.still)
+        flow = np.zeros((net.blocks, 3))
+        flow[: net.host.nodes] = self.flow.numpy()[0]
+        return mass.numpy(), flow
 
     def settle(self, after, solver, progress: wp.array) -> None:
         """Rates of what has no inertia in the state `after`."""

@@ -1,5 +1,7 @@
 """What is prescribed from outside: motion of supports, and loads that change."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import warp as wp
 
@@ -7,7 +9,7 @@ from ddg_warp import arguments, arrays
 from ddg_warp.chains import pose_starts
 from ddg_warp.drag import flow_at
 from ddg_warp.errors import SolverError
-from ddg_warp.kernels import drag, motion, step
+from ddg_warp.kernels import drag, element, motion, step
 
 
 def poses(model, t0: float, t1: float) -> np.ndarray:
@@ -144,6 +146,17 @@ class ChainDrag:
             + [group.mass, group.rotary, group.count, newton.coefficient, newton.rate, progress],
             [newton.mass, newton.rotary, newton.target_angle, newton.load_scale],
         )
+
+    def at(self, data, t: float) -> tuple[np.ndarray, np.ndarray]:
+        """Inertia and drag (node, column) of a group's state at t, with the resistance over a second, and the flow (dim,)."""
+        group, real, device = self.group, self.model.types.real, self.model.wp_device
+        one, free = wp.full(group.columns, 1.0, dtype=real, device=device), wp.zeros_like(group.still)
+        solve = SimpleNamespace(x=data.x, coefficient=one, rate=one, load_scale=free)
+        solve.mass = arrays.allocate((group.nodes, group.columns), element.inertia_type(group.kind, real), device)
+        solve.rotary, solve.target_angle = wp.zeros_like(data.theta), wp.clone(data.theta)
+        self.upload(t, t)
+        self.resist(data, solve, group.still)
+        return arrays.download(solve.mass), self.flow.numpy()[0].astype(float)
 
     def settle(self, after, newton, progress: wp.array) -> None:
         """Rates of what has no inertia in the state `after`."""
