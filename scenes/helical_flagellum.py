@@ -31,10 +31,10 @@ def build(
     theory: str = "gray_hancock",
     swims: bool = False,
     n: int = 40,
-    turns: int = 4,
+    turns: int = 2,
     dt: float = 0.02,
     duration: float = 0.4,
-    stiffness: float = 1e7,
+    stiffness: float = 1e5,
 ) -> ddg.Scene:
     """The helix about z, without inertia, turned at its first end.
 
@@ -49,16 +49,24 @@ def build(
     """
     if theory not in LAWS:
         raise ValueError(f"theory {theory!r}: take one of {', '.join(LAWS)}")
-    analysis = ddg.Dynamics(dt=dt, duration=duration, scheme="implicit_midpoint")
-    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), analysis=analysis)
+    analysis = ddg.Dynamics(dt=dt, duration=duration)
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), analysis=analysis, initial=turning)
     angle = 2.0 * np.pi * np.arange(n * turns + 1) / n
     points = np.stack([RADIUS * np.cos(angle), RADIUS * np.sin(angle), PITCH * angle / (2.0 * np.pi)], -1)
-    section = ddg.Stiffness(EA=100.0 * stiffness, EI1=stiffness, GJ=stiffness, radius=THICKNESS)
+    section = ddg.Stiffness(EA=10.0 * stiffness, EI1=stiffness, GJ=stiffness, radius=THICKNESS)
     rod = scene.add_rod(points, section=section, name=f"{theory}, {'swims' if swims else 'held'}")
     motor = ddg.Motion(angle=lambda t: RATE * t, axis=(0.0, 0.0, 1.0))
     scene.clamp_end(rod, "first", motion=motor, components="xy" if swims else "xyz")
     scene.drag(rod, LAWS[theory])
     return scene
+
+
+def turning(model):
+    """The state at rest, turning at once as a rigid body."""
+    points = model.scene.batches[0].points[0]
+    edges = np.diff(points, axis=0)
+    axis = np.array([0.0, 0.0, RATE])
+    return model.state(velocities=np.cross(axis, points), spins=edges @ axis / np.linalg.norm(edges, axis=1))
 
 
 def grand_resistance(theory: str, turns: float) -> tuple[float, float, float]:
@@ -94,7 +102,8 @@ def check(result) -> list[ddg.Check]:
     edges = 2.0 * np.pi / (np.unwrap(np.arctan2(points[:, 1], points[:, 0]))[1])
     A, B, D = grand_resistance(theory, (len(points) - 1) / edges)
     U = -B / A * RATE if how == "swims" else 0.0
-    tolerance = 8.0 / edges**2 + 0.5 * (RATE * result.dt) ** 2 + 5e-4
+    bent = 60.0 / result.scene.batches[0].section.EI1  # how far the helix is from being rigid
+    tolerance = 8.0 / edges**2 + 0.5 * (RATE * result.dt) ** 2 + bent
     found = {name: values[-1] for name, values in result.series.items()}
     checks = {"torque [N m]": (found["torque"], -(B * U + D * RATE))}
     if how == "swims":
