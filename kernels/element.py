@@ -115,16 +115,19 @@ class ChainKind:
         return result
 
 
-@cache
 def inertia_type(kind: ChainKind, real):
-    """What a node has of inertia: its mass [kg]; with drag, a structure.
+    """What a node has of inertia: its mass [kg]; with drag, a `drag_structure`."""
+    return drag_structure(kind.dim, real) if kind.drag else real
 
-    Beside the mass: resistance over a solve of length s, D / s [N/m], where the fluid alone would carry the node, and the resistance to
-    the spin of the edge that starts there, over s [N m].
+
+@cache
+def drag_structure(dim: int, real):
+    """Mass of a node, and its drag over a solve of length s; one for all kinds, whose kernels Warp shares where they are alike.
+
+    That is its resistance D / s [N/m], where the fluid alone would carry it, and the resistance to the spin of the edge that starts
+    there, over s [N m].
     """
-    V, M = wp.types.vector(kind.dim, real), wp.types.matrix((kind.dim, kind.dim), real)
-    if not kind.drag:
-        return real
+    V, M = wp.types.vector(dim, real), wp.types.matrix((dim, dim), real)
 
     @wp.struct
     class NodeInertia:
