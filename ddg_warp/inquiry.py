@@ -101,7 +101,7 @@ class Drag:
     """What the fluid exerts on rods; see `kernels.drag`.
 
     Attributes:
-        force: on points (P, 3) [N], in the order of `State.points`; where rods share a node, each has an equal part.
+        force: on points (P, 3) [N], in the order of `State.points`; rows that share a node have equal parts.
         moment: about edges (edges,) [N m], in the order of `State.angles`; None if no rod has twist.
         power: of both on the rods [W]; in a fluid at rest negative, what it takes out of them.
 

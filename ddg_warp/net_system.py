@@ -95,7 +95,7 @@ class Assembly:
         for first in range(0, len(net.sets), system.SETS):
             sets = net.sets[first : first + system.SETS]
             terms = tuple(part.term for part in sets)
-            self.kernels.append(system.assemble_kernel(terms, real, linear, first == 0, drag and first == 0))
+            self.kernels.append(system.assemble_kernel(terms, real, linear, first == 0, drag))
             own = []
             for i in range(first, first + len(sets)):
                 data = Contributions()

@@ -306,6 +306,21 @@ def strain_rate_damping(kind, variant):
     assert (kept[1] < 0.9 * kept[0]).all()
 
 
+def drag(kind, variant):
+    """A fluid takes power from rods that move, in every world as they move there, and holds their fall back."""
+    scene, added = kind.scene(gravity=(0.0, 0.0, -1.0))
+    scene.drag(added.rods or None, tangential=1.0, normal=2.0, rotational=1e-4)
+    model = variant.build(scene)
+    speed, factors = np.zeros((variant.worlds, model.points_count, 3)), 1.0 + np.arange(variant.worlds)
+    speed[:, :, 2] = factors[:, None]
+    found = model.drag(model.state(velocities=speed if variant.worlds > 1 else speed[0]))
+    power = variant.each(found.power)
+    assert (power < 0.0).all()
+    close(power, power[0] * factors**2, rtol=1e-6)
+    close(variant.each(found.force)[..., 2].sum(1), power / factors, rtol=1e-6)
+    _steps(model, 2)
+
+
 # Analyses.
 
 
@@ -436,7 +451,7 @@ QUESTIONS = {
     for function in (
         *(energies, reactions, stresses, total_twist, fields, report),
         *(parameters, set_parameter, set_rest),
-        *(motion, turned_clamp, load, couple, pressure, mass_damping, strain_rate_damping),
+        *(motion, turned_clamp, load, couple, pressure, mass_damping, strain_rate_damping, drag),
         *(implicit_euler, implicit_midpoint, equilibrium, spectrum, continuation),
         *(record, export, failure),
     )

@@ -42,6 +42,10 @@ REFUSED = {
     },
     "pressure": dict.fromkeys((*RODS, *JOINED, "rods alone and joined"), ("shell 0", "does not exist")),
     "couple": dict.fromkeys((*SHELLS, "shell of revolution", "shells of both kinds"), ("rod 0", "does not exist")),
+    "drag": {
+        **dict.fromkeys((*SHELLS, "shells of both kinds"), ("shell 0", "name the rods")),
+        "shell of revolution": ("shell of revolution 0", "name the rods"),
+    },
     "continuation": {"rod without bending": ("singular_start", "hold what can move without any stiffness")},
 }
 for _question in (

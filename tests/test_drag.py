@@ -1,0 +1,313 @@
+"""Drag by resistive force theory, f = -(zeta_t t t^T + zeta_n (I - t t^T)) (v - u) per length, against closed forms."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp.integrate import statics
+from ddg_warp.scenes import flagellum, helical_flagellum
+from ddg_warp.simulate import simulate
+from ddg_warp.stability import spectrum
+
+sys.path.append(str(Path(__file__).parent / "contracts"))
+
+from objects import OBJECTS
+
+ALONE = ("rod", "rod clamped at its end", "planar rod", "rod without twist", "rod without bending", "closed rod")
+JOINED = ("rods joined rigidly", "rods joined by a hinge", "planar rods joined rigidly")
+MANY = [*ALONE, *JOINED, "rods alone and joined"]
+DAILY = ("planar rod", "rods joined by a hinge")
+EVERY = [pytest.param(name, marks=() if name in DAILY else pytest.mark.slow) for name in MANY]
+SCHEMES = ("implicit_euler", "implicit_midpoint")
+TANGENTIAL, NORMAL, ROTATIONAL = 0.7, 1.9, 3e-3
+
+
+def fluid(name: str, device, worlds: int = 1, law=None, held: bool = False, **options):
+    """A kind of rods in a fluid, without gravity unless told otherwise."""
+    scene, added = OBJECTS[name].scene(held=held, **({"gravity": (0.0, 0.0, 0.0)} | options))
+    if law is None:
+        scene.drag(tangential=TANGENTIAL, normal=NORMAL, rotational=ROTATIONAL)
+    else:
+        scene.drag(law=law)
+    return scene.build(device, "float64", worlds=worlds), added
+
+
+def filament(device, n: int = 20, scheme: str = "implicit_euler", clamped: bool = False, law=None, **section):
+    """A straight rod along x without inertia: model and integrator. EI = GJ = 1, length 1."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2 if not section else 3)
+    section = ddg.Stiffness(**({"EA": 1e4, "EI1": 1.0, "GJ": 1.0, "radius": 0.01} | section))
+    rod = scene.add_rod(np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), n + 1), section=section)
+    if clamped:
+        scene.clamp_end(rod)
+    scene.drag(rod, law, **({} if law else {"tangential": 0.5, "normal": 1.0, "rotational": 0.1}))
+    model = scene.build(device)
+    return model, ddg.Integrator(model, scheme, rtol=1e-10)
+
+
+def polygon_drag(points, closed: bool, v, u=0.0):
+    """Force of the fluid on a polygon that moves without turning, edge by edge."""
+    edges = np.roll(points, -1, 0) - points if closed else np.diff(points, axis=0)
+    length = np.linalg.norm(edges, axis=1, keepdims=True)
+    t, away = edges / length, np.broadcast_to(u - v, edges.shape)
+    along = t * (away * t).sum(1, keepdims=True)
+    return (length * (TANGENTIAL * along + NORMAL * (away - along))).sum(0)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_force_and_power(device, name):
+    """Of rods that move without turning, in every world its own velocity: the sum over edges; power is force times velocity."""
+    u = np.array([0.2, 0.0, -0.1])
+    model, _ = fluid(name, device, worlds=2, flow=tuple(u))
+    velocity = np.array([[0.3, 0.0, 0.4], [-0.5, 0.0, 0.1]])
+    state = model.state(velocities=np.repeat(velocity[:, None], model.points_count, 1))
+    drag = model.drag(state)
+    starts = np.concatenate([[0], np.cumsum(model.curves.counts)])
+    points = state.points()[0]
+    for world in range(2):
+        expected = sum(
+            polygon_drag(points[a:b], closed, velocity[world], u)
+            for a, b, closed in zip(starts[:-1], starts[1:], model.curves.closed, strict=True)
+        )
+        np.testing.assert_allclose(drag.force[world].sum(0), expected, rtol=1e-12, atol=1e-14)
+        assert drag.power[world] == pytest.approx(expected @ velocity[world], rel=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("name", MANY)
+def test_the_fluid_takes_what_the_rods_lose(device, name, scheme):
+    """Free rods come to rest: momentum changes by the force of the fluid, and by the midpoint rule K + E - E0 = made - dissipated."""
+    model, _ = fluid(name, device)
+    points = model.state().points()
+    rates = np.cross((0.0, 4.0, 0.0), points - points.mean(0)) + (0.4, 0.0, 0.1)
+    state = model.state(velocities=rates)
+    integrator, dt = ddg.Integrator(model, scheme, rtol=1e-11), 2e-3
+    before = sum(model.energies(state).values())
+    power = [model.drag(state).power]
+    for _ in range(20):
+        state = integrator.step(state, dt)
+        power.append(model.drag(state).power)
+    change, taken = sum(model.energies(state).values()) - before, dt * np.trapezoid(power)
+    assert change < -0.02 * before
+    if scheme == "implicit_midpoint":
+        account = integrator.statistics()["energy"]
+        assert change == pytest.approx(account["made"] - account["dissipated"], abs=1e-9 * before)
+        assert account["dissipated"] == pytest.approx(-taken, rel=0.02)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_a_flow_carries_what_has_no_inertia(device, name):
+    """Free rods without mass move with the fluid, x = x0 + the integral of u, and feel no force: exact but for that of u in time."""
+    kind = OBJECTS[name]
+    scene, _ = kind.scene(held=False, gravity=(0.0, 0.0, 0.0), flow=lambda t: (np.cos(t), 0.0, 2.0 * t))
+    for batch in scene.batches:
+        section = batch.section
+        batch.section = ddg.Stiffness(section.EA, section.EI1, section.EI2, section.GJ, radius=0.01)
+    scene.drag(tangential=TANGENTIAL, normal=NORMAL, rotational=ROTATIONAL)
+    model = scene.build(device, "float64")
+    state, dt = model.state(), 0.1
+    integrator = ddg.Integrator(model, "implicit_midpoint")
+    for _ in range(5):
+        state = integrator.step(state, dt)
+    middles = dt * (np.arange(5) + 0.5)
+    moved = state.points() - model.state().points()
+    np.testing.assert_allclose(moved - dt * np.array([np.cos(middles).sum(), 0.0, 2.0 * middles.sum()]), 0.0, atol=1e-9)
+
+
+def decay(device, scheme: str, steps: int, n: int) -> float:
+    """Factor by which the first bending mode of a clamped filament decays in the time 0.1 zeta_n L^4 / EI, by the tip."""
+    model, integrator = filament(device, n, scheme, clamped=True)
+    points = model.state().points()
+    beta, x = 1.875104069, points[:, 0]
+    ratio = (np.cosh(beta) + np.cos(beta)) / (np.sinh(beta) + np.sin(beta))
+    points[:, 2] = 1e-5 * (np.cosh(beta * x) - np.cos(beta * x) - ratio * (np.sinh(beta * x) - np.sin(beta * x)))
+    state = model.state(points=points)
+    for _ in range(steps):
+        state = integrator.step(state, 0.1 / steps)
+    return state.points()[-1, 2] / points[-1, 2]
+
+
+def test_bending_relaxes_at_its_rate(device):
+    """zeta_n y_t = -EI y_xxxx: modes decay at beta^4 EI / (zeta_n L^4), beta^4 = 12.3624 (clamped and free); orders in time and space."""
+    in_space = [abs(decay(device, "implicit_midpoint", 320, n) - np.exp(-1.2362362)) for n in (10, 20, 40)]
+    fine = decay(device, "implicit_midpoint", 640, 20)
+    in_time = {s: [abs(decay(device, s, steps, 20) - fine) for steps in (20, 40, 80)] for s in SCHEMES}
+    print(in_space, in_time)
+    assert in_space[-1] < 1e-3
+    np.testing.assert_allclose(np.diff(np.log2(in_space)), -2.0, atol=0.1)
+    for scheme, order in zip(SCHEMES, (1, 2), strict=True):
+        np.testing.assert_allclose(np.diff(np.log2(in_time[scheme])), -order, atol=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_twist_relaxes_at_its_rate(device, scheme):
+    """zeta_r theta_t = GJ theta_xx: clamped and free, twist decays at (pi / 2 L)^2 GJ / zeta_r."""
+    n, steps, time = 40, 200, 0.04
+    model, integrator = filament(device, n, scheme, clamped=True, GJ=1.0)
+    state = model.state()
+    theta = state.groups[0].theta
+    x = (np.arange(n) + 0.5) / n
+    values = theta.numpy()
+    values.reshape(-1)[1 : n + 1] = 0.1 * np.sin(0.5 * np.pi * x)
+    theta.assign(values)
+    for _ in range(steps):
+        state = integrator.step(state, time / steps)
+    rate = (0.5 * np.pi) ** 2 / 0.1
+    assert state.angles()[-1] == pytest.approx(0.1 * np.sin(0.5 * np.pi * x[-1]) * np.exp(-rate * time), rel=1e-2)
+
+
+@pytest.mark.slow
+def test_orders_of_the_driven_filament():
+    """The tip of the flagellum against linear hyperdiffusion: second order in space, and in time by the midpoint rule."""
+
+    def tip(**given) -> complex:
+        result = simulate(flagellum.build(**given), device="cpu", observe=flagellum.observe, progress=False)
+        amplitude, phase, _ = flagellum.check(result)
+        return amplitude.measured * np.exp(1j * phase.measured)
+
+    exact = complex(flagellum.shape(3.0, np.array(1.0)))
+    in_space = [abs(tip(n=n, steps=800) - exact) for n in (10, 20, 40)]
+    finest = {scheme: tip(n=40, steps=1600, scheme=scheme) for scheme in SCHEMES}
+    print("space", np.diff(np.log2(in_space)))
+    np.testing.assert_allclose(np.diff(np.log2(in_space)), -2.0, atol=0.1)
+    for scheme, order in zip(SCHEMES, (1, 2), strict=True):
+        errors = [abs(tip(n=40, steps=steps, scheme=scheme) - finest["implicit_midpoint"]) for steps in (50, 100, 200)]
+        print(scheme, np.diff(np.log2(errors)))
+        np.testing.assert_allclose(np.diff(np.log2(errors)), -order, atol=0.12)
+
+
+def test_coefficients_of_helices():
+    """A, B and D of a helix of four turns, in closed form against quadrature of its pieces (4 turns, a = 0.02 m, mu = 1 Pa s)."""
+    known = {"gray_hancock": (18.4317, -1.51113, 1.11712), "lighthill": (25.2005, -1.63259, 1.53737)}
+    for theory, (A, B, D) in known.items():
+        found = helical_flagellum.grand_resistance(theory, 4)
+        spin = 4.0 * np.pi * 0.02**2 * np.cos(helical_flagellum.THETA) ** 2 * 8.68783  # of zeta_r, which those leave out
+        np.testing.assert_allclose(found, (A, B, D + spin), rtol=1e-5)
+
+
+def test_slender_bodies():
+    """Cox's cylinder of length 1 m and radius 0.01 m in 1 Pa s: 1.6542 and 2.61891 N s/m^2."""
+    rows = ddg.Viscous(1.0).coefficients("", np.array(0.01), np.array(1.0))
+    np.testing.assert_allclose([float(row) for row in rows[:3]], [1.6542, 2.61891, 4e-4 * np.pi], rtol=1e-5)
+
+
+SAND = ddg.Granular(lateral=5.0, friction=2.0, leading=1.0, angle=0.3, speed=1e-4)
+
+
+def test_sand_minds_directions_alone(device):
+    """Forces along and across a rod of unit length, by angle, at two speeds; far below v0 they go to zero with the velocity."""
+    model, _ = filament(device, n=4, law=SAND)
+    for psi in (0.1, 0.7, 1.3):
+        sine = np.sin(psi) / np.hypot(np.tan(0.3), np.sin(psi))  # sin(beta)
+        expected = -np.array([2.0 * np.cos(psi) + (1.0 - sine), 0.0, 5.0 * sine])
+        for speed in (0.5, 2.0, 1e-9):
+            v = speed * np.array([np.cos(psi), 0.0, np.sin(psi)])
+            force = model.drag(model.state(velocities=np.tile(v, (5, 1)))).force.sum(0)
+            if speed > 1e-6:
+                np.testing.assert_allclose(force, expected, rtol=2e-6)
+            else:
+                assert np.abs(force).max() < 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_sand_stops_a_rod(device, scheme):
+    """Along itself it slows down evenly, v = v0 - (C_F + C_L) t / m, and stands still from m v0 / (C_F + C_L) on, here 0.2 s."""
+    model, integrator = filament(device, n=4, scheme=scheme, law=SAND, mass_per_length=1.0)
+    state, speeds, dt = model.state(velocities=np.tile((0.6, 0.0, 0.0), (5, 1))), [], 1e-3
+    for _ in range(300):
+        state = integrator.step(state, dt)
+        speeds.append(state.velocities()[:, 0].mean())
+    assert speeds[99] == pytest.approx(0.3, rel=0.02)
+    assert abs(speeds[-1]) < 1e-3
+    assert state.points()[0, 0] == pytest.approx(0.06, rel=0.02)
+
+
+@pytest.mark.parametrize("dt", [1e-2, 1.0, 1e3])
+def test_long_steps(device, dt):
+    """A strongly bent filament without inertia straightens, however long the steps: its energy only falls."""
+    model, integrator = filament(device)
+    points = model.state().points()
+    angle = 4.0 * points[:, 0]
+    points[:, 0], points[:, 2] = np.sin(angle) / 4.0, (1.0 - np.cos(angle)) / 4.0
+    state, energies = model.state(points=points), []
+    for _ in range(6):
+        energies.append(sum(model.energies(state).values()))
+        state = integrator.step(state, dt)
+    assert np.all(np.diff(energies) <= 1e-12 * energies[0])
+    assert integrator.statistics()["retries"] == 0
+
+
+@pytest.mark.slow
+def test_drag_is_the_scale_where_it_is_all_there_is(device):
+    """Driven at its base with nothing else, a filament is solved as exactly as one with a tighter tolerance."""
+    tips = []
+    for rtol in (1e-6, 1e-10):
+        scene = flagellum.build(n=20, steps=50, amplitude=0.05)
+        model = scene.build(device, "float64")
+        integrator, state = ddg.Integrator(model, rtol=rtol), scene.initial(model)
+        for _ in range(50):
+            state = integrator.step(state, 0.02)
+        tips.append(state.points()[-1])
+    np.testing.assert_allclose(tips[0], tips[1], atol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MANY)
+def test_nothing_in_statics_and_spectra(device, name):
+    """Velocity is zero: equilibria and frequencies with drag are those without, bit by bit; at rest it does no work."""
+    found = []
+    for dragged in (False, True):
+        scene, _ = OBJECTS[name].scene(gravity=(0.0, 0.0, -0.5))
+        if dragged:
+            scene.drag(tangential=TANGENTIAL, normal=NORMAL, rotational=ROTATIONAL)
+        model = scene.build(device, "float64")
+        state = statics.solve(model)
+        found.append((state.points(), spectrum(model, state, 3).frequencies))
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    np.testing.assert_array_equal(found[0][1], found[1][1])
+    drag = model.drag(state)
+    assert drag.power == 0.0
+    assert not drag.force.any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("linear", ["partitioned", "block_jacobi", "chain", "sweep"])
+def test_solvers_agree(device, linear):
+    """Every linear solver takes the same steps of a rod that sinks and bends."""
+    found = []
+    for way in ("sweep", linear):
+        model, _ = fluid("rod", device, held=True, gravity=(0.0, 0.0, -9.81))
+        integrator, state = ddg.Integrator(model, linear=way, rtol=1e-10), model.state()
+        for _ in range(10):
+            state = integrator.step(state, 0.02)
+        found.append(state.points())
+    np.testing.assert_allclose(found[0], found[1], atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_joined_halves_are_one_rod(device, scheme):
+    """Two halves joined rigidly move as the rod that they make, in a cross flow that bends it; also without mass."""
+    for mass in (0.0, 0.3):
+        found = []
+        for halves in (1, 2):
+            scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), flow=lambda t: (0.0, np.sin(3.0 * t), 1.0))
+            section = ddg.Stiffness(EA=1e4, EI1=1.0, GJ=1.0, mass_per_length=mass, rotary_inertia=1e-3 * mass)
+            points = np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 17)
+            rods = [scene.add_rod(part, section=section) for part in ([points] if halves == 1 else [points[:9], points[8:]])]
+            scene.clamp_end(rods[0])
+            if halves == 2:
+                scene.join([(rods[0], -1), (rods[1], 0)])
+            scene.drag(tangential=2.0, normal=4.0, rotational=0.01)
+            model = scene.build(device, "float64")
+            integrator, state = ddg.Integrator(model, scheme, rtol=1e-9), model.state()
+            for _ in range(20):
+                state = integrator.step(state, 0.02)
+            found.append(state.points()[-1])
+        assert np.abs(found[0] - (1.0, 0.0, 0.0)).max() > 0.05
+        np.testing.assert_allclose(found[0], found[1], atol=2e-3)  # a rigid joint's half cells are of second order
