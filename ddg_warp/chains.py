@@ -208,7 +208,9 @@ def pieces_of(scene: Scene, batch: RodBatch, ghosts: Ghosts, chosen: np.ndarray)
         raise SceneError(f"rod {batch.first + int(np.argmax(flags.any(1)))} is closed: it has no end to clamp")
     dragged = np.isin(batch.first + np.arange(batch.rods), [rod for rods, _ in scene.drags for rod in rods])
     flags, result = np.column_stack([flags, dragged]), []
-    coefficients = drag.of_batch(scene, batch, np.linalg.norm(geometry.edge_vectors(batch.points, batch.closed), axis=-1))
+    coefficients = drag.of_batch(
+        scene, batch, np.linalg.norm(geometry.edge_vectors(batch.points, batch.closed), axis=-1)
+    )
     for pattern in np.unique(flags[chosen], axis=0):
         rows = np.flatnonzero((flags == pattern).all(1) & chosen)
         result.append(_piece(scene.dimension, batch, rows, ghosts, coefficients[rows], bool(pattern[2])))

@@ -95,8 +95,8 @@ class Granular:
     """Drag of a granular medium, by the direction of the velocity and not by its size: see `kernels.drag` (Maladen et al. 2009).
 
     With the angle psi between velocity and rod, forces per length are C_S sin(beta) across and C_F cos(psi) + C_L (1 - sin(beta))
-    along it, tan(beta) = sin(psi) / tan(gamma). A step takes the velocity that its start has: a rod that is set in motion at once is held
-    back too much in its first step.
+    along it, tan(beta) = sin(psi) / tan(gamma). A step takes the velocity that its start has, with an error of first order: a rod that
+    is set in motion at once is held back too much in its first step.
 
     Attributes:
         lateral, friction, leading: C_S, C_F, C_L [N/m]; C_L may be negative, though not below -C_F.
@@ -129,19 +129,20 @@ def flow_at(scene, t: float, error=SolverError) -> np.ndarray:
     Raises:
         error: it is not finite, or leaves the plane of a planar scene; names the function and the time.
     """
-    if not callable(scene.flow):
-        flow = np.array(scene.flow, float)
-    else:
-        flow = arguments.value_at("the flow", scene.flow, t, 3, error).reshape(-1)[:3]
+    flow = arguments.value_at("flow", scene.flow, t, 3, error) if callable(scene.flow) else np.array(scene.flow, float)
+    if flow.shape != (3,):
+        raise error(f"flow has shape {flow.shape} at t = {t:g}; it is uniform, give (3,)")
     if scene.dimension == 2 and flow[1] != 0.0:
-        raise error(f"flow is {tuple(flow.tolist())} at t = {t:g}; a scene of dimension 2 stays in the plane of x and z, give 0 along y")
+        raise error(
+            f"flow is {tuple(flow.tolist())} at t = {t:g}; a scene of dimension 2 stays in the plane of x and z, give 0 along y"
+        )
     return flow
 
 
 def check_flow(scene) -> None:
     """Refuse a flow at t = 0 that is none, or that no rod feels."""
     flow_at(scene, 0.0, SceneError)
-    if not scene.drags:
+    if not scene.drags and (callable(scene.flow) or any(scene.flow)):
         raise SceneError("flow is given, and no rod feels it; call drag(...), or leave flow out")
 
 
@@ -150,7 +151,7 @@ def _not_negative(what: str, value, unit: str) -> float:
 
 
 def of_batch(scene, batch, lengths: np.ndarray) -> np.ndarray:
-    """Coefficients (R, edges, rows of `kernels.drag`) of the drag on a batch of rods with edges of these lengths (R, edges); zero where there is none."""
+    """Drag on a batch of rods with edges of these lengths (R, edges): coefficients (R, edges, rows of `kernels.drag`), zero without."""
     from ddg_warp.kernels.drag import ROWS
 
     result = np.zeros((*lengths.shape, ROWS))

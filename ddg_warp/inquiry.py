@@ -1,4 +1,4 @@
-"""What can be asked of a model at a state: energies, reactions, internal forces, fields of surfaces, link, writhe, twist."""
+"""What can be asked of a model at a state: energies, reactions, drag, internal forces, fields of surfaces, link, writhe, twist."""
 
 from dataclasses import dataclass
 
@@ -61,7 +61,7 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     """Force and moment of every support of the scene: those of rods in the order they were added, then of shells, then of rings.
 
     They balance the internal forces and the loads on held dofs, and hold the normals of clamped mesh edges and of planes of
-    symmetry; the inertia of a held node itself is left out, which a moving support would have to add. Of a ring, x is the radial
+    symmetry; the inertia of a held node itself is left out, and drag on it, which a moving support would have to add. Of a ring, x is the radial
     force summed around it, and moments do not hold the direction of the meridian. A dof that several supports hold counts with the
     first of them, so that the reactions add up.
 
@@ -138,7 +138,7 @@ def drag(model, state) -> Drag:
             inertia, u = NetDrag(model).at(state.net, state.time)
             force = np.einsum("wkij,wkj->wki", inertia["resistance"], u - v)
         power += (force * v).sum((1, 2))
-        rows, places = model.net_rows
+        _, places = model.net_rows
         turns = force[:, model.net.angle_start :, 0]
         blocks = force / np.maximum(1, np.bincount(places, minlength=force.shape[1]))[:, None]
     force, moment = model.gather_nodes(forces, blocks), model.gather_edges(moments, turns)

@@ -422,12 +422,14 @@ class Model:
         )
 
     def gather_nodes(self, values: list[np.ndarray], blocks: wp.array | None = None) -> np.ndarray:
-        """From arrays (node, column, dim) of every group and blocks of the net (worlds N, 3) to the user's order, in three dimensions."""
+        """From arrays (node, column, dim) of groups and blocks of the net (worlds N, 3) to the user's order, in three dimensions."""
         start = np.concatenate([[0], np.cumsum(self.curves.counts)])
         out = np.zeros((self.worlds, self.points_count, 3))
         if blocks is not None:
             rows, places = self.net_rows
-            out[:, rows] = np.asarray(blocks.numpy() if isinstance(blocks, wp.array) else blocks).reshape(self.worlds, -1, 3)[:, places]
+            out[:, rows] = np.asarray(blocks.numpy() if isinstance(blocks, wp.array) else blocks).reshape(
+                self.worlds, -1, 3
+            )[:, places]
         for group, value in zip(self.groups, values, strict=True):
             axes = [0, 2] if group.kind.dim == 2 else [0, 1, 2]
             k, column, index = _user_index(group, group.host.own, start)

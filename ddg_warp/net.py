@@ -175,7 +175,9 @@ class Net:
         """What float32 makes of every rod over a step of s [s] (rods,); see `precision.float32_errors`."""
         errors = {}
         for p in {id(rod.piece): rod.piece for rod in self.rods}.values():
-            mass = p.mass.mean(1) + s * drag.least(p.drag) * p.length / p.mass.shape[1] if p.kind.drag else p.mass.mean(1)
+            mass = (
+                p.mass.mean(1) + s * drag.least(p.drag) * p.length / p.mass.shape[1] if p.kind.drag else p.mass.mean(1)
+            )
             parameters = {name: v.T for name, v in p.parameters.items()}
             errors[id(p)] = float32_errors(p.kind, mass, p.length, parameters, s)
         return np.array([errors[id(rod.piece)][rod.row] for rod in self.rods])

@@ -59,7 +59,9 @@ class NetNewton:
         self.load = wp.array(np.tile(host.load, (worlds, 1)), dtype=V, device=device)
         self.size, self.stiffness = make(self.all, self.real), make(self.all, self.linear)
         self.change, self.noise, self.square, self.dots = (make((worlds, blocks), self.real) for _ in range(4))
-        self.mass = make((worlds, blocks), block_inertia(self.real)) if drag else wp.array(host.mass, dtype=V, device=device)
+        self.mass = (
+            make((worlds, blocks), block_inertia(self.real)) if drag else wp.array(host.mass, dtype=V, device=device)
+        )
         bits = (host.fixed * [1, 2, 4]).sum(1).astype(np.uint8)
         self.fixed = wp.array(bits, dtype=wp.uint8, device=device)
         self.held = self.fixed  # components in space, for predictors: rates along oblique planes stay in them

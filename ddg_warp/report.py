@@ -28,6 +28,8 @@ def report(model) -> str:
             present.add(term.name)
             elements = int((host.count - (0 if kind.closed else term.measure.span)).sum()) * model.worlds
             lines.append(f"  {term.name}: {elements} elements, {term.measure.name} x {term.density.name}")
+        if kind.drag:
+            lines.append("  drag, implicit")
         lines.append(f"  solver: {SOLVERS[automatic(group)]}, linear algebra in {model.types.linear.__name__}")
         lines.append(f"  memory: {bytes_per_node(model, group)} bytes a node")
     if model.net is not None:
@@ -53,6 +55,8 @@ def net_lines(model) -> list[str]:
     for part in net.sets:
         measure, density = part.term.measure.name, part.term.density.name
         lines.append(f"  {part.term.name}: {part.elements * model.worlds} elements, {measure} x {density}")
+    if host.drag:
+        lines.append(f"  drag on {host.drag[0].shape[1]} edges of rods, implicit")
     size = 9 * table.positions * model.worlds * (4 if linear.__name__ == "float32" else 8)
     lines.append(
         f"  solver: PCG ({net_preconditioner(model.net)}), one Newton loop a world, linear algebra in {linear.__name__}; "

@@ -49,8 +49,7 @@ def check_scene(scene) -> None:
         raise SceneError(
             f"gravity is {tuple(scene.gravity)}; a scene of dimension 2 stays in the plane of x and z, give 0 along y"
         )
-    if scene.drags or callable(scene.flow) or any(scene.flow):
-        drag.check_flow(scene)
+    drag.check_flow(scene)
     objects = [*scene.batches, *scene.shells, *scene.axisymmetric_shells]
     size = max(
         (np.nanmax(np.ptp(o.points.reshape(-1, o.points.shape[-1]), axis=0)) for o in objects if o.points.size),

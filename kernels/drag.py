@@ -22,14 +22,16 @@ from ddg_warp.kernels import outcome
 from ddg_warp.kernels.balance import node_functions
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, inertia_type, until_function
 
-TANGENTIAL, NORMAL, ROTATIONAL, LATERAL, FRICTION, LEADING, SLOPE, SPEED = range(8)  # rows of coefficients; SLOPE is tan(gamma)
+TANGENTIAL, NORMAL, ROTATIONAL, LATERAL, FRICTION, LEADING, SLOPE, SPEED = range(
+    8
+)  # rows of coefficients; SLOPE is tan(gamma)
 ROWS = 8
 
 
 @cache
 def edge_function(dim: int, real):
     """half(e, v, p): resistance [N s/m] of half an edge, with coefficients p, that moves at v against the fluid."""
-    V, M, P = wp.types.vector(dim, real), wp.types.matrix((dim, dim), real), wp.types.vector(ROWS, real)
+    V, P = wp.types.vector(dim, real), wp.types.vector(ROWS, real)
 
     @wp.func
     def half(e: V, v: V, p: P):

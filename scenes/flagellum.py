@@ -22,7 +22,12 @@ HYPERDIFFUSION = "Machin 1958, Wiggins and Goldstein 1998"
 
 
 def build(
-    sp: float = 3.0, n: int = 50, steps: int = 100, periods: int = 2, amplitude: float = 1e-3, scheme: str = "implicit_midpoint"
+    sp: float = 3.0,
+    n: int = 50,
+    steps: int = 100,
+    periods: int = 2,
+    amplitude: float = 1e-3,
+    scheme: str = "implicit_midpoint",
 ) -> ddg.Scene:
     """The filament along x, without inertia, on its periodic motion.
 
@@ -35,7 +40,9 @@ def build(
         scheme: of time integration
     """
     analysis = ddg.Dynamics(dt=PERIOD / steps, duration=periods * PERIOD, scheme=scheme)
-    scene = ddg.Scene(dimension=2, gravity=(0.0, 0.0, 0.0), analysis=analysis, initial=lambda model: swinging(model, sp, amplitude))
+    scene = ddg.Scene(
+        dimension=2, gravity=(0.0, 0.0, 0.0), analysis=analysis, initial=lambda model: swinging(model, sp, amplitude)
+    )
     points = np.linspace((0.0, 0.0, 0.0), (LENGTH, 0.0, 0.0), n + 1)
     rod = scene.add_rod(points, section=ddg.Stiffness(EA=1e4, EI1=EI, radius=0.01), name=f"filament, Sp = {sp:g}")
     drive = ddg.Motion(translation=lambda t: (0.0, 0.0, amplitude * LENGTH * np.sin(OMEGA * t)))
@@ -93,9 +100,22 @@ def last_period(result) -> list[ddg.Check]:
     order = 2 if analysis.scheme == "implicit_midpoint" else 1
     tolerance = 0.2 * (sp / batch.edges) ** 2 + 4.0 * (OMEGA * analysis.dt) ** order + 40.0 * amplitude**2
     return [
-        ddg.Check(f"tip's amplitude over the base's, Sp = {sp:g}", abs(found), abs(exact), tolerance, HYPERDIFFUSION, relative=True),
+        ddg.Check(
+            f"tip's amplitude over the base's, Sp = {sp:g}",
+            abs(found),
+            abs(exact),
+            tolerance,
+            HYPERDIFFUSION,
+            relative=True,
+        ),
         ddg.Check("tip's phase [rad]", np.angle(found), np.angle(exact), tolerance, HYPERDIFFUSION),
-        ddg.Check("mean thrust over its closed form", force.mean() / thrust(sp, amplitude), 1.0, tolerance + OMEGA * analysis.dt, HYPERDIFFUSION),
+        ddg.Check(
+            "mean thrust over its closed form",
+            force.mean() / thrust(sp, amplitude),
+            1.0,
+            tolerance + OMEGA * analysis.dt,
+            HYPERDIFFUSION,
+        ),
     ]
 
 

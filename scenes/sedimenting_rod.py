@@ -1,10 +1,10 @@
 """A straight rod that sinks inclined through a viscous fluid: it drifts sideways, and does not turn.
 
-With the tilt phi against the vertical, weight w per length and mass m per length, resistive force theory gives velocities along and across
+With the tilt phi against the vertical, weight w and mass m per length, resistive force theory gives velocities along and across
 
     v_t = w cos(phi) / zeta_t (1 - exp(-zeta_t t / m)) ,  v_n = w sin(phi) / zeta_n (1 - exp(-zeta_n t / m)) ,
 
-and in the end the drift tan(delta) = (zeta_n - zeta_t) sin(phi) cos(phi) / (zeta_t sin(phi)^2 + zeta_n cos(phi)^2) against the vertical.
+and in the end the drift tan(delta) = (zeta_n - zeta_t) sin(phi) cos(phi) / (zeta_t sin(phi)^2 + zeta_n cos(phi)^2).
 """
 
 import numpy as np
@@ -20,7 +20,12 @@ SOURCE = "resistive force theory (Cox 1970)"
 
 
 def build(
-    tilt: float = 50.0, n: int = 10, radius: float = 0.01, duration: float = 1.0, dt: float = 0.01, scheme: str = "implicit_midpoint"
+    tilt: float = 50.0,
+    n: int = 10,
+    radius: float = 0.01,
+    duration: float = 1.0,
+    dt: float = 0.01,
+    scheme: str = "implicit_midpoint",
 ) -> ddg.Scene:
     """The rod in the plane of x and z.
 
@@ -35,7 +40,9 @@ def build(
     analysis = ddg.Dynamics(dt=dt, duration=duration, scheme=scheme)
     scene = ddg.Scene(gravity=(0.0, 0.0, -GRAVITY), analysis=analysis)
     points = np.linspace(-0.5 * LENGTH, 0.5 * LENGTH, n + 1)[:, None] * direction(tilt)
-    section = ddg.Stiffness(EA=1e4, EI1=1.0, GJ=1.0, mass_per_length=WEIGHT / GRAVITY, rotary_inertia=1e-5, radius=radius)
+    section = ddg.Stiffness(
+        EA=1e4, EI1=1.0, GJ=1.0, mass_per_length=WEIGHT / GRAVITY, rotary_inertia=1e-5, radius=radius
+    )
     rod = scene.add_rod(points, section=section, name=f"rod tilted by {tilt:g} degrees")
     scene.drag(rod, LAW)
     return scene

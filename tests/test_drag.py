@@ -79,7 +79,7 @@ def test_force_and_power(device, name):
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("name", MANY)
 def test_the_fluid_takes_what_the_rods_lose(device, name, scheme):
-    """Free rods come to rest: momentum changes by the force of the fluid, and by the midpoint rule K + E - E0 = made - dissipated."""
+    """Free rods come to rest; the midpoint rule accounts for it, K + E - E0 = made - dissipated, which is what drag's power says."""
     model, _ = fluid(name, device)
     points = model.state().points()
     rates = np.cross((0.0, 4.0, 0.0), points - points.mean(0)) + (0.4, 0.0, 0.1)
@@ -131,7 +131,7 @@ def decay(device, scheme: str, steps: int, n: int) -> float:
 
 
 def test_bending_relaxes_at_its_rate(device):
-    """zeta_n y_t = -EI y_xxxx: modes decay at beta^4 EI / (zeta_n L^4), beta^4 = 12.3624 (clamped and free); orders in time and space."""
+    """zeta_n y_t = -EI y_xxxx: the mode decays at beta^4 EI / (zeta_n L^4), beta^4 = 12.3624; orders in time and space."""
     in_space = [abs(decay(device, "implicit_midpoint", 320, n) - np.exp(-1.2362362)) for n in (10, 20, 40)]
     fine = decay(device, "implicit_midpoint", 640, 20)
     in_time = {s: [abs(decay(device, s, steps, 20) - fine) for steps in (20, 40, 80)] for s in SCHEMES}
@@ -185,7 +185,9 @@ def test_coefficients_of_helices():
     known = {"gray_hancock": (18.4317, -1.51113, 1.11712), "lighthill": (25.2005, -1.63259, 1.53737)}
     for theory, (A, B, D) in known.items():
         found = helical_flagellum.grand_resistance(theory, 4)
-        spin = 4.0 * np.pi * 0.02**2 * np.cos(helical_flagellum.THETA) ** 2 * 8.68783  # of zeta_r, which those leave out
+        spin = (
+            4.0 * np.pi * 0.02**2 * np.cos(helical_flagellum.THETA) ** 2 * 8.68783
+        )  # of zeta_r, which those leave out
         np.testing.assert_allclose(found, (A, B, D + spin), rtol=1e-5)
 
 
@@ -299,7 +301,9 @@ def test_joined_halves_are_one_rod(device, scheme):
             scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), flow=lambda t: (0.0, np.sin(3.0 * t), 1.0))
             section = ddg.Stiffness(EA=1e4, EI1=1.0, GJ=1.0, mass_per_length=mass, rotary_inertia=1e-3 * mass)
             points = np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 17)
-            rods = [scene.add_rod(part, section=section) for part in ([points] if halves == 1 else [points[:9], points[8:]])]
+            rods = [
+                scene.add_rod(part, section=section) for part in ([points] if halves == 1 else [points[:9], points[8:]])
+            ]
             scene.clamp_end(rods[0])
             if halves == 2:
                 scene.join([(rods[0], -1), (rods[1], 0)])

@@ -56,7 +56,7 @@ class Integrator:
         retry_limit: how often in a row a rod's failed step is tried again: first from the last state instead of the predictor,
             then in halves, and so on, down to 2^-(retry_limit / 2) of the step.
         energy_bound: what the midpoint rule may make of the energy, or lose, of every lone rod, and of the net in every world: a
-            fraction of the largest kinetic and elastic energy that it has had, and of what damping took, or None for anything.
+            fraction of the largest kinetic and elastic energy that it has had, and of what damping and drag took, or None for anything.
             Loads and supports may do any work. A step that would leave the bound is tried again in halves, and then fails by the
             outcome `energy_drift`. Counted from a state that the integrator has not made itself (a run that is resumed counts
             anew); what rounding may make does not count. Where steps resolve the motion the rule keeps the energy to some 1e-3,
@@ -65,7 +65,7 @@ class Integrator:
         check_every: steps between readings of the outcomes; by default 1 on the CPU and 32 on CUDA.
 
     Raises:
-        SceneError: a free node has no mass, the scheme does not exist, or implicit Euler is given a bound.
+        SceneError: a free node has neither mass nor drag that holds it back in all directions, the scheme does not exist, or implicit Euler is given a bound.
     """
 
     def __init__(

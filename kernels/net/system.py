@@ -24,7 +24,7 @@ def mass_type(real, drag: bool):
 
 @cache
 def balance_kernels(real, linear, drag: bool = False):
-    """outer(...): loads, inertia and drag at every block; collect(...): forces of a set; settle(...): residual, and whether it balances."""
+    """outer(...): loads, inertia, drag at every block; collect(...): forces of a set; settle(...): residual, whether it balances."""
     V, H, Mass = wp.types.vector(3, real), wp.types.vector(3, linear), mass_type(real, drag)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)

@@ -14,6 +14,8 @@ refuse("Integrator", {
     "sweep of a ring": (lambda: ddg.Integrator(built(rods(RING, closed=True)), linear="sweep"), "rod 1", "closed", "auto"),
     "massless": (lambda: ddg.Integrator(_massless()), "node 2", "rod 1", "no mass", "density"),
     "massless net": (lambda: ddg.Integrator(_massless(True)), "node 2 of rod 1", "no mass", "density"),
+    "massless, drag across": (lambda: ddg.Integrator(_massless(drag=True)), "node 2", "rod 1", "no mass", "drag along and across"),
+    "massless net, drag across": (lambda: ddg.Integrator(_massless(True, True)), "node 2 of rod 1", "drag along and across"),
     "multilevel rods": (lambda: ddg.Integrator(model(), linear="multilevel"), "'multilevel'", "nets", "auto"),
     "chain_multilevel rods": (lambda: ddg.Integrator(model(), linear="chain_multilevel"), "nets", "auto"),
     "sweep of a net": (lambda: ddg.Integrator(model("net"), linear="sweep"), "'sweep'", "with a net"),
@@ -64,9 +66,11 @@ for name in ("max_iterations", "max_halvings"):
     each("Integrator", name, [0, 2.5, "many", False], whole, name, "at least 1")
 
 
-def _massless(joined: bool = False):
+def _massless(joined: bool = False, drag: bool = False):
     scene = rods(section=ddg.Stiffness(EA=1e3, EI1=1.0, GJ=1.0))
     scene.clamp(1)
+    if drag:
+        scene.drag(1, tangential=0.0, normal=1.0)
     if joined:
         scene.join([(0, 0), (1, 0)])
     return built(scene)
@@ -91,6 +95,8 @@ refuse("step", {
     "amplitude that ends": (lambda: _loaded(lambda t: 1.0 if t < 0.005 else NAN), "amplitude", "not finite", "t = 0.01"),
     "net, motion that ends": (lambda: _run(lambda t: (0.0, 0.0, 0.0 if t < 0.005 else NAN), net=True), "translation", "t = 0.01"),
     "net, amplitude that ends": (lambda: _loaded(lambda t: 1.0 if t < 0.005 else NAN, net=True), "amplitude", "t = 0.01"),
+    "flow that ends": (lambda: _flows(lambda t: (0.0, 0.0, 0.0 if t < 0.005 else NAN)), "flow", "not finite", "t = 0.01"),
+    "net, flow of two later": (lambda: _flows(lambda t: (0.0,) * (3 if t < 0.005 else 2), True), "flow", "(0.0, 0.0)", "t = 0.01"),
     "out of the plane": (lambda: _planar(lambda t: (0.0, t, 0.0)), "translation", "along y", "t = 0.01"),
     "motion that jumps": (lambda: _run(_jump), "jumps at t = 0.005", "continuous"),
     "net, motion that jumps": (lambda: _run(_jump, net=True), "jumps at t = 0.005", "continuous"),
@@ -104,6 +110,14 @@ def _jump(t):
 def _stepped(scene):
     made = built(scene)
     return ddg.Integrator(made).step(made.state(), 0.01)
+
+
+def _flows(flow, net=False):
+    scene = rods(scene=ddg.Scene(flow=flow))
+    scene.drag(tangential=1.0, normal=1.0)
+    if net:
+        scene.join([(0, 0), (1, 0)])
+    return _stepped(scene)
 
 
 def _run(translation=None, angle=None, net=False):

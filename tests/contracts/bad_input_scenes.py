@@ -17,6 +17,11 @@ from bad_inputs import (
 
 import ddg_warp as ddg
 
+
+def _in_fluid(scene):
+    scene.drag(tangential=1.0, normal=2.0)
+
+
 # --- Scene(...) ---
 each("scene", "gravity", [(0.0, 0.0), 9.81, (0.0, 0.0, NAN), "down", (0.0, 0.0, 1.0, 0.0), None],
      lambda v: ddg.Scene(gravity=v), "gravity", "three finite numbers")
@@ -29,6 +34,14 @@ each(
     "mass_damping",
     "not negative",
 )
+each("scene", "flow", [(0.0, 1.0), 3.0, "fast", (0.0, 0.0, NAN), None], lambda v: ddg.Scene(flow=v), "flow", "three finite numbers")
+each("scene", "flow to", [(0.0, 1.0), 3.0, None, (0.0, NAN, 0.0), np.zeros((2, 3))],
+     lambda v: built(rods(scene=ddg.Scene(flow=lambda t: v)), _in_fluid), "flow", "t = 0")
+refuse("scene", {
+    "flow without drag": (lambda: built(rods(scene=ddg.Scene(flow=(1.0, 0.0, 0.0)))), "flow", "drag(...)"),
+    "flow out of the plane": (
+        lambda: built(rods(scene=ddg.Scene(dimension=2, flow=(0.0, 1.0, 0.0))), _in_fluid), "flow", "0 along y"),
+})
 each("scene", "analysis", [None, "statics", 3], lambda v: ddg.Scene(analysis=v), "analysis", "Dynamics(...)")
 each("scene", "callbacks", [[5], print, [print, None]], lambda v: ddg.Scene(callbacks=v), "callbacks", "functions of the state")
 each("scene", "initial", [5, "rest"], lambda v: ddg.Scene(initial=v), "initial", "function of the model")
@@ -249,6 +262,24 @@ LOADS = {
     "couple nan": (lambda s: s.add_couple(1, 3, (NAN, 0.0, 0.0)), "couple on edge 3", "three finite"),
     "couple of two": (lambda s: s.add_couple(1, 3, (1.0, 0.0)), "couple on edge 3", "three finite"),
     "couple edge": (lambda s: s.add_couple(1, 4, (1.0, 0.0, 0.0)), "edge 4", "rod 1", "4 edges"),
+    "drag rod": (lambda s: s.drag(7, tangential=1.0, normal=1.0), "rod 7", "2 rods"),
+    "drag rod twice": (lambda s: s.drag([1, 1], tangential=1.0, normal=1.0), "drag: rods", "1 is named twice"),
+    "drag twice": (lambda s: (s.drag(1, ddg.Viscous(1.0)), _in_fluid(s)), "rod 1 has drag already"),
+    "drag of nothing": (lambda s: s.drag(1), "drag: tangential", "None"),
+    "drag one way": (lambda s: s.drag(1, tangential=1.0), "drag: normal", "None"),
+    "drag negative": (lambda s: s.drag(1, tangential=-1.0, normal=1.0), "drag: tangential", "not negative"),
+    "drag nan": (lambda s: s.drag(1, tangential=1.0, normal=1.0, rotational=NAN), "drag: rotational", "[N s]"),
+    "drag by a number": (lambda s: s.drag(1, 3.0), "drag: law is 3.0", "Viscous"),
+    "drag by both": (lambda s: s.drag(1, ddg.Viscous(1.0), normal=2.0), "law and coefficients", "one of them"),
+    "drag viscosity": (lambda s: s.drag(1, ddg.Viscous(0.0)), "Viscous: viscosity", "[Pa s]"),
+    "drag theory": (lambda s: s.drag(1, ddg.Viscous(1.0, "stokes")), "Viscous: theory", "'lighthill'"),
+    "drag scale": (lambda s: s.drag(1, ddg.Viscous(1.0, "lighthill")), "'lighthill'", "scale"),
+    "drag scale negative": (lambda s: s.drag(1, ddg.Viscous(1.0, scale=-1.0)), "Viscous: scale", "positive"),
+    "drag of a thick rod": (lambda s: s.drag(1, ddg.Viscous(1.0, scale=1e-3)), "rod 1", "'odd'", "too large", "tangential"),
+    "drag in sand": (lambda s: s.drag(1, ddg.Granular(-1.0, 1.0)), "Granular: lateral", "not negative"),
+    "drag in sand, leading": (lambda s: s.drag(1, ddg.Granular(1.0, 1.0, leading=-2.0)), "Granular: leading", "-friction"),
+    "drag in sand, angle": (lambda s: s.drag(1, ddg.Granular(1.0, 1.0, angle=2.0)), "Granular: angle", "pi / 2"),
+    "drag in sand, speed": (lambda s: s.drag(1, ddg.Granular(1.0, 1.0, speed=0.0)), "Granular: speed", "positive"),
     "mass node": (lambda s: s.add_mass(1, 5, 1.0), "node 5", "rod 1", "5 nodes"),
     "mass zero": (lambda s: s.add_mass(1, 4, 0.0), "mass at node 4 is 0.0", "positive"),
     "mass negative": (lambda s: s.add_mass(1, 4, -1.0), "mass at node 4", "positive"),
