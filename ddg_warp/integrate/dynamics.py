@@ -65,7 +65,8 @@ class Integrator:
         check_every: steps between readings of the outcomes; by default 1 on the CPU and 32 on CUDA.
 
     Raises:
-        SceneError: a free node has neither mass nor drag that holds it back in all directions, the scheme does not exist, or implicit Euler is given a bound.
+        SceneError: a free node has neither mass nor drag along and across its rod, the scheme does not exist, or implicit Euler is
+            given a bound.
     """
 
     def __init__(
