@@ -19,7 +19,7 @@ from objects import OBJECTS
 ALONE = ("rod", "rod clamped at its end", "planar rod", "rod without twist", "rod without bending", "closed rod")
 JOINED = ("rods joined rigidly", "rods joined by a hinge", "planar rods joined rigidly")
 MANY = [*ALONE, *JOINED, "rods alone and joined"]
-DAILY = ("planar rod", "rods joined by a hinge")
+DAILY = ("planar rod",)
 EVERY = [pytest.param(name, marks=() if name in DAILY else pytest.mark.slow) for name in MANY]
 SCHEMES = ("implicit_euler", "implicit_midpoint")
 TANGENTIAL, NORMAL, ROTATIONAL = 0.7, 1.9, 3e-3
@@ -35,9 +35,11 @@ def fluid(name: str, device, worlds: int = 1, law=None, held: bool = False, **op
     return scene.build(device, "float64", worlds=worlds), added
 
 
-def filament(device, n: int = 20, scheme: str = "implicit_euler", clamped: bool = False, law=None, **section):
+def filament(
+    device, n: int = 20, scheme: str = "implicit_euler", clamped: bool = False, law=None, dimension: int = 2, **section
+):
     """A straight rod along x without inertia: model and integrator. EI = GJ = 1, length 1."""
-    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=2 if not section else 3)
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), dimension=dimension)
     section = ddg.Stiffness(**({"EA": 1e4, "EI1": 1.0, "GJ": 1.0, "radius": 0.01} | section))
     rod = scene.add_rod(np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), n + 1), section=section)
     if clamped:
@@ -118,16 +120,19 @@ def test_a_flow_carries_what_has_no_inertia(device, name):
 
 
 def decay(device, scheme: str, steps: int, n: int) -> float:
-    """Factor by which the first bending mode of a clamped filament decays in the time 0.1 zeta_n L^4 / EI, by the tip."""
+    """Factor by which the first bending mode of a clamped filament decays in the time 0.1 zeta_n L^4 / EI."""
     model, integrator = filament(device, n, scheme, clamped=True)
     points = model.state().points()
     beta, x = 1.875104069, points[:, 0]
     ratio = (np.cosh(beta) + np.cos(beta)) / (np.sinh(beta) + np.sin(beta))
-    points[:, 2] = 1e-5 * (np.cosh(beta * x) - np.cos(beta * x) - ratio * (np.sinh(beta * x) - np.sin(beta * x)))
+    points[:, 2] = 1e-3 * (np.cosh(beta * x) - np.cos(beta * x) - ratio * (np.sinh(beta * x) - np.sin(beta * x)))
     state = model.state(points=points)
     for _ in range(steps):
         state = integrator.step(state, 0.1 / steps)
-    return state.points()[-1, 2] / points[-1, 2]
+    weight = points[:, 2] * np.append(
+        np.ones(n), 0.5
+    )  # projects on the mode: the midpoint rule keeps what else there is
+    return (weight @ state.points()[:, 2]) / (weight @ points[:, 2])
 
 
 def test_bending_relaxes_at_its_rate(device):
@@ -147,7 +152,7 @@ def test_bending_relaxes_at_its_rate(device):
 def test_twist_relaxes_at_its_rate(device, scheme):
     """zeta_r theta_t = GJ theta_xx: clamped and free, twist decays at (pi / 2 L)^2 GJ / zeta_r."""
     n, steps, time = 40, 200, 0.04
-    model, integrator = filament(device, n, scheme, clamped=True, GJ=1.0)
+    model, integrator = filament(device, n, scheme, clamped=True, dimension=3)
     state = model.state()
     theta = state.groups[0].theta
     x = (np.arange(n) + 0.5) / n

@@ -49,6 +49,7 @@ SMALL = {
     "whirling": {},
 }
 LONG = (
+    "helical_flagellum",
     "cable_gripped_at_both_ends",
     "hanging_sheet",
     "parachute",
