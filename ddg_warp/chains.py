@@ -38,7 +38,7 @@ class Piece:
     rotary: np.ndarray
     length: np.ndarray
     parameters: dict[str, np.ndarray]
-    drag: np.ndarray  # (R, edges, rows), zero without
+    drag: np.ndarray | None  # coefficients of its law (R, edges, rows), None without
 
 
 @dataclass(frozen=True)
@@ -129,8 +129,8 @@ def compile_chains(scene: Scene) -> tuple[list[ChainGroup], list[list[Held]]]:
         raise SceneError(
             "the scene has no rods and no shells; add some with scene.add_rods(points, section=..., material=...)"
         )
-    ghosts, joined = Ghosts(scene), net_rods(scene)
-    pieces = [piece for batch in scene.batches for piece in pieces_of(scene, batch, ghosts, ~joined)]
+    ghosts, laws, joined = Ghosts(scene), drag.law_of_rods(scene), net_rods(scene)
+    pieces = [piece for batch in scene.batches for piece in pieces_of(scene, batch, ghosts, laws, ~joined)]
     pieces.sort(key=lambda piece: (*piece.kind.key, piece.x.shape[1]))
     groups: list[list[Piece]] = []
     for piece in pieces:
@@ -199,21 +199,18 @@ def scene_motions(scene: Scene) -> list:
     return list({id(s.motion): s.motion for s in supports if s.motion is not None}.values())
 
 
-def pieces_of(scene: Scene, batch: RodBatch, ghosts: Ghosts, chosen: np.ndarray) -> list[Piece]:
-    """The chosen rods (R,) of a batch, those with the same ghosts together, and those with drag."""
+def pieces_of(scene: Scene, batch: RodBatch, ghosts: Ghosts, laws: np.ndarray, chosen: np.ndarray) -> list[Piece]:
+    """The chosen rods (R,) of a batch, those with the same ghosts together, and those with drag, whose `laws` (R,) are not -1."""
     check_batch(batch, scene.dimension)
     chosen = chosen[batch.first : batch.first + batch.rods]
     flags = ghosts.count[batch.first : batch.first + batch.rods]
     if batch.closed and flags.any():
         raise SceneError(f"rod {batch.first + int(np.argmax(flags.any(1)))} is closed: it has no end to clamp")
-    dragged = np.isin(batch.first + np.arange(batch.rods), [rod for rods, _ in scene.drags for rod in rods])
-    flags, result = np.column_stack([flags, dragged]), []
-    coefficients = drag.of_batch(
-        scene, batch, np.linalg.norm(geometry.edge_vectors(batch.points, batch.closed), axis=-1)
-    )
+    laws = laws[batch.first : batch.first + batch.rods]
+    flags, result = np.column_stack([flags, laws >= 0]), []
     for pattern in np.unique(flags[chosen], axis=0):
         rows = np.flatnonzero((flags == pattern).all(1) & chosen)
-        result.append(_piece(scene.dimension, batch, rows, ghosts, coefficients[rows], bool(pattern[2])))
+        result.append(_piece(scene, batch, rows, ghosts, laws[rows] if pattern[2] else None))
     return result
 
 
@@ -232,10 +229,8 @@ def _kind(dimension: int, batch: RodBatch, dragged: bool) -> ChainKind:
     return ChainKind(dimension, batch.twist, batch.closed, terms, drag=dragged)
 
 
-def _piece(
-    dimension: int, batch: RodBatch, rows: np.ndarray, outside: Ghosts, coefficients: np.ndarray, dragged: bool
-) -> Piece:
-    rods = batch.first + rows
+def _piece(scene: Scene, batch: RodBatch, rows: np.ndarray, outside: Ghosts, laws: np.ndarray | None) -> Piece:
+    rods, dimension = batch.first + rows, scene.dimension
     before, after = ghosts = tuple(int(count) for count in outside.count[rods[0]])
     points = batch.points[rows]
     if dimension == 2:
@@ -270,7 +265,7 @@ def _piece(
     given = batch.director
     if given is not None and given.ndim > 1:
         given = np.broadcast_to(given, (batch.rods, *given.shape[1:]))[rows]
-    kind = _kind(dimension, batch, dragged)
+    kind = _kind(dimension, batch, laws is not None)
     frames = np.zeros_like(tangents)
     if kind.twist:
         frames[:, real] = geometry.directors(tangents[:, real], given)
@@ -320,7 +315,7 @@ def _piece(
         on_edges(section.rotary_inertia) * own,
         own.sum(1),
         parameters,
-        np.pad(coefficients, ((0, 0), ghosts, (0, 0))),
+        None if laws is None else drag.coefficients(scene, laws, batch.name, on_edges(section.radius), own),
     )
 
 

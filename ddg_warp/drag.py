@@ -150,18 +150,32 @@ def _not_negative(what: str, value, unit: str) -> float:
     return arguments.number(what, value, f"one number that is not negative [{unit}]", lambda v: v >= 0.0)
 
 
-def of_batch(scene, batch, lengths: np.ndarray) -> np.ndarray:
-    """Drag on a batch of rods with edges of these lengths (R, edges): coefficients (R, edges, rows of `kernels.drag`), zero without."""
+def law_of_rods(scene) -> np.ndarray:
+    """Place of its law among the scene's drags, of every rod (R,); -1 without.
+
+    Raises:
+        SceneError: a rod has two.
+    """
+    result = np.full(scene.rod_count, -1)
+    for place, (rods, _) in enumerate(scene.drags):
+        twice = rods[result[rods] >= 0]
+        if twice.size:
+            raise SceneError(f"drag: rod {twice[0]} has drag already; give it one law")
+        result[rods] = place
+    return result
+
+
+def coefficients(scene, laws: np.ndarray, name: str, radius: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """Rows of `kernels.drag` (R, edges, rows) of rods with these laws (R,); none on edges without length, which are ghosts."""
     from ddg_warp.kernels.drag import ROWS
 
-    result = np.zeros((*lengths.shape, ROWS))
-    radius = np.broadcast_to(np.asarray(batch.section.radius, float), lengths.shape)
-    for rods, law in scene.drags:
-        own = rods[(rods >= batch.first) & (rods < batch.first + batch.rods)] - batch.first
-        where = f"drag: rod {batch.first} ('{batch.name}')"
-        if own.size:
-            rows = law.coefficients(where, radius[own], lengths[own].sum(1, keepdims=True))
-            result[own] = np.stack([np.broadcast_to(row, radius[own].shape) for row in rows], -1)
+    result, radius = np.zeros((*lengths.shape, ROWS)), np.broadcast_to(radius, lengths.shape)
+    for place in np.unique(laws):
+        rods = laws == place
+        law, length = scene.drags[place][1], lengths[rods].sum(1, keepdims=True)
+        rows = law.coefficients(f"drag: rods '{name}'", radius[rods], length)
+        result[rods] = np.stack([np.broadcast_to(row, radius[rods].shape) for row in rows], -1)
+    result[lengths == 0.0] = 0.0
     return result
 
 

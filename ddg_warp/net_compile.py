@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ddg_warp import axisymmetric, net_conditions, net_elements, shell_geometry
+from ddg_warp import axisymmetric, drag, net_conditions, net_elements, shell_geometry
 from ddg_warp import shells as shell_terms
 from ddg_warp.chains import Ghosts, Piece, net_rods, pieces_of
 from ddg_warp.errors import SceneError
@@ -28,11 +28,12 @@ def compile_net(scene) -> Net | None:
     if scene.shells and scene.dimension == 2:
         raise SceneError("a scene with shells has dimension 3; leave dimension=2 to rods")
     builder, ghosts, spatial = _Builder(scene), Ghosts(scene), spatial_scene(scene)
+    laws = drag.law_of_rods(scene)
     for batch in scene.batches:
         if chosen[batch.first : batch.first + batch.rods].any():
             if scene.dimension == 2:
                 batch = _spatial(batch)
-            for piece in pieces_of(spatial, batch, ghosts, chosen):
+            for piece in pieces_of(spatial, batch, ghosts, laws, chosen):
                 for row, rod in enumerate(piece.rods):
                     builder.add_rod(piece, row, int(rod))
     for shell in scene.shells:

@@ -268,7 +268,7 @@ class Scene(Structures):
 
         Drag needs motion: it does nothing in statics, continuation and spectra. In a time step it is implicit, with the tangents of the
         step's start (of the predicted midpoint by the midpoint rule), so that overdamped rods take long steps; rods that drag holds
-        back need no mass. `Model.drag` tells forces and power.
+        back need no mass; the velocities of these are means over the last step. `Model.drag` tells forces and power.
 
         Args:
             rods: those in the fluid, all added so far by default.
@@ -277,7 +277,7 @@ class Scene(Structures):
             rotational: moment per length over the spin about the tangent [N s].
 
         Raises:
-            SceneError: a coefficient is none, a rod has drag already, or, without `rods`, there are shells, which feel none.
+            SceneError: a coefficient is none, or, without `rods`, there are shells, which feel none; at `build`, a rod has two laws.
         """
         if rods is None:
             for kind, shells in (("shell", self.shells), ("shell of revolution", self.axisymmetric_shells)):
@@ -291,10 +291,6 @@ class Scene(Structures):
             raise SceneError(f"drag: law is {law!r}; give Viscous(viscosity), Granular(...), or tangential and normal")
         elif tangential is not None or normal is not None or rotational != 0.0:
             raise SceneError("drag: a law and coefficients are given; give one of them")
-        for others, _ in self.drags:
-            twice = np.intersect1d(rods, others)
-            if twice.size:
-                raise SceneError(f"drag: rod {twice[0]} has drag already; give one law that has both")
         self.drags.append((rods, law))
 
     def build(self, device=None, precision: str | None = None, worlds: int = 1, allow_rounding: bool = False):

@@ -22,9 +22,8 @@ from ddg_warp.kernels import outcome
 from ddg_warp.kernels.balance import node_functions
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, inertia_type, until_function
 
-TANGENTIAL, NORMAL, ROTATIONAL, LATERAL, FRICTION, LEADING, SLOPE, SPEED = range(
-    8
-)  # rows of coefficients; SLOPE is tan(gamma)
+# rows of coefficients; SLOPE is tan(gamma), SPEED is zero where nothing is granular
+TANGENTIAL, NORMAL, ROTATIONAL, LATERAL, FRICTION, LEADING, SLOPE, SPEED = range(8)
 ROWS = 8
 
 

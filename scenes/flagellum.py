@@ -26,7 +26,7 @@ def build(
     n: int = 50,
     steps: int = 100,
     periods: int = 2,
-    amplitude: float = 1e-3,
+    amplitude: float = 0.02,
     scheme: str = "implicit_midpoint",
 ) -> ddg.Scene:
     """The filament along x, without inertia, on its periodic motion.
@@ -98,7 +98,7 @@ def last_period(result) -> list[ddg.Check]:
     found = 2j * np.mean(tip * np.exp(-1j * OMEGA * times)) / (amplitude * LENGTH)
     exact = complex(shape(sp, np.array(LENGTH)))
     order = 2 if analysis.scheme == "implicit_midpoint" else 1
-    tolerance = 0.2 * (sp / batch.edges) ** 2 + 4.0 * (OMEGA * analysis.dt) ** order + 40.0 * amplitude**2
+    tolerance = 0.5 * (sp / batch.edges) ** 2 + 0.5 * (OMEGA * analysis.dt) ** order + 4.0 * amplitude**2
     return [
         ddg.Check(
             f"tip's amplitude over the base's, Sp = {sp:g}",

@@ -33,7 +33,7 @@ def build(
     n: int = 40,
     turns: int = 2,
     dt: float = 0.02,
-    duration: float = 0.4,
+    duration: float = 2.0,
     stiffness: float = 1e5,
 ) -> ddg.Scene:
     """The helix about z, without inertia, turned at its first end.

@@ -275,7 +275,7 @@ LOADS = {
     "drag theory": (lambda s: s.drag(1, ddg.Viscous(1.0, "stokes")), "Viscous: theory", "'lighthill'"),
     "drag scale": (lambda s: s.drag(1, ddg.Viscous(1.0, "lighthill")), "'lighthill'", "scale"),
     "drag scale negative": (lambda s: s.drag(1, ddg.Viscous(1.0, scale=-1.0)), "Viscous: scale", "positive"),
-    "drag of a thick rod": (lambda s: s.drag(1, ddg.Viscous(1.0, scale=1e-3)), "rod 1", "'odd'", "too large", "tangential"),
+    "drag of a thick rod": (lambda s: s.drag(1, ddg.Viscous(1.0, scale=1e-3)), "'odd'", "too large", "tangential"),
     "drag in sand": (lambda s: s.drag(1, ddg.Granular(-1.0, 1.0)), "Granular: lateral", "not negative"),
     "drag in sand, leading": (lambda s: s.drag(1, ddg.Granular(1.0, 1.0, leading=-2.0)), "Granular: leading", "-friction"),
     "drag in sand, angle": (lambda s: s.drag(1, ddg.Granular(1.0, 1.0, angle=2.0)), "Granular: angle", "pi / 2"),
