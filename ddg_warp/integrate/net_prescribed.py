@@ -176,11 +176,12 @@ class NetDrag:
         felt[ends] = 1.0
         felt[angles[angles >= 0], 0] = 1.0
         self.moves = put(host.mass + felt, net.vector)
-        self.flow = wp.zeros(1, dtype=net.vector, device=device)
+        self.flow = put(flow_at(model.scene, 0.0)[None], net.vector)
 
     def upload(self, t0: float, t1: float) -> None:
         """The flow at the time that the scheme balances forces at."""
-        self.flow.assign(flow_at(self.model.scene, 0.5 * (t0 + t1) if self.midpoint else t1)[None])
+        if callable(self.model.scene.flow):
+            self.flow.assign(flow_at(self.model.scene, 0.5 * (t0 + t1) if self.midpoint else t1)[None])
 
     def resist(self, before, solver, progress: wp.array) -> None:
         """Write inertia and drag of a solve from the state `before`, once its iterate is predicted."""

@@ -125,7 +125,8 @@ class ChainDrag:
         self.model, self.group, self.midpoint = model, group, midpoint
         self._resist, self._settle = drag.chain_kernels(group.kind, model.types.real)
         self.settles = midpoint and bool((group.host.mass <= 0.0).any() or (group.host.rotary <= 0.0).any())
-        self.flow = wp.zeros(1, dtype=wp.types.vector(group.kind.dim, model.types.real), device=model.wp_device)
+        vector = wp.types.vector(group.kind.dim, model.types.real)
+        self.flow = wp.array(self._flow(0.0), dtype=vector, device=model.wp_device)
 
     @property
     def kernels(self) -> list:
@@ -134,8 +135,11 @@ class ChainDrag:
 
     def upload(self, t0: float, t1: float) -> None:
         """The flow at the time that the scheme balances forces at."""
-        flow = flow_at(self.model.scene, 0.5 * (t0 + t1) if self.midpoint else t1)
-        self.flow.assign((flow[[0, 2]] if self.group.kind.dim == 2 else flow)[None])
+        if callable(self.model.scene.flow):
+            self.flow.assign(self._flow(0.5 * (t0 + t1) if self.midpoint else t1))
+
+    def _flow(self, t: float) -> np.ndarray:
+        return flow_at(self.model.scene, t)[None, [0, 2] if self.group.kind.dim == 2 else [0, 1, 2]]
 
     def resist(self, before, newton, progress: wp.array) -> None:
         """Write inertia and drag of a solve from the state `before`, once its iterate is predicted."""
