@@ -50,6 +50,7 @@ SMALL = {
 }
 LONG = (
     "helical_flagellum",
+    "sedimenting_rod",
     "cable_gripped_at_both_ends",
     "hanging_sheet",
     "parachute",

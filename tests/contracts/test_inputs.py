@@ -334,7 +334,7 @@ def test_signatures_say_what_they_take():
     one, several = (inspect.signature(getattr(ddg.Scene, name)) for name in ("add_rod", "add_rods"))
     assert one.parameters == several.parameters
     assert list(inspect.signature(ddg.Scene).parameters) == [
-        *("gravity", "dimension", "analysis", "mass_damping", "initial", "callbacks")
+        *("gravity", "dimension", "analysis", "mass_damping", "flow", "initial", "callbacks")
     ]
     assert {p.kind for p in inspect.signature(ddg.Scene).parameters.values()} == {inspect.Parameter.KEYWORD_ONLY}
     assert typing.get_type_hints(ddg.Scene.add_rod)["return"] is int
