@@ -187,6 +187,33 @@ def test_orders_of_the_driven_filament():
         np.testing.assert_allclose(np.diff(np.log2(errors)), -order, atol=0.12)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("joined", [False, True])
+@pytest.mark.parametrize(("scheme", "order"), zip(SCHEMES, (1, 2), strict=True))
+def test_orders_in_space(device, scheme, order, joined):
+    """A curved rod without mass, alone or in two halves, that its clamp turns in a flow that changes, with rotational drag."""
+
+    def run(steps: int) -> np.ndarray:
+        scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), flow=lambda t: (0.0, np.sin(3.0 * t), 0.5))
+        s = np.linspace(0.0, 1.0, 17)
+        points = np.stack([np.cos(2.0 * s), np.sin(2.0 * s), 0.5 * s], -1)
+        section = ddg.Stiffness(EA=200.0, EI1=0.3, EI2=0.2, GJ=0.2)
+        rods = [scene.add_rod(part, section=section) for part in ((points[:9], points[8:]) if joined else (points,))]
+        if joined:
+            scene.join([(rods[0], -1), (rods[1], 0)])
+        scene.clamp(rods[0], motion=ddg.Motion(angle=lambda t: 3.0 * t * t, axis=(0.0, 0.0, 1.0)))
+        scene.drag(tangential=0.5, normal=1.5, rotational=0.05)
+        model = scene.build(device, "float64")
+        integrator, state = ddg.Integrator(model, scheme, rtol=1e-11), model.state()
+        for _ in range(steps):
+            state = integrator.step(state, 0.4 / steps)
+        return state.points()
+
+    found = [run(steps) for steps in (20, 40, 80)]
+    changes = [np.abs(a - b).max() for a, b in zip(found, found[1:], strict=False)]
+    assert np.log2(changes[0] / changes[1]) == pytest.approx(order, abs=0.1)
+
+
 def test_coefficients_of_helices():
     """A, B and D of a helix of four turns, in closed form against quadrature of its pieces (4 turns, a = 0.02 m, mu = 1 Pa s)."""
     known = {"gray_hancock": (18.4317, -1.51113, 1.11712), "lighthill": (25.2005, -1.63259, 1.53737)}
