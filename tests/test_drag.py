@@ -189,7 +189,7 @@ def test_orders_of_the_driven_filament():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("joined", [False, True])
-@pytest.mark.parametrize(("scheme", "order"), zip(SCHEMES, (1, 2), strict=True))
+@pytest.mark.parametrize(("scheme", "order"), [("implicit_euler", 1), ("implicit_midpoint", 2)])
 def test_orders_in_space(device, scheme, order, joined):
     """A curved rod without mass, alone or in two halves, that its clamp turns in a flow that changes, with rotational drag."""
 
@@ -210,8 +210,8 @@ def test_orders_in_space(device, scheme, order, joined):
         return state.points()
 
     found = [run(steps) for steps in (20, 40, 80)]
-    changes = [np.abs(a - b).max() for a, b in zip(found, found[1:], strict=False)]
-    assert np.log2(changes[0] / changes[1]) == pytest.approx(order, abs=0.1)
+    first, second = np.abs(np.diff(found, axis=0)).max((1, 2))
+    assert np.log2(first / second) == pytest.approx(order, abs=0.1)
 
 
 def test_coefficients_of_helices():

@@ -124,14 +124,13 @@ class ChainDrag:
     def __init__(self, model, group, midpoint: bool = False):
         self.model, self.group, self.midpoint = model, group, midpoint
         self._resist, self._settle = drag.chain_kernels(group.kind, model.types.real)
-        self.settles = midpoint and bool((group.host.mass <= 0.0).any() or (group.host.rotary <= 0.0).any())
         vector = wp.types.vector(group.kind.dim, model.types.real)
         self.flow = wp.array(self._flow(0.0), dtype=vector, device=model.wp_device)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [self._resist, *([self._settle] if self.settles else [])]
+        return [self._resist, *([self._settle] if self.midpoint else [])]
 
     def upload(self, t0: float, t1: float) -> None:
         """The flow at the time that the scheme balances forces at."""
@@ -165,7 +164,7 @@ class ChainDrag:
     def settle(self, after, newton, progress: wp.array) -> None:
         """Rates of what has no inertia in the state `after`."""
         group = self.group
-        if self.settles:
+        if self.midpoint:
             self._launch(
                 self._settle,
                 [newton.x, newton.theta, group.mass, group.rotary, group.count, newton.status, progress, newton.rate]
