@@ -13,6 +13,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, until_function
+from ddg_warp.kernels.islands import islands_type
 
 
 @cache
@@ -103,6 +104,7 @@ def check_kernel(kind: ChainKind, real, linear):
     `drowned` is raised where only rounding excuses a residual. Residuals of held dofs are written as zero. `noise` bounds the
     rounding in `change`, which sums the differences of the element energies and the work of inertia and loads along the step.
     """
+    Islands = islands_type(real)
     dim, nb, twist, closed = kind.dim, kind.block, kind.twist, kind.closed
     V = wp.types.vector(dim, real)
     _, behind, balance = node_functions(kind, real)
@@ -117,7 +119,7 @@ def check_kernel(kind: ChainKind, real, linear):
         count: wp.array(dtype=int),
         mass: wp.array2d(dtype=real),
         rotary: wp.array2d(dtype=real),
-        coefficient: wp.array(dtype=real),
+        islands: Islands,
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
         base: wp.array2d(dtype=V),
@@ -132,29 +134,21 @@ def check_kernel(kind: ChainKind, real, linear):
         length: wp.array(dtype=real),
         rtol: real,
         floor: real,
-        load_scale: wp.array(dtype=real),
-        status: wp.array(dtype=int),
-        slot: wp.array(dtype=int),
-        iteration: wp.array(dtype=int),
-        step_length: wp.array(dtype=real),
-        placed: wp.array(dtype=int),
         right_out: wp.array3d(dtype=linear),
         change_out: wp.array2d(dtype=real),
         noise_out: wp.array2d(dtype=linear),
-        unbalanced_out: wp.array(dtype=int),
-        drowned_out: wp.array(dtype=int),
     ):
         start, r = wp.tid()
         n = count[r]
-        if status[r] != 0 or start >= n:
+        if islands.status[r] != 0 or start >= n:
             return
-        c = coefficient[r]
-        accepted = slot[r]
-        taken = step_length[r]
-        limit = rtol * load_scale[r]
-        if iteration[r] == 0 or taken < real(1.0):
+        c = islands.coefficient[r]
+        accepted = islands.slot[r]
+        taken = islands.step_length[r]
+        limit = rtol * islands.load_scale[r]
+        if islands.iteration[r] == 0 or taken < real(1.0):
             limit /= real(n)
-        moved = placed[r] != 0
+        moved = islands.placed[r] != 0
         for k in range(start, until(start, n)):
             f, moment, size, elastic = balance(
                 g, mass, rotary, c, x, theta, target, target_angle, gravity, load, load_angle, loaded, k, n, r
@@ -174,14 +168,14 @@ def check_kernel(kind: ChainKind, real, linear):
                 held = ((mask >> d) & 1) == 1
                 right_out[d, k, r] = linear(wp.where(held, real(0.0), f[d]))
                 if not held and not wp.abs(f[d]) <= limit:
-                    drowned_out[r] = 1
+                    islands.drowned[r] = 1
                     if not wp.abs(f[d]) <= least:
-                        unbalanced_out[r] = 1
+                        islands.unbalanced[r] = 1
             if wp.static(twist):
                 held = ((mask >> wp.static(dim)) & 1) == 1
                 right_out[wp.static(nb - 1), k, r] = linear(wp.where(held, real(0.0), moment))
                 if not held and not wp.abs(moment) <= limit * length[r]:
-                    drowned_out[r] = 1
+                    islands.drowned[r] = 1
                     arm = wp.length(x[along(k + 1, n), r] - here)
                     least = floor * (
                         real(2.0) * stiff * arm * arm * reach / length[r]
@@ -189,8 +183,8 @@ def check_kernel(kind: ChainKind, real, linear):
                         + wp.abs(elastic)
                     )
                     if not wp.abs(moment) <= least:
-                        unbalanced_out[r] = 1
-            if iteration[r] == 0:
+                        islands.unbalanced[r] = 1
+            if islands.iteration[r] == 0:
                 continue
             change = real(0.0)
             noise = real(0.5) * size * reach

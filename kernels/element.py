@@ -14,6 +14,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import frames
+from ddg_warp.kernels.islands import islands_type
 from ddg_warp.kernels.measures.turning import packed_index
 from ddg_warp.kernels.terms import Term
 
@@ -483,6 +484,7 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
     reference twist nears a jump. `stiffness` is the largest a term has against moving its first edge [N/m]. Thread (0, 0) clears
     `active`, which the sweep then raises.
     """
+    Islands = islands_type(real)
     V = wp.types.vector(kind.dim, real)
     until = until_function(kind)
     _, window, lagged, _ = gather_functions(kind, real)
@@ -506,31 +508,27 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
         theta: wp.array2d(dtype=real),
         frame: wp.array3d(dtype=real),
         last: wp.array3d(dtype=real),
-        rate: wp.array(dtype=real),
+        islands: Islands,
         buffer: wp.array(dtype=real),
         table: wp.array2d(dtype=int),
         count: wp.array(dtype=int),
-        status: wp.array(dtype=int),
-        slot: wp.array(dtype=int),
         clamped: wp.array(dtype=int),
-        iteration: wp.array(dtype=int),
         reuse: int,
         factor_out: wp.array3d(dtype=linear),
         geometric_out: wp.array3d(dtype=linear),
         gradient_out: wp.array3d(dtype=real),
         energy_out: wp.array3d(dtype=real),
         stiffness_out: wp.array2d(dtype=linear),
-        turned_out: wp.array(dtype=int),
-        active_out: wp.array(dtype=int),
     ):
         start, r = wp.tid()
         if start == 0 and r == 0:
-            active_out[0] = 0
+            islands.active[0] = 0
         n = count[r]
-        if status[r] != 0 or start >= n - wp.static(0 if closed else 1):
+        if islands.status[r] != 0 or start >= n - wp.static(0 if closed else 1):
             return
-        frozen = reuse != 0 and iteration[r] > 0
-        exact = iteration[r] >= wp.static(begin)
+        frozen = reuse != 0 and islands.iteration[r] > 0
+        exact = islands.iteration[r] >= wp.static(begin)
+        rate = islands.rate[r]
         for k in range(start, until(start, n - wp.static(0 if closed else 1))):
             whole = wp.static(closed) or k < n - 2
             q = window(x, theta, k, n, whole, r)
@@ -540,19 +538,19 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
             stiffest = real(0.0)
             if whole or wp.static(everywhere):
                 own, part, stiff = evaluate_first(
-                    q, s, buffer, table, last, rate[r], clamped[r], frozen, exact, factor_out, geometric_out, k, r
+                    q, s, buffer, table, last, rate, clamped[r], frozen, exact, factor_out, geometric_out, k, r
                 )
                 energy += own
                 f += part
                 stiffest = wp.max(stiffest, stiff)
             if wp.static(terms > 1):
                 own_too, part_too, stiff_too = evaluate_last(
-                    q, s, buffer, table, last, rate[r], clamped[r], frozen, exact, factor_out, geometric_out, k, r
+                    q, s, buffer, table, last, rate, clamped[r], frozen, exact, factor_out, geometric_out, k, r
                 )
                 energy += own_too
                 f += part_too
                 stiffest = wp.max(stiffest, stiff_too)
-            energy_out[1 - slot[r], k, r] = energy
+            energy_out[1 - islands.slot[r], k, r] = energy
             stiffness_out[k, r] = linear(stiffest)
             for i in range(wp.static(size)):
                 gradient_out[i, k, r] = f[i]
@@ -574,7 +572,7 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
                         uf = transport(X(s[6], s[7], s[8]), tf0, tf)
                         m = reference_twist(ue, uf, te, tf, s[12])
                         if wp.min(along_e, along_f) < real(0.0) or wp.abs(m - s[12]) > real(1.5):
-                            turned_out[r] = 1
+                            islands.turned[r] = 1
 
     return evaluate
 

@@ -10,6 +10,7 @@ import warp as wp
 
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.element import ChainKind
+from ddg_warp.kernels.islands import islands_type
 from ddg_warp.kernels.search import PLACE, RELAG, search_functions, shorter_function
 
 STOP, DIRECT = 0, 3  # beside PLACE and RELAG: nothing more to do, and a direction is wanted
@@ -18,27 +19,24 @@ STOP, DIRECT = 0, 3  # beside PLACE and RELAG: nothing more to do, and a directi
 @cache
 def judge_functions(twist: bool, real):
     """balanced(...): whether a rod has stopped; decide(...): what an active rod does next (STOP, PLACE, RELAG or DIRECT)."""
+    Islands = islands_type(real)
     shorter = shorter_function(real)
 
     @wp.func
-    def balanced(
-        status: wp.array(dtype=int),
-        unbalanced: wp.array(dtype=int),
-        drowned: wp.array(dtype=int),
-        iteration: wp.array(dtype=int),
-        r: int,
-    ):
+    def balanced(islands: Islands, r: int):
         """Whether the rod has stopped, by its last iterate or before; lowers its flags where it has not."""
-        if status[r] != 0:
+        if islands.status[r] != 0:
             return True
         # rounding excuses a residual only after an iteration: the predictor's may be all of a coarse precision's load
-        if unbalanced[r] == 0 and (drowned[r] == 0 or iteration[r] > 0):
-            status[r] = wp.where(
-                drowned[r] == 0, int(wp.static(outcome.CONVERGED)), int(wp.static(outcome.CONVERGED_TO_ROUNDING))
+        if islands.unbalanced[r] == 0 and (islands.drowned[r] == 0 or islands.iteration[r] > 0):
+            islands.status[r] = wp.where(
+                islands.drowned[r] == 0,
+                int(wp.static(outcome.CONVERGED)),
+                int(wp.static(outcome.CONVERGED_TO_ROUNDING)),
             )
             return True
-        unbalanced[r] = 0
-        drowned[r] = 0
+        islands.unbalanced[r] = 0
+        islands.drowned[r] = 0
         return False
 
     @wp.func
@@ -49,61 +47,52 @@ def judge_functions(twist: bool, real):
         worst: real,
         max_iterations: int,
         max_halvings: int,
-        status: wp.array(dtype=int),
-        slot: wp.array(dtype=int),
-        iteration: wp.array(dtype=int),
-        halvings: wp.array(dtype=int),
-        step_length: wp.array(dtype=real),
-        decrement: wp.array(dtype=real),
-        merit: wp.array(dtype=real),
-        load_scale: wp.array(dtype=real),
-        largest: wp.array(dtype=real),
-        turned: wp.array(dtype=int),
+        islands: Islands,
         r: int,
     ):
         """From the energy's change and its rounding, the square and the largest component of the residual.
 
         PLACE leaves the shorter step in `step_length`; RELAG asks for frames of the iterate and a step of no length.
         """
-        first = iteration[r] == 0
-        largest[r] = worst
+        first = islands.iteration[r] == 0
+        islands.residual[r] = worst
         total = change
         if first:
             total = real(0.0)
-            if load_scale[r] == real(0.0):
-                load_scale[r] = worst
+            if islands.load_scale[r] == real(0.0):
+                islands.load_scale[r] = worst
         finite = wp.isfinite(square) and wp.isfinite(total)
         if first and not finite:
-            status[r] = wp.static(outcome.NON_FINITE)
+            islands.status[r] = wp.static(outcome.NON_FINITE)
             return wp.static(STOP)
-        taken = step_length[r]
-        expected = taken * decrement[r]
+        taken = islands.step_length[r]
+        expected = taken * islands.decrement[r]
         accept = first
         if not first and finite:
             if expected > real(10.0) * rounding:
                 accept = total <= real(-1.0e-4) * expected + rounding
             else:
-                accept = square <= real(4.0) * merit[r] or taken == real(0.0)
+                accept = square <= real(4.0) * islands.merit[r] or taken == real(0.0)
         if not accept:
-            halvings[r] = halvings[r] + 1
-            if halvings[r] > max_halvings:
-                status[r] = wp.static(outcome.LINE_SEARCH_FAILED)
+            islands.halvings[r] = islands.halvings[r] + 1
+            if islands.halvings[r] > max_halvings:
+                islands.status[r] = wp.static(outcome.LINE_SEARCH_FAILED)
                 return wp.static(STOP)
-            step_length[r] = shorter(taken, expected, total, finite)
+            islands.step_length[r] = shorter(taken, expected, total, finite)
             return wp.static(PLACE)
-        iteration[r] = iteration[r] + 1
-        if iteration[r] > max_iterations:
-            status[r] = wp.static(outcome.MAX_ITERATIONS)
+        islands.iteration[r] = islands.iteration[r] + 1
+        if islands.iteration[r] > max_iterations:
+            islands.status[r] = wp.static(outcome.MAX_ITERATIONS)
             return wp.static(STOP)
-        merit[r] = square
-        slot[r] = 1 - slot[r]
-        halvings[r] = 0
+        islands.merit[r] = square
+        islands.slot[r] = 1 - islands.slot[r]
+        islands.halvings[r] = 0
         if wp.static(twist):
-            if turned[r] != 0:
+            if islands.turned[r] != 0:
                 # angles mean something else now: take no step, and ask for a direction in the new frames
-                turned[r] = 0
-                decrement[r] = real(1.0e30)
-                step_length[r] = real(0.0)
+                islands.turned[r] = 0
+                islands.decrement[r] = real(1.0e30)
+                islands.step_length[r] = real(0.0)
                 return wp.static(RELAG)
         return wp.static(DIRECT)
 
@@ -113,6 +102,7 @@ def judge_functions(twist: bool, real):
 @cache
 def judge_kernel(kind: ChainKind, real, linear):
     """The line search of a rod by one thread: sums over its nodes, decides, and puts a shortened step or new frames."""
+    Islands = islands_type(real)
     V = wp.types.vector(kind.dim, real)
     place, turn_angles, relag, _ = search_functions(kind, real, linear)
     balanced, decide = judge_functions(kind.twist, real)
@@ -133,24 +123,11 @@ def judge_kernel(kind: ChainKind, real, linear):
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
         frame: wp.array3d(dtype=real),
-        status: wp.array(dtype=int),
-        unbalanced: wp.array(dtype=int),
-        drowned: wp.array(dtype=int),
-        slot: wp.array(dtype=int),
-        iteration: wp.array(dtype=int),
-        halvings: wp.array(dtype=int),
-        step_length: wp.array(dtype=real),
-        decrement: wp.array(dtype=real),
-        merit: wp.array(dtype=real),
-        load_scale: wp.array(dtype=real),
-        largest: wp.array(dtype=real),
-        turned: wp.array(dtype=int),
-        wanted: wp.array(dtype=int),
-        active: wp.array(dtype=int),
+        islands: Islands,
     ):
         r = wp.tid()
-        wanted[r] = 0
-        if balanced(status, unbalanced, drowned, iteration, r):
+        islands.wanted[r] = 0
+        if balanced(islands, r):
             return
         n = count[r]
         total = real(0.0)
@@ -164,31 +141,13 @@ def judge_kernel(kind: ChainKind, real, linear):
                 size = wp.abs(real(residual[d, k, r]))
                 worst = wp.max(worst, size)
                 square += size * size
-        taken = step_length[r]
-        what = decide(
-            total,
-            rounding * floor,
-            square,
-            worst,
-            max_iterations,
-            max_halvings,
-            status,
-            slot,
-            iteration,
-            halvings,
-            step_length,
-            decrement,
-            merit,
-            load_scale,
-            largest,
-            turned,
-            r,
-        )
+        taken = islands.step_length[r]
+        what = decide(total, rounding * floor, square, worst, max_iterations, max_halvings, islands, r)
         if what == wp.static(STOP):
             return
-        active[0] = 1
+        islands.active[0] = 1
         if what == wp.static(PLACE):
-            less = step_length[r]
+            less = islands.step_length[r]
             place(x, base, direction, fixed, less, n, r)
             turn_angles(theta, direction, less - taken, n, r)
         if wp.static(twist):
@@ -197,6 +156,6 @@ def judge_kernel(kind: ChainKind, real, linear):
                 for k in range(n):
                     base[k, r] = x[k, r]
         if what == wp.static(DIRECT):
-            wanted[r] = 1
+            islands.wanted[r] = 1
 
     return judge

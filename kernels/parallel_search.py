@@ -10,6 +10,7 @@ import warp as wp
 
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.element import ChainKind
+from ddg_warp.kernels.islands import islands_type
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
 from ddg_warp.kernels.search import PLACE, TURNED
 
@@ -91,6 +92,7 @@ def sum_kernels(kind: ChainKind, real, linear):
 @cache
 def decide_kernels(kind: ChainKind, real, linear):
     """Decisions of a rod from its partial sums: `judge` of an iterate, `take` of a direction."""
+    Islands = islands_type(real)
     balanced, decide = judge_functions(kind.twist, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -100,30 +102,13 @@ def decide_kernels(kind: ChainKind, real, linear):
         floor: real,
         max_iterations: int,
         max_halvings: int,
-        status: wp.array(dtype=int),
-        unbalanced: wp.array(dtype=int),
-        drowned: wp.array(dtype=int),
-        slot: wp.array(dtype=int),
-        iteration: wp.array(dtype=int),
-        halvings: wp.array(dtype=int),
-        step_length: wp.array(dtype=real),
-        decrement: wp.array(dtype=real),
-        merit: wp.array(dtype=real),
-        load_scale: wp.array(dtype=real),
-        largest: wp.array(dtype=real),
-        turned: wp.array(dtype=int),
-        lost: wp.array(dtype=int),
-        wanted: wp.array(dtype=int),
-        bad: wp.array(dtype=int),
-        todo: wp.array(dtype=int),
-        angle_change: wp.array(dtype=real),
-        active: wp.array(dtype=int),
+        islands: Islands,
     ):
         r = wp.tid()
-        wanted[r] = 0
-        todo[r] = 0
-        bad[r] = 0
-        if balanced(status, unbalanced, drowned, iteration, r):
+        islands.wanted[r] = 0
+        islands.todo[r] = 0
+        islands.bad[r] = 0
+        if balanced(islands, r):
             return
         total = real(0.0)
         rounding = real(0.0)
@@ -134,77 +119,50 @@ def decide_kernels(kind: ChainKind, real, linear):
             rounding += partial[1, i, r]
             square += partial[2, i, r]
             worst = wp.max(worst, partial[3, i, r])
-        if iteration[r] == 0:
-            lost[r] = 0
-        taken = step_length[r]
-        what = decide(
-            total,
-            rounding * floor,
-            square,
-            worst,
-            max_iterations,
-            max_halvings,
-            status,
-            slot,
-            iteration,
-            halvings,
-            step_length,
-            decrement,
-            merit,
-            load_scale,
-            largest,
-            turned,
-            r,
-        )
+        if islands.iteration[r] == 0:
+            islands.lost[r] = 0
+        taken = islands.step_length[r]
+        what = decide(total, rounding * floor, square, worst, max_iterations, max_halvings, islands, r)
         if what == wp.static(STOP):
             return
-        active[0] = 1
+        islands.active[0] = 1
         if what == wp.static(DIRECT):
-            wanted[r] = 1
+            islands.wanted[r] = 1
         else:
-            todo[r] = what
-            angle_change[r] = step_length[r] - taken
+            islands.todo[r] = what
+            islands.angle_change[r] = islands.step_length[r] - taken
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def take(
         partial: wp.array3d(dtype=real),
         ranges: int,
         rotation_cap: real,
-        wanted: wp.array(dtype=int),
-        bad: wp.array(dtype=int),
-        status: wp.array(dtype=int),
-        iteration: wp.array(dtype=int),
-        step_length: wp.array(dtype=real),
-        decrement: wp.array(dtype=real),
-        lost: wp.array(dtype=int),
-        clamped: wp.array(dtype=int),
-        todo: wp.array(dtype=int),
-        angle_change: wp.array(dtype=real),
+        islands: Islands,
     ):
         r = wp.tid()
-        if wanted[r] == 0:
+        if islands.wanted[r] == 0:
             return
-        if bad[r] > 0 and clamped[r] == 0:
+        if islands.bad[r] > 0 and islands.clamped[r] == 0:
             # compression has made the matrix indefinite: the same iterate again, without what compression takes away
-            clamped[r] = 1
-            iteration[r] = iteration[r] - 1
-            step_length[r] = real(0.0)
+            islands.clamped[r] = 1
+            islands.iteration[r] = islands.iteration[r] - 1
+            islands.step_length[r] = real(0.0)
             return
-        lost[r] = lost[r] + bad[r]
+        islands.lost[r] = islands.lost[r] + islands.bad[r]
         total = real(0.0)
         rotation = real(0.0)
         for i in range(ranges):
             total += partial[0, i, r]
             rotation = wp.max(rotation, partial[1, i, r])
         if not wp.isfinite(total):
-            status[r] = wp.static(outcome.NON_FINITE)
+            islands.status[r] = wp.static(outcome.NON_FINITE)
             return
         whole = real(1.0)
         if rotation > rotation_cap * rotation_cap:
             whole = rotation_cap / wp.sqrt(rotation)
-        step_length[r] = whole
-        angle_change[r] = whole
-        decrement[r] = total
-        todo[r] = wp.where(rotation > real(wp.static(TURNED**2)), wp.static(PLACE), wp.static(STRAIGHT))
+        islands.step_length[r] = whole
+        islands.angle_change[r] = whole
+        islands.decrement[r] = total
+        islands.todo[r] = wp.where(rotation > real(wp.static(TURNED**2)), wp.static(PLACE), wp.static(STRAIGHT))
 
     return judge, take

@@ -12,6 +12,7 @@ import warp as wp
 from ddg_warp.kernels import outcome, pivot
 from ddg_warp.kernels.block_band import block_functions, product_function, substitute_function
 from ddg_warp.kernels.element import ChainKind
+from ddg_warp.kernels.islands import islands_type
 from ddg_warp.kernels.search import TURNED, search_functions
 
 PRECONDITIONERS = ("jacobi", "block_jacobi", "chain")
@@ -170,41 +171,33 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
 
 
 @cache
-def repeat_kernel(fails: bool):
+def repeat_kernel(real, fails: bool):
     """Where the exact Hessian is indefinite: end the solve (`fails`), or undo the acceptance and ask for the iterate again.
 
     `negative` counts lost pivots and negative curvatures of this iteration; `clamped` then leaves the geometric stiffness and
     what compression takes away out of the next matrix, and the line search, which has the same numbers, accepts again.
     `done` says that the direction has been found.
     """
+    Islands = islands_type(real)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def repeat(
-        done: int,
-        wanted: wp.array(dtype=int),
-        negative: wp.array(dtype=int),
-        clamped: wp.array(dtype=int),
-        status: wp.array(dtype=int),
-        iteration: wp.array(dtype=int),
-        slot: wp.array(dtype=int),
-        lost: wp.array(dtype=int),
-    ):
+    def repeat(done: int, islands: Islands, negative: wp.array(dtype=int)):
         r = wp.tid()
-        if wanted[r] == 0:
+        if islands.wanted[r] == 0:
             return
-        if negative[r] > 0 and clamped[r] == 0:
-            wanted[r] = 0
+        if negative[r] > 0 and islands.clamped[r] == 0:
+            islands.wanted[r] = 0
             negative[r] = 0
             if wp.static(fails):
-                status[r] = wp.static(outcome.INDEFINITE)
+                islands.status[r] = wp.static(outcome.INDEFINITE)
                 return
-            clamped[r] = 1
-            iteration[r] = iteration[r] - 1
-            slot[r] = 1 - slot[r]
+            islands.clamped[r] = 1
+            islands.iteration[r] = islands.iteration[r] - 1
+            islands.slot[r] = 1 - islands.slot[r]
         elif done != 0:
-            lost[r] = lost[r] + negative[r]
+            islands.lost[r] = islands.lost[r] + negative[r]
             negative[r] = 0
-            clamped[r] = 0
+            islands.clamped[r] = 0
 
     return repeat
 
@@ -212,6 +205,7 @@ def repeat_kernel(fails: bool):
 @cache
 def take_kernel(kind: ChainKind, real, linear):
     """Take the direction that was found: cap its rotation, move, and keep its decrement r . d."""
+    Islands = islands_type(real)
     dim = kind.dim
     V = wp.types.vector(dim, real)
     place, turn_angles, _, _ = search_functions(kind, real, linear)
@@ -228,13 +222,11 @@ def take_kernel(kind: ChainKind, real, linear):
         base: wp.array2d(dtype=V),
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
-        wanted: wp.array(dtype=int),
-        step_length: wp.array(dtype=real),
-        decrement: wp.array(dtype=real),
+        islands: Islands,
         work: wp.array(dtype=wp.int64),
     ):
         r = wp.tid()
-        if wanted[r] == 0:
+        if islands.wanted[r] == 0:
             return
         n = count[r]
         rotation = real(0.0)
@@ -260,8 +252,8 @@ def take_kernel(kind: ChainKind, real, linear):
                 for d in range(wp.static(dim)):
                     step[d] = real(direction[d, k, r])
                 x[k, r] = x[k, r] + step
-        step_length[r] = whole
-        decrement[r] = total
+        islands.step_length[r] = whole
+        islands.decrement[r] = total
         wp.atomic_add(work, 0, wp.int64(iterations[r]))
 
     return take

@@ -17,12 +17,15 @@ import warp as wp
 
 from ddg_warp.kernels import frames, motion, outcome
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, until_function
+from ddg_warp.kernels.islands import attempt_functions, islands_type
 from ddg_warp.kernels.search import TURNED, search_functions
 
 
 @cache
 def begin_kernel(kind: ChainKind, real, midpoint: bool):
     """Predictor, target of the inertia, copy of the lagged frames; restarts the search of every rod that still has to move."""
+    Islands = islands_type(real)
+    length, restart = attempt_functions(real, midpoint)
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
     until = until_function(kind)
@@ -40,49 +43,23 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
         dt: wp.array(dtype=real),
         damping: wp.array(dtype=real),
         outer: wp.array(dtype=real),
-        progress: wp.array(dtype=real),
-        portion: wp.array(dtype=real),
-        cautious: wp.array(dtype=int),
+        islands: Islands,
         x_out: wp.array2d(dtype=V),
         theta_out: wp.array2d(dtype=real),
         frame_out: wp.array3d(dtype=real),
         target_out: wp.array2d(dtype=V),
         target_angle_out: wp.array2d(dtype=real),
-        coefficient_out: wp.array(dtype=real),
-        rate_out: wp.array(dtype=real),
-        status_out: wp.array(dtype=int),
-        iteration_out: wp.array(dtype=int),
-        halvings_out: wp.array(dtype=int),
-        turned_out: wp.array(dtype=int),
-        clamped_out: wp.array(dtype=int),
-        unbalanced_out: wp.array(dtype=int),
-        drowned_out: wp.array(dtype=int),
-        load_scale_out: wp.array(dtype=real),
-        bent_out: wp.array(dtype=int),
-        active_out: wp.array(dtype=int),
     ):
         start, r = wp.tid()
         n = count[r]
-        if progress[r] >= real(1.0) or start >= n:
+        if islands.progress[r] >= real(1.0) or start >= n:
             return
-        s = dt[world[r]] * portion[r]
-        if wp.static(midpoint):
-            s *= real(0.5)
+        s = length(islands, r, dt[world[r]])
         rate = real(1.0) / s
         coefficient = rate * (rate + damping[0])
         if start == 0:
-            coefficient_out[r] = coefficient
-            rate_out[r] = rate
-            status_out[r] = 0
-            iteration_out[r] = 0
-            halvings_out[r] = 0
-            turned_out[r] = 0
-            clamped_out[r] = 0
-            unbalanced_out[r] = 0
-            drowned_out[r] = 0
-            load_scale_out[r] = outer[r]
-            active_out[0] = 1
-        ahead = wp.where(cautious[r] == 0, s, real(0.0))
+            restart(islands, r, rate, coefficient, outer[r])
+        ahead = wp.where(islands.cautious[r] == 0, s, real(0.0))
         for k in range(start, until(start, n)):
             mask = int(fixed[k, r])
             here = x0[k, r]
@@ -92,11 +69,11 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
                 if ((mask >> d) & 1) == 0:
                     here[d] = here[d] + ahead * v[d]
             x_out[k, r] = here
-            if cautious[r] == 0 and k + 1 < n:
+            if islands.cautious[r] == 0 and k + 1 < n:
                 turn = (v0[k + 1, r] - v) * s
                 edge = x0[k + 1, r] - x0[k, r]
                 if wp.length_sq(turn) > real(wp.static(TURNED**2)) * wp.length_sq(edge):
-                    bent_out[r] = 1
+                    islands.bent[r] = 1
             if wp.static(twist):
                 angle = theta0[k, r]
                 spin = omega0[k, r]
@@ -117,6 +94,7 @@ def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
     For the midpoint rule the lagged frames are carried to the predicted midpoint. Frames lagged at the start of the step spin
     about their edges by O(h) at the midpoint, which the rotary inertia does not see: it would be of first order there.
     """
+    Islands = islands_type(real)
     dim, carried = kind.dim, kind.twist and midpoint
     V = wp.types.vector(dim, real)
     place, _, relag, _ = search_functions(kind, real, linear)
@@ -127,22 +105,20 @@ def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
         v0: wp.array2d(dtype=V),
         fixed: wp.array2d(dtype=wp.uint8),
         count: wp.array(dtype=int),
-        rate: wp.array(dtype=real),
-        progress: wp.array(dtype=real),
-        bent: wp.array(dtype=int),
+        islands: Islands,
         base: wp.array2d(dtype=V),
         direction: wp.array3d(dtype=linear),
         x: wp.array2d(dtype=V),
         frame: wp.array3d(dtype=real),
     ):
         r = wp.tid()
-        if progress[r] >= real(1.0):
+        if islands.progress[r] >= real(1.0):
             return
         n = count[r]
-        if bent[r] != 0:
+        if islands.bent[r] != 0:
             for k in range(n):
                 base[k, r] = x0[k, r]
-                v = v0[k, r] / rate[r]
+                v = v0[k, r] / islands.rate[r]
                 for d in range(wp.static(dim)):
                     direction[d, k, r] = linear(wp.where(((int(fixed[k, r]) >> d) & 1) == 0, v[d], real(0.0)))
             place(x, base, direction, fixed, real(1.0), n, r)
@@ -155,20 +131,15 @@ def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
 @cache
 def start_kernel(real):
     """Starts a step: every rod that has not been given up has all of it to do."""
+    Islands = islands_type(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def start(
-        status: wp.array(dtype=int),
-        progress_out: wp.array(dtype=real),
-        portion_out: wp.array(dtype=real),
-        cautious_out: wp.array(dtype=int),
-        retries_out: wp.array(dtype=int),
-    ):
+    def start(islands: Islands):
         r = wp.tid()
-        portion_out[r] = real(1.0)
-        cautious_out[r] = 0
-        retries_out[r] = 0
-        progress_out[r] = wp.where(status[r] == wp.static(outcome.GIVEN_UP), real(1.0), real(0.0))
+        islands.portion[r] = real(1.0)
+        islands.cautious[r] = 0
+        islands.retries[r] = 0
+        islands.progress[r] = wp.where(islands.status[r] == wp.static(outcome.GIVEN_UP), real(1.0), real(0.0))
 
     return start
 
@@ -176,6 +147,7 @@ def start_kernel(real):
 @cache
 def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
     """Positions, angles and their velocities at the end of the step, of the rods that converged."""
+    Islands = islands_type(real)
     V, twist = wp.types.vector(kind.dim, real), kind.twist
     until = until_function(kind)
 
@@ -188,9 +160,7 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
         theta0: wp.array2d(dtype=real),
         omega0: wp.array2d(dtype=real),
         count: wp.array(dtype=int),
-        status: wp.array(dtype=int),
-        progress: wp.array(dtype=real),
-        rate: wp.array(dtype=real),
+        islands: Islands,
         x_out: wp.array2d(dtype=V),
         v_out: wp.array2d(dtype=V),
         theta_out: wp.array2d(dtype=real),
@@ -200,7 +170,9 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
         n = count[r]
         if start >= n:
             return
-        moves = progress[r] < real(1.0) and status[r] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
+        moves = islands.progress[r] < real(1.0) and islands.status[r] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
+        if start == 0:
+            islands.moved[r] = wp.where(moves, 1, 0)
         for k in range(start, until(start, n)):
             before = x0[k, r]
             v = v0[k, r]
@@ -213,7 +185,7 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
             angle = angle0
             if moves:
                 end = x[k, r]
-                change = (end - before) * rate[r]
+                change = (end - before) * islands.rate[r]
                 if wp.static(midpoint):
                     end = real(2.0) * end - before
                     v = real(2.0) * change - v
@@ -221,7 +193,7 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
                     v = change
                 if wp.static(twist):
                     angle = theta[k, r]
-                    turn = (angle - angle0) * rate[r]
+                    turn = (angle - angle0) * islands.rate[r]
                     if wp.static(midpoint):
                         angle = real(2.0) * angle - angle0
                         spin = real(2.0) * turn - spin
@@ -263,15 +235,14 @@ def finish_frames_kernel(kind: ChainKind, real):
         frame: wp.array3d(dtype=real),
         frame0: wp.array3d(dtype=real),
         count: wp.array(dtype=int),
-        status: wp.array(dtype=int),
-        progress: wp.array(dtype=real),
+        moved: wp.array(dtype=int),
         frame_out: wp.array3d(dtype=real),
     ):
         start, r = wp.tid()
         n = count[r]
         if start >= n - wp.static(0 if closed else 1):
             return
-        if progress[r] >= real(1.0) or status[r] > wp.static(outcome.CONVERGED_TO_ROUNDING):
+        if moved[r] == 0:
             for k in range(start, until(start, n - wp.static(0 if closed else 1))):
                 for c in range(7):
                     frame_out[c, k, r] = frame0[c, k, r]
@@ -295,59 +266,56 @@ def advance_kernel(real):
     `tally` counts outcomes by their code, solves that rounding ended as `rounded`. `work` holds Newton iterations (sum, largest),
     solves, retries, lost pivots.
     """
+    Islands = islands_type(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def advance(
-        iteration: wp.array(dtype=int),
-        lost: wp.array(dtype=int),
+        islands: Islands,
         retry_limit: int,
         smallest: real,
         rounded: int,
-        status: wp.array(dtype=int),
-        progress: wp.array(dtype=real),
-        portion: wp.array(dtype=real),
-        cautious: wp.array(dtype=int),
-        retries: wp.array(dtype=int),
-        reason: wp.array(dtype=int),
         tally: wp.array(dtype=wp.int64),
         work: wp.array(dtype=wp.int64),
         remaining: wp.array(dtype=int),
     ):
         r = wp.tid()
-        if progress[r] >= real(1.0):
+        if islands.progress[r] >= real(1.0):
             return
-        result = status[r]
+        result = islands.status[r]
         counted = result
         if result == wp.static(outcome.CONVERGED_TO_ROUNDING):
             counted = rounded
         wp.atomic_add(tally, counted, wp.int64(1))
-        wp.atomic_add(work, 0, wp.int64(iteration[r]))
-        wp.atomic_max(work, 1, wp.int64(iteration[r]))
+        wp.atomic_add(work, 0, wp.int64(islands.iteration[r]))
+        wp.atomic_max(work, 1, wp.int64(islands.iteration[r]))
         wp.atomic_add(work, 2, wp.int64(1))
-        if lost[r] > 0:
-            wp.atomic_add(work, 4, wp.int64(lost[r]))
+        if islands.lost[r] > 0:
+            wp.atomic_add(work, 4, wp.int64(islands.lost[r]))
         if result <= wp.static(outcome.CONVERGED_TO_ROUNDING):
-            progress[r] = progress[r] + portion[r]
-            cautious[r] = 0
-            retries[r] = 0
+            islands.progress[r] = islands.progress[r] + islands.portion[r]
+            islands.cautious[r] = 0
+            islands.retries[r] = 0
             # a step twice as long, where it starts at a multiple of its length, so that all end together
-            longer = real(2.0) * portion[r]
-            if progress[r] < real(1.0) and wp.floor(progress[r] / longer) * longer == progress[r]:
-                portion[r] = longer
+            longer = real(2.0) * islands.portion[r]
+            if (
+                islands.progress[r] < real(1.0)
+                and wp.floor(islands.progress[r] / longer) * longer == islands.progress[r]
+            ):
+                islands.portion[r] = longer
         else:
             wp.atomic_add(work, 3, wp.int64(1))
-            retries[r] = retries[r] + 1
+            islands.retries[r] = islands.retries[r] + 1
             # another start would lead to the same step, and its energy
-            if cautious[r] == 0 and result != wp.static(outcome.ENERGY_DRIFT):
-                cautious[r] = 1
+            if islands.cautious[r] == 0 and result != wp.static(outcome.ENERGY_DRIFT):
+                islands.cautious[r] = 1
             else:
-                cautious[r] = 0
-                portion[r] = real(0.5) * portion[r]
-            if retries[r] > retry_limit or portion[r] < smallest:
-                reason[r] = result
-                status[r] = wp.static(outcome.GIVEN_UP)
-                progress[r] = real(1.0)
-        if progress[r] < real(1.0):
+                islands.cautious[r] = 0
+                islands.portion[r] = real(0.5) * islands.portion[r]
+            if islands.retries[r] > retry_limit or islands.portion[r] < smallest:
+                islands.reason[r] = result
+                islands.status[r] = wp.static(outcome.GIVEN_UP)
+                islands.progress[r] = real(1.0)
+        if islands.progress[r] < real(1.0):
             remaining[0] = 1
 
     return advance
@@ -356,6 +324,7 @@ def advance_kernel(real):
 @cache
 def motion_kernels(kind: ChainKind, real, midpoint: bool):
     """Kernels that put prescribed nodes and edge angles where their motion has them at the end of the (partial) step."""
+    Islands = islands_type(real)
     dim = kind.dim
     V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
     along, *_ = gather_functions(kind, real)
@@ -368,24 +337,23 @@ def motion_kernels(kind: ChainKind, real, midpoint: bool):
         where: wp.array2d(dtype=int),
         rest: wp.array2d(dtype=real),
         pose: wp.array2d(dtype=real),
-        progress: wp.array(dtype=real),
-        portion: wp.array(dtype=real),
+        islands: Islands,
         x: wp.array2d(dtype=V),
     ):
         """`where` is (node, rod, motion of each component, -1 for none), `rest` the positions in the rest state."""
         i = wp.tid()
         k = where[i, 0]
         r = where[i, 1]
-        if progress[r] >= real(1.0):
+        if islands.progress[r] >= real(1.0):
             return
         at = X(rest[i, 0], rest[i, 1], rest[i, 2])
         here = x[k, r]
         for d in range(wp.static(dim)):
             m = where[i, 2 + d]
             if m >= 0:
-                p = placed(pose, m, progress[r] + portion[r], at)
+                p = placed(pose, m, islands.progress[r] + islands.portion[r], at)
                 if wp.static(midpoint):
-                    p = real(0.5) * (p + placed(pose, m, progress[r], at))
+                    p = real(0.5) * (p + placed(pose, m, islands.progress[r], at))
                 here[d] = p[d * wp.static(axis)]
         x[k, r] = here
 
@@ -395,8 +363,7 @@ def motion_kernels(kind: ChainKind, real, midpoint: bool):
         rest: wp.array2d(dtype=real),
         pose: wp.array2d(dtype=real),
         count: wp.array(dtype=int),
-        progress: wp.array(dtype=real),
-        portion: wp.array(dtype=real),
+        islands: Islands,
         x: wp.array2d(dtype=V),
         frame: wp.array3d(dtype=real),
         theta: wp.array2d(dtype=real),
@@ -406,14 +373,14 @@ def motion_kernels(kind: ChainKind, real, midpoint: bool):
         k = where[i, 0]
         r = where[i, 1]
         m = where[i, 2]
-        if progress[r] >= real(1.0):
+        if islands.progress[r] >= real(1.0):
             return
         t = wp.normalize(x[along(k + 1, count[r]), r] - x[k, r])
         director = X(rest[i, 0], rest[i, 1], rest[i, 2])
-        start = progress[r]
-        end = start + portion[r]
+        start = islands.progress[r]
+        end = start + islands.portion[r]
         if wp.static(midpoint):
-            end = start + real(0.5) * portion[r]
+            end = start + real(0.5) * islands.portion[r]
         u = transport(
             X(frame[0, k, r], frame[1, k, r], frame[2, k, r]), X(frame[3, k, r], frame[4, k, r], frame[5, k, r]), t
         )

@@ -163,13 +163,13 @@ def largest_residual(integrator: ddg.Integrator, state) -> float:
     worst = []
     for chain in integrator._chains:
         newton = chain.newton
-        newton.status.zero_()
-        newton.iteration.zero_()
+        newton.islands.status.zero_()
+        newton.islands.iteration.zero_()
         newton.evaluate(state.groups[chain.index].last)
         newton.check()
-        newton.unbalanced.fill_(1)
+        newton.islands.unbalanced.fill_(1)
         newton.sweep()
-        worst.append(float(newton.residual.numpy().max()))
+        worst.append(float(newton.islands.residual.numpy().max()))
     return max(worst)
 
 

@@ -51,14 +51,14 @@ class PrescribedMotion:
         """Poses of all motions between t0 and t1."""
         self.pose.assign(poses(self.model, t0, t1))
 
-    def apply(self, progress: wp.array, portion: wp.array, x: wp.array, frame: wp.array, theta: wp.array) -> None:
-        """Put held nodes and angles where they belong once `portion` of the way follows the `progress` made, rod by rod."""
+    def apply(self, islands, x: wp.array, frame: wp.array, theta: wp.array) -> None:
+        """Put held nodes and angles where the part of the step that a rod tries ends."""
         nodes, *angles = self.kernels
         held, group, device = self.group.moving, self.group, self.model.wp_device
         wp.launch(
             nodes,
             held.nodes.shape[0],
-            [held.nodes, held.node_rest, self.pose, progress, portion],
+            [held.nodes, held.node_rest, self.pose, islands],
             [x],
             device=device,
         )
@@ -66,7 +66,7 @@ class PrescribedMotion:
             wp.launch(
                 kernel,
                 held.edges.shape[0],
-                [held.edges, held.edge_rest, self.pose, group.count, progress, portion, x, frame],
+                [held.edges, held.edge_rest, self.pose, group.count, islands, x, frame],
                 [theta],
                 device=device,
             )

@@ -10,6 +10,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.element import CPU_OPTIONS
+from ddg_warp.kernels.islands import islands_type
 from ddg_warp.kernels.terms import Term
 
 SLICE = 32  # rows of a slice of H
@@ -18,6 +19,7 @@ SLICE = 32  # rows of a slice of H
 @cache
 def balance_kernels(real, linear):
     """outer(...): loads and inertia at every block; collect(...): forces of a set; settle(...): residual, and whether it balances."""
+    Islands = islands_type(real)
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -115,8 +117,7 @@ def balance_kernels(real, linear):
         size: wp.array(dtype=real),
         stiffness: wp.array(dtype=linear),
         fixed: wp.array(dtype=wp.uint8),
-        status: wp.array(dtype=int),
-        load_scale: wp.array(dtype=real),
+        islands: Islands,
         allowed: wp.array(dtype=real),
         blocks: int,
         nodes: int,
@@ -129,8 +130,6 @@ def balance_kernels(real, linear):
         ratio_out: wp.array2d(dtype=real),
         square_out: wp.array2d(dtype=real),
         noise: wp.array2d(dtype=real),
-        unbalanced_out: wp.array(dtype=int),
-        drowned_out: wp.array(dtype=int),
     ):
         """Residual of free dofs, and its squares with moments over the length `arm`; see `kernels.balance` for the criterion.
 
@@ -140,7 +139,7 @@ def balance_kernels(real, linear):
         """
         i = wp.tid()
         w = i / blocks
-        if status[w] != 0:
+        if islands.status[w] != 0:
             return
         k = i - w * blocks
         f = force[i]
@@ -149,7 +148,7 @@ def balance_kernels(real, linear):
         reach = wp.max(wp.abs(q[i])) + longest
         if k >= nodes:
             reach += real(1.0)
-        limit = rtol * load_scale[w] * allowed[i]
+        limit = rtol * islands.load_scale[w] * allowed[i]
         least = floor * (real(stiffness[i]) * reach + size[i])
         least_out[i] = least
         r = H()
@@ -161,9 +160,9 @@ def balance_kernels(real, linear):
                 r[d] = linear(f[d])
                 square += f[d] * f[d] / (length * length)
                 if not wp.abs(f[d]) <= limit:
-                    drowned_out[w] = 1
+                    islands.drowned[w] = 1
                     if not wp.abs(f[d]) <= least:
-                        unbalanced_out[w] = 1
+                        islands.unbalanced[w] = 1
         right_out[i] = r
         ratio_out[w, k] = ratio
         square_out[w, k] = square
