@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.geometry import signed_angle, transport, unit
-from ddg_warp.kernels import islands
+from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.net import elements as net_elements
 from ddg_warp.kernels.terms import AXISYMMETRIC, GLUE, JOINT, SHELLS, Term
 from ddg_warp.precision import PRECISIONS
@@ -81,10 +81,10 @@ class NetSample:
             zeros(2, ELEMENTS),
             zeros(ELEMENTS),
         ]
-        search = islands.allocate(1, real, self.device)
+        search = Islands(1, real, self.device)
         search.clamped.fill_(1)
         kernel = net_elements.evaluate_kernel(self.term, real, real)
-        wp.launch(kernel, ELEMENTS, [*self._inputs(real), search], out, device=self.device)
+        wp.launch(kernel, ELEMENTS, [*self._inputs(real), *search.arrays], out, device=self.device)
         factor, tension, gradient, energy = (array.numpy().astype(float) for array in out[:4])
         rows = factor.reshape(n, slots, ELEMENTS, 3).transpose(0, 1, 3, 2).reshape(n, 3 * slots, ELEMENTS)
         return rows, tension[: self.measure.tensions], gradient, energy[1]

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import islands
+from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.net import elements, krylov, newton, system
 from ddg_warp.linear.multilevel import Multilevel
 from ddg_warp.linear.net_chain import Chains
@@ -70,7 +70,7 @@ class NetNewton:
         self.inverse = make(self.all, M)
         self.matrix = make((9, worlds * self.system.positions), self.linear)
         self.krylov_dots = make((worlds, blocks), self.linear)
-        self.islands = islands.allocate(worlds, self.real, device)
+        self.islands = Islands(worlds, self.real, device)
         self.iterations, self.stalled = flags(2)
         self.sum_change, self.sum_noise, self.sum_square, self.best = scalars(4)
         self.decrease, self.turn, self.worst, self.goal = scalars(4)
@@ -156,7 +156,7 @@ class NetNewton:
             wp.launch(
                 kernel,
                 self.worlds * part.elements,
-                self.net.inputs(part, state, index, q=self.q, rate=self.islands.rate) + [self.islands],
+                self.net.inputs(part, state, index, q=self.q, rate=self.islands.rate) + self.islands.arrays,
                 [own["factor"], own["tension"], own["gradient"], own["energy"], own["stiffness"]],
                 device=self.device,
                 block_dim=128,
@@ -177,7 +177,7 @@ class NetNewton:
             self.planes.forces(self.force)
         self._launch(
             self._settle,
-            [self.q, self.force, self.size, self.stiffness, self.fixed, self.islands]
+            [self.q, self.force, self.size, self.stiffness, self.fixed, *self.islands.arrays]
             + [self.allowed.blocks, blocks, net.host.nodes, self.arm, self.longest]
             + [options.rtol, options.floor_factor * self.eps],
             [self.right, self.allowed.least, self.allowed.ratio, self.square, self.noise],
@@ -215,7 +215,7 @@ class NetNewton:
             [self.sum_change, self.sum_noise, self.sum_square, self.worst, options.rtol]
             + [options.floor_factor * self.eps]
             + [options.max_iterations, options.max_halvings, LOOSEST, options.linear_rtol, SPARE]
-            + [self.islands, self.best, self.stalled, self.forcing, self.goal],
+            + [*self.islands.arrays, self.best, self.stalled, self.forcing, self.goal],
             device=self.device,
         )
 
@@ -332,7 +332,7 @@ class NetNewton:
             self._take,
             self.worlds,
             [self.decrease, self.turn, self.options.rotation_cap, self.iterations],
-            [self.islands, self.pcg_work],
+            [*self.islands.arrays, self.pcg_work],
             device=self.device,
         )
 

@@ -6,7 +6,8 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError, check_options
-from ddg_warp.kernels import balance, chain, element, geometric, islands, search, step
+from ddg_warp.kernels import balance, chain, element, geometric, search, step
+from ddg_warp.kernels.islands import Islands
 
 EARLY = 2  # iterations that "progressive" makes by Gauss-Newton: far from a solution the exact matrix is no better
 PSD_MODES = ("auto", "gauss_newton", "project", "progressive", "none")
@@ -89,7 +90,7 @@ class ChainNewton:
         self.elimination = make(2 * kind.block**2 + kind.block, *nodes, dtype=self.linear) if not kind.closed else None
         self.right, self.direction = (make(kind.block, *nodes, dtype=self.linear) for _ in range(2))
         self.energy_change, self.energy_noise = make(*nodes), make(*nodes, dtype=self.linear)
-        self.islands = islands.allocate(columns, self.real, device)
+        self.islands = Islands(columns, self.real, device)
         self.without_compression = self.islands.clamped  # rods whose matrix leaves out what compression takes away
         self.psd = self.automatic_psd() if options.psd == "auto" else options.psd
         self.exact = self.psd != "gauss_newton" and kind.span == 2  # a rod that only stretches has its Hessian anyway
@@ -134,7 +135,7 @@ class ChainNewton:
         wp.launch(
             self._predict,
             self.group.columns,
-            [before.x, before.v, self.group.fixed, self.group.count, self.islands],
+            [before.x, before.v, self.group.fixed, self.group.count, *self.islands.arrays],
             [self.base, self.direction, self.x, self.frame],
             device=self.device,
         )
@@ -155,7 +156,7 @@ class ChainNewton:
         wp.launch(
             self._evaluate,
             group.element_threads,
-            [self.x, self.theta, self.frame, last, self.islands, *group.parameters.arrays, group.count]
+            [self.x, self.theta, self.frame, last, *self.islands.arrays, *group.parameters.arrays, group.count]
             + [self.without_compression, int(self.reuse)],
             [self.factor, self.geometric, self.gradient, self.energy, self.stiffness],
             device=self.device,
@@ -176,7 +177,7 @@ class ChainNewton:
         wp.launch(
             self._check,
             group.node_threads,
-            [self.gradient, self.energy, self.stiffness, group.count, group.mass, group.rotary, self.islands]
+            [self.gradient, self.energy, self.stiffness, group.count, group.mass, group.rotary, *self.islands.arrays]
             + [self.x, self.theta, self.base, self.direction, self.target, self.target_angle]
             + [group.gravity, group.load, group.load_angle, int(group.host.loaded), group.fixed, group.length]
             + [options.rtol, options.floor_factor * self.eps],
@@ -191,7 +192,7 @@ class ChainNewton:
             self._sweep,
             group.columns,
             [self.factor, self.geometric, self.right, self.energy_change, self.energy_noise, group.count]
-            + [group.mass, group.rotary, self.islands, group.fixed]
+            + [group.mass, group.rotary, *self.islands.arrays, group.fixed]
             + [options.floor_factor * self.eps, options.rotation_cap]
             + [options.max_iterations, options.max_halvings]
             + [self.x, self.theta, self.base, self.elimination, self.direction],
@@ -201,7 +202,7 @@ class ChainNewton:
         wp.launch(
             self._adjust,
             group.columns,
-            [group.count, group.fixed, self.direction, self.islands],
+            [group.count, group.fixed, self.direction, *self.islands.arrays],
             [self.x, self.theta, self.frame, self.base],
             device=self.device,
         )

@@ -4,8 +4,9 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import geometry
-from ddg_warp.kernels import element, islands
+from ddg_warp.kernels import element
 from ddg_warp.kernels.element import ChainKind
+from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.terms import Term
 
 
@@ -219,8 +220,9 @@ class Sample:
         out = [wp.zeros(shape, dtype=real, device=self.device) for shape in shapes]
         inputs = [*self._inputs(real, **changed), *before]
         if searching:
-            rate, inputs[4] = inputs[4], islands.allocate(2, real, self.device)
-            inputs[4].rate = rate
+            islands = Islands(2, real, self.device)
+            wp.copy(islands.rate, inputs[4])
+            inputs[4:5] = islands.arrays
         outputs, grid = out, (*self.shape, *columns)
         wp.launch(kernel, grid, inputs, outputs, device=self.device, block_dim=128)  # `evaluate` is bound to that
         return [array.numpy().astype(float) for array in out]

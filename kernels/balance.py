@@ -13,7 +13,17 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, until_function
-from ddg_warp.kernels.islands import islands_type
+from ddg_warp.kernels.islands import (
+    COEFFICIENT,
+    DROWNED,
+    ITERATION,
+    LOAD_SCALE,
+    PLACED,
+    SLOT,
+    STATUS,
+    STEP_LENGTH,
+    UNBALANCED,
+)
 
 
 @cache
@@ -104,7 +114,6 @@ def check_kernel(kind: ChainKind, real, linear):
     `drowned` is raised where only rounding excuses a residual. Residuals of held dofs are written as zero. `noise` bounds the
     rounding in `change`, which sums the differences of the element energies and the work of inertia and loads along the step.
     """
-    Islands = islands_type(real)
     dim, nb, twist, closed = kind.dim, kind.block, kind.twist, kind.closed
     V = wp.types.vector(dim, real)
     _, behind, balance = node_functions(kind, real)
@@ -119,7 +128,8 @@ def check_kernel(kind: ChainKind, real, linear):
         count: wp.array(dtype=int),
         mass: wp.array2d(dtype=real),
         rotary: wp.array2d(dtype=real),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
         base: wp.array2d(dtype=V),
@@ -140,15 +150,15 @@ def check_kernel(kind: ChainKind, real, linear):
     ):
         start, r = wp.tid()
         n = count[r]
-        if islands.status[r] != 0 or start >= n:
+        if flags[STATUS, r] != 0 or start >= n:
             return
-        c = islands.coefficient[r]
-        accepted = islands.slot[r]
-        taken = islands.step_length[r]
-        limit = rtol * islands.load_scale[r]
-        if islands.iteration[r] == 0 or taken < real(1.0):
+        c = scalars[COEFFICIENT, r]
+        accepted = flags[SLOT, r]
+        taken = scalars[STEP_LENGTH, r]
+        limit = rtol * scalars[LOAD_SCALE, r]
+        if flags[ITERATION, r] == 0 or taken < real(1.0):
             limit /= real(n)
-        moved = islands.placed[r] != 0
+        moved = flags[PLACED, r] != 0
         for k in range(start, until(start, n)):
             f, moment, size, elastic = balance(
                 g, mass, rotary, c, x, theta, target, target_angle, gravity, load, load_angle, loaded, k, n, r
@@ -168,14 +178,14 @@ def check_kernel(kind: ChainKind, real, linear):
                 held = ((mask >> d) & 1) == 1
                 right_out[d, k, r] = linear(wp.where(held, real(0.0), f[d]))
                 if not held and not wp.abs(f[d]) <= limit:
-                    islands.drowned[r] = 1
+                    flags[DROWNED, r] = 1
                     if not wp.abs(f[d]) <= least:
-                        islands.unbalanced[r] = 1
+                        flags[UNBALANCED, r] = 1
             if wp.static(twist):
                 held = ((mask >> wp.static(dim)) & 1) == 1
                 right_out[wp.static(nb - 1), k, r] = linear(wp.where(held, real(0.0), moment))
                 if not held and not wp.abs(moment) <= limit * length[r]:
-                    islands.drowned[r] = 1
+                    flags[DROWNED, r] = 1
                     arm = wp.length(x[along(k + 1, n), r] - here)
                     least = floor * (
                         real(2.0) * stiff * arm * arm * reach / length[r]
@@ -183,8 +193,8 @@ def check_kernel(kind: ChainKind, real, linear):
                         + wp.abs(elastic)
                     )
                     if not wp.abs(moment) <= least:
-                        islands.unbalanced[r] = 1
-            if islands.iteration[r] == 0:
+                        flags[UNBALANCED, r] = 1
+            if flags[ITERATION, r] == 0:
                 continue
             change = real(0.0)
             noise = real(0.5) * size * reach

@@ -12,7 +12,7 @@ import warp as wp
 from ddg_warp.kernels import geometric, pivot
 from ddg_warp.kernels.balance import node_functions
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions
-from ddg_warp.kernels.islands import islands_type
+from ddg_warp.kernels.islands import CLAMPED, COEFFICIENT, DROWNED, ITERATION, STATUS, UNBALANCED
 
 
 @cache
@@ -55,7 +55,6 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
 
     From iteration `exact_from` on, H has the geometric stiffness of rods that are not `clamped`.
     """
-    Islands = islands_type(real)
     dim, nb, nb2, twist, span, closed = kind.dim, kind.block, kind.block**2, kind.twist, kind.span, kind.closed
     window, vertex_rows, edge_rows, tensions = kind.window, kind.vertex_strains, kind.edge_strains, kind.tensions
     H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
@@ -114,19 +113,20 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
         mass: wp.array2d(dtype=real),
         rotary: wp.array2d(dtype=real),
         fixed: wp.array2d(dtype=wp.uint8),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         reuse: int,
         blocks_out: wp.array3d(dtype=linear),
     ):
         k, r = wp.tid()
         n = count[r]
-        if islands.status[r] != 0 or k >= n:
+        if flags[STATUS, r] != 0 or k >= n:
             return
-        if islands.unbalanced[r] == 0 and (islands.drowned[r] == 0 or islands.iteration[r] > 0):
+        if flags[UNBALANCED, r] == 0 and (flags[DROWNED, r] == 0 or flags[ITERATION, r] > 0):
             return
-        if reuse != 0 and islands.iteration[r] > 0:
+        if reuse != 0 and flags[ITERATION, r] > 0:
             return
-        c = islands.coefficient[r]
+        c = scalars[COEFFICIENT, r]
         b = behind(k, n)
         free = free_of(fixed, k, r)
         D = M()
@@ -151,7 +151,7 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
                     C = own(F, row, bb, r, 2)
                     D += wp.outer(C, C)
             if wp.static(curved):
-                if islands.clamped[r] == 0 and islands.iteration[r] >= wp.static(begin):
+                if flags[CLAMPED, r] == 0 and flags[ITERATION, r] >= wp.static(begin):
                     if wp.static(closed) or k < n - 2:
                         D += first_first(second, k, r)
                         E += first_mid(second, k, r)

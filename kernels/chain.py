@@ -16,7 +16,24 @@ import warp as wp
 
 from ddg_warp.kernels import geometric, outcome, pivot
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind
-from ddg_warp.kernels.islands import islands_type
+from ddg_warp.kernels.islands import (
+    ACTIVE,
+    ANGLE_CHANGE,
+    CLAMPED,
+    COEFFICIENT,
+    DECREMENT,
+    HALVINGS,
+    ITERATION,
+    LOAD_SCALE,
+    LOST,
+    PLACED,
+    RESIDUAL,
+    SLOT,
+    STALE,
+    STATUS,
+    STEP_LENGTH,
+    TODO,
+)
 from ddg_warp.kernels.judge import judge_functions
 from ddg_warp.kernels.search import PLACE, RELAG, TURNED, search_functions
 
@@ -28,7 +45,6 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
     From iteration `exact_from` on, the matrix has the geometric stiffness G. Where a pivot is lost, the same iterate comes again
     with `clamped[r]` raised: without what compression takes away, and, for this iteration, without G; or the solve `fails`.
     """
-    Islands = islands_type(real)
     balanced, _ = judge_functions(kind.twist, real)
     dim, nb, twist, span = kind.dim, kind.block, kind.twist, kind.span
     window, nb2 = kind.window, kind.block**2
@@ -95,7 +111,8 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
         # inertia
         mass: wp.array2d(dtype=real),
         rotary: wp.array2d(dtype=real),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         fixed: wp.array2d(dtype=wp.uint8),
         # options
         floor: real,
@@ -111,13 +128,13 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
         # state of the search
     ):
         r = wp.tid()
-        if balanced(islands, r):
+        if balanced(flags, scalars, r):
             return
         n = count[r]
-        first = islands.iteration[r] == 0
-        taken = islands.step_length[r]
-        c = islands.coefficient[r]
-        accepted_slot = islands.slot[r]
+        first = flags[ITERATION, r] == 0
+        taken = scalars[STEP_LENGTH, r]
+        c = scalars[COEFFICIENT, r]
+        accepted_slot = flags[SLOT, r]
         Waa = M()
         Wab = M()
         Wac = M()
@@ -147,7 +164,7 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
                         Wbc += wp.outer(B, C)
                         Wcc += wp.outer(C, C)
                     if wp.static(exact):
-                        if islands.clamped[r] == 0 and islands.iteration[r] >= wp.static(begin):
+                        if flags[CLAMPED, r] == 0 and flags[ITERATION, r] >= wp.static(begin):
                             Waa += aa(G, j, r)
                             Wab += ab(G, j, r)
                             Wac += ac(G, j, r)
@@ -216,63 +233,63 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
             Wbc = M()
             Wcc = M()
 
-        islands.residual[r] = real(worst)
+        scalars[RESIDUAL, r] = real(worst)
         if first:
-            if islands.load_scale[r] == real(0.0):
-                islands.load_scale[r] = real(worst)
-            islands.lost[r] = 0
+            if scalars[LOAD_SCALE, r] == real(0.0):
+                scalars[LOAD_SCALE, r] = real(worst)
+            flags[LOST, r] = 0
             change = real(0.0)
         finite = wp.isfinite(worst) and wp.isfinite(newton) and wp.isfinite(change)
-        if lost_here > 0 and islands.clamped[r] == 0:
+        if lost_here > 0 and flags[CLAMPED, r] == 0:
             if wp.static(fails):
-                islands.status[r] = wp.static(outcome.INDEFINITE)
+                flags[STATUS, r] = wp.static(outcome.INDEFINITE)
                 return
             # the matrix is indefinite: the same iterate again, without what compression (or curvature) takes away
-            islands.clamped[r] = 1
-            islands.active[0] = 1
+            flags[CLAMPED, r] = 1
+            flags[ACTIVE, 0] = 1
             return
         accept = first and finite
         if first and not finite:
-            islands.status[r] = wp.static(outcome.NON_FINITE)
+            flags[STATUS, r] = wp.static(outcome.NON_FINITE)
             return
         if not first and finite:
-            expected = taken * islands.decrement[r]
+            expected = taken * scalars[DECREMENT, r]
             rounding = floor * noise
             if expected > real(10.0) * rounding:
                 accept = change <= real(-1.0e-4) * expected + rounding
             else:
-                accept = newton <= islands.decrement[r]
+                accept = newton <= scalars[DECREMENT, r]
         if not accept:
-            islands.halvings[r] = islands.halvings[r] + 1
-            if islands.halvings[r] > max_halvings:
-                islands.status[r] = wp.static(outcome.LINE_SEARCH_FAILED)
+            flags[HALVINGS, r] = flags[HALVINGS, r] + 1
+            if flags[HALVINGS, r] > max_halvings:
+                flags[STATUS, r] = wp.static(outcome.LINE_SEARCH_FAILED)
                 return
-            less = shorter(taken, taken * islands.decrement[r], change, finite)
-            islands.step_length[r] = less
-            islands.angle_change[r] = less - taken
-            islands.todo[r] = wp.static(PLACE)
-            islands.active[0] = 1
+            less = shorter(taken, taken * scalars[DECREMENT, r], change, finite)
+            scalars[STEP_LENGTH, r] = less
+            scalars[ANGLE_CHANGE, r] = less - taken
+            flags[TODO, r] = wp.static(PLACE)
+            flags[ACTIVE, 0] = 1
             return
 
-        islands.iteration[r] = islands.iteration[r] + 1
-        if islands.iteration[r] > max_iterations:
-            islands.status[r] = wp.static(outcome.MAX_ITERATIONS)
+        flags[ITERATION, r] = flags[ITERATION, r] + 1
+        if flags[ITERATION, r] > max_iterations:
+            flags[STATUS, r] = wp.static(outcome.MAX_ITERATIONS)
             return
-        islands.active[0] = 1
-        islands.slot[r] = 1 - accepted_slot
-        islands.decrement[r] = newton
-        islands.halvings[r] = 0
-        islands.placed[r] = 0
-        islands.lost[r] = islands.lost[r] + lost_here
+        flags[ACTIVE, 0] = 1
+        flags[SLOT, r] = 1 - accepted_slot
+        scalars[DECREMENT, r] = newton
+        flags[HALVINGS, r] = 0
+        flags[PLACED, r] = 0
+        flags[LOST, r] = flags[LOST, r] + lost_here
         if wp.static(exact):
-            islands.clamped[r] = 0
+            flags[CLAMPED, r] = 0
         if wp.static(twist):
-            if islands.turned[r] != 0:
+            if flags[STALE, r] != 0:
                 # angles mean something else in new frames: take no step, and ask for a direction there
-                islands.turned[r] = 0
-                islands.decrement[r] = real(1.0e30)
-                islands.step_length[r] = real(0.0)
-                islands.todo[r] = wp.static(RELAG)
+                flags[STALE, r] = 0
+                scalars[DECREMENT, r] = real(1.0e30)
+                scalars[STEP_LENGTH, r] = real(0.0)
+                flags[TODO, r] = wp.static(RELAG)
                 return
         e1 = H()
         e2 = H()
@@ -304,8 +321,8 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
         if rotation > rotation_cap * rotation_cap:
             whole = rotation_cap / wp.sqrt(rotation)
         if rotation > real(wp.static(TURNED**2)):
-            islands.angle_change[r] = whole - real(1.0)
-            islands.todo[r] = wp.static(PLACE)
-        islands.step_length[r] = whole
+            scalars[ANGLE_CHANGE, r] = whole - real(1.0)
+            flags[TODO, r] = wp.static(PLACE)
+        scalars[STEP_LENGTH, r] = whole
 
     return sweep

@@ -14,7 +14,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import frames
-from ddg_warp.kernels.islands import islands_type
+from ddg_warp.kernels.islands import ACTIVE, ITERATION, RATE, SLOT, STALE, STATUS
 from ddg_warp.kernels.measures.turning import packed_index
 from ddg_warp.kernels.terms import Term
 
@@ -484,7 +484,6 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
     reference twist nears a jump. `stiffness` is the largest a term has against moving its first edge [N/m]. Thread (0, 0) clears
     `active`, which the sweep then raises.
     """
-    Islands = islands_type(real)
     V = wp.types.vector(kind.dim, real)
     until = until_function(kind)
     _, window, lagged, _ = gather_functions(kind, real)
@@ -508,7 +507,8 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
         theta: wp.array2d(dtype=real),
         frame: wp.array3d(dtype=real),
         last: wp.array3d(dtype=real),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         buffer: wp.array(dtype=real),
         table: wp.array2d(dtype=int),
         count: wp.array(dtype=int),
@@ -522,13 +522,13 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
     ):
         start, r = wp.tid()
         if start == 0 and r == 0:
-            islands.active[0] = 0
+            flags[ACTIVE, 0] = 0
         n = count[r]
-        if islands.status[r] != 0 or start >= n - wp.static(0 if closed else 1):
+        if flags[STATUS, r] != 0 or start >= n - wp.static(0 if closed else 1):
             return
-        frozen = reuse != 0 and islands.iteration[r] > 0
-        exact = islands.iteration[r] >= wp.static(begin)
-        rate = islands.rate[r]
+        frozen = reuse != 0 and flags[ITERATION, r] > 0
+        exact = flags[ITERATION, r] >= wp.static(begin)
+        rate = scalars[RATE, r]
         for k in range(start, until(start, n - wp.static(0 if closed else 1))):
             whole = wp.static(closed) or k < n - 2
             q = window(x, theta, k, n, whole, r)
@@ -550,7 +550,7 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
                 energy += own_too
                 f += part_too
                 stiffest = wp.max(stiffest, stiff_too)
-            energy_out[1 - islands.slot[r], k, r] = energy
+            energy_out[1 - flags[SLOT, r], k, r] = energy
             stiffness_out[k, r] = linear(stiffest)
             for i in range(wp.static(size)):
                 gradient_out[i, k, r] = f[i]
@@ -572,7 +572,7 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
                         uf = transport(X(s[6], s[7], s[8]), tf0, tf)
                         m = reference_twist(ue, uf, te, tf, s[12])
                         if wp.min(along_e, along_f) < real(0.0) or wp.abs(m - s[12]) > real(1.5):
-                            islands.turned[r] = 1
+                            flags[STALE, r] = 1
 
     return evaluate
 

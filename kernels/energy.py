@@ -14,7 +14,7 @@ import warp as wp
 
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, term_functions
-from ddg_warp.kernels.islands import islands_type
+from ddg_warp.kernels.islands import PROGRESS, RATE, STATUS
 from ddg_warp.kernels.terms import Term
 
 DRIFT, ROUNDING, HELD, DISSIPATED = range(4)  # rows of a balance
@@ -102,7 +102,6 @@ def window_function(kind: ChainKind, index: int, real):
 @cache
 def chain_kernel(kind: ChainKind, real, linear):
     """Rows of a step of every rod, summed over ranges: range i holds the nodes i, i + ranges, ... (see `kernels.parallel_search`)."""
-    Islands = islands_type(real)
     V, B = wp.types.vector(kind.dim, real), wp.types.vector(ROWS, real)
     _, window, lagged, _ = gather_functions(kind, real)
     rows_of_all = window_function(kind, len(kind.terms) - 1, real)
@@ -119,7 +118,8 @@ def chain_kernel(kind: ChainKind, real, linear):
         theta: wp.array2d(dtype=real),
         frame: wp.array3d(dtype=real),
         last: wp.array3d(dtype=real),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         buffer: wp.array(dtype=real),
         table: wp.array2d(dtype=int),
         count: wp.array(dtype=int),
@@ -138,7 +138,7 @@ def chain_kernel(kind: ChainKind, real, linear):
     ):
         """`load` and `load_angle` are those of the iterate, those `there` those that the step was solved with."""
         start, r = wp.tid()
-        if islands.progress[r] >= real(1.0):
+        if scalars[PROGRESS, r] >= real(1.0):
             return
         n = count[r]
         total = B()
@@ -146,14 +146,14 @@ def chain_kernel(kind: ChainKind, real, linear):
             m = mass[k, r]
             here = x[k, r]
             moved = here - x0[k, r]
-            v = moved * (real(2.0) * islands.rate[r]) - v0[k, r]
+            v = moved * (real(2.0) * scalars[RATE, r]) - v0[k, r]
             kinetic = real(0.5) * m * wp.length_sq(v)
-            damped = real(2.0) * damping[0] * islands.rate[r] * m * wp.length_sq(moved)
+            damped = real(2.0) * damping[0] * scalars[RATE, r] * m * wp.length_sq(moved)
             if wp.static(twist):
                 turned = theta[k, r] - theta0[k, r]
-                spin = turned * (real(2.0) * islands.rate[r]) - omega0[k, r]
+                spin = turned * (real(2.0) * scalars[RATE, r]) - omega0[k, r]
                 kinetic += real(0.5) * rotary[k, r] * spin * spin
-                damped += real(2.0) * damping[0] * islands.rate[r] * rotary[k, r] * turned * turned
+                damped += real(2.0) * damping[0] * scalars[RATE, r] * rotary[k, r] * turned * turned
             made = real(0.0)
             worked = real(0.0)
             if follows != 0:
@@ -171,7 +171,7 @@ def chain_kernel(kind: ChainKind, real, linear):
                 q = window(x, theta, k, n, whole, r)
                 s0 = lagged(frame0, k, n, whole, r)
                 s = lagged(frame, k, n, whole, r)
-                total += rows_of_all(q0, s0, q, s, buffer, table, last, islands.rate[r], whole, reach, floor, k, r)
+                total += rows_of_all(q0, s0, q, s, buffer, table, last, scalars[RATE, r], whole, reach, floor, k, r)
                 least = floor * reach
                 total[wp.static(ROUNDING)] = total[wp.static(ROUNDING)] + real(stiffness[k, r]) * least * least
         for i in range(wp.static(ROWS)):
@@ -188,18 +188,18 @@ def judge_kernel(real):
     and all that was dissipated. A step fails that brings what was made beyond the fraction `bound` of the energy held and dissipated,
     and farther from zero.
     """
-    Islands = islands_type(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def judge(
         rows: wp.array3d(dtype=real),
         bound: real,
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         account: wp.array2d(dtype=real),
         failed_out: wp.array2d(dtype=real),
     ):
         r = wp.tid()
-        if islands.progress[r] >= real(1.0) or islands.status[r] > wp.static(outcome.CONVERGED_TO_ROUNDING):
+        if scalars[PROGRESS, r] >= real(1.0) or flags[STATUS, r] > wp.static(outcome.CONVERGED_TO_ROUNDING):
             return
         drift = account[wp.static(DRIFT), r]
         rounding = account[wp.static(ROUNDING), r]
@@ -214,7 +214,7 @@ def judge_kernel(real):
         held = wp.max(held, account[wp.static(HELD), r])
         allowed = bound * (held + dissipated) + rounding
         if not wp.abs(drift) <= wp.max(allowed, before):
-            islands.status[r] = wp.static(outcome.ENERGY_DRIFT)
+            flags[STATUS, r] = wp.static(outcome.ENERGY_DRIFT)
             failed_out[0, r] = drift
             failed_out[1, r] = held + dissipated
             return

@@ -10,7 +10,22 @@ import warp as wp
 
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.element import ChainKind
-from ddg_warp.kernels.islands import islands_type
+from ddg_warp.kernels.islands import (
+    ACTIVE,
+    DECREMENT,
+    DROWNED,
+    HALVINGS,
+    ITERATION,
+    LOAD_SCALE,
+    MERIT,
+    RESIDUAL,
+    SLOT,
+    STALE,
+    STATUS,
+    STEP_LENGTH,
+    UNBALANCED,
+    WANTED,
+)
 from ddg_warp.kernels.search import PLACE, RELAG, search_functions, shorter_function
 
 STOP, DIRECT = 0, 3  # beside PLACE and RELAG: nothing more to do, and a direction is wanted
@@ -19,24 +34,23 @@ STOP, DIRECT = 0, 3  # beside PLACE and RELAG: nothing more to do, and a directi
 @cache
 def judge_functions(twist: bool, real):
     """balanced(...): whether a rod has stopped; decide(...): what an active rod does next (STOP, PLACE, RELAG or DIRECT)."""
-    Islands = islands_type(real)
     shorter = shorter_function(real)
 
     @wp.func
-    def balanced(islands: Islands, r: int):
+    def balanced(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), r: int):
         """Whether the rod has stopped, by its last iterate or before; lowers its flags where it has not."""
-        if islands.status[r] != 0:
+        if flags[STATUS, r] != 0:
             return True
         # rounding excuses a residual only after an iteration: the predictor's may be all of a coarse precision's load
-        if islands.unbalanced[r] == 0 and (islands.drowned[r] == 0 or islands.iteration[r] > 0):
-            islands.status[r] = wp.where(
-                islands.drowned[r] == 0,
+        if flags[UNBALANCED, r] == 0 and (flags[DROWNED, r] == 0 or flags[ITERATION, r] > 0):
+            flags[STATUS, r] = wp.where(
+                flags[DROWNED, r] == 0,
                 int(wp.static(outcome.CONVERGED)),
                 int(wp.static(outcome.CONVERGED_TO_ROUNDING)),
             )
             return True
-        islands.unbalanced[r] = 0
-        islands.drowned[r] = 0
+        flags[UNBALANCED, r] = 0
+        flags[DROWNED, r] = 0
         return False
 
     @wp.func
@@ -47,52 +61,53 @@ def judge_functions(twist: bool, real):
         worst: real,
         max_iterations: int,
         max_halvings: int,
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         r: int,
     ):
         """From the energy's change and its rounding, the square and the largest component of the residual.
 
         PLACE leaves the shorter step in `step_length`; RELAG asks for frames of the iterate and a step of no length.
         """
-        first = islands.iteration[r] == 0
-        islands.residual[r] = worst
+        first = flags[ITERATION, r] == 0
+        scalars[RESIDUAL, r] = worst
         total = change
         if first:
             total = real(0.0)
-            if islands.load_scale[r] == real(0.0):
-                islands.load_scale[r] = worst
+            if scalars[LOAD_SCALE, r] == real(0.0):
+                scalars[LOAD_SCALE, r] = worst
         finite = wp.isfinite(square) and wp.isfinite(total)
         if first and not finite:
-            islands.status[r] = wp.static(outcome.NON_FINITE)
+            flags[STATUS, r] = wp.static(outcome.NON_FINITE)
             return wp.static(STOP)
-        taken = islands.step_length[r]
-        expected = taken * islands.decrement[r]
+        taken = scalars[STEP_LENGTH, r]
+        expected = taken * scalars[DECREMENT, r]
         accept = first
         if not first and finite:
             if expected > real(10.0) * rounding:
                 accept = total <= real(-1.0e-4) * expected + rounding
             else:
-                accept = square <= real(4.0) * islands.merit[r] or taken == real(0.0)
+                accept = square <= real(4.0) * scalars[MERIT, r] or taken == real(0.0)
         if not accept:
-            islands.halvings[r] = islands.halvings[r] + 1
-            if islands.halvings[r] > max_halvings:
-                islands.status[r] = wp.static(outcome.LINE_SEARCH_FAILED)
+            flags[HALVINGS, r] = flags[HALVINGS, r] + 1
+            if flags[HALVINGS, r] > max_halvings:
+                flags[STATUS, r] = wp.static(outcome.LINE_SEARCH_FAILED)
                 return wp.static(STOP)
-            islands.step_length[r] = shorter(taken, expected, total, finite)
+            scalars[STEP_LENGTH, r] = shorter(taken, expected, total, finite)
             return wp.static(PLACE)
-        islands.iteration[r] = islands.iteration[r] + 1
-        if islands.iteration[r] > max_iterations:
-            islands.status[r] = wp.static(outcome.MAX_ITERATIONS)
+        flags[ITERATION, r] = flags[ITERATION, r] + 1
+        if flags[ITERATION, r] > max_iterations:
+            flags[STATUS, r] = wp.static(outcome.MAX_ITERATIONS)
             return wp.static(STOP)
-        islands.merit[r] = square
-        islands.slot[r] = 1 - islands.slot[r]
-        islands.halvings[r] = 0
+        scalars[MERIT, r] = square
+        flags[SLOT, r] = 1 - flags[SLOT, r]
+        flags[HALVINGS, r] = 0
         if wp.static(twist):
-            if islands.turned[r] != 0:
+            if flags[STALE, r] != 0:
                 # angles mean something else now: take no step, and ask for a direction in the new frames
-                islands.turned[r] = 0
-                islands.decrement[r] = real(1.0e30)
-                islands.step_length[r] = real(0.0)
+                flags[STALE, r] = 0
+                scalars[DECREMENT, r] = real(1.0e30)
+                scalars[STEP_LENGTH, r] = real(0.0)
                 return wp.static(RELAG)
         return wp.static(DIRECT)
 
@@ -102,7 +117,6 @@ def judge_functions(twist: bool, real):
 @cache
 def judge_kernel(kind: ChainKind, real, linear):
     """The line search of a rod by one thread: sums over its nodes, decides, and puts a shortened step or new frames."""
-    Islands = islands_type(real)
     V = wp.types.vector(kind.dim, real)
     place, turn_angles, relag, _ = search_functions(kind, real, linear)
     balanced, decide = judge_functions(kind.twist, real)
@@ -123,11 +137,12 @@ def judge_kernel(kind: ChainKind, real, linear):
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
         frame: wp.array3d(dtype=real),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
     ):
         r = wp.tid()
-        islands.wanted[r] = 0
-        if balanced(islands, r):
+        flags[WANTED, r] = 0
+        if balanced(flags, scalars, r):
             return
         n = count[r]
         total = real(0.0)
@@ -141,13 +156,13 @@ def judge_kernel(kind: ChainKind, real, linear):
                 size = wp.abs(real(residual[d, k, r]))
                 worst = wp.max(worst, size)
                 square += size * size
-        taken = islands.step_length[r]
-        what = decide(total, rounding * floor, square, worst, max_iterations, max_halvings, islands, r)
+        taken = scalars[STEP_LENGTH, r]
+        what = decide(total, rounding * floor, square, worst, max_iterations, max_halvings, flags, scalars, r)
         if what == wp.static(STOP):
             return
-        islands.active[0] = 1
+        flags[ACTIVE, 0] = 1
         if what == wp.static(PLACE):
-            less = islands.step_length[r]
+            less = scalars[STEP_LENGTH, r]
             place(x, base, direction, fixed, less, n, r)
             turn_angles(theta, direction, less - taken, n, r)
         if wp.static(twist):
@@ -156,6 +171,6 @@ def judge_kernel(kind: ChainKind, real, linear):
                 for k in range(n):
                     base[k, r] = x[k, r]
         if what == wp.static(DIRECT):
-            islands.wanted[r] = 1
+            flags[WANTED, r] = 1
 
     return judge

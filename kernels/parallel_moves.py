@@ -10,7 +10,7 @@ import warp as wp
 
 from ddg_warp.kernels import frames
 from ddg_warp.kernels.element import ChainKind
-from ddg_warp.kernels.islands import islands_type
+from ddg_warp.kernels.islands import ANGLE_CHANGE, BENT, PROGRESS, RATE, STEP_LENGTH, TODO
 from ddg_warp.kernels.search import PLACE, RELAG, move_functions
 
 
@@ -20,7 +20,6 @@ def move_kernels(kind: ChainKind, real, linear):
 
     `turn` also carries frames, into a second array, as neighbours still read those of before.
     """
-    Islands = islands_type(real)
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
     step_of, excess, put, carry = move_functions(kind, real, linear)
@@ -117,7 +116,8 @@ def move_kernels(kind: ChainKind, real, linear):
         count: wp.array(dtype=int),
         fixed: wp.array2d(dtype=wp.uint8),
         held: wp.array3d(dtype=int),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         direction: wp.array3d(dtype=linear),
         prefix: wp.array2d(dtype=V),
         sums: wp.array3d(dtype=V),
@@ -131,7 +131,7 @@ def move_kernels(kind: ChainKind, real, linear):
     ):
         """Puts a node where its step ends: of turned edges the sum from the held node before it, closing at the next."""
         k, r = wp.tid()
-        what = islands.todo[r]
+        what = flags[TODO, r]
         if what == 0 or k >= count[r]:
             return
         if what == wp.static(RELAG):
@@ -155,9 +155,9 @@ def move_kernels(kind: ChainKind, real, linear):
                 shift -= start
                 if q > p:
                     shift -= (before(prefix, sums, width, q, r) - start) * (real(k - p) / real(q - p))
-        put(x, base, direction, fixed, islands.step_length[r], shift, k, r)
+        put(x, base, direction, fixed, scalars[STEP_LENGTH, r], shift, k, r)
         if wp.static(twist):
-            theta[k, r] = theta[k, r] + islands.angle_change[r] * real(direction[wp.static(dim), k, r])
+            theta[k, r] = theta[k, r] + scalars[ANGLE_CHANGE, r] * real(direction[wp.static(dim), k, r])
 
     return turn, scan, offset, move
 
@@ -165,7 +165,6 @@ def move_kernels(kind: ChainKind, real, linear):
 @cache
 def predict_kernels(kind: ChainKind, real, linear):
     """`aim`: bent rods step along their velocity, with edges turned; `renew`: every rod that moves takes new frames."""
-    Islands = islands_type(real)
     dim, nb = kind.dim, kind.block
     V = wp.types.vector(dim, real)
 
@@ -175,21 +174,22 @@ def predict_kernels(kind: ChainKind, real, linear):
         v0: wp.array2d(dtype=V),
         fixed: wp.array2d(dtype=wp.uint8),
         count: wp.array(dtype=int),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         base_out: wp.array2d(dtype=V),
         direction_out: wp.array3d(dtype=linear),
     ):
         k, r = wp.tid()
         if k >= count[r]:
             return
-        moving = islands.progress[r] < real(1.0) and islands.bent[r] != 0
+        moving = scalars[PROGRESS, r] < real(1.0) and flags[BENT, r] != 0
         if k == 0:
-            islands.step_length[r] = real(1.0)
-            islands.angle_change[r] = real(0.0)
-            islands.todo[r] = wp.where(moving, wp.static(PLACE), 0)
+            scalars[STEP_LENGTH, r] = real(1.0)
+            scalars[ANGLE_CHANGE, r] = real(0.0)
+            flags[TODO, r] = wp.where(moving, wp.static(PLACE), 0)
         if moving:
             base_out[k, r] = x0[k, r]
-            v = v0[k, r] / islands.rate[r]
+            v = v0[k, r] / scalars[RATE, r]
             for d in range(wp.static(nb)):
                 direction_out[d, k, r] = linear(0.0)
             for d in range(wp.static(dim)):
@@ -197,8 +197,8 @@ def predict_kernels(kind: ChainKind, real, linear):
                     direction_out[d, k, r] = linear(v[d])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def renew(islands: Islands):
+    def renew(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real)):
         r = wp.tid()
-        islands.todo[r] = wp.where(islands.progress[r] < real(1.0), wp.static(RELAG), 0)
+        flags[TODO, r] = wp.where(scalars[PROGRESS, r] < real(1.0), wp.static(RELAG), 0)
 
     return aim, renew

@@ -10,7 +10,19 @@ import warp as wp
 
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.element import ChainKind
-from ddg_warp.kernels.islands import islands_type
+from ddg_warp.kernels.islands import (
+    ACTIVE,
+    ANGLE_CHANGE,
+    BAD,
+    CLAMPED,
+    DECREMENT,
+    ITERATION,
+    LOST,
+    STATUS,
+    STEP_LENGTH,
+    TODO,
+    WANTED,
+)
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
 from ddg_warp.kernels.search import PLACE, TURNED
 
@@ -92,7 +104,6 @@ def sum_kernels(kind: ChainKind, real, linear):
 @cache
 def decide_kernels(kind: ChainKind, real, linear):
     """Decisions of a rod from its partial sums: `judge` of an iterate, `take` of a direction."""
-    Islands = islands_type(real)
     balanced, decide = judge_functions(kind.twist, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -102,13 +113,14 @@ def decide_kernels(kind: ChainKind, real, linear):
         floor: real,
         max_iterations: int,
         max_halvings: int,
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
     ):
         r = wp.tid()
-        islands.wanted[r] = 0
-        islands.todo[r] = 0
-        islands.bad[r] = 0
-        if balanced(islands, r):
+        flags[WANTED, r] = 0
+        flags[TODO, r] = 0
+        flags[BAD, r] = 0
+        if balanced(flags, scalars, r):
             return
         total = real(0.0)
         rounding = real(0.0)
@@ -119,50 +131,51 @@ def decide_kernels(kind: ChainKind, real, linear):
             rounding += partial[1, i, r]
             square += partial[2, i, r]
             worst = wp.max(worst, partial[3, i, r])
-        if islands.iteration[r] == 0:
-            islands.lost[r] = 0
-        taken = islands.step_length[r]
-        what = decide(total, rounding * floor, square, worst, max_iterations, max_halvings, islands, r)
+        if flags[ITERATION, r] == 0:
+            flags[LOST, r] = 0
+        taken = scalars[STEP_LENGTH, r]
+        what = decide(total, rounding * floor, square, worst, max_iterations, max_halvings, flags, scalars, r)
         if what == wp.static(STOP):
             return
-        islands.active[0] = 1
+        flags[ACTIVE, 0] = 1
         if what == wp.static(DIRECT):
-            islands.wanted[r] = 1
+            flags[WANTED, r] = 1
         else:
-            islands.todo[r] = what
-            islands.angle_change[r] = islands.step_length[r] - taken
+            flags[TODO, r] = what
+            scalars[ANGLE_CHANGE, r] = scalars[STEP_LENGTH, r] - taken
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def take(
         partial: wp.array3d(dtype=real),
         ranges: int,
         rotation_cap: real,
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
     ):
         r = wp.tid()
-        if islands.wanted[r] == 0:
+        if flags[WANTED, r] == 0:
             return
-        if islands.bad[r] > 0 and islands.clamped[r] == 0:
+        if flags[BAD, r] > 0 and flags[CLAMPED, r] == 0:
             # compression has made the matrix indefinite: the same iterate again, without what compression takes away
-            islands.clamped[r] = 1
-            islands.iteration[r] = islands.iteration[r] - 1
-            islands.step_length[r] = real(0.0)
+            flags[CLAMPED, r] = 1
+            flags[ITERATION, r] = flags[ITERATION, r] - 1
+            scalars[STEP_LENGTH, r] = real(0.0)
             return
-        islands.lost[r] = islands.lost[r] + islands.bad[r]
+        flags[LOST, r] = flags[LOST, r] + flags[BAD, r]
         total = real(0.0)
         rotation = real(0.0)
         for i in range(ranges):
             total += partial[0, i, r]
             rotation = wp.max(rotation, partial[1, i, r])
         if not wp.isfinite(total):
-            islands.status[r] = wp.static(outcome.NON_FINITE)
+            flags[STATUS, r] = wp.static(outcome.NON_FINITE)
             return
         whole = real(1.0)
         if rotation > rotation_cap * rotation_cap:
             whole = rotation_cap / wp.sqrt(rotation)
-        islands.step_length[r] = whole
-        islands.angle_change[r] = whole
-        islands.decrement[r] = total
-        islands.todo[r] = wp.where(rotation > real(wp.static(TURNED**2)), wp.static(PLACE), wp.static(STRAIGHT))
+        scalars[STEP_LENGTH, r] = whole
+        scalars[ANGLE_CHANGE, r] = whole
+        scalars[DECREMENT, r] = total
+        flags[TODO, r] = wp.where(rotation > real(wp.static(TURNED**2)), wp.static(PLACE), wp.static(STRAIGHT))
 
     return judge, take

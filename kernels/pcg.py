@@ -12,7 +12,7 @@ import warp as wp
 from ddg_warp.kernels import outcome, pivot
 from ddg_warp.kernels.block_band import block_functions, product_function, substitute_function
 from ddg_warp.kernels.element import ChainKind
-from ddg_warp.kernels.islands import islands_type
+from ddg_warp.kernels.islands import CLAMPED, DECREMENT, ITERATION, LOST, SLOT, STATUS, STEP_LENGTH, WANTED
 from ddg_warp.kernels.search import TURNED, search_functions
 
 PRECONDITIONERS = ("jacobi", "block_jacobi", "chain")
@@ -178,26 +178,25 @@ def repeat_kernel(real, fails: bool):
     what compression takes away out of the next matrix, and the line search, which has the same numbers, accepts again.
     `done` says that the direction has been found.
     """
-    Islands = islands_type(real)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def repeat(done: int, islands: Islands, negative: wp.array(dtype=int)):
+    def repeat(done: int, flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), negative: wp.array(dtype=int)):
         r = wp.tid()
-        if islands.wanted[r] == 0:
+        if flags[WANTED, r] == 0:
             return
-        if negative[r] > 0 and islands.clamped[r] == 0:
-            islands.wanted[r] = 0
+        if negative[r] > 0 and flags[CLAMPED, r] == 0:
+            flags[WANTED, r] = 0
             negative[r] = 0
             if wp.static(fails):
-                islands.status[r] = wp.static(outcome.INDEFINITE)
+                flags[STATUS, r] = wp.static(outcome.INDEFINITE)
                 return
-            islands.clamped[r] = 1
-            islands.iteration[r] = islands.iteration[r] - 1
-            islands.slot[r] = 1 - islands.slot[r]
+            flags[CLAMPED, r] = 1
+            flags[ITERATION, r] = flags[ITERATION, r] - 1
+            flags[SLOT, r] = 1 - flags[SLOT, r]
         elif done != 0:
-            islands.lost[r] = islands.lost[r] + negative[r]
+            flags[LOST, r] = flags[LOST, r] + negative[r]
             negative[r] = 0
-            islands.clamped[r] = 0
+            flags[CLAMPED, r] = 0
 
     return repeat
 
@@ -205,7 +204,6 @@ def repeat_kernel(real, fails: bool):
 @cache
 def take_kernel(kind: ChainKind, real, linear):
     """Take the direction that was found: cap its rotation, move, and keep its decrement r . d."""
-    Islands = islands_type(real)
     dim = kind.dim
     V = wp.types.vector(dim, real)
     place, turn_angles, _, _ = search_functions(kind, real, linear)
@@ -222,11 +220,12 @@ def take_kernel(kind: ChainKind, real, linear):
         base: wp.array2d(dtype=V),
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         work: wp.array(dtype=wp.int64),
     ):
         r = wp.tid()
-        if islands.wanted[r] == 0:
+        if flags[WANTED, r] == 0:
             return
         n = count[r]
         rotation = real(0.0)
@@ -252,8 +251,8 @@ def take_kernel(kind: ChainKind, real, linear):
                 for d in range(wp.static(dim)):
                     step[d] = real(direction[d, k, r])
                 x[k, r] = x[k, r] + step
-        islands.step_length[r] = whole
-        islands.decrement[r] = total
+        scalars[STEP_LENGTH, r] = whole
+        scalars[DECREMENT, r] = total
         wp.atomic_add(work, 0, wp.int64(iterations[r]))
 
     return take

@@ -17,14 +17,26 @@ import warp as wp
 
 from ddg_warp.kernels import frames, motion, outcome
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, until_function
-from ddg_warp.kernels.islands import attempt_functions, islands_type
+from ddg_warp.kernels.islands import (
+    BENT,
+    CAUTIOUS,
+    ITERATION,
+    LOST,
+    MOVED,
+    PORTION,
+    PROGRESS,
+    RATE,
+    REASON,
+    RETRIES,
+    STATUS,
+    attempt_functions,
+)
 from ddg_warp.kernels.search import TURNED, search_functions
 
 
 @cache
 def begin_kernel(kind: ChainKind, real, midpoint: bool):
     """Predictor, target of the inertia, copy of the lagged frames; restarts the search of every rod that still has to move."""
-    Islands = islands_type(real)
     length, restart = attempt_functions(real, midpoint)
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
@@ -43,7 +55,8 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
         dt: wp.array(dtype=real),
         damping: wp.array(dtype=real),
         outer: wp.array(dtype=real),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         x_out: wp.array2d(dtype=V),
         theta_out: wp.array2d(dtype=real),
         frame_out: wp.array3d(dtype=real),
@@ -52,14 +65,14 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
     ):
         start, r = wp.tid()
         n = count[r]
-        if islands.progress[r] >= real(1.0) or start >= n:
+        if scalars[PROGRESS, r] >= real(1.0) or start >= n:
             return
-        s = length(islands, r, dt[world[r]])
+        s = length(scalars, r, dt[world[r]])
         rate = real(1.0) / s
         coefficient = rate * (rate + damping[0])
         if start == 0:
-            restart(islands, r, rate, coefficient, outer[r])
-        ahead = wp.where(islands.cautious[r] == 0, s, real(0.0))
+            restart(flags, scalars, r, rate, coefficient, outer[r])
+        ahead = wp.where(flags[CAUTIOUS, r] == 0, s, real(0.0))
         for k in range(start, until(start, n)):
             mask = int(fixed[k, r])
             here = x0[k, r]
@@ -69,11 +82,11 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
                 if ((mask >> d) & 1) == 0:
                     here[d] = here[d] + ahead * v[d]
             x_out[k, r] = here
-            if islands.cautious[r] == 0 and k + 1 < n:
+            if flags[CAUTIOUS, r] == 0 and k + 1 < n:
                 turn = (v0[k + 1, r] - v) * s
                 edge = x0[k + 1, r] - x0[k, r]
                 if wp.length_sq(turn) > real(wp.static(TURNED**2)) * wp.length_sq(edge):
-                    islands.bent[r] = 1
+                    flags[BENT, r] = 1
             if wp.static(twist):
                 angle = theta0[k, r]
                 spin = omega0[k, r]
@@ -94,7 +107,6 @@ def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
     For the midpoint rule the lagged frames are carried to the predicted midpoint. Frames lagged at the start of the step spin
     about their edges by O(h) at the midpoint, which the rotary inertia does not see: it would be of first order there.
     """
-    Islands = islands_type(real)
     dim, carried = kind.dim, kind.twist and midpoint
     V = wp.types.vector(dim, real)
     place, _, relag, _ = search_functions(kind, real, linear)
@@ -105,20 +117,21 @@ def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
         v0: wp.array2d(dtype=V),
         fixed: wp.array2d(dtype=wp.uint8),
         count: wp.array(dtype=int),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         base: wp.array2d(dtype=V),
         direction: wp.array3d(dtype=linear),
         x: wp.array2d(dtype=V),
         frame: wp.array3d(dtype=real),
     ):
         r = wp.tid()
-        if islands.progress[r] >= real(1.0):
+        if scalars[PROGRESS, r] >= real(1.0):
             return
         n = count[r]
-        if islands.bent[r] != 0:
+        if flags[BENT, r] != 0:
             for k in range(n):
                 base[k, r] = x0[k, r]
-                v = v0[k, r] / islands.rate[r]
+                v = v0[k, r] / scalars[RATE, r]
                 for d in range(wp.static(dim)):
                     direction[d, k, r] = linear(wp.where(((int(fixed[k, r]) >> d) & 1) == 0, v[d], real(0.0)))
             place(x, base, direction, fixed, real(1.0), n, r)
@@ -131,15 +144,14 @@ def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
 @cache
 def start_kernel(real):
     """Starts a step: every rod that has not been given up has all of it to do."""
-    Islands = islands_type(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def start(islands: Islands):
+    def start(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real)):
         r = wp.tid()
-        islands.portion[r] = real(1.0)
-        islands.cautious[r] = 0
-        islands.retries[r] = 0
-        islands.progress[r] = wp.where(islands.status[r] == wp.static(outcome.GIVEN_UP), real(1.0), real(0.0))
+        scalars[PORTION, r] = real(1.0)
+        flags[CAUTIOUS, r] = 0
+        flags[RETRIES, r] = 0
+        scalars[PROGRESS, r] = wp.where(flags[STATUS, r] == wp.static(outcome.GIVEN_UP), real(1.0), real(0.0))
 
     return start
 
@@ -147,7 +159,6 @@ def start_kernel(real):
 @cache
 def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
     """Positions, angles and their velocities at the end of the step, of the rods that converged."""
-    Islands = islands_type(real)
     V, twist = wp.types.vector(kind.dim, real), kind.twist
     until = until_function(kind)
 
@@ -160,7 +171,8 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
         theta0: wp.array2d(dtype=real),
         omega0: wp.array2d(dtype=real),
         count: wp.array(dtype=int),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         x_out: wp.array2d(dtype=V),
         v_out: wp.array2d(dtype=V),
         theta_out: wp.array2d(dtype=real),
@@ -170,9 +182,9 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
         n = count[r]
         if start >= n:
             return
-        moves = islands.progress[r] < real(1.0) and islands.status[r] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
+        moves = scalars[PROGRESS, r] < real(1.0) and flags[STATUS, r] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
         if start == 0:
-            islands.moved[r] = wp.where(moves, 1, 0)
+            flags[MOVED, r] = wp.where(moves, 1, 0)
         for k in range(start, until(start, n)):
             before = x0[k, r]
             v = v0[k, r]
@@ -185,7 +197,7 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
             angle = angle0
             if moves:
                 end = x[k, r]
-                change = (end - before) * islands.rate[r]
+                change = (end - before) * scalars[RATE, r]
                 if wp.static(midpoint):
                     end = real(2.0) * end - before
                     v = real(2.0) * change - v
@@ -193,7 +205,7 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
                     v = change
                 if wp.static(twist):
                     angle = theta[k, r]
-                    turn = (angle - angle0) * islands.rate[r]
+                    turn = (angle - angle0) * scalars[RATE, r]
                     if wp.static(midpoint):
                         angle = real(2.0) * angle - angle0
                         spin = real(2.0) * turn - spin
@@ -266,11 +278,11 @@ def advance_kernel(real):
     `tally` counts outcomes by their code, solves that rounding ended as `rounded`. `work` holds Newton iterations (sum, largest),
     solves, retries, lost pivots.
     """
-    Islands = islands_type(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def advance(
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         retry_limit: int,
         smallest: real,
         rounded: int,
@@ -279,43 +291,43 @@ def advance_kernel(real):
         remaining: wp.array(dtype=int),
     ):
         r = wp.tid()
-        if islands.progress[r] >= real(1.0):
+        if scalars[PROGRESS, r] >= real(1.0):
             return
-        result = islands.status[r]
+        result = flags[STATUS, r]
         counted = result
         if result == wp.static(outcome.CONVERGED_TO_ROUNDING):
             counted = rounded
         wp.atomic_add(tally, counted, wp.int64(1))
-        wp.atomic_add(work, 0, wp.int64(islands.iteration[r]))
-        wp.atomic_max(work, 1, wp.int64(islands.iteration[r]))
+        wp.atomic_add(work, 0, wp.int64(flags[ITERATION, r]))
+        wp.atomic_max(work, 1, wp.int64(flags[ITERATION, r]))
         wp.atomic_add(work, 2, wp.int64(1))
-        if islands.lost[r] > 0:
-            wp.atomic_add(work, 4, wp.int64(islands.lost[r]))
+        if flags[LOST, r] > 0:
+            wp.atomic_add(work, 4, wp.int64(flags[LOST, r]))
         if result <= wp.static(outcome.CONVERGED_TO_ROUNDING):
-            islands.progress[r] = islands.progress[r] + islands.portion[r]
-            islands.cautious[r] = 0
-            islands.retries[r] = 0
+            scalars[PROGRESS, r] = scalars[PROGRESS, r] + scalars[PORTION, r]
+            flags[CAUTIOUS, r] = 0
+            flags[RETRIES, r] = 0
             # a step twice as long, where it starts at a multiple of its length, so that all end together
-            longer = real(2.0) * islands.portion[r]
+            longer = real(2.0) * scalars[PORTION, r]
             if (
-                islands.progress[r] < real(1.0)
-                and wp.floor(islands.progress[r] / longer) * longer == islands.progress[r]
+                scalars[PROGRESS, r] < real(1.0)
+                and wp.floor(scalars[PROGRESS, r] / longer) * longer == scalars[PROGRESS, r]
             ):
-                islands.portion[r] = longer
+                scalars[PORTION, r] = longer
         else:
             wp.atomic_add(work, 3, wp.int64(1))
-            islands.retries[r] = islands.retries[r] + 1
+            flags[RETRIES, r] = flags[RETRIES, r] + 1
             # another start would lead to the same step, and its energy
-            if islands.cautious[r] == 0 and result != wp.static(outcome.ENERGY_DRIFT):
-                islands.cautious[r] = 1
+            if flags[CAUTIOUS, r] == 0 and result != wp.static(outcome.ENERGY_DRIFT):
+                flags[CAUTIOUS, r] = 1
             else:
-                islands.cautious[r] = 0
-                islands.portion[r] = real(0.5) * islands.portion[r]
-            if islands.retries[r] > retry_limit or islands.portion[r] < smallest:
-                islands.reason[r] = result
-                islands.status[r] = wp.static(outcome.GIVEN_UP)
-                islands.progress[r] = real(1.0)
-        if islands.progress[r] < real(1.0):
+                flags[CAUTIOUS, r] = 0
+                scalars[PORTION, r] = real(0.5) * scalars[PORTION, r]
+            if flags[RETRIES, r] > retry_limit or scalars[PORTION, r] < smallest:
+                flags[REASON, r] = result
+                flags[STATUS, r] = wp.static(outcome.GIVEN_UP)
+                scalars[PROGRESS, r] = real(1.0)
+        if scalars[PROGRESS, r] < real(1.0):
             remaining[0] = 1
 
     return advance
@@ -324,7 +336,6 @@ def advance_kernel(real):
 @cache
 def motion_kernels(kind: ChainKind, real, midpoint: bool):
     """Kernels that put prescribed nodes and edge angles where their motion has them at the end of the (partial) step."""
-    Islands = islands_type(real)
     dim = kind.dim
     V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
     along, *_ = gather_functions(kind, real)
@@ -337,23 +348,24 @@ def motion_kernels(kind: ChainKind, real, midpoint: bool):
         where: wp.array2d(dtype=int),
         rest: wp.array2d(dtype=real),
         pose: wp.array2d(dtype=real),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         x: wp.array2d(dtype=V),
     ):
         """`where` is (node, rod, motion of each component, -1 for none), `rest` the positions in the rest state."""
         i = wp.tid()
         k = where[i, 0]
         r = where[i, 1]
-        if islands.progress[r] >= real(1.0):
+        if scalars[PROGRESS, r] >= real(1.0):
             return
         at = X(rest[i, 0], rest[i, 1], rest[i, 2])
         here = x[k, r]
         for d in range(wp.static(dim)):
             m = where[i, 2 + d]
             if m >= 0:
-                p = placed(pose, m, islands.progress[r] + islands.portion[r], at)
+                p = placed(pose, m, scalars[PROGRESS, r] + scalars[PORTION, r], at)
                 if wp.static(midpoint):
-                    p = real(0.5) * (p + placed(pose, m, islands.progress[r], at))
+                    p = real(0.5) * (p + placed(pose, m, scalars[PROGRESS, r], at))
                 here[d] = p[d * wp.static(axis)]
         x[k, r] = here
 
@@ -363,7 +375,8 @@ def motion_kernels(kind: ChainKind, real, midpoint: bool):
         rest: wp.array2d(dtype=real),
         pose: wp.array2d(dtype=real),
         count: wp.array(dtype=int),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         x: wp.array2d(dtype=V),
         frame: wp.array3d(dtype=real),
         theta: wp.array2d(dtype=real),
@@ -373,14 +386,14 @@ def motion_kernels(kind: ChainKind, real, midpoint: bool):
         k = where[i, 0]
         r = where[i, 1]
         m = where[i, 2]
-        if islands.progress[r] >= real(1.0):
+        if scalars[PROGRESS, r] >= real(1.0):
             return
         t = wp.normalize(x[along(k + 1, count[r]), r] - x[k, r])
         director = X(rest[i, 0], rest[i, 1], rest[i, 2])
-        start = islands.progress[r]
-        end = start + islands.portion[r]
+        start = scalars[PROGRESS, r]
+        end = start + scalars[PORTION, r]
         if wp.static(midpoint):
-            end = start + real(0.5) * islands.portion[r]
+            end = start + real(0.5) * scalars[PORTION, r]
         u = transport(
             X(frame[0, k, r], frame[1, k, r], frame[2, k, r]), X(frame[3, k, r], frame[4, k, r], frame[5, k, r]), t
         )

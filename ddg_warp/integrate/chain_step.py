@@ -39,7 +39,7 @@ class ChainStep(PartStep):
             self._begin,
             group.node_threads,
             [before.x, before.v, before.theta, before.omega, before.frame, group.fixed, group.count, group.world]
-            + [self.integrator._dt, self.damping, group.outer, self.islands],
+            + [self.integrator._dt, self.damping, group.outer, *self.islands.arrays],
             [newton.x, newton.theta, newton.frame, newton.target, newton.target_angle],
         )
         newton.predict(before)
@@ -54,7 +54,7 @@ class ChainStep(PartStep):
         self._launch(
             self._nodes,
             group.node_threads,
-            [newton.x, newton.theta, before.x, before.v, before.theta, before.omega, group.count, self.islands],
+            [newton.x, newton.theta, before.x, before.v, before.theta, before.omega, group.count, *self.islands.arrays],
             [after.x, after.v, after.theta, after.omega],
         )
         if self._frames:

@@ -51,7 +51,7 @@ class _Energy:
         wp.launch(
             self._judge,
             self.account.shape[1],
-            [self.rows, step.integrator.energy_bound, step.islands],
+            [self.rows, step.integrator.energy_bound, *step.islands.arrays],
             [self.account, self.failed],
             device=self.device,
         )
@@ -92,7 +92,7 @@ class ChainEnergy(_Energy):
             self._measure,
             (self.ranges, group.columns),
             [before.x, before.v, before.theta, before.omega, before.frame, newton.x, newton.theta, newton.frame]
-            + [before.last, step.islands, *group.parameters.arrays, group.count, group.mass, group.rotary]
+            + [before.last, *step.islands.arrays, *group.parameters.arrays, group.count, group.mass, group.rotary]
             + [
                 *self._loads,
                 group.load,
@@ -138,7 +138,7 @@ class NetEnergy(_Energy):
                 kernel,
                 step.model.worlds * part.elements,
                 net.inputs(part, middle, i, q=solver.q, rate=step.islands.rate)
-                + [before.q, own["stiffness"], self.floor, step.islands],
+                + [before.q, own["stiffness"], self.floor, *step.islands.arrays],
                 [self._values[i]],
                 device=self.device,
             )
@@ -147,7 +147,17 @@ class NetEnergy(_Energy):
         wp.launch(
             self._blocks,
             solver.all,
-            [before.q, before.v, solver.q, solver.mass, step.islands, step.damping, self._load, solver.load, self.floor]
+            [
+                before.q,
+                before.v,
+                solver.q,
+                solver.mass,
+                *step.islands.arrays,
+                step.damping,
+                self._load,
+                solver.load,
+                self.floor,
+            ]
             + [net.blocks],
             [self._values[-1]],
             device=self.device,

@@ -60,10 +60,10 @@ class NetMotion:
     def apply(self, islands, q: wp.array, frame: wp.array) -> None:
         """Put held blocks and normals where the part of the step that a world tries has them; `frame` are lagged."""
         net = self.net
-        rows = [self.pose, islands]
+        rows = [self.pose, *islands.arrays]
         self._launch(self._nodes, self.nodes, [self.nodes, self.rest, *rows, net.blocks], [q])
         if len(self.edges):
-            inputs = [self.edges, self.edge_rest, self.pose, net.ends, frame, islands]
+            inputs = [self.edges, self.edge_rest, self.pose, net.ends, frame, *islands.arrays]
             self._launch(self._angles, self.edges, [*inputs, net.blocks, net.angle_start], [q])
         for index, (where, rest) in self.normals.items():
             self._launch(self._normals, where, [where, rest, *rows, net.sets[index].elements], [self.data[index]])
@@ -71,7 +71,7 @@ class NetMotion:
     def turn(self, islands, before: NetState, after: NetState) -> None:
         """Turn the normals of a state that a part of the step ends in, in the worlds that moved."""
         for index, (where, rest) in self.normals.items():
-            inputs = [where, rest, self.pose, islands, self.net.sets[index].elements]
+            inputs = [where, rest, self.pose, *islands.arrays, self.net.sets[index].elements]
             self._launch(self._turn, where, [*inputs, before.data[index]], [after.data[index]])
 
     def _launch(self, kernel, where: wp.array, inputs: list, outputs: list) -> None:

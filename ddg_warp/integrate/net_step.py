@@ -51,7 +51,16 @@ class NetStep(PartStep):
         self._launch(
             self._begin,
             solver.all,
-            [before.q, before.v, solver.held, solver.mass, self.integrator._dt, self.damping, solver.outer, islands]
+            [
+                before.q,
+                before.v,
+                solver.held,
+                solver.mass,
+                self.integrator._dt,
+                self.damping,
+                solver.outer,
+                *islands.arrays,
+            ]
             + [blocks],
             [solver.q, solver.base, solver.target],
         )
@@ -62,7 +71,9 @@ class NetStep(PartStep):
         solver.solve(start)
         if self.energy:
             self.energy.judge(before, start)
-        self._launch(self._finish, solver.all, [solver.q, before.q, before.v, islands, blocks], [after.q, after.v])
+        self._launch(
+            self._finish, solver.all, [solver.q, before.q, before.v, *islands.arrays, blocks], [after.q, after.v]
+        )
         self.net.carry(start, after, kept=before, moved=islands.moved)
         if self.motion:
             self.motion.turn(islands, before, after)

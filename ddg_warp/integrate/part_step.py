@@ -53,7 +53,7 @@ class PartStep:
 
     def step(self, before, after) -> None:
         """Launch a whole step from one state to another; only launches, so that it can be captured."""
-        self._launch(self._start, len(self.islands.status), [self.islands], [])
+        self._launch(self._start, len(self.islands), self.islands.arrays, [])
         self._try(before, after)
         wp.capture_while(self.remaining, lambda: self._try(after, after))
 
@@ -62,8 +62,8 @@ class PartStep:
         self.attempt(before, after)
         self.remaining.zero_()
         limit = self.integrator.retry_limit
-        inputs = [self.islands, limit, 0.5 ** (limit // 2), self.rounded]
-        self._launch(self._advance, len(self.islands.status), inputs, [self.tally, self.work, self.remaining])
+        inputs = [*self.islands.arrays, limit, 0.5 ** (limit // 2), self.rounded]
+        self._launch(self._advance, len(self.islands), inputs, [self.tally, self.work, self.remaining])
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)

@@ -58,7 +58,7 @@ class PrescribedMotion:
         wp.launch(
             nodes,
             held.nodes.shape[0],
-            [held.nodes, held.node_rest, self.pose, islands],
+            [held.nodes, held.node_rest, self.pose, *islands.arrays],
             [x],
             device=device,
         )
@@ -66,7 +66,7 @@ class PrescribedMotion:
             wp.launch(
                 kernel,
                 held.edges.shape[0],
-                [held.edges, held.edge_rest, self.pose, group.count, islands, x, frame],
+                [held.edges, held.edge_rest, self.pose, group.count, *islands.arrays, x, frame],
                 [theta],
                 device=device,
             )

@@ -32,7 +32,7 @@ class AssembledNewton(ChainNewton):
         wp.launch(
             self._assemble,
             (group.nodes, group.columns),
-            [self.factor, self.geometric, group.count, group.mass, group.rotary, group.fixed, self.islands]
+            [self.factor, self.geometric, group.count, group.mass, group.rotary, group.fixed, *self.islands.arrays]
             + [int(self.reuse)],
             [self.blocks],
             device=self.device,

@@ -52,12 +52,12 @@ class PartitionedNewton(AssembledNewton):
         self._launch(
             self._aim,
             group.nodes,
-            [before.x, before.v, group.fixed, group.count, self.islands],
+            [before.x, before.v, group.fixed, group.count, *self.islands.arrays],
             [self.base, self.direction],
         )
         self.move()
         if self.midpoint and group.kind.twist:
-            wp.launch(self._renew, group.columns, [self.islands], device=self.device)
+            wp.launch(self._renew, group.columns, self.islands.arrays, device=self.device)
             self.move()
 
     def sweep(self) -> None:
@@ -81,7 +81,7 @@ class PartitionedNewton(AssembledNewton):
             self._judge,
             self.group.columns,
             [self.partial, self.ranges, options.floor_factor * self.eps, options.max_iterations, options.max_halvings]
-            + [self.islands],
+            + self.islands.arrays,
             device=self.device,
         )
 
@@ -102,7 +102,7 @@ class PartitionedNewton(AssembledNewton):
         wp.launch(
             self._take,
             group.columns,
-            [self.partial, self.ranges, self.options.rotation_cap, self.islands],
+            [self.partial, self.ranges, self.options.rotation_cap, *self.islands.arrays],
             device=self.device,
         )
 
@@ -126,7 +126,7 @@ class PartitionedNewton(AssembledNewton):
         self._launch(
             move,
             group.nodes,
-            [group.count, group.fixed, self.held, islands, self.direction]
+            [group.count, group.fixed, self.held, *islands.arrays, self.direction]
             + [self.prefix, self.sums, self.mean, self.width, self.new_frame],
             [self.x, self.theta, self.frame, self.base],
         )

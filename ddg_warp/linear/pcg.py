@@ -66,7 +66,7 @@ class PcgNewton(AssembledNewton):
             self._take,
             group.columns,
             [self.right, self.iterations, group.count, self.options.rotation_cap],
-            [self.direction, group.fixed, self.base, self.x, self.theta, self.islands, self.pcg_work],
+            [self.direction, group.fixed, self.base, self.x, self.theta, *self.islands.arrays, self.pcg_work],
             device=device,
         )
 
@@ -76,7 +76,7 @@ class PcgNewton(AssembledNewton):
             wp.launch(
                 self._repeat,
                 self.group.columns,
-                [done, self.islands, self.negative],
+                [done, *self.islands.arrays, self.negative],
                 device=self.device,
             )
 
@@ -89,7 +89,7 @@ class PcgNewton(AssembledNewton):
             group.columns,
             [self.right, self.energy_change, self.energy_noise, group.count, options.floor_factor * self.eps]
             + [options.max_iterations, options.max_halvings, self.direction, group.fixed, self.base]
-            + [self.x, self.theta, self.frame, self.islands],
+            + [self.x, self.theta, self.frame, *self.islands.arrays],
             device=device,
         )
         if self._factor:

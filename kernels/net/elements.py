@@ -14,7 +14,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.element import CPU_OPTIONS
-from ddg_warp.kernels.islands import islands_type
+from ddg_warp.kernels.islands import CLAMPED, SLOT, STATUS
 from ddg_warp.kernels.terms import Term
 
 FRAME = 6  # reals of the reference frame of an edge: first director and tangent
@@ -294,7 +294,6 @@ def evaluate_kernel(term: Term, real, linear):
     its two-by-two stress, leaves out the negative part). Energies go to the half of `energy_out` that the line search does not
     hold. `stiffness_out` is the largest that a strain has against moving the element.
     """
-    Islands = islands_type(real)
     measure, density = term.measure, term.density
     V, F = wp.types.vector(3, real), wp.types.vector(3, linear)
     Q, S, E, _ = measure.types(real)
@@ -335,7 +334,8 @@ def evaluate_kernel(term: Term, real, linear):
         blocks: int,
         angle_start: int,
         elements: int,
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         factor_out: wp.array2d(dtype=F),
         tension_out: wp.array2d(dtype=linear),
         gradient_out: wp.array2d(dtype=V),
@@ -344,25 +344,25 @@ def evaluate_kernel(term: Term, real, linear):
     ):
         tid = wp.tid()
         world = tid / elements
-        if islands.status[world] != 0:
+        if flags[STATUS, world] != 0:
             return
         x, s, w, p = gather(q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid)
         e, jacobian = jacobian_of(x, s, w)
         slope = slope_of(e, p)
-        energy_out[1 - islands.slot[world], tid] = w * energy_of(e, p)
+        energy_out[1 - flags[SLOT, world], tid] = w * energy_of(e, p)
         f = (slope * w) * jacobian
         for i in range(wp.static(slots_count)):
             gradient_out[i, tid] = spread(f, i)
         shift = E()
         if wp.static(tensions == 1):
             c, shift = tension_of(x, w, slope)
-            if c < real(0.0) and islands.clamped[world] != 0:
+            if c < real(0.0) and flags[CLAMPED, world] != 0:
                 c = real(0.0)
                 shift = E()
             tension_out[0, tid] = linear(c)
         if wp.static(tensions == 3):
             c3, _shift = tension_of(x, w, slope)
-            if islands.clamped[world] != 0:
+            if flags[CLAMPED, world] != 0:
                 c3 = definite(c3)
             for i in range(3):
                 tension_out[i, tid] = linear(c3[i])

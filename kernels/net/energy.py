@@ -6,7 +6,7 @@ import warp as wp
 
 from ddg_warp.kernels.element import CPU_OPTIONS
 from ddg_warp.kernels.energy import DISSIPATED, DRIFT, HELD, ROUNDING, balance_function
-from ddg_warp.kernels.islands import islands_type
+from ddg_warp.kernels.islands import PROGRESS, RATE
 from ddg_warp.kernels.net.elements import functions
 from ddg_warp.kernels.terms import Term
 
@@ -14,7 +14,6 @@ from ddg_warp.kernels.terms import Term
 @cache
 def element_kernel(term: Term, real, linear):
     """Rows of the elements of a set; row i of world w is i * worlds + w."""
-    Islands = islands_type(real)
     V = wp.types.vector(3, real)
     gather, _ = functions(term, real)
     balance = balance_function(term, real)
@@ -36,12 +35,13 @@ def element_kernel(term: Term, real, linear):
         q0: wp.array(dtype=V),
         stiffness: wp.array(dtype=linear),
         floor: real,
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         rows_out: wp.array2d(dtype=real),
     ):
         tid = wp.tid()
         w = tid / elements
-        if islands.progress[w] >= real(1.0):
+        if scalars[PROGRESS, w] >= real(1.0):
             return
         b, s, weight, p = gather(
             q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid
@@ -53,7 +53,7 @@ def element_kernel(term: Term, real, linear):
         reach = wp.max(wp.abs(q[slots[0, e] + w * blocks]))
         rows = balance(a, s, b, s, weight, p, reach, floor)
         least = floor * reach
-        worlds = islands.progress.shape[0]
+        worlds = scalars.shape[1]
         rows_out[wp.static(DRIFT) * worlds + w, e] = rows[wp.static(DRIFT)]
         rows_out[wp.static(ROUNDING) * worlds + w, e] = rows[wp.static(ROUNDING)] + real(stiffness[tid]) * least * least
         rows_out[wp.static(HELD) * worlds + w, e] = rows[wp.static(HELD)]
@@ -65,7 +65,6 @@ def element_kernel(term: Term, real, linear):
 @cache
 def block_kernel(real):
     """Rows of the blocks of a net: work of loads that follow, kinetic energy at the end of the step, what damping takes in."""
-    Islands = islands_type(real)
     V = wp.types.vector(3, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -74,7 +73,8 @@ def block_kernel(real):
         v0: wp.array(dtype=V),
         q: wp.array(dtype=V),
         mass: wp.array(dtype=V),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         damping: wp.array(dtype=real),
         load: wp.array(dtype=V),
         load_there: wp.array(dtype=V),
@@ -85,17 +85,17 @@ def block_kernel(real):
         """`load` is that of the iterate, `load_there` what the step was solved with."""
         i = wp.tid()
         w = i / blocks
-        if islands.progress[w] >= real(1.0):
+        if scalars[PROGRESS, w] >= real(1.0):
             return
         k = i - w * blocks
         moved = q[i] - q0[i]
-        v = moved * (real(2.0) * islands.rate[w]) - v0[i]
-        worlds = islands.progress.shape[0]
+        v = moved * (real(2.0) * scalars[RATE, w]) - v0[i]
+        worlds = scalars.shape[1]
         rows_out[wp.static(DRIFT) * worlds + w, k] = real(2.0) * wp.dot(load_there[i] - load[i], moved)
         rows_out[wp.static(ROUNDING) * worlds + w, k] = real(2.0) * floor * wp.abs(wp.dot(load[i], moved))
         rows_out[wp.static(HELD) * worlds + w, k] = real(0.5) * wp.dot(wp.cw_mul(mass[k], v), v)
         rows_out[wp.static(DISSIPATED) * worlds + w, k] = (
-            real(2.0) * damping[0] * islands.rate[w] * wp.dot(wp.cw_mul(mass[k], moved), moved)
+            real(2.0) * damping[0] * scalars[RATE, w] * wp.dot(wp.cw_mul(mass[k], moved), moved)
         )
 
     return measure

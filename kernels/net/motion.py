@@ -9,13 +9,12 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import frames, motion
-from ddg_warp.kernels.islands import islands_type
+from ddg_warp.kernels.islands import MOVED, PORTION, PROGRESS
 
 
 @cache
 def motion_kernels(real, midpoint: bool):
     """nodes(...), angles(...) of the iterate; normals(...) for the solve, and turn(...) at the end of the step."""
-    Islands = islands_type(real)
     V = wp.types.vector(3, real)
     transport, *_ = frames.functions(real)
     turned, placed, branch = motion.functions(real)
@@ -33,22 +32,23 @@ def motion_kernels(real, midpoint: bool):
         where: wp.array2d(dtype=int),
         rest: wp.array(dtype=V),
         pose: wp.array2d(dtype=real),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         blocks: int,
         q: wp.array(dtype=V),
     ):
         """`where` is the block, then the motion of each of its components, -1 for none."""
         i, w = wp.tid()
-        if islands.progress[w] >= real(1.0):
+        if scalars[PROGRESS, w] >= real(1.0):
             return
         k = where[i, 0]
         here = q[k + w * blocks]
         for d in range(3):
             m = where[i, 1 + d]
             if m >= 0:
-                p = placed(pose, m, islands.progress[w] + islands.portion[w], rest[k])
+                p = placed(pose, m, scalars[PROGRESS, w] + scalars[PORTION, w], rest[k])
                 if wp.static(midpoint):
-                    p = real(0.5) * (p + placed(pose, m, islands.progress[w], rest[k]))
+                    p = real(0.5) * (p + placed(pose, m, scalars[PROGRESS, w], rest[k]))
                 here[d] = p[d]
         q[k + w * blocks] = here
 
@@ -59,14 +59,15 @@ def motion_kernels(real, midpoint: bool):
         pose: wp.array2d(dtype=real),
         ends: wp.array2d(dtype=int),
         frame: wp.array2d(dtype=real),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         blocks: int,
         angle_start: int,
         q: wp.array(dtype=V),
     ):
         """`where` is (rod edge, motion), `rest` the edge's first material director at rest; `frame` are the lagged frames."""
         i, w = wp.tid()
-        if islands.progress[w] >= real(1.0):
+        if scalars[PROGRESS, w] >= real(1.0):
             return
         e = where[i, 0]
         m = where[i, 1]
@@ -74,9 +75,9 @@ def motion_kernels(real, midpoint: bool):
         k = e + angle_start + w * blocks
         t = wp.normalize(q[ends[e, 1] + w * blocks] - q[ends[e, 0] + w * blocks])
         u = transport(V(frame[0, f], frame[1, f], frame[2, f]), V(frame[3, f], frame[4, f], frame[5, f]), t)
-        at = reached(islands.progress[w], islands.portion[w])
+        at = reached(scalars[PROGRESS, w], scalars[PORTION, w])
         here = q[k]
-        here[0] = branch(pose, m, islands.progress[w], at, rest[i], u, t, here[0])
+        here[0] = branch(pose, m, scalars[PROGRESS, w], at, rest[i], u, t, here[0])
         q[k] = here
 
     @wp.func
@@ -89,14 +90,15 @@ def motion_kernels(real, midpoint: bool):
         where: wp.array2d(dtype=int),
         rest: wp.array(dtype=V),
         pose: wp.array2d(dtype=real),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         elements: int,
         data_out: wp.array2d(dtype=real),
     ):
         """`where` is (element, first row of its data, motion), `rest` the normal at rest."""
         i, w = wp.tid()
-        if islands.progress[w] < real(1.0):
-            n = turned(pose, where[i, 2], reached(islands.progress[w], islands.portion[w]), rest[i])
+        if scalars[PROGRESS, w] < real(1.0):
+            n = turned(pose, where[i, 2], reached(scalars[PROGRESS, w], scalars[PORTION, w]), rest[i])
             write(where, i, w * elements, n, data_out)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -104,7 +106,8 @@ def motion_kernels(real, midpoint: bool):
         where: wp.array2d(dtype=int),
         rest: wp.array(dtype=V),
         pose: wp.array2d(dtype=real),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         elements: int,
         before: wp.array2d(dtype=real),
         data_out: wp.array2d(dtype=real),
@@ -115,8 +118,8 @@ def motion_kernels(real, midpoint: bool):
         n = V()
         for d in range(3):
             n[d] = before[where[i, 1] + d, column]
-        if islands.moved[w] != 0:
-            n = turned(pose, where[i, 2], islands.progress[w] + islands.portion[w], rest[i])
+        if flags[MOVED, w] != 0:
+            n = turned(pose, where[i, 2], scalars[PROGRESS, w] + scalars[PORTION, w], rest[i])
         write(where, i, w * elements, n, data_out)
 
     return nodes, angles, normals, turn

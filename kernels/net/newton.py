@@ -6,7 +6,24 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import outcome
-from ddg_warp.kernels.islands import attempt_functions, islands_type
+from ddg_warp.kernels.islands import (
+    ACTIVE,
+    CAUTIOUS,
+    DECREMENT,
+    DROWNED,
+    ITERATION,
+    LOAD_SCALE,
+    MERIT,
+    MOVED,
+    PROGRESS,
+    RATE,
+    STATUS,
+    STEP_LENGTH,
+    TODO,
+    UNBALANCED,
+    WANTED,
+    attempt_functions,
+)
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
 
 POLISH = 1e-3  # reduction to which a direction must have been solved before rounding excuses what it leaves
@@ -16,7 +33,6 @@ STALLED = 8  # iterations without progress, where energies drown in rounding, th
 @cache
 def search_kernels(real, linear):
     """judge(...) of an iterate, measure(...) and take(...) of a direction, move(...) of the blocks."""
-    Islands = islands_type(real)
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     balanced, decide = judge_functions(False, real)
 
@@ -33,7 +49,8 @@ def search_kernels(real, linear):
         loosest: real,
         tightest: real,
         spare: real,
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         best: wp.array(dtype=real),
         stalled: wp.array(dtype=int),
         forcing: wp.array(dtype=linear),
@@ -47,23 +64,23 @@ def search_kernels(real, linear):
         estimate block by block.
         """
         w = wp.tid()
-        islands.wanted[w] = 0
-        islands.todo[w] = 0
+        flags[WANTED, w] = 0
+        flags[TODO, w] = 0
         # what an inexact direction leaves is not rounding yet
         polish = (
-            islands.status[w] == 0
-            and islands.unbalanced[w] == 0
-            and islands.drowned[w] != 0
+            flags[STATUS, w] == 0
+            and flags[UNBALANCED, w] == 0
+            and flags[DROWNED, w] != 0
             and real(forcing[w]) > real(wp.static(POLISH))
         )
-        if polish and islands.iteration[w] > 0:
-            islands.unbalanced[w] = 1
-        if balanced(islands, w):
+        if polish and flags[ITERATION, w] > 0:
+            flags[UNBALANCED, w] = 1
+        if balanced(flags, scalars, w):
             return
-        before = islands.merit[w]
-        first = islands.iteration[w] == 0
-        drowns = not first and islands.step_length[w] * islands.decrement[w] <= real(10.0) * noise[w] * floor
-        what = decide(change[w], noise[w] * floor, square[w], worst[w], max_iterations, max_halvings, islands, w)
+        before = scalars[MERIT, w]
+        first = flags[ITERATION, w] == 0
+        drowns = not first and scalars[STEP_LENGTH, w] * scalars[DECREMENT, w] <= real(10.0) * noise[w] * floor
+        what = decide(change[w], noise[w] * floor, square[w], worst[w], max_iterations, max_halvings, flags, scalars, w)
         if what == wp.static(STOP):
             return
         if what == wp.static(DIRECT):
@@ -72,22 +89,22 @@ def search_kernels(real, linear):
                 best[w] = square[w]
                 stalled[w] = 0
             if stalled[w] > wp.static(STALLED):
-                islands.status[w] = wp.static(outcome.CONVERGED_TO_ROUNDING)
+                flags[STATUS, w] = wp.static(outcome.CONVERGED_TO_ROUNDING)
                 return
-        islands.active[0] = 1
+        flags[ACTIVE, 0] = 1
         if what == wp.static(DIRECT):
             eta = loosest
             if not first and before > real(0.0):
                 eta = wp.clamp(real(0.9) * square[w] / before, tightest, loosest)
-            enough = rtol * islands.load_scale[w] / worst[w]
-            goal[w] = wp.where(spare * enough >= eta, spare * rtol * islands.load_scale[w], real(wp.static(math.inf)))
+            enough = rtol * scalars[LOAD_SCALE, w] / worst[w]
+            goal[w] = wp.where(spare * enough >= eta, spare * rtol * scalars[LOAD_SCALE, w], real(wp.static(math.inf)))
             eta = wp.max(eta, wp.min(enough, real(0.5)))
             if polish:
                 eta = wp.min(eta, real(wp.static(POLISH)))
             forcing[w] = linear(eta)
-            islands.wanted[w] = 1
+            flags[WANTED, w] = 1
         else:
-            islands.todo[w] = 1
+            flags[TODO, w] = 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def measure(
@@ -136,22 +153,23 @@ def search_kernels(real, linear):
         turn: wp.array(dtype=real),
         rotation_cap: real,
         iterations: wp.array(dtype=int),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         work: wp.array(dtype=wp.int64),
     ):
         """Length of the step: whole, or so that nothing turns by more than the cap."""
         w = wp.tid()
-        if islands.wanted[w] == 0:
+        if flags[WANTED, w] == 0:
             return
         if not wp.isfinite(decrease[w]):
-            islands.status[w] = wp.static(outcome.NON_FINITE)
+            flags[STATUS, w] = wp.static(outcome.NON_FINITE)
             return
         whole = real(1.0)
         if turn[w] > rotation_cap * rotation_cap:
             whole = rotation_cap / wp.sqrt(turn[w])
-        islands.step_length[w] = whole
-        islands.decrement[w] = decrease[w]
-        islands.todo[w] = 2
+        scalars[STEP_LENGTH, w] = whole
+        scalars[DECREMENT, w] = decrease[w]
+        flags[TODO, w] = 2
         wp.atomic_add(work, 0, wp.int64(iterations[w]))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -180,7 +198,6 @@ def search_kernels(real, linear):
 @cache
 def step_kernels(real, midpoint: bool):
     """begin(...) and finish(...) of a time step; see `kernels.step` for the schemes."""
-    Islands = islands_type(real)
     length, restart = attempt_functions(real, midpoint)
     V = wp.types.vector(3, real)
 
@@ -193,7 +210,8 @@ def step_kernels(real, midpoint: bool):
         dt: wp.array(dtype=real),
         damping: wp.array(dtype=real),
         outer: wp.array(dtype=real),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         blocks: int,
         q_out: wp.array(dtype=V),
         base_out: wp.array(dtype=V),
@@ -204,19 +222,19 @@ def step_kernels(real, midpoint: bool):
         w = i / blocks
         k = i - w * blocks
         if k == 0:
-            islands.moved[w] = wp.where(islands.progress[w] < real(1.0), 1, 0)
-        if islands.progress[w] >= real(1.0):
+            flags[MOVED, w] = wp.where(scalars[PROGRESS, w] < real(1.0), 1, 0)
+        if scalars[PROGRESS, w] >= real(1.0):
             return
-        s = length(islands, w, dt[w])
+        s = length(scalars, w, dt[w])
         rate = real(1.0) / s
         coefficient = rate * (rate + damping[0])
         if k == 0:
-            restart(islands, w, rate, coefficient, outer[w])
+            restart(flags, scalars, w, rate, coefficient, outer[w])
         mask = int(fixed[k])
         here = q0[i]
         v = v0[i]
         target_out[i] = here + v * (rate / coefficient)
-        if islands.cautious[w] == 0:
+        if flags[CAUTIOUS, w] == 0:
             for d in range(3):
                 if ((mask >> d) & 1) == 0 and mass[k][d] > real(0.0):
                     here[d] = here[d] + s * v[d]
@@ -228,7 +246,8 @@ def step_kernels(real, midpoint: bool):
         q: wp.array(dtype=V),
         q0: wp.array(dtype=V),
         v0: wp.array(dtype=V),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         blocks: int,
         q_out: wp.array(dtype=V),
         v_out: wp.array(dtype=V),
@@ -239,12 +258,12 @@ def step_kernels(real, midpoint: bool):
         start = q0[i]
         v = v0[i]
         end = start
-        ahead = islands.progress[w] < real(1.0) and islands.status[w] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
+        ahead = scalars[PROGRESS, w] < real(1.0) and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
         if i == w * blocks:
-            islands.moved[w] = wp.where(ahead, 1, 0)
+            flags[MOVED, w] = wp.where(ahead, 1, 0)
         if ahead:
             end = q[i]
-            change = (end - start) * islands.rate[w]
+            change = (end - start) * scalars[RATE, w]
             if wp.static(midpoint):
                 end = real(2.0) * end - start
                 v = real(2.0) * change - v

@@ -10,7 +10,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.element import CPU_OPTIONS
-from ddg_warp.kernels.islands import islands_type
+from ddg_warp.kernels.islands import DROWNED, LOAD_SCALE, STATUS, UNBALANCED
 from ddg_warp.kernels.terms import Term
 
 SLICE = 32  # rows of a slice of H
@@ -19,7 +19,6 @@ SLICE = 32  # rows of a slice of H
 @cache
 def balance_kernels(real, linear):
     """outer(...): loads and inertia at every block; collect(...): forces of a set; settle(...): residual, and whether it balances."""
-    Islands = islands_type(real)
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -117,7 +116,8 @@ def balance_kernels(real, linear):
         size: wp.array(dtype=real),
         stiffness: wp.array(dtype=linear),
         fixed: wp.array(dtype=wp.uint8),
-        islands: Islands,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         allowed: wp.array(dtype=real),
         blocks: int,
         nodes: int,
@@ -139,7 +139,7 @@ def balance_kernels(real, linear):
         """
         i = wp.tid()
         w = i / blocks
-        if islands.status[w] != 0:
+        if flags[STATUS, w] != 0:
             return
         k = i - w * blocks
         f = force[i]
@@ -148,7 +148,7 @@ def balance_kernels(real, linear):
         reach = wp.max(wp.abs(q[i])) + longest
         if k >= nodes:
             reach += real(1.0)
-        limit = rtol * islands.load_scale[w] * allowed[i]
+        limit = rtol * scalars[LOAD_SCALE, w] * allowed[i]
         least = floor * (real(stiffness[i]) * reach + size[i])
         least_out[i] = least
         r = H()
@@ -160,9 +160,9 @@ def balance_kernels(real, linear):
                 r[d] = linear(f[d])
                 square += f[d] * f[d] / (length * length)
                 if not wp.abs(f[d]) <= limit:
-                    islands.drowned[w] = 1
+                    flags[DROWNED, w] = 1
                     if not wp.abs(f[d]) <= least:
-                        islands.unbalanced[w] = 1
+                        flags[UNBALANCED, w] = 1
         right_out[i] = r
         ratio_out[w, k] = ratio
         square_out[w, k] = square
