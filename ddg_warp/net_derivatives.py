@@ -84,29 +84,28 @@ class NetSample:
         search = Islands(1, real, self.device)
         search.clamped.fill_(1)
         kernel = net_elements.evaluate_kernel(self.term, real, real)
-        wp.launch(kernel, ELEMENTS, [*self._inputs(real), *search.arrays], out, device=self.device)
+        wp.launch(kernel, ELEMENTS, [self._elements(real), *search.arrays], out, device=self.device)
         factor, tension, gradient, energy = (array.numpy().astype(float) for array in out[:4])
         rows = factor.reshape(n, slots, ELEMENTS, 3).transpose(0, 1, 3, 2).reshape(n, 3 * slots, ELEMENTS)
         return rows, tension[: self.measure.tensions], gradient, energy[1]
 
     def reverse(self, which: int, seed: np.ndarray, real) -> dict[str, np.ndarray]:
         """Reverse mode of the energy (which = 0) or gradient (1) kernel, by input."""
-        inputs = self._inputs(real, requires_grad=True)
-        adjoints = [wp.zeros_like(array) for array in inputs[: len(INPUTS)]]
+        given = self._elements(real)
         dtype = wp.types.vector(3, real) if which else real
         seeds = wp.array(np.ascontiguousarray(seed), dtype=dtype, device=self.device)
         wp.launch(
             net_elements.term_kernels(self.term, real, reverse=True)[which],
             ELEMENTS,
-            inputs,
+            [given],
             [wp.zeros_like(seeds, requires_grad=True)],
             adjoint=True,
-            adj_inputs=[*adjoints, *[None] * (len(inputs) - len(adjoints))],
+            adj_inputs=[net_elements.elements_type(real)()],
             adj_outputs=[seeds],
             device=self.device,
         )
-        values = (array.numpy().astype(float) for array in adjoints)
-        return {name: v.reshape(self.data[name].shape) for name, v in zip(INPUTS, values, strict=True)}
+        values = {name: getattr(given, name).grad.numpy().astype(float) for name in INPUTS}
+        return {name: v.reshape(self.data[name].shape) for name, v in values.items()}
 
     def difference(self, function, name: str, where) -> np.ndarray:
         """Central difference of fourth order of function(**data) along data[name][where]."""
@@ -194,25 +193,28 @@ class NetSample:
                 buffer[row] = buffer[self.term.parameter_names.index(f"{parameter.family}_1")]
         return NetSample(self.term, self.device, self.exact_in_float32, {**self.data, "buffer": buffer})
 
-    def _inputs(self, real, requires_grad: bool = False, **changed) -> list:
-        data = {**self.data, **changed}
-        vector = wp.types.vector(3, real)
-        out = []
+    def _elements(self, real, **changed):
+        """What kernels read; see `kernels.net.elements.elements_type`."""
+        data, given = {**self.data, **changed}, net_elements.elements_type(real)()
+
+        def put(values, dtype):
+            return wp.array(
+                np.ascontiguousarray(values), dtype=dtype, device=self.device, requires_grad=dtype is not int
+            )
+
         for name in INPUTS:
             values = data[name].ravel() if name == "buffer" else data[name]
-            dtype = vector if name == "q" else real
-            array = wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device, requires_grad=requires_grad)
-            out.append(array)
-        table = np.array([(row * ELEMENTS, 1, 0) for row in range(len(data["buffer"]))], np.int32)
-        integers = [wp.array(v, dtype=int, device=self.device) for v in (table, self.slots.astype(np.int32))]
-        constants = wp.array(np.ascontiguousarray(data["constants"]), dtype=real, device=self.device)
-        return [*out, *integers, constants, self.slots.size, self.angle_start, ELEMENTS]
+            setattr(given, name, put(values, wp.types.vector(3, real) if name == "q" else real))
+        given.table = put(np.array([(row * ELEMENTS, 1, 0) for row in range(len(data["buffer"]))], np.int32), int)
+        given.slots, given.data = put(self.slots.astype(np.int32), int), put(data["constants"], real)
+        given.blocks, given.angle_start, given.elements = self.slots.size, self.angle_start, ELEMENTS
+        return given
 
     def _launch(self, which: int, real, shapes, vectors=False, columns=(), extra=(), **changed) -> list[np.ndarray]:
         dtype = wp.types.vector(3, real) if vectors else real
         out = [wp.zeros(shape, dtype=dtype, device=self.device) for shape in shapes]
         kernel = net_elements.term_kernels(self.term, real, reverse=True)[which]
-        wp.launch(kernel, (ELEMENTS, *columns), [*self._inputs(real, **changed), *extra], out, device=self.device)
+        wp.launch(kernel, (ELEMENTS, *columns), [self._elements(real, **changed), *extra], out, device=self.device)
         return [array.numpy().astype(float) for array in out]
 
 

@@ -103,7 +103,7 @@ def follow(net, state, angles: bool, rates: bool) -> None:
             _turn(state.q, edges, np.where(free, rest - strain.numpy().reshape(shape), 0.0))
         if rates:
             net.strains(state, index, strain, stress)
-            inputs = [*net.inputs(part, state, index), state.v]
+            inputs = [net.elements(state, index), state.v]
             wp.launch(term_kernels(TERM, net.real)[4], edges.size, inputs, [next_stress], device=net.device)
             slip = (next_stress.numpy() - stress.numpy()).reshape(shape) / np.where(stiffness > 0.0, stiffness, 1.0)
             _turn(state.v, edges, np.where(free, -slip, 0.0))

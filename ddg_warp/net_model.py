@@ -137,21 +137,15 @@ class DeviceNet:
                 lag.assign(np.tile(part.host.lag, (1, self.worlds)))
         return state
 
-    def inputs(self, part: DeviceSet, state: NetState, index: int, q=None, rate=None) -> list:
-        """What every kernel of a term reads."""
-        return [
-            state.q if q is None else q,
-            state.frame,
-            state.lag[index],
-            state.last[index],
-            self.still if rate is None else rate,
-            *part.parameters.arrays,
-            part.slots,
-            state.data.get(index, part.data),
-            self.blocks,
-            self.angle_start,
-            part.elements,
-        ]
+    def elements(self, state: NetState, index: int, q=None, rate=None):
+        """What every kernel of a term reads of set `index` at a state, or at other dofs `q`, at rest or at a rate."""
+        part, given = self.sets[index], elements.elements_type(self.real)()
+        given.q, given.frame = state.q if q is None else q, state.frame
+        given.lag, given.last, given.rate = state.lag[index], state.last[index], self.still if rate is None else rate
+        (given.buffer, given.table), given.slots = part.parameters.arrays, part.slots
+        given.data = state.data.get(index, part.data)
+        given.blocks, given.angle_start, given.elements = self.blocks, self.angle_start, part.elements
+        return given
 
     def strains(self, state: NetState, index: int, strain: wp.array, stress: wp.array | None = None) -> None:
         """Strains of a set (strains, W E), and stresses if asked for."""
@@ -159,7 +153,7 @@ class DeviceNet:
         wp.launch(
             elements.term_kernels(part.term, self.real)[3],
             self.worlds * part.elements,
-            self.inputs(part, state, index) + [int(stress is not None)],
+            [self.elements(state, index), int(stress is not None)],
             [strain, strain if stress is None else stress],
             device=self.device,
         )

@@ -156,7 +156,7 @@ class NetNewton:
             wp.launch(
                 kernel,
                 self.worlds * part.elements,
-                self.net.inputs(part, state, index, q=self.q, rate=self.islands.rate) + self.islands.arrays,
+                [self.net.elements(state, index, self.q, self.islands.rate), *self.islands.arrays],
                 [own["factor"], own["tension"], own["gradient"], own["energy"], own["stiffness"]],
                 device=self.device,
                 block_dim=128,

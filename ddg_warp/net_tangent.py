@@ -289,7 +289,7 @@ class NetTangent:
         wp.launch(
             elements.term_kernels(part.term, self.net.real)[which],
             (part.elements * self.net.worlds, *columns),
-            [*self.net.inputs(part, state.net, index), *more],
+            [self.net.elements(state.net, index), *more],
             [out],
             device=self.net.device,
         )

@@ -137,8 +137,13 @@ class NetEnergy(_Energy):
             wp.launch(
                 kernel,
                 step.model.worlds * part.elements,
-                net.inputs(part, middle, i, q=solver.q, rate=step.islands.rate)
-                + [before.q, own["stiffness"], self.floor, *step.islands.arrays],
+                [
+                    net.elements(middle, i, q=solver.q, rate=step.islands.rate),
+                    before.q,
+                    own["stiffness"],
+                    self.floor,
+                    *step.islands.arrays,
+                ],
                 [self._values[i]],
                 device=self.device,
             )

@@ -7,31 +7,21 @@ import warp as wp
 from ddg_warp.kernels.element import CPU_OPTIONS
 from ddg_warp.kernels.energy import DISSIPATED, DRIFT, HELD, ROUNDING, balance_function
 from ddg_warp.kernels.islands import PROGRESS, RATE
-from ddg_warp.kernels.net.elements import functions
+from ddg_warp.kernels.net.elements import elements_type, functions
 from ddg_warp.kernels.terms import Term
 
 
 @cache
 def element_kernel(term: Term, real, linear):
     """Rows of the elements of a set; row i of world w is i * worlds + w."""
+    Elements = elements_type(real)
     V = wp.types.vector(3, real)
     gather, _ = functions(term, real)
     balance = balance_function(term, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def measure(
-        q: wp.array(dtype=V),
-        frame: wp.array2d(dtype=real),
-        lag: wp.array2d(dtype=real),
-        last: wp.array2d(dtype=real),
-        rate: wp.array(dtype=real),
-        buffer: wp.array(dtype=real),
-        table: wp.array2d(dtype=int),
-        slots: wp.array2d(dtype=int),
-        data: wp.array2d(dtype=real),
-        blocks: int,
-        angle_start: int,
-        elements: int,
+        given: Elements,
         q0: wp.array(dtype=V),
         stiffness: wp.array(dtype=linear),
         floor: real,
@@ -40,17 +30,13 @@ def element_kernel(term: Term, real, linear):
         rows_out: wp.array2d(dtype=real),
     ):
         tid = wp.tid()
-        w = tid / elements
+        w = tid / given.elements
         if scalars[PROGRESS, w] >= real(1.0):
             return
-        b, s, weight, p = gather(
-            q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid
-        )
-        a, _s, _w, _p = gather(
-            q0, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid
-        )
-        e = tid - w * elements
-        reach = wp.max(wp.abs(q[slots[0, e] + w * blocks]))
+        b, s, weight, p = gather(given, given.q, tid)
+        a, _s, _w, _p = gather(given, q0, tid)
+        e = tid - w * given.elements
+        reach = wp.max(wp.abs(given.q[given.slots[0, e] + w * given.blocks]))
         rows = balance(a, s, b, s, weight, p, reach, floor)
         least = floor * reach
         worlds = scalars.shape[1]
