@@ -110,8 +110,13 @@ class Moving:
 
 def _outer_forces(host: ChainGroup, gravity: np.ndarray) -> np.ndarray:
     """Sum of the magnitudes of the outer forces on every rod (R,) [N]: the scale that residuals are compared with."""
-    loads = np.moveaxis(host.load, -1, 0) if host.loaded else np.zeros(len(gravity))
-    total = sum(np.abs(host.mass * g + load) for g, load in zip(gravity, loads, strict=True)).sum(0)
+    forces = np.zeros_like(host.mass)
+    for d, g in enumerate(gravity):
+        force = host.mass * g
+        if host.loaded:
+            force += host.load[..., d]
+        forces += np.abs(force, out=force)
+    total = forces.sum(0)
     if host.loaded:
         total += np.abs(host.load_angle).sum(0) / host.length
     for load in host.timed_loads:
