@@ -10,7 +10,7 @@ from ddg_warp.chains import Piece
 from ddg_warp.elements import ElementSet
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.terms import JOINT
-from ddg_warp.net import Net, NetSet
+from ddg_warp.net import Net, NetRod, NetSet
 from ddg_warp.net_glue import glue_sets
 
 
@@ -48,34 +48,43 @@ def _joint_places(scene, net: Net) -> list[tuple[int, int, list]]:
 
 
 def _rod_sets(net: Net, joints) -> list[NetSet]:
-    """Stretch and bending of the rods; vertices at rigid joints are left to these."""
-    skipped = {(member.rod, node) for node, _, members in joints for member, _, _ in members}
-    sets = []
+    """Stretch and bending of the rods, in their order; vertices at rigid joints are left to these."""
+    skipped = np.array([rod.rod * net.nodes + node for node, _, members in joints for rod, _, _ in members], int)
+    alike: dict[int, list[NetRod]] = {}
     for rod in net.rods:
-        piece, row = rod.piece, rod.row
-        kind, nodes, n = piece.kind, rod.all_nodes, len(rod.all_nodes)
+        alike.setdefault(id(rod.piece), []).append(rod)
+    sets = []
+    for rods in alike.values():  # all rods of a piece
+        piece, kind = rods[0].piece, rods[0].piece.kind
+        nodes, edges = (np.array([getattr(rod, what) for rod in rods]) for what in ("all_nodes", "all_edges"))
+        n = nodes.shape[1]
         for term in kind.terms:
             span = term.measure.span
             count = n if kind.closed else n - span
-            k = np.arange(count)
+            row, k = np.indices((len(rods), count)).reshape(2, -1)
             if span == 2:
-                k = k[np.array([(rod.rod, nodes[(i + 1) % n]) not in skipped for i in k], bool)]
-            values = {
-                name: _row(piece.parameters[f"{term.name}.{name}"], row, count)[k] for name in term.parameter_names
-            }
-            slots = [nodes[(k + i) % n] for i in range(span + 1)]
+                joined = np.isin(piece.rods[row] * net.nodes + nodes[row, (k + 1) % n], skipped)
+                row, k = row[~joined], k[~joined]
+            values = {}
+            for name in term.parameter_names:
+                given = piece.parameters[f"{term.name}.{name}"]
+                values[name] = given[row % len(given), k % given.shape[1]]
+            slots = [nodes[row, (k + i) % n] for i in range(span + 1)]
             lag = np.zeros((0, len(k)))
             if term.measure.angles:
-                slots += [rod.all_edges[k], rod.all_edges[(k + 1) % n]]
-                lag = piece.reference_twist[row][k][None]
-            owner = np.array([np.full(len(k), rod.rod), k])
-            sets.append(NetSet(term, np.array(slots), lag, np.zeros((0, len(k))), values, owner))
-    return sets
+                slots += [edges[row, k], edges[row, (k + 1) % n]]
+                lag = piece.reference_twist[row, k][None]
+            sets.append(
+                NetSet(term, np.array(slots), lag, np.zeros((0, len(k))), values, np.array([piece.rods[row], k]))
+            )
+    return [_by_rod(part) for part in _gather_sets(sets)]
 
 
-def _row(values: np.ndarray, row: int, count: int) -> np.ndarray:
-    values = values[row if len(values) > 1 else 0]
-    return np.broadcast_to(values if len(values) == 1 else values[:count], (count,))
+def _by_rod(part: NetSet) -> NetSet:
+    """The same elements in the order of their rods."""
+    order = np.argsort(part.owner[0], kind="stable")
+    slots, lag, data, owner = (values[:, order] for values in (part.slots, part.lag, part.data, part.owner))
+    return NetSet(part.term, slots, lag, data, {name: values[order] for name, values in part.parameters.items()}, owner)
 
 
 def _joint_sets(net: Net, joints) -> list[NetSet]:
@@ -83,37 +92,33 @@ def _joint_sets(net: Net, joints) -> list[NetSet]:
 
     The joint holds each rod by the frame that the rod has at the node: between its edges there, or extrapolated at an end.
     """
-    sets = []
-    for node, spin, members in joints:
-        for rod, k, sign in members:
-            piece, row, n = rod.piece, rod.row, len(rod.all_nodes)
-            frames, tangents = piece.director[row], piece.tangent[row]
-            points = net.rest[rod.all_nodes]
-            edges = len(tangents)
-            lengths = np.linalg.norm(np.roll(points, -1, 0)[:edges] - points[:edges], axis=1)
-            other = rod.all_nodes[(k + 1) % n if sign > 0 else k]
-            across = (
-                k - 1 if sign > 0 else k + 1
-            )  # the rod's edge on the other side of the node; at an end there is none
-            if piece.kind.closed:
-                across %= edges
-            inside = 0 <= across < edges
-            second = across if inside else k + (1 if sign > 0 else -1)
-            ends = [(frames[e], tangents[e], lengths[e]) for e in (second, k)]
-            tangent, director = geometry.frames_at_nodes(*ends, -1.0 if inside else 1.0)
-            half = 0.5 * lengths[k]
-            pair = [np.array([[sign * tangent, sign * tangents[k]]]), np.array([[director, frames[k]]])]
-            twist = geometry.reference_twist(*pair, False)[0, 0]
-            if isinstance(piece.batch.natural, str) and piece.batch.natural == "shape":
-                rest = np.array([*(value[0, 0] for value in geometry.curvatures(*pair, False)), twist]) / half
-            else:
-                rest = _natural_at(piece, row, k if sign > 0 else k + 1) * [1.0, sign, 1.0]
-            lag = np.concatenate([director, sign * tangent, [twist]])[:, None]
-            stiffness = rod.stiffness(k)[:, None]
-            parameters = JOINT.bind(measure=[[half]], stiffness=[*stiffness], rest=[[value] for value in rest])
-            slots = np.array([[node], [other], [rod.all_edges[k]], [spin]])
-            sets.append(NetSet(JOINT, slots, lag, np.array([[sign]]), parameters, np.array([[rod.rod], [k]])))
-    return sets
+    members = [(node, spin, *member) for node, spin, found in joints for member in found]
+    if not members:
+        return []
+    node, spin, rods, k, sign = zip(*members, strict=True)
+    node, spin, k, sign = map(np.array, (node, spin, k, sign))
+    first, edges = np.array([(rod.all_edges[0], len(rod.all_edges)) for rod in rods]).T
+    closed = np.array([rod.piece.kind.closed for rod in rods])
+    across = (k - sign).astype(int)  # the rod's edge on the other side of the node; at an end there is none
+    across = np.where(closed, across % edges, across)
+    inside = (across >= 0) & (across < edges)
+    here, there = (first - net.nodes + e for e in (k, np.where(inside, across, (k + sign).astype(int))))
+    frames, tangents = net.frame[:3].T, net.frame[3:].T
+    lengths = geometry.length(np.diff(net.rest[net.ends], axis=1)[:, 0])
+    ends = [(frames[e], tangents[e], lengths[e]) for e in (there, here)]
+    tangent, director = geometry.frames_at_nodes(*ends, np.where(inside, -1.0, 1.0))
+    half, along = 0.5 * lengths[here], sign[:, None]
+    pair = np.stack([along * tangent, along * tangents[here]], 1), np.stack([director, frames[here]], 1)
+    twist = geometry.reference_twist(*pair, False)[:, 0]
+    rest = np.stack([*(value[:, 0] for value in geometry.curvatures(*pair, False)), twist]) / half
+    for i, rod in enumerate(rods):
+        if not isinstance(rod.piece.batch.natural, str) or rod.piece.batch.natural != "shape":
+            natural = _natural_at(rod.piece, rod.row, k[i] if sign[i] > 0 else k[i] + 1)
+            rest[:, i] = natural * [1.0, sign[i], 1.0]
+    lag = np.concatenate([director.T, (along * tangent).T, [twist]])
+    parameters = JOINT.bind(measure=half, stiffness=[*net.stiffness[:, here]], rest=[*rest])
+    slots = np.array([node, net.ends[here, np.where(sign > 0, 1, 0)], first + k, spin])
+    return [NetSet(JOINT, slots, lag, sign[None], parameters, np.array([[rod.rod for rod in rods], k]))]
 
 
 def _natural_at(piece: Piece, row: int, node: int) -> np.ndarray:
@@ -123,7 +128,7 @@ def _natural_at(piece: Piece, row: int, node: int) -> np.ndarray:
             rest = [piece.parameters[f"{term.name}.{name}"] for name in term.rest]
             vertices = len(piece.x[row]) - (0 if piece.kind.closed else 2)
             vertex = (node - 1) % vertices if piece.kind.closed else min(max(node - 1, 0), vertices - 1)
-            return np.array([_row(value, row, vertices)[vertex] for value in rest])
+            return np.array([value[row % len(value), vertex % value.shape[1]] for value in rest])
     raise AssertionError("a rod of a rigid joint has a bending term")
 
 

@@ -83,7 +83,8 @@ class NetNewton:
         self.ends = wp.array(np.ascontiguousarray(ends, np.int32), dtype=int, device=device)
         # curvature is linear in the angles of mesh edges: they need no cap, which would shorten the steps of all else
         capless = np.concatenate([np.zeros(0, int), *(shell.edges for shell in host.shells)])
-        spins = np.setdiff1d(np.arange(host.nodes, blocks), capless)
+        spins = np.arange(host.nodes, blocks)
+        spins = spins[~np.isin(spins, capless)]
         self.spins = wp.array(spins.astype(np.int32), dtype=int, device=device)
         turning = len(ends) + len(spins)
         self.turns = make((worlds, turning), self.real)
