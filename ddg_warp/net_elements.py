@@ -9,7 +9,7 @@ from ddg_warp import shells as shell_terms
 from ddg_warp.chains import Piece
 from ddg_warp.elements import ElementSet
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.terms import JOINT
+from ddg_warp.kernels.terms import JOINTS, term_key
 from ddg_warp.net import Net, NetSet
 from ddg_warp.net_glue import glue_sets
 
@@ -87,6 +87,8 @@ def _joint_sets(net: Net, joints) -> list[NetSet]:
     for node, spin, members in joints:
         for rod, k, sign in members:
             piece, row, n = rod.piece, rod.row, len(rod.all_nodes)
+            by_angle = piece.batch.by_angle
+            term = JOINTS[term_key("rigid_joint", by_angle)]
             frames, tangents = piece.director[row], piece.tangent[row]
             points = net.rest[rod.all_nodes]
             edges = len(tangents)
@@ -105,14 +107,15 @@ def _joint_sets(net: Net, joints) -> list[NetSet]:
             pair = [np.array([[sign * tangent, sign * tangents[k]]]), np.array([[director, frames[k]]])]
             twist = geometry.reference_twist(*pair, False)[0, 0]
             if isinstance(piece.batch.natural, str) and piece.batch.natural == "shape":
-                rest = np.array([*(value[0, 0] for value in geometry.curvatures(*pair, False)), twist]) / half
+                bends = (value[0, 0] for value in geometry.curvatures(*pair, False, by_angle))
+                rest = np.array([*bends, twist]) / half
             else:
                 rest = _natural_at(piece, row, k if sign > 0 else k + 1) * [1.0, sign, 1.0]
             lag = np.concatenate([director, sign * tangent, [twist]])[:, None]
             stiffness = rod.stiffness(k)[:, None]
-            parameters = JOINT.bind(measure=[[half]], stiffness=[*stiffness], rest=[[value] for value in rest])
+            parameters = term.bind(measure=[[half]], stiffness=[*stiffness], rest=[[value] for value in rest])
             slots = np.array([[node], [other], [rod.all_edges[k]], [spin]])
-            sets.append(NetSet(JOINT, slots, lag, np.array([[sign]]), parameters, np.array([[rod.rod], [k]])))
+            sets.append(NetSet(term, slots, lag, np.array([[sign]]), parameters, np.array([[rod.rod], [k]])))
     return sets
 
 

@@ -151,7 +151,7 @@ def check_batch(batch, dimension: int) -> None:
         _refuse(
             np.sum(before * after, -1) <= -1.0 + 1e-12,
             batch,
-            "edges {k} and {k} + 1 fold back by 180 degrees, where curvature is infinite; move a node",
+            "edges {k} and {k} + 1 fold back by 180 degrees, where curvature is infinite or has no direction; move a node",
         )
     section = batch.section
     for what in ("EA", "EI1", "EI2", "GJ", "mass_per_length", "rotary_inertia", "radius", "viscosity"):
