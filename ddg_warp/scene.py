@@ -124,8 +124,9 @@ class Scene(Structures):
             bend: False leaves bending and twist out: a chain of springs.
             name: shown in reports and output.
             laws: a `Law` for terms by name, such as "rod_bend_twist", instead of the quadratic one with the section's stiffness.
-            curvature: what it is where two edges meet at the angle phi, l the mean of their lengths: "tangent", 2 tan(phi/2) / l, or
-                "angle", phi / l; see `ddg_warp.kernels.measures.turning_angle`. Both are of second order; circles are exact with phi.
+            curvature: what it is where edges meet at the angle phi, l the mean of their lengths: "tangent", 2 tan(phi/2) / l, or
+                "angle", phi / l, by which circles are exact; but a fold costs no more than EI pi^2 / 2 l, and lets the rod through. See
+                `ddg_warp.kernels.measures.turning_angle`.
 
         Returns:
             Indices of the rods.

@@ -29,7 +29,9 @@ from ddg_warp.kernels.measures import rod_curvature_twist as rod
 from ddg_warp.kernels.measures.curvature_binormal import curvature_binormal
 from ddg_warp.kernels.measures.planar_curvature import planar_curvature
 
-NEAR = 1.0 / 16.0  # y up to which 14 terms of the series of atan are exact in float64; above, differences lose less than 3 digits
+NEAR = (
+    1.0 / 16.0
+)  # y up to which 14 terms of the series of atan are exact in float64; above, differences lose less than 3 digits
 
 
 @cache
@@ -61,8 +63,8 @@ def ratio_function(real):
 
 def _functions(tangent: Measure, functions, real):
     Q, S, E, M = tangent.types(real)
-    n, size = len(tangent.strains), tangent.size
-    X, H = wp.types.matrix((n, n), real), wp.types.vector(size * (size + 1) // 2, real)
+    size = tangent.size
+    H = wp.types.vector(size * (size + 1) // 2, real)
     strains_of, jacobian_of, _, curvature_of = functions(real)
     ratio = ratio_function(real)
     bends = E(*(0.0 if name.startswith("twist") else 1.0 for name in tangent.strains))

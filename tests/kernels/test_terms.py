@@ -9,8 +9,9 @@ from first_terms import first_of_their_kind
 from ddg_warp import derivatives
 from ddg_warp.kernels.terms import REGISTRY
 
-# Of every day: `rod_stretch` has its measure in common with `rod_stretch_damped`, and its density with bending.
-DAILY = first_of_their_kind(REGISTRY) - {"rod_stretch"}
+# Of every day: `rod_stretch` has its measure in common with `rod_stretch_damped`, and its density with bending; curvature by the
+# angle is one function of the strains of all bending terms, and planar rods stand for it.
+DAILY = first_of_their_kind(REGISTRY) - {"rod_stretch", "rod_bend_twist_angle", "rod_bend_angle"}
 CLOSED = ("planar_bend",)  # of those, in closed chains every day too
 CASES = [
     pytest.param(
