@@ -117,12 +117,12 @@ def _registry(*terms: Term) -> dict[str, Term]:
 REGISTRY = _registry(
     Term("rod_stretch", edge_stretch, quadratic, "axial stretch of rod edges, EA"),
     Term("rod_bend_twist", rod_curvature_twist, quadratic, "anisotropic bending and twist, EI1, EI2, GJ"),
-    Term("rod_bend_twist", rod_curvature_twist_angle, quadratic, "the same, curvature by the turning angle"),
+    Term("rod_bend_twist", rod_curvature_twist_angle, quadratic, "rod_bend_twist, curvature by the turning angle"),
     Term("rod_bend", curvature_binormal, quadratic, "isotropic bending without twist, EI"),
-    Term("rod_bend", curvature_binormal_angle, quadratic, "the same, curvature by the turning angle"),
+    Term("rod_bend", curvature_binormal_angle, quadratic, "rod_bend, curvature by the turning angle"),
     Term("planar_stretch", edge_stretch_2d, quadratic, "axial stretch in the plane, EA"),
     Term("planar_bend", planar_curvature, quadratic, "bending in the plane, EI"),
-    Term("planar_bend", planar_curvature_angle, quadratic, "the same, curvature by the turning angle"),
+    Term("planar_bend", planar_curvature_angle, quadratic, "planar_bend, curvature by the turning angle"),
 )
 
 SHELLS = _registry(
@@ -145,7 +145,7 @@ JOINTS = {
     term.key: term
     for term in (
         Term("rigid_joint", joint_curvature_twist, quadratic, "bending and twist of half cells at rigid joints"),
-        Term("rigid_joint", joint_curvature_twist_angle, quadratic, "the same, curvature by the turning angle"),
+        Term("rigid_joint", joint_curvature_twist_angle, quadratic, "rigid_joint, curvature by the turning angle"),
     )
 }
 GLUE = Term("glued_edge", rod_surface_angle, quadratic, "what turns the edges of an attached rod with the shell")

@@ -1,21 +1,22 @@
 """Curvature by the turning angle: phi / w where the other measures of rods have 2 tan(phi/2) / w, w the Voronoi length [m].
 
-The constant curvature of a circle then is that of a regular polygon exactly, and energy stays finite at a fold. Both converge with
-second order; phi is twice the logarithm of the rotation between the tangents, as in the Cosserat rods of Spillmann and Teschner
-(CoRdE, 2007) and Lang, Linn and Arnold (2011).
+Both are discrete curvatures of second order (Crane and Wardetzky, A glimpse into discrete differential geometry, Notices of the AMS 64,
+2017). By phi a regular polygon has the curvature and the energy of a circle, exactly; at a fold it stays finite, and a rod can be
+pushed through it. Singular where the rod folds back by 180 degrees: there curvature has no direction.
 
 A bending strain k of the other measure becomes a(y) k with a = atan(sqrt y) / sqrt y and y = (w |k| / 2)^2 = tan^2(phi/2); twist
-stays. With g = w^2 / 2, so that dy = g k . dk, the map has the Jacobian D = a I + a' g k k^T, and contracted with a slope M its second
-derivative is
+stays. With g = w^2 / 2, so that dy = g k . dk, this map has the Jacobian D = a I + a' g k k^T, and contracted with a slope M its second
+derivative is, in the bending strains,
 
-    X = a' g (M k^T + k M^T) + (a' g I + a'' g^2 k k^T) (M . k)
+    X = a' g (M k^T + k M^T) + (a' g I + a'' g^2 k k^T) (M . k) .
 
-in the bending strains, from which the chain rule makes D J, and D^T M : d2k + J^T X J, of the other measure's J and d2k.
+The chain rule then makes D J of the other measure's Jacobian, and its second derivative contracted with D^T M, plus J^T X J.
 
-For that, |k| has to be 2 tan(phi/2) / w. Means of the directors of both edges make it less by cos(m/2), m the twist between them; so
-directors are those of each edge, turned by m/2 towards the other (`between`): they are one direction, whatever the twist, and no turn
-of it jumps. To first order that turn changes no strain, as both edges then see curvature alike. To second order it takes
-|dk/dm|^2: X has (w^2 / 4) (D^T M . k) for twist with twist.
+For that, |k| has to be 2 tan(phi/2) / w, of which means of the directors of both edges see cos(m/2) where these differ by the twist m.
+So each edge has its directors turned towards the other's by m/2 (`between`): they are one direction then, and turn smoothly with m,
+any number of times. Strains k(q, c) about directors turned by c = m/2 towards each other do not change with c, to first order, and
+d2k/dc2 = -k. So J is as if c were constant, and to the second derivative k (dm/2)^2 is added: (w^2 / 4) (D^T M . k) in X for the
+twist, which is m / w.
 """
 
 from dataclasses import replace
