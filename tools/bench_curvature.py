@@ -263,7 +263,7 @@ def plot(rows: list[dict], path: Path, across: str, label: str) -> None:
     """Errors over a column of the table, a panel each a case; left out without matplotlib."""
     try:
         from matplotlib.figure import Figure
-        from matplotlib.ticker import NullFormatter
+        from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
     except ModuleNotFoundError as error:
         print(f"no plot without {error.name}: `pip install matplotlib`")
         return
@@ -278,13 +278,18 @@ def plot(rows: list[dict], path: Path, across: str, label: str) -> None:
             panel.loglog([row[across] for row in own], [row["error"] for row in own], line, markersize=4, label=choice)
         if across == "n":
             panel.set_xticks([row["n"] for row in own], [str(row["n"]) for row in own])
-            panel.xaxis.set_minor_formatter(NullFormatter())
+        else:  # of runs of much the same time, too
+            low, high = panel.get_xlim()
+            panel.set_xlim(0.5 * low, 2.0 * high)
+            panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+            panel.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+        panel.xaxis.set_minor_formatter(NullFormatter())
         panel.yaxis.set_minor_formatter(NullFormatter())
         panel.tick_params(labelsize=7)
         if i == 0:
             panel.legend(fontsize=8)
     figure.supxlabel(label, fontsize=9)
-    figure.supylabel("error, see the table", fontsize=9)
+    figure.supylabel("error", fontsize=9)
     figure.savefig(path, dpi=100)
 
 

@@ -52,11 +52,13 @@ def functions(real, between: bool = False):
         ue = transport(V(s[0], s[1], s[2]), V(s[3], s[4], s[5]), te)
         uf = transport(V(s[6], s[7], s[8]), V(s[9], s[10], s[11]), tf)
         twist = q[7] - q[6] + reference_twist(ue, uf, te, tf, s[12])
-        half = real(0.0)
+        angle_e = q[6]
+        angle_f = q[7]
         if wp.static(between):
-            half = real(0.5) * twist
-        m1e = rotate(ue, te, q[6] + half)
-        m1f = rotate(uf, tf, q[7] - half)
+            angle_e = q[6] + real(0.5) * twist
+            angle_f = q[7] - real(0.5) * twist
+        m1e = rotate(ue, te, angle_e)
+        m1f = rotate(uf, tf, angle_f)
         return te, tf, m1e, wp.cross(te, m1e), m1f, wp.cross(tf, m1f), twist, ie, i_f
 
     @wp.func
