@@ -15,7 +15,7 @@ from ddg_warp import arguments, geometry
 from ddg_warp.descriptions import RodBatch, Support
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.element import ChainKind
-from ddg_warp.kernels.terms import REGISTRY, Term
+from ddg_warp.kernels.terms import REGISTRY, Term, term_key
 from ddg_warp.scene import Scene
 from ddg_warp.validate import check_batch, check_index
 
@@ -247,7 +247,8 @@ def _kind(dimension: int, batch: RodBatch) -> ChainKind:
                 f"rod {batch.first} ('{batch.name}'): it has no term {term!r} to give a law; it has {', '.join(names)}"
             )
     viscous = bool(np.any(np.asarray(batch.section.viscosity) > 0.0))
-    terms = tuple(REGISTRY[name].of(batch.laws).damped(viscous) for name in names)
+    keys = [*(term_key(name, batch.by_angle) for name in names[:-1]), names[-1]]  # the last is stretch
+    terms = tuple(REGISTRY[key].of(batch.laws).damped(viscous) for key in keys)
     return ChainKind(dimension, batch.twist, batch.closed, terms)
 
 
@@ -413,9 +414,9 @@ def _natural(batch, rows, ghosts, kind, edges, tangents, frames, twist, voronoi)
     if isinstance(batch.natural, str) and batch.natural == "straight":
         return [np.zeros((1, 1))] * (1 if kind.dim == 2 else 3)
     if kind.dim == 2:
-        shape = [geometry.planar_curvature(edges[..., [0, 2]], batch.closed)]
+        shape = [geometry.planar_curvature(edges[..., [0, 2]], batch.closed, batch.by_angle)]
     elif kind.twist:
-        shape = [*geometry.curvatures(tangents, frames, batch.closed), twist]
+        shape = [*geometry.curvatures(tangents, frames, batch.closed, batch.by_angle), twist]
     else:
         (t0, t1) = geometry.ahead(tangents, batch.closed)
         if np.any(geometry.length(geometry.cross(t0, t1)) > 1e-9):

@@ -66,7 +66,9 @@ def _rest_scene(term: Term, kind: ChainKind) -> Scene:
     values = {known.family: 0.5 for known in term.parameters if known.family not in brought}
     laws = {term.name: Law(own, **values)}
     natural = "shape" if term.rest else "straight"
-    scene.add_rod(points, section=section, closed=kind.closed, natural=natural, twist=kind.twist, laws=laws)
+    curvature = "angle" if any(one.measure.by_angle for one in kind.terms) else "tangent"
+    options = {"natural": natural, "twist": kind.twist, "curvature": curvature, "laws": laws}
+    scene.add_rod(points, section=section, closed=kind.closed, **options)
     return scene
 
 
@@ -307,7 +309,7 @@ CHECKS = {
 
 def checks_of(term: Term, closed: bool, precision: str) -> list[str]:
     """Checks that make sense: a rod that is straight at rest has no rest shape when closed."""
-    straight = term.measure.name == "curvature_binormal" or not term.rest
+    straight = is_vector(term) or not term.rest
     return [
         name
         for name, (_, _, single) in CHECKS.items()

@@ -115,6 +115,12 @@ class RodBatch:
     name: str
     first: int  # index of its first rod
     laws: Mapping[str, Law] = field(default_factory=dict)  # by term
+    curvature: str = "tangent"  # or "angle"
+
+    @property
+    def by_angle(self) -> bool:
+        """Whether curvature is the turning angle over the length."""
+        return self.curvature == "angle"
 
     @property
     def rods(self) -> int:

@@ -103,15 +103,26 @@ def reference_twist(tangents: np.ndarray, frames: np.ndarray, closed: bool) -> n
     return signed_angle(transport(u0, t0, t1), u1, t1)
 
 
-def curvatures(tangents: np.ndarray, frames: np.ndarray, closed: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Integrated material curvatures 2 tan(phi/2) of every vertex in the two planes of the frame, (R, vertices) each."""
+def curvatures(
+    tangents: np.ndarray, frames: np.ndarray, closed: bool, by_angle: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Integrated material curvatures of every vertex in the two planes of the frame, (R, vertices) each.
+
+    Their size is 2 tan(phi/2), about the means of both edges' directors; or phi `by_angle`, about the directors halfway between.
+    """
     (t0, t1), (u0, u1) = ahead(tangents, closed), ahead(frames, closed)
     kb = 2.0 * cross(t0, t1) / (1.0 + dot(t0, t1))[..., None]
+    if by_angle:
+        half = 0.5 * reference_twist(tangents, frames, closed)
+        u0, u1 = material_directors(u0, t0, half), material_directors(u1, t1, -half)
+        size = length(kb)[..., None]
+        kb *= np.where(size > 0.0, 2.0 * np.arctan(0.5 * size) / np.where(size > 0.0, size, 1.0), 1.0)
     second = 0.5 * dot(kb, cross(t0, u0) + cross(t1, u1))
     return second, -0.5 * dot(kb, u0 + u1)
 
 
-def planar_curvature(edges: np.ndarray, closed: bool) -> np.ndarray:
-    """Integrated signed curvature 2 tan(phi/2) of planar edges (R, edges, 2)."""
+def planar_curvature(edges: np.ndarray, closed: bool, by_angle: bool = False) -> np.ndarray:
+    """Integrated signed curvature of planar edges (R, edges, 2): 2 tan(phi/2), or phi `by_angle`."""
     e, f = ahead(unit(edges), closed)
-    return 2.0 * (e[..., 0] * f[..., 1] - e[..., 1] * f[..., 0]) / (1.0 + dot(e, f))
+    half = (e[..., 0] * f[..., 1] - e[..., 1] * f[..., 0]) / (1.0 + dot(e, f))
+    return 2.0 * (np.arctan(half) if by_angle else half)

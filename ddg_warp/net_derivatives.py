@@ -17,14 +17,14 @@ import warp as wp
 from ddg_warp.geometry import signed_angle, transport, unit
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.net import elements as net_elements
-from ddg_warp.kernels.terms import AXISYMMETRIC, GLUE, JOINT, SHELLS, Term
+from ddg_warp.kernels.terms import AXISYMMETRIC, GLUE, JOINTS, SHELLS, Term
 from ddg_warp.precision import PRECISIONS
 from ddg_warp.samples import rotation
 
 ELEMENTS = 8
 TRAP = 2.0**-30
 INPUTS = ("q", "frame", "lag", "last", "rate", "buffer")
-TERMS = {**SHELLS, **AXISYMMETRIC, JOINT.name: JOINT, GLUE.name: GLUE}
+TERMS = {**SHELLS, **AXISYMMETRIC, **JOINTS, GLUE.name: GLUE}
 KINDS = np.array([[0, 1, 2], [1, 2, 3], [2, 3, 0], [3, 0, 1], [1, 1, 1], [0, 1, 1], [1, 3, 1], [1, 2, 0]])  # of edges
 
 

@@ -9,7 +9,7 @@ from ddg_warp import shells as shell_terms
 from ddg_warp.chains import Piece
 from ddg_warp.elements import ElementSet
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.terms import JOINT
+from ddg_warp.kernels.terms import JOINTS, term_key
 from ddg_warp.net import Net, NetRod, NetSet
 from ddg_warp.net_glue import glue_sets
 
@@ -93,8 +93,13 @@ def _joint_sets(net: Net, joints) -> list[NetSet]:
     The joint holds each rod by the frame that the rod has at the node: between its edges there, or extrapolated at an end.
     """
     members = [(node, spin, *member) for node, spin, found in joints for member in found]
-    if not members:
-        return []
+    kinds = [[member for member in members if member[2].piece.batch.by_angle == by_angle] for by_angle in (False, True)]
+    return [_half_cells(net, found, by_angle) for by_angle, found in enumerate(kinds) if found]
+
+
+def _half_cells(net: Net, members: list, by_angle: bool) -> NetSet:
+    """Those of rods of one kind of curvature."""
+    term = JOINTS[term_key("rigid_joint", by_angle)]
     node, spin, rods, k, sign = zip(*members, strict=True)
     node, spin, k, sign = map(np.array, (node, spin, k, sign))
     first, edges = np.array([(rod.all_edges[0], len(rod.all_edges)) for rod in rods]).T
@@ -110,15 +115,15 @@ def _joint_sets(net: Net, joints) -> list[NetSet]:
     half, along = 0.5 * lengths[here], sign[:, None]
     pair = np.stack([along * tangent, along * tangents[here]], 1), np.stack([director, frames[here]], 1)
     twist = geometry.reference_twist(*pair, False)[:, 0]
-    rest = np.stack([*(value[:, 0] for value in geometry.curvatures(*pair, False)), twist]) / half
+    rest = np.stack([*(value[:, 0] for value in geometry.curvatures(*pair, False, by_angle)), twist]) / half
     for i, rod in enumerate(rods):
         if not isinstance(rod.piece.batch.natural, str) or rod.piece.batch.natural != "shape":
             natural = _natural_at(rod.piece, rod.row, k[i] if sign[i] > 0 else k[i] + 1)
             rest[:, i] = natural * [1.0, sign[i], 1.0]
     lag = np.concatenate([director.T, (along * tangent).T, [twist]])
-    parameters = JOINT.bind(measure=half, stiffness=[*net.stiffness[:, here]], rest=[*rest])
+    parameters = term.bind(measure=half, stiffness=[*net.stiffness[:, here]], rest=[*rest])
     slots = np.array([node, net.ends[here, np.where(sign > 0, 1, 0)], first + k, spin])
-    return [NetSet(JOINT, slots, lag, sign[None], parameters, np.array([[rod.rod for rod in rods], k]))]
+    return NetSet(term, slots, lag, sign[None], parameters, np.array([[rod.rod for rod in rods], k]))
 
 
 def _natural_at(piece: Piece, row: int, node: int) -> np.ndarray:

@@ -273,7 +273,7 @@ def _random_state(sample: Sample) -> dict[str, np.ndarray]:
 
 def is_vector(term: Term) -> bool:
     """Whether the strains are components of a vector in space, which turns with the rod."""
-    return term.measure.name == "curvature_binormal"
+    return term.measure.name.startswith("curvature_binormal")
 
 
 def rotation(dim: int, angle: float) -> np.ndarray:

@@ -171,7 +171,7 @@ def _check_shape(batch, rows: np.ndarray, dimension: int) -> None:
     _refuse(doubled, batch, message, rows)
     if batch.bend:
         before, after = geometry.ahead(edges / lengths[..., None], batch.closed)
-        message = "edges {k} and {k} + 1 fold back by 180 degrees, where curvature is infinite; move a node"
+        message = "edges {k} and {k} + 1 fold back by 180 degrees, where curvature is infinite or has no direction; move a node"
         _refuse(geometry.dot(before, after) <= -1.0 + 1e-12, batch, message, rows)
 
 

@@ -110,8 +110,8 @@ class ChainStep(PartStep):
             if np.linalg.norm(before[0, k] + after[0, k]) < FOLDED:
                 k, after = k - first, (k + 1) % lengths.shape[1] - first
                 return (
-                    f"edges {k} and {after} fold back by 180 degrees in the last good state, where curvature is infinite; "
-                    f"move node {after} of the state it starts from, or take a smaller dt if it folded on the way"
+                    f"edges {k} and {after} fold back by 180 degrees in the last good state, where curvature is infinite or has no "
+                    f"direction; move node {after} of the state it starts from, or take a smaller dt if it folded on the way"
                 )
         return self.advice(state)
 

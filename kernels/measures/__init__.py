@@ -29,6 +29,7 @@ class Measure:
         spins: rotation vectors of rigid joints among the dofs, after the angles.
         points: how many nodes, the first of the stencil, are read as positions, too; after the rotation vectors.
         frames: how many of the angles belong to edges with a reference frame, which the lagged data begin with.
+        by_angle: whether a rod's curvature is its turning angle over the length, instead of 2 tan(phi/2).
         strains: names and units of the strains.
         functions: real -> (strains, jacobian, tension, curvature). `strains(q, s, w) -> E`; `jacobian(q, s, w) -> (E, J)`;
             `tension` is None, or `tension(q, w, slope) -> (c, shift)` with the second derivative of the strains,
@@ -50,6 +51,7 @@ class Measure:
     spins: int = 0
     points: int = 0
     frames: int = 0
+    by_angle: bool = False
 
     @property
     def size(self) -> int:

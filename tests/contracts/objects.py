@@ -203,4 +203,5 @@ OBJECTS = {
     "rods alone and joined": Object(_mixed(_rod(), _ring, _joined(True))),
     "rods and shells": Object(_mixed(_rod(), _joined(False), _stiffened, _sheet("hinge"))),
     "shells of both kinds": Object(_mixed(_sheet("midedge_dof"), _dome), axis=UP, turns=False),
+    "rods by the turning angle": Object(_mixed(_rod(curvature="angle"), _joined(True, curvature="angle"))),
 }

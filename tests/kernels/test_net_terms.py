@@ -45,9 +45,10 @@ def test_nothing_is_left_out():
 
 
 def test_every_day_has_every_kind():
-    """Every density and every sort of element; measures left to other tests are those of shells and of shells of revolution."""
+    """Every density and every sort of element; measures left to other tests are those of shells and of shells of revolution,
+    and curvature by the angle."""
     assert {TERMS[name].density.name for name in DAILY} == {term.density.name for term in TERMS.values()}
-    assert set(TERMS) - set(DAILY) <= {*SHELLS, *AXISYMMETRIC}
+    assert set(TERMS) - set(DAILY) <= {*SHELLS, *AXISYMMETRIC, "rigid_joint_angle"}
 
 
 def test_every_listed_term_has_a_table():
