@@ -181,12 +181,14 @@ class Ghosts:
 
 
 def net_rods(scene: Scene) -> np.ndarray:
-    """Which rods belong to the scene's net: those that are joined or attached to something (R,) bool."""
+    """Which rods belong to the scene's net: those that are joined or attached to something, or magnetised (R,) bool."""
     chosen = np.zeros(scene.rod_count, bool)
     for joint in scene.joints:
         chosen[[rod for rod, _ in joint.members]] = True
     for attachment in scene.attachments:
         chosen[attachment.rod] = True
+    for magnet in scene.magnets:
+        chosen[magnet.rods] = True
     return chosen
 
 

@@ -8,7 +8,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.integrate.energy import NetEnergy
-from ddg_warp.integrate.net_prescribed import NetLoads, NetMotion
+from ddg_warp.integrate.net_prescribed import NetField, NetLoads, NetMotion
 from ddg_warp.integrate.prescribed import jump_between
 from ddg_warp.kernels import outcome, step
 from ddg_warp.kernels.net import elements, frames, newton
@@ -59,13 +59,15 @@ class NetStep:
         self.energy = NetEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
         self.motion = NetMotion(model, self.midpoint) if host.moving else None
-        self.loads = NetLoads(model, self.midpoint)
+        self.loads, self.field = NetLoads(model, self.midpoint), NetField(model, self.midpoint)
+        self._data = (self.motion.data if self.motion else {}) | self.field.data
 
     def prescribe(self, t0: float, t1: float) -> None:
         """Hand the device what supports and loads do between t0 and t1."""
         if self.motion:
             self.motion.upload(t0, t1)
         self.loads.upload(t0, t1)
+        self.field.upload(t0, t1)
 
     def step(self, before, after) -> None:
         """Launch a whole step from one state to another; only launches, so that it can be captured."""
@@ -122,6 +124,7 @@ class NetStep:
         self.net.carry(start, after, kept=before, moved=self.moved)
         if self.motion:
             self.motion.turn(self.progress, self.portion, self.moved, before, after)
+        self.field.finish(self.moved, before, after)
         self.net.update_strains(after)
         self.remaining.zero_()
         self._launch(
@@ -138,12 +141,11 @@ class NetStep:
 
         Frames lagged at the start of the step would spin about their edges by O(h) at the midpoint, unseen by the rotary
         inertia: the rule would be of first order. Rotations of joints have no inertia and are not predicted, so that those
-        found are of the whole half step. Normals that supports turn are those that the solve is about.
+        found are of the whole half step. Normals that supports turn, and the magnetic field, are those that the solve is about.
         """
-        data = self.motion.data if self.motion else {}
         if not (self.midpoint and self.net.edges):
-            return replace(before, data=data)
-        middle = NetState(self.newton.q, before.v, self.middle.frame, self.middle.lag, before.last, data)
+            return replace(before, data=self._data)
+        middle = NetState(self.newton.q, before.v, self.middle.frame, self.middle.lag, before.last, self._data)
         self.net.carry(before, middle, moved=self.moved)
         return middle
 
@@ -154,13 +156,13 @@ class NetStep:
         """Compile and load every kernel before a capture."""
         real, device = self.model.types.real, self.model.wp_device
         kernels = [self._begin, self._finish, self._start, self._advance, *self.newton.kernels]
-        kernels += [*(self.motion.kernels if self.motion else []), *self.loads.kernels]
+        kernels += [*(self.motion.kernels if self.motion else []), *self.loads.kernels, *self.field.kernels]
         kernels += self.energy.kernels if self.energy else []
         kernels += [frames.edge_kernel(real)] if self.net.edges else []
         kernels += [frames.reset_kernel(real)] if self.net.host.spins else []
         for part in self.net.sets:
             measure = part.term.measure
-            if measure.frames:
+            if len(part.host.lag):
                 kernels.append(frames.lag_kernel(measure, real))
             if part.term.density.lagged:
                 kernels.append(elements.term_kernels(part.term, real)[3])

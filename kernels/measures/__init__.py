@@ -2,7 +2,7 @@
 
 The local dofs are q = [edge vectors of the stencil..., angles of its edges..., rotation vectors of joints..., positions...], so
 that translation invariance holds by construction and forces on nodes are differences of edge forces; positions are there only
-where the place in space is a strain, as the radius of a surface of revolution is. Where a measure needs more it
+where the place in space is a strain, as the radius of a surface of revolution is, or says what the field is there. Where a measure needs more it
 reads s, which stays constant during a step: lagged frames of a rod, or data of the element such as the normal of a clamp. w is
 the rest measure of the element (rest length, Voronoi length, area): strains are pointwise quantities, so a density and its
 parameters do not depend on the mesh.
@@ -28,6 +28,7 @@ class Measure:
         tensions: scalars of the geometric stiffness; 0 where it is left to the exact Hessian.
         spins: rotation vectors of rigid joints among the dofs, after the angles.
         points: how many nodes, the first of the stencil, are read as positions, too; after the rotation vectors.
+        field: how many of the data, the last, are the magnetic field, which changes with time.
         frames: how many of the angles belong to edges with a reference frame, which the lagged data begin with.
         strains: names and units of the strains.
         functions: real -> (strains, jacobian, tension, curvature). `strains(q, s, w) -> E`; `jacobian(q, s, w) -> (E, J)`;
@@ -49,6 +50,7 @@ class Measure:
     tensions: int = 0
     spins: int = 0
     points: int = 0
+    field: int = 0
     frames: int = 0
 
     @property
