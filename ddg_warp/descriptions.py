@@ -267,6 +267,11 @@ class MagneticField:
         self._check(value, gradient, t, error)
         return np.concatenate([value - gradient @ self.origin, gradient.ravel()])
 
+    def over(self, points: np.ndarray, t: float, otherwise: float) -> np.ndarray:
+        """B at points (n, 3) [T]; see `at`."""
+        field, gradient = np.split(self.at(t, otherwise), [3])
+        return field + points @ gradient.reshape(3, 3).T
+
     def _check(self, value: np.ndarray, gradient: np.ndarray, t: float, error) -> None:
         wrong = ""
         if value.shape != (3,) or gradient.shape != (3, 3):

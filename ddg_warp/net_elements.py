@@ -197,7 +197,8 @@ def _pairs(scene, net: Net, magnets: list[_Magnets]) -> list[NetSet]:
 
     ends, owner, volume, direction, size = map(joined, ("ends", "owner", "volume", "direction", "size"))
     counts = [len(magnet.k) for magnet in magnets]
-    along, framed = (np.repeat(flags, counts) for flags in zip(*((m.along, m.rod.edges.size > 0) for m in magnets)))
+    along = np.repeat([m.along for m in magnets], counts)
+    framed = np.repeat([m.rod.edges.size > 0 for m in magnets], counts)
     angle = np.concatenate([m.angles if m.rod.edges.size else np.zeros(len(m.k), int) for m in magnets])
     middle, pairs = net.rest[ends].mean(0), []
     for listed in scene.dipoles:

@@ -193,7 +193,7 @@ class NetTangent:
         self.prescribe(state, at)
 
     def prescribe(self, state, at: float) -> None:
-        """Turn the normals that clamped mesh edges prescribe to where their motions have them at load parameter `at`; the field of it."""
+        """Put the normals that supports turn, and the magnetic field, where they are at load parameter `at`."""
         for index, data in state.net.data.items():
             part = self.net.sets[index]
             values = data.numpy().astype(np.float64)

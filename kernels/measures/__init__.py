@@ -2,10 +2,10 @@
 
 The local dofs are q = [edge vectors of the stencil..., angles of its edges..., rotation vectors of joints..., positions...], so
 that translation invariance holds by construction and forces on nodes are differences of edge forces; positions are there only
-where the place in space is a strain, as the radius of a surface of revolution is, or says what the field is there. Where a measure needs more it
-reads s, which stays constant during a step: lagged frames of a rod, or data of the element such as the normal of a clamp. w is
-the rest measure of the element (rest length, Voronoi length, area): strains are pointwise quantities, so a density and its
-parameters do not depend on the mesh.
+where the place in space is a strain, as the radius of a surface of revolution is, or a field differs from place to place. Where a
+measure needs more it reads s, which stays constant during a step: lagged frames of a rod, or data of the element such as the
+normal of a clamp or the magnetic field. w is the rest measure of the element (rest length, Voronoi length, area, volume): strains
+are pointwise quantities, so a density and its parameters do not depend on the mesh.
 """
 
 from collections.abc import Callable

@@ -1,8 +1,8 @@
-"""What is prescribed in a net: by moving supports positions of nodes, angles of rod edges and normals of clamped mesh edges; the
+"""What is prescribed in a net: positions of nodes, angles of rod edges and normals of clamped mesh edges by supports that move; the
 magnetic field.
 
-What supports do is at the end of the part of the step that is taken; for the midpoint rule positions are the mean of those at both of its ends, so
-that the extrapolated ones are exact, and angles and normals those in the middle.
+Supports are at the end of the part of the step that is taken; for the midpoint rule positions are the mean of those at both of its
+ends, so that the extrapolated ones are exact, and angles and normals those in the middle.
 """
 
 from functools import cache
