@@ -290,27 +290,27 @@ class Structures(Meridians):
         Raises:
             SceneError: an edge that does not exist, or a component that the rod has no director for.
         """
-        rods = arguments.once("magnetize: rods", self._rods(rods))
-        edges = slice(None) if edges is None else edges
-        rods, edges = self._on_rods("magnetize", rods, "edge", edges)
+        rods, added = arguments.once("magnetize: rods", self._rods(rods)), []
         given = arguments.floats(magnetisation)
         given = given * [0.0, 0.0, 1.0] if given.ndim == 0 else given
-        given = arguments.broadcast("magnetize: magnetisation", given, (len(edges), 3))
         for batch in self._batches(rods):
-            where = f"magnetize: rod {batch.first} ('{batch.name}')"
-            count = batch.edges
-            arguments.once(f"{where}: edges", np.array(edges) % count)
-            if not batch.twist and self.dimension == 3 and given[:, :2].any():
+            own = rods[(rods >= batch.first) & (rods < batch.first + batch.rods)]
+            where = f"magnetize: rod {own[0]} ('{batch.name}')"
+            _, chosen = self._on_rods("magnetize", own, "edge", slice(None) if edges is None else edges)
+            chosen = arguments.once(f"{where}: edges", np.array(chosen) % batch.edges)
+            each = arguments.broadcast(f"{where}: magnetisation", given, (len(chosen), 3))
+            if not batch.twist and self.dimension == 3 and each[:, :2].any():
                 raise SceneError(
                     f"{where} has no twist, and so no directors; give the component along its tangent alone"
                 )
-            if self.dimension == 2 and (given[:, 0].any() or (not batch.bend and given[:, 1].any())):
+            if self.dimension == 2 and (each[:, 0].any() or (not batch.bend and each[:, 1].any())):
                 raise SceneError(
                     f"{where} is magnetised across the plane, or has no bending and so no directors; give 0 along these directors"
                 )
             if not np.all(np.asarray(batch.section.area) > 0.0):
                 raise SceneError(f"{where}: its section has no area; give Stiffness(..., area=...) [m^2]")
-        self.magnets.append(Magnet(rods, np.array(edges), given))
+            added.append(Magnet(own, chosen, each))
+        self.magnets += added
 
     def magnetic_field(self, value, gradient=None, origin=(0.0, 0.0, 0.0)) -> None:
         """The magnetic field B = value + gradient (x - origin) that magnetised rods are in.

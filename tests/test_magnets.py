@@ -327,6 +327,37 @@ def test_free_dipoles_keep_their_momentum(device):
     np.testing.assert_allclose((mass * v).sum(0), 0.0, atol=1e-8 * np.abs(mass * v).max())
 
 
+def snake(n: int = 24) -> ddg.Scene:
+    """A soft rod magnetised in turn along and against its tangent, whose edges act on each other up to some edges away."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
+    section, material = ddg.Circle(1e-3), ddg.Material(young=1e6, density=2000.0)
+    rod = scene.add_rod(np.linspace(0.0 * X, 0.1 * X, n + 1), section=section, material=material)
+    scene.clamp_end(rod)
+    scene.magnetize(rod, 1e5 * np.outer(np.sign(np.sin(4.0 * np.pi * (np.arange(n) + 0.5) / n)), Z))
+    scene.magnetic_field((0.01, 0.0, 0.0))
+    scene.add_dipoles(cutoff=0.02)
+    return scene
+
+
+def test_chains_keep_their_preconditioner_under_dipoles(device):
+    """What acts from afar is left to conjugate gradients: some iterations a direction, not hundreds."""
+    integrator = ddg.Integrator(snake().build(device, "float64"))
+    state = integrator.model.state()
+    for _ in range(4):
+        state = integrator.step(state, 0.01)
+    counts = integrator.statistics()
+    directions = 4 * counts["newton_iterations"]["mean"]
+    assert counts["pcg_iterations"] < 6 * directions
+
+
+@pytest.mark.slow
+def test_conjugate_gradients_find_the_same_equilibrium(device):
+    model = snake().build(device, "float64")
+    direct, pcg = (statics.solve(model, load_steps=2, solver=solver).points() for solver in ("direct", "pcg"))
+    assert np.ptp(direct[:, 2]) > 0.05
+    np.testing.assert_allclose(pcg, direct, atol=1e-6)
+
+
 def test_pairs_are_listed_once(device):
     """Edges that share a node are left out, those beyond the cutoff, too; rods named twice count once."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))

@@ -29,6 +29,7 @@ class Measure:
         spins: rotation vectors of rigid joints among the dofs, after the angles.
         points: how many nodes, the first of the stencil, are read as positions, too; after the rotation vectors.
         field: how many of the data, the last, are the magnetic field, which changes with time.
+        apart: whether it couples what may be far apart along a rod, which preconditioners of chains leave out.
         frames: how many of the angles belong to edges with a reference frame, which the lagged data begin with.
         strains: names and units of the strains.
         functions: real -> (strains, jacobian, tension, curvature). `strains(q, s, w) -> E`; `jacobian(q, s, w) -> (E, J)`;
@@ -51,6 +52,7 @@ class Measure:
     spins: int = 0
     points: int = 0
     field: int = 0
+    apart: bool = False
     frames: int = 0
 
     @property

@@ -247,7 +247,8 @@ dipole_pair = Measure(
     frames=2,
     lag_size=12,
     data_size=6,
+    apart=True,
 )
 dipole_pair_tangent = Measure(
-    "dipole_pair_tangent", 3, _PAIR, _PAIR_STRAINS, _pair(lambda: dipole_pair_tangent, False), data_size=6
+    "dipole_pair_tangent", 3, _PAIR, _PAIR_STRAINS, _pair(lambda: dipole_pair_tangent, False), data_size=6, apart=True
 )

@@ -1,5 +1,5 @@
-"""Every derivative of the terms of shells, shells of revolution, rigid joints and glued edges, in both precisions, against
-something else that computes it."""
+"""Every derivative of the terms of shells, shells of revolution, rigid joints, glued edges and magnets, in both precisions,
+against something else that computes it."""
 
 from functools import cache
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ddg_warp import derivatives, net_derivatives
-from ddg_warp.kernels.terms import ALL, AXISYMMETRIC, REGISTRY, SHELLS
+from ddg_warp.kernels.terms import ALL, AXISYMMETRIC, MAGNETS, REGISTRY, SHELLS
 from ddg_warp.net_derivatives import TERMS
 
 
@@ -21,7 +21,7 @@ def rows(term: str, precision: str, device: str) -> dict:
 # test_shell_measures and test_axisymmetric_measures.
 DAILY = (
     *("shell_stretch_damped", "shell_hinge_damped", "shell_tilt"),
-    *("axisymmetric_bend", "rigid_joint", "glued_edge"),
+    *("axisymmetric_bend", "rigid_joint", "glued_edge", "magnetic_tangent", "dipoles_tangent"),
 )
 CASES = [
     pytest.param(precision, term, check, marks=[] if precision == "float64" and term in DAILY else pytest.mark.slow)
@@ -45,9 +45,10 @@ def test_nothing_is_left_out():
 
 
 def test_every_day_has_every_kind():
-    """Every density and every sort of element; measures left to other tests are those of shells and of shells of revolution."""
+    """Every density and every sort of element; measures left to other tests are those of shells, of shells of revolution and of
+    magnets with frames, which meet closed forms in test_magnets."""
     assert {TERMS[name].density.name for name in DAILY} == {term.density.name for term in TERMS.values()}
-    assert set(TERMS) - set(DAILY) <= {*SHELLS, *AXISYMMETRIC}
+    assert set(TERMS) - set(DAILY) <= {*SHELLS, *AXISYMMETRIC, *MAGNETS}
 
 
 def test_every_listed_term_has_a_table():
