@@ -247,11 +247,11 @@ def _draw_field(plot, axes: list[int], low: np.ndarray, high: np.ndarray, field)
     """Adds arrows on a grid that fills the box."""
     size = np.max(high - low)
     step = (1.0 + 2.0 * MARGIN) * size / ARROWS[len(axes)]
-    sides = [low[k] + (high[k] - low[k]) * 0.5 for k in range(3)]
-    grid = [np.array([middle]) for middle in sides]
+    middle = 0.5 * (low + high)
+    grid = list(middle[:, None])
     for k in axes:
         count = max(1, round((high[k] - low[k] + 2.0 * MARGIN * size) / step))
-        grid[k] = sides[k] + step * (np.arange(count) - 0.5 * (count - 1))
+        grid[k] = middle[k] + step * (np.arange(count) - 0.5 * (count - 1))
     points = np.stack(np.meshgrid(*grid, indexing="ij"), -1).reshape(-1, 3)
     vectors = np.asarray(field(points), float)
     longest = np.linalg.norm(vectors[:, axes], axis=1).max()

@@ -208,6 +208,8 @@ def _pairs(scene, net: Net, magnets: list[_Magnets]) -> list[NetSet]:
     a, b = np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0).T
     apart = (ends[:, None, a] != ends[None, :, b]).all((0, 1))
     a, b = a[apart], b[apart]
+    if not a.size:
+        raise SceneError("add_dipoles: no two magnetised edges are within the cutoff of each other; take a larger one")
     for i in np.flatnonzero(np.linalg.norm(middle[a] - middle[b], axis=1) <= 1e-9 * np.abs(middle).max())[:1]:
         names = " and ".join("edge {1} of rod {0}".format(*owner[:, at]) for at in (a[i], b[i]))
         raise SceneError(f"add_dipoles: {names} have their middles at one point, where dipoles attract without bound")

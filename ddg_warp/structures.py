@@ -317,7 +317,7 @@ class Structures(Meridians):
 
         Energy -V M . B of every edge, at its middle, with the field at the time that a step balances forces at (the end of a step of
         implicit Euler's, the middle of one of the midpoint rule). In statics constants grow with the load parameter, which is the
-        time of functions.
+        time of functions. All worlds are in it; their magnetisations may differ (`Model.set_parameter`).
 
         Args:
             value: B at the origin (3,) [T], or a function of the time [s] that gives it.

@@ -160,7 +160,7 @@ class NetField:
         self.model, self.net, self.midpoint = model, model.net, midpoint
         self.data = model.net.field_data()
         self._kernel = field_kernel(model.types.real)
-        self._end = wp.zeros(FIELD, dtype=model.types.real, device=model.wp_device)
+        self._now, self._end = (wp.zeros(FIELD, dtype=model.types.real, device=model.wp_device) for _ in range(2))
 
     @property
     def kernels(self) -> list:
@@ -171,11 +171,11 @@ class NetField:
         """The field of a step."""
         if not self.data:
             return
-        field, real = self.model.scene.applied_field, self.model.types.real
-        at = wp.array(field.at(0.5 * (t0 + t1) if self.midpoint else t1, 1.0), dtype=real, device=self.model.wp_device)
-        for index, data in self.data.items():
-            self._launch(index, at, self.net.every, data, data)
+        field = self.model.scene.applied_field
+        self._now.assign(field.at(0.5 * (t0 + t1) if self.midpoint else t1, 1.0))
         self._end.assign(field.at(t1, 1.0))
+        for index, data in self.data.items():
+            self._launch(index, self._now, self.net.every, data, data)
 
     def finish(self, moved: wp.array, before: NetState, after: NetState) -> None:
         """Put the worlds that `moved` into the field at the end of the step."""

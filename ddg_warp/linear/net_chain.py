@@ -127,9 +127,9 @@ class ChainPlan:
     """Chains, joints and their couplings on the host.
 
     Place k of a rod has its node k and the angle of the edge behind it. Joints take out the nodes where rods meet, the rotations
-    of rigid joints, and the last places of a closed rod, so that what is left couples over two places at most; what acts from afar, as
-    dipoles do, is left out. It falls into chains at rigid joints, not at hinged ones, over which a rod bends. Short chains lie behind each other in columns as long as the longest
-    chain, so that little memory is padding.
+    of rigid joints, and the last places of a closed rod, so that what is left couples over two places at most; what acts from afar,
+    as dipoles do, is left out. It falls into chains at rigid joints, not at hinged ones, over which a rod bends. Short chains lie
+    behind each other in columns as long as the longest chain, so that little memory is padding.
 
     Attributes:
         twist, span: whether chains have angles, and over how many places they couple.

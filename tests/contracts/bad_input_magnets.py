@@ -35,6 +35,7 @@ refuse("magnets", {
     "field alone": (lambda: built(held_rods(), lambda s: s.magnetic_field((0.0, 0.0, 1.0))), "nothing is magnetised", "magnetize"),
     "dipoles alone": (lambda: built(held_rods(), lambda s: s.add_dipoles()), "nothing is magnetised", "magnetize"),
     "dipole without magnetisation": (lambda: built(magnets(), lambda s: s.add_dipoles([0, 1])), "rod 0", "not magnetised"),
+    "dipoles out of reach": (lambda: built(magnets(), lambda s: s.add_dipoles(cutoff=1e-3)), "add_dipoles", "cutoff", "larger"),
     "dipoles of no rod": (lambda: magnets().add_dipoles([7]), "rod 7", "does not exist"),
     "dipoles at one point": (
         lambda: built(magnets(), lambda s: s.magnetize(s.add_rod(line(), section=AREA), 1e4), lambda s: s.add_dipoles()),
