@@ -100,4 +100,4 @@ def check(result) -> list[ddg.Check]:
 
 def benchmark() -> ddg.bench.Study:
     """The tip over the edges of the beam."""
-    return ddg.bench.Study({"n": (20, 40, 80, 160)}, "tip z")
+    return ddg.bench.Study({"n": (20, 40, 80, 160)}, "tip x")

@@ -44,7 +44,9 @@ ACROSS = {
 }
 
 
-@pytest.mark.parametrize("load", ACROSS)
+@pytest.mark.parametrize(
+    "load", [pytest.param(load, marks=() if load in (0.5, 5.0) else pytest.mark.slow) for load in ACROSS]
+)
 def test_cantilever_across_the_field(device, load):
     """Second order in the edges; the tip's angle is that of the last edge's middle, where th' = 0 to first order."""
     errors, sizes = [], (50, 100, 200)
@@ -57,7 +59,7 @@ def test_cantilever_across_the_field(device, load):
     assert order(sizes, errors) == pytest.approx(-2.0, abs=0.1)
 
 
-@pytest.mark.parametrize("kind", ["twist", "no twist"])
+@pytest.mark.parametrize("kind", ["twist", pytest.param("no twist", marks=pytest.mark.slow)])
 def test_rods_in_space_bend_as_planar_ones(device, kind):
     """In space, with frames or without, the same equilibrium."""
     flat, space = (
@@ -106,7 +108,7 @@ def test_field_has_an_origin(device):
     assert other == pytest.approx(one, rel=1e-12)
 
 
-@pytest.mark.parametrize("n", [20, 40])
+@pytest.mark.parametrize("n", [20, pytest.param(40, marks=pytest.mark.slow)])
 def test_antiparallel_field_buckles(device, n):
     """M A B L^2 / EI = (pi / 2)^2; the critical load of n edges is low by 0.2 (pi / 2)^2 / n^2, of second order."""
     model = cantilever(n, -X / MA, dimension=2).build(device, "float64")
@@ -167,7 +169,10 @@ def compass(field, angle: float = 0.0, EA: float = 1e7) -> tuple[ddg.Scene, floa
     return scene, MA / (2.0 * 0.25 * 0.5**2)
 
 
-@pytest.mark.parametrize(("scheme", "expected"), [("implicit_euler", 1.0), ("implicit_midpoint", 2.0)])
+@pytest.mark.parametrize(
+    ("scheme", "expected"),
+    [("implicit_euler", 1.0), pytest.param("implicit_midpoint", 2.0, marks=pytest.mark.slow)],
+)
 def test_order_in_a_field_that_changes(device, scheme, expected):
     """I th'' = V M b sin(W t): th = V M b / (I W^2) (W t - sin(W t)); of first and second order in the step."""
     b, W, end = 1e-4, 3.0, 1.0
@@ -186,6 +191,7 @@ def test_order_in_a_field_that_changes(device, scheme, expected):
     assert order(steps, errors) == pytest.approx(-expected, abs=0.1)
 
 
+@pytest.mark.slow
 def test_needle_turns_over(device):
     """From 1 degree off a strong field that points back to where it points, and beyond: every step converges, and keeps energy."""
     B = 0.5
@@ -201,6 +207,28 @@ def test_needle_turns_over(device):
     assert turned > 3.0
     assert set(integrator.statistics()["outcomes"]) <= {"converged", "converged_to_rounding"}
     assert sum(model.energies(state).values()) == pytest.approx(start, abs=1e-2 * MA * B)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
+def test_twist_swings_in_a_field(device, scheme):
+    """Magnetised across, along z, in a field along z: GJ phi'' - M A B phi = J phi_tt, of which the first mode has the frequency
+    sqrt((M A B + GJ (pi / 2L)^2) / J), J the rotary inertia; let go with a rate, it is farthest after a quarter of its period and back after half."""
+    B, J, n = 5.0 / MA, SECTION.rotary_inertia, 20
+    scene = cantilever(n, B * Z, magnetisation=(MA / 1e-4, 0.0, 0.0), director=Z, analysis=ddg.Dynamics())
+    model = scene.build(device, "float64")
+    middles = (np.arange(n) + 0.5) / n
+    omega = np.sqrt((MA * B + (0.5 * np.pi) ** 2) / J)
+    mode = np.sin(0.5 * np.pi * middles)
+    state = model.state(spins=1e-2 * omega * mode)
+    integrator, steps = ddg.Integrator(model, scheme, rtol=1e-9), 400
+    for _ in range(steps):
+        state = integrator.step(state, 0.5 * np.pi / omega / steps)
+    turned = state.directors()[:, 1]  # of z towards -y
+    np.testing.assert_allclose(np.abs(turned), 1e-2 * mode, atol=1e-4)
+    for _ in range(steps):
+        state = integrator.step(state, 0.5 * np.pi / omega / steps)
+    assert np.abs(state.directors()[:, 1]).max() < 2e-4
 
 
 def test_worlds_have_magnetisations_of_their_own(device):
@@ -254,7 +282,7 @@ def kittel(m: np.ndarray, other: np.ndarray, r: np.ndarray) -> tuple[float, np.n
     return k * (m @ other - 3.0 * mu * nu), force, np.cross(m, field)
 
 
-@pytest.mark.parametrize("across", [False, True])
+@pytest.mark.parametrize("across", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_pair_of_dipoles(device, across):
     """Two edges askew: energy, force and torque on the first against Kittel's closed form; the forces of both cancel."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
@@ -307,6 +335,7 @@ def test_parallel_rods_repel(device):
     np.testing.assert_allclose(second.force, [0.0, -expected, 0.0], atol=1e-6 * expected)
 
 
+@pytest.mark.slow
 def test_free_dipoles_keep_their_momentum(device):
     """Two short rods that attract, let go: what they gain in speed their dipoles lose in energy, and the sum of momenta stays zero."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
@@ -339,6 +368,7 @@ def snake(n: int = 24) -> ddg.Scene:
     return scene
 
 
+@pytest.mark.slow
 def test_chains_keep_their_preconditioner_under_dipoles(device):
     """What acts from afar is left to conjugate gradients: some iterations a direction, not hundreds."""
     integrator = ddg.Integrator(snake().build(device, "float64"))

@@ -24,7 +24,7 @@ SMALL = {
     "leaf": {"cells": 20},
     "lee_frame": {"n": 40},
     "localized_helix": {},
-    "magnetic_buckling": {"n": 25},
+    "magnetic_buckling": {"over": 0.9},
     "magnetic_cantilever": {},
     "michell_ring": {"n": 100},
     "parachute": {"rings": 3, "lines": 6},

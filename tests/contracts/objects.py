@@ -84,9 +84,9 @@ def _rod(points=None, clamp: str = "edge", **options):
 
 
 def _magnetised(scene, material) -> Added:
-    """Along and across its tangent, in a field across the plane of the other loads that is none at the start."""
+    """Along its tangent, in a field across the plane of the other loads that is none at the start."""
     added = _rod()(scene, material)
-    scene.magnetize(added.rods, (1e4, 0.0, 2e4))
+    scene.magnetize(added.rods, 2e4)
     scene.magnetic_field(lambda t: (0.0, 2e-3 * t**4, 0.0))
     return added
 
