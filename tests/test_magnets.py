@@ -212,8 +212,9 @@ def test_needle_turns_over(device):
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
 def test_twist_swings_in_a_field(device, scheme):
-    """Magnetised across, along z, in a field along z: GJ phi'' - M A B phi = J phi_tt, of which the first mode has the frequency
-    sqrt((M A B + GJ (pi / 2L)^2) / J), J the rotary inertia; let go with a rate, it is farthest after a quarter of its period and back after half."""
+    """Magnetised across, along z, in a field along z: GJ phi'' - M A B phi = J phi_tt, J the rotary inertia, of which the first mode
+    has the frequency sqrt((M A B + GJ (pi / 2L)^2) / J); let go with a rate, it is farthest after a quarter of its period and back
+    after half."""
     B, J, n = 5.0 / MA, SECTION.rotary_inertia, 20
     scene = cantilever(n, B * Z, magnetisation=(MA / 1e-4, 0.0, 0.0), director=Z, analysis=ddg.Dynamics())
     model = scene.build(device, "float64")
