@@ -208,10 +208,13 @@ class Ghosts:
 
 
 def net_rods(scene: Scene) -> np.ndarray:
-    """Which rods belong to the scene's net: those that are joined or attached to something (R,) bool."""
+    """Which rods belong to the scene's net: those that are joined or attached to something, or magnetised (R,) bool."""
     members = [rod for joint in scene.joints for rod, _ in joint.members]
+    members += [attachment.rod for attachment in scene.attachments]
     chosen = np.zeros(scene.rod_count, bool)
-    chosen[np.array(members + [attachment.rod for attachment in scene.attachments], int)] = True
+    chosen[np.array(members, int)] = True
+    for magnet in scene.magnets:
+        chosen[magnet.rods] = True
     return chosen
 
 

@@ -191,7 +191,7 @@ def factor(case: Case) -> float:
     for term, (first, *_, row) in zip(kind.terms, kind.places(), strict=True):
         rows = slice(row, row + len(term.measure.strains))
         w = sample.data["buffer"][first]
-        stiff = _raised(strain_rate[rows], stress_rate[rows]) if term.density.coupled else stress_rate[rows]
+        stiff = raised(strain_rate[rows], stress_rate[rows]) if term.density.coupled else stress_rate[rows]
         expected += w * np.einsum("minr,mjnr->ijnr", strain_rate[rows], stiff)
         if term.measure.tensions:
             edge = np.moveaxis(sample.edges(), -1, 0)
@@ -201,7 +201,7 @@ def factor(case: Case) -> float:
     return relative(_gauss_newton(case), expected)
 
 
-def _raised(strain_rate: np.ndarray, stress_rate: np.ndarray) -> np.ndarray:
+def raised(strain_rate: np.ndarray, stress_rate: np.ndarray) -> np.ndarray:
     """psi'' de/dq (m, window, n, R) without what is negative of psi'', which is in the exact matrix alone."""
     J, S = (np.moveaxis(rate, (0, 1), (-2, -1)) for rate in (strain_rate, stress_rate))
     values, vectors = np.linalg.eigh(S @ np.linalg.pinv(J))

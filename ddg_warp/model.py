@@ -489,7 +489,7 @@ def _numbers(what: str, values) -> np.ndarray:
 
 def needs_net(scene) -> bool:
     """Whether a scene has anything but rods on their own."""
-    return bool(scene.shells or scene.joints or scene.attachments or scene.axisymmetric_shells)
+    return bool(scene.shells or scene.joints or scene.attachments or scene.magnets or scene.axisymmetric_shells)
 
 
 def _node_radius(batch) -> np.ndarray:

@@ -18,7 +18,7 @@ class NetState:
         q, v: blocks (W N,) of positions [m], angles and rotation vectors since the last step [rad], and their rates.
         frame: director and tangent of rod edges (6, W edges).
         lag: own lagged rows of each element set (rows, W E); last: strains of each damped set at this state.
-        data: data (rows, W E) of those sets, by index, with normals among them that supports turn.
+        data: data (rows, W E) of those sets, by index, that have normals among them that supports turn, or the magnetic field.
     """
 
     q: wp.array
@@ -119,12 +119,16 @@ class DeviceNet:
             state.lag.append(zeros(rows, count if rows else 1))
             strains = len(part.term.measure.strains) if part.term.density.lagged else 0
             state.last.append(zeros(strains, count if strains else 1))
-        state.data = self.turning_data()
+        state.data = self.turning_data() | self.field_data()
         return state
 
     def turning_data(self) -> dict[int, wp.array]:
         """Data of the sets with normals that supports turn, as at rest."""
         return {i: part.own_data() for i, part in enumerate(self.sets) if len(part.turning)}
+
+    def field_data(self) -> dict[int, wp.array]:
+        """Data of the sets that are in a magnetic field, in that of the rest state."""
+        return {i: part.own_data() for i, part in enumerate(self.sets) if part.term.measure.field}
 
     def rest(self) -> NetState:
         """The rest state."""
@@ -188,7 +192,7 @@ class DeviceNet:
         )
         for part, same, old, new in zip(self.sets, kept.lag, before.lag, after.lag, strict=True):
             measure, dim = part.term.measure, self.worlds * part.elements
-            if measure.frames:
+            if len(part.host.lag):
                 inputs = [after.q, after.frame, part.slots, part.data, self.blocks, self.angle_start, self.edges]
                 launch(frames.lag_kernel(measure, real), dim, [*inputs, moved, same, old], [new])
         self.reset_spins(after.q)

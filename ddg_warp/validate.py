@@ -47,6 +47,7 @@ def check_scene(scene) -> None:
         raise SceneError(
             f"gravity is {tuple(scene.gravity)}; a scene of dimension 2 stays in the plane of x and z, give 0 along y"
         )
+    _check_magnets(scene)
     supports = [s for s in (*scene.supports, *scene.shell_supports, *scene.ring_supports) if s.motion is not None]
     if not supports or scene.initial is not None or not isinstance(scene.analysis, Dynamics):
         return  # a state may start elsewhere, and equilibria have no time before the first
@@ -71,6 +72,22 @@ def check_scene(scene) -> None:
                 f"{support.call}: the motion's angle at t = 0 is {angle:g} rad; supports start as they are at rest, so subtract its "
                 "value at 0, or turn the points"
             )
+
+
+def _check_magnets(scene) -> None:
+    """Refuse a field or dipoles without anything magnetised, and magnets that nothing acts on."""
+    magnetised = np.concatenate([np.zeros(0, int), *(magnet.rods for magnet in scene.magnets)])
+    if scene.applied_field is not None and not magnetised.size:
+        raise SceneError("magnetic_field: nothing is magnetised; add scene.magnetize(rod, ...), or leave the field out")
+    for pairs in scene.dipoles:
+        if pairs.rods is None and not magnetised.size:
+            raise SceneError("add_dipoles: nothing is magnetised; add scene.magnetize(rod, ...)")
+        for rod in [] if pairs.rods is None else np.setdiff1d(pairs.rods, magnetised)[:1]:
+            raise SceneError(f"add_dipoles: rod {rod} is not magnetised; add scene.magnetize({rod}, ...)")
+    if magnetised.size and scene.applied_field is None and not scene.dipoles:
+        raise SceneError(
+            f"magnetize: nothing acts on rod {magnetised[0]}; add scene.magnetic_field(...) or scene.add_dipoles(...)"
+        )
 
 
 def check_motion(call: str, motion, planar: bool) -> None:
@@ -129,7 +146,7 @@ def check_batch(batch, dimension: int) -> None:
     for rows in batch.runs(np.arange(batch.rods)):
         _check_shape(batch, rows, dimension)
     section = batch.section
-    for what in ("EA", "EI1", "EI2", "GJ", "mass_per_length", "rotary_inertia", "radius", "viscosity"):
+    for what in ("EA", "EI1", "EI2", "GJ", "mass_per_length", "rotary_inertia", "radius", "viscosity", "area"):
         try:
             value = np.asarray(getattr(section, what), float)
             np.broadcast_to(value, (batch.rods, batch.edges))

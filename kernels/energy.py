@@ -54,7 +54,8 @@ def balance_function(term: Term, real):
             taken = w * wp.dot(slope_of(middle, p) - slope, strain)
         force = wp.max(wp.abs((slope * w) * jacobian))
         rounding = floor * (wp.abs(start) + wp.abs(end) + force * reach)
-        return B(end - start - w * wp.dot(slope, strain), rounding, end, taken)
+        # that of a magnet may be negative, and counts by its size
+        return B(end - start - w * wp.dot(slope, strain), rounding, wp.abs(end), taken)
 
     return balance
 

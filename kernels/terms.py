@@ -7,6 +7,7 @@ import numpy as np
 
 from ddg_warp.kernels.densities import POSITIVE, Density, Parameter
 from ddg_warp.kernels.densities.damping import damped
+from ddg_warp.kernels.densities.dipole import dipole_dipole, dipole_in_field
 from ddg_warp.kernels.densities.quadratic import quadratic
 from ddg_warp.kernels.densities.st_venant_kirchhoff import st_venant_kirchhoff
 from ddg_warp.kernels.measures import Measure
@@ -18,6 +19,12 @@ from ddg_warp.kernels.measures.edge_tilt import edge_tilt
 from ddg_warp.kernels.measures.hinge_angle import hinge_angle
 from ddg_warp.kernels.measures.isometric_bending import isometric_bending
 from ddg_warp.kernels.measures.joint_curvature_twist import joint_curvature_twist
+from ddg_warp.kernels.measures.magnetised_edge import (
+    dipole_pair,
+    dipole_pair_tangent,
+    magnetised_edge,
+    magnetised_tangent,
+)
 from ddg_warp.kernels.measures.midedge_curvature import midedge_curvature, midedge_curvature_dof
 from ddg_warp.kernels.measures.midedge_metric import midedge_metric
 from ddg_warp.kernels.measures.planar_curvature import planar_curvature
@@ -31,7 +38,7 @@ from ddg_warp.kernels.measures.turning_angle import (
     rod_curvature_twist_angle,
 )
 
-MEASURE = Parameter("measure", "m or m^2", POSITIVE, rest=True)
+MEASURE = Parameter("measure", "m, m^2, m^3 or m^6", POSITIVE, rest=True)
 
 
 @dataclass(frozen=True)
@@ -150,4 +157,14 @@ JOINTS = {
 }
 GLUE = Term("glued_edge", rod_surface_angle, quadratic, "what turns the edges of an attached rod with the shell")
 
-ALL = {**REGISTRY, **SHELLS, **AXISYMMETRIC, **JOINTS, GLUE.name: GLUE}
+MAGNETS = {
+    term.name: term
+    for term in (
+        Term("magnetic", magnetised_edge, dipole_in_field, "magnetised rod edges in a field"),
+        Term("magnetic_tangent", magnetised_tangent, dipole_in_field, "the same, magnetised along their tangents"),
+        Term("dipoles", dipole_pair, dipole_dipole, "magnetised rod edges in each other's field"),
+        Term("dipoles_tangent", dipole_pair_tangent, dipole_dipole, "the same, magnetised along their tangents"),
+    )
+}
+
+ALL = {**REGISTRY, **SHELLS, **AXISYMMETRIC, **JOINTS, GLUE.name: GLUE, **MAGNETS}

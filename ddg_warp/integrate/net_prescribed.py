@@ -1,4 +1,4 @@
-"""What is prescribed of a net from outside: motion of supports, and loads that change or follow what they act on."""
+"""What is prescribed of a net from outside: motion of supports, loads that change or follow what they act on, a magnetic field."""
 
 import numpy as np
 import warp as wp
@@ -6,8 +6,9 @@ import warp as wp
 from ddg_warp.chains import pose_starts
 from ddg_warp.integrate.prescribed import poses
 from ddg_warp.kernels import motion
+from ddg_warp.kernels.measures.magnetised_edge import FIELD
 from ddg_warp.kernels.net import loads
-from ddg_warp.kernels.net.motion import motion_kernels
+from ddg_warp.kernels.net.motion import field_kernel, motion_kernels
 from ddg_warp.net_model import NetState
 from ddg_warp.net_system import lists
 
@@ -146,3 +147,43 @@ class NetLoads:
             [load],
             device=self.model.wp_device,
         )
+
+
+class NetField:
+    """The magnetic field among the data of magnetised edges, at the time that the scheme balances forces at and at the end of a step.
+
+    Attributes:
+        data: of those sets by index, with the field that a solve is about.
+    """
+
+    def __init__(self, model, midpoint: bool):
+        self.model, self.net, self.midpoint = model, model.net, midpoint
+        self.data = model.net.field_data()
+        self._kernel = field_kernel(model.types.real)
+        self._now, self._end = (wp.zeros(FIELD, dtype=model.types.real, device=model.wp_device) for _ in range(2))
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [self._kernel] if self.data else []
+
+    def upload(self, t0: float, t1: float) -> None:
+        """The field of a step."""
+        if not self.data:
+            return
+        field = self.model.scene.applied_field
+        self._now.assign(field.at(0.5 * (t0 + t1) if self.midpoint else t1, 1.0))
+        self._end.assign(field.at(t1, 1.0))
+        for index, data in self.data.items():
+            self._launch(index, self._now, self.net.every, data, data)
+
+    def finish(self, moved: wp.array, before: NetState, after: NetState) -> None:
+        """Put the worlds that `moved` into the field at the end of the step."""
+        for index in self.data:
+            self._launch(index, self._end, moved, before.data[index], after.data[index])
+
+    def _launch(self, index: int, field: wp.array, moved: wp.array, before: wp.array, after: wp.array) -> None:
+        part, first = self.net.sets[index], self.net.sets[index].term.measure.data_size - FIELD
+        inputs = [field, first, part.elements, moved, before]
+        dim = part.elements * self.model.worlds
+        wp.launch(self._kernel, dim, inputs, [after], device=self.model.wp_device)

@@ -6,7 +6,7 @@ import numpy as np
 
 from ddg_warp.errors import SceneError
 from ddg_warp.integrate.energy import NetEnergy
-from ddg_warp.integrate.net_prescribed import NetLoads, NetMotion
+from ddg_warp.integrate.net_prescribed import NetField, NetLoads, NetMotion
 from ddg_warp.integrate.part_step import PartStep
 from ddg_warp.kernels.net import elements, frames, newton
 from ddg_warp.linear.choice import net_preconditioner
@@ -43,7 +43,8 @@ class NetStep(PartStep):
         self.middle = model.net.empty() if self.midpoint and model.net.edges else None
         self.energy = NetEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.motion = NetMotion(model, self.midpoint) if host.moving else None
-        self.loads = NetLoads(model, self.midpoint)
+        self.loads, self.field = NetLoads(model, self.midpoint), NetField(model, self.midpoint)
+        self._data = (self.motion.data if self.motion else {}) | self.field.data
 
     def attempt(self, before, after) -> None:
         """One solve of every world that has not finished the step, from state `before` to `after`."""
@@ -77,6 +78,7 @@ class NetStep(PartStep):
         self.net.carry(start, after, kept=before, moved=islands.moved)
         if self.motion:
             self.motion.turn(islands, before, after)
+        self.field.finish(islands.moved, before, after)
         self.net.update_strains(after)
 
     def _start_frames(self, before):
@@ -84,12 +86,11 @@ class NetStep(PartStep):
 
         Frames lagged at the start of the step would spin about their edges by O(h) at the midpoint, unseen by the rotary
         inertia: the rule would be of first order. Rotations of joints have no inertia and are not predicted, so that those
-        found are of the whole half step. Normals that supports turn are those that the solve is about.
+        found are of the whole half step. Normals that supports turn, and the magnetic field, are those that the solve is about.
         """
-        data = self.motion.data if self.motion else {}
         if not (self.midpoint and self.net.edges):
-            return replace(before, data=data)
-        middle = NetState(self.newton.q, before.v, self.middle.frame, self.middle.lag, before.last, data)
+            return replace(before, data=self._data)
+        middle = NetState(self.newton.q, before.v, self.middle.frame, self.middle.lag, before.last, self._data)
         self.net.carry(before, middle, moved=self.islands.moved)
         return middle
 
@@ -100,9 +101,9 @@ class NetStep(PartStep):
         kernels = [self._begin, self._finish]
         kernels += [frames.edge_kernel(real)] if net.edges else []
         kernels += [frames.reset_kernel(real)] if net.host.spins else []
-        for term in (part.term for part in net.sets):
-            kernels += [frames.lag_kernel(term.measure, real)] if term.measure.frames else []
-            kernels += [elements.term_kernels(term, real)[3]] if term.density.lagged else []
+        for part in net.sets:
+            kernels += [frames.lag_kernel(part.term.measure, real)] if len(part.host.lag) else []
+            kernels += [elements.term_kernels(part.term, real)[3]] if part.term.density.lagged else []
         return kernels
 
     def who(self, world: int) -> str:

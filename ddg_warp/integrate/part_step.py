@@ -21,12 +21,12 @@ class PartStep:
         counts_of: the step that this one replaces, whose islands and counts it takes over.
 
     Attributes:
-        energy, motion, loads: watch of the energy, motion of the supports, loads that change; None without.
+        energy, motion, loads, field: watch of the energy, motion of the supports, loads that change, the magnetic field; None without.
         rounded: outcome that solves which rounding ends are counted as.
         tally, work: counts of outcomes and of work; see `kernels.step.advance_kernel`.
     """
 
-    energy = motion = loads = None
+    energy = motion = loads = field = None
 
     def __init__(self, integrator, model, newton, counts_of: "PartStep | None" = None):
         self.integrator, self.model, self.newton = integrator, model, newton
@@ -48,7 +48,7 @@ class PartStep:
 
     def prescribe(self, t0: float, t1: float) -> None:
         """Hand the device what supports and loads do between t0 and t1."""
-        for part in filter(None, (self.motion, self.loads)):
+        for part in filter(None, (self.motion, self.loads, self.field)):
             part.upload(t0, t1)
 
     def step(self, before, after) -> None:
@@ -71,7 +71,7 @@ class PartStep:
     def load_modules(self) -> None:
         """Compile and load every kernel before a capture."""
         kernels = [self._start, self._advance, *self.own_kernels, *self.newton.kernels]
-        for part in filter(None, (self.motion, self.loads, self.energy)):
+        for part in filter(None, (self.motion, self.loads, self.field, self.energy)):
             kernels += part.kernels
         arrays.load_kernels(kernels, self.model.wp_device)
 

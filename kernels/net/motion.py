@@ -1,7 +1,8 @@
-"""What moving supports prescribe in a net: positions of nodes, angles of rod edges, normals of clamped mesh edges.
+"""What is prescribed in a net: positions of nodes, angles of rod edges and normals of clamped mesh edges by supports that move; the
+magnetic field.
 
-All at the end of the part of the step that is taken; for the midpoint rule positions are the mean of those at both of its ends, so
-that the extrapolated ones are exact, and angles and normals those in the middle.
+Supports are at the end of the part of the step that is taken; for the midpoint rule positions are the mean of those at both of its
+ends, so that the extrapolated ones are exact, and angles and normals those in the middle.
 """
 
 from functools import cache
@@ -123,3 +124,26 @@ def motion_kernels(real, midpoint: bool):
         write(where, i, w * elements, n, data_out)
 
     return nodes, angles, normals, turn
+
+
+@cache
+def field_kernel(real):
+    """Field and gradient among the data of elements, from row `first` on, in worlds that `moved`; others keep theirs."""
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def put(
+        field: wp.array(dtype=real),
+        first: int,
+        elements: int,
+        moved: wp.array(dtype=int),
+        before: wp.array2d(dtype=real),
+        data_out: wp.array2d(dtype=real),
+    ):
+        tid = wp.tid()
+        for c in range(field.shape[0]):
+            value = field[c]
+            if moved[tid / elements] == 0:
+                value = before[first + c, tid]
+            data_out[first + c, tid] = value
+
+    return put

@@ -20,7 +20,15 @@ from questions import QUESTIONS, Variant
 import ddg_warp as ddg
 
 VARIANTS = [(worlds, precision) for worlds in (1, 3) for precision in ("float64", "mixed")]
-RODS = ("rod", "rod clamped at its end", "planar rod", "rod without twist", "rod without bending", "closed rod")
+RODS = (
+    "rod",
+    "rod clamped at its end",
+    "planar rod",
+    "rod without twist",
+    "rod without bending",
+    "closed rod",
+    "magnetised rod",
+)
 JOINED = ("rods joined rigidly", "rods joined by a hinge", "planar rods joined rigidly")
 MANY_RODS = ("rods alone and joined", "rods by the turning angle")
 SHELLS = tuple(name for name in OBJECTS if name.startswith("shell,"))
