@@ -12,6 +12,7 @@ from ddg_warp import arrays
 from ddg_warp.couples import couple_derivatives, couple_forces
 from ddg_warp.integrate.prescribed import PrescribedMotion
 from ddg_warp.kernels import element
+from ddg_warp.kernels.islands import Islands
 from ddg_warp.rigid import Body
 from ddg_warp.tolerance import support_forces
 from ddg_warp.turning import turned
@@ -142,8 +143,9 @@ class ChainTangent:
         if group.moving is not None:
             motion = PrescribedMotion(self.model, group)
             motion.upload(before, at)
-            whole = wp.full(group.columns, 1.0, dtype=self.model.types.real, device=self.model.wp_device)
-            motion.apply(group.still, whole, data.x, data.frame, data.theta)
+            islands = Islands(group.columns, self.model.types.real, self.model.wp_device)
+            islands.portion.fill_(1.0)
+            motion.apply(islands, data.x, data.frame, data.theta)
 
     def edges(self, q: np.ndarray) -> np.ndarray:
         """Edge vectors of the windows (E, dim), zero where there is none."""

@@ -6,15 +6,17 @@ elements as everywhere else. Users never see ghosts: rods are addressed by their
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 
 from ddg_warp import arguments, drag, geometry
 from ddg_warp.descriptions import RodBatch, Support
 from ddg_warp.errors import SceneError
+from ddg_warp.kernels.drag import ROWS as DRAG_ROWS
 from ddg_warp.kernels.element import ChainKind
-from ddg_warp.kernels.terms import REGISTRY, Term
+from ddg_warp.kernels.terms import REGISTRY, Term, term_key
 from ddg_warp.scene import Scene
 from ddg_warp.validate import check_batch, check_index
 
@@ -22,13 +24,38 @@ PADDING = 1.25  # longest over shortest rod of a group
 STILL, FREE = -1, -2  # instead of a pose, of a dof that is held still, and of one that is free
 
 
+@dataclass(frozen=True)
+class Alike:
+    """Rods of one batch with the same ghosts, all with drag or none."""
+
+    batch: RodBatch
+    rows: np.ndarray  # of the batch
+    ghosts: tuple[int, int]  # at the first and last node, 0 or 1
+    kind: ChainKind
+
+    @property
+    def nodes(self) -> int:
+        """Nodes of a rod, with ghosts."""
+        return self.batch.nodes + sum(self.ghosts)
+
+    @property
+    def rods(self) -> np.ndarray:
+        """The scene's indices."""
+        return self.batch.first + self.rows
+
+    @property
+    def runs(self) -> list["Alike"]:
+        """The same rods, a few at a time, so that what is computed on the way to their arrays stays in the processor's cache."""
+        return [replace(self, rows=rows) for rows in self.batch.runs(self.rows)]
+
+
 @dataclass
 class Piece:
-    """Rods of one batch with the same ghosts: arrays (R, ...) including ghosts; see `ChainGroup` for their meaning."""
+    """A run of rods of one batch with the same ghosts: arrays (R, ...) including ghosts; see `ChainGroup` for their meaning."""
 
     batch: RodBatch
     rods: np.ndarray
-    ghosts: tuple[int, int]  # at the first and last node, 0 or 1
+    ghosts: tuple[int, int]
     kind: ChainKind
     x: np.ndarray
     tangent: np.ndarray
@@ -38,6 +65,7 @@ class Piece:
     rotary: np.ndarray
     length: np.ndarray
     parameters: dict[str, np.ndarray]
+    stiffness: list[np.ndarray]  # EI1, EI2 and GJ of the section, each broadcastable to (R, edges)
     drag: np.ndarray | None  # coefficients of its law (R, edges, rows), None without
 
 
@@ -129,17 +157,17 @@ def compile_chains(scene: Scene) -> tuple[list[ChainGroup], list[list[Held]]]:
         raise SceneError(
             "the scene has no rods and no shells; add some with scene.add_rods(points, section=..., material=...)"
         )
-    ghosts, laws, joined = Ghosts(scene), drag.law_of_rods(scene), net_rods(scene)
-    pieces = [piece for batch in scene.batches for piece in pieces_of(scene, batch, ghosts, laws, ~joined)]
-    pieces.sort(key=lambda piece: (*piece.kind.key, piece.x.shape[1]))
-    groups: list[list[Piece]] = []
-    for piece in pieces:
+    ghosts, laws, joined = Ghosts(scene), drag.Laws(scene), net_rods(scene)
+    parts = [part for batch in scene.batches for part in alike(scene.dimension, batch, ghosts, laws, ~joined)]
+    parts.sort(key=lambda part: (*part.kind.key, part.nodes))
+    groups: list[list[Alike]] = []
+    for part in parts:
         last = groups[-1] if groups else None
-        if last and last[0].kind == piece.kind and piece.x.shape[1] <= PADDING * last[0].x.shape[1]:
-            last.append(piece)
+        if last and last[0].kind == part.kind and part.nodes <= PADDING * last[0].nodes:
+            last.append(part)
         else:
-            groups.append([piece])
-    chains = [_join(group) for group in groups]
+            groups.append([part])
+    chains = [_join(group, ghosts, laws) for group in groups]
     place = np.full((scene.rod_count, 2), -1)  # rods of the net have none
     for g, chain in enumerate(chains):
         place[chain.rods] = np.column_stack([np.full(len(chain.rods), g), np.arange(len(chain.rods))])
@@ -184,12 +212,13 @@ class Ghosts:
 
 
 def net_rods(scene: Scene) -> np.ndarray:
-    """Which rods belong to the scene's net: those that are joined or attached to something (R,) bool."""
+    """Which rods belong to the scene's net: those that are joined or attached to something, or magnetised (R,) bool."""
+    members = [rod for joint in scene.joints for rod, _ in joint.members]
+    members += [attachment.rod for attachment in scene.attachments]
     chosen = np.zeros(scene.rod_count, bool)
-    for joint in scene.joints:
-        chosen[[rod for rod, _ in joint.members]] = True
-    for attachment in scene.attachments:
-        chosen[attachment.rod] = True
+    chosen[np.array(members, int)] = True
+    for magnet in scene.magnets:
+        chosen[magnet.rods] = True
     return chosen
 
 
@@ -199,18 +228,18 @@ def scene_motions(scene: Scene) -> list:
     return list({id(s.motion): s.motion for s in supports if s.motion is not None}.values())
 
 
-def pieces_of(scene: Scene, batch: RodBatch, ghosts: Ghosts, laws: np.ndarray, chosen: np.ndarray) -> list[Piece]:
-    """The chosen rods (R,) of a batch, those with the same ghosts together, and those with drag, whose `laws` (R,) are not -1."""
-    check_batch(batch, scene.dimension)
+def alike(dimension: int, batch: RodBatch, ghosts: Ghosts, laws: drag.Laws, chosen: np.ndarray) -> list[Alike]:
+    """The chosen rods (R,) of a batch, those with the same ghosts together, and those with drag."""
+    check_batch(batch, dimension)
     chosen = chosen[batch.first : batch.first + batch.rods]
     flags = ghosts.count[batch.first : batch.first + batch.rods]
     if batch.closed and flags.any():
         raise SceneError(f"rod {batch.first + int(np.argmax(flags.any(1)))} is closed: it has no end to clamp")
-    laws = laws[batch.first : batch.first + batch.rods]
-    flags, result = np.column_stack([flags, laws >= 0]), []
-    for pattern in np.unique(flags[chosen], axis=0):
-        rows = np.flatnonzero((flags == pattern).all(1) & chosen)
-        result.append(_piece(scene, batch, rows, ghosts, laws[rows] if pattern[2] else None))
+    dragged, result = laws.of_rods[batch.first : batch.first + batch.rods] >= 0, []
+    for *pattern, drags in product((0, 1), (0, 1), (False, True)):
+        rows = np.flatnonzero((flags == pattern).all(1) & (dragged == drags) & chosen)
+        if rows.size:
+            result.append(Alike(batch, rows, tuple(pattern), _kind(dimension, batch, drags)))
     return result
 
 
@@ -225,22 +254,27 @@ def _kind(dimension: int, batch: RodBatch, dragged: bool) -> ChainKind:
                 f"rod {batch.first} ('{batch.name}'): it has no term {term!r} to give a law; it has {', '.join(names)}"
             )
     viscous = bool(np.any(np.asarray(batch.section.viscosity) > 0.0))
-    terms = tuple(REGISTRY[name].of(batch.laws).damped(viscous) for name in names)
+    keys = [*(term_key(name, batch.by_angle) for name in names[:-1]), names[-1]]  # the last is stretch
+    terms = tuple(REGISTRY[key].of(batch.laws).damped(viscous) for key in keys)
     return ChainKind(dimension, batch.twist, batch.closed, terms, drag=dragged)
 
 
-def _piece(scene: Scene, batch: RodBatch, rows: np.ndarray, outside: Ghosts, laws: np.ndarray | None) -> Piece:
-    rods, dimension = batch.first + rows, scene.dimension
-    before, after = ghosts = tuple(int(count) for count in outside.count[rods[0]])
-    points = batch.points[rows]
-    if dimension == 2:
+def piece_of(part: Alike, outside: Ghosts, laws: drag.Laws) -> Piece:
+    """The arrays of some rods.
+
+    Raises:
+        SceneError: a director, a law or a rest shape that they cannot have; names the first rod.
+    """
+    batch, rows, rods, kind, (before, after) = part.batch, part.rows, part.rods, part.kind, part.ghosts
+    points = np.asfortranarray(batch.points[rows])  # as what is made of it: components of vectors lie together
+    if kind.dim == 2:
         points = points * [1.0, 0.0, 1.0]
     if before:
         points = np.concatenate([_ghost(points, 0, 1, outside.tangent[rods, 0]), points], axis=1)
     if after:
         points = np.concatenate([points, _ghost(points, -1, -2, outside.tangent[rods, 1])], axis=1)
     edges = geometry.edge_vectors(points, batch.closed)
-    lengths = np.linalg.norm(edges, axis=-1)
+    lengths = geometry.length(edges)
     real = slice(before, lengths.shape[1] - after)
     tangents = edges / lengths[..., None]
     section = batch.section
@@ -256,7 +290,7 @@ def _piece(scene: Scene, batch: RodBatch, rows: np.ndarray, outside: Ghosts, law
     own = np.zeros_like(lengths)
     own[:, real] = lengths[:, real]
     line_mass = on_edges(section.mass_per_length) * own
-    mass = np.zeros(points.shape[:2])
+    mass = np.zeros_like(points[..., 0])
     if batch.closed:
         mass += 0.5 * (line_mass + np.roll(line_mass, 1, axis=1))
     else:
@@ -265,7 +299,6 @@ def _piece(scene: Scene, batch: RodBatch, rows: np.ndarray, outside: Ghosts, law
     given = batch.director
     if given is not None and given.ndim > 1:
         given = np.broadcast_to(given, (batch.rods, *given.shape[1:]))[rows]
-    kind = _kind(dimension, batch, laws is not None)
     frames = np.zeros_like(tangents)
     if kind.twist:
         frames[:, real] = geometry.directors(tangents[:, real], given)
@@ -283,7 +316,7 @@ def _piece(scene: Scene, batch: RodBatch, rows: np.ndarray, outside: Ghosts, law
         voronoi[:, 0] = 0.5 * lengths[:, 1]
     if after:
         voronoi[:, -1] = 0.5 * lengths[:, -2]
-    natural = _natural(batch, rows, ghosts, kind, edges, tangents, frames, twist, voronoi) if batch.bend else []
+    natural = _natural(batch, rows, part.ghosts, kind, edges, tangents, frames, twist, voronoi) if batch.bend else []
     damping = on_edges(section.viscosity)
 
     def on_vertices(value):
@@ -301,13 +334,12 @@ def _piece(scene: Scene, batch: RodBatch, rows: np.ndarray, outside: Ghosts, law
         given = {"measure": weight, "stiffness": stiffness, "rest": rest, "viscosity": spread}
         values = _bound(batch, term, given, on_edges if stretch else on_vertices)
         parameters |= {f"{term.name}.{name}": _compress(np.atleast_2d(v)) for name, v in values.items()}
-    keep = [0, 2] if dimension == 2 else [0, 1, 2]
     return Piece(
         batch,
         rods,
-        ghosts,
+        part.ghosts,
         kind,
-        points[..., keep],
+        points[..., [0, 2]] if kind.dim == 2 else points,
         tangents,
         frames,
         twist,
@@ -315,7 +347,8 @@ def _piece(scene: Scene, batch: RodBatch, rows: np.ndarray, outside: Ghosts, law
         on_edges(section.rotary_inertia) * own,
         own.sum(1),
         parameters,
-        None if laws is None else drag.coefficients(scene, laws, batch.name, on_edges(section.radius), own),
+        [on_edges(value) for value in (section.EI1, section.EI2, section.GJ)],
+        laws.coefficients(rods, batch.name, on_edges(section.radius), own) if kind.drag else None,
     )
 
 
@@ -324,7 +357,7 @@ def _bound(batch: RodBatch, term: Term, given: dict, along) -> dict[str, np.ndar
     where, families = f"rod {batch.first} ('{batch.name}'), {term.name}", {known.family for known in term.parameters}
     law = batch.laws.get(term.name)
     unstrained = 1.0 if term.measure.span == 1 else 0.0
-    bent = [np.abs((value - unstrained) * given["measure"]).max() > 1e-9 for value in given["rest"]]
+    bent = (np.abs((value - unstrained) * given["measure"]).max() > 1e-9 for value in given["rest"])
     if law is not None and "rest" not in families and any(bent):
         raise SceneError(f"{where}: the law {term.density.name!r} has no strains at rest; give natural='straight'")
     given = {family: value for family, value in given.items() if family in families}
@@ -389,12 +422,12 @@ def _natural(batch, rows, ghosts, kind, edges, tangents, frames, twist, voronoi)
     if isinstance(batch.natural, str) and batch.natural == "straight":
         return [np.zeros((1, 1))] * (1 if kind.dim == 2 else 3)
     if kind.dim == 2:
-        shape = [geometry.planar_curvature(edges[..., [0, 2]], batch.closed)]
+        shape = [geometry.planar_curvature(edges[..., [0, 2]], batch.closed, batch.by_angle)]
     elif kind.twist:
-        shape = [*geometry.curvatures(tangents, frames, batch.closed), twist]
+        shape = [*geometry.curvatures(tangents, frames, batch.closed, batch.by_angle), twist]
     else:
         (t0, t1) = geometry.ahead(tangents, batch.closed)
-        if np.any(np.linalg.norm(np.cross(t0, t1), axis=-1) > 1e-9):
+        if np.any(geometry.length(geometry.cross(t0, t1)) > 1e-9):
             raise SceneError(
                 f"rod {batch.first} ('{batch.name}') is curved at rest, which needs twist=True; "
                 "or give natural='straight' if it is straight when free"
@@ -416,72 +449,57 @@ def _compress(values: np.ndarray) -> np.ndarray:
     return values[:, :1] if np.all(values == values[:, :1]) else values
 
 
-def _join(pieces: list[Piece]) -> ChainGroup:
-    kind = pieces[0].kind
-    rods = np.concatenate([piece.rods for piece in pieces])
-    count = np.concatenate([np.full(len(piece.rods), piece.x.shape[1]) for piece in pieces])
+def _join(parts: list[Alike], ghosts: Ghosts, laws: drag.Laws) -> ChainGroup:
+    kind, rods = parts[0].kind, np.concatenate([part.rods for part in parts])
+    count = np.concatenate([np.full(len(part.rods), part.nodes) for part in parts])
     n, total = int(count.max()), len(rods)
-
-    def stack(name, *tail):
-        out = np.zeros((n, total, *tail))
-        at = 0
-        for piece in pieces:
-            value = getattr(piece, name)
-            out[: value.shape[1], at : at + value.shape[0]] = np.swapaxes(value, 0, 1)
-            at += value.shape[0]
-        return out
-
-    frame = np.zeros((kind.lagged_rows, n, total))
-    if kind.twist:
-        frame[0:3] = np.moveaxis(stack("director", 3), -1, 0)
-        frame[3:6] = np.moveaxis(stack("tangent", 3), -1, 0)
-        frame[6] = stack("reference_twist")
+    x, frame = np.zeros((n, total, kind.dim)), np.zeros((kind.lagged_rows, n, total))
+    mass, rotary, length, parameters, at = np.zeros((n, total)), np.zeros((n, total)), np.zeros(total), [], 0
+    coefficients = np.zeros((DRAG_ROWS, n, total)) if kind.drag else None
+    for run in (run for part in parts for run in part.runs):
+        piece, columns = piece_of(run, ghosts, laws), slice(at, at + len(run.rods))
+        edges = piece.rotary.shape[1]
+        x[: run.nodes, columns] = piece.x.swapaxes(0, 1)
+        mass[: run.nodes, columns], rotary[:edges, columns] = piece.mass.T, piece.rotary.T
+        if kind.twist:
+            frame[0:3, :edges, columns], frame[3:6, :edges, columns] = piece.director.T, piece.tangent.T
+            frame[6, : piece.reference_twist.shape[1], columns] = piece.reference_twist.T
+        if kind.drag:
+            coefficients[:, :edges, columns] = piece.drag.T
+        length[columns], at = piece.length, columns.stop
+        parameters.append((len(run.rods), piece.parameters))
     fixed = np.zeros((n, total), np.uint8)
     if kind.twist and not kind.closed:
         fixed[count - 1, np.arange(total)] = 1 << kind.dim  # the last node starts no edge
     return ChainGroup(
         kind=kind,
         rods=rods,
-        first=np.concatenate([np.full(len(piece.rods), piece.ghosts[0]) for piece in pieces]),
-        own=np.concatenate([np.full(len(piece.rods), piece.batch.nodes) for piece in pieces]),
+        first=np.concatenate([np.full(len(part.rods), part.ghosts[0]) for part in parts]),
+        own=np.concatenate([np.full(len(part.rods), part.batch.nodes) for part in parts]),
         count=count,
-        x=stack("x", kind.dim),
+        x=x,
         frame=frame,
-        mass=stack("mass"),
-        rotary=stack("rotary"),
+        mass=mass,
+        rotary=rotary,
         fixed=fixed,
-        length=np.concatenate([piece.length for piece in pieces]),
-        drag=np.moveaxis(stack("drag", pieces[0].drag.shape[-1]), -1, 0) if kind.drag else None,
+        length=length,
+        drag=coefficients,
         parameters={
-            name: _join_parameter([piece.parameters[name] for piece in pieces], pieces, n, total)
-            for name in pieces[0].parameters
+            name: _join_parameter([(rods, values[name]) for rods, values in parameters], n) for name in parameters[0][1]
         },
         load=np.zeros((n, total, kind.dim)),
         load_angle=np.zeros((n, total)),
     )
 
 
-def _join_parameter(values: list[np.ndarray], pieces: list[Piece], n: int, total: int) -> np.ndarray:
-    """One parameter of all pieces as (node, rod), with size 1 along what it does not depend on."""
-    if len(values) == 1:
-        value = values[0]
-        if value.shape[1] > 1:
-            value = np.pad(value, ((0, 0), (0, n - value.shape[1])), mode="edge")
-        return np.ascontiguousarray(value.T)
-    along = any(value.shape[1] > 1 for value in values)
-    out = np.zeros((n if along else 1, total))
-    at = 0
-    for value, piece in zip(values, pieces, strict=True):
-        rods = len(piece.rods)
-        full = np.broadcast_to(value, (rods, value.shape[1]))
-        if along:
-            full = (
-                np.broadcast_to(full, (rods, n))
-                if full.shape[1] == 1
-                else np.pad(full, ((0, 0), (0, n - full.shape[1])), "edge")
-            )
-        out[:, at : at + rods] = full.T
-        at += rods
+def _join_parameter(values: list[tuple[int, np.ndarray]], n: int) -> np.ndarray:
+    """One parameter of runs of so many rods each as (node, rod), with size 1 along what it does not depend on."""
+    along = any(value.shape[1] > 1 for _, value in values)
+    out, at = np.zeros((n if along else 1, sum(rods for rods, _ in values))), 0
+    for rods, value in values:
+        columns, at = slice(at, at + rods), at + rods
+        out[: value.shape[1], columns] = value.T
+        out[value.shape[1] :, columns] = value.T[-1:]
     return _compress(out.T).T
 
 

@@ -8,6 +8,7 @@ import errno
 import os
 import shlex
 import sys
+from functools import partial
 from pathlib import Path
 
 from ddg_warp.catalog import (
@@ -247,6 +248,9 @@ def draw(directory: Path, module, result, shapes: int = 6) -> None:
         options = {"points_by_time": frames, "unit": unit}
         if result.dt is None:
             options["label"] = "load parameter"
+        if (applied := result.scene.applied_field) is not None:
+            last = frames[-1][0]
+            options["field"] = partial(applied.over, t=last, otherwise=last if result.dt is None else 1.0)
         if hasattr(module, "picture") and not result.failure:
             options |= module.picture(result, dict(frames))
         rods_picture(reader, path=directory / "picture.png", title=title, **options)

@@ -66,7 +66,9 @@ def _rest_scene(term: Term, kind: ChainKind) -> Scene:
     values = {known.family: 0.5 for known in term.parameters if known.family not in brought}
     laws = {term.name: Law(own, **values)}
     natural = "shape" if term.rest else "straight"
-    scene.add_rod(points, section=section, closed=kind.closed, natural=natural, twist=kind.twist, laws=laws)
+    curvature = "angle" if any(one.measure.by_angle for one in kind.terms) else "tangent"
+    options = {"natural": natural, "twist": kind.twist, "curvature": curvature, "laws": laws}
+    scene.add_rod(points, section=section, closed=kind.closed, **options)
     return scene
 
 
@@ -189,7 +191,7 @@ def factor(case: Case) -> float:
     for term, (first, *_, row) in zip(kind.terms, kind.places(), strict=True):
         rows = slice(row, row + len(term.measure.strains))
         w = sample.data["buffer"][first]
-        stiff = _raised(strain_rate[rows], stress_rate[rows]) if term.density.coupled else stress_rate[rows]
+        stiff = raised(strain_rate[rows], stress_rate[rows]) if term.density.coupled else stress_rate[rows]
         expected += w * np.einsum("minr,mjnr->ijnr", strain_rate[rows], stiff)
         if term.measure.tensions:
             edge = np.moveaxis(sample.edges(), -1, 0)
@@ -199,7 +201,7 @@ def factor(case: Case) -> float:
     return relative(_gauss_newton(case), expected)
 
 
-def _raised(strain_rate: np.ndarray, stress_rate: np.ndarray) -> np.ndarray:
+def raised(strain_rate: np.ndarray, stress_rate: np.ndarray) -> np.ndarray:
     """psi'' de/dq (m, window, n, R) without what is negative of psi'', which is in the exact matrix alone."""
     J, S = (np.moveaxis(rate, (0, 1), (-2, -1)) for rate in (strain_rate, stress_rate))
     values, vectors = np.linalg.eigh(S @ np.linalg.pinv(J))
@@ -307,7 +309,7 @@ CHECKS = {
 
 def checks_of(term: Term, closed: bool, precision: str) -> list[str]:
     """Checks that make sense: a rod that is straight at rest has no rest shape when closed."""
-    straight = term.measure.name == "curvature_binormal" or not term.rest
+    straight = is_vector(term) or not term.rest
     return [
         name
         for name, (_, _, single) in CHECKS.items()

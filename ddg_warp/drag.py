@@ -150,33 +150,40 @@ def _not_negative(what: str, value, unit: str) -> float:
     return arguments.number(what, value, f"one number that is not negative [{unit}]", lambda v: v >= 0.0)
 
 
-def law_of_rods(scene) -> np.ndarray:
-    """Place of its law among the scene's drags, of every rod (R,); -1 without.
+class Laws:
+    """Which law of drag every rod of a scene has.
+
+    Attributes:
+        given: the laws; of_rods: place of its law among them, of every rod (R,); -1 without.
 
     Raises:
         SceneError: a rod has two.
     """
-    result = np.full(scene.rod_count, -1)
-    for place, (rods, _) in enumerate(scene.drags):
-        twice = rods[result[rods] >= 0]
-        if twice.size:
-            raise SceneError(f"drag: rod {twice[0]} has drag already; give it one law")
-        result[rods] = place
-    return result
 
+    def __init__(self, scene):
+        self.given, self.of_rods = [law for _, law in scene.drags], np.full(scene.rod_count, -1)
+        for place, (rods, _) in enumerate(scene.drags):
+            twice = rods[self.of_rods[rods] >= 0]
+            if twice.size:
+                raise SceneError(f"drag: rod {twice[0]} has drag already; give it one law")
+            self.of_rods[rods] = place
 
-def coefficients(scene, laws: np.ndarray, name: str, radius: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Rows of `kernels.drag` (R, edges, rows) of rods with these laws (R,); none on edges without length, which are ghosts."""
-    from ddg_warp.kernels.drag import ROWS
+    def coefficients(self, rods: np.ndarray, name: str, radius: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+        """Rows of `kernels.drag` (R, edges, rows) of rods (R,) with drag; none on edges without length, which are ghosts."""
+        from ddg_warp.kernels.drag import ROWS
 
-    result, radius = np.zeros((*lengths.shape, ROWS)), np.broadcast_to(radius, lengths.shape)
-    for place in np.unique(laws):
-        rods = laws == place
-        law, length = scene.drags[place][1], lengths[rods].sum(1, keepdims=True)
-        rows = law.coefficients(f"drag: rods '{name}'", radius[rods], length)
-        result[rods] = np.stack([np.broadcast_to(row, radius[rods].shape) for row in rows], -1)
-    result[lengths == 0.0] = 0.0
-    return result
+        result, radius, laws = (
+            np.zeros((*lengths.shape, ROWS)),
+            np.broadcast_to(radius, lengths.shape),
+            self.of_rods[rods],
+        )
+        for place in np.unique(laws):
+            chosen = laws == place
+            own, length = radius[chosen], lengths[chosen].sum(1, keepdims=True)
+            rows = self.given[place].coefficients(f"drag: rods '{name}'", own, length)
+            result[chosen] = np.stack([np.broadcast_to(row, own.shape) for row in rows], -1)
+        result[lengths == 0.0] = 0.0
+        return result
 
 
 def holds(coefficients: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,8 @@ DPI = 160
 FLAT = 1e-3  # thickness over size below which rods are drawn in their plane
 ELEVATION, AZIMUTH = 18.0, -58.0  # of the eye on solid scenes [degrees]
 MARGIN = 0.06  # of the size, around the rods
+FIELD_COLOR = "#c9bfd6"
+ARROWS = {2: 9, 3: 4}  # of a field along the longest side of a picture, by its dimension
 GREY = "0.35"
 LIGHT_GREY = (0.78, 0.78, 0.78, 1.0)
 CLOSE = 1.5  # how much larger a solid scene is drawn without its axes
@@ -46,6 +48,7 @@ def rods_picture(
     colors: np.ndarray | None = None,
     bodies: Mapping[float, tuple[np.ndarray, np.ndarray]] | None = None,
     side_by_side: bool = False,
+    field: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> None:
     """Draws rods and surfaces at a few times, the last on top; flat where they stay in a coordinate plane.
 
@@ -61,6 +64,7 @@ def rods_picture(
         colors: RGB of each rod, shape (R, 3), instead of a color a time.
         bodies: What else stands there at each time: points (n, 3) and triangles (t, 3).
         side_by_side: Whether every shape has a panel of its own.
+        field: Vectors (n, 3) at points (n, 3), drawn as arrows behind the latest shape, the largest as long as their distance.
     """
     curves = getattr(rods, "curves", rods)
     frames = sorted(points_by_time.items()) if isinstance(points_by_time, Mapping) else list(points_by_time)
@@ -86,6 +90,8 @@ def rods_picture(
     ]
     for number, (time, shape) in enumerate(zip(times, points, strict=True)):
         plot, latest = plots[number % panels], side_by_side or number == len(times) - 1
+        if field is not None and latest:
+            _draw_field(plot, axes, low, high, field)
         color = TIME_COLORS(norm(time)) if len(times) > 1 else TIME_COLORS(0.5)
         if values is not None:
             color = TIME_COLORS(norm(values)) if latest else LIGHT_GREY
@@ -235,6 +241,29 @@ def _draw_rods(plot, points: np.ndarray, curves, color, latest: bool) -> None:
     )
     lines.set(capstyle="round", joinstyle="round")
     plot.add_collection(lines)
+
+
+def _draw_field(plot, axes: list[int], low: np.ndarray, high: np.ndarray, field) -> None:
+    """Adds arrows on a grid that fills the box."""
+    size = np.max(high - low)
+    step = (1.0 + 2.0 * MARGIN) * size / ARROWS[len(axes)]
+    middle = 0.5 * (low + high)
+    grid = list(middle[:, None])
+    for k in axes:
+        count = max(1, round((high[k] - low[k] + 2.0 * MARGIN * size) / step))
+        grid[k] = middle[k] + step * (np.arange(count) - 0.5 * (count - 1))
+    points = np.stack(np.meshgrid(*grid, indexing="ij"), -1).reshape(-1, 3)
+    vectors = np.asarray(field(points), float)
+    longest = np.linalg.norm(vectors[:, axes], axis=1).max()
+    if longest == 0.0:
+        return
+    vectors = 0.8 * step / longest * vectors
+    starts = (points - 0.5 * vectors)[:, axes]
+    style = {"color": FIELD_COLOR, "zorder": 0}
+    if len(axes) == 2:
+        plot.quiver(*starts.T, *vectors[:, axes].T, angles="xy", scale_units="xy", scale=1.0, width=0.004, **style)
+    else:
+        plot.quiver(*starts.T, *vectors.T, linewidth=0.8, arrow_length_ratio=0.25, **style)
 
 
 def _draw_triangles(plot, corners: np.ndarray, color) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Hashable
 
 import warp as wp
 
-from ddg_warp.threads import capturing, launching
+from ddg_warp.threads import capturing
 
 
 class Graphs:
@@ -18,10 +18,6 @@ class Graphs:
     def __init__(self, model, load: Callable[[], None]):
         self._model, self._load = model, load
         self._graphs, self._version = {}, model.version
-
-    def __del__(self):
-        with launching():  # what frees a graph ends captures of other threads
-            self.clear()
 
     def clear(self) -> None:
         """Forget what was captured."""

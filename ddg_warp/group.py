@@ -114,9 +114,15 @@ class Moving:
 
 def _outer_forces(host: ChainGroup, gravity: np.ndarray) -> np.ndarray:
     """Sum of the magnitudes of the outer forces on every rod (R,) [N]: the scale that residuals are compared with."""
-    inside = np.arange(host.shape[0])[:, None] < host.count
-    forces = np.abs(host.mass[..., None] * gravity + host.load).sum(-1) * inside
-    total = forces.sum(0) + np.abs(host.load_angle).sum(0) / host.length
+    forces = np.zeros_like(host.mass)
+    for d, g in enumerate(gravity):
+        force = host.mass * g
+        if host.loaded:
+            force += host.load[..., d]
+        forces += np.abs(force, out=force)
+    total = forces.sum(0)
+    if host.loaded:
+        total += np.abs(host.load_angle).sum(0) / host.length
     for load in host.timed_loads:
         size = np.abs(load.force).sum() + (abs(load.moment) + np.abs(load.couple).sum()) / host.length[load.columns]
         np.add.at(total, load.columns, size)

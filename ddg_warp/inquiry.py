@@ -8,7 +8,7 @@ import warp as wp
 from ddg_warp import arrays, end_moments
 from ddg_warp.integrate.net_prescribed import NetDrag
 from ddg_warp.integrate.prescribed import ChainDrag
-from ddg_warp.kernels.terms import AXISYMMETRIC, SHELLS
+from ddg_warp.kernels.terms import AXISYMMETRIC, MAGNETS, SHELLS
 from ddg_warp.tangent import Tangent
 from ddg_warp.threads import launches
 
@@ -244,8 +244,9 @@ def stresses(model, state) -> dict[str, list[np.ndarray]]:
             for column, rod in enumerate(group.host.rods):
                 of_rod = values[rows, : group.host.count[column] - missing, :, column]
                 rods[rod] = _each_world(np.moveaxis(of_rod, (2, 1), (0, 1)))
-    for index in range(len(model.net.sets) if model.net is not None else 0):
-        _add_net_stresses(model, state, index, result)
+    for index, part in enumerate(model.net.sets if model.net is not None else ()):
+        if part.term.name not in MAGNETS:
+            _add_net_stresses(model, state, index, result)
     return result
 
 

@@ -49,6 +49,7 @@ class Stiffness:
         rotary_inertia: rho (I1 + I2) [kg m], inertia about the tangent per length.
         radius: of the drawn tube [m].
         viscosity: strain-rate damping [s], as in `Material`.
+        area: of the section [m^2], which a magnetisation needs; 0 where it is not known.
     """
 
     EA: float
@@ -59,6 +60,7 @@ class Stiffness:
     rotary_inertia: float = 0.0
     radius: float = 1e-3
     viscosity: float = 0.0
+    area: float = 0.0
 
     def stiffness(self, material: Material | None) -> "Stiffness":
         """This section itself; a material, if given, is ignored."""
@@ -91,6 +93,7 @@ def _elastic(material: Material, area, i1, i2, torsion) -> Stiffness:
         rotary_inertia=material.density * (i1 + i2),
         radius=np.sqrt(area / pi),
         viscosity=material.viscosity,
+        area=area,
     )
 
 

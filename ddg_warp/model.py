@@ -10,7 +10,7 @@ from ddg_warp.chains import compile_chains, scene_motions
 from ddg_warp.errors import SceneError
 from ddg_warp.group import Group
 from ddg_warp.io import Curves, Surfaces
-from ddg_warp.kernels import element, outcome, step
+from ddg_warp.kernels import element, step
 from ddg_warp.precision import choose, warn_of_rounding
 from ddg_warp.state import GroupState, State
 from ddg_warp.threads import launches
@@ -390,11 +390,11 @@ class Model:
         for group, data in zip(self.groups, state.groups, strict=True):
             if group.kind.twist:
                 new = arrays.allocate(data.frame.shape, self.types.real, self.wp_device)
-                moved = wp.full(group.columns, outcome.CONVERGED, dtype=int, device=self.wp_device)
+                every = wp.full(group.columns, 1, dtype=int, device=self.wp_device)
                 wp.launch(
                     step.finish_frames_kernel(group.kind, self.types.real),
                     group.element_threads,
-                    [data.x, data.frame, data.frame, group.count, moved, group.still],
+                    [data.x, data.frame, data.frame, group.count, every],
                     [new],
                     device=self.wp_device,
                 )
@@ -498,7 +498,7 @@ def _numbers(what: str, values) -> np.ndarray:
 
 def needs_net(scene) -> bool:
     """Whether a scene has anything but rods on their own."""
-    return bool(scene.shells or scene.joints or scene.attachments or scene.axisymmetric_shells)
+    return bool(scene.shells or scene.joints or scene.attachments or scene.magnets or scene.axisymmetric_shells)
 
 
 def _node_radius(batch) -> np.ndarray:

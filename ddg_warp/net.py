@@ -31,14 +31,6 @@ class NetRod:
     all_nodes: np.ndarray  # with ghosts
     all_edges: np.ndarray
 
-    def stiffness(self, edges) -> np.ndarray:
-        """EI1, EI2 and GJ of the section (3, ...) on edges, counted with ghosts, which have those of the edge beside them."""
-        batch, (before, _) = self.piece.batch, self.piece.ghosts
-        edges = np.clip(np.asarray(edges) - before, 0, batch.edges - 1)
-        values = (batch.section.EI1, batch.section.EI2, batch.section.GJ)
-        shape, rod = (batch.rods, batch.edges), self.rod - batch.first
-        return np.array([np.broadcast_to(np.asarray(value, float), shape)[rod, edges] for value in values])
-
 
 @dataclass
 class NetShell:
@@ -93,6 +85,7 @@ class Net:
         rods, shells, meridians: what the net was made from.
         sets: elements by term.
         ends: nodes of every rod edge (rod_edges, 2); frame: director and tangent of it (6, rod_edges).
+        stiffness: EI1, EI2 and GJ of its section (3, rod_edges) [N m^2].
         mass: of every dof (N, 3) [kg, kg m^2]; fixed: held dofs (N, 3).
         load: dead forces (N, 3); timed: those that change; pressures, bands, couples, edge_couples: loads that follow what they act on.
         held: what each support of `scene.supports`, then of `scene.shell_supports` and `scene.ring_supports`, holds here.
@@ -110,6 +103,7 @@ class Net:
     sets: list[NetSet]
     ends: np.ndarray
     frame: np.ndarray
+    stiffness: np.ndarray
     mass: np.ndarray
     fixed: np.ndarray
     load: np.ndarray

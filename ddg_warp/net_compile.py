@@ -9,7 +9,7 @@ import numpy as np
 
 from ddg_warp import axisymmetric, drag, net_conditions, net_elements, shell_geometry
 from ddg_warp import shells as shell_terms
-from ddg_warp.chains import Ghosts, Piece, net_rods, pieces_of
+from ddg_warp.chains import Ghosts, Piece, alike, net_rods, piece_of
 from ddg_warp.errors import SceneError
 from ddg_warp.net import Net, NetRod, NetShell
 from ddg_warp.structures import COINCIDE
@@ -27,25 +27,18 @@ def compile_net(scene) -> Net | None:
         return None
     if scene.shells and scene.dimension == 2:
         raise SceneError("a scene with shells has dimension 3; leave dimension=2 to rods")
-    builder, ghosts, spatial = _Builder(scene), Ghosts(scene), spatial_scene(scene)
-    laws = drag.law_of_rods(scene)
+    builder, ghosts, laws = _Builder(scene), Ghosts(scene), drag.Laws(scene)
     for batch in scene.batches:
         if chosen[batch.first : batch.first + batch.rods].any():
             if scene.dimension == 2:
                 batch = _spatial(batch)
-            for piece in pieces_of(spatial, batch, ghosts, laws, chosen):
-                for row, rod in enumerate(piece.rods):
-                    builder.add_rod(piece, row, int(rod))
+            for run in (run for part in alike(3, batch, ghosts, laws, chosen) for run in part.runs):
+                builder.add_rods(piece_of(run, ghosts, laws))
     for shell in scene.shells:
         builder.add_shell(shell)
     for shell in scene.axisymmetric_shells:
         builder.add_meridian(shell)
     return builder.finish()
-
-
-def spatial_scene(scene):
-    """The scene as one of dimension 3, for what is compiled as in space."""
-    return scene.copy(dimension=3) if scene.dimension == 2 else scene
 
 
 def _spatial(batch):
@@ -72,26 +65,29 @@ class _Builder:
         self.rods: dict[int, NetRod] = {}
         self.shells: list[tuple] = []
         self.meridians: list[np.ndarray] = []
+        self.numbers: list[tuple[np.ndarray, np.ndarray]] = []  # of the nodes and of the angles of some rods
         self.rod_edges = 0
         self.frames: list[np.ndarray] = []
+        self.stiffness: list[np.ndarray] = []
         self.ends: list[np.ndarray] = []
 
-    def add_rod(self, piece: Piece, row: int, rod: int) -> None:
-        """Number a rod's nodes and angles."""
-        x = piece.x[row]
-        nodes = self._number(x)
-        closed = piece.kind.closed
-        edges = len(x) - (0 if closed else 1)
-        angles = np.zeros(0, int)
+    def add_rods(self, piece: Piece) -> None:
+        """Number the nodes and angles of rods."""
+        (rods, n, _), closed, (before, after) = piece.x.shape, piece.kind.closed, piece.ghosts
+        nodes = self._number(piece.x.reshape(-1, 3)).reshape(rods, n)
+        edges = n - (0 if closed else 1)
+        angles = np.zeros((rods, 0), int)
         if piece.kind.twist:
-            angles = self.rod_edges + np.arange(edges)
-            self.rod_edges += edges
-            self.frames.append(np.concatenate([piece.director[row].T, piece.tangent[row].T]))
-            self.ends.append(np.column_stack([nodes[:edges], np.roll(nodes, -1)[:edges]]))
-        before, after = piece.ghosts
-        own = slice(before, len(x) - after)
-        own_edges = angles[before : edges - after] if angles.size else angles
-        self.rods[rod] = NetRod(rod, nodes[own], own_edges, before, piece, row, nodes, angles)
+            angles = self.rod_edges + np.arange(rods * edges).reshape(rods, edges)
+            self.rod_edges += angles.size
+            self.frames.append(np.concatenate([v.reshape(-1, 3).T for v in (piece.director, piece.tangent)]))
+            self.stiffness.append(np.array([np.broadcast_to(v, angles.shape).ravel() for v in piece.stiffness]))
+            self.ends.append(np.stack([nodes[:, :edges], np.roll(nodes, -1, axis=1)[:, :edges]], -1).reshape(-1, 2))
+        self.numbers.append((nodes, angles))
+        own, own_edges = nodes[:, before : n - after], angles[:, before : edges - after]
+        for row, rod in enumerate(piece.rods.tolist()):
+            places = nodes[row], angles[row]
+            self.rods[rod] = NetRod(rod, own[row], own_edges[row], before, piece, row, *places)
 
     def add_shell(self, shell) -> None:
         """Number a shell's vertices."""
@@ -113,10 +109,10 @@ class _Builder:
         merged = self._merge(points)
         rest_nodes = np.zeros((merged.max() + 1, 3))
         rest_nodes[merged[::-1]] = points[::-1]  # the first of the merged nodes says where
-        for rod in self.rods.values():
-            rod.nodes, rod.all_nodes = merged[rod.nodes], merged[rod.all_nodes]
         nodes = len(rest_nodes)
-        ends = merged[np.concatenate(self.ends)] if self.ends else np.zeros((0, 2), int)
+        for numbers, places in self.numbers:  # which the rods look at
+            numbers[:], places[:] = merged[numbers], places + nodes
+        ends = merged[np.concatenate([np.zeros((0, 2), int), *self.ends])]
         shells, mesh_edges = [], 0
         for (surface, numbers), shell in zip(self.shells, scene.shells, strict=True):
             kinds, supports = self._kinds(surface, len(shells))
@@ -142,8 +138,6 @@ class _Builder:
         angles = self.rod_edges + mesh_edges
         spins = sum(joint.rigid for joint in scene.joints)
         rods = sorted(self.rods.values(), key=lambda rod: rod.rod)
-        for rod in rods:
-            rod.edges, rod.all_edges = rod.edges + nodes, rod.all_edges + nodes
         blocks = nodes + angles + spins
         net = Net(
             rest=np.concatenate([rest_nodes, np.zeros((blocks - nodes, 3))]),
@@ -154,7 +148,8 @@ class _Builder:
             shells=shells,
             sets=[],
             ends=ends,
-            frame=np.concatenate(self.frames, axis=1) if self.frames else np.zeros((6, 0)),
+            frame=np.concatenate([np.zeros((6, 0)), *self.frames], axis=1),
+            stiffness=np.concatenate([np.zeros((3, 0)), *self.stiffness], axis=1),
             mass=np.zeros((blocks, 3)),
             fixed=np.zeros((blocks, 3), bool),
             load=np.zeros((blocks, 3)),
@@ -176,30 +171,26 @@ class _Builder:
 
     def _merge(self, points: np.ndarray) -> np.ndarray:
         """New number of every node; joined ones share theirs."""
-        pairs = []
-
-        def unite(i, j, what):
-            gap = np.linalg.norm(points[i] - points[j])
-            if gap > COINCIDE * max(1e-300, np.abs(points[[i, j]]).max()):
-                raise SceneError(f"{what} lie {gap:.3g} m apart at rest; what is joined starts at one point")
-            pairs.append((i, j))
-
+        pairs, what = [], []
         for number, joint in enumerate(self.scene.joints):
-            places = []
-            for rod, node in joint.members:
-                places.append(self.rods[rod].nodes[node])
-            for place in places[1:]:
-                unite(places[0], place, f"joint {number}: its members")
+            first, *others = (self.rods[rod].nodes[node] for rod, node in joint.members)
+            pairs += [(first, other) for other in others]
+            what += [f"joint {number}: its members"] * len(others)
         for link in self.scene.attachments:
-            nodes, vertices = self.rods[link.rod].nodes, self.shells[link.shell][1]
-            for node, vertex in zip(link.nodes, link.vertices, strict=True):
-                unite(nodes[node], vertices[vertex], f"node {node} of rod {link.rod} and vertex {vertex}")
+            nodes, vertices = self.rods[link.rod].nodes[link.nodes], self.shells[link.shell][1][link.vertices]
+            pairs += zip(nodes, vertices, strict=True)
+            places = zip(link.nodes, link.vertices, strict=True)
+            what += [f"node {node} of rod {link.rod} and vertex {vertex}" for node, vertex in places]
         if not pairs:
             return np.arange(len(points))
+        first, second = np.array(pairs).T
+        gap = np.linalg.norm(points[first] - points[second], axis=1)
+        size = np.abs(points[np.array(pairs)]).max(axis=(1, 2))
+        for i in np.flatnonzero(gap > COINCIDE * np.maximum(1e-300, size))[:1]:
+            raise SceneError(f"{what[i]} lie {gap[i]:.3g} m apart at rest; what is joined starts at one point")
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
-        first, second = np.array(pairs).T
         graph = coo_array((np.ones(len(first)), (first, second)), shape=(len(points), len(points)))
         return connected_components(graph, directed=False)[1]
 

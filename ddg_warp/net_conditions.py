@@ -19,7 +19,7 @@ def add_masses(scene, net: Net) -> None:
     for rod in net.rods:
         np.add.at(net.mass, rod.all_nodes, rod.piece.mass[rod.row][:, None])
         if rod.all_edges.size:
-            net.mass[rod.all_edges, 0] += np.broadcast_to(rod.piece.rotary[rod.row], rod.all_edges.shape)
+            net.mass[rod.all_edges, 0] += rod.piece.rotary[rod.row]
     for shell, description in zip(net.shells, scene.shells, strict=True):
         weight = shell.plate.area * shell.plate.thickness * description.material.density / 3.0
         np.add.at(net.mass, shell.nodes[shell.surface.triangles], np.repeat(weight[:, None, None], 3, 1))

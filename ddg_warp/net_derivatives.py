@@ -1,5 +1,5 @@
-"""The derivative table of the terms of nets: shells, shells of revolution, rigid joints and glued edges. `ddg_warp.derivatives`
-says what the checks mean.
+"""The derivative table of the terms of nets: shells, shells of revolution, rigid joints, glued edges, magnets.
+`ddg_warp.derivatives` says what the checks mean.
 
 Every element of the sample has blocks of its own, so that a change of one block is seen by one element alone:
 
@@ -14,16 +14,19 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
+from ddg_warp.derivatives import raised
 from ddg_warp.geometry import signed_angle, transport, unit
+from ddg_warp.kernels.densities.dipole import dipole_dipole
+from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.net import elements as net_elements
-from ddg_warp.kernels.terms import AXISYMMETRIC, GLUE, JOINT, SHELLS, Term
+from ddg_warp.kernels.terms import AXISYMMETRIC, GLUE, JOINTS, MAGNETS, SHELLS, Term
 from ddg_warp.precision import PRECISIONS
 from ddg_warp.samples import rotation
 
 ELEMENTS = 8
 TRAP = 2.0**-30
 INPUTS = ("q", "frame", "lag", "last", "rate", "buffer")
-TERMS = {**SHELLS, **AXISYMMETRIC, JOINT.name: JOINT, GLUE.name: GLUE}
+TERMS = {**SHELLS, **AXISYMMETRIC, **JOINTS, GLUE.name: GLUE, **MAGNETS}
 KINDS = np.array([[0, 1, 2], [1, 2, 3], [2, 3, 0], [3, 0, 1], [1, 1, 1], [0, 1, 1], [1, 3, 1], [1, 2, 0]])  # of edges
 
 
@@ -80,31 +83,31 @@ class NetSample:
             zeros(2, ELEMENTS),
             zeros(ELEMENTS),
         ]
-        flags = [wp.full(1, value, dtype=int, device=self.device) for value in (0, 0, 1)]  # the last: projected
+        search = Islands(1, real, self.device)
+        search.clamped.fill_(1)
         kernel = net_elements.evaluate_kernel(self.term, real, real)
-        wp.launch(kernel, ELEMENTS, [*self._inputs(real), *flags], out, device=self.device)
+        wp.launch(kernel, ELEMENTS, [self._elements(real), *search.arrays], out, device=self.device)
         factor, tension, gradient, energy = (array.numpy().astype(float) for array in out[:4])
         rows = factor.reshape(n, slots, ELEMENTS, 3).transpose(0, 1, 3, 2).reshape(n, 3 * slots, ELEMENTS)
         return rows, tension[: self.measure.tensions], gradient, energy[1]
 
     def reverse(self, which: int, seed: np.ndarray, real) -> dict[str, np.ndarray]:
         """Reverse mode of the energy (which = 0) or gradient (1) kernel, by input."""
-        inputs = self._inputs(real, requires_grad=True)
-        adjoints = [wp.zeros_like(array) for array in inputs[: len(INPUTS)]]
+        given = self._elements(real)
         dtype = wp.types.vector(3, real) if which else real
         seeds = wp.array(np.ascontiguousarray(seed), dtype=dtype, device=self.device)
         wp.launch(
             net_elements.term_kernels(self.term, real, reverse=True)[which],
             ELEMENTS,
-            inputs,
+            [given],
             [wp.zeros_like(seeds, requires_grad=True)],
             adjoint=True,
-            adj_inputs=[*adjoints, *[None] * (len(inputs) - len(adjoints))],
+            adj_inputs=[net_elements.elements_type(real)()],
             adj_outputs=[seeds],
             device=self.device,
         )
-        values = (array.numpy().astype(float) for array in adjoints)
-        return {name: v.reshape(self.data[name].shape) for name, v in zip(INPUTS, values, strict=True)}
+        values = {name: getattr(given, name).grad.numpy().astype(float) for name in INPUTS}
+        return {name: v.reshape(self.data[name].shape) for name, v in values.items()}
 
     def difference(self, function, name: str, where) -> np.ndarray:
         """Central difference of fourth order of function(**data) along data[name][where]."""
@@ -175,6 +178,11 @@ class NetSample:
             measure.name, (3, 6, 9) if measure.name.startswith("midedge") else ()
         )
         rows["last"] = (0,) if measure.name == "isometric_bending" and self.term.density.lagged else ()
+        if measure.field:
+            first = measure.data_size - measure.field
+            rows["constants"] = (first,)
+            gradient = data["constants"][first + 3 :].reshape(3, 3, -1)
+            data["constants"][first + 3 :] = np.einsum("ia,abe,jb->ije", turn, gradient, turn).reshape(9, -1)
         for name, starts in rows.items():
             for at in starts:
                 data[name][at : at + 3] = turn @ data[name][at : at + 3]
@@ -192,25 +200,28 @@ class NetSample:
                 buffer[row] = buffer[self.term.parameter_names.index(f"{parameter.family}_1")]
         return NetSample(self.term, self.device, self.exact_in_float32, {**self.data, "buffer": buffer})
 
-    def _inputs(self, real, requires_grad: bool = False, **changed) -> list:
-        data = {**self.data, **changed}
-        vector = wp.types.vector(3, real)
-        out = []
+    def _elements(self, real, **changed):
+        """What kernels read; see `kernels.net.elements.elements_type`."""
+        data, given = {**self.data, **changed}, net_elements.elements_type(real)()
+
+        def put(values, dtype):
+            return wp.array(
+                np.ascontiguousarray(values), dtype=dtype, device=self.device, requires_grad=dtype is not int
+            )
+
         for name in INPUTS:
             values = data[name].ravel() if name == "buffer" else data[name]
-            dtype = vector if name == "q" else real
-            array = wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device, requires_grad=requires_grad)
-            out.append(array)
-        table = np.array([(row * ELEMENTS, 1, 0) for row in range(len(data["buffer"]))], np.int32)
-        integers = [wp.array(v, dtype=int, device=self.device) for v in (table, self.slots.astype(np.int32))]
-        constants = wp.array(np.ascontiguousarray(data["constants"]), dtype=real, device=self.device)
-        return [*out, *integers, constants, self.slots.size, self.angle_start, ELEMENTS]
+            setattr(given, name, put(values, wp.types.vector(3, real) if name == "q" else real))
+        given.table = put(np.array([(row * ELEMENTS, 1, 0) for row in range(len(data["buffer"]))], np.int32), int)
+        given.slots, given.data = put(self.slots.astype(np.int32), int), put(data["constants"], real)
+        given.blocks, given.angle_start, given.elements = self.slots.size, self.angle_start, ELEMENTS
+        return given
 
     def _launch(self, which: int, real, shapes, vectors=False, columns=(), extra=(), **changed) -> list[np.ndarray]:
         dtype = wp.types.vector(3, real) if vectors else real
         out = [wp.zeros(shape, dtype=dtype, device=self.device) for shape in shapes]
         kernel = net_elements.term_kernels(self.term, real, reverse=True)[which]
-        wp.launch(kernel, (ELEMENTS, *columns), [*self._inputs(real, **changed), *extra], out, device=self.device)
+        wp.launch(kernel, (ELEMENTS, *columns), [self._elements(real, **changed), *extra], out, device=self.device)
         return [array.numpy().astype(float) for array in out]
 
 
@@ -254,6 +265,13 @@ def _random_state(sample: NetSample) -> dict[str, np.ndarray]:
         data["frame"] = np.concatenate([u0, t0], axis=1).T
         turns = 2.0 * np.pi * random.integers(-2, 3, size=(2, ELEMENTS))
         data["lag"] = signed_angle(u, sides, unit(e)) + turns + 0.3 * random.normal(size=turns.shape)
+    if sample.term.name in MAGNETS:
+        constants[:] = random.normal(size=constants.shape)
+        frames = []
+        for a, b in measure.edges[: measure.frames]:  # some 20 degrees away
+            t = unit(unit(q[sample.slots[b]] - q[sample.slots[a]]) + 0.3 * random.normal(size=(ELEMENTS, 3)))
+            frames.append(np.concatenate([unit(np.cross(t, random.normal(size=t.shape))).T, t.T]))
+        data["frame"] = np.concatenate(frames, axis=1) if frames else data["frame"]
     if measure.spins:
         constants[0] = np.where(np.arange(ELEMENTS) % 2, 1.0, -1.0)
         tangent = unit(q[sample.slots[1]] - q[sample.slots[0]])
@@ -341,8 +359,11 @@ def lagged(case: NetCase) -> float:
     names += ["last"] if case.term.density.lagged else []
     errors = []
     for name in names:
-        expected = [case.difference(name, (row,)) for row in range(len(case.sample.data[name]))]
-        errors.append(_relative(case.reverse[name], np.array(expected)))
+        rows, columns = case.sample.data[name].shape
+        for first in range(0, columns, ELEMENTS):  # one frame of every element
+            there = slice(first, first + ELEMENTS)
+            expected = [case.difference(name, (row, there)) for row in range(rows)]
+            errors.append(_relative(case.reverse[name][:, there], np.array(expected)))
     if case.term.density.lagged:
         errors.append(_relative(case.reverse["rate"], case.difference("rate", ...).sum()))
     return max(errors, default=0.0)
@@ -367,7 +388,12 @@ def factor(case: NetCase) -> float:
     strain_rate, stress_rate = (
         sample.block_derivative(lambda i=i, **data: sample.strains(**data)[i]) for i in range(2)
     )
-    w, (_, stress) = sample.data["buffer"][0], sample.strains()
+    w, (strain, stress) = sample.data["buffer"][0], sample.strains()
+    if measure.field:  # of a direction n in a field -s what is positive of the curvature along the sphere, -n . s
+        aligned = np.maximum(0.0, -(strain[:3] * stress[:3]).sum(0)) * (np.arange(6) < 3)[:, None]
+        stress_rate = aligned[:, None] * strain_rate
+    if case.term.density is dipole_dipole:
+        stress_rate = raised(strain_rate, stress_rate)
     expected = w * np.einsum("mae,mbe->abe", strain_rate, stress_rate)
     if measure.tensions == 1:
         expected += _on_edges(sample, (w * np.maximum(stress[0], 0.0))[:, None, None])
@@ -386,6 +412,8 @@ def definite(case: NetCase) -> float:
 
 def rest(case: NetCase) -> float:
     sample = case.sample
+    if not case.term.rest:
+        return 0.0  # a dipole has no rest shape
     strain = sample.strains()[0]
     buffer = sample.data["buffer"].copy()
     buffer[[case.term.parameter_names.index(name) for name in case.term.rest]] = strain

@@ -74,7 +74,8 @@ def _elements(net: Net, rod: NetRod, edges, shell: NetShell, mesh_edges, bending
     frame, tangent = piece.director[rod.row][k], piece.tangent[rod.row][k]
     angle = np.stack([geometry.signed_angle(np.broadcast_to(frame, e.shape), side, tangent) for side in sides])
     rest = -(1.0 - share) * angle[0] - share * angle[1]
-    stiffness = GLUE / (length**2 / rod.stiffness(k).max(axis=0) + 1.0 / _bending(shell, mesh_edges, heights))
+    section = net.stiffness[:, rod.edges[edges] - net.nodes].max(axis=0)
+    stiffness = GLUE / (length**2 / section + 1.0 / _bending(shell, mesh_edges, heights))
     angles = rod.edges[edges], np.where(turns, shell.edges[mesh_edges], rod.edges[edges])
     owner = np.array([np.full(len(edges), rod.rod), k])
     data = np.stack([share, np.where(turns, along, 0.0)])
@@ -103,7 +104,7 @@ def follow(net, state, angles: bool, rates: bool) -> None:
             _turn(state.q, edges, np.where(free, rest - strain.numpy().reshape(shape), 0.0))
         if rates:
             net.strains(state, index, strain, stress)
-            inputs = [*net.inputs(part, state, index), state.v]
+            inputs = [net.elements(state, index), state.v]
             wp.launch(term_kernels(TERM, net.real)[4], edges.size, inputs, [next_stress], device=net.device)
             slip = (next_stress.numpy() - stress.numpy()).reshape(shape) / np.where(stiffness > 0.0, stiffness, 1.0)
             _turn(state.v, edges, np.where(free, -slip, 0.0))

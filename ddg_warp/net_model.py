@@ -18,7 +18,7 @@ class NetState:
         q, v: blocks (W N,) of positions [m], angles and rotation vectors since the last step [rad], and their rates.
         frame: director and tangent of rod edges (6, W edges).
         lag: own lagged rows of each element set (rows, W E); last: strains of each damped set at this state.
-        data: data (rows, W E) of those sets, by index, with normals among them that supports turn.
+        data: data (rows, W E) of those sets, by index, that have normals among them that supports turn, or the magnetic field.
     """
 
     q: wp.array
@@ -119,12 +119,16 @@ class DeviceNet:
             state.lag.append(zeros(rows, count if rows else 1))
             strains = len(part.term.measure.strains) if part.term.density.lagged else 0
             state.last.append(zeros(strains, count if strains else 1))
-        state.data = self.turning_data()
+        state.data = self.turning_data() | self.field_data()
         return state
 
     def turning_data(self) -> dict[int, wp.array]:
         """Data of the sets with normals that supports turn, as at rest."""
         return {i: part.own_data() for i, part in enumerate(self.sets) if len(part.turning)}
+
+    def field_data(self) -> dict[int, wp.array]:
+        """Data of the sets that are in a magnetic field, in that of the rest state."""
+        return {i: part.own_data() for i, part in enumerate(self.sets) if part.term.measure.field}
 
     def rest(self) -> NetState:
         """The rest state."""
@@ -137,21 +141,15 @@ class DeviceNet:
                 lag.assign(np.tile(part.host.lag, (1, self.worlds)))
         return state
 
-    def inputs(self, part: DeviceSet, state: NetState, index: int, q=None, rate=None) -> list:
-        """What every kernel of a term reads."""
-        return [
-            state.q if q is None else q,
-            state.frame,
-            state.lag[index],
-            state.last[index],
-            self.still if rate is None else rate,
-            *part.parameters.arrays,
-            part.slots,
-            state.data.get(index, part.data),
-            self.blocks,
-            self.angle_start,
-            part.elements,
-        ]
+    def elements(self, state: NetState, index: int, q=None, rate=None):
+        """What every kernel of a term reads of set `index` at a state, or at other dofs `q`, at rest or at a rate."""
+        part, given = self.sets[index], elements.elements_type(self.real)()
+        given.q, given.frame = state.q if q is None else q, state.frame
+        given.lag, given.last, given.rate = state.lag[index], state.last[index], self.still if rate is None else rate
+        (given.buffer, given.table), given.slots = part.parameters.arrays, part.slots
+        given.data = state.data.get(index, part.data)
+        given.blocks, given.angle_start, given.elements = self.blocks, self.angle_start, part.elements
+        return given
 
     def strains(self, state: NetState, index: int, strain: wp.array, stress: wp.array | None = None) -> None:
         """Strains of a set (strains, W E), and stresses if asked for."""
@@ -159,7 +157,7 @@ class DeviceNet:
         wp.launch(
             elements.term_kernels(part.term, self.real)[3],
             self.worlds * part.elements,
-            self.inputs(part, state, index) + [int(stress is not None)],
+            [self.elements(state, index), int(stress is not None)],
             [strain, strain if stress is None else stress],
             device=self.device,
         )
@@ -194,7 +192,7 @@ class DeviceNet:
         )
         for part, same, old, new in zip(self.sets, kept.lag, before.lag, after.lag, strict=True):
             measure, dim = part.term.measure, self.worlds * part.elements
-            if measure.frames:
+            if len(part.host.lag):
                 inputs = [after.q, after.frame, part.slots, part.data, self.blocks, self.angle_start, self.edges]
                 launch(frames.lag_kernel(measure, real), dim, [*inputs, moved, same, old], [new])
         self.reset_spins(after.q)

@@ -7,6 +7,7 @@ import warp as wp
 
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.drag import block_inertia
+from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.net import elements, krylov, newton, system
 from ddg_warp.linear.multilevel import Multilevel
 from ddg_warp.linear.net_chain import Chains
@@ -75,22 +76,21 @@ class NetNewton:
         self.inverse = make(self.all, M)
         self.matrix = make((9, worlds * self.system.positions), self.linear)
         self.krylov_dots = make((worlds, blocks), self.linear)
-        self.status, self.slot, self.iteration, self.halvings, self.unbalanced = flags(5)
-        self.drowned, self.turned, self.wanted, self.todo, self.iterations, self.lost, self.projected = flags(7)
-        (self.stalled,), (self.best,) = flags(), scalars()
-        self.coefficient, self.rate, self.step_length, self.decrement, self.merit = scalars(5)
-        self.load_scale, self.residual, self.sum_change, self.sum_noise, self.sum_square = scalars(5)
+        self.islands = Islands(worlds, self.real, device)
+        self.iterations, self.stalled = flags(2)
+        self.sum_change, self.sum_noise, self.sum_square, self.best = scalars(4)
         self.decrease, self.turn, self.worst, self.goal = scalars(4)
         self.goal.fill_(math.inf)
         self.forcing, self.rho, self.rho_first, self.total, self.curvature = scalars(5, self.linear)
-        self.active, self.busy = make(1, int), make(1, int)
+        self.busy = make(1, int)
         self.pcg_work = make(1, wp.int64)
         self.parts = [self._part(part, make, H) for part in net.sets]
         ends = host.edges
         self.ends = wp.array(np.ascontiguousarray(ends, np.int32), dtype=int, device=device)
         # curvature is linear in the angles of mesh edges: they need no cap, which would shorten the steps of all else
         capless = np.concatenate([np.zeros(0, int), *(shell.edges for shell in host.shells)])
-        spins = np.setdiff1d(np.arange(host.nodes, blocks), capless)
+        spins = np.arange(host.nodes, blocks)
+        spins = spins[~np.isin(spins, capless)]
         self.spins = wp.array(spins.astype(np.int32), dtype=int, device=device)
         turning = len(ends) + len(spins)
         self.turns = make((worlds, turning), self.real)
@@ -143,11 +143,11 @@ class NetNewton:
 
     def solve(self, state) -> None:
         """Iterate until no world is active, with the lagged data of `state`; can be captured."""
-        wp.capture_while(self.active, lambda: self.iterate(state))
+        wp.capture_while(self.islands.active, lambda: self.iterate(state))
 
     def iterate(self, state) -> None:
         """One iteration of every active world."""
-        self.active.zero_()
+        self.islands.active.zero_()
         self.evaluate(state)
         self.balance()
         self.judge()
@@ -163,8 +163,7 @@ class NetNewton:
             wp.launch(
                 kernel,
                 self.worlds * part.elements,
-                self.net.inputs(part, state, index, q=self.q, rate=self.rate)
-                + [self.status, self.slot, self.projected],
+                [self.net.elements(state, index, self.q, self.islands.rate), *self.islands.arrays],
                 [own["factor"], own["tension"], own["gradient"], own["energy"], own["stiffness"]],
                 device=self.device,
                 block_dim=128,
@@ -172,39 +171,40 @@ class NetNewton:
 
     def balance(self) -> None:
         """Residuals, the change of the energy, and the worlds that are out of equilibrium."""
-        net, options, blocks = self.net, self.options, self.net.blocks
+        net, options, islands, blocks = self.net, self.options, self.islands, self.net.blocks
         self.outer_forces()
         for part, own, (starts, items) in zip(net.sets, self.parts, self.system.meets, strict=True):
             self._launch(
                 self._collect,
                 [own["gradient"], own["energy"], own["stiffness"], starts, items, part.term.measure.slots]
-                + [part.elements, self.status, self.slot, blocks],
+                + [part.elements, self.islands.status, self.islands.slot, blocks],
                 [self.force, self.size, self.stiffness, self.change, self.noise],
             )
         if self.planes:
             self.planes.forces(self.force)
         self._launch(
             self._settle,
-            [self.q, self.force, self.size, self.stiffness, self.fixed, self.status, self.load_scale]
+            [self.q, self.force, self.size, self.stiffness, self.fixed, *self.islands.arrays]
             + [self.allowed.blocks, blocks, net.host.nodes, self.arm, self.longest]
             + [options.rtol, options.floor_factor * self.eps],
-            [
-                self.right,
-                self.allowed.least,
-                self.allowed.ratio,
-                self.square,
-                self.noise,
-                self.unbalanced,
-                self.drowned,
-            ],
+            [self.right, self.allowed.least, self.allowed.ratio, self.square, self.noise],
         )
-        self.allowed.sum_up(self.right, options.rtol, self.load_scale, self.status, self.unbalanced, self.drowned)
+        self.allowed.sum_up(self.right, options.rtol, islands, islands.unbalanced, islands.drowned)
 
     def outer_forces(self) -> None:
         """Begin the sums at every block: loads, gravity and inertia."""
         self._launch(
             self._outer,
-            [self.q, self.base, self.target, self.mass, self.gravity, self.load, self.coefficient, self.status]
+            [
+                self.q,
+                self.base,
+                self.target,
+                self.mass,
+                self.gravity,
+                self.load,
+                self.islands.coefficient,
+                self.islands.status,
+            ]
             + [self.net.blocks, self.net.host.nodes],
             [self.force, self.size, self.stiffness, self.change, self.noise],
         )
@@ -222,35 +222,33 @@ class NetNewton:
             [self.sum_change, self.sum_noise, self.sum_square, self.worst, options.rtol]
             + [options.floor_factor * self.eps]
             + [options.max_iterations, options.max_halvings, LOOSEST, options.linear_rtol, SPARE]
-            + [self.status, self.unbalanced, self.drowned, self.slot, self.iteration, self.halvings]
-            + [self.step_length, self.decrement, self.merit, self.load_scale, self.residual, self.turned]
-            + [self.best, self.stalled, self.forcing, self.goal, self.wanted, self.todo, self.active],
+            + [*self.islands.arrays, self.best, self.stalled, self.forcing, self.goal],
             device=self.device,
         )
 
     def assemble(self) -> None:
         """H of the worlds that want a direction."""
-        self._assembly(self.mass, self.coefficient, self.wanted, self.matrix)
+        self._assembly(self.mass, self.islands.coefficient, self.islands.wanted, self.matrix)
         if self.planes:
-            self.planes.matrix(self.matrix, self.wanted)
+            self.planes.matrix(self.matrix, self.islands.wanted)
 
     def direct(self) -> None:
         """Directions by conjugate gradients."""
         table, blocks = self.system, self.net.blocks
         self._launch(
             self._invert,
-            [self.matrix, table.diagonal, self.fixed, self.wanted, blocks, table.positions],
+            [self.matrix, table.diagonal, self.fixed, self.islands.wanted, blocks, table.positions],
             [self.inverse],
         )
         self._launch(
             self._start,
-            [self.right, self.inverse, self.wanted, blocks],
+            [self.right, self.inverse, self.islands.wanted, blocks],
             [self.rest, self.direction, self.p, self.krylov_dots],
         )
         if self.chains:
-            self.chains.prepare(self.matrix, self.inverse, self.fixed, self.wanted)
+            self.chains.prepare(self.matrix, self.inverse, self.fixed, self.islands.wanted)
         if self.levels:
-            self.levels.prepare(self.matrix, self.fixed, self.wanted)
+            self.levels.prepare(self.matrix, self.fixed, self.islands.wanted)
         self.precondition(self.p)
         self._sum_linear(self.krylov_dots, self.total)
         self.busy.zero_()
@@ -258,7 +256,7 @@ class NetNewton:
             self._begin,
             self.worlds,
             [self.total],
-            [self.wanted, self.rho, self.rho_first, self.iterations, self.projected, self.busy],
+            [self.islands.wanted, self.rho, self.rho_first, self.iterations, self.islands.clamped, self.busy],
             device=self.device,
         )
         wp.capture_while(self.busy, self.reduce)
@@ -267,24 +265,24 @@ class NetNewton:
         """Iterate until the residual is small in the norm of the preconditioner, and go on where the tolerance says that it is not."""
         wp.capture_while(self.busy, self.cycle)
         self._launch(
-            self._compare, [self.rest, self.allowed.blocks, self.wanted, self.net.blocks], [self.allowed.ratio]
+            self._compare, [self.rest, self.allowed.blocks, self.islands.wanted, self.net.blocks], [self.allowed.ratio]
         )
-        self.allowed.sum_up(self.rest, self.options.rtol, self.load_scale, self.status, *self._unread)
+        self.allowed.sum_up(self.rest, self.options.rtol, self.islands, *self._unread)
         self._worst(self.allowed.ratio, self.worst)
         wp.launch(
             self._confirm,
             self.worlds,
             [self.worst, self.goal, self.options.linear_rtol],
-            [self.forcing, self.wanted, self.busy],
+            [self.forcing, self.islands.wanted, self.busy],
             device=self.device,
         )
 
     def precondition(self, z: wp.array) -> None:
         """What chains and levels make of z, which holds the residual times the inverses of the diagonal blocks."""
         if self.chains:
-            self.chains.apply(self.matrix, self.rest, self.fixed, self.wanted, z, self.krylov_dots)
+            self.chains.apply(self.matrix, self.rest, self.fixed, self.islands.wanted, z, self.krylov_dots)
         if self.levels:
-            self.levels.apply(self.rest, self.fixed, self.wanted, z, self.krylov_dots)
+            self.levels.apply(self.rest, self.fixed, self.islands.wanted, z, self.krylov_dots)
 
     def cycle(self) -> None:
         """One iteration of conjugate gradients."""
@@ -293,48 +291,66 @@ class NetNewton:
         self.busy.zero_()
         self._launch(
             product,
-            [self.matrix, table.columns, table.slices, self.fixed, self.p, self.wanted, blocks, table.positions],
+            [
+                self.matrix,
+                table.columns,
+                table.slices,
+                self.fixed,
+                self.p,
+                self.islands.wanted,
+                blocks,
+                table.positions,
+            ],
             [self.product, self.krylov_dots],
         )
         self._sum_linear(self.krylov_dots, self.curvature)
         self._launch(
             advance,
-            [self.p, self.product, self.inverse, self.rho, self.curvature, self.iterations, self.wanted, blocks],
+            [
+                self.p,
+                self.product,
+                self.inverse,
+                self.rho,
+                self.curvature,
+                self.iterations,
+                self.islands.wanted,
+                blocks,
+            ],
             [self.direction, self.rest, self.z, self.krylov_dots],
         )
         self.precondition(self.z)
         self._sum_linear(self.krylov_dots, self.total)
-        self._launch(turn, [self.z, self.total, self.rho, self.wanted, blocks], [self.p])
+        self._launch(turn, [self.z, self.total, self.rho, self.islands.wanted, blocks], [self.p])
         wp.launch(
             test,
             self.worlds,
             [self.total, self.curvature, self.rho_first, self.forcing, self._limit],
-            [self.rho, self.iterations, self.projected, self.wanted, self.busy],
+            [self.rho, self.iterations, self.islands.clamped, self.islands.wanted, self.busy],
             device=self.device,
         )
 
     def take(self) -> None:
         """Lengths of the steps along the directions."""
         blocks = self.net.blocks
-        self._launch(self._measure, [self.right, self.direction, self.wanted, blocks], [self.dots])
+        self._launch(self._measure, [self.right, self.direction, self.islands.wanted, blocks], [self.dots])
         self._sum(self.dots, self.decrease)
         self.measure_turns()
         wp.launch(
             self._take,
             self.worlds,
             [self.decrease, self.turn, self.options.rotation_cap, self.iterations],
-            [self.wanted, self.status, self.step_length, self.decrement, self.todo, self.pcg_work],
+            [*self.islands.arrays, self.pcg_work],
             device=self.device,
         )
 
     def measure_turns(self) -> None:
         """Largest turn that the directions make, squared; these are in space then."""
         if self.planes:
-            self.planes.back(self.direction, self.wanted)
+            self.planes.back(self.direction, self.islands.wanted)
         wp.launch(
             self._rotate,
             self.turns.size,
-            [self.q, self.direction, self.ends, self.spins, self.wanted, self.net.blocks],
+            [self.q, self.direction, self.ends, self.spins, self.islands.wanted, self.net.blocks],
             [self.turns],
             device=self.device,
         )
@@ -342,7 +358,11 @@ class NetNewton:
 
     def move(self) -> None:
         """Take the step that is to be taken."""
-        self._launch(self._move, [self.direction, self.step_length, self.todo, self.net.blocks], [self.base, self.q])
+        self._launch(
+            self._move,
+            [self.direction, self.islands.step_length, self.islands.todo, self.net.blocks],
+            [self.base, self.q],
+        )
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
         """One thread for each block of every world."""

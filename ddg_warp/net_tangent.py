@@ -190,10 +190,10 @@ class NetTangent:
                             before, at, host.frame[:3, f], frame[:, world, f], x[1] - x[0], q[world, block, 0]
                         )
         state.net.q.assign(q.reshape(-1, 3))
-        self.turn_clamps(state, at)
+        self.prescribe(state, at)
 
-    def turn_clamps(self, state, at: float) -> None:
-        """Turn the normals that clamped mesh edges prescribe to where their motions have them at load parameter `at`."""
+    def prescribe(self, state, at: float) -> None:
+        """Put the normals that supports turn, and the magnetic field, where they are at load parameter `at`."""
         for index, data in state.net.data.items():
             part = self.net.sets[index]
             values = data.numpy().astype(np.float64)
@@ -204,6 +204,8 @@ class NetTangent:
                 turned = self.model.motions[motion].turn(at, part.turning_rest[chosen])
                 for d in range(3):
                     values[row + d, element + columns] = turned[:, d]
+            if part.term.measure.field:
+                values[-part.term.measure.field :] = self.model.scene.applied_field.at(at, at)[:, None]
             data.assign(values)
 
     def edges(self, q: np.ndarray) -> np.ndarray:
@@ -289,7 +291,7 @@ class NetTangent:
         wp.launch(
             elements.term_kernels(part.term, self.net.real)[which],
             (part.elements * self.net.worlds, *columns),
-            [*self.net.inputs(part, state.net, index), *more],
+            [self.net.elements(state.net, index), *more],
             [out],
             device=self.net.device,
         )

@@ -49,7 +49,7 @@ class Allowed:
             limit.assign(loads[:, level.body] * level.weight)
         return wp.array(given.astype(float), dtype=self._real, device=self.net.device)
 
-    def sum_up(self, right, rtol: float, load_scale, status, unbalanced, drowned) -> None:
+    def sum_up(self, right, rtol: float, islands, unbalanced, drowned) -> None:
         """Raise the flags of worlds with a part whose residuals sum up to too much."""
         value, rounding, below, kernel = right, self.least, self.net.blocks, self.kernels[0]
         place = below
@@ -57,7 +57,7 @@ class Allowed:
             wp.launch(
                 kernel,
                 (limit.shape[1], self.net.worlds),
-                [value, rounding, starts, items, below, limit, place, rtol, load_scale, status],
+                [value, rounding, starts, items, below, limit, place, rtol, islands.load_scale, islands.status],
                 [sums, squares, self.ratio, unbalanced, drowned],
                 device=self.net.device,
             )

@@ -7,6 +7,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError, check_options
 from ddg_warp.kernels import balance, chain, element, geometric, search, step
+from ddg_warp.kernels.islands import Islands
 
 EARLY = 2  # iterations that "progressive" makes by Gauss-Newton: far from a solution the exact matrix is no better
 PSD_MODES = ("auto", "gauss_newton", "project", "progressive", "none")
@@ -63,7 +64,7 @@ class ChainNewton:
         x, theta, frame: the iterate and its lagged frames; base: the accepted positions it was reached from.
         target, target_angle, coefficient: the quadratic of inertia, coefficient * m |x - target|^2 / 2.
         mass, rotary: m; with drag, of which `kernels.drag` makes them at the start of a solve, its own.
-        status, iteration, ...: state of every rod's search; see `kernels.chain`.
+        islands: state of every rod's search; see `kernels.islands`.
     """
 
     reuse = False  # whether the matrix of a step's first iterate serves the whole step
@@ -78,12 +79,6 @@ class ChainNewton:
 
         def make(*shape, dtype=self.real):
             return arrays.allocate(shape, dtype, device)
-
-        def flags():
-            return wp.zeros(columns, dtype=int, device=device)
-
-        def scalars():
-            return wp.zeros(columns, dtype=self.real, device=device)
 
         twisted = nodes if kind.twist else (1, 1)
         self.x, self.base, self.target = (make(*nodes, dtype=vector) for _ in range(3))
@@ -100,9 +95,8 @@ class ChainNewton:
         self.elimination = make(2 * kind.block**2 + kind.block, *nodes, dtype=self.linear) if not kind.closed else None
         self.right, self.direction = (make(kind.block, *nodes, dtype=self.linear) for _ in range(2))
         self.energy_change, self.energy_noise = make(*nodes), make(*nodes, dtype=self.linear)
-        self.status, self.slot, self.iteration, self.halvings = flags(), flags(), flags(), flags()
-        self.lost, self.turned, self.clamped, self.unbalanced, self.drowned = (flags() for _ in range(5))
-        self.without_compression = self.clamped  # rods whose matrix leaves the stiffness that compression takes away
+        self.islands = Islands(columns, self.real, device)
+        self.without_compression = self.islands.clamped  # rods whose matrix leaves out what compression takes away
         self.psd = self.automatic_psd() if options.psd == "auto" else options.psd
         self.exact = self.psd != "gauss_newton" and kind.span == 2  # a rod that only stretches has its Hessian anyway
         rows = kind.geometric_rows if self.exact else 1
@@ -112,10 +106,6 @@ class ChainNewton:
         if self.psd == "project" and self.exact:
             self.without_compression = wp.full(columns, 1, dtype=int, device=device)
             self._project = geometric.project_kernel(kind, self.real, self.linear)
-        self.coefficient, self.rate = scalars(), scalars()
-        self.step_length, self.decrement, self.load_scale, self.residual = scalars(), scalars(), scalars(), scalars()
-        self.todo, self.placed, self.angle_change = flags(), flags(), scalars()
-        self.active = wp.zeros(1, dtype=int, device=device)
         self.device = device
         self._evaluate = element.evaluate_kernel(kind, self.real, self.linear, self.exact_from)
         self._check = balance.check_kernel(kind, self.real, self.linear)
@@ -145,19 +135,19 @@ class ChainNewton:
         """None: the sweep is direct."""
         return 0
 
-    def predict(self, before, progress: wp.array, bent: wp.array) -> None:
-        """Redo the predictor of `bent` rods from the state `before`, with edges turned; carry frames to midpoints."""
+    def predict(self, before) -> None:
+        """Redo the predictor of bent rods from the state `before`, with edges turned; carry frames to midpoints."""
         wp.launch(
             self._predict,
             self.group.columns,
-            [before.x, before.v, self.group.fixed, self.group.count, self.rate, progress, bent],
+            [before.x, before.v, self.group.fixed, self.group.count, *self.islands.arrays],
             [self.base, self.direction, self.x, self.frame],
             device=self.device,
         )
 
     def solve(self, last: wp.array) -> None:
         """Iterate until no rod is active; can be captured. `last` holds the strains of the last step."""
-        wp.capture_while(self.active, lambda: self.iterate(last))
+        wp.capture_while(self.islands.active, lambda: self.iterate(last))
 
     def iterate(self, last: wp.array) -> None:
         """One iteration of every active rod."""
@@ -171,9 +161,9 @@ class ChainNewton:
         wp.launch(
             self._evaluate,
             group.element_threads,
-            [self.x, self.theta, self.frame, last, self.rate, *group.parameters.arrays, group.count]
-            + [self.status, self.slot, self.without_compression, self.iteration, int(self.reuse)],
-            [self.factor, self.geometric, self.gradient, self.energy, self.stiffness, self.turned, self.active],
+            [self.x, self.theta, self.frame, last, *self.islands.arrays, *group.parameters.arrays, group.count]
+            + [self.without_compression, int(self.reuse)],
+            [self.factor, self.geometric, self.gradient, self.energy, self.stiffness],
             device=self.device,
             block_dim=128,
         )
@@ -181,7 +171,7 @@ class ChainNewton:
             wp.launch(
                 self._project,
                 (group.elements, group.columns),
-                [self.x, group.count, self.status, group.kind.window, self.factor],
+                [self.x, group.count, self.islands.status, group.kind.window, self.factor],
                 [self.geometric],
                 device=self.device,
             )
@@ -192,12 +182,11 @@ class ChainNewton:
         wp.launch(
             self._check,
             group.node_threads,
-            [self.gradient, self.energy, self.stiffness, group.count, self.mass, self.rotary, self.coefficient]
+            [self.gradient, self.energy, self.stiffness, group.count, self.mass, self.rotary, *self.islands.arrays]
             + [self.x, self.theta, self.base, self.direction, self.target, self.target_angle]
             + [group.gravity, group.load, group.load_angle, int(group.host.loaded), group.fixed, group.length]
-            + [options.rtol, options.floor_factor * self.eps, self.load_scale, self.status]
-            + [self.slot, self.iteration, self.step_length, self.placed],
-            [self.right, self.energy_change, self.energy_noise, self.unbalanced, self.drowned],
+            + [options.rtol, options.floor_factor * self.eps],
+            [self.right, self.energy_change, self.energy_noise],
             device=self.device,
         )
 
@@ -208,20 +197,17 @@ class ChainNewton:
             self._sweep,
             group.columns,
             [self.factor, self.geometric, self.right, self.energy_change, self.energy_noise, group.count]
-            + [self.mass, self.rotary, self.coefficient, group.fixed]
+            + [self.mass, self.rotary, *self.islands.arrays, group.fixed]
             + [options.floor_factor * self.eps, options.rotation_cap]
             + [options.max_iterations, options.max_halvings]
-            + [self.x, self.theta, self.base, self.elimination, self.direction]
-            + [self.status, self.slot, self.iteration, self.halvings, self.step_length, self.decrement]
-            + [self.load_scale, self.residual, self.lost, self.turned, self.clamped, self.unbalanced, self.drowned]
-            + [self.angle_change, self.todo, self.placed, self.active],
+            + [self.x, self.theta, self.base, self.elimination, self.direction],
             device=self.device,
             block_dim=self._threads,
         )
         wp.launch(
             self._adjust,
             group.columns,
-            [group.count, group.fixed, self.direction, self.step_length, self.angle_change],
-            [self.x, self.theta, self.frame, self.base, self.todo, self.placed],
+            [group.count, group.fixed, self.direction, *self.islands.arrays],
+            [self.x, self.theta, self.frame, self.base],
             device=self.device,
         )

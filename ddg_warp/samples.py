@@ -6,6 +6,7 @@ import warp as wp
 from ddg_warp import geometry
 from ddg_warp.kernels import element
 from ddg_warp.kernels.element import ChainKind
+from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.terms import Term
 
 
@@ -73,7 +74,6 @@ class Sample:
         `curved` asks for the latter, with compression in the factor.
         """
         kind = self.kind
-        flags = [wp.zeros(2, dtype=int, device=self.device) for _ in range(4)]
         clamped = wp.full(2, 0 if curved else 1, dtype=int, device=self.device)
         out = self._launch(
             element.evaluate_kernel(kind, real, real, 0 if curved else None),
@@ -85,8 +85,8 @@ class Sample:
                 (2, *self.shape),
                 self.shape,
             ],
-            before=[*flags[:2], clamped, flags[0], 0],
-            after=flags[2:],
+            before=[clamped, 0],
+            searching=True,
         )
         return out[0], out[2], out[3][1], out[1]
 
@@ -215,10 +215,15 @@ class Sample:
         table = np.array([(row * n * rods, rods, 1) for row in range(len(data["buffer"]))], np.int32)
         return [*out, *(wp.array(v, dtype=int, device=self.device) for v in (table, self.count.astype(np.int32)))]
 
-    def _launch(self, kernel, real, shapes, before=(), after=(), columns=(), **changed) -> list[np.ndarray]:
+    def _launch(self, kernel, real, shapes, before=(), columns=(), searching=False, **changed) -> list[np.ndarray]:
+        """Arrays that a kernel writes; `searching` ones take the rates with all else of their islands."""
         out = [wp.zeros(shape, dtype=real, device=self.device) for shape in shapes]
         inputs = [*self._inputs(real, **changed), *before]
-        outputs, grid = [*out, *after], (*self.shape, *columns)
+        if searching:
+            islands = Islands(2, real, self.device)
+            wp.copy(islands.rate, inputs[4])
+            inputs[4:5] = islands.arrays
+        outputs, grid = out, (*self.shape, *columns)
         wp.launch(kernel, grid, inputs, outputs, device=self.device, block_dim=128)  # `evaluate` is bound to that
         return [array.numpy().astype(float) for array in out]
 
@@ -268,7 +273,7 @@ def _random_state(sample: Sample) -> dict[str, np.ndarray]:
 
 def is_vector(term: Term) -> bool:
     """Whether the strains are components of a vector in space, which turns with the rod."""
-    return term.measure.name == "curvature_binormal"
+    return term.measure.name.startswith("curvature_binormal")
 
 
 def rotation(dim: int, angle: float) -> np.ndarray:

@@ -85,12 +85,13 @@ class Scene(Structures):
         bend: bool = True,
         name: str = "rod",
         laws: Mapping[str, Law] | None = None,
+        curvature: str = "tangent",
     ) -> int:
         """Add one rod with points (n, 3); arguments as in `add_rods`, without R: a director (3,) or (edges, 3). Returns its index."""
         if np.ndim(director) == 2 and len(director) > 1:
             director = [director]
         options = {"closed": closed, "natural": natural, "twist": twist, "bend": bend, "name": name}
-        options["laws"] = laws
+        options |= {"laws": laws, "curvature": curvature}
         return self.add_rods([points], section=section, material=material, director=director, **options)[0]
 
     def add_rods(
@@ -106,6 +107,7 @@ class Scene(Structures):
         bend: bool = True,
         name: str = "rod",
         laws: Mapping[str, Law] | None = None,
+        curvature: str = "tangent",
     ) -> range:
         """Add rods of equal node count.
 
@@ -125,6 +127,9 @@ class Scene(Structures):
             bend: False leaves bending and twist out: a chain of springs.
             name: shown in reports and output.
             laws: a `Law` for terms by name, such as "rod_bend_twist", instead of the quadratic one with the section's stiffness.
+            curvature: what it is where edges meet at the angle phi, l the mean of their lengths: "tangent", 2 tan(phi/2) / l, or
+                "angle", phi / l, by which circles are exact; but a fold costs no more than EI pi^2 / 2 l, and lets the rod through. See
+                `ddg_warp.kernels.measures.turning_angle`.
 
         Returns:
             Indices of the rods.
@@ -152,6 +157,8 @@ class Scene(Structures):
             )
         if not isinstance(material, Material) and not isinstance(section, Stiffness):
             raise SceneError(f"rods '{name}': a {type(section).__name__} needs a material; give material=Material(...)")
+        if arguments.choice(f"rods '{name}': curvature", curvature, ("tangent", "angle")) == "angle" and not bend:
+            raise SceneError(f"rods '{name}': curvature is 'angle' and bend is False; without bending leave it out")
         planar = self.dimension == 2
         points.setflags(write=False)
         batch = RodBatch(
@@ -165,6 +172,7 @@ class Scene(Structures):
             name,
             self.rod_count,
             laws_of(f"rods '{name}'", section, material, laws),
+            curvature,
         )
         self.batches.append(batch)
         return range(batch.first, batch.first + batch.rods)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ddg_warp.errors import SceneError
+from ddg_warp.geometry import cross, dot, length
 
 MODELS = ("midedge_dof", "midedge_boundary", "midedge", "hinge", "isometric")  # of bending; see `ddg_warp.shells`
 TURNING = ("midedge_dof", "midedge_boundary")  # models whose mesh edges have an angle
@@ -62,10 +63,16 @@ def metric(surface, positions: np.ndarray) -> np.ndarray:
     """First fundamental form (a11, a12, a22) of the triangles in the basis x1 - x0, x2 - x0 (T, 3) [m^2]."""
     x0, x1, x2 = np.moveaxis(positions[surface.triangles], 1, 0)
     a1, a2 = x1 - x0, x2 - x0
-    return np.stack([_dot(a1, a1), _dot(a1, a2), _dot(a2, a2)], -1)
+    return np.stack([dot(a1, a1), dot(a1, a2), dot(a2, a2)], -1)
 
 
-def second_form(surface, positions: np.ndarray, kinds: EdgeKinds, rotations: np.ndarray | None = None) -> np.ndarray:
+def second_form(
+    surface,
+    positions: np.ndarray,
+    kinds: EdgeKinds,
+    rotations: np.ndarray | None = None,
+    angles: np.ndarray | None = None,
+) -> np.ndarray:
     """Second fundamental form (b11, b12, b22) of the triangles from mid-edge normals (T, 3) [m].
 
     Args:
@@ -73,34 +80,33 @@ def second_form(surface, positions: np.ndarray, kinds: EdgeKinds, rotations: np.
         positions: (P, 3) [m].
         kinds: of the edges.
         rotations: angle of the mid-edge normal of each edge about it, from the averaged one (E,) [rad]; zero by default.
+        angles: `edge_angles` at these positions, where they are known.
     """
-    corners = positions[surface.triangles]
-    behind = positions[mid_edge_nodes(surface)[:, 3:]]
-    kind, vector = kinds.of_triangles(surface)
-    xi = np.zeros(len(kinds.kind)) if rotations is None else rotations
+    angles = edge_angles(surface, positions, kinds) if angles is None else angles
+    corners, edges, signs = positions[surface.triangles], surface.triangle_edges, surface.triangle_signs
+    kind = kinds.kind[edges]
+    phi = angles[edges, np.where(signs > 0, 0, 1)] * np.where(kind == NEIGHBOUR, 0.5, 1.0)
+    if rotations is not None:
+        phi += np.where(kind <= NEIGHBOUR, signs * rotations[edges], 0.0)
     c = np.empty((len(corners), 3))
     for i in range(3):
         first = corners[:, (i + 1) % 3]
-        e, a, b = corners[:, (i + 2) % 3] - first, corners[:, i] - first, behind[:, i] - first
-        N, k = vector[:, i], kind[:, i]
-        b = np.where((k == SYMMETRY)[:, None], a - 2.0 * _dot(a, N)[:, None] * N, b)
-        phi = np.choose(k, [0.0 * k, 0.5 * dihedral(e, a, b), tilt(e, a, N), 0.5 * dihedral(e, a, b)])
-        phi += np.where(k <= NEIGHBOUR, surface.triangle_signs[:, i] * xi[surface.triangle_edges[:, i]], 0.0)
-        d = a - e * (_dot(a, e) / _dot(e, e))[:, None]
-        c[:, i] = -2.0 * np.sqrt(_dot(d, d)) * phi
+        e, a = corners[:, (i + 2) % 3] - first, corners[:, i] - first
+        d = a - e * (dot(a, e) / dot(e, e))[:, None]
+        c[:, i] = -2.0 * length(d) * phi[:, i]
     return np.stack([c[:, 0] + c[:, 1], c[:, 0], c[:, 0] + c[:, 2]], -1)
 
 
 def dihedral(e: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Angle between the triangles (e, a) and (b, e) about e, positive where convex on the side of their normals [rad]."""
-    n, m = np.cross(e, a), np.cross(b, e)
-    return np.arctan2(_dot(np.cross(n, m), e), _dot(n, m) * np.sqrt(_dot(e, e)))
+    n, m = cross(e, a), cross(b, e)
+    return np.arctan2(dot(cross(n, m), e), dot(n, m) * length(e))
 
 
 def tilt(e: np.ndarray, a: np.ndarray, N: np.ndarray) -> np.ndarray:
     """Angle about e between the triangle (e, a) and the unit normal N of a clamp, signed as `dihedral` [rad]."""
-    n = np.cross(e, a)
-    return np.arctan2(_dot(np.cross(n, N), e), _dot(n, N) * np.sqrt(_dot(e, e)))
+    n = cross(e, a)
+    return np.arctan2(dot(cross(n, N), e), dot(n, N) * length(e))
 
 
 def mid_edge_nodes(surface) -> np.ndarray:
@@ -116,19 +122,18 @@ def edge_angles(surface, positions: np.ndarray, kinds: EdgeKinds) -> np.ndarray:
 
     Dihedral where there is a neighbour, tilt of the triangle at a support, zero at free edges and where there is no triangle.
     """
-    result, N = np.zeros((len(surface.edges), 2)), kinds.vector
+    result = np.zeros((len(surface.edges), 2))
     for side in range(2):
         ends = surface.edges if side == 0 else surface.edges[:, ::-1]
-        first = positions[ends[:, 0]]
         corner, behind = surface.edge_opposite[:, side], surface.edge_opposite[:, 1 - side]
-        e, a, b = positions[ends[:, 1]] - first, positions[corner] - first, positions[behind] - first
-        clamped = tilt(e, a, N)
-        mirrored = 0.5 * dihedral(e, a, a - 2.0 * _dot(a, N)[:, None] * N)
-        angle = np.choose(kinds.kind, [np.zeros(len(e)), dihedral(e, a, b), clamped, mirrored])
-        result[:, side] = np.where(corner < 0, 0.0, angle)
+        for kind in (NEIGHBOUR, CLAMPED, SYMMETRY):
+            at = np.flatnonzero((kinds.kind == kind) & (corner >= 0))
+            first, N = positions[ends[at, 0]], kinds.vector[at]
+            e, a, b = (positions[vertex[at]] - first for vertex in (ends[:, 1], corner, behind))
+            if kind == NEIGHBOUR:
+                result[at, side] = dihedral(e, a, b)
+            elif kind == CLAMPED:
+                result[at, side] = tilt(e, a, N)
+            else:
+                result[at, side] = 0.5 * dihedral(e, a, a - 2.0 * dot(a, N)[:, None] * N)
     return result
-
-
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Scalar products along the last axis."""
-    return np.sum(a * b, -1)

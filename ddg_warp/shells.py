@@ -103,14 +103,15 @@ def plate(surface, positions, thickness, young, poisson, kinds: EdgeKinds, rest=
     """
     positions = np.asarray(positions, float)
     count = len(surface.triangles)
-    _refuse_folds(surface, edge_angles(surface, positions, kinds))
-    angle = np.zeros((len(surface.edges), 2))
+    shape = edge_angles(surface, positions, kinds)
+    _refuse_folds(surface, shape)
+    angle = np.zeros_like(shape)
     if isinstance(rest, str):
         if rest not in ("shape", "flat"):
             raise SceneError(f"rest = {rest!r}; it is 'shape', 'flat' or two arrays (abar, bbar)")
         abar, bbar = metric(surface, positions), np.zeros((count, 3))
         if rest == "shape":
-            bbar, angle = second_form(surface, positions, kinds), edge_angles(surface, positions, kinds)
+            bbar, angle = second_form(surface, positions, kinds, angles=shape), shape
     else:
         abar, bbar = (np.asarray(values, float) for values in rest)
         for name, values in (("abar", abar), ("bbar", bbar)):

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from ddg_warp.errors import SceneError
+from ddg_warp.geometry import cross, length
 
 DEGENERATE = 1e-10
 """Least double area of a triangle, over the square of its longest edge."""
@@ -180,7 +181,7 @@ class Surface:
             )
         corners = self.points[triangles]
         sides = corners[:, BEFORE] - corners[:, AFTER]
-        double_area = np.linalg.norm(np.cross(sides[:, 1], sides[:, 2]), axis=-1)
+        double_area = length(cross(sides[:, 1], sides[:, 2]))
         longest = np.einsum("tij,tij->ti", sides, sides).max(axis=1)
         for t in np.flatnonzero(double_area <= DEGENERATE * longest)[:1]:
             raise SceneError(

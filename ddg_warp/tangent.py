@@ -109,23 +109,25 @@ class Tangent:
         state.stable = None
 
     def move_supports(self, state, before: float, at: float) -> None:
-        """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""
-        if self.model.motions:
+        """Put held dofs, and the magnetic field, where they are at load parameter `at`; the state belongs to `before`."""
+        if self.model.motions or self.prescribes:
             for part in self.parts:
                 part.move_supports(state, before, at)
             self.model.carry_frames(state)
 
     @property
-    def clamps_turn(self) -> bool:
-        """Whether supports turn normals of shells."""
-        return self.model.net is not None and any(len(part.turning) for part in self.model.net.sets)
+    def prescribes(self) -> bool:
+        """Whether supports turn normals of shells, or a magnetic field acts: what states hold beside their dofs."""
+        return self.model.net is not None and any(
+            len(part.turning) or part.term.measure.field for part in self.model.net.sets
+        )
 
-    def with_clamps_turned(self, state, at: float):
-        """The state with the normals that supports turn where they are at `at`; itself where none does."""
-        if not self.clamps_turn:
+    def with_prescribed(self, state, at: float):
+        """The state with the normals that supports turn, and the magnetic field, of `at`; itself where there is neither."""
+        if not self.prescribes:
             return state
         state = state.copy()
-        self.parts[-1].turn_clamps(state, at)
+        self.parts[-1].prescribe(state, at)
         return state
 
     def support_step(self, state, before: float, at: float) -> np.ndarray:

@@ -92,7 +92,10 @@ launching, capturing = _turns.launching, _turns.capturing
 
 
 def launches(what):
-    """Decorate what launches: a function, or a class, whose constructor may load kernels and whose other methods launch."""
+    """Decorate what launches: a function, or a class, whose constructor may load kernels and whose other methods launch.
+
+    Where threads share a stream, what an object of such a class holds is freed in its turn, too.
+    """
     if not isinstance(what, type):
         return _within(launching, what)
     for name, member in list(vars(what).items()):
@@ -101,7 +104,14 @@ def launches(what):
                 setattr(what, name, _within(capturing, member))
             elif not name.startswith("_"):
                 setattr(what, name, _within(launching, member))
+    what.__del__ = _release
     return what
+
+
+def _release(self) -> None:
+    if _turns.shared:
+        with launching():
+            vars(self).clear()
 
 
 def _within(turn, function):

@@ -136,7 +136,19 @@ def outer_forces(host, gravity) -> np.ndarray:
         np.add.at(force, load.blocks, np.abs(load.force).sum(-1))
     for load in host.followers:
         np.add.at(force, load.places, np.abs(load.forces(host.rest[load.places])).sum(-1))
+    for part in host.sets:
+        if part.term.measure.field:
+            np.add.at(force, part.slots[0], _magnetic_forces(host, part))
     return force
+
+
+def _magnetic_forces(host, part) -> np.ndarray:
+    """Sizes of what a field at rest does to edges (E,) [N]: a couple per length is like a force at the end of the rod."""
+    lengths = {rod.rod: rod.piece.length[rod.row] for rod in host.rods}
+    length = np.array([lengths[rod] for rod in part.owner[0]])
+    field, gradient = np.split(np.abs(part.data[-part.term.measure.field :]), [3])
+    moment = part.parameters["measure"] * np.abs(part.parameters["magnetisation"])
+    return moment * (field.sum(0) / length + gradient.sum(0))
 
 
 def largest_excess(levels: list[Level], loads: np.ndarray, rtol: float, residual: np.ndarray, floor: np.ndarray):

@@ -50,17 +50,17 @@ def check_scene(scene) -> None:
             f"gravity is {tuple(scene.gravity)}; a scene of dimension 2 stays in the plane of x and z, give 0 along y"
         )
     drag.check_flow(scene)
+    _check_magnets(scene)
+    supports = [s for s in (*scene.supports, *scene.shell_supports, *scene.ring_supports) if s.motion is not None]
+    if not supports or scene.initial is not None or not isinstance(scene.analysis, Dynamics):
+        return  # a state may start elsewhere, and equilibria have no time before the first
     objects = [*scene.batches, *scene.shells, *scene.axisymmetric_shells]
     size = max(
         (np.nanmax(np.ptp(o.points.reshape(-1, o.points.shape[-1]), axis=0)) for o in objects if o.points.size),
         default=1.0,
     )
-    if scene.initial is not None or not isinstance(scene.analysis, Dynamics):
-        return  # a state may start elsewhere, and equilibria have no time before the first
-    for support in (*scene.supports, *scene.shell_supports, *scene.ring_supports):
+    for support in supports:
         motion = support.motion
-        if motion is None:
-            continue
         held = ["xyz".index(c) for c in support.components]
         shift, angle = motion.shift(0.0)[:, held], motion.turned(0.0)
         if np.abs(shift).max() > STARTS * size:
@@ -75,6 +75,22 @@ def check_scene(scene) -> None:
                 f"{support.call}: the motion's angle at t = 0 is {angle:g} rad; supports start as they are at rest, so subtract its "
                 "value at 0, or turn the points"
             )
+
+
+def _check_magnets(scene) -> None:
+    """Refuse a field or dipoles without anything magnetised, and magnets that nothing acts on."""
+    magnetised = np.concatenate([np.zeros(0, int), *(magnet.rods for magnet in scene.magnets)])
+    if scene.applied_field is not None and not magnetised.size:
+        raise SceneError("magnetic_field: nothing is magnetised; add scene.magnetize(rod, ...), or leave the field out")
+    for pairs in scene.dipoles:
+        if pairs.rods is None and not magnetised.size:
+            raise SceneError("add_dipoles: nothing is magnetised; add scene.magnetize(rod, ...)")
+        for rod in [] if pairs.rods is None else np.setdiff1d(pairs.rods, magnetised)[:1]:
+            raise SceneError(f"add_dipoles: rod {rod} is not magnetised; add scene.magnetize({rod}, ...)")
+    if magnetised.size and scene.applied_field is None and not scene.dipoles:
+        raise SceneError(
+            f"magnetize: nothing acts on rod {magnetised[0]}; add scene.magnetic_field(...) or scene.add_dipoles(...)"
+        )
 
 
 def check_motion(call: str, motion, planar: bool) -> None:
@@ -130,34 +146,10 @@ def check_batch(batch, dimension: int) -> None:
     least = 3 if batch.bend or batch.closed else 2
     if batch.nodes < least:
         raise SceneError(f"rod {batch.first} {name} has {batch.nodes} nodes; it needs at least {least}")
-    _refuse(~np.isfinite(batch.points).all(-1), batch, "node {k} is at a non-finite position; check the points")
-    edges = geometry.edge_vectors(batch.points, batch.closed)
-    if dimension == 2:
-        outside = np.abs(edges[..., 1]) > DOUBLED * np.linalg.norm(edges, axis=-1)
-        _refuse(
-            outside,
-            batch,
-            "edge {k} leaves the plane of x and z, in which a scene of dimension 2 stays; give all nodes one y",
-        )
-        edges = edges[..., [0, 2]]
-    lengths = np.linalg.norm(edges, axis=-1)
-    doubled = lengths <= DOUBLED * lengths.max(axis=-1, keepdims=True)
-    if batch.closed:
-        _refuse(
-            doubled & (np.arange(batch.edges) == batch.edges - 1),
-            batch,
-            f"node {batch.nodes - 1} lies on node 0, to which a closed rod joins it; leave the last point out",
-        )
-    _refuse(doubled, batch, "edge {k} has no length, nodes {k} and {k} + 1 lie at one point; remove one of them")
-    if batch.bend:
-        before, after = geometry.ahead(edges / lengths[..., None], batch.closed)
-        _refuse(
-            np.sum(before * after, -1) <= -1.0 + 1e-12,
-            batch,
-            "edges {k} and {k} + 1 fold back by 180 degrees, where curvature is infinite; move a node",
-        )
+    for rows in batch.runs(np.arange(batch.rods)):
+        _check_shape(batch, rows, dimension)
     section = batch.section
-    for what in ("EA", "EI1", "EI2", "GJ", "mass_per_length", "rotary_inertia", "radius", "viscosity"):
+    for what in ("EA", "EI1", "EI2", "GJ", "mass_per_length", "rotary_inertia", "radius", "viscosity", "area"):
         try:
             value = np.asarray(getattr(section, what), float)
             np.broadcast_to(value, (batch.rods, batch.edges))
@@ -178,7 +170,29 @@ def check_batch(batch, dimension: int) -> None:
         raise SceneError(f"rod {batch.first} {name}: EI1 and EI2 differ, which needs twist=True")
     _check_natural(batch, dimension)
     if batch.director is not None:
-        _check_director(batch, edges / lengths[..., None])
+        _check_director(batch, dimension)
+
+
+def _check_shape(batch, rows: np.ndarray, dimension: int) -> None:
+    points = np.asfortranarray(batch.points[rows])
+    _refuse(~np.isfinite(points).all(-1), batch, "node {k} is at a non-finite position; check the points", rows)
+    edges = geometry.edge_vectors(points, batch.closed)
+    if dimension == 2:
+        outside = np.abs(edges[..., 1]) > DOUBLED * geometry.length(edges)
+        message = "edge {k} leaves the plane of x and z, in which a scene of dimension 2 stays; give all nodes one y"
+        _refuse(outside, batch, message, rows)
+        edges = edges[..., [0, 2]]
+    lengths = geometry.length(edges)
+    doubled = lengths <= DOUBLED * lengths.max(axis=-1, keepdims=True)
+    if batch.closed:
+        message = f"node {batch.nodes - 1} lies on node 0, to which a closed rod joins it; leave the last point out"
+        _refuse(doubled & (np.arange(batch.edges) == batch.edges - 1), batch, message, rows)
+    message = "edge {k} has no length, nodes {k} and {k} + 1 lie at one point; remove one of them"
+    _refuse(doubled, batch, message, rows)
+    if batch.bend:
+        before, after = geometry.ahead(edges / lengths[..., None], batch.closed)
+        message = "edges {k} and {k} + 1 fold back by 180 degrees, where curvature is infinite or has no direction; move a node"
+        _refuse(geometry.dot(before, after) <= -1.0 + 1e-12, batch, message, rows)
 
 
 def _check_natural(batch, dimension: int) -> None:
@@ -201,7 +215,7 @@ def _check_natural(batch, dimension: int) -> None:
         )
 
 
-def _check_director(batch, tangents: np.ndarray) -> None:
+def _check_director(batch, dimension: int) -> None:
     given, full = batch.director, (batch.rods, batch.edges, 3)
     if given.shape not in ((3,), (batch.rods, 3), full, (1, *full[1:])):
         raise SceneError(
@@ -209,11 +223,11 @@ def _check_director(batch, tangents: np.ndarray) -> None:
         )
     given = given if given.ndim == 3 else np.broadcast_to(given, (batch.rods, 3))[:, None]
     _refuse(~np.isfinite(given).all(-1), batch, "director of edge {k} is not finite; give finite numbers")
-    tangents = tangents[:, : given.shape[1]]
-    if tangents.shape[2] == 3:
-        across = np.linalg.norm(np.cross(given, tangents), axis=-1)
+    if dimension == 3:
+        tangents = geometry.unit(geometry.edge_vectors(batch.points, batch.closed)[:, : given.shape[1]])
+        across = geometry.length(geometry.cross(given, tangents))
         _refuse(
-            across <= 1e-9 * np.linalg.norm(given, axis=-1),
+            across <= 1e-9 * geometry.length(given),
             batch,
             "director of edge {k} is parallel to the edge; give one across it",
         )
@@ -226,10 +240,11 @@ def check_index(what: str, index: int, size: np.ndarray, rods: np.ndarray) -> No
         raise SceneError(f"{what} {index} does not exist: rod {rods[bad[0]]} has {size[bad[0]]} {what}s")
 
 
-def _refuse(bad: np.ndarray, batch, message: str) -> None:
-    """Raise for the first True of bad (rods, nodes or edges or vertices)."""
+def _refuse(bad: np.ndarray, batch, message: str, rows: np.ndarray | None = None) -> None:
+    """Raise for the first True of bad (rods, nodes or edges or vertices), of all rods of a batch or of some rows."""
     if bad.any():
         rod, k = np.argwhere(bad)[0]
+        rod = rod if rows is None else rows[rod]
         raise SceneError(f"rod {batch.first + rod} ('{batch.name}'): " + message.format(k=k))
 
 

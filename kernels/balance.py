@@ -13,6 +13,17 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, inertia_type, until_function
+from ddg_warp.kernels.islands import (
+    COEFFICIENT,
+    DROWNED,
+    ITERATION,
+    LOAD_SCALE,
+    PLACED,
+    SLOT,
+    STATUS,
+    STEP_LENGTH,
+    UNBALANCED,
+)
 
 
 @cache
@@ -122,7 +133,8 @@ def check_kernel(kind: ChainKind, real, linear):
         count: wp.array(dtype=int),
         mass: wp.array2d(dtype=Inertia),
         rotary: wp.array2d(dtype=real),
-        coefficient: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
         base: wp.array2d(dtype=V),
@@ -137,29 +149,21 @@ def check_kernel(kind: ChainKind, real, linear):
         length: wp.array(dtype=real),
         rtol: real,
         floor: real,
-        load_scale: wp.array(dtype=real),
-        status: wp.array(dtype=int),
-        slot: wp.array(dtype=int),
-        iteration: wp.array(dtype=int),
-        step_length: wp.array(dtype=real),
-        placed: wp.array(dtype=int),
         right_out: wp.array3d(dtype=linear),
         change_out: wp.array2d(dtype=real),
         noise_out: wp.array2d(dtype=linear),
-        unbalanced_out: wp.array(dtype=int),
-        drowned_out: wp.array(dtype=int),
     ):
         start, r = wp.tid()
         n = count[r]
-        if status[r] != 0 or start >= n:
+        if flags[STATUS, r] != 0 or start >= n:
             return
-        c = coefficient[r]
-        accepted = slot[r]
-        taken = step_length[r]
-        limit = rtol * load_scale[r]
-        if iteration[r] == 0 or taken < real(1.0):
+        c = scalars[COEFFICIENT, r]
+        accepted = flags[SLOT, r]
+        taken = scalars[STEP_LENGTH, r]
+        limit = rtol * scalars[LOAD_SCALE, r]
+        if flags[ITERATION, r] == 0 or taken < real(1.0):
             limit /= real(n)
-        moved = placed[r] != 0
+        moved = flags[PLACED, r] != 0
         for k in range(start, until(start, n)):
             f, moment, size, elastic = balance(
                 g, mass, rotary, c, x, theta, target, target_angle, gravity, load, load_angle, loaded, k, n, r
@@ -184,14 +188,14 @@ def check_kernel(kind: ChainKind, real, linear):
                 held = ((mask >> d) & 1) == 1
                 right_out[d, k, r] = linear(wp.where(held, real(0.0), f[d]))
                 if not held and not wp.abs(f[d]) <= limit:
-                    drowned_out[r] = 1
+                    flags[DROWNED, r] = 1
                     if not wp.abs(f[d]) <= least:
-                        unbalanced_out[r] = 1
+                        flags[UNBALANCED, r] = 1
             if wp.static(twist):
                 held = ((mask >> wp.static(dim)) & 1) == 1
                 right_out[wp.static(nb - 1), k, r] = linear(wp.where(held, real(0.0), moment))
                 if not held and not wp.abs(moment) <= limit * length[r]:
-                    drowned_out[r] = 1
+                    flags[DROWNED, r] = 1
                     arm = wp.length(x[along(k + 1, n), r] - here)
                     least = floor * (
                         real(2.0) * stiff * arm * arm * reach / length[r]
@@ -199,8 +203,8 @@ def check_kernel(kind: ChainKind, real, linear):
                         + wp.abs(elastic)
                     )
                     if not wp.abs(moment) <= least:
-                        unbalanced_out[r] = 1
-            if iteration[r] == 0:
+                        flags[UNBALANCED, r] = 1
+            if flags[ITERATION, r] == 0:
                 continue
             change = real(0.0)
             noise = real(0.5) * size * reach

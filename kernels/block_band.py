@@ -12,6 +12,7 @@ import warp as wp
 from ddg_warp.kernels import geometric, pivot
 from ddg_warp.kernels.balance import node_functions
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, inertia_type
+from ddg_warp.kernels.islands import CLAMPED, COEFFICIENT, DROWNED, ITERATION, STATUS, UNBALANCED
 
 
 @cache
@@ -109,28 +110,24 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
     def assemble(
         F: wp.array3d(dtype=linear),
         second: wp.array3d(dtype=linear),
-        clamped: wp.array(dtype=int),
         count: wp.array(dtype=int),
         mass: wp.array2d(dtype=Inertia),
         rotary: wp.array2d(dtype=real),
-        coefficient: wp.array(dtype=real),
         fixed: wp.array2d(dtype=wp.uint8),
-        status: wp.array(dtype=int),
-        unbalanced: wp.array(dtype=int),
-        drowned: wp.array(dtype=int),
-        iteration: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         reuse: int,
         blocks_out: wp.array3d(dtype=linear),
     ):
         k, r = wp.tid()
         n = count[r]
-        if status[r] != 0 or k >= n:
+        if flags[STATUS, r] != 0 or k >= n:
             return
-        if unbalanced[r] == 0 and (drowned[r] == 0 or iteration[r] > 0):
+        if flags[UNBALANCED, r] == 0 and (flags[DROWNED, r] == 0 or flags[ITERATION, r] > 0):
             return
-        if reuse != 0 and iteration[r] > 0:
+        if reuse != 0 and flags[ITERATION, r] > 0:
             return
-        c = coefficient[r]
+        c = scalars[COEFFICIENT, r]
         b = behind(k, n)
         free = free_of(fixed, k, r)
         D = M()
@@ -155,7 +152,7 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
                     C = own(F, row, bb, r, 2)
                     D += wp.outer(C, C)
             if wp.static(curved):
-                if clamped[r] == 0 and iteration[r] >= wp.static(begin):
+                if flags[CLAMPED, r] == 0 and flags[ITERATION, r] >= wp.static(begin):
                     if wp.static(closed) or k < n - 2:
                         D += first_first(second, k, r)
                         E += first_mid(second, k, r)

@@ -16,6 +16,25 @@ import warp as wp
 
 from ddg_warp.kernels import geometric, outcome, pivot
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, inertia_type
+from ddg_warp.kernels.islands import (
+    ACTIVE,
+    ANGLE_CHANGE,
+    CLAMPED,
+    COEFFICIENT,
+    DECREMENT,
+    HALVINGS,
+    ITERATION,
+    LOAD_SCALE,
+    LOST,
+    PLACED,
+    RESIDUAL,
+    SLOT,
+    STALE,
+    STATUS,
+    STEP_LENGTH,
+    TODO,
+)
+from ddg_warp.kernels.judge import judge_functions
 from ddg_warp.kernels.search import PLACE, RELAG, TURNED, search_functions
 
 
@@ -26,6 +45,7 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
     From iteration `exact_from` on, the matrix has the geometric stiffness G. Where a pivot is lost, the same iterate comes again
     with `clamped[r]` raised: without what compression takes away, and, for this iteration, without G; or the solve `fails`.
     """
+    balanced, _ = judge_functions(kind.twist, real)
     dim, nb, twist, span = kind.dim, kind.block, kind.twist, kind.span
     window, nb2, drag, Inertia = kind.window, kind.block**2, kind.drag, inertia_type(kind, real)
     V, H, M = wp.types.vector(dim, real), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
@@ -91,7 +111,8 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
         # inertia
         mass: wp.array2d(dtype=Inertia),
         rotary: wp.array2d(dtype=real),
-        coefficient: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         fixed: wp.array2d(dtype=wp.uint8),
         # options
         floor: real,
@@ -105,40 +126,15 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
         Y: wp.array3d(dtype=linear),
         direction: wp.array3d(dtype=linear),
         # state of the search
-        status: wp.array(dtype=int),
-        slot: wp.array(dtype=int),
-        iteration: wp.array(dtype=int),
-        halvings: wp.array(dtype=int),
-        step_length: wp.array(dtype=real),
-        decrement: wp.array(dtype=real),
-        load_scale: wp.array(dtype=real),
-        residual: wp.array(dtype=real),
-        lost: wp.array(dtype=int),
-        turned: wp.array(dtype=int),
-        clamped: wp.array(dtype=int),
-        unbalanced: wp.array(dtype=int),
-        drowned: wp.array(dtype=int),
-        angle_change: wp.array(dtype=real),
-        todo: wp.array(dtype=int),
-        placed: wp.array(dtype=int),
-        active: wp.array(dtype=int),
     ):
         r = wp.tid()
-        if status[r] != 0:
+        if balanced(flags, scalars, r):
             return
-        # rounding excuses a residual only after an iteration: the predictor's may be all of a coarse precision's load
-        if unbalanced[r] == 0 and (drowned[r] == 0 or iteration[r] > 0):
-            status[r] = wp.where(
-                drowned[r] == 0, int(wp.static(outcome.CONVERGED)), int(wp.static(outcome.CONVERGED_TO_ROUNDING))
-            )
-            return
-        unbalanced[r] = 0
-        drowned[r] = 0
         n = count[r]
-        first = iteration[r] == 0
-        taken = step_length[r]
-        c = coefficient[r]
-        accepted_slot = slot[r]
+        first = flags[ITERATION, r] == 0
+        taken = scalars[STEP_LENGTH, r]
+        c = scalars[COEFFICIENT, r]
+        accepted_slot = flags[SLOT, r]
         Waa = M()
         Wab = M()
         Wac = M()
@@ -168,7 +164,7 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
                         Wbc += wp.outer(B, C)
                         Wcc += wp.outer(C, C)
                     if wp.static(exact):
-                        if clamped[r] == 0 and iteration[r] >= wp.static(begin):
+                        if flags[CLAMPED, r] == 0 and flags[ITERATION, r] >= wp.static(begin):
                             Waa += aa(G, j, r)
                             Wab += ab(G, j, r)
                             Wac += ac(G, j, r)
@@ -244,63 +240,63 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
             Wbc = M()
             Wcc = M()
 
-        residual[r] = real(worst)
+        scalars[RESIDUAL, r] = real(worst)
         if first:
-            if load_scale[r] == real(0.0):
-                load_scale[r] = real(worst)
-            lost[r] = 0
+            if scalars[LOAD_SCALE, r] == real(0.0):
+                scalars[LOAD_SCALE, r] = real(worst)
+            flags[LOST, r] = 0
             change = real(0.0)
         finite = wp.isfinite(worst) and wp.isfinite(newton) and wp.isfinite(change)
-        if lost_here > 0 and clamped[r] == 0:
+        if lost_here > 0 and flags[CLAMPED, r] == 0:
             if wp.static(fails):
-                status[r] = wp.static(outcome.INDEFINITE)
+                flags[STATUS, r] = wp.static(outcome.INDEFINITE)
                 return
             # the matrix is indefinite: the same iterate again, without what compression (or curvature) takes away
-            clamped[r] = 1
-            active[0] = 1
+            flags[CLAMPED, r] = 1
+            flags[ACTIVE, 0] = 1
             return
         accept = first and finite
         if first and not finite:
-            status[r] = wp.static(outcome.NON_FINITE)
+            flags[STATUS, r] = wp.static(outcome.NON_FINITE)
             return
         if not first and finite:
-            expected = taken * decrement[r]
+            expected = taken * scalars[DECREMENT, r]
             rounding = floor * noise
             if expected > real(10.0) * rounding:
                 accept = change <= real(-1.0e-4) * expected + rounding
             else:
-                accept = newton <= decrement[r]
+                accept = newton <= scalars[DECREMENT, r]
         if not accept:
-            halvings[r] = halvings[r] + 1
-            if halvings[r] > max_halvings:
-                status[r] = wp.static(outcome.LINE_SEARCH_FAILED)
+            flags[HALVINGS, r] = flags[HALVINGS, r] + 1
+            if flags[HALVINGS, r] > max_halvings:
+                flags[STATUS, r] = wp.static(outcome.LINE_SEARCH_FAILED)
                 return
-            less = shorter(taken, taken * decrement[r], change, finite)
-            step_length[r] = less
-            angle_change[r] = less - taken
-            todo[r] = wp.static(PLACE)
-            active[0] = 1
+            less = shorter(taken, taken * scalars[DECREMENT, r], change, finite)
+            scalars[STEP_LENGTH, r] = less
+            scalars[ANGLE_CHANGE, r] = less - taken
+            flags[TODO, r] = wp.static(PLACE)
+            flags[ACTIVE, 0] = 1
             return
 
-        iteration[r] = iteration[r] + 1
-        if iteration[r] > max_iterations:
-            status[r] = wp.static(outcome.MAX_ITERATIONS)
+        flags[ITERATION, r] = flags[ITERATION, r] + 1
+        if flags[ITERATION, r] > max_iterations:
+            flags[STATUS, r] = wp.static(outcome.MAX_ITERATIONS)
             return
-        active[0] = 1
-        slot[r] = 1 - accepted_slot
-        decrement[r] = newton
-        halvings[r] = 0
-        placed[r] = 0
-        lost[r] = lost[r] + lost_here
+        flags[ACTIVE, 0] = 1
+        flags[SLOT, r] = 1 - accepted_slot
+        scalars[DECREMENT, r] = newton
+        flags[HALVINGS, r] = 0
+        flags[PLACED, r] = 0
+        flags[LOST, r] = flags[LOST, r] + lost_here
         if wp.static(exact):
-            clamped[r] = 0
+            flags[CLAMPED, r] = 0
         if wp.static(twist):
-            if turned[r] != 0:
+            if flags[STALE, r] != 0:
                 # angles mean something else in new frames: take no step, and ask for a direction there
-                turned[r] = 0
-                decrement[r] = real(1.0e30)
-                step_length[r] = real(0.0)
-                todo[r] = wp.static(RELAG)
+                flags[STALE, r] = 0
+                scalars[DECREMENT, r] = real(1.0e30)
+                scalars[STEP_LENGTH, r] = real(0.0)
+                flags[TODO, r] = wp.static(RELAG)
                 return
         e1 = H()
         e2 = H()
@@ -332,8 +328,8 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
         if rotation > rotation_cap * rotation_cap:
             whole = rotation_cap / wp.sqrt(rotation)
         if rotation > real(wp.static(TURNED**2)):
-            angle_change[r] = whole - real(1.0)
-            todo[r] = wp.static(PLACE)
-        step_length[r] = whole
+            scalars[ANGLE_CHANGE, r] = whole - real(1.0)
+            flags[TODO, r] = wp.static(PLACE)
+        scalars[STEP_LENGTH, r] = whole
 
     return sweep

@@ -21,6 +21,7 @@ import warp as wp
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.balance import node_functions
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, inertia_type, until_function
+from ddg_warp.kernels.islands import COEFFICIENT, LOAD_SCALE, PROGRESS, RATE, STATUS
 
 # rows of coefficients; SLOPE is tan(gamma), SPEED is zero where nothing is granular
 TANGENTIAL, NORMAL, ROTATIONAL, LATERAL, FRICTION, LEADING, SLOPE, SPEED = range(8)
@@ -93,20 +94,19 @@ def chain_kernels(kind: ChainKind, real):
         mass: wp.array2d(dtype=real),
         rotary: wp.array2d(dtype=real),
         count: wp.array(dtype=int),
-        coefficient: wp.array(dtype=real),
-        rate: wp.array(dtype=real),
-        progress: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         inertia_out: wp.array2d(dtype=Inertia),
         rotary_out: wp.array2d(dtype=real),
         target_angle: wp.array2d(dtype=real),
-        load_scale: wp.array(dtype=real),
     ):
         """Edges of `tangents` say which way the rod runs. Raises the load scale to the drag on a rod that moves as its fastest node."""
         start, r = wp.tid()
         n = count[r]
-        if progress[r] >= real(1.0) or start >= n:
+        if scalars[PROGRESS, r] >= real(1.0) or start >= n:
             return
-        s = real(1.0) / rate[r]
+        rate = scalars[RATE, r]
+        s = real(1.0) / rate
         u = flow[0]
         for k in range(start, until(start, n)):
             D = M()
@@ -117,18 +117,18 @@ def chain_kernels(kind: ChainKind, real):
                 D += of_edge(tangents, v0, coefficients, u, b, n, r)
             node = Inertia()
             node.mass = mass[k, r]
-            node.resistance = D * rate[r]
+            node.resistance = D * rate
             node.carried = x0[k, r] + u * s
             moved = wp.length(x[k, r] - x0[k, r]) + wp.length(u) * s
-            wp.atomic_max(load_scale, r, real(n) * moved * wp.max(wp.get_diag(node.resistance)))
+            wp.atomic_max(scalars, LOAD_SCALE, r, real(n) * moved * wp.max(wp.get_diag(node.resistance)))
             if wp.static(twist):
                 spin = real(0.0)
                 if wp.static(closed) or k < n - 1:
                     end = along(k + 1, n)
                     length = wp.length(tangents[end, r] - tangents[k, r])
-                    spin = coefficients[wp.static(ROTATIONAL), k, r] * length * rate[r]
+                    spin = coefficients[wp.static(ROTATIONAL), k, r] * length * rate
                 node.spin = spin
-                share = spin / coefficient[r]
+                share = spin / scalars[COEFFICIENT, r]
                 both = rotary[k, r] + share
                 rotary_out[k, r] = both
                 if share > real(0.0):
@@ -143,9 +143,8 @@ def chain_kernels(kind: ChainKind, real):
         mass: wp.array2d(dtype=real),
         rotary: wp.array2d(dtype=real),
         count: wp.array(dtype=int),
-        status: wp.array(dtype=int),
-        progress: wp.array(dtype=real),
-        rate: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         x_end: wp.array2d(dtype=V),
         theta_end: wp.array2d(dtype=real),
         v_out: wp.array2d(dtype=V),
@@ -154,14 +153,18 @@ def chain_kernels(kind: ChainKind, real):
         """Rates of what has no inertia are means over the step of the midpoint rule, which would keep them swinging about these."""
         start, r = wp.tid()
         n = count[r]
-        if start >= n or progress[r] >= real(1.0) or status[r] > wp.static(outcome.CONVERGED_TO_ROUNDING):
+        if (
+            start >= n
+            or scalars[PROGRESS, r] >= real(1.0)
+            or flags[STATUS, r] > wp.static(outcome.CONVERGED_TO_ROUNDING)
+        ):
             return
         for k in range(start, until(start, n)):
             if mass[k, r] <= real(0.0):
-                v_out[k, r] = (x_end[k, r] - x[k, r]) * rate[r]
+                v_out[k, r] = (x_end[k, r] - x[k, r]) * scalars[RATE, r]
             if wp.static(twist):
                 if rotary[k, r] <= real(0.0):
-                    omega_out[k, r] = (theta_end[k, r] - theta[k, r]) * rate[r]
+                    omega_out[k, r] = (theta_end[k, r] - theta[k, r]) * scalars[RATE, r]
 
     return resist, settle
 
@@ -199,18 +202,17 @@ def net_kernels(real):
         starts: wp.array(dtype=int),
         items: wp.array(dtype=int),
         flow: wp.array(dtype=V),
-        rate: wp.array(dtype=real),
-        progress: wp.array(dtype=real),
         outer: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         blocks: int,
         nodes: int,
         inertia_out: wp.array2d(dtype=Inertia),
-        load_scale: wp.array(dtype=real),
     ):
         """Items of a block are edges that meet there, or the one whose angle it is. Where loads give no scale, drag does."""
         i = wp.tid()
         w = i / blocks
-        if progress[w] >= real(1.0):
+        if scalars[PROGRESS, w] >= real(1.0):
             return
         k = i - w * blocks
         D = M()
@@ -229,22 +231,22 @@ def net_kernels(real):
                 D += half(e, (v0[a] + v0[b]) * real(0.5) - u, p)
             else:
                 D[0, 0] = coefficients[wp.static(ROTATIONAL), edge] * wp.length(e)
+        rate = scalars[RATE, w]
         block = Inertia()
         block.mass = mass[k]
-        block.resistance = D * rate[w]
-        block.carried = q0[i] + u / rate[w]
+        block.resistance = D * rate
+        block.carried = q0[i] + u / rate
         inertia_out[w, k] = block
         if k < nodes and outer[w] == real(0.0):
-            moved = wp.length(q[i] - q0[i]) + wp.length(u) / rate[w]
-            wp.atomic_max(load_scale, w, real(nodes) * moved * wp.max(wp.get_diag(block.resistance)))
+            moved = wp.length(q[i] - q0[i]) + wp.length(u) / rate
+            wp.atomic_max(scalars, LOAD_SCALE, w, real(nodes) * moved * wp.max(wp.get_diag(block.resistance)))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def settle(
         q: wp.array(dtype=V),
         inertia: wp.array2d(dtype=Inertia),
-        status: wp.array(dtype=int),
-        progress: wp.array(dtype=real),
-        rate: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         blocks: int,
         q_end: wp.array(dtype=V),
         v_out: wp.array(dtype=V),
@@ -252,11 +254,11 @@ def net_kernels(real):
         """As of chains, of dofs that feel drag."""
         i = wp.tid()
         w = i / blocks
-        if progress[w] >= real(1.0) or status[w] > wp.static(outcome.CONVERGED_TO_ROUNDING):
+        if scalars[PROGRESS, w] >= real(1.0) or flags[STATUS, w] > wp.static(outcome.CONVERGED_TO_ROUNDING):
             return
         block = inertia[w, i - w * blocks]
         v = v_out[i]
-        mean = (q_end[i] - q[i]) * rate[w]
+        mean = (q_end[i] - q[i]) * scalars[RATE, w]
         for d in range(3):
             if block.mass[d] <= real(0.0) and block.resistance[d, d] > real(0.0):
                 v[d] = mean[d]

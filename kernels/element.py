@@ -14,6 +14,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import frames
+from ddg_warp.kernels.islands import ACTIVE, ITERATION, RATE, SLOT, STALE, STATUS
 from ddg_warp.kernels.measures.turning import packed_index
 from ddg_warp.kernels.terms import Term
 
@@ -531,31 +532,28 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
         theta: wp.array2d(dtype=real),
         frame: wp.array3d(dtype=real),
         last: wp.array3d(dtype=real),
-        rate: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         buffer: wp.array(dtype=real),
         table: wp.array2d(dtype=int),
         count: wp.array(dtype=int),
-        status: wp.array(dtype=int),
-        slot: wp.array(dtype=int),
         clamped: wp.array(dtype=int),
-        iteration: wp.array(dtype=int),
         reuse: int,
         factor_out: wp.array3d(dtype=linear),
         geometric_out: wp.array3d(dtype=linear),
         gradient_out: wp.array3d(dtype=real),
         energy_out: wp.array3d(dtype=real),
         stiffness_out: wp.array2d(dtype=linear),
-        turned_out: wp.array(dtype=int),
-        active_out: wp.array(dtype=int),
     ):
         start, r = wp.tid()
         if start == 0 and r == 0:
-            active_out[0] = 0
+            flags[ACTIVE, 0] = 0
         n = count[r]
-        if status[r] != 0 or start >= n - wp.static(0 if closed else 1):
+        if flags[STATUS, r] != 0 or start >= n - wp.static(0 if closed else 1):
             return
-        frozen = reuse != 0 and iteration[r] > 0
-        exact = iteration[r] >= wp.static(begin)
+        frozen = reuse != 0 and flags[ITERATION, r] > 0
+        exact = flags[ITERATION, r] >= wp.static(begin)
+        rate = scalars[RATE, r]
         for k in range(start, until(start, n - wp.static(0 if closed else 1))):
             whole = wp.static(closed) or k < n - 2
             q = window(x, theta, k, n, whole, r)
@@ -565,19 +563,19 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
             stiffest = real(0.0)
             if whole or wp.static(everywhere):
                 own, part, stiff = evaluate_first(
-                    q, s, buffer, table, last, rate[r], clamped[r], frozen, exact, factor_out, geometric_out, k, r
+                    q, s, buffer, table, last, rate, clamped[r], frozen, exact, factor_out, geometric_out, k, r
                 )
                 energy += own
                 f += part
                 stiffest = wp.max(stiffest, stiff)
             if wp.static(terms > 1):
                 own_too, part_too, stiff_too = evaluate_last(
-                    q, s, buffer, table, last, rate[r], clamped[r], frozen, exact, factor_out, geometric_out, k, r
+                    q, s, buffer, table, last, rate, clamped[r], frozen, exact, factor_out, geometric_out, k, r
                 )
                 energy += own_too
                 f += part_too
                 stiffest = wp.max(stiffest, stiff_too)
-            energy_out[1 - slot[r], k, r] = energy
+            energy_out[1 - flags[SLOT, r], k, r] = energy
             stiffness_out[k, r] = linear(stiffest)
             for i in range(wp.static(size)):
                 gradient_out[i, k, r] = f[i]
@@ -599,7 +597,7 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
                         uf = transport(X(s[6], s[7], s[8]), tf0, tf)
                         m = reference_twist(ue, uf, te, tf, s[12])
                         if wp.min(along_e, along_f) < real(0.0) or wp.abs(m - s[12]) > real(1.5):
-                            turned_out[r] = 1
+                            flags[STALE, r] = 1
 
     return evaluate
 

@@ -14,6 +14,7 @@ import warp as wp
 
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, inertia_type, term_functions
+from ddg_warp.kernels.islands import PROGRESS, RATE, STATUS
 from ddg_warp.kernels.terms import Term
 
 DRIFT, ROUNDING, HELD, DISSIPATED = range(4)  # rows of a balance
@@ -53,7 +54,8 @@ def balance_function(term: Term, real):
             taken = w * wp.dot(slope_of(middle, p) - slope, strain)
         force = wp.max(wp.abs((slope * w) * jacobian))
         rounding = floor * (wp.abs(start) + wp.abs(end) + force * reach)
-        return B(end - start - w * wp.dot(slope, strain), rounding, end, taken)
+        # that of a magnet may be negative, and counts by its size
+        return B(end - start - w * wp.dot(slope, strain), rounding, wp.abs(end), taken)
 
     return balance
 
@@ -117,7 +119,8 @@ def chain_kernel(kind: ChainKind, real, linear):
         theta: wp.array2d(dtype=real),
         frame: wp.array3d(dtype=real),
         last: wp.array3d(dtype=real),
-        rate: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         buffer: wp.array(dtype=real),
         table: wp.array2d(dtype=int),
         count: wp.array(dtype=int),
@@ -131,13 +134,12 @@ def chain_kernel(kind: ChainKind, real, linear):
         stiffness: wp.array2d(dtype=linear),
         damping: wp.array(dtype=real),
         floor: real,
-        progress: wp.array(dtype=real),
         ranges: int,
         rows_out: wp.array3d(dtype=real),
     ):
         """`load` and `load_angle` are those of the iterate, those `there` those that the step was solved with."""
         start, r = wp.tid()
-        if progress[r] >= real(1.0):
+        if scalars[PROGRESS, r] >= real(1.0):
             return
         n = count[r]
         total = B()
@@ -148,14 +150,14 @@ def chain_kernel(kind: ChainKind, real, linear):
                 m = mass[k, r]
             here = x[k, r]
             moved = here - x0[k, r]
-            v = moved * (real(2.0) * rate[r]) - v0[k, r]
+            v = moved * (real(2.0) * scalars[RATE, r]) - v0[k, r]
             kinetic = real(0.5) * m * wp.length_sq(v)
-            damped = real(2.0) * damping[0] * rate[r] * m * wp.length_sq(moved)
+            damped = real(2.0) * damping[0] * scalars[RATE, r] * m * wp.length_sq(moved)
             if wp.static(twist):
                 turned = theta[k, r] - theta0[k, r]
-                spin = turned * (real(2.0) * rate[r]) - omega0[k, r]
+                spin = turned * (real(2.0) * scalars[RATE, r]) - omega0[k, r]
                 kinetic += real(0.5) * rotary[k, r] * spin * spin
-                damped += real(2.0) * damping[0] * rate[r] * rotary[k, r] * turned * turned
+                damped += real(2.0) * damping[0] * scalars[RATE, r] * rotary[k, r] * turned * turned
                 if wp.static(drag):
                     damped += real(2.0) * mass[k, r].spin * turned * turned
             if wp.static(drag):
@@ -178,7 +180,7 @@ def chain_kernel(kind: ChainKind, real, linear):
                 q = window(x, theta, k, n, whole, r)
                 s0 = lagged(frame0, k, n, whole, r)
                 s = lagged(frame, k, n, whole, r)
-                total += rows_of_all(q0, s0, q, s, buffer, table, last, rate[r], whole, reach, floor, k, r)
+                total += rows_of_all(q0, s0, q, s, buffer, table, last, scalars[RATE, r], whole, reach, floor, k, r)
                 least = floor * reach
                 total[wp.static(ROUNDING)] = total[wp.static(ROUNDING)] + real(stiffness[k, r]) * least * least
         for i in range(wp.static(ROWS)):
@@ -200,13 +202,13 @@ def judge_kernel(real):
     def judge(
         rows: wp.array3d(dtype=real),
         bound: real,
-        progress: wp.array(dtype=real),
-        status: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         account: wp.array2d(dtype=real),
         failed_out: wp.array2d(dtype=real),
     ):
         r = wp.tid()
-        if progress[r] >= real(1.0) or status[r] > wp.static(outcome.CONVERGED_TO_ROUNDING):
+        if scalars[PROGRESS, r] >= real(1.0) or flags[STATUS, r] > wp.static(outcome.CONVERGED_TO_ROUNDING):
             return
         drift = account[wp.static(DRIFT), r]
         rounding = account[wp.static(ROUNDING), r]
@@ -221,7 +223,7 @@ def judge_kernel(real):
         held = wp.max(held, account[wp.static(HELD), r])
         allowed = bound * (held + dissipated) + rounding
         if not wp.abs(drift) <= wp.max(allowed, before):
-            status[r] = wp.static(outcome.ENERGY_DRIFT)
+            flags[STATUS, r] = wp.static(outcome.ENERGY_DRIFT)
             failed_out[0, r] = drift
             failed_out[1, r] = held + dissipated
             return

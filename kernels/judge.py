@@ -10,6 +10,22 @@ import warp as wp
 
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.element import ChainKind
+from ddg_warp.kernels.islands import (
+    ACTIVE,
+    DECREMENT,
+    DROWNED,
+    HALVINGS,
+    ITERATION,
+    LOAD_SCALE,
+    MERIT,
+    RESIDUAL,
+    SLOT,
+    STALE,
+    STATUS,
+    STEP_LENGTH,
+    UNBALANCED,
+    WANTED,
+)
 from ddg_warp.kernels.search import PLACE, RELAG, search_functions, shorter_function
 
 STOP, DIRECT = 0, 3  # beside PLACE and RELAG: nothing more to do, and a direction is wanted
@@ -21,24 +37,20 @@ def judge_functions(twist: bool, real):
     shorter = shorter_function(real)
 
     @wp.func
-    def balanced(
-        status: wp.array(dtype=int),
-        unbalanced: wp.array(dtype=int),
-        drowned: wp.array(dtype=int),
-        iteration: wp.array(dtype=int),
-        r: int,
-    ):
+    def balanced(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), r: int):
         """Whether the rod has stopped, by its last iterate or before; lowers its flags where it has not."""
-        if status[r] != 0:
+        if flags[STATUS, r] != 0:
             return True
         # rounding excuses a residual only after an iteration: the predictor's may be all of a coarse precision's load
-        if unbalanced[r] == 0 and (drowned[r] == 0 or iteration[r] > 0):
-            status[r] = wp.where(
-                drowned[r] == 0, int(wp.static(outcome.CONVERGED)), int(wp.static(outcome.CONVERGED_TO_ROUNDING))
+        if flags[UNBALANCED, r] == 0 and (flags[DROWNED, r] == 0 or flags[ITERATION, r] > 0):
+            flags[STATUS, r] = wp.where(
+                flags[DROWNED, r] == 0,
+                int(wp.static(outcome.CONVERGED)),
+                int(wp.static(outcome.CONVERGED_TO_ROUNDING)),
             )
             return True
-        unbalanced[r] = 0
-        drowned[r] = 0
+        flags[UNBALANCED, r] = 0
+        flags[DROWNED, r] = 0
         return False
 
     @wp.func
@@ -49,61 +61,53 @@ def judge_functions(twist: bool, real):
         worst: real,
         max_iterations: int,
         max_halvings: int,
-        status: wp.array(dtype=int),
-        slot: wp.array(dtype=int),
-        iteration: wp.array(dtype=int),
-        halvings: wp.array(dtype=int),
-        step_length: wp.array(dtype=real),
-        decrement: wp.array(dtype=real),
-        merit: wp.array(dtype=real),
-        load_scale: wp.array(dtype=real),
-        largest: wp.array(dtype=real),
-        turned: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         r: int,
     ):
         """From the energy's change and its rounding, the square and the largest component of the residual.
 
         PLACE leaves the shorter step in `step_length`; RELAG asks for frames of the iterate and a step of no length.
         """
-        first = iteration[r] == 0
-        largest[r] = worst
+        first = flags[ITERATION, r] == 0
+        scalars[RESIDUAL, r] = worst
         total = change
         if first:
             total = real(0.0)
-            if load_scale[r] == real(0.0):
-                load_scale[r] = worst
+            if scalars[LOAD_SCALE, r] == real(0.0):
+                scalars[LOAD_SCALE, r] = worst
         finite = wp.isfinite(square) and wp.isfinite(total)
         if first and not finite:
-            status[r] = wp.static(outcome.NON_FINITE)
+            flags[STATUS, r] = wp.static(outcome.NON_FINITE)
             return wp.static(STOP)
-        taken = step_length[r]
-        expected = taken * decrement[r]
+        taken = scalars[STEP_LENGTH, r]
+        expected = taken * scalars[DECREMENT, r]
         accept = first
         if not first and finite:
             if expected > real(10.0) * rounding:
                 accept = total <= real(-1.0e-4) * expected + rounding
             else:
-                accept = square <= real(4.0) * merit[r] or taken == real(0.0)
+                accept = square <= real(4.0) * scalars[MERIT, r] or taken == real(0.0)
         if not accept:
-            halvings[r] = halvings[r] + 1
-            if halvings[r] > max_halvings:
-                status[r] = wp.static(outcome.LINE_SEARCH_FAILED)
+            flags[HALVINGS, r] = flags[HALVINGS, r] + 1
+            if flags[HALVINGS, r] > max_halvings:
+                flags[STATUS, r] = wp.static(outcome.LINE_SEARCH_FAILED)
                 return wp.static(STOP)
-            step_length[r] = shorter(taken, expected, total, finite)
+            scalars[STEP_LENGTH, r] = shorter(taken, expected, total, finite)
             return wp.static(PLACE)
-        iteration[r] = iteration[r] + 1
-        if iteration[r] > max_iterations:
-            status[r] = wp.static(outcome.MAX_ITERATIONS)
+        flags[ITERATION, r] = flags[ITERATION, r] + 1
+        if flags[ITERATION, r] > max_iterations:
+            flags[STATUS, r] = wp.static(outcome.MAX_ITERATIONS)
             return wp.static(STOP)
-        merit[r] = square
-        slot[r] = 1 - slot[r]
-        halvings[r] = 0
+        scalars[MERIT, r] = square
+        flags[SLOT, r] = 1 - flags[SLOT, r]
+        flags[HALVINGS, r] = 0
         if wp.static(twist):
-            if turned[r] != 0:
+            if flags[STALE, r] != 0:
                 # angles mean something else now: take no step, and ask for a direction in the new frames
-                turned[r] = 0
-                decrement[r] = real(1.0e30)
-                step_length[r] = real(0.0)
+                flags[STALE, r] = 0
+                scalars[DECREMENT, r] = real(1.0e30)
+                scalars[STEP_LENGTH, r] = real(0.0)
                 return wp.static(RELAG)
         return wp.static(DIRECT)
 
@@ -133,24 +137,12 @@ def judge_kernel(kind: ChainKind, real, linear):
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
         frame: wp.array3d(dtype=real),
-        status: wp.array(dtype=int),
-        unbalanced: wp.array(dtype=int),
-        drowned: wp.array(dtype=int),
-        slot: wp.array(dtype=int),
-        iteration: wp.array(dtype=int),
-        halvings: wp.array(dtype=int),
-        step_length: wp.array(dtype=real),
-        decrement: wp.array(dtype=real),
-        merit: wp.array(dtype=real),
-        load_scale: wp.array(dtype=real),
-        largest: wp.array(dtype=real),
-        turned: wp.array(dtype=int),
-        wanted: wp.array(dtype=int),
-        active: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
     ):
         r = wp.tid()
-        wanted[r] = 0
-        if balanced(status, unbalanced, drowned, iteration, r):
+        flags[WANTED, r] = 0
+        if balanced(flags, scalars, r):
             return
         n = count[r]
         total = real(0.0)
@@ -164,31 +156,13 @@ def judge_kernel(kind: ChainKind, real, linear):
                 size = wp.abs(real(residual[d, k, r]))
                 worst = wp.max(worst, size)
                 square += size * size
-        taken = step_length[r]
-        what = decide(
-            total,
-            rounding * floor,
-            square,
-            worst,
-            max_iterations,
-            max_halvings,
-            status,
-            slot,
-            iteration,
-            halvings,
-            step_length,
-            decrement,
-            merit,
-            load_scale,
-            largest,
-            turned,
-            r,
-        )
+        taken = scalars[STEP_LENGTH, r]
+        what = decide(total, rounding * floor, square, worst, max_iterations, max_halvings, flags, scalars, r)
         if what == wp.static(STOP):
             return
-        active[0] = 1
+        flags[ACTIVE, 0] = 1
         if what == wp.static(PLACE):
-            less = step_length[r]
+            less = scalars[STEP_LENGTH, r]
             place(x, base, direction, fixed, less, n, r)
             turn_angles(theta, direction, less - taken, n, r)
         if wp.static(twist):
@@ -197,6 +171,6 @@ def judge_kernel(kind: ChainKind, real, linear):
                 for k in range(n):
                     base[k, r] = x[k, r]
         if what == wp.static(DIRECT):
-            wanted[r] = 1
+            flags[WANTED, r] = 1
 
     return judge

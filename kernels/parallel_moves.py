@@ -10,6 +10,7 @@ import warp as wp
 
 from ddg_warp.kernels import frames
 from ddg_warp.kernels.element import ChainKind
+from ddg_warp.kernels.islands import ANGLE_CHANGE, BENT, PROGRESS, RATE, STEP_LENGTH, TODO
 from ddg_warp.kernels.search import PLACE, RELAG, move_functions
 
 
@@ -115,10 +116,9 @@ def move_kernels(kind: ChainKind, real, linear):
         count: wp.array(dtype=int),
         fixed: wp.array2d(dtype=wp.uint8),
         held: wp.array3d(dtype=int),
-        todo: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         direction: wp.array3d(dtype=linear),
-        step_length: wp.array(dtype=real),
-        angle_change: wp.array(dtype=real),
         prefix: wp.array2d(dtype=V),
         sums: wp.array3d(dtype=V),
         mean: wp.array(dtype=V),
@@ -131,7 +131,7 @@ def move_kernels(kind: ChainKind, real, linear):
     ):
         """Puts a node where its step ends: of turned edges the sum from the held node before it, closing at the next."""
         k, r = wp.tid()
-        what = todo[r]
+        what = flags[TODO, r]
         if what == 0 or k >= count[r]:
             return
         if what == wp.static(RELAG):
@@ -155,9 +155,9 @@ def move_kernels(kind: ChainKind, real, linear):
                 shift -= start
                 if q > p:
                     shift -= (before(prefix, sums, width, q, r) - start) * (real(k - p) / real(q - p))
-        put(x, base, direction, fixed, step_length[r], shift, k, r)
+        put(x, base, direction, fixed, scalars[STEP_LENGTH, r], shift, k, r)
         if wp.static(twist):
-            theta[k, r] = theta[k, r] + angle_change[r] * real(direction[wp.static(dim), k, r])
+            theta[k, r] = theta[k, r] + scalars[ANGLE_CHANGE, r] * real(direction[wp.static(dim), k, r])
 
     return turn, scan, offset, move
 
@@ -174,26 +174,22 @@ def predict_kernels(kind: ChainKind, real, linear):
         v0: wp.array2d(dtype=V),
         fixed: wp.array2d(dtype=wp.uint8),
         count: wp.array(dtype=int),
-        rate: wp.array(dtype=real),
-        progress: wp.array(dtype=real),
-        bent: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         base_out: wp.array2d(dtype=V),
         direction_out: wp.array3d(dtype=linear),
-        step_length_out: wp.array(dtype=real),
-        angle_change_out: wp.array(dtype=real),
-        todo_out: wp.array(dtype=int),
     ):
         k, r = wp.tid()
         if k >= count[r]:
             return
-        moving = progress[r] < real(1.0) and bent[r] != 0
+        moving = scalars[PROGRESS, r] < real(1.0) and flags[BENT, r] != 0
         if k == 0:
-            step_length_out[r] = real(1.0)
-            angle_change_out[r] = real(0.0)
-            todo_out[r] = wp.where(moving, wp.static(PLACE), 0)
+            scalars[STEP_LENGTH, r] = real(1.0)
+            scalars[ANGLE_CHANGE, r] = real(0.0)
+            flags[TODO, r] = wp.where(moving, wp.static(PLACE), 0)
         if moving:
             base_out[k, r] = x0[k, r]
-            v = v0[k, r] / rate[r]
+            v = v0[k, r] / scalars[RATE, r]
             for d in range(wp.static(nb)):
                 direction_out[d, k, r] = linear(0.0)
             for d in range(wp.static(dim)):
@@ -201,8 +197,8 @@ def predict_kernels(kind: ChainKind, real, linear):
                     direction_out[d, k, r] = linear(v[d])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def renew(progress: wp.array(dtype=real), todo_out: wp.array(dtype=int)):
+    def renew(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real)):
         r = wp.tid()
-        todo_out[r] = wp.where(progress[r] < real(1.0), wp.static(RELAG), 0)
+        flags[TODO, r] = wp.where(scalars[PROGRESS, r] < real(1.0), wp.static(RELAG), 0)
 
     return aim, renew

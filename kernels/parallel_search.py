@@ -10,6 +10,19 @@ import warp as wp
 
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.element import ChainKind
+from ddg_warp.kernels.islands import (
+    ACTIVE,
+    ANGLE_CHANGE,
+    BAD,
+    CLAMPED,
+    DECREMENT,
+    ITERATION,
+    LOST,
+    STATUS,
+    STEP_LENGTH,
+    TODO,
+    WANTED,
+)
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
 from ddg_warp.kernels.search import PLACE, TURNED
 
@@ -100,30 +113,14 @@ def decide_kernels(kind: ChainKind, real, linear):
         floor: real,
         max_iterations: int,
         max_halvings: int,
-        status: wp.array(dtype=int),
-        unbalanced: wp.array(dtype=int),
-        drowned: wp.array(dtype=int),
-        slot: wp.array(dtype=int),
-        iteration: wp.array(dtype=int),
-        halvings: wp.array(dtype=int),
-        step_length: wp.array(dtype=real),
-        decrement: wp.array(dtype=real),
-        merit: wp.array(dtype=real),
-        load_scale: wp.array(dtype=real),
-        largest: wp.array(dtype=real),
-        turned: wp.array(dtype=int),
-        lost: wp.array(dtype=int),
-        wanted: wp.array(dtype=int),
-        bad: wp.array(dtype=int),
-        todo: wp.array(dtype=int),
-        angle_change: wp.array(dtype=real),
-        active: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
     ):
         r = wp.tid()
-        wanted[r] = 0
-        todo[r] = 0
-        bad[r] = 0
-        if balanced(status, unbalanced, drowned, iteration, r):
+        flags[WANTED, r] = 0
+        flags[TODO, r] = 0
+        flags[BAD, r] = 0
+        if balanced(flags, scalars, r):
             return
         total = real(0.0)
         rounding = real(0.0)
@@ -134,77 +131,51 @@ def decide_kernels(kind: ChainKind, real, linear):
             rounding += partial[1, i, r]
             square += partial[2, i, r]
             worst = wp.max(worst, partial[3, i, r])
-        if iteration[r] == 0:
-            lost[r] = 0
-        taken = step_length[r]
-        what = decide(
-            total,
-            rounding * floor,
-            square,
-            worst,
-            max_iterations,
-            max_halvings,
-            status,
-            slot,
-            iteration,
-            halvings,
-            step_length,
-            decrement,
-            merit,
-            load_scale,
-            largest,
-            turned,
-            r,
-        )
+        if flags[ITERATION, r] == 0:
+            flags[LOST, r] = 0
+        taken = scalars[STEP_LENGTH, r]
+        what = decide(total, rounding * floor, square, worst, max_iterations, max_halvings, flags, scalars, r)
         if what == wp.static(STOP):
             return
-        active[0] = 1
+        flags[ACTIVE, 0] = 1
         if what == wp.static(DIRECT):
-            wanted[r] = 1
+            flags[WANTED, r] = 1
         else:
-            todo[r] = what
-            angle_change[r] = step_length[r] - taken
+            flags[TODO, r] = what
+            scalars[ANGLE_CHANGE, r] = scalars[STEP_LENGTH, r] - taken
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def take(
         partial: wp.array3d(dtype=real),
         ranges: int,
         rotation_cap: real,
-        wanted: wp.array(dtype=int),
-        bad: wp.array(dtype=int),
-        status: wp.array(dtype=int),
-        iteration: wp.array(dtype=int),
-        step_length: wp.array(dtype=real),
-        decrement: wp.array(dtype=real),
-        lost: wp.array(dtype=int),
-        clamped: wp.array(dtype=int),
-        todo: wp.array(dtype=int),
-        angle_change: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
     ):
         r = wp.tid()
-        if wanted[r] == 0:
+        if flags[WANTED, r] == 0:
             return
-        if bad[r] > 0 and clamped[r] == 0:
+        if flags[BAD, r] > 0 and flags[CLAMPED, r] == 0:
             # compression has made the matrix indefinite: the same iterate again, without what compression takes away
-            clamped[r] = 1
-            iteration[r] = iteration[r] - 1
-            step_length[r] = real(0.0)
+            flags[CLAMPED, r] = 1
+            flags[ITERATION, r] = flags[ITERATION, r] - 1
+            scalars[STEP_LENGTH, r] = real(0.0)
             return
-        lost[r] = lost[r] + bad[r]
+        flags[LOST, r] = flags[LOST, r] + flags[BAD, r]
         total = real(0.0)
         rotation = real(0.0)
         for i in range(ranges):
             total += partial[0, i, r]
             rotation = wp.max(rotation, partial[1, i, r])
         if not wp.isfinite(total):
-            status[r] = wp.static(outcome.NON_FINITE)
+            flags[STATUS, r] = wp.static(outcome.NON_FINITE)
             return
         whole = real(1.0)
         if rotation > rotation_cap * rotation_cap:
             whole = rotation_cap / wp.sqrt(rotation)
-        step_length[r] = whole
-        angle_change[r] = whole
-        decrement[r] = total
-        todo[r] = wp.where(rotation > real(wp.static(TURNED**2)), wp.static(PLACE), wp.static(STRAIGHT))
+        scalars[STEP_LENGTH, r] = whole
+        scalars[ANGLE_CHANGE, r] = whole
+        scalars[DECREMENT, r] = total
+        flags[TODO, r] = wp.where(rotation > real(wp.static(TURNED**2)), wp.static(PLACE), wp.static(STRAIGHT))
 
     return judge, take

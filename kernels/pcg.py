@@ -12,6 +12,7 @@ import warp as wp
 from ddg_warp.kernels import outcome, pivot
 from ddg_warp.kernels.block_band import block_functions, product_function, substitute_function
 from ddg_warp.kernels.element import ChainKind
+from ddg_warp.kernels.islands import CLAMPED, DECREMENT, ITERATION, LOST, SLOT, STATUS, STEP_LENGTH, WANTED
 from ddg_warp.kernels.search import TURNED, search_functions
 
 PRECONDITIONERS = ("jacobi", "block_jacobi", "chain")
@@ -170,7 +171,7 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
 
 
 @cache
-def repeat_kernel(fails: bool):
+def repeat_kernel(real, fails: bool):
     """Where the exact Hessian is indefinite: end the solve (`fails`), or undo the acceptance and ask for the iterate again.
 
     `negative` counts lost pivots and negative curvatures of this iteration; `clamped` then leaves the geometric stiffness and
@@ -179,32 +180,23 @@ def repeat_kernel(fails: bool):
     """
 
     @wp.kernel(module="unique", enable_backward=False)
-    def repeat(
-        done: int,
-        wanted: wp.array(dtype=int),
-        negative: wp.array(dtype=int),
-        clamped: wp.array(dtype=int),
-        status: wp.array(dtype=int),
-        iteration: wp.array(dtype=int),
-        slot: wp.array(dtype=int),
-        lost: wp.array(dtype=int),
-    ):
+    def repeat(done: int, flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), negative: wp.array(dtype=int)):
         r = wp.tid()
-        if wanted[r] == 0:
+        if flags[WANTED, r] == 0:
             return
-        if negative[r] > 0 and clamped[r] == 0:
-            wanted[r] = 0
+        if negative[r] > 0 and flags[CLAMPED, r] == 0:
+            flags[WANTED, r] = 0
             negative[r] = 0
             if wp.static(fails):
-                status[r] = wp.static(outcome.INDEFINITE)
+                flags[STATUS, r] = wp.static(outcome.INDEFINITE)
                 return
-            clamped[r] = 1
-            iteration[r] = iteration[r] - 1
-            slot[r] = 1 - slot[r]
+            flags[CLAMPED, r] = 1
+            flags[ITERATION, r] = flags[ITERATION, r] - 1
+            flags[SLOT, r] = 1 - flags[SLOT, r]
         elif done != 0:
-            lost[r] = lost[r] + negative[r]
+            flags[LOST, r] = flags[LOST, r] + negative[r]
             negative[r] = 0
-            clamped[r] = 0
+            flags[CLAMPED, r] = 0
 
     return repeat
 
@@ -228,13 +220,12 @@ def take_kernel(kind: ChainKind, real, linear):
         base: wp.array2d(dtype=V),
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
-        wanted: wp.array(dtype=int),
-        step_length: wp.array(dtype=real),
-        decrement: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         work: wp.array(dtype=wp.int64),
     ):
         r = wp.tid()
-        if wanted[r] == 0:
+        if flags[WANTED, r] == 0:
             return
         n = count[r]
         rotation = real(0.0)
@@ -260,8 +251,8 @@ def take_kernel(kind: ChainKind, real, linear):
                 for d in range(wp.static(dim)):
                     step[d] = real(direction[d, k, r])
                 x[k, r] = x[k, r] + step
-        step_length[r] = whole
-        decrement[r] = total
+        scalars[STEP_LENGTH, r] = whole
+        scalars[DECREMENT, r] = total
         wp.atomic_add(work, 0, wp.int64(iterations[r]))
 
     return take

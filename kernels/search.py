@@ -6,6 +6,7 @@ import warp as wp
 
 from ddg_warp.kernels import frames
 from ddg_warp.kernels.element import ChainKind, gather_functions
+from ddg_warp.kernels.islands import ANGLE_CHANGE, PLACED, STEP_LENGTH, TODO
 
 PLACE, RELAG = 1, 2  # what a sweep leaves to `adjust`
 TURNED = 0.1  # largest turn of an edge in a step that is still taken straight [rad]; its stretch is TURNED^2 / 2
@@ -204,31 +205,29 @@ def adjust_kernel(kind: ChainKind, real, linear):
         count: wp.array(dtype=int),
         fixed: wp.array2d(dtype=wp.uint8),
         direction: wp.array3d(dtype=linear),
-        step_length: wp.array(dtype=real),
-        angle_change: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
         frame: wp.array3d(dtype=real),
         base: wp.array2d(dtype=V),
-        todo: wp.array(dtype=int),
-        placed: wp.array(dtype=int),
     ):
         r = wp.tid()
-        if todo[r] == wp.static(PLACE):
-            if placed[r] == 0:
+        if flags[TODO, r] == wp.static(PLACE):
+            if flags[PLACED, r] == 0:
                 # the sweep stepped straight; from now on the positions it came from are needed
-                placed[r] = 1
-                straight = step_length[r] - angle_change[r]
+                flags[PLACED, r] = 1
+                straight = scalars[STEP_LENGTH, r] - scalars[ANGLE_CHANGE, r]
                 for j in range(count[r]):
                     back = V()
                     for d in range(wp.static(dim)):
                         back[d] = straight * real(direction[d, j, r])
                     base[j, r] = x[j, r] - back
-            place(x, base, direction, fixed, step_length[r], count[r], r)
-            turn_angles(theta, direction, angle_change[r], count[r], r)
+            place(x, base, direction, fixed, scalars[STEP_LENGTH, r], count[r], r)
+            turn_angles(theta, direction, scalars[ANGLE_CHANGE, r], count[r], r)
         if wp.static(twist):
-            if todo[r] == wp.static(RELAG):
+            if flags[TODO, r] == wp.static(RELAG):
                 relag(x, frame, count[r], r)
-        todo[r] = 0
+        flags[TODO, r] = 0
 
     return adjust

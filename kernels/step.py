@@ -17,12 +17,27 @@ import warp as wp
 
 from ddg_warp.kernels import frames, motion, outcome
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, until_function
+from ddg_warp.kernels.islands import (
+    BENT,
+    CAUTIOUS,
+    ITERATION,
+    LOST,
+    MOVED,
+    PORTION,
+    PROGRESS,
+    RATE,
+    REASON,
+    RETRIES,
+    STATUS,
+    attempt_functions,
+)
 from ddg_warp.kernels.search import TURNED, search_functions
 
 
 @cache
 def begin_kernel(kind: ChainKind, real, midpoint: bool):
     """Predictor, target of the inertia, copy of the lagged frames; restarts the search of every rod that still has to move."""
+    length, restart = attempt_functions(real, midpoint)
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
     until = until_function(kind)
@@ -40,49 +55,24 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
         dt: wp.array(dtype=real),
         damping: wp.array(dtype=real),
         outer: wp.array(dtype=real),
-        progress: wp.array(dtype=real),
-        portion: wp.array(dtype=real),
-        cautious: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         x_out: wp.array2d(dtype=V),
         theta_out: wp.array2d(dtype=real),
         frame_out: wp.array3d(dtype=real),
         target_out: wp.array2d(dtype=V),
         target_angle_out: wp.array2d(dtype=real),
-        coefficient_out: wp.array(dtype=real),
-        rate_out: wp.array(dtype=real),
-        status_out: wp.array(dtype=int),
-        iteration_out: wp.array(dtype=int),
-        halvings_out: wp.array(dtype=int),
-        turned_out: wp.array(dtype=int),
-        clamped_out: wp.array(dtype=int),
-        unbalanced_out: wp.array(dtype=int),
-        drowned_out: wp.array(dtype=int),
-        load_scale_out: wp.array(dtype=real),
-        bent_out: wp.array(dtype=int),
-        active_out: wp.array(dtype=int),
     ):
         start, r = wp.tid()
         n = count[r]
-        if progress[r] >= real(1.0) or start >= n:
+        if scalars[PROGRESS, r] >= real(1.0) or start >= n:
             return
-        s = dt[world[r]] * portion[r]
-        if wp.static(midpoint):
-            s *= real(0.5)
+        s = length(scalars, r, dt[world[r]])
         rate = real(1.0) / s
         coefficient = rate * (rate + damping[0])
         if start == 0:
-            coefficient_out[r] = coefficient
-            rate_out[r] = rate
-            status_out[r] = 0
-            iteration_out[r] = 0
-            halvings_out[r] = 0
-            turned_out[r] = 0
-            clamped_out[r] = 0
-            unbalanced_out[r] = 0
-            drowned_out[r] = 0
-            load_scale_out[r] = outer[r]
-            active_out[0] = 1
-        ahead = wp.where(cautious[r] == 0, s, real(0.0))
+            restart(flags, scalars, r, rate, coefficient, outer[r])
+        ahead = wp.where(flags[CAUTIOUS, r] == 0, s, real(0.0))
         for k in range(start, until(start, n)):
             mask = int(fixed[k, r])
             here = x0[k, r]
@@ -92,11 +82,11 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
                 if ((mask >> d) & 1) == 0:
                     here[d] = here[d] + ahead * v[d]
             x_out[k, r] = here
-            if cautious[r] == 0 and k + 1 < n:
+            if flags[CAUTIOUS, r] == 0 and k + 1 < n:
                 turn = (v0[k + 1, r] - v) * s
                 edge = x0[k + 1, r] - x0[k, r]
                 if wp.length_sq(turn) > real(wp.static(TURNED**2)) * wp.length_sq(edge):
-                    bent_out[r] = 1
+                    flags[BENT, r] = 1
             if wp.static(twist):
                 angle = theta0[k, r]
                 spin = omega0[k, r]
@@ -127,22 +117,21 @@ def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
         v0: wp.array2d(dtype=V),
         fixed: wp.array2d(dtype=wp.uint8),
         count: wp.array(dtype=int),
-        rate: wp.array(dtype=real),
-        progress: wp.array(dtype=real),
-        bent: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         base: wp.array2d(dtype=V),
         direction: wp.array3d(dtype=linear),
         x: wp.array2d(dtype=V),
         frame: wp.array3d(dtype=real),
     ):
         r = wp.tid()
-        if progress[r] >= real(1.0):
+        if scalars[PROGRESS, r] >= real(1.0):
             return
         n = count[r]
-        if bent[r] != 0:
+        if flags[BENT, r] != 0:
             for k in range(n):
                 base[k, r] = x0[k, r]
-                v = v0[k, r] / rate[r]
+                v = v0[k, r] / scalars[RATE, r]
                 for d in range(wp.static(dim)):
                     direction[d, k, r] = linear(wp.where(((int(fixed[k, r]) >> d) & 1) == 0, v[d], real(0.0)))
             place(x, base, direction, fixed, real(1.0), n, r)
@@ -157,18 +146,12 @@ def start_kernel(real):
     """Starts a step: every rod that has not been given up has all of it to do."""
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def start(
-        status: wp.array(dtype=int),
-        progress_out: wp.array(dtype=real),
-        portion_out: wp.array(dtype=real),
-        cautious_out: wp.array(dtype=int),
-        retries_out: wp.array(dtype=int),
-    ):
+    def start(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real)):
         r = wp.tid()
-        portion_out[r] = real(1.0)
-        cautious_out[r] = 0
-        retries_out[r] = 0
-        progress_out[r] = wp.where(status[r] == wp.static(outcome.GIVEN_UP), real(1.0), real(0.0))
+        scalars[PORTION, r] = real(1.0)
+        flags[CAUTIOUS, r] = 0
+        flags[RETRIES, r] = 0
+        scalars[PROGRESS, r] = wp.where(flags[STATUS, r] == wp.static(outcome.GIVEN_UP), real(1.0), real(0.0))
 
     return start
 
@@ -188,9 +171,8 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
         theta0: wp.array2d(dtype=real),
         omega0: wp.array2d(dtype=real),
         count: wp.array(dtype=int),
-        status: wp.array(dtype=int),
-        progress: wp.array(dtype=real),
-        rate: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         x_out: wp.array2d(dtype=V),
         v_out: wp.array2d(dtype=V),
         theta_out: wp.array2d(dtype=real),
@@ -200,7 +182,9 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
         n = count[r]
         if start >= n:
             return
-        moves = progress[r] < real(1.0) and status[r] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
+        moves = scalars[PROGRESS, r] < real(1.0) and flags[STATUS, r] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
+        if start == 0:
+            flags[MOVED, r] = wp.where(moves, 1, 0)
         for k in range(start, until(start, n)):
             before = x0[k, r]
             v = v0[k, r]
@@ -213,7 +197,7 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
             angle = angle0
             if moves:
                 end = x[k, r]
-                change = (end - before) * rate[r]
+                change = (end - before) * scalars[RATE, r]
                 if wp.static(midpoint):
                     end = real(2.0) * end - before
                     v = real(2.0) * change - v
@@ -221,7 +205,7 @@ def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
                     v = change
                 if wp.static(twist):
                     angle = theta[k, r]
-                    turn = (angle - angle0) * rate[r]
+                    turn = (angle - angle0) * scalars[RATE, r]
                     if wp.static(midpoint):
                         angle = real(2.0) * angle - angle0
                         spin = real(2.0) * turn - spin
@@ -263,15 +247,14 @@ def finish_frames_kernel(kind: ChainKind, real):
         frame: wp.array3d(dtype=real),
         frame0: wp.array3d(dtype=real),
         count: wp.array(dtype=int),
-        status: wp.array(dtype=int),
-        progress: wp.array(dtype=real),
+        moved: wp.array(dtype=int),
         frame_out: wp.array3d(dtype=real),
     ):
         start, r = wp.tid()
         n = count[r]
         if start >= n - wp.static(0 if closed else 1):
             return
-        if progress[r] >= real(1.0) or status[r] > wp.static(outcome.CONVERGED_TO_ROUNDING):
+        if moved[r] == 0:
             for k in range(start, until(start, n - wp.static(0 if closed else 1))):
                 for c in range(7):
                     frame_out[c, k, r] = frame0[c, k, r]
@@ -298,56 +281,53 @@ def advance_kernel(real):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def advance(
-        iteration: wp.array(dtype=int),
-        lost: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         retry_limit: int,
         smallest: real,
         rounded: int,
-        status: wp.array(dtype=int),
-        progress: wp.array(dtype=real),
-        portion: wp.array(dtype=real),
-        cautious: wp.array(dtype=int),
-        retries: wp.array(dtype=int),
-        reason: wp.array(dtype=int),
         tally: wp.array(dtype=wp.int64),
         work: wp.array(dtype=wp.int64),
         remaining: wp.array(dtype=int),
     ):
         r = wp.tid()
-        if progress[r] >= real(1.0):
+        if scalars[PROGRESS, r] >= real(1.0):
             return
-        result = status[r]
+        result = flags[STATUS, r]
         counted = result
         if result == wp.static(outcome.CONVERGED_TO_ROUNDING):
             counted = rounded
         wp.atomic_add(tally, counted, wp.int64(1))
-        wp.atomic_add(work, 0, wp.int64(iteration[r]))
-        wp.atomic_max(work, 1, wp.int64(iteration[r]))
+        wp.atomic_add(work, 0, wp.int64(flags[ITERATION, r]))
+        wp.atomic_max(work, 1, wp.int64(flags[ITERATION, r]))
         wp.atomic_add(work, 2, wp.int64(1))
-        if lost[r] > 0:
-            wp.atomic_add(work, 4, wp.int64(lost[r]))
+        if flags[LOST, r] > 0:
+            wp.atomic_add(work, 4, wp.int64(flags[LOST, r]))
         if result <= wp.static(outcome.CONVERGED_TO_ROUNDING):
-            progress[r] = progress[r] + portion[r]
-            cautious[r] = 0
-            retries[r] = 0
+            scalars[PROGRESS, r] = scalars[PROGRESS, r] + scalars[PORTION, r]
+            flags[CAUTIOUS, r] = 0
+            flags[RETRIES, r] = 0
             # a step twice as long, where it starts at a multiple of its length, so that all end together
-            longer = real(2.0) * portion[r]
-            if progress[r] < real(1.0) and wp.floor(progress[r] / longer) * longer == progress[r]:
-                portion[r] = longer
+            longer = real(2.0) * scalars[PORTION, r]
+            if (
+                scalars[PROGRESS, r] < real(1.0)
+                and wp.floor(scalars[PROGRESS, r] / longer) * longer == scalars[PROGRESS, r]
+            ):
+                scalars[PORTION, r] = longer
         else:
             wp.atomic_add(work, 3, wp.int64(1))
-            retries[r] = retries[r] + 1
+            flags[RETRIES, r] = flags[RETRIES, r] + 1
             # another start would lead to the same step, and its energy
-            if cautious[r] == 0 and result != wp.static(outcome.ENERGY_DRIFT):
-                cautious[r] = 1
+            if flags[CAUTIOUS, r] == 0 and result != wp.static(outcome.ENERGY_DRIFT):
+                flags[CAUTIOUS, r] = 1
             else:
-                cautious[r] = 0
-                portion[r] = real(0.5) * portion[r]
-            if retries[r] > retry_limit or portion[r] < smallest:
-                reason[r] = result
-                status[r] = wp.static(outcome.GIVEN_UP)
-                progress[r] = real(1.0)
-        if progress[r] < real(1.0):
+                flags[CAUTIOUS, r] = 0
+                scalars[PORTION, r] = real(0.5) * scalars[PORTION, r]
+            if flags[RETRIES, r] > retry_limit or scalars[PORTION, r] < smallest:
+                flags[REASON, r] = result
+                flags[STATUS, r] = wp.static(outcome.GIVEN_UP)
+                scalars[PROGRESS, r] = real(1.0)
+        if scalars[PROGRESS, r] < real(1.0):
             remaining[0] = 1
 
     return advance
@@ -368,24 +348,24 @@ def motion_kernels(kind: ChainKind, real, midpoint: bool):
         where: wp.array2d(dtype=int),
         rest: wp.array2d(dtype=real),
         pose: wp.array2d(dtype=real),
-        progress: wp.array(dtype=real),
-        portion: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         x: wp.array2d(dtype=V),
     ):
         """`where` is (node, rod, motion of each component, -1 for none), `rest` the positions in the rest state."""
         i = wp.tid()
         k = where[i, 0]
         r = where[i, 1]
-        if progress[r] >= real(1.0):
+        if scalars[PROGRESS, r] >= real(1.0):
             return
         at = X(rest[i, 0], rest[i, 1], rest[i, 2])
         here = x[k, r]
         for d in range(wp.static(dim)):
             m = where[i, 2 + d]
             if m >= 0:
-                p = placed(pose, m, progress[r] + portion[r], at)
+                p = placed(pose, m, scalars[PROGRESS, r] + scalars[PORTION, r], at)
                 if wp.static(midpoint):
-                    p = real(0.5) * (p + placed(pose, m, progress[r], at))
+                    p = real(0.5) * (p + placed(pose, m, scalars[PROGRESS, r], at))
                 here[d] = p[d * wp.static(axis)]
         x[k, r] = here
 
@@ -395,8 +375,8 @@ def motion_kernels(kind: ChainKind, real, midpoint: bool):
         rest: wp.array2d(dtype=real),
         pose: wp.array2d(dtype=real),
         count: wp.array(dtype=int),
-        progress: wp.array(dtype=real),
-        portion: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         x: wp.array2d(dtype=V),
         frame: wp.array3d(dtype=real),
         theta: wp.array2d(dtype=real),
@@ -406,14 +386,14 @@ def motion_kernels(kind: ChainKind, real, midpoint: bool):
         k = where[i, 0]
         r = where[i, 1]
         m = where[i, 2]
-        if progress[r] >= real(1.0):
+        if scalars[PROGRESS, r] >= real(1.0):
             return
         t = wp.normalize(x[along(k + 1, count[r]), r] - x[k, r])
         director = X(rest[i, 0], rest[i, 1], rest[i, 2])
-        start = progress[r]
-        end = start + portion[r]
+        start = scalars[PROGRESS, r]
+        end = start + scalars[PORTION, r]
         if wp.static(midpoint):
-            end = start + real(0.5) * portion[r]
+            end = start + real(0.5) * scalars[PORTION, r]
         u = transport(
             X(frame[0, k, r], frame[1, k, r], frame[2, k, r]), X(frame[3, k, r], frame[4, k, r], frame[5, k, r]), t
         )

@@ -7,6 +7,7 @@ import numpy as np
 
 from ddg_warp.kernels.densities import POSITIVE, Density, Parameter
 from ddg_warp.kernels.densities.damping import damped
+from ddg_warp.kernels.densities.dipole import dipole_dipole, dipole_in_field
 from ddg_warp.kernels.densities.quadratic import quadratic
 from ddg_warp.kernels.densities.st_venant_kirchhoff import st_venant_kirchhoff
 from ddg_warp.kernels.measures import Measure
@@ -18,19 +19,31 @@ from ddg_warp.kernels.measures.edge_tilt import edge_tilt
 from ddg_warp.kernels.measures.hinge_angle import hinge_angle
 from ddg_warp.kernels.measures.isometric_bending import isometric_bending
 from ddg_warp.kernels.measures.joint_curvature_twist import joint_curvature_twist
+from ddg_warp.kernels.measures.magnetised_edge import (
+    dipole_pair,
+    dipole_pair_tangent,
+    magnetised_edge,
+    magnetised_tangent,
+)
 from ddg_warp.kernels.measures.midedge_curvature import midedge_curvature, midedge_curvature_dof
 from ddg_warp.kernels.measures.midedge_metric import midedge_metric
 from ddg_warp.kernels.measures.planar_curvature import planar_curvature
 from ddg_warp.kernels.measures.rod_curvature_twist import rod_curvature_twist
 from ddg_warp.kernels.measures.rod_surface_angle import rod_surface_angle
 from ddg_warp.kernels.measures.triangle_metric import triangle_metric
+from ddg_warp.kernels.measures.turning_angle import (
+    curvature_binormal_angle,
+    joint_curvature_twist_angle,
+    planar_curvature_angle,
+    rod_curvature_twist_angle,
+)
 
-MEASURE = Parameter("measure", "m or m^2", POSITIVE, rest=True)
+MEASURE = Parameter("measure", "m, m^2, m^3 or m^6", POSITIVE, rest=True)
 
 
 @dataclass(frozen=True)
 class Term:
-    """An elastic energy: `name` is what users see, whether it is damped or not."""
+    """An elastic energy: `name` is what users see, whether it is damped or not, and whichever curvature it has."""
 
     name: str
     measure: Measure
@@ -40,7 +53,7 @@ class Term:
     @property
     def key(self) -> str:
         """Name in the registries, which hold each term with and without strain-rate damping."""
-        return self.name + ("_damped" if self.density.lagged else "")
+        return term_key(self.name, self.measure.by_angle) + ("_damped" if self.density.lagged else "")
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -64,8 +77,8 @@ class Term:
 
     @property
     def law(self) -> tuple:
-        """What elements of one set have in common: name, and law but for its damping."""
-        return self.name, self.density.undamped or self.density
+        """What elements of one set have in common: name, measure, and law but for its damping."""
+        return self.name, self.measure, self.density.undamped or self.density
 
     def damped(self, wanted: bool = True) -> "Term":
         """This term with strain-rate damping, if `wanted`."""
@@ -98,6 +111,11 @@ class Term:
         return result
 
 
+def term_key(name: str, by_angle: bool) -> str:
+    """Key of a term by its name and whether its curvature is the turning angle."""
+    return f"{name}_angle" if by_angle else name
+
+
 def _registry(*terms: Term) -> dict[str, Term]:
     """Terms by key, each with and without damping."""
     return {each.key: each for term in terms for each in (term, term.damped())}
@@ -106,9 +124,12 @@ def _registry(*terms: Term) -> dict[str, Term]:
 REGISTRY = _registry(
     Term("rod_stretch", edge_stretch, quadratic, "axial stretch of rod edges, EA"),
     Term("rod_bend_twist", rod_curvature_twist, quadratic, "anisotropic bending and twist, EI1, EI2, GJ"),
+    Term("rod_bend_twist", rod_curvature_twist_angle, quadratic, "rod_bend_twist, curvature by the turning angle"),
     Term("rod_bend", curvature_binormal, quadratic, "isotropic bending without twist, EI"),
+    Term("rod_bend", curvature_binormal_angle, quadratic, "rod_bend, curvature by the turning angle"),
     Term("planar_stretch", edge_stretch_2d, quadratic, "axial stretch in the plane, EA"),
     Term("planar_bend", planar_curvature, quadratic, "bending in the plane, EI"),
+    Term("planar_bend", planar_curvature_angle, quadratic, "planar_bend, curvature by the turning angle"),
 )
 
 SHELLS = _registry(
@@ -127,7 +148,23 @@ AXISYMMETRIC = _registry(
     Term("axisymmetric_rim", axisymmetric_rim, st_venant_kirchhoff, "its bending at poles and rims, E h^3"),
 )
 
-JOINT = Term("rigid_joint", joint_curvature_twist, quadratic, "bending and twist of half cells at rigid joints")
+JOINTS = {
+    term.key: term
+    for term in (
+        Term("rigid_joint", joint_curvature_twist, quadratic, "bending and twist of half cells at rigid joints"),
+        Term("rigid_joint", joint_curvature_twist_angle, quadratic, "rigid_joint, curvature by the turning angle"),
+    )
+}
 GLUE = Term("glued_edge", rod_surface_angle, quadratic, "what turns the edges of an attached rod with the shell")
 
-ALL = {**REGISTRY, **SHELLS, **AXISYMMETRIC, JOINT.name: JOINT, GLUE.name: GLUE}
+MAGNETS = {
+    term.name: term
+    for term in (
+        Term("magnetic", magnetised_edge, dipole_in_field, "magnetised rod edges in a field"),
+        Term("magnetic_tangent", magnetised_tangent, dipole_in_field, "the same, magnetised along their tangents"),
+        Term("dipoles", dipole_pair, dipole_dipole, "magnetised rod edges in each other's field"),
+        Term("dipoles_tangent", dipole_pair_tangent, dipole_dipole, "the same, magnetised along their tangents"),
+    )
+}
+
+ALL = {**REGISTRY, **SHELLS, **AXISYMMETRIC, **JOINTS, GLUE.name: GLUE, **MAGNETS}

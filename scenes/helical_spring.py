@@ -21,13 +21,14 @@ HEIGHT = WIRE * np.sin(PITCH)  # m
 SOURCE = "uniform helix (Love 1927)"
 
 
-def build(stretch: float = 2.0, turns: float = TURNS, n: int = 400) -> ddg.Scene:
+def build(stretch: float = 2.0, turns: float = TURNS, n: int = 400, curvature: str = "tangent") -> ddg.Scene:
     """The spring along z.
 
     Args:
         stretch: height over height at rest
         turns: turns of the wire; 10 at rest
         n: edges of the wire
+        curvature: by what it is measured, tangent or angle
     """
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), analysis=ddg.Statics(load_steps=1))
     points, normals = wire(stretch, turns, n)
@@ -35,7 +36,8 @@ def build(stretch: float = 2.0, turns: float = TURNS, n: int = 400) -> ddg.Scene
         points,
         section=ddg.Stiffness(EA=EA, EI1=B, GJ=C, radius=0.1),
         director=normals,
-        natural=natural(n),
+        natural=natural(n, curvature == "angle"),
+        curvature=curvature,
         name="spring",
     )
     scene.clamp(rod, edges=[0, -1])
@@ -59,12 +61,12 @@ def wire(stretch: float, turns: float, n: int) -> tuple[np.ndarray, np.ndarray]:
     return points, -np.stack([np.cos(middle), np.sin(middle), np.zeros(n)], axis=1)
 
 
-def natural(n: int) -> tuple[float, float, float]:
+def natural(n: int, by_angle: bool = False) -> tuple[float, float, float]:
     """Curvatures and twist of the nodes and edges of the helix at rest [1/m]: there the discrete spring is free of stress."""
     points, normals = wire(1.0, TURNS, n)
     edges = geometry.edge_vectors(points[None, :3], False)
     tangents, length = geometry.unit(edges), np.linalg.norm(edges[0, 0])
-    first, second = geometry.curvatures(tangents, normals[None, :2], False)
+    first, second = geometry.curvatures(tangents, normals[None, :2], False, by_angle)
     twist = geometry.reference_twist(tangents, normals[None, :2], False)
     return first.item() / length, second.item() / length, twist.item() / length
 

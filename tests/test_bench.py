@@ -109,6 +109,16 @@ def test_many_rods(tmp_path):
     assert (tmp_path / "rods_cpu.png").stat().st_size > 0
 
 
+@pytest.mark.slow
+def test_builds_are_timed(tmp_path):
+    command = [sys.executable, str(ROOT / "tools/bench_rods.py"), "--build", "--quick", "--out", str(tmp_path)]
+    subprocess.run(command, capture_output=True, text=True, check=True)
+    with open(tmp_path / "builds_cpu.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 3
+    assert all(float(row["model_s"]) >= float(row["build_s"]) > 0.0 for row in rows)
+
+
 def test_order_of_what_converges():
     """error = c n^-2 over edges and c dt over steps, with the least error of other settings held."""
     study = bench.Study({"n": (10, 20, 40), "dt": (0.1, 0.05, 0.025)}, "tip", 0.0)

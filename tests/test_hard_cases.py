@@ -119,10 +119,16 @@ def folded(gap: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("gap", [0.0, 1e-12])
-@pytest.mark.parametrize("precision", ["float64", pytest.param("float32", marks=slow)])
-def test_folded_back_by_half_a_turn(device, gap, precision):
-    """Curvature is infinite there: the error says so, names the edges and what to do, and keeps the state."""
-    scene = cantilever(21, ddg.Circle(0.02), RUBBER)
+@pytest.mark.parametrize(
+    ("precision", "curvature"),
+    [
+        ("float64", "tangent"),
+        *(pytest.param(p, c, marks=slow) for p, c in (("float32", "tangent"), ("float64", "angle"))),
+    ],
+)
+def test_folded_back_by_half_a_turn(device, gap, precision, curvature):
+    """Curvature is infinite there, or has no direction: the error says so, names the edges and what to do, and keeps the state."""
+    scene = cantilever(21, ddg.Circle(0.02), RUBBER, curvature=curvature)
     result = run(scene, device, 0.01, 1, start=folded(gap), precision=precision, fails=("non_finite",))
     for words in ("edges 9 and 10", "fold back by 180 degrees", "curvature is infinite", "move node 10"):
         assert words in str(result.error)
@@ -130,10 +136,12 @@ def test_folded_back_by_half_a_turn(device, gap, precision):
     np.testing.assert_allclose(result.points, folded(gap), atol=1e-6)
 
 
+@pytest.mark.parametrize("curvature", ["tangent", pytest.param("angle", marks=slow)])
 @pytest.mark.parametrize("gap", [1e-3, 0.05])
-def test_nearly_folded(device, gap):
+def test_nearly_folded(device, gap, curvature):
     """Springs open: bending energy becomes motion, none is made, and the rod ends up unfolded, unstretched."""
-    result = run(cantilever(21, ddg.Circle(0.02), RUBBER), device, 0.01, 30, start=folded(gap))
+    scene = cantilever(21, ddg.Circle(0.02), RUBBER, curvature=curvature)
+    result = run(scene, device, 0.01, 30, start=folded(gap))
     assert result.statistics["retries"] == 0
     assert_no_energy_is_made(result)
     assert result.tip[0] > 0.5

@@ -150,12 +150,12 @@ def test_rigid_rotation_costs_nothing(device, name):
     assert tangent.element_energies(state).sum() < 1e-25  # turned again by nothing
 
 
-def halves(device, load, couple, joined: bool):
+def halves(device, load, couple, joined: bool, curvature: str = "tangent"):
     """A cantilever of one rod, or of two that are joined rigidly at 0.4."""
     scene = weightless()
     points = line(0.0 * X, X, 10)
     cuts = [points[:5], points[4:]] if joined else [points]
-    rods = [scene.add_rod(part, section=SECTION, director=Y) for part in cuts]
+    rods = [scene.add_rod(part, section=SECTION, director=Y, curvature=curvature) for part in cuts]
     if joined:
         scene.join([(rods[0], -1), (rods[1], 0)])
     scene.clamp_end(rods[0], "first")
@@ -184,6 +184,14 @@ def test_collinear_rods_bend_as_one(device):
         differences.append(np.abs(two[0] - one[0]).max())
     order = np.polyfit(np.log([0.01, 0.02, 0.04]), np.log(differences), 1)[0]
     assert order == pytest.approx(3.0, abs=0.1)
+
+
+@pytest.mark.slow  # kernels of its own
+def test_collinear_rods_are_one_by_the_angle(device):
+    """Half cells in series share the angle: 2 B (a/2)^2 / l is B a^2 / 2 l, of the cell, at any load in a principal plane."""
+    one, two = (halves(device, (0.0, 0.0, -2.0), 0.0, joined, "angle") for joined in (False, True))
+    np.testing.assert_allclose(two[0], one[0], atol=1e-8)
+    assert one[0][-1, 2] < -0.3
 
 
 def test_energy_of_a_bent_joint(device):

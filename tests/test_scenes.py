@@ -26,6 +26,8 @@ SMALL = {
     "leaf": {"cells": 20},
     "lee_frame": {"n": 40},
     "localized_helix": {},
+    "magnetic_buckling": {"over": 0.9},
+    "magnetic_cantilever": {},
     "michell_ring": {"n": 100},
     "parachute": {"rings": 3, "lines": 6},
     "pinched_cylinder": {"n": 12, "steps": 1, "load": 1e-3},

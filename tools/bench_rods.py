@@ -3,10 +3,11 @@
     python tools/bench_rods.py --cpu  [--quick] [--out DIR]     CPU time a step, tip against published numbers
     python tools/bench_rods.py --cuda [--quick] [--out DIR]     1 to 100,000 rods in every precision
     python tools/bench_rods.py --long [--quick] [--out DIR]     one rod of 10,000 nodes and 100 m
+    python tools/bench_rods.py --build [--quick] [--out DIR]    rods, a net and a sheet on the CPU, from a scene to a first step
 
-Prints a table; writes rods_NAME.csv, .json and, if matplotlib is there, .png. Fails where a rod was given up, or a
-float64 or mixed run is off. Times are medians of blocks of steps after a warm-up; nothing inside of a block waits
-for the device. The CPU's clock is that of this process, which others on the machine leave alone.
+Prints a table; writes rods_NAME.csv, .json and, if matplotlib is there, .png; of builds, builds_cpu.csv and .json. Fails where a
+rod was given up, or a float64 or mixed run is off. Times are medians of blocks of steps after a warm-up; nothing inside of a block
+waits for the device. The CPU's clock is that of this process, which others on the machine leave alone.
 """
 
 import argparse
@@ -19,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import warp as wp
+from bench_tolerance import rods, sheet
 
 import ddg_warp as ddg
 from ddg_warp.report import bytes_per_node
@@ -163,13 +165,13 @@ def largest_residual(integrator: ddg.Integrator, state) -> float:
     worst = []
     for chain in integrator._chains:
         newton = chain.newton
-        newton.status.zero_()
-        newton.iteration.zero_()
+        newton.islands.status.zero_()
+        newton.islands.iteration.zero_()
         newton.evaluate(state.groups[chain.index].last)
         newton.check()
-        newton.unbalanced.fill_(1)
+        newton.islands.unbalanced.fill_(1)
         newton.sweep()
-        worst.append(float(newton.residual.numpy().max()))
+        worst.append(float(newton.islands.residual.numpy().max()))
     return max(worst)
 
 
@@ -267,6 +269,42 @@ def measure(case: Case, device, exact: dict) -> dict:
     return row | {"error": float(error), "passed": bool(good)}
 
 
+def builds(quick: bool, device, repeats: int = 3) -> list[dict]:
+    """Rows of the table of builds: medians of seconds of this process on the CPU, once kernels are loaded.
+
+    `scene_s` is for the calls that describe it, `build_s` for the `Model`, `model_s` for both; `integrator_s` for the `Integrator`,
+    which allocates what steps work with, `state_s` for the first state; `first_step_s`, to a coarse rtol of 0.5, captures the step.
+    """
+    scenes = {
+        "rods of 64 nodes": (lambda count: Case("build", count, 64).scene(), 10 if quick else 100_000),
+        "net of rods, each joined to a stub": (lambda count: rods(count, joined=True), 10 if quick else 10_000),
+        "sheet with turning normals, cells a side": (lambda cells: sheet(cells, "midedge_dof"), 8 if quick else 512),
+    }
+    rows = []
+    for name, (scene_of, size) in scenes.items():
+        seconds = []
+        for count in (4, *(size,) * repeats):
+            clock = [time.process_time()]
+            scene = scene_of(count)
+            clock.append(time.process_time())
+            model = scene.build(device.alias, "float64")
+            clock.append(time.process_time())
+            integrator = ddg.Integrator(model, rtol=0.5)
+            clock.append(time.process_time())
+            state = model.state()
+            clock.append(time.process_time())
+            integrator.step(state, 1.0 / 240.0)
+            clock.append(time.process_time())
+            seconds.append(np.diff(clock))
+            del scene, model, integrator, state
+            gc.collect()
+        described, built, *rest = np.median(seconds[1:], axis=0).tolist()
+        row = {"scene": name, "size": size, "scene_s": described, "build_s": built, "model_s": described + built}
+        rows.append(row | dict(zip(("integrator_s", "state_s", "first_step_s"), rest, strict=True)))
+        print(table(rows[-1:]), file=sys.stderr, flush=True)
+    return rows
+
+
 def plot(rows: list[dict], path: Path, title: str) -> None:
     """Time of a step over rods and over nodes a rod, beside lines of proportional growth."""
     try:
@@ -309,7 +347,7 @@ def write(rows: list[dict], stem: Path, device, commit: str) -> None:
     command = " ".join(["python", "tools/bench_rods.py", *sys.argv[1:]])
     origin = machine(commit)
     write_table(stem, rows, {"command": command, "device": str(device), "machine": origin})
-    if any(row["study"] in ("rods", "nodes") for row in rows):
+    if any(row.get("study") in ("rods", "nodes") for row in rows):
         plot(rows, stem.with_suffix(".png"), origin["processor"] if not device.is_cuda else device.name)
 
 
@@ -324,17 +362,25 @@ def main() -> int:
     parser.add_argument("--cpu", action="store_true", help="the published cantilever on the CPU")
     parser.add_argument("--cuda", action="store_true", help="many rods on a GPU")
     parser.add_argument("--long", action="store_true", help="one long rod; on the CPU with --cpu")
+    parser.add_argument(
+        "--build", action="store_true", help="from a scene to its model, and to a first step, on the CPU"
+    )
     parser.add_argument("--quick", action="store_true", help="small sizes: does it run?")
     parser.add_argument("--linear", default="auto", help="linear solver: auto, sweep, partitioned, ... (default: auto)")
     parser.add_argument("--device", help="Warp device (default: cpu with --cpu, else cuda:0)")
     parser.add_argument("--commit", default="", help="commit, where there is no git checkout")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results", help="default: tools/results")
     chosen = parser.parse_args()
-    if not (chosen.cpu or chosen.cuda or chosen.long):
-        parser.error("choose --cpu, --cuda or --long")
+    if not (chosen.cpu or chosen.cuda or chosen.long or chosen.build):
+        parser.error("choose --cpu, --cuda, --long or --build")
     if chosen.cpu and chosen.cuda:
         parser.error("choose one of --cpu and --cuda")
     wp.config.quiet = True
+    if chosen.build:
+        rows = builds(chosen.quick, wp.get_device("cpu"))
+        write(rows, chosen.out / "builds_cpu", wp.get_device("cpu"), chosen.commit)
+        print(table(rows))
+        return 0
     device = wp.get_device(chosen.device or ("cpu" if chosen.cpu else "cuda:0"))
     cases = cpu_cases(chosen.quick) if chosen.cpu else cuda_cases(chosen.quick) if chosen.cuda else []
     if chosen.long:

@@ -137,8 +137,8 @@ def measure(bending: str, cells: int, device, quick: bool, linear: str) -> dict:
     statistics = integrator.statistics()
     newton, net = integrator._net.newton, state.net
     triangles = len(model.surfaces.triangles)
-    newton.status.zero_()
-    newton.wanted.fill_(1)
+    newton.islands.status.zero_()
+    newton.islands.wanted.fill_(1)
     repeats = 3 if quick else 30
 
     def assembly():

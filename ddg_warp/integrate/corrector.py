@@ -181,8 +181,8 @@ class Corrector:
         rate = (tangent.loads(load + delta, q) - tangent.loads(load - delta, q)) / (2.0 * delta)
         ahead, behind = (tangent.support_step(state, load, load + d) for d in (delta, -delta))
         support = (ahead - behind) / (2.0 * delta)
-        if tangent.clamps_turn:
-            ahead, behind = (tangent.gradient(tangent.with_clamps_turned(state, load + d)) for d in (delta, -delta))
+        if tangent.prescribes:
+            ahead, behind = (tangent.gradient(tangent.with_prescribed(state, load + d)) for d in (delta, -delta))
             rate = rate - (ahead - behind) / (2.0 * delta)
         return outer - gradient, stiffness, rate - stiffness @ support, support, gradient, outer
 

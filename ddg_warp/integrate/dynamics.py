@@ -3,28 +3,22 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import arguments, arrays, drag, geometry, validate
-from ddg_warp.errors import SceneError, SolverError
+from ddg_warp import arguments, drag, validate
+from ddg_warp.errors import SceneError
 from ddg_warp.graphs import Graphs
 from ddg_warp.integrate import energy
 from ddg_warp.integrate.buffers import Buffer
+from ddg_warp.integrate.chain_step import NET_ONLY, ChainStep
 from ddg_warp.integrate.net_step import NetStep
-from ddg_warp.integrate.prescribed import ChainDrag, PrescribedMotion, TimedLoads, jump_between
-from ddg_warp.kernels import element, outcome, step
-from ddg_warp.linear.choice import automatic
-from ddg_warp.linear.partitioned import PartitionedNewton
-from ddg_warp.linear.pcg import PcgNewton, ProjectiveNewton
-from ddg_warp.newton import ChainNewton, NewtonOptions
+from ddg_warp.kernels import outcome
+from ddg_warp.newton import NewtonOptions
 from ddg_warp.precision import FLOAT32_LIMIT, lost_in_rounding
 from ddg_warp.state import State
 from ddg_warp.threads import launches
 
 SOLVERS = ("newton", "projective")
 SCHEMES = ("implicit_euler", "implicit_midpoint")
-DIRECT = {"sweep": ChainNewton, "partitioned": PartitionedNewton}  # solvers of open rods by their name
-NET_ONLY = ("multilevel", "chain_multilevel")  # preconditioners of nets
 ENERGY_BOUND = 0.1
-FOLDED = 1e-5  # how close to opposite [rad] edges that meet are called folded, in messages
 
 
 @launches
@@ -95,7 +89,7 @@ class Integrator:
         self.check_every = check_every or (32 if model.wp_device.is_cuda else 1)
         _require_mass(model)
         _refuse_curved_membranes(model)
-        self._chains = [_ChainStep(self, model, group) for group in model.groups]
+        self._chains = [ChainStep(self, model, group) for group in model.groups]
         self._net = NetStep(self, model) if model.net is not None else None
         self._buffers = [Buffer(model), Buffer(model)]
         self._graphs = Graphs(model, self._load_modules)
@@ -196,7 +190,7 @@ class Integrator:
         """Solve in float64 where float32 factors would not be good enough for a step of s, from now on."""
         for i, chain in enumerate(self._chains):
             if chain.newton.linear is wp.float32 and chain.group.float32_errors(s).max() > FLOAT32_LIMIT:
-                self._chains[i] = _ChainStep(self, self.model, chain.group, wp.float64, counts_of=chain)
+                self._chains[i] = ChainStep(self, self.model, chain.group, wp.float64, counts_of=chain)
                 self._graphs.clear()
         net = self._net
         if (
@@ -236,22 +230,6 @@ class Integrator:
             part.load_modules()
 
 
-def _newton(model, group, integrator: Integrator, precision) -> ChainNewton:
-    """The solver of a group that the integrator's `linear` asks for."""
-    linear = automatic(group) if integrator.linear in ("auto", *NET_ONLY) else integrator.linear
-    given = (model, group, integrator.options)
-    last = (precision, integrator.scheme == "implicit_midpoint")
-    if integrator.solver == "projective":
-        return ProjectiveNewton(*given, *last)
-    if linear in DIRECT and group.kind.closed:
-        raise SceneError(
-            f"linear {linear!r}: rod {group.host.rods[0]} is closed; use 'auto' or a preconditioner of PCG"
-        )
-    if linear in DIRECT:
-        return DIRECT[linear](*given, *last)
-    return PcgNewton(*given, linear, *last)
-
-
 def _refuse_curved_membranes(model) -> None:
     """Its strains turn with the normals, so that the matrix of a time step, which is made positive, is far from the tangent."""
     for i, shell in enumerate(model.scene.shells):
@@ -277,174 +255,3 @@ def _require_mass(model) -> None:
                 f"node {k - host.first[column]} of rod {host.rods[column]} is free and has no mass; "
                 "give the material a density, the section a mass_per_length, or the rod drag along and across"
             )
-
-
-class _ChainStep:
-    """A time step of one group of rods."""
-
-    def __init__(self, integrator: Integrator, model, group, precision=None, counts_of=None):
-        self.integrator, self.model, self.group = integrator, model, group
-        self.index = model.groups.index(group)
-        self.newton = _newton(model, group, integrator, precision)
-        kind, real, device = group.kind, model.types.real, model.wp_device
-        midpoint = integrator.scheme == "implicit_midpoint"
-        self.kernels = {
-            "start": step.start_kernel(real),
-            "begin": step.begin_kernel(kind, real, midpoint),
-            "nodes": step.finish_nodes_kernel(kind, real, midpoint),
-            "advance": step.advance_kernel(real),
-        }
-        if kind.twist:
-            self.kernels["frames"] = step.finish_frames_kernel(kind, real)
-        columns = group.columns
-        self.progress, self.portion = (wp.zeros(columns, dtype=real, device=device) for _ in range(2))
-        self.cautious, self.retries, self.reason, self.bent = (
-            wp.zeros(columns, dtype=int, device=device) for _ in range(4)
-        )
-        self.remaining = wp.zeros(1, dtype=int, device=device)
-        self.rounded = outcome.CONVERGED_TO_ROUNDING  # how solves that rounding ends are counted
-        self.tally = wp.zeros(len(outcome.NAMES) + 1, dtype=wp.int64, device=device)
-        self.work = wp.zeros(5, dtype=wp.int64, device=device)
-        if counts_of is not None:
-            self.tally, self.work = counts_of.tally, counts_of.work
-            self.newton.status = counts_of.newton.status
-            self.reason = counts_of.reason
-        self.energy = energy.ChainEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
-        self.damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
-        self.moving = PrescribedMotion(model, group, midpoint) if group.moving else None
-        self.loads = TimedLoads(model, group, midpoint) if group.host.timed_loads else None
-        self.drag = ChainDrag(model, group, midpoint) if kind.drag else None
-
-    def prescribe(self, t0: float, t1: float) -> None:
-        """Hand the device what supports, timed loads and the flow do between t0 and t1."""
-        for part in (self.moving, self.loads, self.drag):
-            if part:
-                part.upload(t0, t1)
-
-    def step(self, before, after) -> None:
-        """Launch a whole step from one group state to another; only launches, so that it can be captured."""
-        dt = self.integrator._dt
-        newton = self.newton
-        self._launch(
-            "start", self.group.columns, [newton.status], [self.progress, self.portion, self.cautious, self.retries]
-        )
-        self._attempt(before, after, dt)
-        wp.capture_while(self.remaining, lambda: self._attempt(after, after, dt))
-
-    def _attempt(self, before, after, dt) -> None:
-        """One solve of every rod that has not finished the step, from state `before` to `after`."""
-        group, newton = self.group, self.newton
-        self._launch(
-            "begin",
-            group.node_threads,
-            [before.x, before.v, before.theta, before.omega, before.frame, group.fixed, group.count, group.world, dt]
-            + [self.damping, group.outer, self.progress, self.portion, self.cautious],
-            [newton.x, newton.theta, newton.frame, newton.target, newton.target_angle, newton.coefficient, newton.rate]
-            + [newton.status, newton.iteration, newton.halvings, newton.turned, newton.clamped]
-            + [newton.unbalanced, newton.drowned]
-            + [newton.load_scale, self.bent, newton.active],
-        )
-        newton.predict(before, self.progress, self.bent)
-        self.bent.zero_()
-        if self.moving:
-            self.moving.apply(self.progress, self.portion, newton.x, newton.frame, newton.theta)
-        if self.loads:
-            self.loads.apply(newton.x, group.load, group.load_angle)
-        if self.drag:
-            self.drag.resist(before, newton, self.progress)
-        newton.solve(before.last)
-        if self.energy:
-            self.energy.judge(before)
-        self._launch(
-            "nodes",
-            group.node_threads,
-            [newton.x, newton.theta, before.x, before.v, before.theta, before.omega]
-            + [group.count, newton.status, self.progress, newton.rate],
-            [after.x, after.v, after.theta, after.omega],
-        )
-        if self.drag:
-            self.drag.settle(after, newton, self.progress)
-        if group.kind.twist:
-            self._launch(
-                "frames",
-                group.element_threads,
-                [after.x, newton.frame, before.frame, group.count, newton.status, self.progress],
-                [after.frame],
-            )
-        if group.kind.viscous:
-            self.model.strains(group, after, after.last)
-        self.remaining.zero_()
-        self._launch(
-            "advance",
-            group.columns,
-            [newton.iteration, newton.lost, self.integrator.retry_limit, 0.5 ** (self.integrator.retry_limit // 2)]
-            + [self.rounded],
-            [newton.status, self.progress, self.portion, self.cautious, self.retries, self.reason]
-            + [self.tally, self.work, self.remaining],
-        )
-
-    def _launch(self, name: str, dim, inputs: list, outputs: list) -> None:
-        wp.launch(self.kernels[name], dim, inputs, outputs, device=self.model.wp_device)
-
-    def load_modules(self) -> None:
-        """Compile and load every kernel before a capture."""
-        kernels = [*self.kernels.values(), *self.newton.kernels]
-        if self.group.kind.viscous:
-            kernels.append(element.strain_kernel(self.group.kind, self.model.types.real))
-        for part in (self.moving, self.loads, self.drag, self.energy):
-            kernels += part.kernels if part else ()
-        arrays.load_kernels(kernels, self.model.wp_device)
-
-    def raise_failures(self, state: State) -> None:
-        """Raise for rods that were given up."""
-        if not int(self.tally.numpy()[outcome.MAX_ITERATIONS :].sum()):
-            return
-        status = self.newton.status.numpy()
-        failed = np.flatnonzero(status == outcome.GIVEN_UP)
-        if not failed.size:
-            return
-        host = self.group.host
-        column = int(failed[0])
-        rod = int(host.rods[column % self.group.rods])
-        name = outcome.NAMES[int(self.reason.numpy()[column])]
-        if self.energy and name == "energy_drift":
-            what = self.energy.failure(column)
-        else:
-            node, size = self._worst_node(column)
-            what = f"residual {size:.3g} N at node {node}; {self._remedy(state, column)}"
-        raise SolverError(
-            f"rod {rod} ('{self.model.curves.names[rod]}') could not be stepped to t = {state.time:g} s: {name} within "
-            f"{self.integrator.retry_limit} retries, {what}",
-            state=state,
-            outcome=name,
-            rods=[int(host.rods[c % self.group.rods]) for c in failed],
-        )
-
-    def _worst_node(self, column: int) -> tuple[int, float]:
-        """Where the largest residual was, estimated by the element forces that meet there."""
-        size = float(self.newton.residual.numpy()[column])
-        direction = np.abs(arrays.download(self.newton.direction)[:, :, column]).max(0)
-        largest = int(np.argmax(np.where(np.isfinite(direction), direction, np.inf)))
-        return largest - int(self.group.host.first[column % self.group.rods]), size
-
-    def _remedy(self, state: State, column: int) -> str:
-        """What to do about a rod that was given up: edges of its last good state that no step can start from, or advice."""
-        host, closed, rod = self.group.host, self.group.kind.closed, column % self.group.rods
-        x = arrays.download(state.groups[self.index].x)[: host.count[rod], column][None]
-        edges, first = geometry.edge_vectors(x.astype(float), closed), int(host.first[rod])
-        lengths = np.linalg.norm(edges, axis=-1)
-        if not (lengths > 0.0).all():
-            k = int(np.argmin(lengths[0] > 0.0)) - first
-            return f"edge {k} has no length in the last good state; move a node of the state it starts from"
-        if self.group.kind.span == 2:
-            before, after = geometry.ahead(edges / lengths[..., None], closed)
-            k = int(np.argmin(np.sum(before * after, -1)[0]))
-            if np.linalg.norm(before[0, k] + after[0, k]) < FOLDED:
-                k, after = k - first, (k + 1) % lengths.shape[1] - first
-                return (
-                    f"edges {k} and {after} fold back by 180 degrees in the last good state, where curvature is infinite; "
-                    f"move node {after} of the state it starts from, or take a smaller dt if it folded on the way"
-                )
-        dt = self.integrator._dt_host
-        jump = jump_between(self.model, state.time - dt, state.time)
-        return jump or "take a smaller dt, a looser rtol, or check its loads and supports"

@@ -23,7 +23,7 @@ class _Energy:
     """Watches the energy of the steps of a part; see `kernels.energy`.
 
     Args:
-        step: a `_ChainStep` or a `NetStep`.
+        step: a `ChainStep` or a `NetStep`.
         count: of its rods in all worlds, or of worlds; rows: how many sums over parts of each are added up.
         kept: the watch of the step that this one replaces.
 
@@ -51,8 +51,8 @@ class _Energy:
         wp.launch(
             self._judge,
             self.account.shape[1],
-            [self.rows, step.integrator.energy_bound, step.progress],
-            [step.newton.status, self.account, self.failed],
+            [self.rows, step.integrator.energy_bound, *step.islands.arrays],
+            [self.account, self.failed],
             device=self.device,
         )
 
@@ -92,7 +92,7 @@ class ChainEnergy(_Energy):
             self._measure,
             (self.ranges, group.columns),
             [before.x, before.v, before.theta, before.omega, before.frame, newton.x, newton.theta, newton.frame]
-            + [before.last, newton.rate, *group.parameters.arrays, group.count, newton.mass, group.rotary]
+            + [before.last, *step.islands.arrays, *group.parameters.arrays, group.count, newton.mass, group.rotary]
             + [
                 *self._loads,
                 group.load,
@@ -101,7 +101,6 @@ class ChainEnergy(_Energy):
                 newton.stiffness,
                 step.damping,
                 self.floor,
-                step.progress,
                 self.ranges,
             ],
             [self.rows],
@@ -138,8 +137,13 @@ class NetEnergy(_Energy):
             wp.launch(
                 kernel,
                 step.model.worlds * part.elements,
-                net.inputs(part, middle, i, q=solver.q, rate=solver.rate)
-                + [before.q, own["stiffness"], self.floor, step.progress],
+                [
+                    net.elements(middle, i, q=solver.q, rate=step.islands.rate),
+                    before.q,
+                    own["stiffness"],
+                    self.floor,
+                    *step.islands.arrays,
+                ],
                 [self._values[i]],
                 device=self.device,
             )
@@ -148,8 +152,18 @@ class NetEnergy(_Energy):
         wp.launch(
             self._blocks,
             solver.all,
-            [before.q, before.v, solver.q, solver.mass, solver.rate, step.damping, self._load, solver.load, self.floor]
-            + [step.progress, net.blocks],
+            [
+                before.q,
+                before.v,
+                solver.q,
+                solver.mass,
+                *step.islands.arrays,
+                step.damping,
+                self._load,
+                solver.load,
+                self.floor,
+            ]
+            + [net.blocks],
             [self._values[-1]],
             device=self.device,
         )

@@ -35,7 +35,7 @@ def newton(solver, state: State, before: float, at: float) -> State | None:
     if (np.abs(tangent.loads(before, q) - gradient) > UNBALANCED * solver.allowed(first))[free].any():
         # a crumpled start, or a rest shape that has changed: stresses of no equilibrium say nothing about the next one
         stress = [0.0 * part for part in tangent.linear_stress(state, jump)]
-    state, factor, polished = tangent.with_clamps_turned(state, at), None, False
+    state, factor, polished = tangent.with_prescribed(state, at), None, False
     for iteration in range(MAX_ITERATIONS):
         q = tangent.dofs(state)
         outer, gradient = tangent.loads(at, q), tangent.gradient(state)

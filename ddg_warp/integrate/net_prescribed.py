@@ -1,4 +1,4 @@
-"""What is prescribed of a net from outside: motion of supports, and loads that change or follow what they act on."""
+"""What is prescribed of a net from outside: motion of supports, loads that change or follow, a magnetic field, drag."""
 
 from types import SimpleNamespace
 
@@ -9,8 +9,10 @@ from ddg_warp.chains import pose_starts
 from ddg_warp.drag import flow_at
 from ddg_warp.integrate.prescribed import poses
 from ddg_warp.kernels import drag, motion
+from ddg_warp.kernels.islands import Islands
+from ddg_warp.kernels.measures.magnetised_edge import FIELD
 from ddg_warp.kernels.net import loads
-from ddg_warp.kernels.net.motion import motion_kernels
+from ddg_warp.kernels.net.motion import field_kernel, motion_kernels
 from ddg_warp.net_model import NetState
 from ddg_warp.net_system import lists
 
@@ -60,21 +62,21 @@ class NetMotion:
         """Poses of all motions between t0 and t1."""
         self.pose.assign(poses(self.model, t0, t1))
 
-    def apply(self, progress: wp.array, portion: wp.array, q: wp.array, frame: wp.array) -> None:
-        """Put held blocks and normals where a solve of `portion` after the `progress` made has them; `frame` are lagged."""
+    def apply(self, islands, q: wp.array, frame: wp.array) -> None:
+        """Put held blocks and normals where the part of the step that a world tries has them; `frame` are lagged."""
         net = self.net
-        rows = [self.pose, progress, portion]
+        rows = [self.pose, *islands.arrays]
         self._launch(self._nodes, self.nodes, [self.nodes, self.rest, *rows, net.blocks], [q])
         if len(self.edges):
-            inputs = [self.edges, self.edge_rest, self.pose, net.ends, frame, progress, portion]
+            inputs = [self.edges, self.edge_rest, self.pose, net.ends, frame, *islands.arrays]
             self._launch(self._angles, self.edges, [*inputs, net.blocks, net.angle_start], [q])
         for index, (where, rest) in self.normals.items():
             self._launch(self._normals, where, [where, rest, *rows, net.sets[index].elements], [self.data[index]])
 
-    def turn(self, progress, portion, moved, before: NetState, after: NetState) -> None:
-        """Turn the normals of a state that a part of the step ends in, in the worlds that `moved`."""
+    def turn(self, islands, before: NetState, after: NetState) -> None:
+        """Turn the normals of a state that a part of the step ends in, in the worlds that moved."""
         for index, (where, rest) in self.normals.items():
-            inputs = [where, rest, self.pose, progress, portion, moved, self.net.sets[index].elements]
+            inputs = [where, rest, self.pose, *islands.arrays, self.net.sets[index].elements]
             self._launch(self._turn, where, [*inputs, before.data[index]], [after.data[index]])
 
     def _launch(self, kernel, where: wp.array, inputs: list, outputs: list) -> None:
@@ -151,6 +153,46 @@ class NetLoads:
         )
 
 
+class NetField:
+    """The magnetic field among the data of magnetised edges, at the time that the scheme balances forces at and at the end of a step.
+
+    Attributes:
+        data: of those sets by index, with the field that a solve is about.
+    """
+
+    def __init__(self, model, midpoint: bool):
+        self.model, self.net, self.midpoint = model, model.net, midpoint
+        self.data = model.net.field_data()
+        self._kernel = field_kernel(model.types.real)
+        self._now, self._end = (wp.zeros(FIELD, dtype=model.types.real, device=model.wp_device) for _ in range(2))
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [self._kernel] if self.data else []
+
+    def upload(self, t0: float, t1: float) -> None:
+        """The field of a step."""
+        if not self.data:
+            return
+        field = self.model.scene.applied_field
+        self._now.assign(field.at(0.5 * (t0 + t1) if self.midpoint else t1, 1.0))
+        self._end.assign(field.at(t1, 1.0))
+        for index, data in self.data.items():
+            self._launch(index, self._now, self.net.every, data, data)
+
+    def finish(self, moved: wp.array, before: NetState, after: NetState) -> None:
+        """Put the worlds that `moved` into the field at the end of the step."""
+        for index in self.data:
+            self._launch(index, self._end, moved, before.data[index], after.data[index])
+
+    def _launch(self, index: int, field: wp.array, moved: wp.array, before: wp.array, after: wp.array) -> None:
+        part, first = self.net.sets[index], self.net.sets[index].term.measure.data_size - FIELD
+        inputs = [field, first, part.elements, moved, before]
+        dim = part.elements * self.model.worlds
+        wp.launch(self._kernel, dim, inputs, [after], device=self.model.wp_device)
+
+
 class NetDrag:
     """Drag on the rods of a net, against a fluid that flows.
 
@@ -183,33 +225,34 @@ class NetDrag:
         if callable(self.model.scene.flow):
             self.flow.assign(flow_at(self.model.scene, 0.5 * (t0 + t1) if self.midpoint else t1)[None])
 
-    def resist(self, before, solver, progress: wp.array) -> None:
+    def resist(self, before, solver, islands) -> None:
         """Write inertia and drag of a solve from the state `before`, once its iterate is predicted."""
         self._launch(
             self.kernels[0],
             [before.q, before.v, solver.q if self.midpoint else before.q, solver.q, self.mass, self.ends]
-            + [self.coefficients, self.starts, self.items, self.flow, solver.rate, progress, solver.outer]
+            + [self.coefficients, self.starts, self.items, self.flow, solver.outer, *islands.arrays]
             + [self.net.blocks, self.net.host.nodes],
-            [solver.mass, solver.load_scale],
+            [solver.mass],
         )
 
     def at(self, state, t: float) -> tuple[np.ndarray, np.ndarray]:
         """Inertia and drag (world, block) of a net's state at t, with the resistance over a second, and the flow (blocks, 3)."""
         net, device = self.net, self.model.wp_device
-        one, free = wp.full(net.worlds, 1.0, dtype=net.real, device=device), wp.zeros_like(net.still)
+        islands = Islands(net.worlds, net.real, device)
+        islands.rate.fill_(1.0)
         mass = wp.zeros((net.worlds, net.blocks), dtype=drag.block_inertia(net.real), device=device)
         self.upload(t, t)
-        self.resist(state, SimpleNamespace(q=state.q, rate=one, outer=one, mass=mass, load_scale=free), net.still)
+        self.resist(state, SimpleNamespace(q=state.q, outer=net.still, mass=mass), islands)
         flow = np.zeros((net.blocks, 3))
         flow[: net.host.nodes] = self.flow.numpy()[0]
         return mass.numpy(), flow
 
-    def settle(self, after, solver, progress: wp.array) -> None:
+    def settle(self, after, solver, islands) -> None:
         """Rates of what has no inertia in the state `after`."""
         if self.midpoint:
             self._launch(
                 self.kernels[1],
-                [solver.q, solver.mass, solver.status, progress, solver.rate, self.net.blocks, after.q],
+                [solver.q, solver.mass, *islands.arrays, self.net.blocks, after.q],
                 [after.v],
             )
 

@@ -43,14 +43,14 @@ class StaticNewton(NetNewton):
 
     def begin(self, q: np.ndarray, dead: np.ndarray, at: float, scale: np.ndarray) -> None:
         """Set out from dofs `q` under dead loads (blocks, 3), those that follow at load parameter `at`; load scales of bodies."""
-        for flag in (self.status, self.iteration, self.halvings, self.unbalanced, self.drowned, self.projected):
-            flag.zero_()
+        for name in ("status", "iteration", "halvings", "unbalanced", "drowned", "clamped"):
+            getattr(self.islands, name).zero_()
         for array in (self.q, self.base):
             array.assign(q.reshape(-1, 3))
         self.loads.scale(dead, at)
         wp.copy(self.load, self.loads.constant)
-        wp.copy(self.load_scale, self.allowed.assign(scale.reshape(self.worlds, -1)))
-        self.active.fill_(1)
+        wp.copy(self.islands.load_scale, self.allowed.assign(scale.reshape(self.worlds, -1)))
+        self.islands.active.fill_(1)
 
     def outer_forces(self) -> None:
         """Loads on the iterate."""
@@ -62,7 +62,7 @@ class StaticNewton(NetNewton):
         if follows:
             self._launch(
                 self._follow,
-                [self.q, self.base, self.load, self._there, self.status, self.net.blocks],
+                [self.q, self.base, self.load, self._there, self.islands.status, self.net.blocks],
                 [self.change],
             )
 
@@ -76,9 +76,13 @@ class StaticNewton(NetNewton):
             return
         self.measure_turns()
         if self.planes:
-            self.planes.into(self.direction, self.wanted)
+            self.planes.into(self.direction, self.islands.wanted)
         wp.launch(
-            self._far, self.worlds, [self.turn, FAR * self.options.rotation_cap], [self.wanted], device=self.device
+            self._far,
+            self.worlds,
+            [self.turn, FAR * self.options.rotation_cap],
+            [self.islands.wanted],
+            device=self.device,
         )
 
     def follow(self, state, step: wp.array) -> None:
@@ -89,7 +93,7 @@ class StaticNewton(NetNewton):
         self.assemble()
         self._launch(
             self._cycle[0],
-            [self.matrix, table.columns, table.slices, self.fixed, step, self.wanted, blocks, table.positions],
+            [self.matrix, table.columns, table.slices, self.fixed, step, self.islands.wanted, blocks, table.positions],
             [self.product, self.krylov_dots],
         )
         self._launch(self._less, [self.product], [self.right])
@@ -126,7 +130,7 @@ class NetEquilibrium:
         """How the free dofs follow held ones that make a `step` (size,), by the tangent; None if there is no answer."""
         self._begin(state, at)
         self._step.assign(step.reshape(-1, 3))
-        self.newton.wanted.fill_(1)
+        self.newton.islands.wanted.fill_(1)
         self.newton.forcing.fill_(FORCING)
         self.newton.goal.fill_(math.inf)
         self._graphs.replay("follow", lambda: self.newton.follow(self._start, self._step))
@@ -144,10 +148,10 @@ class NetEquilibrium:
         for _ in range(2 if again else 1):
             self._begin(state, at)
             self._graphs.replay("solve", lambda: self.newton.solve(self._start))
-            owner.iterations += int(self.newton.iteration.numpy().sum())
+            owner.iterations += int(self.newton.islands.iteration.numpy().sum())
             wp.copy(state.net.q, self.newton.q)
             self.model.carry_frames(state)
-            status = int(self.newton.status.numpy().max())
+            status = int(self.newton.islands.status.numpy().max())
             q = self.tangent.dofs(state)
             outer = self.tangent.loads(at, q)
             residual = outer - self.tangent.gradient(state)
@@ -155,7 +159,7 @@ class NetEquilibrium:
                 name = outcome.NAMES[status]
                 raise SolverError(owner.where(name, residual, at), state=state, outcome=name)
         owner.outcome = outcome.NAMES[status]
-        state.stable = False if self.newton.projected.numpy().any() else None
+        state.stable = False if self.newton.islands.clamped.numpy().any() else None
         return owner.found(state, outer, residual, at)
 
     def _begin(self, state: State, at: float) -> None:

@@ -10,6 +10,7 @@ from ddg_warp.chains import pose_starts
 from ddg_warp.drag import flow_at
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels import drag, element, motion, step
+from ddg_warp.kernels.islands import Islands
 
 
 def poses(model, t0: float, t1: float) -> np.ndarray:
@@ -54,14 +55,14 @@ class PrescribedMotion:
         """Poses of all motions between t0 and t1."""
         self.pose.assign(poses(self.model, t0, t1))
 
-    def apply(self, progress: wp.array, portion: wp.array, x: wp.array, frame: wp.array, theta: wp.array) -> None:
-        """Put held nodes and angles where they belong once `portion` of the way follows the `progress` made, rod by rod."""
+    def apply(self, islands, x: wp.array, frame: wp.array, theta: wp.array) -> None:
+        """Put held nodes and angles where the part of the step that a rod tries ends."""
         nodes, *angles = self.kernels
         held, group, device = self.group.moving, self.group, self.model.wp_device
         wp.launch(
             nodes,
             held.nodes.shape[0],
-            [held.nodes, held.node_rest, self.pose, progress, portion],
+            [held.nodes, held.node_rest, self.pose, *islands.arrays],
             [x],
             device=device,
         )
@@ -69,7 +70,7 @@ class PrescribedMotion:
             wp.launch(
                 kernel,
                 held.edges.shape[0],
-                [held.edges, held.edge_rest, self.pose, group.count, progress, portion, x, frame],
+                [held.edges, held.edge_rest, self.pose, group.count, *islands.arrays, x, frame],
                 [theta],
                 device=device,
             )
@@ -140,34 +141,36 @@ class ChainDrag:
     def _flow(self, t: float) -> np.ndarray:
         return flow_at(self.model.scene, t)[None, [0, 2] if self.group.kind.dim == 2 else [0, 1, 2]]
 
-    def resist(self, before, newton, progress: wp.array) -> None:
+    def resist(self, before, newton, islands) -> None:
         """Write inertia and drag of a solve from the state `before`, once its iterate is predicted."""
         group = self.group
         self._launch(
             self._resist,
             [before.x, before.v, before.theta, newton.x if self.midpoint else before.x, newton.x, group.drag, self.flow]
-            + [group.mass, group.rotary, group.count, newton.coefficient, newton.rate, progress],
-            [newton.mass, newton.rotary, newton.target_angle, newton.load_scale],
+            + [group.mass, group.rotary, group.count, *islands.arrays],
+            [newton.mass, newton.rotary, newton.target_angle],
         )
 
     def at(self, data, t: float) -> tuple[np.ndarray, np.ndarray]:
         """Inertia and drag (node, column) of a group's state at t, with the resistance over a second, and the flow (dim,)."""
         group, real, device = self.group, self.model.types.real, self.model.wp_device
-        one, free = wp.full(group.columns, 1.0, dtype=real, device=device), wp.zeros_like(group.still)
-        solve = SimpleNamespace(x=data.x, coefficient=one, rate=one, load_scale=free)
+        islands = Islands(group.columns, real, device)
+        islands.coefficient.fill_(1.0)
+        islands.rate.fill_(1.0)
+        solve = SimpleNamespace(x=data.x)
         solve.mass = arrays.allocate((group.nodes, group.columns), element.inertia_type(group.kind, real), device)
         solve.rotary, solve.target_angle = wp.zeros_like(data.theta), wp.clone(data.theta)
         self.upload(t, t)
-        self.resist(data, solve, group.still)
+        self.resist(data, solve, islands)
         return arrays.download(solve.mass), self.flow.numpy()[0].astype(float)
 
-    def settle(self, after, newton, progress: wp.array) -> None:
+    def settle(self, after, newton, islands) -> None:
         """Rates of what has no inertia in the state `after`."""
         group = self.group
         if self.midpoint:
             self._launch(
                 self._settle,
-                [newton.x, newton.theta, group.mass, group.rotary, group.count, newton.status, progress, newton.rate]
+                [newton.x, newton.theta, group.mass, group.rotary, group.count, *islands.arrays]
                 + [after.x, after.theta],
                 [after.v, after.omega],
             )

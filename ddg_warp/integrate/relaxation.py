@@ -38,7 +38,7 @@ def relax(
     """
     equilibrium = Equilibrium(model, StaticsOptions())
     tangent = equilibrium.tangent
-    state = (state or model.state()).copy()
+    state = tangent.with_prescribed((state or model.state()).copy(), at)
     state.time = at
     lever = np.where(tangent.angle, tangent.edge_length(), 1.0)
     velocity, peak, mass, first = np.zeros(tangent.size), 0.0, None, None

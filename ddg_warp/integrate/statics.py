@@ -305,7 +305,7 @@ class Equilibrium:
         tangent.move_supports(alone, before, at)
         if not step.any():
             return alone
-        state = tangent.with_clamps_turned(state, at)
+        state = tangent.with_prescribed(state, at)
         direction = (self.net.following if self.net else self._following)(state, step, at)
         if direction is None:
             return alone

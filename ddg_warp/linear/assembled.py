@@ -12,16 +12,13 @@ class AssembledNewton(ChainNewton):
 
     Attributes:
         blocks: D, E and F of every node, (3 block^2, nodes, columns).
-        wanted: rods that want a direction; merit: squares of their accepted residuals.
     """
 
     def __init__(self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False):
         super().__init__(model, group, options, linear, midpoint)
-        kind, device = group.kind, model.wp_device
+        kind = group.kind
         self.blocks = self.vectors(3 * kind.block**2)
-        self.placed = wp.full(group.columns, 1, dtype=int, device=device)  # `base` holds where every step comes from
-        self.merit = wp.zeros(group.columns, dtype=self.real, device=device)
-        self.wanted = wp.zeros(group.columns, dtype=int, device=device)
+        self.islands.placed.fill_(1)  # `base` holds where every step comes from
         self._assemble = block_band.assemble_kernel(kind, self.real, self.linear, self.exact_from)
 
     def vectors(self, rows: int | None = None) -> wp.array:
@@ -35,17 +32,8 @@ class AssembledNewton(ChainNewton):
         wp.launch(
             self._assemble,
             (group.nodes, group.columns),
-            [
-                self.factor,
-                self.geometric,
-                self.clamped,
-                group.count,
-                self.mass,
-                self.rotary,
-                self.coefficient,
-                group.fixed,
-            ]
-            + [self.status, self.unbalanced, self.drowned, self.iteration, int(self.reuse)],
+            [self.factor, self.geometric, group.count, self.mass, self.rotary, group.fixed, *self.islands.arrays]
+            + [int(self.reuse)],
             [self.blocks],
             device=self.device,
         )

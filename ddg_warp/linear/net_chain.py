@@ -127,9 +127,9 @@ class ChainPlan:
     """Chains, joints and their couplings on the host.
 
     Place k of a rod has its node k and the angle of the edge behind it. Joints take out the nodes where rods meet, the rotations
-    of rigid joints, and the last places of a closed rod, so that what is left couples over two places at most. It falls into chains
-    at rigid joints, not at hinged ones, over which a rod bends. Short chains lie behind each other in columns as long as the longest
-    chain, so that little memory is padding.
+    of rigid joints, and the last places of a closed rod, so that what is left couples over two places at most; what acts from afar,
+    as dipoles do, is left out. It falls into chains at rigid joints, not at hinged ones, over which a rod bends. Short chains lie
+    behind each other in columns as long as the longest chain, so that little memory is padding.
 
     Attributes:
         twist, span: whether chains have angles, and over how many places they couple.
@@ -144,6 +144,10 @@ class ChainPlan:
 
     def __init__(self, host, rows: np.ndarray, columns: np.ndarray):
         self._blocks = host.blocks
+        if any(part.term.measure.apart for part in host.sets):
+            slots = [part.slots.astype(np.int64) for part in host.sets if not part.term.measure.apart]
+            near = np.concatenate([(s[:, None] * host.blocks + s[None]).ravel() for s in slots])
+            rows = np.where(np.isin(rows.astype(np.int64) * host.blocks + columns, near), rows, -1)
         used = np.flatnonzero(rows >= 0)
         self._order = used[np.argsort(rows[used].astype(np.int64) * host.blocks + columns[used])]
         self._keys = rows[self._order].astype(np.int64) * host.blocks + columns[self._order]

@@ -33,7 +33,6 @@ class PartitionedNewton(AssembledNewton):
         self.mean = wp.zeros(columns, dtype=vector, device=device)
         self.held = arrays.upload(_held_neighbours(group), int, device)
         self.new_frame = arrays.allocate(self.frame.shape, real, device)
-        self.bad = wp.zeros(columns, dtype=int, device=device)
         self.reduction = CyclicReduction(kind, group.nodes, columns, self.linear, device)
         self._weigh, self._gauge = parallel_search.sum_kernels(kind, real, self.linear)
         self._judge, self._take = parallel_search.decide_kernels(kind, real, self.linear)
@@ -47,18 +46,18 @@ class PartitionedNewton(AssembledNewton):
         around = [kernel for kernel in self.kernels_around if kernel is not self._predict]  # it has its own
         return [*around, self._assemble, *own, *self.reduction.kernels]
 
-    def predict(self, before, progress: wp.array, bent: wp.array) -> None:
-        """Redo the predictor of `bent` rods from the state `before`, with edges turned; carry frames to midpoints."""
+    def predict(self, before) -> None:
+        """Redo the predictor of bent rods from the state `before`, with edges turned; carry frames to midpoints."""
         group = self.group
         self._launch(
             self._aim,
             group.nodes,
-            [before.x, before.v, group.fixed, group.count, self.rate, progress, bent],
-            [self.base, self.direction, self.step_length, self.angle_change, self.todo],
+            [before.x, before.v, group.fixed, group.count, *self.islands.arrays],
+            [self.base, self.direction],
         )
         self.move()
         if self.midpoint and group.kind.twist:
-            wp.launch(self._renew, group.columns, [progress], [self.todo], device=self.device)
+            wp.launch(self._renew, group.columns, self.islands.arrays, device=self.device)
             self.move()
 
     def sweep(self) -> None:
@@ -75,22 +74,21 @@ class PartitionedNewton(AssembledNewton):
         self._launch(
             self._weigh,
             self.ranges,
-            [self.right, self.energy_change, self.energy_noise, self.group.count, self.status, self.ranges],
+            [self.right, self.energy_change, self.energy_noise, self.group.count, self.islands.status, self.ranges],
             [self.partial],
         )
         wp.launch(
             self._judge,
             self.group.columns,
             [self.partial, self.ranges, options.floor_factor * self.eps, options.max_iterations, options.max_halvings]
-            + [self.status, self.unbalanced, self.drowned, self.slot, self.iteration, self.halvings]
-            + [self.step_length, self.decrement, self.merit, self.load_scale, self.residual, self.turned, self.lost]
-            + [self.wanted, self.bad, self.todo, self.angle_change, self.active],
+            + self.islands.arrays,
             device=self.device,
         )
 
     def direct(self) -> None:
         """Directions by cyclic reduction."""
-        self.reduction.solve(self.blocks, self.right, self.group.count, self.wanted, self.direction, self.bad)
+        islands = self.islands
+        self.reduction.solve(self.blocks, self.right, self.group.count, islands.wanted, self.direction, islands.bad)
 
     def take(self) -> None:
         """Lengths of the steps along the directions."""
@@ -98,38 +96,37 @@ class PartitionedNewton(AssembledNewton):
         self._launch(
             self._gauge,
             self.ranges,
-            [self.right, self.direction, self.x, group.count, self.wanted, self.ranges],
+            [self.right, self.direction, self.x, group.count, self.islands.wanted, self.ranges],
             [self.base, self.partial],
         )
         wp.launch(
             self._take,
             group.columns,
-            [self.partial, self.ranges, self.options.rotation_cap, self.wanted, self.bad, self.status, self.iteration]
-            + [self.step_length, self.decrement, self.lost, self.clamped, self.todo, self.angle_change],
+            [self.partial, self.ranges, self.options.rotation_cap, *self.islands.arrays],
             device=self.device,
         )
 
     def move(self) -> None:
         """Do what is left to do with every rod: a step, straight or with edges turned, or frames of its iterate."""
-        group, (turn, scan, offset, move) = self.group, self._moves
+        group, islands, (turn, scan, offset, move) = self.group, self.islands, self._moves
         self._launch(
             turn,
             group.nodes,
-            [group.count, self.todo, self.direction, self.step_length, self.base, self.x, self.frame],
+            [group.count, islands.todo, self.direction, islands.step_length, self.base, self.x, self.frame],
             [self.prefix, self.new_frame],
         )
-        self._launch(scan, self.ranges, [group.count, self.todo, self.width, self.prefix], [self.sums])
+        self._launch(scan, self.ranges, [group.count, islands.todo, self.width, self.prefix], [self.sums])
         wp.launch(
             offset,
             group.columns,
-            [group.count, self.todo, self.width, self.ranges, self.sums],
+            [group.count, islands.todo, self.width, self.ranges, self.sums],
             [self.mean],
             device=self.device,
         )
         self._launch(
             move,
             group.nodes,
-            [group.count, group.fixed, self.held, self.todo, self.direction, self.step_length, self.angle_change]
+            [group.count, group.fixed, self.held, *islands.arrays, self.direction]
             + [self.prefix, self.sums, self.mean, self.width, self.new_frame],
             [self.x, self.theta, self.frame, self.base],
         )

@@ -41,7 +41,7 @@ class PcgNewton(AssembledNewton):
         self._judge = judge.judge_kernel(kind, self.real, self.linear)
         self._factor = block_band.factor_kernel(kind, self.linear) if by_chain else None
         self._start, self._product, self._advance = pcg.solver_kernels(kind, self.linear, preconditioner)
-        self._repeat = pcg.repeat_kernel(self.psd == "none") if self._repeats else None
+        self._repeat = pcg.repeat_kernel(self.real, self.psd == "none") if self._repeats else None
         self._take = pcg.take_kernel(kind, self.real, self.linear)
         self._limit = 10 * kind.block * group.nodes
 
@@ -66,8 +66,7 @@ class PcgNewton(AssembledNewton):
             self._take,
             group.columns,
             [self.right, self.iterations, group.count, self.options.rotation_cap],
-            [self.direction, group.fixed, self.base, self.x, self.theta, self.wanted, self.step_length, self.decrement]
-            + [self.pcg_work],
+            [self.direction, group.fixed, self.base, self.x, self.theta, *self.islands.arrays, self.pcg_work],
             device=device,
         )
 
@@ -77,7 +76,7 @@ class PcgNewton(AssembledNewton):
             wp.launch(
                 self._repeat,
                 self.group.columns,
-                [done, self.wanted, self.negative, self.clamped, self.status, self.iteration, self.slot, self.lost],
+                [done, *self.islands.arrays, self.negative],
                 device=self.device,
             )
 
@@ -90,17 +89,15 @@ class PcgNewton(AssembledNewton):
             group.columns,
             [self.right, self.energy_change, self.energy_noise, group.count, options.floor_factor * self.eps]
             + [options.max_iterations, options.max_halvings, self.direction, group.fixed, self.base]
-            + [self.x, self.theta, self.frame, self.status, self.unbalanced, self.drowned, self.slot]
-            + [self.iteration, self.halvings, self.step_length, self.decrement, self.merit, self.load_scale]
-            + [self.residual, self.turned, self.wanted, self.active],
+            + [self.x, self.theta, self.frame, *self.islands.arrays],
             device=device,
         )
         if self._factor:
             wp.launch(
                 self._factor,
                 group.columns,
-                [self.blocks, group.count, self.wanted, self.iteration, int(self.reuse)],
-                [self.factors, self.negative if self._repeat else self.lost],
+                [self.blocks, group.count, self.islands.wanted, self.islands.iteration, int(self.reuse)],
+                [self.factors, self.negative if self._repeat else self.islands.lost],
                 device=device,
             )
 
@@ -111,7 +108,7 @@ class PcgNewton(AssembledNewton):
         wp.launch(
             self._start,
             group.columns,
-            [self.blocks, self.factors, group.count, self.wanted, self.right],
+            [self.blocks, self.factors, group.count, self.islands.wanted, self.right],
             [self.rest, self.direction, self.z, self.p, self.rho, self.rho_first, self.iterations, self.busy],
             device=self.device,
         )
@@ -122,7 +119,7 @@ class PcgNewton(AssembledNewton):
         wp.launch(
             self._product,
             (group.nodes, group.columns),
-            [self.blocks, self.p, group.count, self.wanted],
+            [self.blocks, self.p, group.count, self.islands.wanted],
             [self.q, self.busy],
             device=device,
         )
@@ -131,7 +128,7 @@ class PcgNewton(AssembledNewton):
             group.columns,
             [self.blocks, self.factors, group.count, self.options.linear_rtol, self._limit],
             [self.q, self.rest, self.direction, self.z, self.p, self.rho, self.rho_first]
-            + [self.iterations, self.wanted, self.busy, self.negative],
+            + [self.iterations, self.islands.wanted, self.busy, self.negative],
             device=device,
         )
 
@@ -165,7 +162,7 @@ class ProjectiveNewton(PcgNewton):
         wp.launch(
             self._direct,
             self.group.columns,
-            [self.factors, self.right, self.group.count, self.wanted],
+            [self.factors, self.right, self.group.count, self.islands.wanted],
             [self.direction],
             device=self.device,
         )

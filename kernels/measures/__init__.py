@@ -2,10 +2,10 @@
 
 The local dofs are q = [edge vectors of the stencil..., angles of its edges..., rotation vectors of joints..., positions...], so
 that translation invariance holds by construction and forces on nodes are differences of edge forces; positions are there only
-where the place in space is a strain, as the radius of a surface of revolution is. Where a measure needs more it
-reads s, which stays constant during a step: lagged frames of a rod, or data of the element such as the normal of a clamp. w is
-the rest measure of the element (rest length, Voronoi length, area): strains are pointwise quantities, so a density and its
-parameters do not depend on the mesh.
+where the place in space is a strain, as the radius of a surface of revolution is, or a field differs from place to place. Where a
+measure needs more it reads s, which stays constant during a step: lagged frames of a rod, or data of the element such as the
+normal of a clamp or the magnetic field. w is the rest measure of the element (rest length, Voronoi length, area, volume): strains
+are pointwise quantities, so a density and its parameters do not depend on the mesh.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,10 @@ class Measure:
         tensions: scalars of the geometric stiffness; 0 where it is left to the exact Hessian.
         spins: rotation vectors of rigid joints among the dofs, after the angles.
         points: how many nodes, the first of the stencil, are read as positions, too; after the rotation vectors.
+        field: how many of the data, the last, are the magnetic field, which changes with time.
+        apart: whether it couples what may be far apart along a rod, which preconditioners of chains leave out.
         frames: how many of the angles belong to edges with a reference frame, which the lagged data begin with.
+        by_angle: whether a rod's curvature is its turning angle over the length, instead of 2 tan(phi/2).
         strains: names and units of the strains.
         functions: real -> (strains, jacobian, tension, curvature). `strains(q, s, w) -> E`; `jacobian(q, s, w) -> (E, J)`;
             `tension` is None, or `tension(q, w, slope) -> (c, shift)` with the second derivative of the strains,
@@ -49,7 +52,10 @@ class Measure:
     tensions: int = 0
     spins: int = 0
     points: int = 0
+    field: int = 0
+    apart: bool = False
     frames: int = 0
+    by_angle: bool = False
 
     @property
     def size(self) -> int:

@@ -56,11 +56,12 @@ def rotations(real):
 
 
 @cache
-def _functions(real):
+def functions(real, between: bool = False):
+    """Functions of the measure, `between` as for a rod's vertex."""
     Q, S, E, _ = joint_curvature_twist.types(real)
     R, T, _, _ = rod_curvature_twist.types(real)
     V = wp.types.vector(3, real)
-    rod_strains, rod_jacobian, *_ = rod_curvature_twist.functions(real)
+    rod_strains, rod_jacobian, *_ = rod_curvature_twist.functions(real, between)
     turned, transposed = rotations(real)
 
     @wp.func
@@ -99,7 +100,7 @@ joint_curvature_twist = Measure(
     3,
     ((0, 1),),
     ("curvature_1 [1/m]", "curvature_2 [1/m]", "twist [1/m]"),
-    _functions,
+    functions,
     angles=1,
     spins=1,
     frames=1,

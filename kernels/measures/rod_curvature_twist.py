@@ -33,7 +33,8 @@ from ddg_warp.kernels.measures import Measure, turning
 
 
 @cache
-def _functions(real):
+def functions(real, between: bool = False):
+    """Functions of the measure; with `between`, about the directors halfway between those of both edges (see `turning_angle`)."""
     Q, S, E, M = rod_curvature_twist.types(real)
     V = wp.types.vector(3, real)
     H, M3 = wp.types.vector(36, real), wp.types.matrix((3, 3), real)
@@ -51,8 +52,13 @@ def _functions(real):
         ue = transport(V(s[0], s[1], s[2]), V(s[3], s[4], s[5]), te)
         uf = transport(V(s[6], s[7], s[8]), V(s[9], s[10], s[11]), tf)
         twist = q[7] - q[6] + reference_twist(ue, uf, te, tf, s[12])
-        m1e = rotate(ue, te, q[6])
-        m1f = rotate(uf, tf, q[7])
+        angle_e = q[6]
+        angle_f = q[7]
+        if wp.static(between):
+            angle_e = q[6] + real(0.5) * twist
+            angle_f = q[7] - real(0.5) * twist
+        m1e = rotate(ue, te, angle_e)
+        m1f = rotate(uf, tf, angle_f)
         return te, tf, m1e, wp.cross(te, m1e), m1f, wp.cross(tf, m1f), twist, ie, i_f
 
     @wp.func
@@ -178,7 +184,7 @@ rod_curvature_twist = Measure(
     3,
     ((0, 1), (1, 2)),
     ("curvature_1 [1/m]", "curvature_2 [1/m]", "twist [1/m]"),
-    _functions,
+    functions,
     angles=2,
     frames=2,
     lag_size=13,

@@ -14,14 +14,39 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.element import CPU_OPTIONS
+from ddg_warp.kernels.islands import CLAMPED, SLOT, STATUS
 from ddg_warp.kernels.terms import Term
 
 FRAME = 6  # reals of the reference frame of an edge: first director and tangent
 
 
 @cache
+def elements_type(real):
+    """What every kernel of a term reads: the dofs and lagged data of the net, and the elements of a set."""
+    V, R, I = wp.types.vector(3, real), wp.array2d(dtype=real), wp.array2d(dtype=int)
+
+    @wp.struct
+    class Elements:
+        q: wp.array(dtype=V)
+        frame: R
+        lag: R
+        last: R  # strains of the last step
+        rate: wp.array(dtype=real)
+        buffer: wp.array(dtype=real)
+        table: I
+        slots: I
+        data: R
+        blocks: int
+        angle_start: int
+        elements: int
+
+    return Elements
+
+
+@cache
 def functions(term: Term, real):
-    """gather(...) -> (q, s, w, p) of an element; spread(f, slot) -> derivative with respect to the block of a slot."""
+    """gather(given, q, tid) -> (q, s, w, p) of an element; spread(f, slot) -> derivative with respect to the block of a slot."""
+    Elements = elements_type(real)
     measure, density = term.measure, term.density
     V = wp.types.vector(3, real)
     Q, S, _, _ = measure.types(real)
@@ -41,61 +66,51 @@ def functions(term: Term, real):
     lagged = density.lagged
 
     @wp.func
-    def gather(
-        q: wp.array(dtype=V),
-        frame: wp.array2d(dtype=real),
-        lag: wp.array2d(dtype=real),
-        last: wp.array2d(dtype=real),
-        rate: wp.array(dtype=real),
-        buffer: wp.array(dtype=real),
-        table: wp.array2d(dtype=int),
-        slots: wp.array2d(dtype=int),
-        data: wp.array2d(dtype=real),
-        blocks: int,
-        angle_start: int,
-        elements: int,
-        tid: int,
-    ):
-        world = tid / elements
-        e = tid - world * elements
-        shift = world * blocks
+    def gather(given: Elements, q: wp.array(dtype=V), tid: int):
+        world = tid / given.elements
+        e = tid - world * given.elements
+        shift = world * given.blocks
         local = Q()
         for i in range(wp.static(edge_count)):
-            edge = q[slots[second[i], e] + shift] - q[slots[first[i], e] + shift]
+            edge = q[given.slots[second[i], e] + shift] - q[given.slots[first[i], e] + shift]
             for d in range(3):
                 local[3 * i + d] = edge[d]
         for i in range(wp.static(angles)):
-            angle = q[slots[wp.static(nodes) + i, e] + shift]
+            angle = q[given.slots[wp.static(nodes) + i, e] + shift]
             local[wp.static(angle_row) + i] = angle[0]
         for i in range(wp.static(spins)):
-            spin = q[slots[wp.static(nodes + angles) + i, e] + shift]
+            spin = q[given.slots[wp.static(nodes + angles) + i, e] + shift]
             for d in range(3):
                 local[wp.static(spin_row) + 3 * i + d] = spin[d]
         for i in range(wp.static(points)):
-            position = q[slots[i, e] + shift]
+            position = q[given.slots[i, e] + shift]
             for d in range(3):
                 local[wp.static(point_row) + 3 * i + d] = position[d]
         s = S()
         for i in range(wp.static(frames)):
             # frames of a world lie behind each other, too
-            f = slots[wp.static(nodes) + i, e] - angle_start + world * (frame.shape[1] / rate.shape[0])
+            f = (
+                given.slots[wp.static(nodes) + i, e]
+                - given.angle_start
+                + world * (given.frame.shape[1] / given.rate.shape[0])
+            )
             for c in range(wp.static(FRAME)):
-                s[wp.static(FRAME) * i + c] = frame[c, f]
+                s[wp.static(FRAME) * i + c] = given.frame[c, f]
         for c in range(wp.static(own)):
-            s[wp.static(FRAME * frames) + c] = lag[c, tid]
+            s[wp.static(FRAME * frames) + c] = given.lag[c, tid]
         if wp.static(data_size > 0):
-            column = wp.where(data.shape[1] > elements, tid, e)
+            column = wp.where(given.data.shape[1] > given.elements, tid, e)
             for c in range(wp.static(data_size)):
-                s[wp.static(FRAME * frames + own) + c] = data[c, column]
+                s[wp.static(FRAME * frames + own) + c] = given.data[c, column]
         p = P()
         for i in range(wp.static(static_size)):
             row = i + 1
-            p[i] = buffer[table[row, 0] + e * table[row, 1] + world * table[row, 2]]
+            p[i] = given.buffer[given.table[row, 0] + e * given.table[row, 1] + world * given.table[row, 2]]
         if wp.static(lagged):
             for i in range(wp.static(n)):
-                p[wp.static(static_size) + i] = last[i, tid]
-            p[wp.static(size - 1)] = rate[world]
-        return local, s, buffer[table[0, 0] + e * table[0, 1] + world * table[0, 2]], p
+                p[wp.static(static_size) + i] = given.last[i, tid]
+            p[wp.static(size - 1)] = given.rate[world]
+        return local, s, given.buffer[given.table[0, 0] + e * given.table[0, 1] + world * given.table[0, 2]], p
 
     @wp.func
     def spread(f: Q, slot: int):
@@ -131,6 +146,7 @@ def term_kernels(term: Term, real, reverse: bool = False):
 
     With `reverse` the first two have an adjoint, which doubles the time that they take to compile.
     """
+    Elements = elements_type(real)
     measure, density = term.measure, term.density
     V = wp.types.vector(3, real)
     Q, S, E, _ = measure.types(real)
@@ -153,60 +169,27 @@ def term_kernels(term: Term, real, reverse: bool = False):
 
     @wp.kernel(module="unique", enable_backward=reverse)
     def energy(
-        q: wp.array(dtype=V),
-        frame: wp.array2d(dtype=real),
-        lag: wp.array2d(dtype=real),
-        last: wp.array2d(dtype=real),
-        rate: wp.array(dtype=real),
-        buffer: wp.array(dtype=real),
-        table: wp.array2d(dtype=int),
-        slots: wp.array2d(dtype=int),
-        data: wp.array2d(dtype=real),
-        blocks: int,
-        angle_start: int,
-        elements: int,
+        given: Elements,
         energy_out: wp.array(dtype=real),
     ):
         e = wp.tid()
-        x, s, w, p = gather(q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, e)
+        x, s, w, p = gather(given, given.q, e)
         energy_out[e] = w * energy_of(strains_of(x, s, w), p)
 
     @wp.kernel(module="unique", enable_backward=reverse)
     def gradient(
-        q: wp.array(dtype=V),
-        frame: wp.array2d(dtype=real),
-        lag: wp.array2d(dtype=real),
-        last: wp.array2d(dtype=real),
-        rate: wp.array(dtype=real),
-        buffer: wp.array(dtype=real),
-        table: wp.array2d(dtype=int),
-        slots: wp.array2d(dtype=int),
-        data: wp.array2d(dtype=real),
-        blocks: int,
-        angle_start: int,
-        elements: int,
+        given: Elements,
         gradient_out: wp.array2d(dtype=V),
     ):
         e = wp.tid()
-        x, s, w, p = gather(q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, e)
+        x, s, w, p = gather(given, given.q, e)
         f = gradient_at(x, s, w, p)
         for i in range(wp.static(slots_count)):
             gradient_out[i, e] = spread(f, i)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def hessian(
-        q: wp.array(dtype=V),
-        frame: wp.array2d(dtype=real),
-        lag: wp.array2d(dtype=real),
-        last: wp.array2d(dtype=real),
-        rate: wp.array(dtype=real),
-        buffer: wp.array(dtype=real),
-        table: wp.array2d(dtype=int),
-        slots: wp.array2d(dtype=int),
-        data: wp.array2d(dtype=real),
-        blocks: int,
-        angle_start: int,
-        elements: int,
+        given: Elements,
         extra: wp.array2d(dtype=real),
         hessian_out: wp.array3d(dtype=real),
     ):
@@ -215,7 +198,7 @@ def term_kernels(term: Term, real, reverse: bool = False):
         `extra` (strains, elements) is added to the stresses that the second derivatives of the strains are weighted with.
         """
         e, column = wp.tid()
-        x, s, w, p = gather(q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, e)
+        x, s, w, p = gather(given, given.q, e)
         v = Q()
         v[column] = real(1.0)
         more = E()
@@ -227,24 +210,13 @@ def term_kernels(term: Term, real, reverse: bool = False):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def strains(
-        q: wp.array(dtype=V),
-        frame: wp.array2d(dtype=real),
-        lag: wp.array2d(dtype=real),
-        last: wp.array2d(dtype=real),
-        rate: wp.array(dtype=real),
-        buffer: wp.array(dtype=real),
-        table: wp.array2d(dtype=int),
-        slots: wp.array2d(dtype=int),
-        data: wp.array2d(dtype=real),
-        blocks: int,
-        angle_start: int,
-        elements: int,
+        given: Elements,
         stressed: int,
         strain_out: wp.array2d(dtype=real),
         stress_out: wp.array2d(dtype=real),
     ):
         e = wp.tid()
-        x, s, w, p = gather(q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, e)
+        x, s, w, p = gather(given, given.q, e)
         strain = strains_of(x, s, w)
         for i in range(wp.static(n)):
             strain_out[i, e] = strain[i]
@@ -255,27 +227,14 @@ def term_kernels(term: Term, real, reverse: bool = False):
 
     @wp.kernel(module="unique", enable_backward=False)
     def linear_stress(
-        q: wp.array(dtype=V),
-        frame: wp.array2d(dtype=real),
-        lag: wp.array2d(dtype=real),
-        last: wp.array2d(dtype=real),
-        rate: wp.array(dtype=real),
-        buffer: wp.array(dtype=real),
-        table: wp.array2d(dtype=int),
-        slots: wp.array2d(dtype=int),
-        data: wp.array2d(dtype=real),
-        blocks: int,
-        angle_start: int,
-        elements: int,
+        given: Elements,
         step: wp.array(dtype=V),
         stress_out: wp.array2d(dtype=real),
     ):
         """Stresses of the strains that a step gives to first order, e + J step."""
         tid = wp.tid()
-        x, s, w, p = gather(q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid)
-        d, _s, _w, _p = gather(
-            step, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid
-        )
+        x, s, w, p = gather(given, given.q, tid)
+        d, _s, _w, _p = gather(given, step, tid)
         e, jacobian = jacobian_of(x, s, w)
         stress = slope_of(e + jacobian * d, p)
         for i in range(wp.static(n)):
@@ -293,6 +252,7 @@ def evaluate_kernel(term: Term, real, linear):
     its two-by-two stress, leaves out the negative part). Energies go to the half of `energy_out` that the line search does not
     hold. `stiffness_out` is the largest that a strain has against moving the element.
     """
+    Elements = elements_type(real)
     measure, density = term.measure, term.density
     V, F = wp.types.vector(3, real), wp.types.vector(3, linear)
     Q, S, E, _ = measure.types(real)
@@ -321,21 +281,9 @@ def evaluate_kernel(term: Term, real, linear):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def evaluate(
-        q: wp.array(dtype=V),
-        frame: wp.array2d(dtype=real),
-        lag: wp.array2d(dtype=real),
-        last: wp.array2d(dtype=real),
-        rate: wp.array(dtype=real),
-        buffer: wp.array(dtype=real),
-        table: wp.array2d(dtype=int),
-        slots: wp.array2d(dtype=int),
-        data: wp.array2d(dtype=real),
-        blocks: int,
-        angle_start: int,
-        elements: int,
-        status: wp.array(dtype=int),
-        slot: wp.array(dtype=int),
-        projected: wp.array(dtype=int),
+        given: Elements,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         factor_out: wp.array2d(dtype=F),
         tension_out: wp.array2d(dtype=linear),
         gradient_out: wp.array2d(dtype=V),
@@ -343,26 +291,26 @@ def evaluate_kernel(term: Term, real, linear):
         stiffness_out: wp.array(dtype=linear),
     ):
         tid = wp.tid()
-        world = tid / elements
-        if status[world] != 0:
+        world = tid / given.elements
+        if flags[STATUS, world] != 0:
             return
-        x, s, w, p = gather(q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid)
+        x, s, w, p = gather(given, given.q, tid)
         e, jacobian = jacobian_of(x, s, w)
         slope = slope_of(e, p)
-        energy_out[1 - slot[world], tid] = w * energy_of(e, p)
+        energy_out[1 - flags[SLOT, world], tid] = w * energy_of(e, p)
         f = (slope * w) * jacobian
         for i in range(wp.static(slots_count)):
             gradient_out[i, tid] = spread(f, i)
         shift = E()
         if wp.static(tensions == 1):
             c, shift = tension_of(x, w, slope)
-            if c < real(0.0) and projected[world] != 0:
+            if c < real(0.0) and flags[CLAMPED, world] != 0:
                 c = real(0.0)
                 shift = E()
             tension_out[0, tid] = linear(c)
         if wp.static(tensions == 3):
             c3, _shift = tension_of(x, w, slope)
-            if projected[world] != 0:
+            if flags[CLAMPED, world] != 0:
                 c3 = definite(c3)
             for i in range(3):
                 tension_out[i, tid] = linear(c3[i])

@@ -6,7 +6,8 @@ import warp as wp
 
 from ddg_warp.kernels.element import CPU_OPTIONS
 from ddg_warp.kernels.energy import DISSIPATED, DRIFT, HELD, ROUNDING, balance_function
-from ddg_warp.kernels.net.elements import functions
+from ddg_warp.kernels.islands import PROGRESS, RATE
+from ddg_warp.kernels.net.elements import elements_type, functions
 from ddg_warp.kernels.net.system import mass_type
 from ddg_warp.kernels.terms import Term
 
@@ -14,45 +15,32 @@ from ddg_warp.kernels.terms import Term
 @cache
 def element_kernel(term: Term, real, linear):
     """Rows of the elements of a set; row i of world w is i * worlds + w."""
+    Elements = elements_type(real)
     V = wp.types.vector(3, real)
     gather, _ = functions(term, real)
     balance = balance_function(term, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def measure(
-        q: wp.array(dtype=V),
-        frame: wp.array2d(dtype=real),
-        lag: wp.array2d(dtype=real),
-        last: wp.array2d(dtype=real),
-        rate: wp.array(dtype=real),
-        buffer: wp.array(dtype=real),
-        table: wp.array2d(dtype=int),
-        slots: wp.array2d(dtype=int),
-        data: wp.array2d(dtype=real),
-        blocks: int,
-        angle_start: int,
-        elements: int,
+        given: Elements,
         q0: wp.array(dtype=V),
         stiffness: wp.array(dtype=linear),
         floor: real,
-        progress: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         rows_out: wp.array2d(dtype=real),
     ):
         tid = wp.tid()
-        w = tid / elements
-        if progress[w] >= real(1.0):
+        w = tid / given.elements
+        if scalars[PROGRESS, w] >= real(1.0):
             return
-        b, s, weight, p = gather(
-            q, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid
-        )
-        a, _s, _w, _p = gather(
-            q0, frame, lag, last, rate, buffer, table, slots, data, blocks, angle_start, elements, tid
-        )
-        e = tid - w * elements
-        reach = wp.max(wp.abs(q[slots[0, e] + w * blocks]))
+        b, s, weight, p = gather(given, given.q, tid)
+        a, _s, _w, _p = gather(given, q0, tid)
+        e = tid - w * given.elements
+        reach = wp.max(wp.abs(given.q[given.slots[0, e] + w * given.blocks]))
         rows = balance(a, s, b, s, weight, p, reach, floor)
         least = floor * reach
-        worlds = progress.shape[0]
+        worlds = scalars.shape[1]
         rows_out[wp.static(DRIFT) * worlds + w, e] = rows[wp.static(DRIFT)]
         rows_out[wp.static(ROUNDING) * worlds + w, e] = rows[wp.static(ROUNDING)] + real(stiffness[tid]) * least * least
         rows_out[wp.static(HELD) * worlds + w, e] = rows[wp.static(HELD)]
@@ -72,24 +60,24 @@ def block_kernel(real, drag: bool = False):
         v0: wp.array(dtype=V),
         q: wp.array(dtype=V),
         mass: Mass,
-        rate: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         damping: wp.array(dtype=real),
         load: wp.array(dtype=V),
         load_there: wp.array(dtype=V),
         floor: real,
-        progress: wp.array(dtype=real),
         blocks: int,
         rows_out: wp.array2d(dtype=real),
     ):
         """`load` is that of the iterate, `load_there` what the step was solved with."""
         i = wp.tid()
         w = i / blocks
-        if progress[w] >= real(1.0):
+        if scalars[PROGRESS, w] >= real(1.0):
             return
         k = i - w * blocks
         moved = q[i] - q0[i]
-        v = moved * (real(2.0) * rate[w]) - v0[i]
-        worlds = progress.shape[0]
+        v = moved * (real(2.0) * scalars[RATE, w]) - v0[i]
+        worlds = scalars.shape[1]
         rows_out[wp.static(DRIFT) * worlds + w, k] = real(2.0) * wp.dot(load_there[i] - load[i], moved)
         rows_out[wp.static(ROUNDING) * worlds + w, k] = real(2.0) * floor * wp.abs(wp.dot(load[i], moved))
         if wp.static(drag):
@@ -97,7 +85,7 @@ def block_kernel(real, drag: bool = False):
         else:
             m = mass[k]
         rows_out[wp.static(HELD) * worlds + w, k] = real(0.5) * wp.dot(wp.cw_mul(m, v), v)
-        damped = real(2.0) * damping[0] * rate[w] * wp.dot(wp.cw_mul(m, moved), moved)
+        damped = real(2.0) * damping[0] * scalars[RATE, w] * wp.dot(wp.cw_mul(m, moved), moved)
         if wp.static(drag):
             away = q[i] - mass[w, k].carried
             damped += real(2.0) * wp.dot(away, mass[w, k].resistance * away)

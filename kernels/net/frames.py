@@ -66,7 +66,9 @@ def lag_kernel(measure, real):
     """Own lagged rows of elements of a measure with frames, which are up to date, as the positions are."""
     return {
         "rod_curvature_twist": vertex_kernel,
+        "rod_curvature_twist_angle": vertex_kernel,
         "joint_curvature_twist": joint_kernel,
+        "joint_curvature_twist_angle": joint_kernel,
         "rod_surface_angle": surface_kernel,
     }[measure.name](real)
 

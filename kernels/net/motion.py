@@ -1,7 +1,8 @@
-"""What moving supports prescribe in a net: positions of nodes, angles of rod edges, normals of clamped mesh edges.
+"""What is prescribed in a net: positions of nodes, angles of rod edges and normals of clamped mesh edges by supports that move; the
+magnetic field.
 
-All at the end of the part of the step that is taken; for the midpoint rule positions are the mean of those at both of its ends, so
-that the extrapolated ones are exact, and angles and normals those in the middle.
+Supports are at the end of the part of the step that is taken; for the midpoint rule positions are the mean of those at both of its
+ends, so that the extrapolated ones are exact, and angles and normals those in the middle.
 """
 
 from functools import cache
@@ -9,6 +10,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import frames, motion
+from ddg_warp.kernels.islands import MOVED, PORTION, PROGRESS
 
 
 @cache
@@ -31,23 +33,23 @@ def motion_kernels(real, midpoint: bool):
         where: wp.array2d(dtype=int),
         rest: wp.array(dtype=V),
         pose: wp.array2d(dtype=real),
-        progress: wp.array(dtype=real),
-        portion: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         blocks: int,
         q: wp.array(dtype=V),
     ):
         """`where` is the block, then the motion of each of its components, -1 for none."""
         i, w = wp.tid()
-        if progress[w] >= real(1.0):
+        if scalars[PROGRESS, w] >= real(1.0):
             return
         k = where[i, 0]
         here = q[k + w * blocks]
         for d in range(3):
             m = where[i, 1 + d]
             if m >= 0:
-                p = placed(pose, m, progress[w] + portion[w], rest[k])
+                p = placed(pose, m, scalars[PROGRESS, w] + scalars[PORTION, w], rest[k])
                 if wp.static(midpoint):
-                    p = real(0.5) * (p + placed(pose, m, progress[w], rest[k]))
+                    p = real(0.5) * (p + placed(pose, m, scalars[PROGRESS, w], rest[k]))
                 here[d] = p[d]
         q[k + w * blocks] = here
 
@@ -58,15 +60,15 @@ def motion_kernels(real, midpoint: bool):
         pose: wp.array2d(dtype=real),
         ends: wp.array2d(dtype=int),
         frame: wp.array2d(dtype=real),
-        progress: wp.array(dtype=real),
-        portion: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         blocks: int,
         angle_start: int,
         q: wp.array(dtype=V),
     ):
         """`where` is (rod edge, motion), `rest` the edge's first material director at rest; `frame` are the lagged frames."""
         i, w = wp.tid()
-        if progress[w] >= real(1.0):
+        if scalars[PROGRESS, w] >= real(1.0):
             return
         e = where[i, 0]
         m = where[i, 1]
@@ -74,9 +76,9 @@ def motion_kernels(real, midpoint: bool):
         k = e + angle_start + w * blocks
         t = wp.normalize(q[ends[e, 1] + w * blocks] - q[ends[e, 0] + w * blocks])
         u = transport(V(frame[0, f], frame[1, f], frame[2, f]), V(frame[3, f], frame[4, f], frame[5, f]), t)
-        at = reached(progress[w], portion[w])
+        at = reached(scalars[PROGRESS, w], scalars[PORTION, w])
         here = q[k]
-        here[0] = branch(pose, m, progress[w], at, rest[i], u, t, here[0])
+        here[0] = branch(pose, m, scalars[PROGRESS, w], at, rest[i], u, t, here[0])
         q[k] = here
 
     @wp.func
@@ -89,15 +91,15 @@ def motion_kernels(real, midpoint: bool):
         where: wp.array2d(dtype=int),
         rest: wp.array(dtype=V),
         pose: wp.array2d(dtype=real),
-        progress: wp.array(dtype=real),
-        portion: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         elements: int,
         data_out: wp.array2d(dtype=real),
     ):
         """`where` is (element, first row of its data, motion), `rest` the normal at rest."""
         i, w = wp.tid()
-        if progress[w] < real(1.0):
-            n = turned(pose, where[i, 2], reached(progress[w], portion[w]), rest[i])
+        if scalars[PROGRESS, w] < real(1.0):
+            n = turned(pose, where[i, 2], reached(scalars[PROGRESS, w], scalars[PORTION, w]), rest[i])
             write(where, i, w * elements, n, data_out)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -105,9 +107,8 @@ def motion_kernels(real, midpoint: bool):
         where: wp.array2d(dtype=int),
         rest: wp.array(dtype=V),
         pose: wp.array2d(dtype=real),
-        progress: wp.array(dtype=real),
-        portion: wp.array(dtype=real),
-        moved: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         elements: int,
         before: wp.array2d(dtype=real),
         data_out: wp.array2d(dtype=real),
@@ -118,8 +119,31 @@ def motion_kernels(real, midpoint: bool):
         n = V()
         for d in range(3):
             n[d] = before[where[i, 1] + d, column]
-        if moved[w] != 0:
-            n = turned(pose, where[i, 2], progress[w] + portion[w], rest[i])
+        if flags[MOVED, w] != 0:
+            n = turned(pose, where[i, 2], scalars[PROGRESS, w] + scalars[PORTION, w], rest[i])
         write(where, i, w * elements, n, data_out)
 
     return nodes, angles, normals, turn
+
+
+@cache
+def field_kernel(real):
+    """Field and gradient among the data of elements, from row `first` on, in worlds that `moved`; others keep theirs."""
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def put(
+        field: wp.array(dtype=real),
+        first: int,
+        elements: int,
+        moved: wp.array(dtype=int),
+        before: wp.array2d(dtype=real),
+        data_out: wp.array2d(dtype=real),
+    ):
+        tid = wp.tid()
+        for c in range(field.shape[0]):
+            value = field[c]
+            if moved[tid / elements] == 0:
+                value = before[first + c, tid]
+            data_out[first + c, tid] = value
+
+    return put

@@ -6,6 +6,24 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import outcome
+from ddg_warp.kernels.islands import (
+    ACTIVE,
+    CAUTIOUS,
+    DECREMENT,
+    DROWNED,
+    ITERATION,
+    LOAD_SCALE,
+    MERIT,
+    MOVED,
+    PROGRESS,
+    RATE,
+    STATUS,
+    STEP_LENGTH,
+    TODO,
+    UNBALANCED,
+    WANTED,
+    attempt_functions,
+)
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
 
 POLISH = 1e-3  # reduction to which a direction must have been solved before rounding excuses what it leaves
@@ -31,25 +49,12 @@ def search_kernels(real, linear):
         loosest: real,
         tightest: real,
         spare: real,
-        status: wp.array(dtype=int),
-        unbalanced: wp.array(dtype=int),
-        drowned: wp.array(dtype=int),
-        slot: wp.array(dtype=int),
-        iteration: wp.array(dtype=int),
-        halvings: wp.array(dtype=int),
-        step_length: wp.array(dtype=real),
-        decrement: wp.array(dtype=real),
-        merit: wp.array(dtype=real),
-        load_scale: wp.array(dtype=real),
-        largest: wp.array(dtype=real),
-        turned: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         best: wp.array(dtype=real),
         stalled: wp.array(dtype=int),
         forcing: wp.array(dtype=linear),
         goal: wp.array(dtype=real),
-        wanted: wp.array(dtype=int),
-        todo: wp.array(dtype=int),
-        active: wp.array(dtype=int),
     ):
         """Decides by the sums over all blocks; `worst` is the largest residual over what it may be at rtol = 1.
 
@@ -59,38 +64,23 @@ def search_kernels(real, linear):
         estimate block by block.
         """
         w = wp.tid()
-        wanted[w] = 0
-        todo[w] = 0
+        flags[WANTED, w] = 0
+        flags[TODO, w] = 0
         # what an inexact direction leaves is not rounding yet
         polish = (
-            status[w] == 0 and unbalanced[w] == 0 and drowned[w] != 0 and real(forcing[w]) > real(wp.static(POLISH))
+            flags[STATUS, w] == 0
+            and flags[UNBALANCED, w] == 0
+            and flags[DROWNED, w] != 0
+            and real(forcing[w]) > real(wp.static(POLISH))
         )
-        if polish and iteration[w] > 0:
-            unbalanced[w] = 1
-        if balanced(status, unbalanced, drowned, iteration, w):
+        if polish and flags[ITERATION, w] > 0:
+            flags[UNBALANCED, w] = 1
+        if balanced(flags, scalars, w):
             return
-        before = merit[w]
-        first = iteration[w] == 0
-        drowns = not first and step_length[w] * decrement[w] <= real(10.0) * noise[w] * floor
-        what = decide(
-            change[w],
-            noise[w] * floor,
-            square[w],
-            worst[w],
-            max_iterations,
-            max_halvings,
-            status,
-            slot,
-            iteration,
-            halvings,
-            step_length,
-            decrement,
-            merit,
-            load_scale,
-            largest,
-            turned,
-            w,
-        )
+        before = scalars[MERIT, w]
+        first = flags[ITERATION, w] == 0
+        drowns = not first and scalars[STEP_LENGTH, w] * scalars[DECREMENT, w] <= real(10.0) * noise[w] * floor
+        what = decide(change[w], noise[w] * floor, square[w], worst[w], max_iterations, max_halvings, flags, scalars, w)
         if what == wp.static(STOP):
             return
         if what == wp.static(DIRECT):
@@ -99,22 +89,22 @@ def search_kernels(real, linear):
                 best[w] = square[w]
                 stalled[w] = 0
             if stalled[w] > wp.static(STALLED):
-                status[w] = wp.static(outcome.CONVERGED_TO_ROUNDING)
+                flags[STATUS, w] = wp.static(outcome.CONVERGED_TO_ROUNDING)
                 return
-        active[0] = 1
+        flags[ACTIVE, 0] = 1
         if what == wp.static(DIRECT):
             eta = loosest
             if not first and before > real(0.0):
                 eta = wp.clamp(real(0.9) * square[w] / before, tightest, loosest)
-            enough = rtol * load_scale[w] / worst[w]
-            goal[w] = wp.where(spare * enough >= eta, spare * rtol * load_scale[w], real(wp.static(math.inf)))
+            enough = rtol * scalars[LOAD_SCALE, w] / worst[w]
+            goal[w] = wp.where(spare * enough >= eta, spare * rtol * scalars[LOAD_SCALE, w], real(wp.static(math.inf)))
             eta = wp.max(eta, wp.min(enough, real(0.5)))
             if polish:
                 eta = wp.min(eta, real(wp.static(POLISH)))
             forcing[w] = linear(eta)
-            wanted[w] = 1
+            flags[WANTED, w] = 1
         else:
-            todo[w] = 1
+            flags[TODO, w] = 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def measure(
@@ -163,26 +153,23 @@ def search_kernels(real, linear):
         turn: wp.array(dtype=real),
         rotation_cap: real,
         iterations: wp.array(dtype=int),
-        wanted: wp.array(dtype=int),
-        status: wp.array(dtype=int),
-        step_length: wp.array(dtype=real),
-        decrement: wp.array(dtype=real),
-        todo: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         work: wp.array(dtype=wp.int64),
     ):
         """Length of the step: whole, or so that nothing turns by more than the cap."""
         w = wp.tid()
-        if wanted[w] == 0:
+        if flags[WANTED, w] == 0:
             return
         if not wp.isfinite(decrease[w]):
-            status[w] = wp.static(outcome.NON_FINITE)
+            flags[STATUS, w] = wp.static(outcome.NON_FINITE)
             return
         whole = real(1.0)
         if turn[w] > rotation_cap * rotation_cap:
             whole = rotation_cap / wp.sqrt(turn[w])
-        step_length[w] = whole
-        decrement[w] = decrease[w]
-        todo[w] = 2
+        scalars[STEP_LENGTH, w] = whole
+        scalars[DECREMENT, w] = decrease[w]
+        flags[TODO, w] = 2
         wp.atomic_add(work, 0, wp.int64(iterations[w]))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -211,6 +198,7 @@ def search_kernels(real, linear):
 @cache
 def step_kernels(real, midpoint: bool):
     """begin(...) and finish(...) of a time step; see `kernels.step` for the schemes."""
+    length, restart = attempt_functions(real, midpoint)
     V = wp.types.vector(3, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -222,54 +210,31 @@ def step_kernels(real, midpoint: bool):
         dt: wp.array(dtype=real),
         damping: wp.array(dtype=real),
         outer: wp.array(dtype=real),
-        progress: wp.array(dtype=real),
-        portion: wp.array(dtype=real),
-        cautious: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         blocks: int,
         q_out: wp.array(dtype=V),
         base_out: wp.array(dtype=V),
         target_out: wp.array(dtype=V),
-        coefficient_out: wp.array(dtype=real),
-        rate_out: wp.array(dtype=real),
-        status_out: wp.array(dtype=int),
-        iteration_out: wp.array(dtype=int),
-        halvings_out: wp.array(dtype=int),
-        unbalanced_out: wp.array(dtype=int),
-        drowned_out: wp.array(dtype=int),
-        load_scale_out: wp.array(dtype=real),
-        projected_out: wp.array(dtype=int),
-        moved_out: wp.array(dtype=int),
-        active_out: wp.array(dtype=int),
     ):
         """Starts a solve from the predictor; dofs without mass, whose rates mean nothing, start from where they are."""
         i = wp.tid()
         w = i / blocks
         k = i - w * blocks
         if k == 0:
-            moved_out[w] = wp.where(progress[w] < real(1.0), 1, 0)
-        if progress[w] >= real(1.0):
+            flags[MOVED, w] = wp.where(scalars[PROGRESS, w] < real(1.0), 1, 0)
+        if scalars[PROGRESS, w] >= real(1.0):
             return
-        s = dt[w] * portion[w]
-        if wp.static(midpoint):
-            s *= real(0.5)
+        s = length(scalars, w, dt[w])
         rate = real(1.0) / s
         coefficient = rate * (rate + damping[0])
         if k == 0:
-            coefficient_out[w] = coefficient
-            rate_out[w] = rate
-            status_out[w] = 0
-            iteration_out[w] = 0
-            halvings_out[w] = 0
-            unbalanced_out[w] = 0
-            drowned_out[w] = 0
-            projected_out[w] = 0
-            load_scale_out[w] = outer[w]
-            active_out[0] = 1
+            restart(flags, scalars, w, rate, coefficient, outer[w])
         mask = int(fixed[k])
         here = q0[i]
         v = v0[i]
         target_out[i] = here + v * (rate / coefficient)
-        if cautious[w] == 0:
+        if flags[CAUTIOUS, w] == 0:
             for d in range(3):
                 if ((mask >> d) & 1) == 0 and mass[k][d] > real(0.0):
                     here[d] = here[d] + s * v[d]
@@ -281,13 +246,11 @@ def step_kernels(real, midpoint: bool):
         q: wp.array(dtype=V),
         q0: wp.array(dtype=V),
         v0: wp.array(dtype=V),
-        status: wp.array(dtype=int),
-        progress: wp.array(dtype=real),
-        rate: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         blocks: int,
         q_out: wp.array(dtype=V),
         v_out: wp.array(dtype=V),
-        moved_out: wp.array(dtype=int),
     ):
         """Blocks and their velocities at the end of the step, of the worlds that converged."""
         i = wp.tid()
@@ -295,12 +258,12 @@ def step_kernels(real, midpoint: bool):
         start = q0[i]
         v = v0[i]
         end = start
-        ahead = progress[w] < real(1.0) and status[w] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
+        ahead = scalars[PROGRESS, w] < real(1.0) and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
         if i == w * blocks:
-            moved_out[w] = wp.where(ahead, 1, 0)
+            flags[MOVED, w] = wp.where(ahead, 1, 0)
         if ahead:
             end = q[i]
-            change = (end - start) * rate[w]
+            change = (end - start) * scalars[RATE, w]
             if wp.static(midpoint):
                 end = real(2.0) * end - start
                 v = real(2.0) * change - v

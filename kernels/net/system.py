@@ -11,6 +11,7 @@ import warp as wp
 
 from ddg_warp.kernels.drag import block_inertia
 from ddg_warp.kernels.element import CPU_OPTIONS
+from ddg_warp.kernels.islands import DROWNED, LOAD_SCALE, STATUS, UNBALANCED
 from ddg_warp.kernels.terms import Term
 
 SLICE = 32  # rows of a slice of H
@@ -132,8 +133,8 @@ def balance_kernels(real, linear, drag: bool = False):
         size: wp.array(dtype=real),
         stiffness: wp.array(dtype=linear),
         fixed: wp.array(dtype=wp.uint8),
-        status: wp.array(dtype=int),
-        load_scale: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         allowed: wp.array(dtype=real),
         blocks: int,
         nodes: int,
@@ -146,8 +147,6 @@ def balance_kernels(real, linear, drag: bool = False):
         ratio_out: wp.array2d(dtype=real),
         square_out: wp.array2d(dtype=real),
         noise: wp.array2d(dtype=real),
-        unbalanced_out: wp.array(dtype=int),
-        drowned_out: wp.array(dtype=int),
     ):
         """Residual of free dofs, and its squares with moments over the length `arm`; see `kernels.balance` for the criterion.
 
@@ -157,7 +156,7 @@ def balance_kernels(real, linear, drag: bool = False):
         """
         i = wp.tid()
         w = i / blocks
-        if status[w] != 0:
+        if flags[STATUS, w] != 0:
             return
         k = i - w * blocks
         f = force[i]
@@ -166,7 +165,7 @@ def balance_kernels(real, linear, drag: bool = False):
         reach = wp.max(wp.abs(q[i])) + longest
         if k >= nodes:
             reach += real(1.0)
-        limit = rtol * load_scale[w] * allowed[i]
+        limit = rtol * scalars[LOAD_SCALE, w] * allowed[i]
         least = floor * (real(stiffness[i]) * reach + size[i])
         least_out[i] = least
         r = H()
@@ -178,9 +177,9 @@ def balance_kernels(real, linear, drag: bool = False):
                 r[d] = linear(f[d])
                 square += f[d] * f[d] / (length * length)
                 if not wp.abs(f[d]) <= limit:
-                    drowned_out[w] = 1
+                    flags[DROWNED, w] = 1
                     if not wp.abs(f[d]) <= least:
-                        unbalanced_out[w] = 1
+                        flags[UNBALANCED, w] = 1
         right_out[i] = r
         ratio_out[w, k] = ratio
         square_out[w, k] = square

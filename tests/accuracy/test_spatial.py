@@ -52,8 +52,9 @@ def test_helical_spring_without_rotation(device, stretch, force, moment):
     assert order(edges, errors[:, 1]) == pytest.approx(2.0, abs=0.1)
 
 
-def test_helical_spring_at_rest_is_free(device):
-    spring = equilibrium(helical_spring.build(1.0, 10.0, 400), device, mode="follow")
+@pytest.mark.parametrize("curvature", ["tangent", pytest.param("angle", marks=pytest.mark.slow)])
+def test_helical_spring_at_rest_is_free(device, curvature):
+    spring = equilibrium(helical_spring.build(1.0, 10.0, 400, curvature), device, mode="follow")
     assert helical_spring.measure(*spring) == pytest.approx((0.0, 0.0), abs=1e-10)
 
 

@@ -84,6 +84,7 @@ ROD = {
     "natural a number": ({"natural": 3.0}, "rod 1", "natural", "3 arrays"),
     "natural none": ({"natural": None}, "rod 1", "natural", "3 arrays"),
     "natural no number": ({"natural": ("a", 0.0, 0.0)}, "rod 1", "natural", "numbers"),
+    "curvature by angle without bending": ({"curvature": "angle", "bend": False}, "'odd'", "'angle'", "leave it out"),
     "director of wrong shape": ({"director": (1.0, 0.0)}, "rod 1", "director", "(2,)", "(rods, edges, 3)"),
     "director of another rod": ({"director": np.ones((1, 7, 3))}, "rod 1", "director", "(1, 7, 3)"),
     "director not finite": ({"director": (0.0, NAN, 1.0)}, "rod 1", "director", "edge 0", "finite"),
@@ -113,6 +114,7 @@ def _rod(options: dict):
 
 
 refuse("rods", {name: (lambda o=options: _rod(o), *words) for name, (options, *words) in ROD.items()})
+each("rods", "curvature", ["secant", None, 1], lambda v: rods(curvature=v), "'odd'", "curvature", "tangent", "angle")
 for flag in ("closed", "twist", "bend"):
     each("rods", flag, ["no", "yes", 1, None], lambda v, f=flag: rods(**{f: v}), "'odd'", flag, "True or False")
 refuse("rods", {"none": (lambda: built(ddg.Scene(), lambda s: s.add_rods(np.zeros((0, 5, 3)), section=STIFFNESS, name="odd")),

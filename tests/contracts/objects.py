@@ -83,6 +83,14 @@ def _rod(points=None, clamp: str = "edge", **options):
     return add
 
 
+def _magnetised(scene, material) -> Added:
+    """Along its tangent, in a field across the plane of the other loads that is none at the start."""
+    added = _rod()(scene, material)
+    scene.magnetize(added.rods, 2e4)
+    scene.magnetic_field(lambda t: (0.0, 2e-3 * t**4, 0.0))
+    return added
+
+
 def _ring(scene, material) -> Added:
     angle = 2.0 * np.pi * np.arange(12) / 12
     points = 0.3 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], -1)
@@ -203,4 +211,6 @@ OBJECTS = {
     "rods alone and joined": Object(_mixed(_rod(), _ring, _joined(True))),
     "rods and shells": Object(_mixed(_rod(), _joined(False), _stiffened, _sheet("hinge"))),
     "shells of both kinds": Object(_mixed(_sheet("midedge_dof"), _dome), axis=UP, turns=False),
+    "rods by the turning angle": Object(_mixed(_rod(curvature="angle"), _joined(True, curvature="angle"))),
+    "magnetised rod": Object(_magnetised, turns=False),
 }

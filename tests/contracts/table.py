@@ -20,8 +20,17 @@ from questions import QUESTIONS, Variant
 import ddg_warp as ddg
 
 VARIANTS = [(worlds, precision) for worlds in (1, 3) for precision in ("float64", "mixed")]
-RODS = ("rod", "rod clamped at its end", "planar rod", "rod without twist", "rod without bending", "closed rod")
+RODS = (
+    "rod",
+    "rod clamped at its end",
+    "planar rod",
+    "rod without twist",
+    "rod without bending",
+    "closed rod",
+    "magnetised rod",
+)
 JOINED = ("rods joined rigidly", "rods joined by a hinge", "planar rods joined rigidly")
+MANY_RODS = ("rods alone and joined", "rods by the turning angle")
 SHELLS = tuple(name for name in OBJECTS if name.startswith("shell,"))
 
 # What is refused: question -> objects -> words of the message.
@@ -33,14 +42,12 @@ REFUSED = {
         ),
         **dict.fromkeys((*SHELLS, "shell of revolution", "shells of both kinds"), ("rod 0", "does not exist")),
     },
-    "fields": dict.fromkeys((*RODS, *JOINED, "shell of revolution", "rods alone and joined"), ("no surfaces",)),
+    "fields": dict.fromkeys((*RODS, *JOINED, "shell of revolution", *MANY_RODS), ("no surfaces",)),
     "set rest": {
-        **dict.fromkeys(
-            (*RODS, *JOINED, "shell of revolution", "rods alone and joined"), ("shell 0", "does not exist")
-        ),
+        **dict.fromkeys((*RODS, *JOINED, "shell of revolution", *MANY_RODS), ("shell 0", "does not exist")),
         "shell, isometric": ("'isometric'", "flat rest shape", "use"),
     },
-    "pressure": dict.fromkeys((*RODS, *JOINED, "rods alone and joined"), ("shell 0", "does not exist")),
+    "pressure": dict.fromkeys((*RODS, *JOINED, *MANY_RODS), ("shell 0", "does not exist")),
     "couple": dict.fromkeys((*SHELLS, "shell of revolution", "shells of both kinds"), ("rod 0", "does not exist")),
     "drag": {
         **dict.fromkeys((*SHELLS, "shells of both kinds"), ("shell 0", "name the rods")),

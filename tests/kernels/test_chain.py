@@ -58,9 +58,9 @@ class Problem:
             wp.copy(newton.frame, state.frame)
             arrays.assign(newton.theta, 2.0 * noise * random.normal(size=shape))
             arrays.assign(newton.target_angle, 2.0 * noise * random.normal(size=shape))
-        newton.coefficient.assign(inertia * random.uniform(0.5, 1.5, size=4))
-        newton.rate.fill_(1.0)
-        newton.clamped.fill_(1)  # these states are compressed so much that the matrix would be indefinite
+        newton.islands.coefficient.assign(inertia * random.uniform(0.5, 1.5, size=4))
+        newton.islands.rate.fill_(1.0)
+        newton.islands.clamped.fill_(1)  # these states are compressed so much that the matrix would be indefinite
         self.last = state.last
 
     def iterate(self):
@@ -108,7 +108,7 @@ class Problem:
     def inertia(self, column: int):
         """Diagonal of inertia, target, and outer force of a rod."""
         host, kind, n = self.group.host, self.kind, self.count[column]
-        rod, c = column % 2, float(arrays.download(self.newton.coefficient)[column])
+        rod, c = column % 2, float(arrays.download(self.newton.islands.coefficient)[column])
         diagonal, force = np.zeros((n, kind.block)), np.zeros((n, kind.block))
         diagonal[:, : kind.dim] = c * host.mass[:n, rod, None]
         force[:, : kind.dim] = host.mass[:n, rod, None] * self.group.gravity_host + host.load[:n, rod]
@@ -151,7 +151,15 @@ class Problem:
             wp.launch(
                 element.term_kernels(kind, i, real)[0],
                 (group.elements, group.columns),
-                [newton.x, newton.theta, newton.frame, self.last, newton.rate, *group.parameters.arrays, group.count],
+                [
+                    newton.x,
+                    newton.theta,
+                    newton.frame,
+                    self.last,
+                    newton.islands.rate,
+                    *group.parameters.arrays,
+                    group.count,
+                ],
                 [out],
                 device=self.device,
             )
@@ -176,7 +184,7 @@ def test_sweep_is_a_dense_solve(device, name, precision):
     problem = Problem(name, device, precision)
     before = problem.iterate_dofs()
     problem.iterate()
-    direction, decrement = problem.direction(), arrays.download(problem.newton.decrement)
+    direction, decrement = problem.direction(), arrays.download(problem.newton.islands.decrement)
     tolerance = 1e-12 if precision == "float64" else 1e-4
     for column, n in enumerate(problem.count):
         H, r = problem.dense(column, before[column, :n].ravel())
@@ -188,8 +196,8 @@ def test_sweep_is_a_dense_solve(device, name, precision):
         assert scale > 0.01
         np.testing.assert_allclose(direction[column, :n].ravel(), expected, rtol=0, atol=tolerance * scale)
         np.testing.assert_allclose(decrement[column], r[free] @ expected[free], rtol=tolerance)
-    assert (arrays.download(problem.newton.status) == outcome.ACTIVE).all()
-    assert (arrays.download(problem.newton.lost) == 0).all()
+    assert (arrays.download(problem.newton.islands.status) == outcome.ACTIVE).all()
+    assert (arrays.download(problem.newton.islands.lost) == 0).all()
 
 
 @EVERY_KIND
@@ -199,7 +207,7 @@ def test_step_follows_the_direction(device, name, noise, inertia):
     problem = Problem(name, device, noise=noise, inertia=inertia)
     before, dim = problem.iterate_dofs(), problem.kind.dim
     problem.iterate()
-    taken = arrays.download(problem.newton.step_length)[:, None, None]
+    taken = arrays.download(problem.newton.islands.step_length)[:, None, None]
     moved, step = problem.iterate_dofs() - before, problem.direction() * taken
     for column, n in enumerate(problem.count):
         held = ~problem.free(column).reshape(n, -1)
@@ -217,7 +225,7 @@ def test_rotation_cap(device, name):
     problem = Problem(name, device, rotation_cap=cap)
     before, dim = problem.iterate_dofs(), problem.kind.dim
     problem.iterate()
-    direction, taken = problem.direction(), arrays.download(problem.newton.step_length)
+    direction, taken = problem.direction(), arrays.download(problem.newton.islands.step_length)
     for column, n in enumerate(problem.count):
         edges, turns = (np.diff(v[column, :n, :dim], axis=0) for v in (before, direction))
         worst = (np.linalg.norm(turns, axis=1) / np.linalg.norm(edges, axis=1)).max()
@@ -230,15 +238,15 @@ def test_too_long_a_step_is_shortened_by_the_energy(device, name):
     problem = Problem(name, device, noise=0.05, inertia=1e3)
     newton, start = problem.newton, problem.iterate_dofs()
     problem.iterate()
-    direction, decrement = problem.direction(), arrays.download(newton.decrement)
+    direction, decrement = problem.direction(), arrays.download(newton.islands.decrement)
     problem.put(start + 3.0 * direction)
-    newton.step_length.fill_(3.0)
+    newton.islands.step_length.fill_(3.0)
     change = problem.energy(start + 3.0 * direction) - problem.energy(start)
     assert (change > 0.0).all()
     problem.iterate()
-    shorter = arrays.download(newton.step_length)
-    assert (arrays.download(newton.halvings) == 1).all()
-    assert (arrays.download(newton.iteration) == 1).all()
+    shorter = arrays.download(newton.islands.step_length)
+    assert (arrays.download(newton.islands.halvings) == 1).all()
+    assert (arrays.download(newton.islands.iteration) == 1).all()
     assert (
         (0.31 < shorter) & (shorter < 1.49)
     ).all()  # strictly between a tenth and half, so that the parabola decided
@@ -249,8 +257,8 @@ def test_too_long_a_step_is_shortened_by_the_energy(device, name):
         error = np.abs(moved[column, :n] - step[column, :n]).max()
         assert error <= second_order(start[column, :n, :dim], step[column, :n, :dim])
     problem.iterate()
-    assert (arrays.download(newton.halvings) == 0).all()  # the shorter step is taken
-    assert (arrays.download(newton.iteration) == 2).all()
+    assert (arrays.download(newton.islands.halvings) == 0).all()  # the shorter step is taken
+    assert (arrays.download(newton.islands.iteration) == 2).all()
 
 
 @EVERY_KIND
@@ -263,11 +271,11 @@ def test_accepted_steps_lower_the_energy(device, name):
     length, iteration, rejected = np.zeros(4), np.zeros(4, int), 0
     for _ in range(400):
         problem.iterate()
-        active = arrays.download(newton.status) == outcome.ACTIVE
+        active = arrays.download(newton.islands.status) == outcome.ACTIVE
         if not active.any():
             break
-        energy, new_length = problem.energy(trial), arrays.download(newton.step_length)
-        now = arrays.download(newton.iteration)
+        energy, new_length = problem.energy(trial), arrays.download(newton.islands.step_length)
+        now = arrays.download(newton.islands.iteration)
         for column in np.flatnonzero(active):
             if now[column] > iteration[column]:
                 assert energy[column] <= lowest[column] + 1e-12 * abs(lowest[column])
@@ -276,7 +284,7 @@ def test_accepted_steps_lower_the_energy(device, name):
                 assert new_length[column] <= 0.5 * length[column]
                 rejected += 1
         trial, length, iteration = problem.iterate_dofs(), new_length, now
-    assert set(arrays.download(newton.status)) <= {outcome.CONVERGED, outcome.CONVERGED_TO_ROUNDING}
+    assert set(arrays.download(newton.islands.status)) <= {outcome.CONVERGED, outcome.CONVERGED_TO_ROUNDING}
     assert rejected > 0 or name == "untwisted"  # where every step is a good one
     assert (iteration > 2).all()
 
@@ -319,7 +327,7 @@ def test_old_frames_are_lagged_anew(device, case):
     newton, start = problem.newton, aged(problem, AGED[case])
     energy = problem.energy(start)
     problem.iterate()
-    if not arrays.download(newton.step_length).any():
+    if not arrays.download(newton.islands.step_length).any():
         problem.iterate()  # one to take new frames, one to step
     np.testing.assert_allclose(problem.energy(start), energy, rtol=1e-12)
     for column in range(4):
@@ -328,7 +336,7 @@ def test_old_frames_are_lagged_anew(device, case):
         assert np.abs(twist).max() < 1.8
     h = 1e-6 / np.abs(problem.direction()).max(axis=(1, 2))
     ends = [problem.energy(start + sign * h[:, None, None] * problem.direction()) for sign in (1.0, -1.0)]
-    np.testing.assert_allclose((ends[0] - ends[1]) / (2.0 * h), -arrays.download(newton.decrement), rtol=1e-6)
+    np.testing.assert_allclose((ends[0] - ends[1]) / (2.0 * h), -arrays.download(newton.islands.decrement), rtol=1e-6)
 
 
 def tip(device, **options) -> np.ndarray:
@@ -370,6 +378,6 @@ def test_indefinite_by_compression_is_clamped(device):
     state = integrator.model.state(points=points * [0.99, 1.0, 1.0] + [0.0, 0.0, 1e-4] * np.arange(12)[:, None] ** 2)
     state = integrator.step(state, 1.0)
     newton = integrator._chains[0].newton
-    assert newton.clamped.numpy()[0] == 1
+    assert newton.islands.clamped.numpy()[0] == 1
     assert set(integrator.statistics()["outcomes"]) <= {"converged", "converged_to_rounding"}
     assert state.points()[-1, 0] < 0.5  # 50 is twenty times the load of Euler

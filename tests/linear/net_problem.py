@@ -115,9 +115,9 @@ class Problem:
         wp.copy(newton.q, self.state.net.q)
         wp.copy(newton.base, self.state.net.q)
         newton.target.assign(q + 5.0 * noise * random.normal(size=q.shape) * free)
-        newton.coefficient.assign([30.0, 50.0])
-        newton.rate.fill_(1.0)
-        newton.wanted.fill_(1)
+        newton.islands.coefficient.assign([30.0, 50.0])
+        newton.islands.rate.fill_(1.0)
+        newton.islands.wanted.fill_(1)
 
     def iterate(self, forcing: float):
         newton = self.newton
@@ -145,7 +145,7 @@ class Problem:
         size = 3 * self.blocks
         own = slice(world * size, (world + 1) * size)
         H = Tangent(self.model).hessian(self.state).toarray()[own, own]
-        return H + np.diag(self.net.host.mass.ravel() * self.newton.coefficient.numpy()[world])
+        return H + np.diag(self.net.host.mass.ravel() * self.newton.islands.coefficient.numpy()[world])
 
     def free(self) -> np.ndarray:
         return ~self.net.host.fixed.ravel()

@@ -23,11 +23,11 @@ def test_matrix_is_the_exact_hessian_of_membranes(device, stretch):
 
 def test_projected_matrix_leaves_out_compression(device):
     problem = Problem(membrane_with_springs(), device, 0.9)
-    problem.newton.coefficient.fill_(0.0)
+    problem.newton.islands.coefficient.fill_(0.0)
     free = problem.free()
     lowest = []
     for projected in (0, 1):
-        problem.newton.projected.fill_(projected)
+        problem.newton.islands.clamped.fill_(projected)
         H = problem.iterate(0.1).matrix(0)[np.ix_(free, free)]
         lowest.append(np.linalg.eigvalsh(H)[0] / np.abs(H).max())
     assert lowest[0] < -1e-3
@@ -38,7 +38,7 @@ def test_projected_matrix_leaves_out_compression(device):
 @pytest.mark.parametrize("bending", ["midedge_dof", "hinge"])
 def test_directions_against_a_dense_solve(device, bending, precision):
     problem = Problem(frame_and_sheet(bending), device, 1.02, precision)
-    problem.newton.projected.fill_(1)
+    problem.newton.islands.clamped.fill_(1)
     problem.iterate(1e-7 if precision == "mixed" else 1e-13)
     free, size = problem.free(), 3 * problem.blocks
     tolerance = 2e-4 if precision == "mixed" else 1e-9
@@ -57,7 +57,7 @@ def test_residual_is_that_of_the_tangent(device):
     problem = Problem(frame_and_sheet(), device, 1.02).iterate(0.1)
     tangent, newton, host = Tangent(problem.model), problem.newton, problem.net.host
     q = newton.q.numpy()
-    inertia = np.tile(host.mass, (2, 1)) * np.repeat(newton.coefficient.numpy(), problem.blocks)[:, None]
+    inertia = np.tile(host.mass, (2, 1)) * np.repeat(newton.islands.coefficient.numpy(), problem.blocks)[:, None]
     force = tangent.loads(1.0, q.ravel()) - tangent.gradient(problem.state)
     expected = np.where(tangent.free, force - (inertia * (q - newton.target.numpy())).ravel(), 0.0)
     found = newton.right.numpy().ravel()
@@ -69,7 +69,7 @@ def test_product_is_that_of_the_matrix(device):
     newton, size, free = problem.newton, 3 * problem.blocks, problem.free()
     vector = np.random.default_rng(0).normal(size=(2 * problem.blocks, 3)) * np.tile(~problem.net.host.fixed, (2, 1))
     newton.p.assign(vector)
-    newton.wanted.fill_(1)
+    newton.islands.wanted.fill_(1)
     newton.rho.fill_(1.0)
     newton.cycle()
     product = newton.product.numpy().reshape(2, size)
@@ -82,9 +82,9 @@ def test_product_is_that_of_the_matrix(device):
 def test_negative_curvature_ends_the_solve_and_projects(device, preconditioner):
     """Where compression makes H indefinite the direction still descends, and the next matrix leaves compression out."""
     problem = Problem(membrane_with_springs(), device, 0.8, preconditioner=preconditioner)
-    problem.newton.coefficient.fill_(1e-3)
+    problem.newton.islands.coefficient.fill_(1e-3)
     newton = problem.iterate(1e-10).newton
-    assert newton.projected.numpy().tolist() == [1, 1]
+    assert newton.islands.clamped.numpy().tolist() == [1, 1]
     assert newton.iterations.numpy().max() < 10
     right, direction = (a.numpy().reshape(2, -1) for a in (newton.right, newton.direction))
     assert ((right * direction).sum(1) > 0.0).all()
@@ -124,8 +124,8 @@ def test_blocks_of_groups_are_those_of_the_matrix(device):
     integrator = ddg.Integrator(model, linear="multilevel", check_every=1)
     integrator.step(model.state(), 0.01)
     newton = integrator._net.newton
-    newton.wanted.fill_(1)
-    newton.levels.prepare(newton.matrix, newton.fixed, newton.wanted)
+    newton.islands.wanted.fill_(1)
+    newton.levels.prepare(newton.matrix, newton.fixed, newton.islands.wanted)
     table, blocks = newton.system, model.net.blocks
     H = np.zeros((3 * blocks, 3 * blocks))
     rows, columns, values = table.rows.numpy(), table.columns.numpy(), newton.matrix.numpy()

@@ -18,7 +18,7 @@ DAILY_IN_FLOAT64 = pytest.mark.parametrize("precision", ["float64", pytest.param
 def applied(problem: Problem, vectors: np.ndarray) -> np.ndarray:
     """The preconditioner on rows of vectors (n, worlds, 3 N), block by block as in a solve."""
     newton = problem.newton
-    newton.wanted.fill_(1)
+    newton.islands.wanted.fill_(1)
     inverse = newton.inverse.numpy().astype(float)
     found = []
     for vector in vectors:
@@ -34,7 +34,7 @@ def applied(problem: Problem, vectors: np.ndarray) -> np.ndarray:
 
 def solved(problem: Problem, forcing: float) -> np.ndarray:
     """Iterations of conjugate gradients of each world to a residual `forcing` times the first, with a projected matrix."""
-    problem.newton.projected.fill_(1)
+    problem.newton.islands.clamped.fill_(1)
     return problem.iterate(forcing).newton.iterations.numpy()
 
 
@@ -73,7 +73,7 @@ def dense(problem: Problem, world: int) -> np.ndarray:
 @pytest.mark.parametrize("scene", [branches, ring_and_spokes, frame_and_sheet])
 def test_is_the_elimination_of_chains_and_joints(device, scene):
     problem = Problem(scene(), device, 1.02, preconditioner="chain")
-    problem.newton.projected.fill_(1)
+    problem.newton.islands.clamped.fill_(1)
     problem.iterate(0.1)
     vectors = np.random.default_rng(1).normal(size=(3, 2, 3 * problem.blocks)) * problem.free()
     found = applied(problem, vectors)
@@ -120,7 +120,7 @@ def indefinite(problem: Problem) -> bool:
 def test_is_symmetric_and_positive_definite(device, preconditioner, scene, stretch):
     """Also where H is not, and where the columns of S of hinged joints hold some of other joints."""
     problem = Problem(scene(), device, stretch, preconditioner=preconditioner)
-    problem.newton.coefficient.fill_(1e-3)
+    problem.newton.islands.coefficient.fill_(1e-3)
     problem.iterate(0.5)
     free = np.flatnonzero(problem.free())
     assert indefinite(problem) or stretch > 0.9
@@ -179,7 +179,7 @@ def test_iterations_do_not_grow_with_the_nodes_of_a_rod(device, rigid, precision
         for linear in ("block_jacobi", "chain"):
             scene = gridshell_dome.build(3, segments, rigid=rigid)
             problem = Problem(scene, device, 1.0, precision, linear, noise=0.0)
-            problem.newton.coefficient.fill_(3600.0)
+            problem.newton.islands.coefficient.fill_(3600.0)
             iterations[linear, segments] = solved(problem, 1e-3).max()
     assert iterations["chain", 15] <= iterations["chain", 5] + 2 <= 10
     assert iterations["chain", 15] < 0.1 * iterations["block_jacobi", 15]

@@ -59,9 +59,9 @@ def solvers(name, device, clamped, precision="float64", noise=0.15, **options):
             wp.copy(newton.frame, state.frame)
             for array in (newton.theta, newton.target_angle):
                 arrays.assign(array, 2.0 * noise * random.normal(size=array.shape))
-        newton.coefficient.assign(random.uniform(1.0, 3.0, size=group.columns))
-        newton.rate.fill_(1.0)
-        newton.clamped.fill_(int(clamped))
+        newton.islands.coefficient.assign(random.uniform(1.0, 3.0, size=group.columns))
+        newton.islands.rate.fill_(1.0)
+        newton.islands.clamped.fill_(int(clamped))
         yield newton, state
 
 
@@ -99,14 +99,14 @@ def test_direction_is_a_dense_solve(device, name, precision, tolerance):
         found += newton.group.columns
         newton.iterate(state.last)
         arrays.assign(newton.direction, np.full(newton.direction.shape, 7.0))
-        wanted = newton.wanted.numpy()
+        wanted = newton.islands.wanted.numpy()
         assert wanted.all()
         wanted[-1] = 0
-        newton.wanted.assign(wanted)
+        newton.islands.wanted.assign(wanted)
         newton.direct()
-        direction, decrement = arrays.download(newton.direction), newton.decrement.numpy()
+        direction, decrement = arrays.download(newton.direction), newton.islands.decrement.numpy()
         assert (direction[..., -1] == 7.0).all()
-        assert (newton.lost.numpy() == 0).all()
+        assert (newton.islands.lost.numpy() == 0).all()
         for column in range(newton.group.columns - 1):
             H, r = dense(newton, column)
             expected, n = np.linalg.solve(H, r), len(r) // newton.group.kind.block
@@ -122,20 +122,20 @@ def test_pivots_are_lost_where_the_matrix_is_indefinite(device):
     """Compression makes some of the matrices so; those rods stay, to be tried without it, and the others move."""
     seen = set()
     for newton, state in solvers("untwisted", device, clamped=False, noise=0.25):
-        newton.coefficient.fill_(0.3)
+        newton.islands.coefficient.fill_(0.3)
         before = arrays.download(newton.x)
         newton.iterate(state.last)
-        clamped, moved = newton.clamped.numpy(), np.abs(arrays.download(newton.x) - before).max(axis=(0, 2))
+        clamped, moved = newton.islands.clamped.numpy(), np.abs(arrays.download(newton.x) - before).max(axis=(0, 2))
         for column in range(newton.group.columns):
             indefinite = np.linalg.eigvalsh(dense(newton, column)[0])[0] < 0.0
             seen.add(bool(indefinite))
             assert clamped[column] == indefinite
             assert (moved[column] == 0.0) == indefinite
-        assert (newton.iteration.numpy() == 1 - clamped).all()
+        assert (newton.islands.iteration.numpy() == 1 - clamped).all()
         newton.iterate(state.last)
-        assert (newton.iteration.numpy() >= 1).all()
-        assert (newton.step_length.numpy() > 0.0).all()
-        assert (newton.lost.numpy() == 0).all()
+        assert (newton.islands.iteration.numpy() >= 1).all()
+        assert (newton.islands.step_length.numpy() > 0.0).all()
+        assert (newton.islands.lost.numpy() == 0).all()
     assert seen == {True, False}
 
 
@@ -143,14 +143,14 @@ def adjusted(newton, todo: int):
     """What one thread a rod makes of the same task, as `x`, `theta` and `frame`."""
     group = newton.group
     copies = [wp.clone(array) for array in (newton.x, newton.theta, newton.frame, newton.base)]
+    newton.islands.todo.fill_(todo)
     wp.launch(
         search.adjust_kernel(group.kind, newton.real, newton.linear),
         group.columns,
-        [group.count, group.fixed, newton.direction, newton.step_length, newton.angle_change, *copies]
-        + [wp.full(group.columns, todo, dtype=int, device=newton.device)]
-        + [wp.full(group.columns, 1, dtype=int, device=newton.device)],
+        [group.count, group.fixed, newton.direction, *newton.islands.arrays, *copies],
         device=newton.device,
     )
+    newton.islands.todo.fill_(todo)  # which that has done
     return [arrays.download(array) for array in copies[:3]]
 
 
@@ -165,9 +165,8 @@ def test_edges_are_turned_as_by_one_thread(device, name, held):
         mask = (arrays.download(group.fixed) >> np.arange(group.kind.block)[:, None, None]) & 1
         step = 0.5 * random.normal(size=newton.direction.shape) * (mask == 0)
         arrays.assign(newton.direction, step)
-        newton.step_length.fill_(0.7)
-        newton.angle_change.fill_(-0.3)
-        newton.todo.fill_(search.PLACE)
+        newton.islands.step_length.fill_(0.7)
+        newton.islands.angle_change.fill_(-0.3)
         expected = adjusted(newton, search.PLACE)
         straight = arrays.download(newton.base) + 0.7 * np.moveaxis(step[: group.kind.dim], 0, -1)
         newton.move()
@@ -183,7 +182,6 @@ def test_frames_are_carried_as_by_one_thread(device):
     for newton, state in solvers("twist", device, clamped=True, noise=0.3):
         if newton.group.kind.twist:
             newton.evaluate(state.last)
-            newton.todo.fill_(search.RELAG)
             before, (x, _, expected) = arrays.download(newton.frame), adjusted(newton, search.RELAG)
             newton.move()
             found = arrays.download(newton.frame)

@@ -69,8 +69,8 @@ class Problem:
             wp.copy(newton.frame, state.frame)
             arrays.assign(newton.theta, 0.2 * random.normal(size=newton.theta.shape))
             arrays.assign(newton.target_angle, 0.2 * random.normal(size=newton.theta.shape))
-        newton.coefficient.assign(random.uniform(1.0, 3.0, size=4))
-        newton.rate.fill_(1.0)
+        newton.islands.coefficient.assign(random.uniform(1.0, 3.0, size=4))
+        newton.islands.rate.fill_(1.0)
         self.before = self.dofs()
         newton.iterate(state.last)
 
@@ -82,7 +82,7 @@ class Problem:
         """Matrix (identity on held dofs) and residual (zero there), from the elements' factors and gradients."""
         kind, host, n = self.kind, self.group.host, int(self.count[column])
         F, g = (arrays.download(a)[:, :, column] for a in (self.newton.factor, self.newton.gradient))
-        c, rod = float(arrays.download(self.newton.coefficient)[column]), column % 2
+        c, rod = float(arrays.download(self.newton.islands.coefficient)[column]), column % 2
         diagonal, force = np.zeros((n, kind.block)), np.zeros((n, kind.block))
         diagonal[:, : kind.dim] = c * host.mass[:n, rod, None]
         force[:, : kind.dim] = host.mass[:n, rod, None] * self.group.gravity_host + host.load[:n, rod]
@@ -164,12 +164,12 @@ def test_product(device, name, closed):
     v = random.normal(size=(problem.kind.block, nodes, columns))
     arrays.assign(newton.p, v)
     arrays.assign(newton.q, np.full_like(v, 7.0))
-    newton.wanted.assign(np.array([1, 1, 0, 1], np.int32))
+    newton.islands.wanted.assign(np.array([1, 1, 0, 1], np.int32))
     _, product, _ = pcg.solver_kernels(problem.kind, newton.linear, "chain")
     problem.launch(
         product,
         (nodes, columns),
-        [newton.blocks, newton.p, problem.group.count, newton.wanted],
+        [newton.blocks, newton.p, problem.group.count, newton.islands.wanted],
         [newton.q, newton.busy],
     )
     found = problem.vector(newton.q)
@@ -209,7 +209,7 @@ def test_factorisation_and_substitution(device, name, closed):
         expected = np.linalg.solve(H, r)
         np.testing.assert_allclose(found[column, :n].ravel(), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
         assert total.numpy()[column] == pytest.approx(r @ expected, rel=1e-12)
-    assert (arrays.download(newton.lost) == 0).all()
+    assert (arrays.download(newton.islands.lost) == 0).all()
 
 
 @EVERY_CHAIN
@@ -218,7 +218,7 @@ def test_direction_is_a_dense_solve(device, name, closed, preconditioner):
     """And the chain preconditioner, exact on open rods, takes one iteration there."""
     problem = Problem(name, closed, device, preconditioner)
     newton = problem.newton
-    direction, decrement = problem.vector(newton.direction), arrays.download(newton.decrement)
+    direction, decrement = problem.vector(newton.direction), arrays.download(newton.islands.decrement)
     iterations = arrays.download(newton.iterations)
     for column, n in enumerate(problem.count):
         H, r, _ = problem.dense(column)

@@ -18,7 +18,7 @@ CONVERGED = {"converged", "converged_to_rounding"}
 def elastic(problem: Problem, column: int) -> np.ndarray:
     """The matrix of a Newton iteration on free dofs, without inertia."""
     host, kind, n, rod = problem.group.host, problem.kind, int(problem.count[column]), column % 2
-    c = float(arrays.download(problem.newton.coefficient)[column])
+    c = float(arrays.download(problem.newton.islands.coefficient)[column])
     inertia = np.repeat(c * host.mass[:n, rod, None], kind.block, 1)
     if kind.twist:
         inertia[:, kind.dim] = c * host.rotary[:n, rod]
@@ -98,18 +98,18 @@ def bent(solver, device, psd: str):
     arrays.assign(newton.x, x)
     arrays.assign(newton.target, x + 0.2 * s[:, None, None] ** 2 * np.array([1.0, 0.5, 0.7]))
     arrays.assign(newton.target_angle, np.ascontiguousarray(s[:, None]))
-    newton.coefficient.fill_(500.0)
-    newton.active.fill_(1)
+    newton.islands.coefficient.fill_(500.0)
+    newton.islands.active.fill_(1)
     return newton, data.last
 
 
 def errors(newton, last) -> list[float]:
     """sqrt(r . H^-1 r), the distance to the solution in the energy norm as Newton sees it, of every iterate."""
     found = []
-    while not newton.status.numpy()[0]:
+    while not newton.islands.status.numpy()[0]:
         newton.iterate(last)
-        found.append(float(newton.decrement.numpy()[0]) ** 0.5)
-    assert newton.status.numpy()[0] in (outcome.CONVERGED, outcome.CONVERGED_TO_ROUNDING)
+        found.append(float(newton.islands.decrement.numpy()[0]) ** 0.5)
+    assert newton.islands.status.numpy()[0] in (outcome.CONVERGED, outcome.CONVERGED_TO_ROUNDING)
     return found[:-1]
 
 

@@ -1,0 +1,110 @@
+"""Islands: what shares one Newton loop. A rod on its own is one; so is, in each world, everything that is coupled.
+
+Whatever decides is an entry of an island in one of two arrays, `flags` (integers) and `scalars`, each (row, island); the rows are
+named here. A kernel finds the island from its thread: the column of a chain, the world of a net. (A kernel's arguments are copied with
+every launch of a graph: two arrays instead of thirty are worth some percent of a step of few rods on a GPU.)
+"""
+
+from functools import cache
+
+import warp as wp
+
+FLAGS = (
+    # the solve: its outcome (see `outcome`), accepted iterates, and how the iterate at hand compares with the tolerance
+    "status",
+    "iteration",
+    "unbalanced",  # a residual is neither small nor rounding
+    "drowned",  # a residual is not small, though it may be rounding
+    # the line search, from the accepted iterate along the direction
+    "slot",  # which half of the energies is the accepted iterate's
+    "halvings",
+    "wanted",  # whether a direction is
+    "todo",  # what is left to be done with the iterate
+    "placed",  # whether its edges were turned rather than moved straight
+    "stale",  # whether frames have to be renewed before the next step
+    # the matrix: whether it leaves out what compression takes away, and pivots lost in all iterations and in this one
+    "clamped",
+    "lost",
+    "bad",
+    # the step: whether it starts from the last state instead of the predictor, and what became of it
+    "cautious",
+    "retries",
+    "reason",  # outcome of the solve that made it be given up
+    "bent",  # whether the predictor has to turn edges
+    "moved",  # whether this part of it succeeded
+    # in the first column, whether any island is still active
+    "active",
+)
+SCALARS = (
+    # the quadratic of inertia, coefficient * m |x - target|^2 / 2, and the reciprocal of the step that the solve is about
+    "coefficient",
+    "rate",
+    "load_scale",
+    "residual",  # largest
+    "step_length",
+    "decrement",  # expected decrease of the energy by a whole step
+    "merit",  # square of the accepted iterate's residual
+    "angle_change",  # what angles have yet to move along the direction
+    # the part of the time step that is done, and the part being tried
+    "progress",
+    "portion",
+)
+(STATUS, ITERATION, UNBALANCED, DROWNED, SLOT, HALVINGS, WANTED, TODO, PLACED, STALE) = range(10)
+(CLAMPED, LOST, BAD, CAUTIOUS, RETRIES, REASON, BENT, MOVED, ACTIVE) = range(10, len(FLAGS))
+(COEFFICIENT, RATE, LOAD_SCALE, RESIDUAL, STEP_LENGTH, DECREMENT, MERIT, ANGLE_CHANGE, PROGRESS, PORTION) = range(10)
+
+
+class Islands:
+    """The entries of `count` islands, all zero at first; each row by its name, too, such as `islands.status`.
+
+    Attributes:
+        arrays: `flags` and `scalars`, for kernels.
+    """
+
+    def __init__(self, count: int, real, device):
+        self.arrays = [
+            wp.zeros((len(names), count), dtype=dtype, device=device)
+            for names, dtype in ((FLAGS, int), (SCALARS, real))
+        ]
+        for names, array in zip((FLAGS, SCALARS), self.arrays, strict=True):
+            for row, name in enumerate(names):
+                setattr(self, name, array[row])
+        self.active = self.active[:1]
+
+    def __len__(self) -> int:
+        return self.arrays[0].shape[1]
+
+
+@cache
+def attempt_functions(real, midpoint: bool):
+    """length(scalars, i, dt) of the implicit Euler step that the next solve of island i is about; restart(...) of its search."""
+
+    @wp.func
+    def length(scalars: wp.array2d(dtype=real), i: int, dt: real):
+        s = dt * scalars[PORTION, i]
+        if wp.static(midpoint):
+            s *= real(0.5)
+        return s
+
+    @wp.func
+    def restart(
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        i: int,
+        rate: real,
+        coefficient: real,
+        load_scale: real,
+    ):
+        scalars[COEFFICIENT, i] = coefficient
+        scalars[RATE, i] = rate
+        scalars[LOAD_SCALE, i] = load_scale
+        flags[STATUS, i] = 0
+        flags[ITERATION, i] = 0
+        flags[HALVINGS, i] = 0
+        flags[STALE, i] = 0
+        flags[CLAMPED, i] = 0
+        flags[UNBALANCED, i] = 0
+        flags[DROWNED, i] = 0
+        flags[ACTIVE, 0] = 1
+
+    return length, restart
