@@ -11,7 +11,7 @@ with Y(0) = 1, Y'(0) = Y''(L) = Y'''(L) = 0. The mean axial force of the fluid i
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.check import once_reached
+from ddg_warp.run.check import once_reached
 
 LENGTH = 1.0  # m
 EI = 1.0  # N m^2

@@ -13,7 +13,7 @@ tan(theta) = 2 pi R / p, that moves at U along its axis and turns at W about it 
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.check import once_reached
+from ddg_warp.run.check import once_reached
 
 RADIUS = 0.25  # m
 PITCH = 1.5  # m

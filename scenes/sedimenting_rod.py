@@ -10,7 +10,7 @@ and in the end the drift tan(delta) = (zeta_n - zeta_t) sin(phi) cos(phi) / (zet
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.check import once_reached
+from ddg_warp.run.check import once_reached
 
 LENGTH = 1.0  # m
 WEIGHT = 1.0  # N/m
