@@ -12,19 +12,22 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # what editors and type checkers read; at run time see `_HOME`
-    from ddg_warp import inquiry, io, meshes, rest_shapes, stability
-    from ddg_warp.check import Check
-    from ddg_warp.descriptions import Dynamics, Law, Statics, Trace
+    from ddg_warp import io
+    from ddg_warp.ask import inquiry
     from ddg_warp.errors import SceneError, SceneWarning, SolverError
-    from ddg_warp.integrate import continuation, statics
-    from ddg_warp.integrate.dynamics import Integrator
-    from ddg_warp.integrate.path import Displacement, Stop
-    from ddg_warp.material import Circle, Ellipse, Material, Rectangle, Ribbon, Stiffness
-    from ddg_warp.model import Model
-    from ddg_warp.motion import Motion
-    from ddg_warp.record import Recorder
-    from ddg_warp.scene import Scene
-    from ddg_warp.state import State
+    from ddg_warp.geometry import meshes
+    from ddg_warp.model import rest_shapes
+    from ddg_warp.model.model import Model
+    from ddg_warp.model.state import State
+    from ddg_warp.run.check import Check
+    from ddg_warp.run.record import Recorder
+    from ddg_warp.scene.descriptions import Dynamics, Law, Statics, Trace
+    from ddg_warp.scene.material import Circle, Ellipse, Material, Rectangle, Ribbon, Stiffness
+    from ddg_warp.scene.motion import Motion
+    from ddg_warp.scene.path import Displacement, Stop
+    from ddg_warp.scene.scene import Scene
+    from ddg_warp.solve import continuation, stability, statics
+    from ddg_warp.solve.dynamics import Integrator
 
 __version__ = "0.1.0"
 __all__ = [
@@ -60,30 +63,37 @@ __all__ = [
 ]
 
 _HOME = {
-    "Check": "check",
-    "Circle": "material",
-    "Displacement": "integrate.path",
-    "Dynamics": "descriptions",
-    "Ellipse": "material",
-    "Integrator": "integrate.dynamics",
-    "Law": "descriptions",
-    "Material": "material",
-    "Model": "model",
-    "Motion": "motion",
-    "Recorder": "record",
-    "Rectangle": "material",
-    "Ribbon": "material",
-    "Scene": "scene",
+    "Check": "run.check",
+    "Circle": "scene.material",
+    "Displacement": "scene.path",
+    "Dynamics": "scene.descriptions",
+    "Ellipse": "scene.material",
+    "Integrator": "solve.dynamics",
+    "Law": "scene.descriptions",
+    "Material": "scene.material",
+    "Model": "model.model",
+    "Motion": "scene.motion",
+    "Recorder": "run.record",
+    "Rectangle": "scene.material",
+    "Ribbon": "scene.material",
+    "Scene": "scene.scene",
     "SceneError": "errors",
     "SceneWarning": "errors",
     "SolverError": "errors",
-    "State": "state",
-    "Statics": "descriptions",
-    "Stiffness": "material",
-    "Stop": "integrate.path",
-    "Trace": "descriptions",
+    "State": "model.state",
+    "Statics": "scene.descriptions",
+    "Stiffness": "scene.material",
+    "Stop": "scene.path",
+    "Trace": "scene.descriptions",
 }
-_MODULES = {"continuation": "integrate.continuation", "statics": "integrate.statics"}
+_MODULES = {
+    "continuation": "solve.continuation",
+    "inquiry": "ask.inquiry",
+    "meshes": "geometry.meshes",
+    "rest_shapes": "model.rest_shapes",
+    "stability": "solve.stability",
+    "statics": "solve.statics",
+}
 
 
 def __getattr__(name: str):

@@ -3,7 +3,7 @@
 `check`, one thread a node (on the CPU a rod), runs before a sweep: it writes the residual, and every node's share of the change of the
 energy since the accepted iterate. It decides where a rod has converged, so that the last iterate costs no sweep: at every free dof
 |residual| <= max(rtol * load scale, floor), where floor bounds what rounding of coordinates and forces leaves,
-floor_factor * eps * (H_ii |x| + sum of |element forces|). Moments are compared over the length of the rod. See `ddg_warp.tolerance`:
+floor_factor * eps * (H_ii |x| + sum of |element forces|). Moments are compared over the length of the rod. See `compile.tolerance`:
 that residuals do not add up either is what a whole Newton step sees to, whose remainder is of second order; where none has been
 made, at the start or after a shortened step, the limit is divided by the nodes, so that they can not.
 """

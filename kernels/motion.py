@@ -1,4 +1,4 @@
-"""Rigid motions over a time step on the device, as `ddg_warp.motion.Motion.pose` describes them.
+"""Rigid motions over a time step on the device, as `ddg_warp.scene.motion.Motion.pose` describes them.
 
 A pose is a row of an array: the rotation vector of the step (3), the rotation at its start (9), the pivot (3), the translations
 at its start and end (3 each). s is the fraction of the step; the turn runs at a constant rate, so that no part of it is a chord.

@@ -3,7 +3,7 @@
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp import meshes
+from ddg_warp.geometry import meshes
 
 SOURCE = "Sze, Liu and Lo 2004, Abaqus S4R"
 

@@ -55,8 +55,8 @@ class PlanarBranch:
     """
 
     def __init__(self, curvature: float, n: int, device: str = "cpu", unit: float = 1000.0):
-        from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
-        from ddg_warp.tangent import Tangent
+        from ddg_warp.solve.statics import Equilibrium, StaticsOptions
+        from ddg_warp.solve.tangent import Tangent
 
         self.unit = unit
         self.model = build(curvature, unit, n).build(device, "float64")
@@ -75,13 +75,13 @@ class PlanarBranch:
 
     def lowest(self, weight: float) -> float:
         """Lowest eigenvalue of the tangent at G = weight."""
-        from ddg_warp import stability
+        from ddg_warp.solve import stability
 
         return float(stability.spectrum(*self.at(weight), 1, "unit", self.tangent).eigenvalues[0])
 
     def flip(self, low: float, high: float) -> float:
         """G between low and high at which the lowest eigenvalue vanishes."""
-        from ddg_warp import stability
+        from ddg_warp.solve import stability
 
         return stability.critical(self.at, low, high)
 

@@ -14,8 +14,8 @@ as its cross-section bends like a beam on the elastic foundation of the strip's 
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp import meshes
-from ddg_warp.rest_shapes import bilayer_curvature, grown_metric, principal_form
+from ddg_warp.geometry import meshes
+from ddg_warp.model.rest_shapes import bilayer_curvature, grown_metric, principal_form
 
 LENGTH = 1.0  # m
 THICKNESS = 0.004  # of both layers [m]

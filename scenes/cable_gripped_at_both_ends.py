@@ -10,7 +10,7 @@ five turns, its loops close and pass through themselves, which loses two turns f
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.check import once_reached
+from ddg_warp.run.check import once_reached
 
 LENGTH = 1.0  # m
 FAR = 1.0e4  # m; where the cable, prolonged along its end tangents, is closed
@@ -75,14 +75,14 @@ def build(
 
 def equilibrium(model):
     """How the cable hangs before it is moved: statics loads it while motions go from 0 to 1 s, and until then they rest."""
-    from ddg_warp.integrate.statics import solve
+    from ddg_warp.solve.statics import solve
 
     return solve(model)
 
 
 def writhe(points: np.ndarray) -> float:
     """Writhe of the cable (n, 3), prolonged along x and closed far away."""
-    from ddg_warp.inquiry import writhe
+    from ddg_warp.ask.inquiry import writhe
 
     first, last = points[0], points[-1]
     along, aside = np.array([FAR, 0.0, 0.0]), np.array([0.0, 0.0, FAR])
@@ -91,7 +91,7 @@ def writhe(points: np.ndarray) -> float:
 
 def observe(model, state) -> dict[str, float]:
     """Turns of the last end, twist and writhe, and the error of the end nodes [m]."""
-    from ddg_warp.inquiry import total_twist
+    from ddg_warp.ask.inquiry import total_twist
 
     points = state.points().reshape(-1, 3)[: model.curves.counts[0]]
     rest, supports = model.scene.batches[0].points[0], model.scene.supports

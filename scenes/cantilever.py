@@ -7,7 +7,7 @@ swings down past the vertical. Implicit Euler damps it: the published numbers ho
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.check import once_reached
+from ddg_warp.run.check import once_reached
 
 LENGTH = 1.0  # m
 DT = 0.01  # s

@@ -10,7 +10,7 @@ on the energy.
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.check import once_reached
+from ddg_warp.run.check import once_reached
 
 FIRST, LAST = (6.0, 0.0), (0.0, 8.0)  # ends in the plane of x and z [m]
 LENGTH = 10.0  # m

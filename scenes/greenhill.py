@@ -9,7 +9,7 @@ and clamped ends give (Greenhill 1883; van der Heijden & Thompson, Nonlinear Dyn
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.buckled import buckled_points
+from ddg_warp.ask.buckled import buckled_points
 
 LENGTH = 1.0  # m
 B, C = 1.0, 1.0  # bending and twisting stiffness [N m^2]; C only sets how far the end must turn
@@ -59,8 +59,8 @@ def exact(tension: float) -> float:
 
 def critical_moment(tension: float, n: int, device: str = "cpu") -> float:
     """Moment over B / L at which the lowest eigenvalue of the tangent vanishes, for a rod of n edges."""
-    from ddg_warp import stability
-    from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
+    from ddg_warp.solve import stability
+    from ddg_warp.solve.statics import Equilibrium, StaticsOptions
 
     unit = exact(tension)
     model = build(tension, unit, n).build(device, "float64")

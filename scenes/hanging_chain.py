@@ -8,7 +8,7 @@ tangent at the hanging equilibrium gives all frequencies; a run with the implici
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.check import once_reached
+from ddg_warp.run.check import once_reached
 from ddg_warp.scenes.vibration import SAMPLES, step_factor
 
 LENGTH = 1.0  # m
@@ -51,7 +51,7 @@ def build(n: int = 50, mode: int = 1, steps: int = 60, periods: float = 1.0, amp
 
 def hanging(model):
     """The equilibrium. The search begins stretched, since an unstretched chain offers no resistance sideways."""
-    from ddg_warp.integrate.statics import solve
+    from ddg_warp.solve.statics import solve
 
     points = model.scene.batches[0].points[0].copy()
     points[:, 2] *= 1.0 + 0.5 * MASS_PER_LENGTH * GRAVITY * LENGTH / EA
@@ -60,7 +60,7 @@ def hanging(model):
 
 def modes(model, count: int = 3) -> tuple[np.ndarray, np.ndarray]:
     """Lowest frequencies omega sqrt(L / g) about the equilibrium, and sideways shapes (modes, nodes), 1 at the free end."""
-    from ddg_warp.stability import spectrum
+    from ddg_warp.solve.stability import spectrum
 
     found = spectrum(model, hanging(model), count)
     shapes = found.modes.reshape(-1, 2, count)[:, 0]
@@ -69,7 +69,7 @@ def modes(model, count: int = 3) -> tuple[np.ndarray, np.ndarray]:
 
 def swinging(model, mode: int, amplitude: float):
     """The equilibrium, displaced by a mode: edges are turned, not stretched, since so stiff a chain would jump at that."""
-    from ddg_warp.tangent import Tangent
+    from ddg_warp.solve.tangent import Tangent
 
     state, tangent = hanging(model), Tangent(model)
     rest = tangent.dofs(state)

@@ -7,9 +7,9 @@ carry half the weight each, and the lowest vertex hangs where that of a finer me
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp import meshes
-from ddg_warp.check import once_reached
-from ddg_warp.inquiry import energies
+from ddg_warp.ask.inquiry import energies
+from ddg_warp.geometry import meshes
+from ddg_warp.run.check import once_reached
 
 SIDE = 1.0  # m
 THICKNESS = 1e-3  # m

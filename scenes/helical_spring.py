@@ -9,7 +9,7 @@ The first and last edge are held on the exact helix, as arms to its axis would h
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp import geometry
+from ddg_warp.geometry import polyline
 
 B, C = 1.0, 2.0 / 3.0  # bending and twisting stiffness [N m^2]; Poisson's ratio is 0.5
 EA = 1.0e5  # N; so stiff that the wire counts as inextensible: EA L^2 / B = 4e8
@@ -64,10 +64,10 @@ def wire(stretch: float, turns: float, n: int) -> tuple[np.ndarray, np.ndarray]:
 def natural(n: int, by_angle: bool = False) -> tuple[float, float, float]:
     """Curvatures and twist of the nodes and edges of the helix at rest [1/m]: there the discrete spring is free of stress."""
     points, normals = wire(1.0, TURNS, n)
-    edges = geometry.edge_vectors(points[None, :3], False)
-    tangents, length = geometry.unit(edges), np.linalg.norm(edges[0, 0])
-    first, second = geometry.curvatures(tangents, normals[None, :2], False, by_angle)
-    twist = geometry.reference_twist(tangents, normals[None, :2], False)
+    edges = polyline.edge_vectors(points[None, :3], False)
+    tangents, length = polyline.unit(edges), np.linalg.norm(edges[0, 0])
+    first, second = polyline.curvatures(tangents, normals[None, :2], False, by_angle)
+    twist = polyline.reference_twist(tangents, normals[None, :2], False)
     return first.item() / length, second.item() / length, twist.item() / length
 
 
@@ -86,7 +86,7 @@ def exact(stretch: float, turns: float) -> tuple[float, float]:
 
 def measure(model, state) -> tuple[float, float]:
     """Force [N] and moment [N m] along the axis, from what holds the two nodes and the angle of the last edge."""
-    from ddg_warp.tangent import Tangent
+    from ddg_warp.solve.tangent import Tangent
 
     points = state.points()[-2:]
     held = Tangent(model).gradient(state).reshape(-1, 4)[-2:]

@@ -7,7 +7,7 @@ first limit load is passed. Limit loads agree with a Ritz solution by Kirchhoff 
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.motion import Motion
+from ddg_warp.scene.motion import Motion
 from ddg_warp.scenes import _sze
 
 RADIUS, HALF_LENGTH, HALF_ANGLE = 2540.0, 254.0, 0.1  # mm, mm, rad
@@ -48,7 +48,7 @@ def build(
 
 def observe(model, state) -> dict[str, float]:
     """How far the crown is lowered [mm] and the force on the whole roof that holds it there [N]."""
-    from ddg_warp.tangent import Tangent
+    from ddg_warp.solve.tangent import Tangent
 
     crown = model.net.host.shells[0].nodes[0]
     force = -4.0 * Tangent(model).gradient(state)[3 * crown]

@@ -8,8 +8,8 @@ it buckles and follows the metric that it has grown instead, the better the thin
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp import meshes
-from ddg_warp.rest_shapes import grown_metric
+from ddg_warp.geometry import meshes
+from ddg_warp.model.rest_shapes import grown_metric
 
 LENGTH, WIDTH = 1.0, 0.25  # m
 YOUNG = 1.0e6  # Pa

@@ -74,7 +74,7 @@ def measure(model, state) -> tuple[float, float, float, float]:
     """What `exact` gives: p and s* by least squares over all edges, moment and tension from what holds the last end."""
     from scipy.optimize import curve_fit
 
-    from ddg_warp.tangent import Tangent
+    from ddg_warp.solve.tangent import Tangent
 
     s, phi = envelope(state)
 

@@ -8,7 +8,7 @@ would have when free.
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.buckled import buckled_points
+from ddg_warp.ask.buckled import buckled_points
 
 RADIUS = 1.0  # m
 B = 1.0  # bending stiffness [N m^2]
@@ -52,8 +52,7 @@ def exact(ratio: float) -> float:
 
 def critical_twist(ratio: float, n: int, device: str = "cpu") -> float:
     """Total twist [rad] at which the lowest eigenvalue of the tangent vanishes, for a ring of n edges."""
-    from ddg_warp import stability
-    from ddg_warp.integrate import statics
+    from ddg_warp.solve import stability, statics
 
     def twisted(fraction):
         model = build(fraction, ratio, n).build(device, "float64")

@@ -11,8 +11,8 @@ A the canopy's area seen from above.
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp import meshes
-from ddg_warp.check import once_reached
+from ddg_warp.geometry import meshes
+from ddg_warp.run.check import once_reached
 
 RADIUS = 2.0  # m, of the mouth
 LINE = 3.0  # m, height of the mouth over the payload

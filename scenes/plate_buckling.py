@@ -9,7 +9,7 @@ of the free and the loaded plate, is singular.
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.buckled import buckled_points
+from ddg_warp.ask.buckled import buckled_points
 from ddg_warp.scenes.plate_square import SIDE, plate_mesh
 
 THICKNESS = 1e-3  # m
@@ -79,7 +79,7 @@ def build(
 
 def critical_load(model, state) -> float:
     """Critical load over the exact one, from the tangents of the free plate and of the loaded one."""
-    from ddg_warp import stability
+    from ddg_warp.solve import stability
 
     return LOADED * stability.buckling(model, model.state(), state)[0]
 

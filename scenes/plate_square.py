@@ -8,7 +8,7 @@ Legendre-Ritz method, the supported ones also by Navier's series; Timoshenko and
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp import meshes
+from ddg_warp.geometry import meshes
 
 SIDE = 1.0  # m
 THICKNESS = 0.01  # m

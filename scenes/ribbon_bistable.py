@@ -11,8 +11,8 @@ the wider it is, and so does a ribbon, 2 to 3 % late. Of plates, not of ribbons,
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp import meshes
-from ddg_warp.rest_shapes import grown_metric
+from ddg_warp.geometry import meshes
+from ddg_warp.model.rest_shapes import grown_metric
 
 LENGTH = 1.0  # m
 APPROACH = 0.25  # of the clamps over the length
@@ -96,9 +96,9 @@ def pitchfork(model, lateral: float = 0.3, step: float = 0.02) -> float:
         lateral: that.
         step: displacement [m] between equilibria on the way.
     """
-    from ddg_warp import stability
-    from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
-    from ddg_warp.tangent import Tangent
+    from ddg_warp.solve import stability
+    from ddg_warp.solve.statics import Equilibrium, StaticsOptions
+    from ddg_warp.solve.tangent import Tangent
 
     tangent, follow = Tangent(model), Equilibrium(model, StaticsOptions(mode="follow"))
     first = 1e-3 * step

@@ -8,7 +8,7 @@ towards the pole, where the moments grow like a logarithm.
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp import meshes
+from ddg_warp.geometry import meshes
 
 RADIUS = 1.0  # m
 YOUNG = 1.0e9  # Pa

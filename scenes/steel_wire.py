@@ -8,7 +8,7 @@ precision, show here first. Implicit Euler at 0.01 s, as in the published compar
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.check import once_reached
+from ddg_warp.run.check import once_reached
 
 LENGTH = 1.0  # m
 RADIUS = 2.0e-3  # m

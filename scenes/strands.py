@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp import meshes
+from ddg_warp.geometry import meshes
 
 GROOM = Path(__file__).resolve().parent / "data" / "strands.usdc"
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # rad

@@ -68,7 +68,7 @@ def alone(scene: ddg.Scene, rod: int) -> ddg.Scene:
 
 def check(result) -> list[ddg.Check]:
     """A few rods, short and long, of every section, against the same rods alone; and no solve that failed."""
-    from ddg_warp.simulate import simulate
+    from ddg_warp.run.simulate import simulate
 
     model, scene = result.model, result.scene
     points = np.split(

@@ -11,7 +11,7 @@ omega = q c / L with c = sqrt(GJ / (rho (I1 + I2))). On a mode of frequency w on
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.check import once_reached
+from ddg_warp.run.check import once_reached
 
 LENGTH = 1.0  # m
 RADIUS = 0.05  # m; thick, so that torsion comes among the lowest modes
@@ -84,8 +84,8 @@ def modes(model, state, count: int = 24) -> dict[str, tuple[np.ndarray, np.ndarr
     Rigid modes are left out, and of each pair of bending modes one is returned, turned into the plane of x and z. Shapes of
     bending are deflections (modes, nodes) with a largest value of 1, ghost nodes left out.
     """
-    from ddg_warp.stability import spectrum
-    from ddg_warp.tangent import Tangent
+    from ddg_warp.solve.stability import spectrum
+    from ddg_warp.solve.tangent import Tangent
 
     tangent = Tangent(model)
     found = spectrum(model, state, count, tangent=tangent)

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp import bench, bench_overview, catalog
-from ddg_warp.catalog import InputError, load_scene
-from ddg_warp.cli import main
+from ddg_warp.run import bench, bench_overview, catalog
+from ddg_warp.run.catalog import InputError, load_scene
+from ddg_warp.run.cli import main
 
 ROOT = Path(__file__).parents[1]
 COLUMNS = "study rods nodes precision rtol ms_per_step newton_mean newton_max outcomes residual error".split()

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from ddg_warp.check import Check
+from ddg_warp.run.check import Check
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,9 @@ import sys
 import numpy as np
 import pytest
 
-from ddg_warp.cli import main
 from ddg_warp.errors import SolverError
 from ddg_warp.io.hdf5 import TrajectoryReader
+from ddg_warp.run.cli import main
 
 SCENE = '''"""A rod that falls freely."""
 
@@ -113,7 +113,7 @@ def test_failed_check_fails_the_run(fall):
 
 
 def test_failed_solver_keeps_what_is_complete(fall, monkeypatch, capsys):
-    from ddg_warp.integrate.dynamics import Integrator
+    from ddg_warp.solve.dynamics import Integrator
 
     step = Integrator.step
 
@@ -142,7 +142,7 @@ def test_resumed_equals_straight(fall):
 
 def test_resumed_runs_end_where_they_were_to_end(fall, monkeypatch):
     """The duration given to a run that was killed holds when it is resumed, and another one for the next time."""
-    from ddg_warp.record import Recorder
+    from ddg_warp.run.record import Recorder
 
     record = Recorder.record
 
@@ -176,7 +176,7 @@ def test_a_run_is_kept_unless_forced(fall, capsys):
 def test_a_run_in_progress_is_left_alone(fall, capsys):
     """Another process records there: it is named, whatever was asked for."""
     import ddg_warp as ddg
-    from ddg_warp.record import Recorder
+    from ddg_warp.run.record import Recorder
 
     scene = ddg.Scene()
     scene.add_rod(np.eye(3), section=ddg.Stiffness(EA=1.0, EI1=1.0, GJ=1.0, mass_per_length=1.0, radius=0.1))
@@ -231,16 +231,16 @@ def test_a_check_that_fails_to_solve_fails_the_run(tmp_path, monkeypatch, capsys
 
 def test_progress_of_a_piped_run(fall, capsys, monkeypatch):
     """Where stderr is no terminal: whole lines with steps, time and time left, at most one in an interval; none of short runs."""
-    import ddg_warp.progress
+    import ddg_warp.run.progress
 
     assert fall("run") == 0
     assert "steps" not in capsys.readouterr().err
-    monkeypatch.setattr(ddg_warp.progress, "LINE_EVERY", 1e-9)
+    monkeypatch.setattr(ddg_warp.run.progress, "LINE_EVERY", 1e-9)
     assert fall("run", "--force") == 0
     lines = [line for line in capsys.readouterr().err.splitlines() if "steps" in line]
     assert 3 <= len(lines) <= 7
     assert lines[-1].startswith("5 of 5 steps, 00:0") and lines[-1].endswith("elapsed, 00:00 remaining")
-    monkeypatch.setattr(ddg_warp.progress, "LINE_EVERY", 1e9)
+    monkeypatch.setattr(ddg_warp.run.progress, "LINE_EVERY", 1e9)
     assert fall("run", "--force") == 0
     assert "steps" not in capsys.readouterr().err
 
@@ -252,7 +252,7 @@ def test_a_run_that_fails_before_its_first_state_says_so(place, tmp_path, monkey
     code = SCENE.replace("    build.shift = shift", "    scene.initial = lost")
     code = code.replace("def build", "def lost(model):\n    raise ddg.SolverError('no equilibrium')\n\n\ndef build", 1)
     if place == "first point":
-        from ddg_warp.integrate import continuation
+        from ddg_warp.solve import continuation
 
         def lost(self, state, stop):
             raise SolverError("no equilibrium", state=state)
@@ -369,7 +369,7 @@ def test_info_names_versions(capsys):
 
 @pytest.mark.parametrize("passed", [True, False])
 def test_check_prints_the_derivative_table(monkeypatch, capsys, device, passed):
-    from ddg_warp import derivatives
+    from ddg_warp.run import derivatives
 
     asked = []
 
@@ -432,7 +432,7 @@ def test_cantilever_swings_as_published(tmp_path, device):
 
 
 def test_import_is_light():
-    code = "import sys, ddg_warp.cli; print(*sys.modules)"
+    code = "import sys, ddg_warp.run.cli; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert {"warp", "torch", "pxr", "h5py", "scipy", "matplotlib", "numpy"}.isdisjoint(loaded)
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp import geometry
-from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
+from ddg_warp.geometry import polyline
 from ddg_warp.kernels.terms import REGISTRY
 from ddg_warp.scenes import tip_load
+from ddg_warp.solve.statics import Equilibrium, StaticsOptions
 
 SECTION = ddg.Stiffness(EA=1e6, EI1=1.0, EI2=1.3, GJ=0.8, mass_per_length=1.0)
 ROUND = ddg.Stiffness(EA=1e6, EI1=1.0, GJ=0.8)
@@ -22,7 +22,7 @@ def equilibrium(scene, device, load_steps: int = 1, **options):
 
 def turning(points: np.ndarray) -> np.ndarray:
     """Angles between neighbouring edges [rad]."""
-    t = geometry.unit(np.diff(points, axis=0))
+    t = polyline.unit(np.diff(points, axis=0))
     return np.arctan2(np.linalg.norm(np.cross(t[:-1], t[1:]), axis=1), np.sum(t[:-1] * t[1:], 1))
 
 
@@ -100,10 +100,10 @@ def test_a_twisted_natural_helix(device, curvature):
     size, m = np.hypot(first, second) / n, twist / n
     phi = size if curvature == "angle" else 2.0 * np.arctan(0.5 * size / np.cos(0.5 * m))
     np.testing.assert_allclose(turning(state.points()), phi, atol=1e-7)
-    tangents = geometry.unit(np.diff(state.points(), axis=0))[None]
+    tangents = polyline.unit(np.diff(state.points(), axis=0))[None]
     directors = state.directors()[None]
-    np.testing.assert_allclose(geometry.reference_twist(tangents, directors, False), m, atol=1e-7)
-    found = geometry.curvatures(tangents, directors, False, by_angle=curvature == "angle")
+    np.testing.assert_allclose(polyline.reference_twist(tangents, directors, False), m, atol=1e-7)
+    found = polyline.curvatures(tangents, directors, False, by_angle=curvature == "angle")
     np.testing.assert_allclose(found, np.array([[[first]], [[second]]]) / n * np.ones((2, 1, n - 1)), atol=1e-7)
 
 

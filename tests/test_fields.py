@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp import meshes
-from ddg_warp.fields import CELL_FIELDS, POINT_FIELDS, point_fields
+from ddg_warp.ask.fields import CELL_FIELDS, POINT_FIELDS, point_fields
+from ddg_warp.geometry import meshes
 from ddg_warp.io.hdf5 import TrajectoryReader
-from ddg_warp.record import Recorder
+from ddg_warp.run.record import Recorder
 
 RADIUS, EA, EI, GJ = 2.0, 1e3, 3.0, 5.0
 SECTION = ddg.Stiffness(EA=EA, EI1=EI, GJ=GJ, mass_per_length=1.0, radius=0.01, rotary_inertia=1e-3)
@@ -73,7 +73,7 @@ def test_rods_in_closed_form(device, name, worlds):
 
 def test_twist_in_closed_form(device):
     """A straight rod clamped at both ends, one of which is turned by 0.6 rad: 0.6 / L everywhere."""
-    from ddg_warp.integrate import statics
+    from ddg_warp.solve import statics
 
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     rod = scene.add_rod(np.linspace([0.0, 0.0, 0.0], [2.0, 0.0, 0.0], 9), section=SECTION)

@@ -8,7 +8,7 @@ import pytest
 from hard_run import attempt
 
 import ddg_warp as ddg
-from ddg_warp import meshes
+from ddg_warp.geometry import meshes
 
 RUBBER = ddg.Material(young=1e6, poisson=0.3, density=1000.0)
 BENDING = ("midedge_dof", "hinge")

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp import meshes
 from ddg_warp.errors import SolverError
-from ddg_warp.simulate import simulate
-from ddg_warp.state import State
+from ddg_warp.geometry import meshes
+from ddg_warp.model.state import State
+from ddg_warp.run.simulate import simulate
 
 RUBBER = ddg.Material(young=1e6, poisson=0.4, density=1000.0)
 DT = 0.01

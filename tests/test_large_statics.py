@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp import meshes
-from ddg_warp.integrate.continuation import Continuation
-from ddg_warp.integrate.statics import Equilibrium, StaticsOptions, solve
-from ddg_warp.linear import choice
+from ddg_warp.geometry import meshes
+from ddg_warp.run.simulate import simulate
 from ddg_warp.scenes import gridshell_dome
-from ddg_warp.simulate import simulate
-from ddg_warp.stability import spectrum
-from ddg_warp.tangent import Tangent
+from ddg_warp.solve import choice
+from ddg_warp.solve.continuation import Continuation
+from ddg_warp.solve.stability import spectrum
+from ddg_warp.solve.statics import Equilibrium, StaticsOptions, solve
+from ddg_warp.solve.tangent import Tangent
 
 RUBBER = ddg.Material(young=1e7, poisson=0.3, density=1000.0)
 THICKNESS = 0.01  # m

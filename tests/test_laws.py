@@ -9,12 +9,12 @@ import pytest
 from test_readme import BLOCKS
 
 import ddg_warp as ddg
-from ddg_warp import derivatives
-from ddg_warp.catalog import load_file
-from ddg_warp.cli import main
-from ddg_warp.integrate.statics import solve
 from ddg_warp.kernels.densities.quadratic import quadratic
 from ddg_warp.kernels.terms import ALL, REGISTRY
+from ddg_warp.run import derivatives
+from ddg_warp.run.catalog import load_file
+from ddg_warp.run.cli import main
+from ddg_warp.solve.statics import solve
 
 FILE = Path(tempfile.mkdtemp()) / "my_law.py"  # the README's law, in a file, since Warp reads the source of functions
 FILE.write_text(dict(BLOCKS)["my_law.py"])

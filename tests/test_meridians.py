@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.integrate.statics import Equilibrium, solve
 from ddg_warp.io.revolve import Revolution
-from ddg_warp.record import Recorder, export_usd
+from ddg_warp.run.record import Recorder, export_usd
+from ddg_warp.solve.statics import Equilibrium, solve
 
 RUBBER = ddg.Material(young=1e6, poisson=0.3, density=1000.0)
 ANGLE = np.linspace(0.0, 1.0, 9)

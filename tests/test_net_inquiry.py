@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp import meshes
-from ddg_warp.cli import main
-from ddg_warp.inquiry import triangle_fields
-from ddg_warp.integrate.statics import solve
-from ddg_warp.record import Recorder
+from ddg_warp.ask.inquiry import triangle_fields
+from ddg_warp.geometry import meshes
+from ddg_warp.run.cli import main
+from ddg_warp.run.record import Recorder
+from ddg_warp.solve.statics import solve
 
 RUBBER = ddg.Material(young=1e6, poisson=0.3, density=1000.0)
 THICKNESS = 0.01

@@ -8,9 +8,9 @@ from scipy import sparse
 from scipy.sparse.linalg import eigsh
 
 import ddg_warp as ddg
-from ddg_warp import meshes
+from ddg_warp.geometry import meshes
 from ddg_warp.scenes import gridshell_dome
-from ddg_warp.tangent import Tangent
+from ddg_warp.solve.tangent import Tangent
 
 slow = pytest.mark.slow
 SCHEMES = ("implicit_euler", "implicit_midpoint")

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ddg_warp import meshes, operators
-from ddg_warp.surface import Surface
+from ddg_warp.geometry import meshes, operators
+from ddg_warp.geometry.surface import Surface
 
 WARP = np.array([[1.0, 0.3, 0.0], [0.0, 0.8, 0.2], [0.1, 0.0, 1.2]])
 

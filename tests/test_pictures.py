@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp import figure
-from ddg_warp.catalog import load_scene, one_liner, scene_files
-from ddg_warp.cli import main
-from ddg_warp.simulate import simulate
+from ddg_warp.run import figure
+from ddg_warp.run.catalog import load_scene, one_liner, scene_files
+from ddg_warp.run.cli import main
+from ddg_warp.run.simulate import simulate
 
 
 @pytest.fixture

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.integrate.relaxation import relax
-from ddg_warp.integrate.statics import solve
-from ddg_warp.stability import spectrum
+from ddg_warp.solve.relaxation import relax
+from ddg_warp.solve.stability import spectrum
+from ddg_warp.solve.statics import solve
 
 
 def cable(device, edges: int = 12):

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp import meshes
-from ddg_warp.integrate.statics import solve
-from ddg_warp.rest_shapes import bilayer_curvature, grown_metric, principal_form
-from ddg_warp.shell_geometry import edge_kinds, metric, second_form
-from ddg_warp.surface import Surface
-from ddg_warp.tangent import Tangent
+from ddg_warp.geometry import meshes
+from ddg_warp.geometry.shell_forms import edge_kinds, metric, second_form
+from ddg_warp.geometry.surface import Surface
+from ddg_warp.model.rest_shapes import bilayer_curvature, grown_metric, principal_form
+from ddg_warp.solve.statics import solve
+from ddg_warp.solve.tangent import Tangent
 
 MATERIAL = ddg.Material(1e6, 0.3, density=1000.0)
 THICKNESS = 0.02

@@ -7,11 +7,11 @@ import pytest
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp import derivatives
-from ddg_warp.integrate.statics import solve
 from ddg_warp.kernels.densities.ribbon import LAWS
 from ddg_warp.kernels.terms import REGISTRY
+from ddg_warp.run import derivatives
 from ddg_warp.scenes import ribbon_bistable, ribbon_helix
+from ddg_warp.solve.statics import solve
 
 NAMES = tuple(LAWS)
 WIDTH, THICKNESS, NU = 0.1, 1e-3, 0.3

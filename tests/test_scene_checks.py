@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.catalog import load_scene
-from ddg_warp.check import Check, once_reached
-from ddg_warp.cli import main
-from ddg_warp.simulate import Result, simulate
-from ddg_warp.summary import checks_table
+from ddg_warp.run.catalog import load_scene
+from ddg_warp.run.check import Check, once_reached
+from ddg_warp.run.cli import main
+from ddg_warp.run.simulate import Result, simulate
+from ddg_warp.run.summary import checks_table
 
 
 def run(name: str, duration=None, **parameters) -> list[Check]:

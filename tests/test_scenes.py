@@ -2,8 +2,8 @@
 
 import pytest
 
-from ddg_warp.catalog import load_scene, parameters, scene_files
-from ddg_warp.simulate import simulate
+from ddg_warp.run.catalog import load_scene, parameters, scene_files
+from ddg_warp.run.simulate import simulate
 
 SMALL = {
     "axisymmetric_dome": {"n": 40},

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp import meshes
-from ddg_warp.integrate.statics import Equilibrium, solve
+from ddg_warp.geometry import meshes
+from ddg_warp.geometry.shell_forms import second_form
 from ddg_warp.scenes import _sze
 from ddg_warp.scenes.hinged_roof import HALF_ANGLE, HALF_LENGTH, POISSON, RADIUS, YOUNG
-from ddg_warp.shell_geometry import second_form
-from ddg_warp.stability import spectrum
+from ddg_warp.solve.stability import spectrum
+from ddg_warp.solve.statics import Equilibrium, solve
 
 MATERIAL = ddg.Material(young=1e9, poisson=0.3)
 

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp import meshes, stability
-from ddg_warp.integrate.statics import solve
-from ddg_warp.linear import lowest
-from ddg_warp.linear.direct import Factorisation
-from ddg_warp.linear.lowest import Lowest
-from ddg_warp.rigid import rigid_modes
-from ddg_warp.stability import spectrum
-from ddg_warp.tangent import Tangent
+from ddg_warp.geometry import meshes
+from ddg_warp.solve import lowest, stability
+from ddg_warp.solve.direct import Factorisation
+from ddg_warp.solve.lowest import Lowest
+from ddg_warp.solve.rigid import rigid_modes
+from ddg_warp.solve.stability import spectrum
+from ddg_warp.solve.statics import solve
+from ddg_warp.solve.tangent import Tangent
 
 SECTION = ddg.Stiffness(EA=1e4, EI1=1.0, EI2=1.5, GJ=0.8, mass_per_length=0.5, rotary_inertia=1e-3)
 STEEL = ddg.Material(young=1e6, poisson=0.3, density=1000.0)

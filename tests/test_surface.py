@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from ddg_warp import meshes
 from ddg_warp.errors import SceneError
-from ddg_warp.surface import Surface
+from ddg_warp.geometry import meshes
+from ddg_warp.geometry.surface import Surface
 
 # Shape, its volume under the surface (divergence theorem: sum of det(a, b, c) / 6) as the mesh is refined, Euler characteristic.
 CLOSED = {

@@ -12,9 +12,9 @@ import sys, threading
 import numpy as np
 import pytest
 import ddg_warp as ddg
-from ddg_warp import meshes
-from ddg_warp.integrate import statics
-from ddg_warp.stability import spectrum
+from ddg_warp.geometry import meshes
+from ddg_warp.solve import statics
+from ddg_warp.solve.stability import spectrum
 
 def scene(number):
     s = ddg.Scene()

@@ -11,10 +11,10 @@ import pytest
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp import meshes
-from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
-from ddg_warp.newton import NewtonOptions
-from ddg_warp.tolerance import FAN
+from ddg_warp.compile.tolerance import FAN
+from ddg_warp.geometry import meshes
+from ddg_warp.solve.chains.newton import NewtonOptions
+from ddg_warp.solve.statics import Equilibrium, StaticsOptions
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 import bench_tolerance as bench

@@ -23,7 +23,8 @@ import numpy as np
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp.bench import Study, measure, orders
+from ddg_warp.run.bench import Study, measure, orders
+from ddg_warp.run.summary import machine, table, write_table
 from ddg_warp.scenes import (
     bend_45,
     bend_twist,
@@ -41,7 +42,6 @@ from ddg_warp.scenes import (
     tip_load,
     whirling,
 )
-from ddg_warp.summary import machine, table, write_table
 
 CHOICES = ("tangent", "angle")
 REPEATED, SHORT = 4, 3.0  # of how many runs the least time counts, where they take less than that together [s]

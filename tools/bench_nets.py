@@ -14,8 +14,8 @@ import numpy as np
 import warp as wp
 
 import ddg_warp as ddg
+from ddg_warp.run.summary import machine, table, write_table
 from ddg_warp.scenes import gridshell_dome, parachute
-from ddg_warp.summary import machine, table, write_table
 
 STEEL = ddg.Material(young=2.1e11, poisson=0.3, density=7850.0)
 DT = 1.0 / 60.0

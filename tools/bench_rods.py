@@ -23,8 +23,8 @@ import warp as wp
 from bench_tolerance import rods, sheet
 
 import ddg_warp as ddg
-from ddg_warp.report import bytes_per_node
-from ddg_warp.summary import machine, table, write_table
+from ddg_warp.ask.report import bytes_per_node
+from ddg_warp.run.summary import machine, table, write_table
 
 EXACT_RTOL = 1e-12  # of the reference, which rounding ends
 DEVIATION = 1e-5  # largest error of a node [m per m of rod]

@@ -16,10 +16,11 @@ import numpy as np
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp import arrays, meshes
-from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
-from ddg_warp.net_newton import PRECONDITIONERS
-from ddg_warp.summary import machine, table, write_table
+from ddg_warp import arrays
+from ddg_warp.geometry import meshes
+from ddg_warp.run.summary import machine, table, write_table
+from ddg_warp.solve.net.newton import PRECONDITIONERS
+from ddg_warp.solve.statics import Equilibrium, StaticsOptions
 
 BANDWIDTH = 4.8e12  # of an H200 [bytes/s]
 SIZES = {"hinge": (32, 70, 223, 707), "midedge": (32, 70, 223, 707), "midedge_dof": (32, 70, 223, 707)}

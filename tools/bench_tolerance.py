@@ -18,8 +18,8 @@ import numpy as np
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp import meshes
-from ddg_warp.summary import machine, table, write_table
+from ddg_warp.geometry import meshes
+from ddg_warp.run.summary import machine, table, write_table
 
 DT = 1.0 / 240.0  # [s]
 STEPS = 20

@@ -33,7 +33,7 @@ def read_mesh(path, prim: str | None = None, weld: float | None = None) -> tuple
     points, triangles, name = _read(existing(path), prim)
     if weld is None:
         return points, triangles, name
-    from ddg_warp import meshes
+    from ddg_warp.geometry import meshes
 
     return *meshes.weld(points, triangles, weld), name
 

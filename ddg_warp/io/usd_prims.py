@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom, Vt
 
+from ddg_warp.geometry.operators import vertex_normals
 from ddg_warp.io import Curves, Surfaces
 from ddg_warp.io.colors import on_scale
 from ddg_warp.io.tube import SIDES, tube_faces, tube_points
 from ddg_warp.io.usd_materials import bind_preview_surface
-from ddg_warp.operators import vertex_normals
 
 HEADER = 64  # bytes at most that a value takes in a file beside its numbers
 

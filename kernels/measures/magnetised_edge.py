@@ -15,7 +15,7 @@ h = n x v
 A magnetisation along the tangent needs neither frames nor angles: rods without twist have it, too.
 
 In a field: strains n and B(x) = B + G x at the middle x of the edge. Nodes: its two. Data: a (3), B (3), G (9, row by row). The field
-may change with time: what prescribes it writes B and G; see `ddg_warp.integrate.net_prescribed`.
+may change with time: what prescribes it writes B and G; see `ddg_warp.solve.net.prescribed`.
 
 Two of them: with r = r u from the middle of one edge to that of the other, strains are the factor n . n' - 3 (n . u) (n' . u) of the
 energy of two point dipoles, and their distance r. Nodes: two of either edge. Data: a, a' (3 each).

@@ -46,7 +46,7 @@ def follower_kernels(real):
         total: int,
         force_out: wp.array(dtype=V),
     ):
-        """Forces on both ends; see `ddg_warp.axisymmetric.NetBand`."""
+        """Forces on both ends; see `ddg_warp.compile.axisymmetric.NetBand`."""
         k, w = wp.tid()
         a = q[places[k, 0] + w * blocks]
         b = q[places[k, 1] + w * blocks]
@@ -86,7 +86,7 @@ def follower_kernels(real):
         total: int,
         force_out: wp.array(dtype=V),
     ):
-        """Forces on the ends and the corner opposite, moment on the angle; see `ddg_warp.net_loads.NetEdgeCouple`."""
+        """Forces on the ends and the corner opposite, moment on the angle; see `ddg_warp.compile.net.loads.NetEdgeCouple`."""
         k, w = wp.tid()
         x = q[places[k, 0] + w * blocks]
         e = q[places[k, 1] + w * blocks] - x

@@ -277,7 +277,7 @@ def step_kernels(real, midpoint: bool):
 
 @cache
 def static_kernels(real, linear):
-    """follow(...), less(...) and far(...) of an equilibrium; see `ddg_warp.integrate.net_statics`."""
+    """follow(...), less(...) and far(...) of an equilibrium; see `ddg_warp.solve.net.statics`."""
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)

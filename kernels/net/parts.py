@@ -1,4 +1,4 @@
-"""Sums of the residual over parts of a net, small to large, against what they may be; see `ddg_warp.tolerance`."""
+"""Sums of the residual over parts of a net, small to large, against what they may be; see `ddg_warp.compile.tolerance`."""
 
 from functools import cache
 

@@ -134,7 +134,7 @@ def balance_kernels(real, linear):
         """Residual of free dofs, and its squares with moments over the length `arm`; see `kernels.balance` for the criterion.
 
         `allowed` is what the residual of a block may be at rtol = 1, over `load_scale`, and `ratio_out` how often it is that; see
-        `ddg_warp.tolerance`.
+        `ddg_warp.compile.tolerance`.
         What rounding leaves of an edge vector follows from the coordinates of both its ends, `longest` apart at most.
         """
         i = wp.tid()

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.integrate.statics import solve
 from ddg_warp.scenes import cantilever, steel_wire
+from ddg_warp.solve.statics import solve
 
 DIGITS = 1.0e-5  # m
 

@@ -19,9 +19,9 @@ from scipy import sparse
 from scipy.optimize import minimize, minimize_scalar
 
 import ddg_warp as ddg
-from ddg_warp import meshes
-from ddg_warp.linear.direct import Factorisation
-from ddg_warp.tangent import Tangent
+from ddg_warp.geometry import meshes
+from ddg_warp.solve.direct import Factorisation
+from ddg_warp.solve.tangent import Tangent
 
 POISSON = 0.3
 BRAZIER = 0.987307  # pi c (1 - 3 c^2 / 2) at c^2 = 2/9

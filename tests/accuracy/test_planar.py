@@ -5,9 +5,9 @@ import pytest
 from convergence import equilibrium, order
 
 import ddg_warp as ddg
-from ddg_warp import stability
-from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
 from ddg_warp.scenes import post_buckling, roll_up, tip_load
+from ddg_warp.solve import stability
+from ddg_warp.solve.statics import Equilibrium, StaticsOptions
 
 
 # Tip of a circle of curvature 2 pi turns / L: (sin a, 1 - cos a) L / a.

@@ -6,9 +6,10 @@ import pytest
 from convergence import equilibrium, order
 
 import ddg_warp as ddg
-from ddg_warp import meshes, stability
-from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
+from ddg_warp.geometry import meshes
 from ddg_warp.scenes import plate_buckling, plate_square
+from ddg_warp.solve import stability
+from ddg_warp.solve.statics import Equilibrium, StaticsOptions
 
 
 def deflection(device, *options, **more) -> float:

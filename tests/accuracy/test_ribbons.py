@@ -8,9 +8,8 @@ import pytest
 from convergence import order
 
 import ddg_warp as ddg
-from ddg_warp import stability
-from ddg_warp.integrate import statics
 from ddg_warp.scenes import michell_ring
+from ddg_warp.solve import stability, statics
 
 POISSON, WIDTH, LENGTH = 0.3, 0.1, 1.0
 

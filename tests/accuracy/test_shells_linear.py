@@ -7,11 +7,12 @@ import pytest
 from convergence import equilibrium, order
 
 import ddg_warp as ddg
-from ddg_warp import meshes, stability
-from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
-from ddg_warp.linear.direct import Factorisation
+from ddg_warp.geometry import meshes
 from ddg_warp.scenes import sphere_indentation
-from ddg_warp.tangent import Tangent
+from ddg_warp.solve import stability
+from ddg_warp.solve.direct import Factorisation
+from ddg_warp.solve.statics import Equilibrium, StaticsOptions
+from ddg_warp.solve.tangent import Tangent
 
 
 def stiffness(device, *options) -> float:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from convergence import equilibrium, order
 
-from ddg_warp.integrate.statics import Equilibrium, StaticsOptions
 from ddg_warp.scenes import cantilever_plate_shear, hinged_roof, pinched_cylinder, pullout_cylinder, slit_annulus
+from ddg_warp.solve.statics import Equilibrium, StaticsOptions
 
 
 def path(module, device, steps, **parameters):

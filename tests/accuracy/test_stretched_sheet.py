@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp import meshes, stability
-from ddg_warp.integrate.statics import Equilibrium
+from ddg_warp.geometry import meshes
+from ddg_warp.solve import stability
+from ddg_warp.solve.statics import Equilibrium
 
 LENGTH, POISSON, STRAIN = 1.0, 0.3, 1e-3
 

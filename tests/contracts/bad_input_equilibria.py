@@ -4,8 +4,7 @@
 from bad_inputs import INF, NAN, built, each, held_rods, line, model, refuse, rods, sheet
 
 import ddg_warp as ddg
-from ddg_warp import stability
-from ddg_warp.integrate import continuation, statics
+from ddg_warp.solve import continuation, stability, statics
 
 # --- statics ---
 each("statics", "model", [None, 3], statics.solve, "statics", "scene.build()")

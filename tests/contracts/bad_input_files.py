@@ -9,11 +9,11 @@ from pathlib import Path
 from bad_inputs import DEVICE, INF, NAN, each, held_rods, model, refuse
 
 import ddg_warp as ddg
-from ddg_warp.catalog import InputError
-from ddg_warp.cli import main
 from ddg_warp.io import read
 from ddg_warp.io.mesh_read import read_mesh
-from ddg_warp.simulate import simulate
+from ddg_warp.run.catalog import InputError
+from ddg_warp.run.cli import main
+from ddg_warp.run.simulate import simulate
 
 
 def recorder(**options):

@@ -5,7 +5,8 @@ import numpy as np
 from bad_inputs import INF, NAN, RING, STIFFNESS, built, each, held_rods, integrator, line, model, refuse, rods
 
 import ddg_warp as ddg
-from ddg_warp import inquiry, rest_shapes
+from ddg_warp.ask import inquiry
+from ddg_warp.model import rest_shapes
 
 # --- Integrator and step ---
 each("Integrator", "model", [None, 3, "rods"], ddg.Integrator, "Integrator", "scene.build()")

@@ -5,7 +5,7 @@ import numpy as np
 from bad_inputs import DEVICE, DOME, INF, NAN, RUBBER, TUBE, built, dome, each, refuse, rods, sheet
 
 import ddg_warp as ddg
-from ddg_warp import meshes
+from ddg_warp.geometry import meshes
 
 M = ddg.Motion
 STILL = M(translation=lambda t: (0.0, 0.0, 0.0))

@@ -11,7 +11,7 @@ from importlib import import_module
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp import meshes
+from ddg_warp.geometry import meshes
 
 DEVICE = "cpu"  # refusals come from the host
 NAN, INF = float("nan"), float("inf")

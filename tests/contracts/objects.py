@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp import meshes
+from ddg_warp.geometry import meshes
 
 RECTANGLE = ddg.Rectangle(0.04, 0.02)
 X, Y, Z = np.eye(3)

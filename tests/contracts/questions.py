@@ -8,10 +8,10 @@ import numpy as np
 from objects import UP, Object
 
 import ddg_warp as ddg
-from ddg_warp import inquiry, stability
-from ddg_warp.integrate import statics
-from ddg_warp.integrate.continuation import Continuation
+from ddg_warp.ask import inquiry
 from ddg_warp.kernels.terms import ALL, AXISYMMETRIC, SHELLS
+from ddg_warp.solve import stability, statics
+from ddg_warp.solve.continuation import Continuation
 
 DT = 0.004
 
@@ -90,7 +90,7 @@ def energies(kind, variant):
 
 def _mass(model) -> np.ndarray:
     """Mass of every row of the points (P,) [kg], shared out where rows share a node."""
-    from ddg_warp.tangent import Tangent
+    from ddg_warp.solve.tangent import Tangent
 
     tangent = Tangent(model)
     dofs = tangent.point_dofs()
@@ -323,7 +323,7 @@ def implicit_midpoint(kind, variant):
 
 def equilibrium(kind, variant):
     """Residual below the tolerance at free dofs, in every world alike."""
-    from ddg_warp.tangent import Tangent
+    from ddg_warp.solve.tangent import Tangent
 
     scene, _ = kind.scene(gravity=(0.0, 0.0, -0.5))
     model = variant.build(scene)
@@ -393,8 +393,8 @@ def record(kind, variant):
 
 def export(kind, variant):
     """The scene that a recorded run exports is valid USD."""
-    from ddg_warp.cli import main
     from ddg_warp.io.usd_check import validate
+    from ddg_warp.run.cli import main
 
     scene, _ = kind.scene()
     model = variant.build(scene)

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp import meshes
 from ddg_warp.errors import SceneWarning
-from ddg_warp.integrate import statics
+from ddg_warp.geometry import meshes
 from ddg_warp.io.mesh_read import read_mesh
-from ddg_warp.tangent import Tangent
+from ddg_warp.solve import statics
+from ddg_warp.solve.tangent import Tangent
 
 STEEL = ddg.Stiffness(EA=1e3, EI1=1.0, GJ=1.0, mass_per_length=1.0, rotary_inertia=0.01)
 RUBBER = ddg.Material(young=1e6, poisson=0.0, density=1000.0)
@@ -342,7 +342,7 @@ def test_signatures_say_what_they_take():
 
 def test_objects_say_what_they_are(device):
     """A few lines each, with the counts that matter."""
-    from ddg_warp.simulate import Result
+    from ddg_warp.run.simulate import Result
 
     scene = joined(None)
     scene.add_force(0, 3, (0.0, 0.0, 1.0))
@@ -424,8 +424,8 @@ def test_oblique_symmetry_is_axis_aligned_symmetry_turned(device, bending):
 @pytest.mark.slow
 def test_oblique_symmetry_in_worlds_precisions_and_paths(device):
     """Three worlds are alike; mixed and float32 agree within their rounding; frequencies and the end of a path are as aligned."""
-    from ddg_warp.integrate.continuation import Continuation
-    from ddg_warp.stability import spectrum
+    from ddg_warp.solve.continuation import Continuation
+    from ddg_warp.solve.stability import spectrum
 
     found = []
     for turn, axes in ((0.0, True), (TURN, False)):

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ddg_warp import meshes
+from ddg_warp.geometry import meshes
 from ddg_warp.io import Curves, Surfaces
 
 SAIL, BALL = meshes.rectangle(4, 2), meshes.sphere(0)

@@ -13,14 +13,14 @@ from ddg_warp.io import CurveError, MeshError, read
 from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader
 from ddg_warp.io.mesh_read import read_mesh
 from ddg_warp.io.usd import validate
-from ddg_warp.record import SCENE, TRAJECTORY, Recorder, export_usd
-from ddg_warp.run_directory import LOCK
+from ddg_warp.run.record import SCENE, TRAJECTORY, Recorder, export_usd
+from ddg_warp.run.run_directory import LOCK
 
 BLOCK = 4
 FULL = """
 import resource, sys
 from stand_in import Model, step, surfaces
-from ddg_warp.record import Recorder, RecordError
+from ddg_warp.run.record import Recorder, RecordError
 
 model = Model(surfaces=surfaces())
 for size in map(int, sys.argv[2:]):

@@ -7,15 +7,15 @@ import pytest
 from pxr import Gf, Usd, UsdGeom, Vt
 from stand_in import Model, State, curves, rest_points, step, surfaces
 
-from ddg_warp import meshes
-from ddg_warp.figure import rods_picture
+from ddg_warp.geometry import meshes
+from ddg_warp.geometry.operators import face_areas, vertex_normals
+from ddg_warp.geometry.surface import Surface
 from ddg_warp.io import Curves, MeshError, MissingFileError, Shapes, Surfaces
 from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader, TrajectoryWriter, read_rods
 from ddg_warp.io.mesh_read import read_mesh
 from ddg_warp.io.usd import CurvesWriter, validate
-from ddg_warp.operators import face_areas, vertex_normals
-from ddg_warp.record import SCENE, TRAJECTORY, Recorder, export_usd
-from ddg_warp.surface import Surface
+from ddg_warp.run.figure import rods_picture
+from ddg_warp.run.record import SCENE, TRAJECTORY, Recorder, export_usd
 
 NO_RODS = Curves(np.zeros(0, int), np.zeros(0, bool), np.zeros(0), np.zeros(0, object), np.zeros(0, int))
 PYRAMID = """

@@ -6,9 +6,9 @@ from first_terms import first_of_their_kind
 from shell_cases import TERMS, Elements, differences, error
 
 import ddg_warp as ddg
-from ddg_warp.axisymmetric import NetBand
+from ddg_warp.compile.axisymmetric import NetBand
 from ddg_warp.kernels.terms import AXISYMMETRIC
-from ddg_warp.tangent import Tangent
+from ddg_warp.solve.tangent import Tangent
 
 PRECISIONS = {"float64": 1e-13, "float32": 2e-5}
 COUNT = 8

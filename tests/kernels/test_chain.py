@@ -5,9 +5,10 @@ import pytest
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp import arrays, geometry
+from ddg_warp import arrays
+from ddg_warp.geometry import polyline
 from ddg_warp.kernels import element, outcome
-from ddg_warp.newton import ChainNewton, NewtonOptions
+from ddg_warp.solve.chains.newton import ChainNewton, NewtonOptions
 
 KINDS = {
     "full": {},
@@ -86,9 +87,9 @@ class Problem:
     def age(self, q: np.ndarray, column: int):
         """Of a rod at q (n, dofs): cosine between tangents and lagged ones, reference twist less lagged, cosine of bends."""
         n, frame = self.count[column], arrays.download(self.newton.frame)[:, :, column]
-        t, (u0, t0) = geometry.unit(np.diff(q[:n, :3], axis=0)), (frame[at : at + 3, : n - 1].T for at in (0, 3))
-        u = geometry.transport(u0, t0, t)
-        twist = geometry.signed_angle(geometry.transport(u[:-1], t[:-1], t[1:]), u[1:], t[1:]) - frame[6, : n - 2]
+        t, (u0, t0) = polyline.unit(np.diff(q[:n, :3], axis=0)), (frame[at : at + 3, : n - 1].T for at in (0, 3))
+        u = polyline.transport(u0, t0, t)
+        twist = polyline.signed_angle(polyline.transport(u[:-1], t[:-1], t[1:]), u[1:], t[1:]) - frame[6, : n - 2]
         twist -= 2.0 * np.pi * np.round(twist / (2.0 * np.pi))
         return np.sum(t * t0, -1), twist, np.sum(t[1:] * t[:-1], -1)
 
@@ -299,7 +300,7 @@ def aged(problem, aim) -> np.ndarray:
             q = start[column].copy()
             edges = np.diff(q[:n, :3], axis=0)
             length = np.linalg.norm(edges[-2:], axis=-1, keepdims=True)
-            edges[-2:] = length * geometry.unit(edges[-2:] / length + 1.5 * random.normal(size=(2, 3)))
+            edges[-2:] = length * polyline.unit(edges[-2:] / length + 1.5 * random.normal(size=(2, 3)))
             q[1:n, :3] = q[0, :3] + np.cumsum(edges, axis=0)
             cosine, twist, fold = problem.age(q, column)
             if aim(cosine, twist) and fold.min() > -0.95:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from ddg_warp.geometry import unit
+from ddg_warp.geometry.polyline import unit
 from ddg_warp.kernels import frames
 
 REALS = pytest.mark.parametrize("real", [wp.float64, wp.float32], ids=["float64", "float32"])

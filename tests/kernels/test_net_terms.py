@@ -6,9 +6,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ddg_warp import derivatives, net_derivatives
 from ddg_warp.kernels.terms import ALL, AXISYMMETRIC, MAGNETS, REGISTRY, SHELLS
-from ddg_warp.net_derivatives import TERMS
+from ddg_warp.run import derivatives, net_derivatives
+from ddg_warp.run.net_derivatives import TERMS
 
 
 @cache

@@ -5,8 +5,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ddg_warp import derivatives
 from ddg_warp.kernels.terms import REGISTRY
+from ddg_warp.run import derivatives
 
 # Each has kernels of its own in each sort of chain: every day edges and vertices, with damping, in space and in the plane, and one
 # of them in closed chains. (A stretch has its measure in common with the damped one, and its density with bending.)

@@ -5,9 +5,9 @@ import pytest
 from net_problem import Problem, frame_and_sheet, membrane_with_springs
 
 import ddg_warp as ddg
-from ddg_warp import meshes
-from ddg_warp.net_newton import PRECONDITIONERS
-from ddg_warp.tangent import Tangent
+from ddg_warp.geometry import meshes
+from ddg_warp.solve.net.newton import PRECONDITIONERS
+from ddg_warp.solve.tangent import Tangent
 
 
 @pytest.mark.parametrize("stretch", [1.05, 0.97], ids=["tension", "compression"])

@@ -7,9 +7,9 @@ import pytest
 from net_problem import CABLE, SECTION, Problem, branches, frame_and_sheet, hinged_grid, line, ring_and_spokes, sheet
 
 import ddg_warp as ddg
-from ddg_warp import meshes
-from ddg_warp.linear.choice import net_preconditioner
+from ddg_warp.geometry import meshes
 from ddg_warp.scenes import gridshell_dome
+from ddg_warp.solve.choice import net_preconditioner
 
 STEEL = ddg.Material(young=2.1e11, poisson=0.3, density=7850.0)
 DAILY_IN_FLOAT64 = pytest.mark.parametrize("precision", ["float64", pytest.param("mixed", marks=pytest.mark.slow)])

@@ -9,9 +9,9 @@ import warp as wp
 import ddg_warp as ddg
 from ddg_warp import arrays
 from ddg_warp.kernels import search
-from ddg_warp.linear import choice
-from ddg_warp.linear.partitioned import PartitionedNewton
-from ddg_warp.newton import NewtonOptions
+from ddg_warp.solve import choice
+from ddg_warp.solve.chains.newton import NewtonOptions
+from ddg_warp.solve.chains.partitioned import PartitionedNewton
 
 KINDS = {"twist": {}, "untwisted": {"twist": False}, "planar": {"dimension": 2}, "stretch": {"bend": False}}
 EVERY_KIND = pytest.mark.parametrize(

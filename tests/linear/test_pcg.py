@@ -7,8 +7,8 @@ import warp as wp
 import ddg_warp as ddg
 from ddg_warp import arrays
 from ddg_warp.kernels import block_band, pcg
-from ddg_warp.linear.pcg import PcgNewton
-from ddg_warp.newton import NewtonOptions
+from ddg_warp.solve.chains.newton import NewtonOptions
+from ddg_warp.solve.chains.pcg import PcgNewton
 
 KINDS = {"twist": {}, "planar": {"dimension": 2}, "stretch": {"bend": False}}
 # Every chain has kernels of its own: in the tests of every day a closed one with all of them stands for the others.

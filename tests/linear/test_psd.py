@@ -8,9 +8,9 @@ from test_pcg import EVERY_CHAIN, Problem
 import ddg_warp as ddg
 from ddg_warp import arrays
 from ddg_warp.kernels import outcome
-from ddg_warp.linear.pcg import PcgNewton
-from ddg_warp.newton import ChainNewton, NewtonOptions
-from ddg_warp.tangent import Tangent
+from ddg_warp.solve.chains.newton import ChainNewton, NewtonOptions
+from ddg_warp.solve.chains.pcg import PcgNewton
+from ddg_warp.solve.tangent import Tangent
 
 CONVERGED = {"converged", "converged_to_rounding"}
 

@@ -1,0 +1,1 @@
+"""What is asked of a state: energies, reactions, stresses, fields, modes."""

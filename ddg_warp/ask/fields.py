@@ -1,0 +1,176 @@
+"""Numbers along rods and over surfaces to look at: what a recording can hold beside positions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from ddg_warp.threads import launches
+
+POINT_FIELDS = {
+    "axial_force": "axial force of rods, positive in tension [N]",
+    "curvature_1": "curvature of rods about their first director [1/m]; of rods without twist its size",
+    "curvature_2": "curvature of rods about their second director [1/m]",
+    "twist": "twist of rods per length [1/m]",
+    "energy_density": "elastic energy of rods per length [J/m]",
+}
+CELL_FIELDS = {
+    "shell_strain": "principal strain of triangles, the largest in magnitude",
+    "shell_curvature": "principal change of curvature of triangles, the largest in magnitude [1/m]",
+    "shell_energy": "elastic energy of triangles per area [J/m^2]",
+}
+
+
+def check_fields(names: Sequence[str]) -> tuple[str, ...]:
+    """The names, refused where one is unknown.
+
+    Raises:
+        ValueError: names what there is.
+    """
+    known = (*POINT_FIELDS, *CELL_FIELDS)
+    if isinstance(names, str) or not set(names) <= set(known):
+        raise ValueError(f"fields = {names!r}; it is a list of names out of {', '.join(known)}")
+    return tuple(dict.fromkeys(names))
+
+
+@launches
+def point_fields(model, state, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Fields of POINT_FIELDS by name, each (worlds, P) in the order of `State.points`; NaN where a point has none.
+
+    Values of edges are means at their nodes. Ends of rods and nodes at rigid joints, which have no vertex of their own, have the
+    values of the vertex beside them.
+    """
+    sums = {name: np.zeros((model.worlds, model.points_count)) for name in POINT_FIELDS}
+    counts = {name: np.zeros((model.worlds, model.points_count)) for name in POINT_FIELDS}
+    energies = [np.full((model.worlds, model.points_count), np.nan) for _ in range(2)]
+    if "energy_density" in names:
+        _need_quadratic(model)
+    for term, strains, stresses, energy, rows in _elements(model, state):
+        values = {"axial_force": stresses[..., 0]} if term.measure.span == 1 else _curvatures(term, strains)
+        values["energy_density"] = energy
+        mine = {name: [np.zeros_like(sums[name]) for _ in range(2)] for name in values}
+        for at in rows:
+            own = at >= 0
+            for name, value in values.items():
+                np.add.at(mine[name][0], (slice(None), at[own]), value[:, own])
+                np.add.at(mine[name][1], (slice(None), at[own]), 1.0)
+        for name, (total, count) in mine.items():
+            if name == "energy_density":  # of edges and of vertices are added, each interpolated by itself
+                part = energies[term.measure.span - 1]
+                part[count > 0] = (total / np.maximum(count, 1.0))[count > 0]
+            else:
+                sums[name] += total
+                counts[name] += count
+    result = {name: np.where(counts[name] > 0, sums[name] / np.maximum(counts[name], 1.0), np.nan) for name in sums}
+    for values in (*result.values(), *energies):
+        _fill_along_rods(model, values)
+    every = np.isfinite(energies)
+    result["energy_density"] = np.where(every.any(0), np.where(every, energies, 0.0).sum(0), np.nan)
+    return {name: result[name] for name in names}
+
+
+@launches
+def cell_fields(model, state, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Fields of CELL_FIELDS by name, each (worlds, triangles) in the order of `model.surfaces`."""
+    if not names:
+        return {}
+    from ddg_warp.ask.inquiry import triangle_fields
+
+    found = triangle_fields(model, state)
+    return {name: found[name.removeprefix("shell_")] for name in names}
+
+
+def _curvatures(term, strains: np.ndarray) -> dict[str, np.ndarray]:
+    if term.measure.name.startswith("curvature_binormal"):  # a vector in space
+        return {"curvature_1": np.linalg.norm(strains, axis=-1)}
+    return {
+        name: strains[..., i]
+        for i, name in zip(range(strains.shape[-1]), ("curvature_1", "curvature_2", "twist"), strict=False)
+    }
+
+
+def _elements(model, state) -> Iterator[tuple]:
+    """Of every term of rods: the term, strains and stresses (worlds, E, strains), energies per length (worlds, E), and the rows of
+    the points that each element counts for, arrays (E,), -1 for ghosts."""
+    from ddg_warp.ask.inquiry import group_strains, net_strains
+
+    start = np.concatenate([[0], np.cumsum(model.curves.counts)])
+    for group, data in zip(model.groups, state.groups, strict=True):
+        strains, stresses = (np.moveaxis(v, 0, -1) for v in group_strains(model, group, data))
+        row = np.full((group.nodes + 2, group.rods), -1)
+        k, column, index = model.places(group)
+        row[k, column] = index
+        for term, place in zip(group.kind.terms, group.kind.places(), strict=True):
+            n, span = len(term.measure.strains), term.measure.span
+            rest = np.zeros((group.nodes, group.columns, n))
+            for i, name in enumerate(term.rest):
+                rest[..., i] = group.parameters[f"{term.name}.{name}"]
+            rest = rest.reshape(group.nodes, group.worlds, group.rods, n)
+            for rod in range(group.rods):
+                count = int(group.host.count[rod])
+                k = np.arange(count if group.kind.closed else count - span)
+                at = [row[(k + shift) % count, rod] for shift in ((0, 1) if span == 1 else (1,))]
+                cut = (k, slice(None), rod, slice(place[3], place[3] + n))
+                strain, stress = (np.moveaxis(values[cut], 0, 1) for values in (strains, stresses))
+                yield term, strain, stress, _energy(strain, stress, np.moveaxis(rest[k, :, rod], 0, 1)), at
+    for index, part in enumerate(model.net.sets if model.net is not None else ()):
+        term = part.term
+        if not term.measure.name.startswith(ROD_MEASURES):
+            continue
+        n, span = len(term.measure.strains), term.measure.span
+        strain, stress = (np.moveaxis(values, 0, -1) for values in net_strains(model.net, state, index))
+        rest = np.zeros_like(strain)
+        for i, name in enumerate(term.rest):
+            rest[..., i] = part.parameters[name]
+        rods = {rod.rod: rod for rod in model.net.host.rods}
+        owner, k = part.host.owner
+        first, own, every = (
+            np.array([value(rods[rod]) for rod in owner], int)
+            for value in (lambda rod: rod.first, lambda rod: len(rod.nodes), lambda rod: len(rod.all_nodes))
+        )
+        at = []
+        for shift in (0, 1) if span == 1 else (1,):
+            place = (k + shift) % every - first
+            at.append(np.where((place >= 0) & (place < own), start[owner] + place, -1))
+        yield term, strain, stress, _energy(strain, stress, rest), at
+
+
+ROD_MEASURES = ("edge_stretch", "rod_curvature", "curvature_binormal", "planar_curvature")
+
+
+def _need_quadratic(model) -> None:
+    for batch in model.scene.batches:
+        for term, law in batch.laws.items():
+            raise ValueError(
+                f"energy_density: {term} of rod {batch.first} ('{batch.name}') has the law {law.density.name!r}, and the field knows "
+                "the quadratic one; inquiry.energies tells"
+            )
+
+
+def _energy(strain: np.ndarray, stress: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Elastic energy per length of a quadratic law."""
+    return 0.5 * (stress * (strain - rest)).sum(-1)
+
+
+def _fill_along_rods(model, values: np.ndarray) -> None:
+    """Gives points without a value that of the nearest of their rod, where it has any; in place."""
+    ends = np.cumsum(model.curves.counts)
+    for first, last in zip(ends - model.curves.counts, ends, strict=True):
+        rod = values[:, first:last]
+        known = np.flatnonzero(np.isfinite(rod[0]))
+        if 0 < len(known) < last - first:
+            nearest = known[np.abs(np.arange(last - first)[:, None] - known).argmin(1)]
+            rod[:] = rod[:, nearest]
+
+
+def directors_at_points(curves, directors: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Directors of edges, (worlds, edges, 3), at the points of frames of shape (worlds, P): (worlds P, 3), of the edge that begins
+    there; the last point of an open rod has that of its last edge, points of surfaces have none, 0."""
+    edges = curves.counts - ~curves.closed
+    starts = np.repeat(np.cumsum(edges) - edges, curves.counts)
+    along = np.arange(curves.counts.sum()) - np.repeat(np.cumsum(curves.counts) - curves.counts, curves.counts)
+    at = starts + np.minimum(along, np.repeat(edges, curves.counts) - 1)
+    out = np.zeros((*shape, 3))
+    out[:, : len(at)] = directors.reshape(shape[0], -1, 3)[:, at]
+    return out.reshape(-1, 3)

@@ -1,0 +1,347 @@
+"""What can be asked of a model at a state: energies, reactions, internal forces, fields of surfaces, link, writhe, twist."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.ask import end_moments
+from ddg_warp.kernels.terms import AXISYMMETRIC, MAGNETS, SHELLS
+from ddg_warp.solve.tangent import Tangent
+from ddg_warp.threads import launches
+
+TWIST = 2  # place of the twist among the strains of rod vertices and of the half cells beside joints
+
+
+@dataclass(frozen=True)
+class Reaction:
+    """What one support exerts on all that it holds together; supports given one by one have one each.
+
+    Attributes:
+        force: (3,) [N]; moment: (3,) about `point` [N m]; all three (worlds, 3) of several worlds.
+    """
+
+    force: np.ndarray
+    moment: np.ndarray
+    point: np.ndarray
+
+
+@launches
+def energies(model, state) -> dict:
+    """Energies by term [J]: elastic terms, kinetic, gravity (zero at the origin). Of several worlds arrays (worlds,)."""
+    result = Tangent(model).energy(state)
+    kinetic, potential = np.zeros(model.worlds), np.zeros(model.worlds)
+    for group, data in zip(model.groups, state.groups, strict=True):
+
+        def total(values, group=group):
+            """Sums over nodes (node, column) and rods of a world."""
+            return values.sum(0).reshape(group.worlds, group.rods).sum(1)
+
+        mass = np.tile(group.host.mass, (1, group.worlds))
+        x, v = (arrays.download(array).astype(np.float64) for array in (data.x, data.v))
+        kinetic += 0.5 * total(mass * (v * v).sum(-1))
+        potential -= total(mass * (x @ group.gravity_host))
+        if group.kind.twist:
+            rotary = np.tile(group.host.rotary, (1, group.worlds))
+            kinetic += 0.5 * total(rotary * arrays.download(data.omega).astype(np.float64) ** 2)
+    if model.net is not None:
+        host = model.net.host
+        q, v = (array.numpy().astype(float).reshape(model.worlds, -1, 3) for array in (state.net.q, state.net.v))
+        kinetic += 0.5 * (host.mass * v * v).sum((1, 2))
+        gravity = np.asarray(model.scene.gravity)
+        potential -= (host.mass[: host.nodes] * q[:, : host.nodes] * gravity).sum((1, 2))
+    every = result | {"kinetic": kinetic, "gravity": potential}
+    return {name: values if model.worlds > 1 else float(values[0]) for name, values in every.items()}
+
+
+@launches
+def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
+    """Force and moment of every support of the scene: those of rods in the order they were added, then of shells, then of rings.
+
+    They balance the internal forces and the loads on held dofs, and hold the normals of clamped mesh edges and of planes of
+    symmetry; the inertia of a held node itself is left out, which a moving support would have to add. Of a ring, x is the radial
+    force summed around it, and moments do not hold the direction of the meridian. A dof that several supports hold counts with the
+    first of them, so that the reactions add up.
+
+    Args:
+        point: what moments are about (3,); by default the first node that a support holds.
+        factor: the load parameter in statics.
+    """
+    tangent = Tangent(model)
+    q = tangent.dofs(state)
+    force = tangent.back(np.where(tangent.free, 0.0, tangent.gradient(state) - tangent.loads(factor, q)))
+    q = tangent.back(q)
+    net = model.net.host.held if model.net is not None else []
+    count, shells = max(len(model.held), len(net)), len(model.scene.shell_supports)
+    turns = np.zeros((model.worlds, count, 3))
+    if net:
+        first = len(model.scene.supports)
+        turns[:, first : first + shells] = _normal_moments(tangent.parts[-1], state)
+    result = []
+    for i in range(count):
+        worlds = []
+        for world in range(model.worlds):
+            places = [*_chain_places(tangent, q, force, model.held[i] if i < len(model.held) else [], world)]
+            if net:
+                places += _net_places(tangent.parts[-1], q, force, net[i], world)
+            about = (
+                places[0][0] if point is None and places else np.zeros(3) if point is None else np.asarray(point, float)
+            )
+            total = sum((push for _, push, _ in places), np.zeros(3))
+            moment = sum((np.cross(here - about, push) + twist for here, push, twist in places), turns[world, i])
+            worlds.append((total, moment, about))
+        result.append(Reaction(*(_each_world(np.array(values)) for values in zip(*worlds, strict=True))))
+    return result
+
+
+def _each_world(values: np.ndarray) -> np.ndarray:
+    """Values (worlds, ...) as they are given out: without their first axis of one world."""
+    return values[0] if len(values) == 1 else values
+
+
+def _chain_places(tangent, q: np.ndarray, force: np.ndarray, support, world: int):
+    """(place, force, moment) of the nodes and edges of chains that a support holds in a world, taken from `force`."""
+    for held in support:
+        part = tangent.parts[held.group]
+        kind = part.group.kind
+        axes = [0, 2] if kind.dim == 2 else [0, 1, 2]
+        x, f = (part.blocks(tangent.of(part, values))[..., : kind.block] for values in (q, force))
+        for node, column in zip(held.k, held.columns + world * part.group.rods, strict=True):
+            here, push, twist = np.zeros(3), np.zeros(3), np.zeros(3)
+            here[axes] = x[column, node, : kind.dim]
+            if not held.components and kind.twist:
+                along = x[column, (node + 1) % part.group.nodes, : kind.dim] - x[column, node, : kind.dim]
+                twist = f[column, node, kind.dim] * along / np.linalg.norm(along)
+                f[column, node, kind.dim] = 0.0
+            else:
+                bits = [(held.components >> d) & 1 for d in range(kind.dim)]
+                push[axes] = f[column, node, : kind.dim] * bits
+                f[column, node, : kind.dim] -= push[axes]
+            yield here, push, twist
+
+
+def _net_places(part, q: np.ndarray, force: np.ndarray, held, world: int) -> list[tuple]:
+    """(place, force, moment) of the blocks of the net that a support holds in a world, taken from `force`."""
+    host, places = part.host, []
+    x, f = (Tangent.of(part, values).reshape(part.net.worlds, -1, 3)[world] for values in (q, force))
+    for block, component in zip(held.blocks, held.components, strict=True):
+        if held.normal is not None:
+            normal = np.array(held.normal)
+            places.append((x[block], (f[block] @ normal) * normal, np.zeros(3)))
+        elif block < host.nodes:
+            places.append((x[block], f[block] * np.eye(3)[component], np.zeros(3)))
+        else:
+            first, last = x[host.ends[block - host.nodes]]
+            places.append((first, np.zeros(3), f[block, 0] * (last - first) / np.linalg.norm(last - first)))
+        f[block, component] = 0.0
+    return places
+
+
+def _normal_moments(part, state) -> np.ndarray:
+    """Moments that the shell supports exert by the normals they give (worlds, supports, 3).
+
+    An element's energy does not change if its nodes and these normals turn together: the moment of the normals is minus that of
+    the forces on its nodes. Where several supports share an element, each has the part along its own edge.
+    """
+    worlds, count = part.net.worlds, len(part.model.scene.shell_supports)
+    result, x = np.zeros((worlds, count, 3)), part.back(part.dofs(state)).reshape(worlds, -1, 3)
+    for index, device in enumerate(part.net.sets):
+        host, measure = device.host, device.term.measure
+        element, row, support = host.normals[:, host.normals[2] < count]
+        if not element.size:
+            continue
+        least, most = np.full(len(host), count), np.full(len(host), -1)
+        np.minimum.at(least, element, support)
+        np.maximum.at(most, element, support)
+        alone = least == most
+        forces = part.forces(state, index)[: measure.nodes].reshape(measure.nodes, worlds, len(host), 3)
+        for world in range(worlds):
+            corners = x[world, host.slots[: measure.nodes]]
+            moments = -np.cross(corners, forces[:, world]).sum(0)
+            np.add.at(result[world], least[alone], moments[alone])
+            for e in np.flatnonzero(least < most):
+                own = element == e
+                corner = (row[own] - 3) // 3  # opposite to the edge
+                edges = corners[(corner + 2) % 3, e] - corners[(corner + 1) % 3, e]
+                shares = edges * np.linalg.lstsq(edges.T, moments[e], rcond=None)[0][:, None]
+                np.add.at(result[world], support[own], shares)
+    return result
+
+
+@launches
+def stresses(model, state) -> dict[str, list[np.ndarray]]:
+    """Conjugate stresses of every rod and shell by term (elements, strains); of several worlds (worlds, elements, strains).
+
+    Of rods: axial force [N] of edges, moments [N m] of vertices about the directors there: means of those of both edges, and at
+    clamped ends, which are included, the directors that the clamp holds. Those beside rigid joints are in "rigid_joint", about
+    the directors of the rod at the joint. What edges glued to a shell turn it with, a moment per length [N], is in "glued_edge". Of
+    shells: forces per length [N/m] ("shell_stretch") and moments per length [N] ("shell_bend", "shell_bend_dof") of triangles,
+    components (11, 22, 12) along the first edge at rest and across it, second Piola and Kirchhoff's; a moment is positive where it
+    raises the second fundamental form. Hinges have moments per their weight. Of shells of revolution: the same along and around
+    (11, 22, 12), forces of edges ("axisymmetric_stretch"), moments of inner nodes ("axisymmetric_bend") and of both ends
+    ("axisymmetric_rim"). What a rod or shell has not is None.
+    """
+    result: dict[str, list] = {}
+    for group, data in zip(model.groups, state.groups, strict=True):
+        values = group_strains(model, group, data)[1]
+        for term, place in zip(group.kind.terms, group.kind.places(), strict=True):
+            rows = slice(place[3], place[3] + len(term.measure.strains))
+            missing = 0 if group.kind.closed else term.measure.span
+            rods = result.setdefault(term.name, [None] * model.scene.rod_count)
+            if term.measure.angles:
+                end_moments.of_group(group, data, values[rows])
+            for column, rod in enumerate(group.host.rods):
+                of_rod = values[rows, : group.host.count[column] - missing, :, column]
+                rods[rod] = _each_world(np.moveaxis(of_rod, (2, 1), (0, 1)))
+    for index, part in enumerate(model.net.sets if model.net is not None else ()):
+        if part.term.name not in MAGNETS:
+            _add_net_stresses(model, state, index, result)
+    return result
+
+
+def group_strains(model, group, data) -> tuple[np.ndarray, np.ndarray]:
+    """Strains and stresses of a group's elements (strains, nodes, worlds, rods)."""
+    shape = (group.kind.strain_rows, group.nodes, group.columns)
+    strain, stress = (arrays.allocate(shape, model.types.real, model.wp_device) for _ in range(2))
+    model.strains(group, data, strain, stress)
+    split = (*shape[:2], group.worlds, group.rods)
+    return arrays.download(strain).reshape(split), arrays.download(stress).reshape(split)
+
+
+def net_strains(net, state, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Strains and stresses of a set of the net (strains, worlds, elements)."""
+    part = net.sets[index]
+    shape = (len(part.term.measure.strains), net.worlds * part.elements)
+    strain, stress = (wp.zeros(shape, dtype=net.real, device=net.device) for _ in range(2))
+    net.strains(state.net, index, strain, stress)
+    split = (shape[0], net.worlds, part.elements)
+    return strain.numpy().astype(float).reshape(split), stress.numpy().astype(float).reshape(split)
+
+
+@launches
+def triangle_fields(model, state) -> dict[str, np.ndarray]:
+    """Numbers to color surfaces by (worlds, triangles), in the order of `model.surfaces`.
+
+    "strain": Green's strain, its largest principal value in magnitude. "curvature" [1/m]: the same of the change of curvature, of
+    shells with mid-edge normals. "energy" [J/m^2]: elastic energy of membrane and mid-edge bending per rest area.
+    """
+    net, surfaces = model.net, model.surfaces
+    if surfaces is None:
+        raise ValueError("the model has no surfaces to color")
+    fields = {name: np.zeros((model.worlds, len(surfaces.triangles))) for name in ("strain", "curvature", "energy")}
+    for index, part in enumerate(net.sets):
+        if not (part.term.name.startswith("shell") and part.term.density.coupled):
+            continue
+        E, W = part.elements, net.worlds
+        values, slope = net_strains(net, state, index)
+        change = np.moveaxis(
+            values - np.stack([np.broadcast_to(part.parameters[name], (W, E)) for name in part.term.rest]), 0, -1
+        )
+        metric = _metric(part, W)
+        principal = _principal(change.reshape(-1, 3), metric).reshape(W, E)
+        row = surfaces.first[part.host.owner[0]] + part.host.owner[1]
+        fields["strain" if part.term.measure.tensions else "curvature"][:, row] = principal
+        fields["energy"][:, row] += 0.5 * np.einsum("cwe,wec->we", slope, change)  # quadratic laws
+    return fields
+
+
+def _metric(part, worlds: int) -> list[np.ndarray]:
+    """Components (11, 12, 22) of the rest metric of a set's elements, of all worlds one after the other."""
+    names = [parameter.name for parameter in part.term.parameters if parameter.family == "metric"]
+    return [np.broadcast_to(part.parameters[name], (worlds, part.elements)).ravel() for name in names]
+
+
+def _principal(covariant: np.ndarray, metric) -> np.ndarray:
+    """Largest |eigenvalue| of symmetric tensors (n, 3) in the basis of two edges, relative to their rest metric."""
+    a11, a12, a22 = metric
+    e11, e12, e22 = covariant.T
+    area = a11 * a22 - a12**2
+    mean = 0.5 * (a22 * e11 - 2.0 * a12 * e12 + a11 * e22) / area  # half the trace of metric^-1 e
+    root = np.sqrt(np.maximum(mean**2 - (e11 * e22 - e12**2) / area, 0.0))
+    return np.abs(mean) + root
+
+
+def _add_net_stresses(model, state, index: int, result: dict[str, list]) -> None:
+    """Stresses of a set of the net, rod by rod or shell by shell."""
+    net, part, scene = model.net, model.net.sets[index], model.scene
+    term = part.term
+    values = net_strains(net, state, index)[1]
+    if term.measure.twists:
+        end_moments.of_net(net, state.net, index, values)
+    values = np.moveaxis(values, 0, -1)
+    if term.density.coupled:
+        metric = _metric(part, net.worlds)
+        values = _resultants(values.reshape(-1, values.shape[-1]), metric).reshape(values.shape)
+    of_shells = (
+        scene.shells if term.name in SHELLS else scene.axisymmetric_shells if term.name in AXISYMMETRIC else None
+    )
+    count = scene.rod_count if of_shells is None else len(of_shells)
+    owners = result.setdefault(term.name, [None] * count)
+    for owner in np.unique(part.host.owner[0]):
+        owners[owner] = _each_world(values[:, part.host.owner[0] == owner])
+
+
+def _resultants(slope: np.ndarray, metric) -> np.ndarray:
+    """Components (11, 22, 12) in an orthonormal basis of slopes (s11, 2 s12, s22) in that of two edges with this rest metric."""
+    a11, a12, a22 = metric
+    basis = np.zeros((len(slope), 2, 2))
+    basis[:, 0, 0], basis[:, 0, 1] = np.sqrt(a11), a12 / np.sqrt(a11)
+    basis[:, 1, 1] = np.sqrt(a22 - a12**2 / a11)
+    s = np.stack([slope[:, 0], 0.5 * slope[:, 1], 0.5 * slope[:, 1], slope[:, 2]], -1).reshape(-1, 2, 2)
+    n = basis @ s @ basis.transpose(0, 2, 1)
+    return np.stack([n[:, 0, 0], n[:, 1, 1], n[:, 0, 1]], -1)
+
+
+def writhe(points: np.ndarray) -> float:
+    """Writhe of a closed polygon (n, 3): the exact Gauss integral over pairs of edges (Klenin and Langowski 2000, method 1a)."""
+    a, b = points, np.roll(points, -1, axis=0)
+    i, j = np.triu_indices(len(points), 2)
+    apart = (i > 0) | (
+        j < len(points) - 1
+    )  # the first and last edge meet: their solid angle is zero, up to a sign of rounding
+    i, j = i[apart], j[apart]
+    r13, r14, r23, r24 = a[j] - a[i], b[j] - a[i], a[j] - b[i], b[j] - b[i]
+    normals = [np.cross(r13, r14), np.cross(r14, r24), np.cross(r24, r23), np.cross(r23, r13)]
+    lengths = [np.linalg.norm(n, axis=1, keepdims=True) for n in normals]
+    n1, n2, n3, n4 = (n / np.where(s > 0.0, s, 1.0) for n, s in zip(normals, lengths, strict=True))
+    pairs = ((n1, n2), (n2, n3), (n3, n4), (n4, n1))
+    # arcsin(p . q), without its loss of half the digits where p and q are parallel
+    solid = sum(np.arctan2((p * q).sum(1), np.linalg.norm(np.cross(p, q), axis=1)) for p, q in pairs)
+    sign = np.sign((np.cross(b[j] - a[j], b[i] - a[i]) * r13).sum(1))
+    return float((sign * solid).sum() / (2.0 * np.pi))
+
+
+@launches
+def total_twist(model, state, rod: int = 0) -> float | np.ndarray:
+    """Turns of a rod's directors about its centreline: the sum of the angles between neighbours, after parallel transport.
+
+    Full turns between neighbours count as they were wound. Of a closed rod, this plus `writhe` is the link of its centreline and
+    a first director's edge, a whole number (Calugareanu, White, Fuller), exactly so for polygons. The half cells beside a rigid
+    joint count with the rod they belong to. Of several worlds an array (worlds,).
+
+    Raises:
+        ValueError: there is no such rod, or it has no twist.
+    """
+    if not 0 <= rod < model.scene.rod_count:
+        raise ValueError(f"total_twist: rod {rod} does not exist; the scene has {model.scene.rod_count} rods")
+    turns, found = np.zeros(model.worlds), False
+    for group, data in zip(model.groups, state.groups, strict=True):
+        (column,) = np.nonzero(group.host.rods == rod)
+        if column.size and group.kind.twist:
+            index, column = next(i for i, term in enumerate(group.kind.terms) if term.measure.angles), column[0]
+            row, measure = group.kind.places()[index][3], group.parameters[f"{group.kind.terms[index].name}.measure"]
+            values = group_strains(model, group, data)[0][row + TWIST, :, :, column]
+            weight = np.broadcast_to(measure, (group.nodes, group.columns))[:, column :: group.rods]
+            vertices = group.host.count[column] - (0 if group.kind.closed else 2)
+            turns += (values * weight)[:vertices].sum(0)
+            found = True
+    for index, part in enumerate(model.net.sets if model.net is not None else ()):
+        of_rod = part.host.owner[0] == rod
+        if part.term.measure.twists and of_rod.any():
+            weight = np.broadcast_to(part.parameters["measure"], (model.worlds, part.elements))
+            turns += (net_strains(model.net, state, index)[0][TWIST] * weight)[:, of_rod].sum(1)
+            found = True
+    if not found or model.scene.dimension == 2:
+        raise ValueError(f"rod {rod} has no twist")
+    return turns / (2.0 * np.pi) if model.worlds > 1 else float(turns[0] / (2.0 * np.pi))

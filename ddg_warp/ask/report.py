@@ -1,0 +1,76 @@
+"""The report of a model: terms, elements, dofs, solver, kernels, memory, and what the scene does without."""
+
+from ddg_warp.kernels import cyclic_reduction
+from ddg_warp.kernels.terms import ALL
+from ddg_warp.solve.choice import automatic, net_preconditioner
+from ddg_warp.solve.net.system import NetSystem
+
+SOLVERS = {
+    "chain": "PCG (closed chains)",
+    "sweep": "chain sweep, one Newton loop a rod",
+    "partitioned": "cyclic reduction (few long rods), one Newton loop a rod",
+}
+
+
+def report(model) -> str:
+    """A few lines of text for a person; a test compares them with what is launched."""
+    rods, nodes = model.scene.rod_count, int(model.curves.counts.sum())
+    lines = [f"{rods} rods, {nodes} nodes, worlds {model.worlds}, {model.precision} on {model.device}"]
+    present = set()
+    for i, group in enumerate(model.groups):
+        kind, host = group.kind, group.host
+        shape = "closed" if kind.closed else "open"
+        lines.append(
+            f"group {i}: {group.rods} {shape} rods of {host.count.min()} to {host.count.max()} nodes, "
+            f"{kind.block} dofs a node, {kind.window} a window"
+        )
+        for term in kind.terms:
+            present.add(term.name)
+            elements = int((host.count - (0 if kind.closed else term.measure.span)).sum()) * model.worlds
+            lines.append(f"  {term.name}: {elements} elements, {term.measure.name} x {term.density.name}")
+        lines.append(f"  solver: {SOLVERS[automatic(group)]}, linear algebra in {model.types.linear.__name__}")
+        lines.append(f"  memory: {bytes_per_node(model, group)} bytes a node")
+    if model.net is not None:
+        lines += net_lines(model)
+        present |= {part.term.name for part in model.net.sets}
+    absent = sorted({term.name for term in ALL.values()} - present)
+    lines.append("not in this scene: " + ", ".join(absent))
+    if not any(group.kind.twist for group in model.groups) and (model.net is None or not model.net.edges):
+        lines.append("no angles, no frames, no rotary inertia")
+    return "\n".join(lines)
+
+
+def net_lines(model) -> list[str]:
+    """What the net holds: dofs, terms, the matrix."""
+    host, net = model.net.host, model.net
+    table = NetSystem(net)
+    linear = model.types.linear
+    lines = [
+        f"net: {len(host.shells)} shells of {sum(len(s.surface.triangles) for s in host.shells)} triangles, "
+        f"{len(host.rods)} rods; {host.nodes} nodes, {host.angles} angles, {host.spins} rigid joints, "
+        f"{int((~host.fixed).sum())} free dofs"
+    ]
+    for part in net.sets:
+        measure, density = part.term.measure.name, part.term.density.name
+        lines.append(f"  {part.term.name}: {part.elements * model.worlds} elements, {measure} x {density}")
+    size = 9 * table.positions * model.worlds * (4 if linear.__name__ == "float32" else 8)
+    lines.append(
+        f"  solver: PCG ({net_preconditioner(model.net)}), one Newton loop a world, linear algebra in {linear.__name__}; "
+        f"H: {table.entries} blocks of 3 x 3, {size / 1e6:.3g} MB"
+    )
+    return lines
+
+
+def bytes_per_node(model, group) -> int:
+    """Device memory of states, iterate and solver for one node of a chain."""
+    kind, nb = group.kind, group.kind.block
+    real, linear = (4 if t.__name__ == "float32" else 8 for t in (model.types.real, model.types.linear))
+    state = 2 * kind.dim + (9 if kind.twist else 0) + (kind.strain_rows if kind.viscous else 0)
+    iterate = 2 * kind.dim + (9 if kind.twist else 0) + kind.window + 2
+    solver = kind.factor_rows + 2 * nb**2 + 2 * nb + 1
+    constant = 2 * real + 1
+    if automatic(group) == "partitioned":
+        iterate += kind.dim + (7 if kind.twist else 0) + 2
+        solver += 3 * nb**2 + nb + sum(cyclic_reduction.level_rows(kind)) // 2
+        constant += 8
+    return 2 * state * real + iterate * real + solver * linear + constant

@@ -1,0 +1,1 @@
+"""From a description to arrays: storages, dofs, elements, conditions."""

@@ -1,0 +1,1 @@
+"""Of nets: everything by index of a block."""

@@ -1,0 +1,222 @@
+"""From a scene to its net: nodes of joined rods and attached vertices become one.
+
+In a scene of dimension 2 the net is the planar one of three-dimensional elements.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ddg_warp.compile import axisymmetric
+from ddg_warp.compile import shells as shell_terms
+from ddg_warp.compile.chains import Ghosts, Piece, alike, net_rods, piece_of
+from ddg_warp.compile.net import conditions
+from ddg_warp.compile.net import elements as net_elements
+from ddg_warp.compile.net.net import Net, NetRod, NetShell
+from ddg_warp.errors import SceneError
+from ddg_warp.geometry import shell_forms
+from ddg_warp.geometry.surface import Surface
+from ddg_warp.scene.structures import COINCIDE
+
+
+def compile_net(scene) -> Net | None:
+    """The net of a scene, None if it has none.
+
+    Raises:
+        SceneError: something cannot be joined, held or loaded as described; the message names it.
+    """
+    chosen = net_rods(scene)
+    if not chosen.any() and not scene.shells and not scene.axisymmetric_shells:
+        return None
+    if scene.shells and scene.dimension == 2:
+        raise SceneError("a scene with shells has dimension 3; leave dimension=2 to rods")
+    builder, ghosts = _Builder(scene), Ghosts(scene)
+    for batch in scene.batches:
+        if chosen[batch.first : batch.first + batch.rods].any():
+            if scene.dimension == 2:
+                batch = _spatial(batch)
+            for run in (run for part in alike(3, batch, ghosts, chosen) for run in part.runs):
+                builder.add_rods(piece_of(run, ghosts))
+    for shell in scene.shells:
+        builder.add_shell(shell)
+    for shell in scene.axisymmetric_shells:
+        builder.add_meridian(shell)
+    return builder.finish()
+
+
+def _spatial(batch):
+    """A planar batch as rods in space with twist, which the net holds in the plane."""
+    section = batch.section
+    natural = batch.natural
+    if not isinstance(natural, str):
+        zero = np.zeros(1)
+        natural = (zero, np.asarray(natural[0]), zero)
+    points = batch.points * [1.0, 0.0, 1.0]
+    section = replace(section, EI2=section.EI1, GJ=section.EI1)
+    return replace(
+        batch, points=points, section=section, twist=batch.bend, natural=natural, director=np.array([0.0, 1.0, 0.0])
+    )
+
+
+class _Builder:
+    """Collects raw nodes and elements, then merges what is shared."""
+
+    def __init__(self, scene):
+        self.scene = scene
+        self.points: list[np.ndarray] = []
+        self.count = 0
+        self.rods: dict[int, NetRod] = {}
+        self.shells: list[tuple] = []
+        self.meridians: list[np.ndarray] = []
+        self.numbers: list[tuple[np.ndarray, np.ndarray]] = []  # of the nodes and of the angles of some rods
+        self.rod_edges = 0
+        self.frames: list[np.ndarray] = []
+        self.stiffness: list[np.ndarray] = []
+        self.ends: list[np.ndarray] = []
+
+    def add_rods(self, piece: Piece) -> None:
+        """Number the nodes and angles of rods."""
+        (rods, n, _), closed, (before, after) = piece.x.shape, piece.kind.closed, piece.ghosts
+        nodes = self._number(piece.x.reshape(-1, 3)).reshape(rods, n)
+        edges = n - (0 if closed else 1)
+        angles = np.zeros((rods, 0), int)
+        if piece.kind.twist:
+            angles = self.rod_edges + np.arange(rods * edges).reshape(rods, edges)
+            self.rod_edges += angles.size
+            self.frames.append(np.concatenate([v.reshape(-1, 3).T for v in (piece.director, piece.tangent)]))
+            self.stiffness.append(np.array([np.broadcast_to(v, angles.shape).ravel() for v in piece.stiffness]))
+            self.ends.append(np.stack([nodes[:, :edges], np.roll(nodes, -1, axis=1)[:, :edges]], -1).reshape(-1, 2))
+        self.numbers.append((nodes, angles))
+        own, own_edges = nodes[:, before : n - after], angles[:, before : edges - after]
+        for row, rod in enumerate(piece.rods.tolist()):
+            places = nodes[row], angles[row]
+            self.rods[rod] = NetRod(rod, own[row], own_edges[row], before, piece, row, *places)
+
+    def add_shell(self, shell) -> None:
+        """Number a shell's vertices."""
+        self.shells.append((shell.surface, self._number(shell.points)))
+
+    def add_meridian(self, shell) -> None:
+        """Number the nodes of a shell of revolution."""
+        radius, height = shell.points.T
+        self.meridians.append(self._number(np.column_stack([radius, 0.0 * radius, height])))
+
+    def _number(self, points: np.ndarray) -> np.ndarray:
+        self.points.append(points)
+        self.count += len(points)
+        return np.arange(self.count - len(points), self.count)
+
+    def finish(self) -> Net:
+        """Everything joined and numbered for good."""
+        scene, points = self.scene, np.concatenate(self.points)
+        merged = self._merge(points)
+        rest_nodes = np.zeros((merged.max() + 1, 3))
+        rest_nodes[merged[::-1]] = points[::-1]  # the first of the merged nodes says where
+        nodes = len(rest_nodes)
+        for numbers, places in self.numbers:  # which the rods look at
+            numbers[:], places[:] = merged[numbers], places + nodes
+        ends = merged[np.concatenate([np.zeros((0, 2), int), *self.ends])]
+        shells, mesh_edges = [], 0
+        for (surface, numbers), shell in zip(self.shells, scene.shells, strict=True):
+            kinds, supports = self._kinds(surface, len(shells))
+            turning = shell.bending in shell_forms.TURNING
+            first = nodes + self.rod_edges + mesh_edges
+            angle = first + np.arange(len(surface.edges)) if turning else np.full(len(surface.edges), -1)
+            mesh_edges += len(surface.edges) if turning else 0
+            material = shell.material
+            try:
+                plate = shell_terms.plate(
+                    surface,
+                    shell.points,
+                    shell.thickness,
+                    material.young,
+                    material.poisson,
+                    kinds,
+                    rest=shell.rest,
+                    viscosity=material.viscosity if np.any(np.asarray(material.viscosity) > 0.0) else None,
+                )
+            except SceneError as error:
+                raise SceneError(f"shell '{shell.name}': {error}") from None
+            shells.append(NetShell(surface, merged[numbers], angle, kinds, supports, plate))
+        angles = self.rod_edges + mesh_edges
+        spins = sum(joint.rigid for joint in scene.joints)
+        rods = sorted(self.rods.values(), key=lambda rod: rod.rod)
+        blocks = nodes + angles + spins
+        net = Net(
+            rest=np.concatenate([rest_nodes, np.zeros((blocks - nodes, 3))]),
+            nodes=nodes,
+            angles=angles,
+            spins=spins,
+            rods=rods,
+            shells=shells,
+            sets=[],
+            ends=ends,
+            frame=np.concatenate([np.zeros((6, 0)), *self.frames], axis=1),
+            stiffness=np.concatenate([np.zeros((3, 0)), *self.stiffness], axis=1),
+            mass=np.zeros((blocks, 3)),
+            fixed=np.zeros((blocks, 3), bool),
+            load=np.zeros((blocks, 3)),
+            meridians=[
+                axisymmetric.meridian(shell, i, scene.ring_supports, merged[numbers])
+                for i, (shell, numbers) in enumerate(zip(scene.axisymmetric_shells, self.meridians, strict=True))
+            ],
+        )
+        net.fixed[nodes : nodes + angles, 1:] = True
+        net.sets = net_elements.element_sets(scene, net)
+        conditions.add_masses(scene, net)
+        conditions.hold(scene, net)
+        conditions.load(scene, net)
+        if scene.dimension == 2:
+            net.fixed[:nodes, 1] = True
+            net.fixed[nodes : nodes + angles] = True
+            net.fixed[nodes + angles :, [0, 2]] = True
+        return net
+
+    def _merge(self, points: np.ndarray) -> np.ndarray:
+        """New number of every node; joined ones share theirs."""
+        pairs, what = [], []
+        for number, joint in enumerate(self.scene.joints):
+            first, *others = (self.rods[rod].nodes[node] for rod, node in joint.members)
+            pairs += [(first, other) for other in others]
+            what += [f"joint {number}: its members"] * len(others)
+        for link in self.scene.attachments:
+            nodes, vertices = self.rods[link.rod].nodes[link.nodes], self.shells[link.shell][1][link.vertices]
+            pairs += zip(nodes, vertices, strict=True)
+            places = zip(link.nodes, link.vertices, strict=True)
+            what += [f"node {node} of rod {link.rod} and vertex {vertex}" for node, vertex in places]
+        if not pairs:
+            return np.arange(len(points))
+        first, second = np.array(pairs).T
+        gap = np.linalg.norm(points[first] - points[second], axis=1)
+        size = np.abs(points[np.array(pairs)]).max(axis=(1, 2))
+        for i in np.flatnonzero(gap > COINCIDE * np.maximum(1e-300, size))[:1]:
+            raise SceneError(f"{what[i]} lie {gap[i]:.3g} m apart at rest; what is joined starts at one point")
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        graph = coo_array((np.ones(len(first)), (first, second)), shape=(len(points), len(points)))
+        return connected_components(graph, directed=False)[1]
+
+    def _kinds(self, surface: Surface, index: int) -> tuple[shell_forms.EdgeKinds, np.ndarray]:
+        """What holds the normals at mesh edges, those whose two vertices a support names; and the place of that support."""
+        clamped, symmetry, supports = {}, {}, np.full(len(surface.edges), -1)
+        corners = surface.points[surface.triangles]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        for place, support in enumerate(self.scene.shell_supports):
+            if support.shell != index or not support.edges:
+                continue
+            inside = np.isin(surface.edges, support.vertices).all(1)
+            if support.edges == "symmetry":
+                for edge in np.flatnonzero(inside & surface.boundary):
+                    symmetry[int(edge)] = support.normal
+                    if int(edge) not in clamped:
+                        supports[edge] = place
+            else:
+                for edge in np.flatnonzero(inside):
+                    sides = surface.edge_triangles[edge]
+                    total = normals[sides[sides >= 0]].sum(0)
+                    clamped[int(edge)] = total / np.linalg.norm(total)
+                    supports[edge] = place
+        for edge in set(clamped) & set(symmetry):
+            del symmetry[edge]
+        return shell_forms.edge_kinds(surface, clamped, symmetry), supports

@@ -1,0 +1,298 @@
+"""Elements of a net: of rods, rigid joints, magnetised edges, shells and meridians, gathered by term."""
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from ddg_warp.compile import axisymmetric
+from ddg_warp.compile import shells as shell_terms
+from ddg_warp.compile.chains import Piece
+from ddg_warp.compile.elements import ElementSet
+from ddg_warp.compile.net.glue import glue_sets
+from ddg_warp.compile.net.net import Net, NetRod, NetSet
+from ddg_warp.errors import SceneError
+from ddg_warp.geometry import polyline, shell_forms
+from ddg_warp.kernels.terms import JOINTS, MAGNETS, term_key
+from ddg_warp.scene.descriptions import Dynamics
+
+
+def element_sets(scene, net: Net) -> list[NetSet]:
+    """Elements of a net by term; marks the dofs that none of them has."""
+    joints = _joint_places(scene, net)
+    rods = [*_rod_sets(net, joints), *_joint_sets(net, joints), *glue_sets(scene, net)]
+    magnets = _magnet_sets(scene, net) if scene.magnets else []
+    return _gather_sets([*rods, *magnets, *_shell_sets(net, scene), *_meridian_sets(net, scene)])
+
+
+def _joint_places(scene, net: Net) -> list[tuple[int, int, list]]:
+    """Of each rigid joint: node, block of its rotation, and its edges as (rod, edge with ghosts, sign)."""
+    by_rod = {rod.rod: rod for rod in net.rods}
+    result = []
+    for number, joint in enumerate(joint for joint in scene.joints if joint.rigid):
+        members, node = [], -1
+        for index, at in joint.members:
+            rod = by_rod[index]
+            if not rod.edges.size:
+                raise SceneError(f"rigid joint {number}: rod {index} has no twist; join it with rigid=False")
+            if "rod_bend_twist" in rod.piece.batch.laws:
+                raise SceneError(
+                    f"rigid joint {number}: rod {index} bends by a law of its own, and half cells at joints know the quadratic one; "
+                    "join it with rigid=False"
+                )
+            k = rod.first + (at if at >= 0 else len(rod.nodes) + at)
+            node = rod.all_nodes[k]
+            count, closed = len(rod.all_nodes), rod.piece.kind.closed
+            if closed or k < count - 1:
+                members.append((rod, k, 1.0))
+            if closed or k > 0:
+                members.append((rod, (k - 1) % count, -1.0))
+        result.append((node, net.nodes + net.angles + number, members))
+    return result
+
+
+def _rod_sets(net: Net, joints) -> list[NetSet]:
+    """Stretch and bending of the rods, in their order; vertices at rigid joints are left to these."""
+    skipped = np.array([rod.rod * net.nodes + node for node, _, members in joints for rod, _, _ in members], int)
+    alike: dict[int, list[NetRod]] = {}
+    for rod in net.rods:
+        alike.setdefault(id(rod.piece), []).append(rod)
+    sets = []
+    for rods in alike.values():  # all rods of a piece
+        piece, kind = rods[0].piece, rods[0].piece.kind
+        nodes, edges = (np.array([getattr(rod, what) for rod in rods]) for what in ("all_nodes", "all_edges"))
+        n = nodes.shape[1]
+        for term in kind.terms:
+            span = term.measure.span
+            count = n if kind.closed else n - span
+            row, k = np.indices((len(rods), count)).reshape(2, -1)
+            if span == 2:
+                joined = np.isin(piece.rods[row] * net.nodes + nodes[row, (k + 1) % n], skipped)
+                row, k = row[~joined], k[~joined]
+            values = {}
+            for name in term.parameter_names:
+                given = piece.parameters[f"{term.name}.{name}"]
+                values[name] = given[row % len(given), k % given.shape[1]]
+            slots = [nodes[row, (k + i) % n] for i in range(span + 1)]
+            lag = np.zeros((0, len(k)))
+            if term.measure.angles:
+                slots += [edges[row, k], edges[row, (k + 1) % n]]
+                lag = piece.reference_twist[row, k][None]
+            sets.append(
+                NetSet(term, np.array(slots), lag, np.zeros((0, len(k))), values, np.array([piece.rods[row], k]))
+            )
+    return [_by_rod(part) for part in _gather_sets(sets)]
+
+
+def _by_rod(part: NetSet) -> NetSet:
+    """The same elements in the order of their rods."""
+    order = np.argsort(part.owner[0], kind="stable")
+    slots, lag, data, owner = (values[:, order] for values in (part.slots, part.lag, part.data, part.owner))
+    return NetSet(part.term, slots, lag, data, {name: values[order] for name, values in part.parameters.items()}, owner)
+
+
+def _joint_sets(net: Net, joints) -> list[NetSet]:
+    """Bending and twist of the half cells between rigid joints and the edges that meet them.
+
+    The joint holds each rod by the frame that the rod has at the node: between its edges there, or extrapolated at an end.
+    """
+    members = [(node, spin, *member) for node, spin, found in joints for member in found]
+    kinds = [[member for member in members if member[2].piece.batch.by_angle == by_angle] for by_angle in (False, True)]
+    return [_half_cells(net, found, by_angle) for by_angle, found in enumerate(kinds) if found]
+
+
+def _half_cells(net: Net, members: list, by_angle: bool) -> NetSet:
+    """Those of rods of one kind of curvature."""
+    term = JOINTS[term_key("rigid_joint", by_angle)]
+    node, spin, rods, k, sign = zip(*members, strict=True)
+    node, spin, k, sign = map(np.array, (node, spin, k, sign))
+    first, edges = np.array([(rod.all_edges[0], len(rod.all_edges)) for rod in rods]).T
+    closed = np.array([rod.piece.kind.closed for rod in rods])
+    across = (k - sign).astype(int)  # the rod's edge on the other side of the node; at an end there is none
+    across = np.where(closed, across % edges, across)
+    inside = (across >= 0) & (across < edges)
+    here, there = (first - net.nodes + e for e in (k, np.where(inside, across, (k + sign).astype(int))))
+    frames, tangents = net.frame[:3].T, net.frame[3:].T
+    lengths = polyline.length(np.diff(net.rest[net.ends], axis=1)[:, 0])
+    ends = [(frames[e], tangents[e], lengths[e]) for e in (there, here)]
+    tangent, director = polyline.frames_at_nodes(*ends, np.where(inside, -1.0, 1.0))
+    half, along = 0.5 * lengths[here], sign[:, None]
+    pair = np.stack([along * tangent, along * tangents[here]], 1), np.stack([director, frames[here]], 1)
+    twist = polyline.reference_twist(*pair, False)[:, 0]
+    rest = np.stack([*(value[:, 0] for value in polyline.curvatures(*pair, False, by_angle)), twist]) / half
+    for i, rod in enumerate(rods):
+        if not isinstance(rod.piece.batch.natural, str) or rod.piece.batch.natural != "shape":
+            natural = _natural_at(rod.piece, rod.row, k[i] if sign[i] > 0 else k[i] + 1)
+            rest[:, i] = natural * [1.0, sign[i], 1.0]
+    lag = np.concatenate([director.T, (along * tangent).T, [twist]])
+    parameters = term.bind(measure=half, stiffness=[*net.stiffness[:, here]], rest=[*rest])
+    slots = np.array([node, net.ends[here, np.where(sign > 0, 1, 0)], first + k, spin])
+    return NetSet(term, slots, lag, sign[None], parameters, np.array([[rod.rod for rod in rods], k]))
+
+
+def _natural_at(piece: Piece, row: int, node: int) -> np.ndarray:
+    """Natural curvatures and twist of the rod's bending term at a node, at an end those of the vertex next to it [1/m]."""
+    for term in piece.kind.terms:
+        if term.measure.angles:
+            rest = [piece.parameters[f"{term.name}.{name}"] for name in term.rest]
+            vertices = len(piece.x[row]) - (0 if piece.kind.closed else 2)
+            vertex = (node - 1) % vertices if piece.kind.closed else min(max(node - 1, 0), vertices - 1)
+            return np.array([value[row % len(value), vertex % value.shape[1]] for value in rest])
+    raise AssertionError("a rod of a rigid joint has a bending term")
+
+
+@dataclass(frozen=True)
+class _Magnets:
+    """The magnetised edges of a rod: ends (2, E) and angles (E,) as blocks, volume [m^3], unit direction (3, E) in the material
+    frame and size [A/m] of the magnetisation.
+    """
+
+    rod: NetRod
+    k: np.ndarray  # edges of the rod
+    ends: np.ndarray
+    volume: np.ndarray
+    direction: np.ndarray
+    size: np.ndarray
+
+    @property
+    def along(self) -> bool:
+        """Whether all are magnetised along their tangents, which takes no frames."""
+        return not self.direction[:2].any()
+
+    @property
+    def angles(self) -> np.ndarray:
+        return self.rod.edges[self.k]
+
+    @property
+    def owner(self) -> np.ndarray:
+        return np.array([np.full(len(self.k), self.rod.rod), self.k + self.rod.first])
+
+
+def _magnet_sets(scene, net: Net) -> list[NetSet]:
+    """Elements of magnetised edges in the applied field, and of pairs of them."""
+    magnets = [found for rod in net.rods if len((found := _magnets(scene, net, rod)).k)]
+    sets = _pairs(scene, net, magnets) if scene.dipoles else []
+    if scene.applied_field is None:
+        return sets
+    # a state that no solver has made stands at the start of the run, where loads of statics are zero
+    field = scene.applied_field.at(0.0, float(isinstance(scene.analysis, Dynamics)), SceneError)
+    for magnet in magnets:
+        term = MAGNETS["magnetic_tangent" if magnet.along else "magnetic"]
+        slots = magnet.ends if magnet.along else np.concatenate([magnet.ends, magnet.angles[None]])
+        data = np.concatenate([magnet.direction, np.repeat(field[:, None], len(magnet.k), axis=1)])
+        values = term.bind(measure=magnet.volume, magnetisation=magnet.size)
+        sets.append(NetSet(term, slots, np.zeros((0, len(magnet.k))), data, values, magnet.owner))
+    return sets
+
+
+def _magnets(scene, net: Net, rod: NetRod) -> _Magnets:
+    batch = rod.piece.batch
+    total = np.zeros((batch.edges, 3))
+    for magnet in scene.magnets:
+        if rod.rod in magnet.rods:
+            total[magnet.edges] += magnet.magnetisation
+    size = np.linalg.norm(total, axis=1)
+    k = np.flatnonzero(size)
+    ends = np.stack([rod.nodes[k], np.roll(rod.nodes, -1)[k]])
+    area = np.broadcast_to(np.asarray(batch.section.area, float), (batch.rods, batch.edges))[rod.rod - batch.first, k]
+    length = np.linalg.norm(net.rest[ends[1]] - net.rest[ends[0]], axis=1)
+    return _Magnets(rod, k, ends, area * length, (total[k] / size[k, None]).T, size[k])
+
+
+def _pairs(scene, net: Net, magnets: list[_Magnets]) -> list[NetSet]:
+    """Elements of all pairs of magnetised edges that are listed."""
+    from scipy.spatial import cKDTree
+
+    def joined(what):
+        return np.concatenate([getattr(magnet, what) for magnet in magnets], axis=-1)
+
+    ends, owner, volume, direction, size = map(joined, ("ends", "owner", "volume", "direction", "size"))
+    counts = [len(magnet.k) for magnet in magnets]
+    along = np.repeat([m.along for m in magnets], counts)
+    framed = np.repeat([m.rod.edges.size > 0 for m in magnets], counts)
+    angle = np.concatenate([m.angles if m.rod.edges.size else np.zeros(len(m.k), int) for m in magnets])
+    middle, pairs = net.rest[ends].mean(0), []
+    for listed in scene.dipoles:
+        chosen = np.arange(len(angle)) if listed.rods is None else np.flatnonzero(np.isin(owner[0], listed.rods))
+        reach = min(listed.cutoff, 2.0 * np.ptp(middle, axis=0).max())
+        pairs.append(chosen[cKDTree(middle[chosen]).query_pairs(reach, output_type="ndarray")])
+    a, b = np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0).T
+    apart = (ends[:, None, a] != ends[None, :, b]).all((0, 1))
+    a, b = a[apart], b[apart]
+    if not a.size:
+        raise SceneError("add_dipoles: no two magnetised edges are within the cutoff of each other; take a larger one")
+    for i in np.flatnonzero(np.linalg.norm(middle[a] - middle[b], axis=1) <= 1e-9 * np.abs(middle).max())[:1]:
+        names = " and ".join("edge {1} of rod {0}".format(*owner[:, at]) for at in (a[i], b[i]))
+        raise SceneError(f"add_dipoles: {names} have their middles at one point, where dipoles attract without bound")
+    along, framed = along[a] & along[b], framed[a] & framed[b]
+    for i in np.flatnonzero(~along & ~framed)[:1]:
+        raise SceneError(
+            f"add_dipoles: of rods {owner[0, a[i]]} and {owner[0, b[i]]} one is magnetised across its tangent and one has no twist; "
+            "give both twist=True"
+        )
+    sets = []
+    for name, chosen in (("dipoles_tangent", along), ("dipoles", ~along)):
+        i, j, term = a[chosen], b[chosen], MAGNETS[name]
+        slots = np.concatenate(
+            [ends[:, i], ends[:, j], *([] if name == "dipoles_tangent" else [angle[None, i], angle[None, j]])]
+        )
+        values = term.bind(measure=volume[i] * volume[j], magnetisation=[size[i], size[j]])
+        data = np.concatenate([direction[:, i], direction[:, j]])
+        sets.append(NetSet(term, slots, np.zeros((0, len(i))), data, values, owner[:, i]))
+    return sets
+
+
+def _shell_sets(net: Net, scene) -> list[NetSet]:
+    sets, count = [], Counter()
+    for index, (shell, description) in enumerate(zip(net.shells, scene.shells, strict=True)):
+        models = description.bending, description.membrane
+        for elements in shell_terms.shell_elements(shell.surface, shell.plate, shell.kinds, *models):
+            sets.append(_bound(elements, shell.nodes, shell.edges, index))
+            element, row, edge = elements.normals.T
+            sets[-1].normals = np.array([element, row, shell.supports[edge]])
+            shell.first[elements.term.name] = count[elements.term.name]
+            count[elements.term.name] += len(elements)
+        if description.bending in shell_forms.TURNING:
+            net.fixed[shell.edges[~shell_terms.turning(shell.kinds, description.bending)], 0] = True
+    return sets
+
+
+def _meridian_sets(net: Net, scene) -> list[NetSet]:
+    none = np.zeros(0, int)
+    sets = []
+    for index, shell in enumerate(net.meridians):
+        net.fixed[shell.nodes, 1] = True
+        net.fixed[shell.nodes[shell.points[:, 0] == 0.0], 0] = True
+        for elements in axisymmetric.element_sets(shell):
+            sets.append(_bound(elements, shell.nodes, none, index))
+            element, row, end = elements.normals.T
+            sets[-1].normals = np.array([element, row, shell.supports[end] + len(scene.shell_supports)])
+    return sets
+
+
+def _bound(elements: ElementSet, nodes: np.ndarray, edges: np.ndarray, index: int) -> NetSet:
+    count = len(elements.nodes)
+    slots = np.concatenate([nodes[elements.nodes], edges[elements.angles]], axis=1).T
+    parameters = {name: np.broadcast_to(p, (count,)) for name, p in elements.parameters.items()}
+    owner = np.array([np.full(count, index), np.arange(count)])
+    return NetSet(elements.term, slots, np.zeros((0, count)), elements.data.T, parameters, owner)
+
+
+def _gather_sets(sets: list[NetSet]) -> list[NetSet]:
+    """One set a term; damped where one of its parts is."""
+    result = []
+    for law in dict.fromkeys(s.term.law for s in sets if len(s)):
+        same = [s for s in sets if s.term.law == law and len(s)]
+        term = next((s.term for s in same if s.term.density.lagged), same[0].term)
+        join = [np.concatenate([getattr(s, what) for s in same], axis=1) for what in ("slots", "lag", "data", "owner")]
+        still = [np.zeros(len(s)) for s in same]
+        parameters = {
+            known.name: np.concatenate(
+                [s.parameters.get(known.name, zero) for s, zero in zip(same, still, strict=True)]
+            )
+            for known in term.parameters
+        }
+        first = np.cumsum([0] + [len(s) for s in same])
+        normals = [s.normals + [[at], [0], [0]] for s, at in zip(same, first, strict=False)]
+        result.append(NetSet(term, *join[:3], parameters, join[3], np.concatenate(normals, axis=1)))
+    return result

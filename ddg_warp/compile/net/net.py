@@ -1,0 +1,179 @@
+"""The net of a scene on the host: shells, joined rods and what they share, as blocks of three dofs and element sets.
+
+Blocks are numbered nodes first, then angles (of rod edges, then of mesh edges), then rotations of rigid joints. See
+`ddg_warp.compile.net.blocks` for how a scene becomes a net.
+"""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from ddg_warp.compile import axisymmetric
+from ddg_warp.compile import shells as shell_terms
+from ddg_warp.compile.chains import Piece
+from ddg_warp.compile.net.loads import NetCouple, NetEdgeCouple, NetLoad, NetPressure
+from ddg_warp.compile.precision import float32_error, float32_errors
+from ddg_warp.compile.tolerance import Bodies
+from ddg_warp.geometry import shell_forms
+from ddg_warp.geometry.surface import Surface
+
+
+@dataclass
+class NetRod:
+    """A rod of the net: blocks of its own nodes, angles of its own edges (indices of blocks; empty without twist)."""
+
+    rod: int
+    nodes: np.ndarray
+    edges: np.ndarray
+    first: int  # ghosts before its first node
+    piece: Piece
+    row: int  # of the piece
+    all_nodes: np.ndarray  # with ghosts
+    all_edges: np.ndarray
+
+
+@dataclass
+class NetShell:
+    """A shell of the net: blocks of its vertices, block of the angle of each mesh edge (-1 without)."""
+
+    surface: Surface
+    nodes: np.ndarray
+    edges: np.ndarray
+    kinds: shell_forms.EdgeKinds
+    supports: np.ndarray  # place among the scene's of the support that gives the normal at each mesh edge, -1 without
+    plate: shell_terms.Plate
+    first: dict[str, int] = field(default_factory=dict)  # its first element in the set of each of its terms
+
+
+@dataclass
+class NetSet:
+    """Elements of one term on blocks: slots (n, E), own lagged rows (m, E), data (d, E), parameters as of `ElementSet`.
+
+    `owner` (2, E) is the rod or shell of each element, and its place in it: edge, vertex, triangle or hinge. `normals` (3, n) are
+    element, first row of the data and support, counted over those of shells and then of rings, of every direction among the data
+    that a support gives: the normal at a mesh edge, or the tangent of a meridian.
+    """
+
+    term: object
+    slots: np.ndarray
+    lag: np.ndarray
+    data: np.ndarray
+    parameters: dict[str, np.ndarray]
+    owner: np.ndarray
+    normals: np.ndarray = field(default_factory=lambda: np.zeros((3, 0), int))
+
+    def __len__(self) -> int:
+        return self.slots.shape[1]
+
+
+@dataclass(frozen=True)
+class NetHeld:
+    """Dofs that a support holds: (block, component) pairs; or the blocks on an oblique plane with this normal."""
+
+    blocks: np.ndarray
+    components: np.ndarray
+    normal: tuple | None = None
+
+
+@dataclass(eq=False)
+class Net:
+    """A scene's net on the host: N blocks of three dofs.
+
+    Attributes:
+        rest: blocks at rest (N, 3): positions, then zeros.
+        nodes, angles, spins: how many blocks of each kind; rod_edges: how many of the angles belong to rods.
+        rods, shells, meridians: what the net was made from.
+        sets: elements by term.
+        ends: nodes of every rod edge (rod_edges, 2); frame: director and tangent of it (6, rod_edges).
+        stiffness: EI1, EI2 and GJ of its section (3, rod_edges) [N m^2].
+        mass: of every dof (N, 3) [kg, kg m^2]; fixed: held dofs (N, 3).
+        load: dead forces (N, 3); timed: those that change; pressures, bands, couples, edge_couples: loads that follow what they act on.
+        held: what each support of `scene.supports`, then of `scene.shell_supports` and `scene.ring_supports`, holds here.
+        moving: (blocks, motion, components (3,) bool, rows of its displacements) of nodes with a motion.
+        turning: (angle blocks, motion) of rod edges.
+        frames: orthonormal rows (3, 3) that the held components of a node on an oblique plane refer to; see `compile.net.planes`.
+    """
+
+    rest: np.ndarray
+    nodes: int
+    angles: int
+    spins: int
+    rods: list[NetRod]
+    shells: list[NetShell]
+    sets: list[NetSet]
+    ends: np.ndarray
+    frame: np.ndarray
+    stiffness: np.ndarray
+    mass: np.ndarray
+    fixed: np.ndarray
+    load: np.ndarray
+    timed: list[NetLoad] = field(default_factory=list)
+    pressures: list[NetPressure] = field(default_factory=list)
+    held: list[NetHeld] = field(default_factory=list)
+    moving: list[tuple[np.ndarray, int, np.ndarray, np.ndarray]] = field(default_factory=list)
+    turning: list[tuple[np.ndarray, int]] = field(default_factory=list)
+    meridians: list[axisymmetric.NetMeridian] = field(default_factory=list)
+    bands: list[axisymmetric.NetBand] = field(default_factory=list)
+    couples: list[NetCouple] = field(default_factory=list)
+    edge_couples: list[NetEdgeCouple] = field(default_factory=list)
+    frames: dict[int, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def blocks(self) -> int:
+        """Number of blocks."""
+        return len(self.rest)
+
+    @property
+    def holds(self) -> np.ndarray:
+        """Whether something of every dof in space is held (N, 3) bool."""
+        result = self.fixed.copy()
+        for block, frame in self.frames.items():
+            result[block] = (np.abs(frame[self.fixed[block]]) > 1e-9).any(0)
+        return result
+
+    @property
+    def followers(self) -> list:
+        """Loads that follow what they act on, each with `places`, `forces` and their `derivative`."""
+        return [*self.pressures, *self.bands, *self.couples, *self.edge_couples]
+
+    @cached_property
+    def bodies(self) -> Bodies:
+        """What its blocks belong to."""
+        return Bodies(self)
+
+    @cached_property
+    def edges(self) -> np.ndarray:
+        """Nodes of the edges whose turns limit a step (E, 2): of rods, meshes and meridians; of rods without twist, of all elements."""
+        shells, meridians = (s.nodes[s.surface.edges] for s in self.shells), (m.ends for m in self.meridians)
+        edges = np.concatenate([self.ends, *shells, *meridians])
+        return edges if len(edges) else np.concatenate([part.slots[:2].T for part in self.sets])
+
+    @cached_property
+    def edge_lengths(self) -> np.ndarray:
+        """Their lengths at rest (E,) [m]."""
+        return np.linalg.norm(np.diff(self.rest[self.edges], axis=1)[:, 0], axis=1)
+
+    def rod_errors(self, s: float) -> np.ndarray:
+        """What float32 makes of every rod over a step of s [s] (rods,); see `precision.float32_errors`."""
+        pieces = {id(rod.piece): rod.piece for rod in self.rods}
+        errors = {
+            key: float32_errors(p.kind, p.mass.mean(1), p.length, {name: v.T for name, v in p.parameters.items()}, s)
+            for key, p in pieces.items()
+        }
+        return np.array([errors[id(rod.piece)][rod.row] for rod in self.rods])
+
+    def shell_errors(self, s: float) -> np.ndarray:
+        """The same of shells (shells,): their membrane against inertia over a step and the lowest bending mode of a plate."""
+        errors = []
+        for shell in self.shells:
+            plate, nodes = shell.plate, len(shell.nodes)
+            area, membrane = plate.area.sum(), plate.young * plate.thickness / (1.0 - plate.poisson**2)
+            bending = (membrane * plate.thickness**2).min() / 12.0 * (np.pi**4 / area**2) * (area / nodes)
+            errors.append(float32_error(membrane.max(), self.mass[shell.nodes].mean() / s**2 + bending))
+        return np.array(errors, float)
+
+    @property
+    def rod_edges(self) -> int:
+        """Angles that belong to rod edges; they come first."""
+        return len(self.ends)

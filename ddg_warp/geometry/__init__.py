@@ -1,0 +1,1 @@
+"""Geometry in NumPy: curves, surfaces, meshes, discrete operators, forms of shells, turning numbers."""

@@ -1,0 +1,1 @@
+"""Model, its state and its parameters by name, on a device."""

@@ -1,0 +1,35 @@
+"""How edges that are glued to shells follow these where a state is given; see `ddg_warp.compile.net.glue`."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp.compile.net.glue import TERM
+from ddg_warp.kernels.net.elements import term_kernels
+
+
+def follow(net, state, angles: bool, rates: bool) -> None:
+    """Turn glued edges that are free with the surface as its nodes are (angles) and move (rates), in place."""
+    for index, part in enumerate(net.sets):
+        if part.term.name != TERM.name:
+            continue
+        shape = (net.worlds, part.elements)
+        edges = part.host.slots[4] + net.blocks * np.arange(net.worlds)[:, None]
+        free = ~net.host.fixed[part.host.slots[4], 0]
+        strain, stress, next_stress = (wp.zeros((1, edges.size), dtype=net.real, device=net.device) for _ in range(3))
+        stiffness, rest = (np.broadcast_to(part.parameters[name], shape) for name in ("stiffness", "rest"))
+        if angles:
+            net.strains(state, index, strain)
+            _turn(state.q, edges, np.where(free, rest - strain.numpy().reshape(shape), 0.0))
+        if rates:
+            net.strains(state, index, strain, stress)
+            inputs = [net.elements(state, index), state.v]
+            wp.launch(term_kernels(TERM, net.real)[4], edges.size, inputs, [next_stress], device=net.device)
+            slip = (next_stress.numpy() - stress.numpy()).reshape(shape) / np.where(stiffness > 0.0, stiffness, 1.0)
+            _turn(state.v, edges, np.where(free, -slip, 0.0))
+
+
+def _turn(blocks: wp.array, places: np.ndarray, by: np.ndarray) -> None:
+    """Add to the first of the three reals of blocks; where one is named twice the last counts."""
+    values = blocks.numpy()
+    values[places, 0] += by
+    blocks.assign(values)

@@ -1,0 +1,126 @@
+"""A group of rods of one kind on a device: its constant arrays, all worlds side by side."""
+
+from dataclasses import replace
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.compile import precision
+from ddg_warp.compile.chains import ChainGroup
+from ddg_warp.model.parameters import ParameterTable
+
+
+class Group:
+    """Constant device arrays of one group of rods, all worlds side by side (columns world * R + rod).
+
+    `parameters` are "term.parameter" of all terms, broadcastable to (node, column).
+    """
+
+    def __init__(self, host: ChainGroup, scene, worlds: int, device, real):
+        kind = replace(host.kind, serial=wp.get_device(device).is_cpu)
+        vector = wp.types.vector(kind.dim, real)
+        self.host, self.kind, self.worlds, self.device = host, kind, worlds, device
+        self.rods = len(host.rods)
+        self.nodes = host.shape[0]
+        self.columns = self.rods * worlds
+        self.elements = self.nodes if kind.closed else self.nodes - 1
+        self.node_threads, self.element_threads = (
+            (1 if kind.serial else along, self.columns) for along in (self.nodes, self.elements)
+        )
+
+        def put(values, dtype):
+            return arrays.upload(np.concatenate([values] * worlds, axis=-1) if worlds > 1 else values, dtype, device)
+
+        self.count = put(host.count, int)
+        self.length = put(host.length, real)
+        self.world = wp.array(np.repeat(np.arange(worlds), self.rods), dtype=int, device=device)
+        self.still = wp.zeros(self.columns, dtype=real, device=device)
+        self.mass = put(host.mass, real)
+        self.rotary = put(host.rotary, real)
+        self.fixed = put(host.fixed, wp.uint8)
+        load = np.concatenate([host.load] * worlds, axis=1) if host.loaded else np.zeros((1, 1, kind.dim))
+        self.load = arrays.upload(load, vector, device)
+        self.load_angle = (
+            put(host.load_angle, real) if host.loaded and kind.twist else wp.zeros((1, 1), dtype=real, device=device)
+        )
+        gravity = np.asarray(scene.gravity, float)
+        self.gravity_host = gravity[[0, 2]] if kind.dim == 2 else gravity
+        self.gravity = wp.array(self.gravity_host[None], dtype=vector, device=device)
+        self.outer = put(_outer_forces(host, self.gravity_host), real)
+        self.moving = Moving(host, worlds, self.rods, device, real) if host.moving_nodes or host.moving_edges else None
+        tiled = {name: np.tile(p, (1, worlds)) if p.shape[1] > 1 else p for name, p in host.parameters.items()}
+        self.parameters = ParameterTable(tiled, 0, real, device)
+
+    def set_parameter(self, name: str, values: np.ndarray) -> None:
+        """Replace "term.parameter" by values of shape (), (worlds,), (elements,) or (worlds, elements)."""
+        elements = self.nodes
+        if values.ndim == 0:
+            new = values.reshape(1, 1)
+        elif values.shape == (self.worlds,) and self.worlds > 1:
+            new = np.repeat(values, self.rods)[None]
+        else:
+            along = np.atleast_2d(values)
+            if (
+                along.ndim > 2
+                or along.shape[0] not in (1, self.worlds)
+                or not elements - 2 <= along.shape[1] <= elements
+            ):
+                raise ValueError(
+                    f"{name} has shape {values.shape}; give one number, ({self.worlds},), (elements,) or ({self.worlds}, elements)"
+                    f" with {elements - 2} vertices or {elements - 1} edges"
+                )
+            along = np.pad(along, ((0, 0), (0, elements - along.shape[1])), mode="edge")
+            new = np.repeat(np.broadcast_to(along, (self.worlds, elements)), self.rods, axis=0).T
+        self.parameters.set(**{name: new})
+
+    def float32_errors(self, s: float) -> np.ndarray:
+        """What float32 makes of every rod over a step of s [s]; see `precision.float32_errors`."""
+        host = self.host
+        values = {name: array[:, : self.rods] for name, array in self.parameters.values.items()}
+        return precision.float32_errors(self.kind, host.mass.sum(0) / host.count, host.length, values, s)
+
+
+class Moving:
+    """Device lists of the dofs of a group that have a prescribed motion.
+
+    Attributes:
+        nodes: (node, column, motion of each component) of held nodes; node_rest: their rest positions (., 3) [m].
+        edges: (edge, column, motion) of held angles; edge_rest: first directors of these edges at rest (., 3).
+    """
+
+    def __init__(self, host: ChainGroup, worlds: int, rods: int, device, real):
+        def where(rows):
+            shift = np.eye(1, rows.shape[1], 1, int)
+            tiled = np.concatenate([rows + world * rods * shift for world in range(worlds)])
+            return wp.array(tiled.astype(np.int32), dtype=int, device=device)
+
+        def rest(values):
+            return wp.array(np.concatenate([values] * worlds), dtype=real, device=device)
+
+        rows = np.concatenate([np.zeros((0, 5), int), *host.moving_nodes])
+        self.nodes = where(rows)
+        points = np.zeros((len(rows), 3))
+        points[:, [0, 2] if host.kind.dim == 2 else [0, 1, 2]] = host.x[rows[:, 0], rows[:, 1]]
+        self.node_rest = rest(points)
+        rows = np.concatenate([np.zeros((0, 3), int), *host.moving_edges])
+        self.edges = where(rows)
+        directors = np.moveaxis(host.frame[0:3], 0, -1)
+        self.edge_rest = rest(directors[rows[:, 0], rows[:, 1]] if len(rows) else np.zeros((0, 3)))
+
+
+def _outer_forces(host: ChainGroup, gravity: np.ndarray) -> np.ndarray:
+    """Sum of the magnitudes of the outer forces on every rod (R,) [N]: the scale that residuals are compared with."""
+    forces = np.zeros_like(host.mass)
+    for d, g in enumerate(gravity):
+        force = host.mass * g
+        if host.loaded:
+            force += host.load[..., d]
+        forces += np.abs(force, out=force)
+    total = forces.sum(0)
+    if host.loaded:
+        total += np.abs(host.load_angle).sum(0) / host.length
+    for load in host.timed_loads:
+        size = np.abs(load.force).sum() + (abs(load.moment) + np.abs(load.couple).sum()) / host.length[load.columns]
+        np.add.at(total, load.columns, size)
+    return total

@@ -1,0 +1,210 @@
+"""A net on a device: constant arrays, its states, and what can be launched on them."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import warp as wp
+
+from ddg_warp.compile.net.net import Net
+from ddg_warp.kernels.net import elements, frames
+from ddg_warp.model.parameters import ParameterTable
+
+
+@dataclass
+class NetState:
+    """Device arrays of a net with N blocks, W worlds.
+
+    Attributes:
+        q, v: blocks (W N,) of positions [m], angles and rotation vectors since the last step [rad], and their rates.
+        frame: director and tangent of rod edges (6, W edges).
+        lag: own lagged rows of each element set (rows, W E); last: strains of each damped set at this state.
+        data: data (rows, W E) of those sets, by index, that have normals among them that supports turn, or the magnetic field.
+    """
+
+    q: wp.array
+    v: wp.array
+    frame: wp.array
+    lag: list[wp.array] = field(default_factory=list)
+    last: list[wp.array] = field(default_factory=list)
+    data: dict[int, wp.array] = field(default_factory=dict)
+
+    def arrays(self) -> dict[str, wp.array]:
+        """All arrays by name."""
+        named = {"q": self.q, "v": self.v, "frame": self.frame}
+        for i, (lag, last) in enumerate(zip(self.lag, self.last, strict=True)):
+            named |= {f"lag_{i}": lag, f"last_{i}": last}
+        return named | {f"data_{i}": data for i, data in self.data.items()}
+
+
+class DeviceSet:
+    """Elements of one term on the device; parameters as in `Group`: one buffer, and rows (offset, along, across worlds).
+
+    `turning` (n, 3) are element, first row of the data and motion of the normals that supports turn, `turning_rest` (n, 3) these
+    normals at rest.
+    """
+
+    def __init__(self, host, worlds: int, device, real, motions: np.ndarray):
+        self.host, self.term, self.worlds, self.device = host, host.term, worlds, device
+        self.elements = len(host)
+        self.slots = wp.array(np.ascontiguousarray(host.slots, np.int32), dtype=int, device=device)
+        data = host.data if host.data.size else np.zeros((1, 1))
+        self.data = wp.array(np.ascontiguousarray(data), dtype=real, device=device)
+        short = {name: _short(np.asarray(p, float))[None] for name, p in host.parameters.items()}
+        self.parameters, self._real = ParameterTable(short, 1, real, device), real
+        self.turning = np.array([*host.normals[:2], motions[host.normals[2]]]).T
+        self.turning = self.turning[self.turning[:, 2] >= 0]
+        element, row, _ = self.turning.T
+        self.turning_rest = host.data[row[:, None] + np.arange(3), element[:, None]]
+
+    def own_data(self) -> wp.array:
+        """Data of every world (rows, W E) at rest."""
+        return wp.array(np.tile(self.host.data, (1, self.worlds)), dtype=self._real, device=self.device)
+
+    def set_parameter(self, name: str, values: np.ndarray) -> None:
+        """Replace a parameter by values of shape (), (worlds,), (elements,) or (worlds, elements)."""
+        if values.ndim == 0:
+            new = values.reshape(1, 1)
+        elif values.shape == (self.worlds,) and self.worlds > 1:
+            new = values[:, None]
+        elif values.shape in ((self.elements,), (self.worlds, self.elements)):
+            new = np.atleast_2d(values)
+        else:
+            raise ValueError(
+                f"{self.term.name}.{name} has shape {values.shape}; give one number, ({self.worlds},), ({self.elements},) or "
+                f"({self.worlds}, {self.elements})"
+            )
+        self.parameters.set(**{name: new})
+
+    def set_rest(self, first: int, parameters: dict[str, np.ndarray]) -> None:
+        """Replace what of the elements from `first` on belongs to their rest shape, in every world; stiffness stays.
+
+        Args:
+            first: element.
+            parameters: all parameters of the term by name, each one number or one an element.
+        """
+        count, changed = max(np.size(values) for values in parameters.values()), {}
+        for name in (parameter.name for parameter in self.term.parameters if parameter.rest):
+            now = self.parameters[name]
+            full = np.repeat(now, self.elements // now.shape[1], axis=1)
+            full[:, first : first + count] = parameters[name]
+            changed[name] = full if len(full) > 1 else _short(full[0])[None]
+        self.parameters.set(**changed)
+
+
+class DeviceNet:
+    """A `Net` with all its worlds on a device; `motions` are those that turn the supports of shells and rings, -1 where none does."""
+
+    def __init__(self, host: Net, worlds: int, device, real, motions: np.ndarray):
+        self.host, self.worlds, self.device, self.real = host, worlds, device, real
+        self.vector = wp.types.vector(3, real)
+        self.blocks, self.angle_start = host.blocks, host.nodes
+        self.edges = host.rod_edges
+        self.sets = [DeviceSet(s, worlds, device, real, motions) for s in host.sets]
+        self.ends = wp.array(np.ascontiguousarray(host.ends, np.int32).reshape(-1, 2), dtype=int, device=device)
+        self.still = wp.zeros(worlds, dtype=real, device=device)
+        self.every = wp.full(worlds, 1, dtype=int, device=device)
+
+    def empty(self) -> NetState:
+        """Arrays of a state, not yet filled."""
+
+        def zeros(rows, columns):
+            return wp.zeros((max(1, rows), max(1, columns)), dtype=self.real, device=self.device)
+
+        blocks = self.worlds * self.blocks
+        q, v = (wp.zeros(blocks, dtype=self.vector, device=self.device) for _ in range(2))
+        state = NetState(q, v, zeros(6, self.worlds * self.edges))
+        for part in self.sets:
+            count = self.worlds * part.elements
+            rows = len(part.host.lag)
+            state.lag.append(zeros(rows, count if rows else 1))
+            strains = len(part.term.measure.strains) if part.term.density.lagged else 0
+            state.last.append(zeros(strains, count if strains else 1))
+        state.data = self.turning_data() | self.field_data()
+        return state
+
+    def turning_data(self) -> dict[int, wp.array]:
+        """Data of the sets with normals that supports turn, as at rest."""
+        return {i: part.own_data() for i, part in enumerate(self.sets) if len(part.turning)}
+
+    def field_data(self) -> dict[int, wp.array]:
+        """Data of the sets that are in a magnetic field, in that of the rest state."""
+        return {i: part.own_data() for i, part in enumerate(self.sets) if part.term.measure.field}
+
+    def rest(self) -> NetState:
+        """The rest state."""
+        state = self.empty()
+        state.q.assign(np.tile(self.host.rest, (self.worlds, 1)))
+        if self.edges:
+            state.frame.assign(np.tile(self.host.frame, (1, self.worlds)))
+        for part, lag in zip(self.sets, state.lag, strict=True):
+            if len(part.host.lag):
+                lag.assign(np.tile(part.host.lag, (1, self.worlds)))
+        return state
+
+    def elements(self, state: NetState, index: int, q=None, rate=None):
+        """What every kernel of a term reads of set `index` at a state, or at other dofs `q`, at rest or at a rate."""
+        part, given = self.sets[index], elements.elements_type(self.real)()
+        given.q, given.frame = state.q if q is None else q, state.frame
+        given.lag, given.last, given.rate = state.lag[index], state.last[index], self.still if rate is None else rate
+        (given.buffer, given.table), given.slots = part.parameters.arrays, part.slots
+        given.data = state.data.get(index, part.data)
+        given.blocks, given.angle_start, given.elements = self.blocks, self.angle_start, part.elements
+        return given
+
+    def strains(self, state: NetState, index: int, strain: wp.array, stress: wp.array | None = None) -> None:
+        """Strains of a set (strains, W E), and stresses if asked for."""
+        part = self.sets[index]
+        wp.launch(
+            elements.term_kernels(part.term, self.real)[3],
+            self.worlds * part.elements,
+            [self.elements(state, index), int(stress is not None)],
+            [strain, strain if stress is None else stress],
+            device=self.device,
+        )
+
+    def update_strains(self, state: NetState) -> None:
+        """Store the strains of a state where strain-rate damping looks for them."""
+        for index, part in enumerate(self.sets):
+            if part.term.density.lagged:
+                self.strains(state, index, state.last[index])
+
+    def carry(
+        self, before: NetState, after: NetState, kept: NetState | None = None, moved: wp.array | None = None
+    ) -> None:
+        """Lagged data of `after` from those of `before` and the positions of `after`, whose joints then start from zero.
+
+        Worlds that have not `moved` take over those of `kept` instead. The states may be the same. Launches alone, so that it
+        can be captured.
+        """
+        real = self.real
+        if not self.edges:
+            return
+        kept, moved = kept or before, moved or self.every
+
+        def launch(kernel, dim, inputs, outputs):
+            wp.launch(kernel, dim, inputs, outputs, device=self.device)
+
+        launch(
+            frames.edge_kernel(real),
+            self.worlds * self.edges,
+            [after.q, self.ends, self.blocks, moved, kept.frame, before.frame],
+            [after.frame],
+        )
+        for part, same, old, new in zip(self.sets, kept.lag, before.lag, after.lag, strict=True):
+            measure, dim = part.term.measure, self.worlds * part.elements
+            if len(part.host.lag):
+                inputs = [after.q, after.frame, part.slots, part.data, self.blocks, self.angle_start, self.edges]
+                launch(frames.lag_kernel(measure, real), dim, [*inputs, moved, same, old], [new])
+        self.reset_spins(after.q)
+
+    def reset_spins(self, blocks: wp.array) -> None:
+        """Zero the rotations of joints, or their rates."""
+        spins = self.host.spins
+        if spins:
+            inputs = [self.blocks - spins, spins, self.blocks]
+            wp.launch(frames.reset_kernel(self.real), self.worlds * spins, inputs, [blocks], device=self.device)
+
+
+def _short(values: np.ndarray) -> np.ndarray:
+    """One value where all are alike."""
+    return values[:1] if values.size and np.all(values == values.flat[0]) else values

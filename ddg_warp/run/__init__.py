@@ -1,0 +1,1 @@
+"""Scenes by name: simulate, record, draw, bench, check, the command line."""

@@ -1,0 +1,332 @@
+"""Speed against error: a scene over a grid of settings, each run timed and compared with a reference.
+
+A scene takes part by `benchmark() -> Study`, and by a default study where it has none. Times are of this machine and this moment;
+what carries over is their ratio, so that every row also gives its time relative to that of the scene's defaults, and never without
+its error. `ddg_warp.run.bench_overview` sums up many scenes.
+"""
+
+import itertools
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ddg_warp.run.catalog import InputError, load_scene, parameters, scene_name
+from ddg_warp.run.simulate import Result, simulate
+from ddg_warp.scene.scene import Dynamics
+
+RUN_SETTINGS = ("dt", "duration", "precision")
+SOLVER_OPTIONS = ("solver", "linear", "rtol")
+RESOLUTION = ("n", "cells", "segments", "rings", "around")  # what scenes call their number of edges or cells
+REFINED = 4  # how much finer the reference of a default study is than the scene, where no check has one
+
+
+@dataclass(frozen=True)
+class Study:
+    """What to vary and what to measure.
+
+    Attributes:
+        grid: Values by name; every combination is run, and the scene's defaults. A name is a parameter of `build`, a setting of the
+            run (dt, duration, precision) or an option of the solver (scheme, solver, linear, rtol).
+        measure: What is compared: the beginning of the name of one of the scene's checks, or a function of a result that gives a
+            number or an array.
+        reference: What `measure` should give; or settings, by name, that turn a case into its reference run. A check has its own.
+        fixed: Settings of all runs.
+        series: Names of the grid that tell the lines of the plot apart; a line then joins the cases that no other of its
+            series beats in both error and time, and the table shows these. By default all names but the first, and
+            every case.
+        unit: Of what is measured; that of a check stands in its name.
+        scale: What errors are divided by to be relative ones; by default the size of the reference.
+        whole: Whether the time is that of the run and its check, as it always is in statics, instead of that of the steps: for what
+            the check computes.
+    """
+
+    grid: Mapping[str, tuple]
+    measure: Callable[[Result], Any] | str
+    reference: Any = None
+    fixed: Mapping[str, Any] = field(default_factory=dict)
+    series: tuple[str, ...] = ()
+    unit: str = ""
+    scale: float | None = None
+    whole: bool = False
+
+    def cases(self) -> list[dict]:
+        """Every combination of the grid, the last name varying fastest."""
+        return [dict(zip(self.grid, values, strict=True)) for values in itertools.product(*self.grid.values())]
+
+
+def study_of(module) -> Study:
+    """The study of a scene: its own, or one of its first check over its resolution, or, without, over the time step.
+
+    Raises:
+        InputError: There is nothing to measure by.
+    """
+    if hasattr(module, "benchmark"):
+        return module.benchmark()
+    settings = parameters(module, {})
+    found = [name for name in RESOLUTION if isinstance(settings.get(name), int)]
+    if found:
+        value = settings[found[0]]
+        grid, finer = {found[0]: (value // 4, value // 2, value)}, {found[0]: REFINED * value}
+    else:
+        analysis = module.build().analysis
+        if not isinstance(analysis, Dynamics):
+            raise InputError(
+                f"{module.__name__} has no benchmark(), and no parameter of {', '.join(RESOLUTION)} to vary; give it "
+                "benchmark() -> ddg_warp.run.bench.Study"
+            )
+        grid = {"dt": tuple(analysis.dt / division for division in (1, 2, 4))}
+        finer = {"dt": analysis.dt / (4 * REFINED)}
+    if hasattr(module, "check"):
+        return Study(grid, "")
+    if hasattr(module, "observe"):
+        return Study(grid, lambda result: [values[-1] for values in result.series.values()], finer)
+    raise InputError(f"{module.__name__} has no check(), observe() or benchmark(): there is nothing to measure by")
+
+
+def benchmark(
+    name: str,
+    out: str | Path,
+    *,
+    device: str | None = None,
+    precision: str | None = None,
+    given: Mapping[str, Any] | None = None,
+) -> bool:
+    """Run a scene's study; write NAME.csv, NAME.json and NAME.png into `out`.
+
+    Args:
+        name: A scene.
+        out: Directory for the results.
+        device: Warp device.
+        precision: Precision of the cases that set none.
+        given: Parameters of the scene in all cases and references, such as its size; they stand in the names of the files.
+
+    Returns:
+        Whether every run reached its end.
+
+    Raises:
+        InputError: The scene has nothing to measure by, or the study varies what is given.
+    """
+    from ddg_warp.run.summary import machine, table, write_table
+
+    module = load_scene(name)
+    study, given = study_of(module), dict(given or {})
+    varied = [
+        key for key in given if key in study.grid or (isinstance(study.reference, Mapping) and key in study.reference)
+    ]
+    if varied:
+        raise InputError(f"--{varied[0]} {given[varied[0]]}: the study of {scene_name(name)} varies it")
+    study = replace(study, fixed={**study.fixed, **given})
+    rows, unit = measure(module, study, device=device, precision=precision)
+    stem = Path(out) / "_".join([scene_name(name), *(f"{key}_{value}" for key, value in given.items())])
+    flags = [*((f"--{key.replace('_', '-')}", str(value)) for key, value in given.items())]
+    flags += [("--device", device)] if device else []
+    origin = {
+        "scene": name,
+        "command": " ".join(["ddg-warp", "bench", name, *(word for flag in flags for word in flag)]),
+        "machine": machine(),
+        "measure": study.measure if isinstance(study.measure, str) else "",
+        "unit": unit,
+        "orders": orders(study, rows),
+        "fixed": study.fixed,
+    }
+    write_table(stem, rows, origin)
+    plot(study, rows, stem.with_suffix(".png"), name, unit)
+    print(table([{**row, "error": f"{row['error']:.3g} {unit}"} for row in best(study, rows)]))
+    for setting, order in origin["orders"].items():
+        print(f"observed order in {setting}: {order:.2f}")
+    return not any(row["failure"] for row in rows)
+
+
+def measure(module, study: Study, *, device: str | None = None, precision: str | None = None) -> tuple[list[dict], str]:
+    """Run every case of a study and the scene's defaults, and the reference runs they need, each once.
+
+    Returns:
+        A row a case: its settings, error, relative_error, ms_per_step, seconds, relative_time (over that of the defaults), steps,
+        newton_iterations, default (whether it is the scene's), failure. And the unit of the error.
+    """
+    shared = dict(study.fixed) | ({} if precision is None else {"precision": precision})
+    usual = defaults(module, study, device)
+    cases = study.cases()
+    if not any(_alike(case, usual) for case in cases):
+        cases.append(usual)
+    clock = clock_of(device) or time.perf_counter
+    references: dict[tuple, Result] = {}
+    loaded: set[tuple] = set()
+    rows, unit = [], study.unit
+    for case in cases:
+        settings = {**shared, **case}
+        kernels = tuple(value for value in settings.values() if isinstance(value, str | bool))
+        if kernels not in loaded:  # once for the kernels, whose loading is no part of what is measured
+            run(module, settings, device)
+            loaded.add(kernels)
+        began = clock()
+        result = run(module, settings, device)
+        failure, error, scale = result.failure, np.nan, 1.0
+        if isinstance(study.measure, str):
+            if not failure:
+                error, scale, unit = _of_check(module, study, result)
+        else:
+            reference = study.reference
+            if isinstance(reference, Mapping):
+                finer = {**settings, **reference}
+                key = tuple(sorted(finer.items()))
+                if key not in references:
+                    references[key] = run(module, finer, device)
+                failure = failure or references[key].failure
+                reference = np.nan if failure else study.measure(references[key])
+            # NaN where a run broke off: there is nothing to compare.
+            if not failure:
+                reference = np.asarray(reference, float)
+                error = float(np.max(np.abs(np.asarray(study.measure(result)) - reference)))
+                scale = float(np.max(np.abs(reference))) or 1.0
+        # The first two steps compile and capture, one for each of the two buffers.
+        steady = result.step_times[2:] or result.step_times
+        seconds_per_step = float(np.mean(steady)) if steady else 0.0
+        seconds = seconds_per_step * len(result.step_times)
+        if study.whole or not isinstance(result.scene.analysis, Dynamics):
+            seconds = clock() - began
+        rows.append(
+            case
+            | {
+                "error": float(error),
+                "relative_error": float(error) / (study.scale or scale),
+                "ms_per_step": 1e3 * seconds_per_step,
+                "seconds": seconds,
+                "steps": len(result.step_times),
+                "newton_iterations": result.statistics.get("newton_iterations", {}).get("mean", 0.0),
+                "default": _alike(case, usual),
+                "failure": failure,
+            }
+        )
+    first = next(row["seconds"] for row in rows if row["default"])
+    return [row | {"relative_time": row["seconds"] / first if first else np.nan} for row in rows], unit
+
+
+def _of_check(module, study: Study, result: Result) -> tuple[float, float, str]:
+    """Error, size of the reference and unit of the check that a study measures by."""
+    checks = [check for check in module.check(result) if check.name.startswith(study.measure)]
+    if not checks:
+        raise InputError(f"{module.__name__}: no check is named '{study.measure}...' with these settings")
+    check = checks[0]
+    if check.relative:
+        return check.error, 1.0, "relative"
+    unit = check.name.partition("[")[2].partition("]")[0]
+    return check.error, abs(float(check.reference)) or 1.0, unit or "1"
+
+
+def defaults(module, study: Study, device: str | None) -> dict:
+    """What the names of a study's grid are where nobody sets them."""
+    import warp as wp
+
+    from ddg_warp.solve.chains.newton import NewtonOptions
+    from ddg_warp.solve.statics import StaticsOptions
+
+    known = parameters(module, {})
+    analysis = module.build(**{name: value for name, value in study.fixed.items() if name in known}).analysis
+    options = NewtonOptions() if isinstance(analysis, Dynamics) else StaticsOptions()
+    usual = {"precision": "mixed" if wp.get_device(device).is_cuda else "float64", "linear": "auto", "solver": "newton"}
+    usual["rtol"] = options.rtol
+    if isinstance(analysis, Dynamics):
+        usual |= {"dt": analysis.dt, "duration": analysis.duration, "scheme": analysis.scheme}
+    else:
+        usual["solver"] = "auto"
+    return {name: {**usual, **known}[name] for name in study.grid}
+
+
+def _alike(case: Mapping, usual: Mapping) -> bool:
+    return all(
+        np.isclose(case[name], value, rtol=1e-9, atol=0.0) if isinstance(value, float) else case[name] == value
+        for name, value in usual.items()
+    )
+
+
+def run(module, settings: Mapping, device: str | None) -> Result:
+    """Run one case without recording it.
+
+    Raises:
+        InputError: A setting is neither a parameter of the scene, nor of the run, nor of the solver.
+    """
+    known = parameters(module, {})
+    unknown = [name for name in settings if name not in (*known, *RUN_SETTINGS, *SOLVER_OPTIONS, "scheme")]
+    if unknown:
+        raise InputError(f"the benchmark of {module.__name__} sets '{unknown[0]}', which is no setting of a run")
+    scene = module.build(**{name: value for name, value in settings.items() if name in known})
+    if "scheme" in settings and "scheme" not in known:
+        scene.analysis = replace(scene.analysis, scheme=settings["scheme"])
+    return simulate(
+        scene,
+        device=device,
+        observe=getattr(module, "observe", None),
+        options={name: value for name, value in settings.items() if name in SOLVER_OPTIONS},
+        clock=clock_of(device),
+        progress=False,
+        **{name: value for name, value in settings.items() if name in RUN_SETTINGS and name not in known},
+    )
+
+
+def clock_of(device: str | None) -> Callable[[], float] | None:
+    """Time of this process on the CPU, which others on the machine leave alone; the run's own clock on CUDA."""
+    import warp as wp
+
+    return None if wp.get_device(device).is_cuda else time.process_time
+
+
+def best(study: Study, rows: list[dict]) -> list[dict]:
+    """The cases that no other of their series beats in both error and time, if the study names series; else all.
+
+    Cases that failed have no error, and are not among the best; they are left out only where there are series.
+    """
+    if not study.series:
+        return rows
+    front = []
+    lowest: dict[tuple, float] = {}
+    for row in sorted(rows, key=lambda row: row["seconds"]):
+        line = tuple(row[name] for name in study.series)
+        if row["error"] < lowest.get(line, np.inf):
+            lowest[line] = row["error"]
+            front.append(row)
+    order = list(dict.fromkeys(tuple(row[name] for name in study.series) for row in rows))
+    return sorted(front, key=lambda row: order.index(tuple(row[name] for name in study.series)))
+
+
+def orders(study: Study, rows: list[dict]) -> dict[str, float]:
+    """Observed orders in the settings that refine: the median of log(error) over log(setting) between neighbouring cases.
+
+    Of a number of edges, cells or steps the order is that in their size. What else is set is as in the case of least error; where
+    that keeps the error from falling with every refinement, there is no order.
+    """
+    result = {}
+    good = [row for row in rows if row["error"] > 0.0]
+    for name, values in study.grid.items():
+        if name == "rtol" or len(values) < 3 or not good or isinstance(values[0], str | bool):
+            continue
+        finest, others = min(good, key=lambda row: row["error"]), [other for other in study.grid if other != name]
+        line = {row[name]: row["error"] for row in good if all(row[other] == finest[other] for other in others)}
+        if len(line) > 1:
+            values, errors = np.log(np.array(sorted(line.items()))).T
+            slopes = np.diff(errors) / np.diff(values) * (1.0 if isinstance(next(iter(line)), float) else -1.0)
+            if (slopes > 0.1).all():
+                result[name] = float(np.median(slopes))
+    return result
+
+
+def plot(study: Study, rows: list[dict], path: Path, title: str, unit: str) -> None:
+    """Error over time, a line a series, the scene's defaults marked; see `Study.series`."""
+    try:
+        from ddg_warp.run.figure import error_plot
+    except ModuleNotFoundError as error:
+        print(f"no plot without {error.name}: `pip install matplotlib`")
+        return
+    names = list(study.series or list(study.grid)[1:])
+    label, across, up = " / ".join(names) or "scene", "time [s]", f"error [{unit}]" if unit else "error"
+
+    def shown(row) -> dict:
+        text = ", ".join(str(row[name]) if name in study.series else f"{name} {row[name]}" for name in names)
+        return {across: row["seconds"], up: row["error"], label: text or title}
+
+    usual = [shown(row) for row in rows if row["default"]]
+    error_plot(path, [shown(row) for row in best(study, rows)], x=across, y=up, series=label, title=title, marked=usual)

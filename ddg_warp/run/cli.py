@@ -1,0 +1,359 @@
+"""The command line: `ddg-warp run | list | check | bench | export | info`.
+
+Exit codes: 0 done; 1 a check or the solver failed; 2 a mistake in what was asked for; 130 interrupted.
+"""
+
+import argparse
+import errno
+import os
+import shlex
+import sys
+from functools import partial
+from pathlib import Path
+
+from ddg_warp.run.catalog import (
+    RUN_SETTINGS,
+    InputError,
+    add_parameters,
+    load_scene,
+    one_liner,
+    own_term,
+    parameters,
+    refused,
+    scene_files,
+    scene_name,
+    stored_settings,
+)
+
+DONE, FAILED, MISTAKE, INTERRUPTED, UNREAD = 0, 1, 2, 130, 141
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # what a disk may come to while a run writes to it
+PRECISIONS = ("float64", "mixed", "float32")
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def __init__(self, **options):
+        super().__init__(allow_abbrev=False, **options)
+
+    def error(self, message: str):
+        raise InputError(message)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; returns its exit code."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        chosen = parser(arguments).parse_args(arguments)
+        code = chosen.command(chosen)
+        sys.stdout.flush()  # here, where a closed pipe is expected
+        return code
+    except BrokenPipeError:  # whoever read the output has left, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return UNREAD
+    except (InputError, OSError) as error:
+        print(f"ddg-warp: {error}", file=sys.stderr)
+        return FAILED if getattr(error, "errno", None) in FULL else MISTAKE
+    except KeyboardInterrupt:
+        print("\nddg-warp: interrupted; what was recorded is kept", file=sys.stderr)
+        return INTERRUPTED
+
+
+def parser(arguments: list[str]) -> Parser:
+    """The parser of these arguments; `run SCENE` and `bench SCENE` add the flags of the scene."""
+    top = Parser(prog="ddg-warp", description="Simulate flexible slender structures on NVIDIA Warp.")
+    commands = top.add_subparsers(metavar="COMMAND", required=True)
+
+    run = commands.add_parser("run", help="run a scene and check it", description="Run a scene and check it.")
+    run.set_defaults(command=run_scene)
+    run.add_argument("scene", metavar="SCENE", help="a scene of `ddg-warp list`, or a Python file; comes first")
+    add_settings(run)
+    run.add_argument("--dt", type=float, metavar="S", help="time step [s] (default: the scene's)")
+    run.add_argument(
+        "--duration", type=float, metavar="S", help="end of the run [s] (default: the scene's, or the resumed run's)"
+    )
+    run.add_argument("--worlds", type=int, metavar="N", help="independent copies (default: 1)")
+    run.add_argument("--out", type=Path, metavar="DIR", help="where results go (default: out/SCENE)")
+    run.add_argument("--resume", type=Path, metavar="DIR", help="continue the run recorded in DIR")
+    run.add_argument("--force", action="store_true", help="replace a run that is there already")
+    run.add_argument(
+        "--fields", metavar="NAME,...", help="record these too, such as velocities,directors,axial_force,shell_energy"
+    )
+    run.add_argument("--json", type=Path, metavar="FILE", help="write the summary to FILE too")
+    if arguments[:1] == ["run"] and len(arguments) > 1 and not arguments[1].startswith("-"):
+        add_parameters(run.add_argument_group(f"parameters of {arguments[1]}"), load_scene(arguments[1]))
+
+    show = commands.add_parser("list", help="list scenes and terms")
+    show.set_defaults(command=list_all)
+
+    check = commands.add_parser("check", help="compare the derivatives of terms with automatic differentiation")
+    check.set_defaults(command=check_terms)
+    check.add_argument(
+        "term", nargs="?", metavar="TERM", help="one term, or FILE.py:NAME of a term or law of your own (default: all)"
+    )
+    check.add_argument("--precision", choices=("float64", "float32"), default="float64", help="default: float64")
+    check.add_argument("--device", default="cpu", help="Warp device (default: cpu)")
+
+    bench = commands.add_parser("bench", help="measure a scene's error against its time")
+    bench.set_defaults(command=bench_scene)
+    bench.add_argument("scene", nargs="?", metavar="NAME", help="a scene (default: list them)")
+    bench.add_argument("--all", action="store_true", help="every scene in turn, and an overview of them")
+    add_settings(bench)
+    bench.add_argument("--out", type=Path, default=Path("out/bench"), metavar="DIR", help="default: out/bench")
+    if arguments[:1] == ["bench"] and len(arguments) > 1 and not arguments[1].startswith("-"):
+        add_parameters(bench.add_argument_group(f"parameters of {arguments[1]}"), load_scene(arguments[1]))
+
+    export = commands.add_parser("export", help="write a recorded run as USD")
+    export.set_defaults(command=export_run)
+    export.add_argument("directory", type=Path, metavar="DIR", help="directory of a run")
+    export.add_argument("--to", type=Path, metavar="FILE", help="a .usdc or .usda file (default: DIR/export.usdc)")
+    export.add_argument("--tube", action="store_true", help="write tube meshes, not curves")
+    export.add_argument(
+        "--revolve", type=int, default=0, metavar="N", help="turn meridians into surfaces of revolution of N sides"
+    )
+
+    info = commands.add_parser("info", help="show versions, devices and machine")
+    info.set_defaults(command=show_info)
+    return top
+
+
+def add_settings(command: argparse.ArgumentParser) -> None:
+    """Add the flags that say where and how accurately to compute."""
+    command.add_argument("--device", help="Warp device, such as cpu or cuda:0 (default: CUDA if there is one)")
+    command.add_argument("--precision", choices=PRECISIONS, help="default: float64 on the CPU, mixed on CUDA")
+
+
+def run_scene(chosen: argparse.Namespace) -> int:
+    """`run`: simulate, record, check, summarise."""
+    module, name = load_scene(chosen.scene), scene_name(chosen.scene)
+    settings, run_settings = settings_of(chosen, module, name)
+    require_device(chosen.device)
+
+    from ddg_warp.run.simulate import simulate
+    from ddg_warp.run.summary import summary, write_json
+
+    scene = built(module, name, settings)
+    directory = chosen.resume or chosen.out or Path("out") / name
+    with refused():
+        result = simulate(
+            scene,
+            device=chosen.device,
+            out=directory,
+            duration=chosen.duration,
+            resume=chosen.resume,
+            force=chosen.force,
+            fields=[name for name in (chosen.fields or "").split(",") if name],
+            observe=getattr(module, "observe", None),
+            provenance={"scene": name, "parameters": settings, "command": shlex.join(["ddg-warp", *sys.argv[1:]])},
+            **run_settings,
+        )
+    checks = judged(module, result)
+    content = summary(name, settings, result, checks)
+    for path in filter(None, (directory / "summary.json", chosen.json)):
+        write_json(path, content)
+    if result.times:
+        draw(directory, module, result)
+    say(result, content, checks, directory)
+    return FAILED if result.failure or any(check.failed for check in checks) else DONE
+
+
+def built(module, name: str, settings: dict):
+    """The scene of these parameters; whatever a scene of the package meets on its way comes of those given."""
+    changed = settings.items() - parameters(module, {}).items()
+    given = ", ".join(f"{key} = {value!r}" for key, value in sorted(changed))
+    with refused(f"scene '{name}'{given and f' with {given}'}: "):
+        try:
+            return module.build(**settings)
+        except (ArithmeticError, LookupError, TypeError) as error:
+            if not (changed and module.__name__.startswith("ddg_warp.")):
+                raise  # a mistake in the scene, which wants its traceback
+            raise InputError(f"scene '{name}' cannot be built with {given} ({error}); change that") from error
+
+
+def judged(module, result) -> list:
+    """The checks of a scene; a check whose own solves fail fails the run."""
+    from ddg_warp.errors import SolverError
+    from ddg_warp.solve.direct import SingularError
+
+    if not hasattr(module, "check") or result.failure:
+        return []
+    try:
+        return module.check(result)
+    except (SolverError, SingularError) as error:
+        result.failure = f"a check could not be computed: {error}"
+        return []
+
+
+def settings_of(chosen: argparse.Namespace, module, name: str) -> tuple[dict, dict]:
+    """Parameters of the scene, and dt, precision and worlds as far as they are given, here or by the run to resume."""
+    known = parameters(module, {})
+    asked = {key: value for key, value in vars(chosen).items() if value is not None}
+    given = {key: value for key, value in asked.items() if key in known or key in RUN_SETTINGS}
+    duration = {"duration": given.pop("duration")} if "duration" in given else {}
+    if chosen.resume is not None:
+        if chosen.out is not None:
+            raise InputError("a resumed run stays in its directory: give --resume or --out")
+        given = stored_settings(chosen.resume, name, given)
+    if given.get("worlds", 1) < 1:
+        raise InputError(f"--worlds {chosen.worlds}: there must be at least one")
+    run_settings = {key: given.pop(key) for key in RUN_SETTINGS if key in given}
+    shared = {"dt": run_settings["dt"]} if "dt" in known and "dt" in run_settings else {}
+    return parameters(module, given | duration | shared), run_settings
+
+
+def say(result, content: dict, checks: list, directory: Path) -> None:
+    """Print what a run did."""
+    from ddg_warp.run.summary import checks_table
+
+    print(result.model.report(), end="\n\n")
+    steps = f"{content['steps']} steps of {content['ms_per_step']:.3g} ms"
+    print(
+        f"{content['scene']}: {content['sim_time']:g} s in {steps}; "
+        f"{content['wall_time']:.3g} s in all, {content['compile_time']:.3g} s to build and compile"
+    )
+    if "stable" in content:
+        verdicts = {
+            True: "stable",
+            False: "UNSTABLE",
+            None: "not asked whether stable: ddg_warp.solve.stability.spectrum tells",
+        }
+        print(f"last equilibrium: {verdicts[content['stable']]}")
+    if checks:
+        print(checks_table(checks))
+    print(f"results are in {directory}")
+    if result.failure:
+        print(f"ddg-warp: the solver failed: {result.failure}", file=sys.stderr)
+
+
+def draw(directory: Path, module, result, shapes: int = 6) -> None:
+    """Draw the rods and surfaces of the first world at a few times into DIR/picture.png, where matplotlib is installed.
+
+    Statics and paths have the load parameter instead of the time; a path of equilibria goes to DIR/path.png, too, load over
+    displacements. A scene may declare `LENGTH_UNIT`, and `picture(result, frames)`, which returns what `figure.rods_picture` is to
+    draw instead of the frames, points by time: `points_by_time` and other arguments of it.
+    """
+    try:
+        from ddg_warp.run.figure import path_plot, rods_picture
+    except ModuleNotFoundError as error:
+        print(f"no picture without {error.name}: `pip install matplotlib`", file=sys.stderr)
+        return
+    from ddg_warp.io.hdf5 import TrajectoryReader
+
+    title, unit = one_liner(Path(module.__file__)), getattr(module, "LENGTH_UNIT", "m")
+    with TrajectoryReader(directory / "trajectory.h5") as reader:
+        chosen = sorted({round((len(reader) - 1) * k / (shapes - 1)) for k in range(shapes)})
+        count = reader.points.shape[-2]
+        at = reader.series["load"] if result.path is not None else reader.time
+        frames = [(float(at[frame]), reader.points[frame].reshape(-1, 3)[:count]) for frame in chosen]
+        options = {"points_by_time": frames, "unit": unit}
+        if result.dt is None:
+            options["label"] = "load parameter"
+        if (applied := result.scene.applied_field) is not None:
+            last = frames[-1][0]
+            options["field"] = partial(applied.over, t=last, otherwise=last if result.dt is None else 1.0)
+        if hasattr(module, "picture") and not result.failure:
+            options |= module.picture(result, dict(frames))
+        rods_picture(reader, path=directory / "picture.png", title=title, **options)
+    if result.path is not None:
+        path_plot(result.path, directory / "path.png", title, unit)
+
+
+def list_all(chosen: argparse.Namespace) -> int:
+    """`list`: scenes and terms with what they are, in one line each."""
+    from ddg_warp.kernels.terms import ALL
+
+    listed = {
+        "scenes": {name: one_liner(path) for name, path in scene_files().items()},
+        "terms": {name: term.text for name, term in ALL.items()},
+    }
+    for title, entries in listed.items():
+        width = max(map(len, entries), default=0)
+        print(f"{title}:")
+        for name, text in entries.items():
+            print(f"  {name:{width}}  {text}")
+    return DONE
+
+
+def check_terms(chosen: argparse.Namespace) -> int:
+    """`check`: the derivative table of a term, or of all."""
+    from ddg_warp.kernels.terms import ALL
+    from ddg_warp.run.summary import table
+
+    term = chosen.term
+    if term is not None and ".py:" in term:
+        term = own_term(*term.rsplit(":", 1))
+    elif term is not None and term not in ALL:
+        raise InputError(f"there is no term '{term}'; there are {', '.join(ALL)}; or give FILE.py:NAME of your own")
+
+    require_device(chosen.device)
+    from ddg_warp.run import derivatives
+
+    rows = derivatives.table(term, chosen.precision, chosen.device)
+    print(table([{**row, "passed": "passed" if row["passed"] else "FAILED"} for row in rows]))
+    return DONE if all(row["passed"] for row in rows) else FAILED
+
+
+def bench_scene(chosen: argparse.Namespace) -> int:
+    """`bench`: a scene's error against its time."""
+    from ddg_warp.run.bench import benchmark
+    from ddg_warp.run.bench_overview import overview
+    from ddg_warp.run.summary import table
+
+    if chosen.scene is None and not chosen.all:
+        print("\n".join(scene_files()))
+        return DONE
+    if chosen.scene is not None and chosen.all:
+        raise InputError(f"bench --all measures every scene; leave out '{chosen.scene}', or --all")
+    require_device(chosen.device)
+    done = True
+    for name in scene_files() if chosen.all else [chosen.scene]:
+        print(f"== {name}", flush=True)
+        known = () if chosen.all else parameters(load_scene(name), {})
+        given = {key: value for key, value in vars(chosen).items() if key in known}
+        done &= benchmark(name, chosen.out, device=chosen.device, precision=chosen.precision, given=given)
+    if chosen.all:
+        print(table(overview(chosen.out)))
+    return DONE if done else FAILED
+
+
+def export_run(chosen: argparse.Namespace) -> int:
+    """`export`: trajectory.h5 as USD."""
+    from ddg_warp.run.record import export_usd
+
+    source = chosen.directory / "trajectory.h5"
+    if not source.is_file():
+        raise InputError(f"there is no run in {chosen.directory}: {source} is missing")
+    target = chosen.to or chosen.directory / "export.usdc"
+    if target.suffix not in (".usda", ".usdc"):
+        raise InputError(f"--to {target}: the file must end in .usdc or .usda")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if chosen.revolve and chosen.revolve < 3:
+        raise InputError(f"--revolve {chosen.revolve}: a surface of revolution has 3 sides at least")
+    with refused():
+        export_usd(source, target, tube=chosen.tube, revolve=chosen.revolve)
+    print(f"wrote {target}")
+    return DONE
+
+
+def show_info(chosen: argparse.Namespace) -> int:
+    """`info`: versions, devices, machine."""
+    from ddg_warp.run.summary import machine
+
+    require_device(None)
+    for name, value in machine().items():
+        items = [f"{key} {item}" for key, item in value.items()] if isinstance(value, dict) else value
+        print(f"{name + ':':11} {', '.join(items) if isinstance(items, list) else items}")
+    return DONE
+
+
+def require_device(name: str | None) -> None:
+    """Start Warp without its chatter; refuse a device that it does not have."""
+    import warp as wp
+
+    import ddg_warp.kernels  # noqa: F401, quietens Warp
+
+    if name is None:
+        return
+    known = [device.alias for device in wp.get_devices()]
+    if name not in known and name != "cuda":
+        raise InputError(f"there is no device '{name}' here; there is {', '.join(known)}")

@@ -1,0 +1,332 @@
+"""Run a scene's analysis and record it. The loop is short on purpose: copy it where you need another one."""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from numbers import Real
+from pathlib import Path
+from typing import Any
+
+from ddg_warp.errors import SolverError
+from ddg_warp.run.catalog import InputError
+from ddg_warp.run.progress import progress_bar
+from ddg_warp.scene.descriptions import Dynamics, Statics
+from ddg_warp.scene.scene import Scene
+
+
+@dataclass(repr=False)
+class Result:
+    """What a run leaves behind; `check(result)` of a scene judges it.
+
+    Attributes:
+        scene: The scene that was run.
+        model: Its model.
+        state: The last good state.
+        times: Time of each recorded state [s], the initial one first; in statics, the load
+            parameter; along a path, the arc length.
+        series: Observed values by name, one a recorded state.
+        statistics: `integrator.statistics()`, and the like of a static run.
+        energies: Energies by term [J] at "start" and "end".
+        dt: Time step [s]; None in statics.
+        step_times: Time that each step of this run took [s], by the clock of the run; the first includes compilation.
+        wall_time: Time from the scene to the end [s].
+        compile_time: Time from the scene to the end of the first step, less a steady step [s].
+        failure: Why the run ended early; empty where it did not.
+        path: The path of equilibria that was followed, if that was the analysis (`ddg_warp.scene.path.Path`).
+    """
+
+    scene: Scene
+    model: Any
+    state: Any
+    times: list[float] = field(default_factory=list)
+    series: dict[str, list[float]] = field(default_factory=dict)
+    statistics: dict = field(default_factory=dict)
+    energies: dict[str, dict[str, float]] = field(default_factory=dict)
+    dt: float | None = None
+    step_times: list[float] = field(default_factory=list)
+    wall_time: float = 0.0
+    compile_time: float = 0.0
+    failure: str = ""
+    path: Any = None
+
+    def __repr__(self) -> str:
+        reached = f"{self.times[0]:g} to {self.times[-1]:g}" if self.times else "none"
+        names = ", ".join(self.series) or "nothing"
+        ended = f"; failed: {self.failure}" if self.failure else ""
+        return f"<Result: {len(self.times)} states, times {reached}, observed {names}, {self.wall_time:.3g} s of wall time{ended}>"
+
+    @property
+    def seconds_per_step(self) -> float:
+        """Mean time of a step [s]; without the first two, which compile and capture, unless there are no others."""
+        steady = self.step_times[2:] or self.step_times
+        return sum(steady) / len(steady) if steady else 0.0
+
+    def at(self, t: float, name: str) -> float:
+        """Observed value `name` of the recorded state at time t [s], to a thousandth of a step.
+
+        Raises:
+            KeyError: No state was recorded at that time.
+        """
+        index = self._index(t)
+        if index is None:
+            raise KeyError(f"no state was recorded at {t} s")
+        return self.series[name][index]
+
+    def reached(self, t: float) -> bool:
+        """Whether a state was recorded at time t [s]."""
+        return self._index(t) is not None
+
+    def _index(self, t: float) -> int | None:
+        if not self.times:
+            return None
+        nearest = min(range(len(self.times)), key=lambda i: abs(self.times[i] - t))
+        return nearest if abs(self.times[nearest] - t) <= 1e-3 * (self.dt or 1e-6) else None
+
+
+def simulate(
+    scene: Scene,
+    *,
+    device: str | None = None,
+    precision: str | None = None,
+    worlds: int = 1,
+    out: str | Path | None = None,
+    dt: float | None = None,
+    duration: float | None = None,
+    resume: str | Path | None = None,
+    force: bool = False,
+    fields: Sequence[str] = (),
+    observe: Callable[[Any, Any], Mapping[str, float]] | None = None,
+    provenance: Mapping | None = None,
+    options: Mapping | None = None,
+    clock: Callable[[], float] | None = None,
+    progress: bool = True,
+) -> Result:
+    """Run the analysis of a scene.
+
+    Args:
+        scene: What to run.
+        device: Warp device; by default CUDA if there is one.
+        precision: "float64", "mixed" or "float32"; by default what suits the device.
+        worlds: Independent copies.
+        out: Directory for trajectory.h5 and scene.usdc; None records nothing.
+        dt: Time step [s] instead of the scene's.
+        duration: End of the run [s] instead of the scene's, or instead of that of the run to resume.
+        resume: Directory of an earlier run, which this one continues.
+        force: Whether to replace a run that `out` holds already.
+        fields: What to record beside positions: "velocities", "directors" and the names of `ddg_warp.ask.fields`.
+        observe: (model, state) -> values by name, taken at the start and after every step.
+        provenance: Attributes of the trajectory: scene, parameters, command.
+        options: Keyword arguments of the `Integrator`, or of `StaticsOptions`: rtol and others.
+        clock: Clock of `step_times` [s]; by default wall time, of finished work on CUDA.
+        progress: Whether to say how far the run is: a bar on a terminal, a line every ten seconds elsewhere.
+
+    Returns:
+        The result; `failure` says why where the run ended early.
+
+    Raises:
+        SceneError: The scene cannot be built.
+        InputError: The duration is no whole number of steps, or a static scene is to move.
+    """
+    began = time.perf_counter()
+    if not isinstance(scene, Scene):
+        raise InputError(f"the scene is {type(scene).__name__}; `build` returns a Scene")
+    analysis = scene.analysis
+    dynamic = isinstance(analysis, Dynamics)
+    if not dynamic and (dt, duration, resume) != (None, None, None):
+        raise InputError("this scene is static: it takes no dt, no duration and nothing to resume")
+    if dynamic:
+        dt = analysis.dt if dt is None else dt
+        duration = recorded_duration(resume, analysis.duration) if duration is None else duration
+        run, steps = advance, step_count(dt, duration)
+    elif isinstance(analysis, Statics):
+        run, steps = equilibrate, analysis.load_steps
+    else:
+        run, steps = follow, analysis.stop.steps
+
+    model = scene.build(device=device, precision=precision, worlds=worlds)
+    try:
+        result = Result(scene, model, scene.initial(model) if scene.initial else model.state(), dt=dt)
+    except SolverError as error:
+        return Result(scene, model, model.state(), dt=dt, failure=f"the first state could not be found: {error}")
+    if resume is not None:
+        continue_from(result, Path(resume))
+    result.energies["start"] = energies(model, result.state)
+    options = dict(options or {})
+    with ExitStack() as stack:
+        recorder = None
+        if out is not None or resume is not None:
+            attributes = {**(provenance or {}), "dt": dt or 0.0, "precision": model.precision, "worlds": worlds}
+            attributes |= {"duration": duration} if dynamic else {}
+            recorder = stack.enter_context(open_recorder(model, out, resume, dt, attributes, force, fields))
+        if recorder is not None and dynamic:
+            options.setdefault("check_every", 1)  # recording waits for every step as it is
+        done = max(0, len(result.times) - 1)
+        bar = stack.enter_context(progress_bar(steps, done, progress))
+
+        def keep(state, **observed) -> None:
+            if len(result.step_times) == 1:
+                result.compile_time = time.perf_counter() - began
+                bar.set_description(refresh=False)
+            result.state = state
+            result.times.append(float(state.time))
+            observed |= {} if observe is None else observe(model, state)
+            for name, value in observed.items():
+                result.series.setdefault(name, []).append(value)
+            if recorder is not None:
+                recorder.record(state, observed=observed)
+
+        try:
+            if resume is None and run is not follow:
+                keep(result.state)
+            run(result, steps, keep, options=options, clock=clock or wall_clock(model.device), bar=bar)
+        except SolverError as error:
+            result.failure = str(error)
+            result.state = error.state if error.state is not None else result.state
+    result.compile_time = max(0.0, result.compile_time - result.seconds_per_step)
+    result.energies["end"] = energies(model, result.state)
+    result.wall_time = time.perf_counter() - began
+    return result
+
+
+def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clock, bar) -> None:
+    """Step to the end and `keep` each state. The scene's callbacks run inside of `integrator.step`."""
+    from ddg_warp.solve.dynamics import Integrator
+
+    integrator = Integrator(result.model, scheme=result.scene.analysis.scheme, **options)
+    state = result.state
+    try:
+        for _ in range(round(float(state.time) / result.dt), steps):
+            started = clock()
+            state = integrator.step(state, result.dt)
+            result.step_times.append(clock() - started)
+            keep(state)
+            bar.update()
+        integrator.check(state)
+    finally:
+        result.statistics = integrator.statistics()
+
+
+def equilibrate(result: Result, steps: int, keep: Callable, *, options: Mapping, clock, bar) -> None:
+    """Load step by step and `keep` each equilibrium."""
+    from ddg_warp.solve.statics import Equilibrium, StaticsOptions
+
+    equilibrium = Equilibrium(result.model, StaticsOptions(**options))
+    state, iterations, outcomes = result.state, [], Counter()
+    try:
+        for step in range(steps):
+            started, before = clock(), equilibrium.iterations
+            state = equilibrium.load(state, 1, step / steps, (step + 1) / steps)
+            result.step_times.append(clock() - started)
+            iterations.append(equilibrium.iterations - before)
+            outcomes[equilibrium.outcome] += 1
+            keep(state)
+            bar.update()
+    except SolverError as error:
+        outcomes[error.outcome] += 1
+        raise
+    finally:
+        mean = sum(iterations) / max(1, len(iterations))
+        newton = {"mean": mean, "max": max(iterations, default=0)}
+        counts = {"newton_iterations": newton, "pcg_iterations": equilibrium.pcg_iterations}
+        result.statistics = {**counts, "outcomes": dict(outcomes)}
+
+
+def follow(result: Result, steps: int, keep: Callable, *, options: Mapping, clock, bar) -> None:
+    """Follow the path of equilibria and `keep` each point, with its load parameter and what is watched."""
+    from ddg_warp.solve.continuation import Continuation
+
+    analysis, started = result.scene.analysis, clock()
+    settings = {name: getattr(analysis, name) for name in ("step", "max_step", "load_scale")}
+    try:
+        continuation = Continuation(result.model, analysis.watch, **{**settings, **options})
+        result.path = continuation.trace(result.state, stop=analysis.stop)
+    except SolverError as error:
+        result.path = getattr(error, "path", None)
+        raise
+    finally:
+        points = result.path.points if result.path is not None else []
+        for point in points:
+            state = point.state.copy()
+            state.time = point.arclength
+            state.stable = point.stable
+            keep(state, load=point.load, **point.values)
+            bar.update()
+        result.step_times = [(clock() - started) / max(1, len(points))] * len(points)
+        iterations = [point.iterations for point in points]
+        newton = {"mean": sum(iterations) / max(1, len(iterations)), "max": max(iterations, default=0)}
+        outcomes = dict(Counter(point.kind for point in points))
+        result.statistics = {"newton_iterations": newton, "pcg_iterations": 0, "outcomes": outcomes}
+
+
+def step_count(dt: float, duration: float) -> int:
+    """Steps of dt [s] in `duration` [s].
+
+    Raises:
+        InputError: One of them is not positive, or they do not fit.
+    """
+    for value in (dt, duration):
+        number = isinstance(value, Real) and not isinstance(value, bool)
+        if not (number and 0.0 < value < float("inf")):
+            raise InputError(f"dt = {dt} s and duration = {duration} s must be positive and finite numbers")
+    steps = round(duration / dt)
+    if steps < 1 or abs(steps * dt - duration) > 1e-6 * dt:
+        raise InputError(f"a duration of {duration} s is no whole number of steps of {dt} s; change one of them")
+    return steps
+
+
+def recorded_duration(resume: str | Path | None, scene: float) -> float:
+    """End of the run to resume [s]; that of the scene where there is none to resume, or it does not say."""
+    from ddg_warp.io.hdf5 import TrajectoryReader
+
+    if resume is None:
+        return scene
+    with TrajectoryReader(Path(resume) / "trajectory.h5") as reader:
+        return reader.provenance.get("duration", scene)
+
+
+def continue_from(result: Result, directory: Path) -> None:
+    """Put the checkpoint of the run in `directory`, and what was observed up to it, into a new result."""
+    from ddg_warp.io.hdf5 import TrajectoryReader
+
+    with TrajectoryReader(directory / "trajectory.h5") as reader:
+        frames = reader.checkpoint_frame
+        result.state = result.model.restore(reader.checkpoint())
+        result.times = reader.time[:frames].tolist()
+        result.series = {name: values[:frames].tolist() for name, values in reader.series.items()}
+
+
+def open_recorder(model, out, resume, dt, provenance, force, fields):
+    """The recorder of a run in `out`, or of the run that it resumes."""
+    from ddg_warp.run.record import Recorder
+
+    fps = round(1.0 / dt, 6) if dt else None  # one time code a step
+    directory, again = Path(resume or out), resume is not None
+    if again:  # where it comes from stays what it was
+        provenance = {name: provenance[name] for name in provenance.keys() & {"duration"}}
+    vectors = {name: name in fields for name in ("velocities", "directors")}
+    fields = [name for name in fields if name not in vectors]
+    return Recorder(
+        model, directory, fps=fps, resume=again, force=force, fields=fields, provenance=provenance, **vectors
+    )
+
+
+def wall_clock(device: str) -> Callable[[], float]:
+    """Wall time [s], read once the device has finished what it was given."""
+    import warp as wp
+
+    if not wp.get_device(device).is_cuda:
+        return time.perf_counter
+
+    def finished() -> float:
+        wp.synchronize_device(device)
+        return time.perf_counter()
+
+    return finished
+
+
+def energies(model, state) -> dict[str, float]:
+    """Energies by term and their total [J]; lists of one a world where there are several."""
+    terms = model.energies(state)
+    return {**terms, "total": sum(terms.values())}

@@ -1,0 +1,1 @@
+"""What a user describes: rods, shells, joints, supports, loads, materials, motions."""

@@ -1,0 +1,318 @@
+"""What a scene is told, entry by entry: analyses, rods and shells, and what holds, loads and joins them."""
+
+from collections.abc import Callable, Mapping
+from copy import deepcopy
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ddg_warp import arguments
+from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.geometry.surface import Surface
+from ddg_warp.scene.material import Material, Stiffness
+from ddg_warp.scene.motion import Motion
+from ddg_warp.scene.path import Displacement, Stop
+
+RUN = 2**16  # nodes
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """Advance in time: step dt [s] to duration [s] by `scheme` (`implicit_euler` or `implicit_midpoint`)."""
+
+    dt: float = 0.01
+    duration: float = 1.0
+    scheme: str = "implicit_euler"
+
+    def __post_init__(self):
+        arguments.positive("Dynamics: dt", self.dt, "s")
+        arguments.positive("Dynamics: duration", self.duration, "s")
+        arguments.choice("Dynamics: scheme", self.scheme, ("implicit_euler", "implicit_midpoint"))
+
+
+@dataclass(frozen=True)
+class Statics:
+    """Find the equilibrium: loads and motions grow with the load parameter from 0 to 1 in `load_steps` increments."""
+
+    load_steps: int = 1
+
+    def __post_init__(self):
+        arguments.count("Statics: load_steps", self.load_steps)
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Follow the path of equilibria from load parameter 0 by arc length, through limit points.
+
+    Attributes:
+        watch: displacements to record by name (`Displacement`).
+        stop: where to end.
+        step, max_step, load_scale: see `ddg_warp.solve.continuation.ContinuationOptions`.
+    """
+
+    watch: dict[str, Displacement] = field(default_factory=dict)
+    stop: Stop = field(default_factory=Stop)
+    step: float = 0.02
+    max_step: float = 0.1
+    load_scale: float = 1.0
+
+    def __post_init__(self):
+        for name in ("step", "max_step", "load_scale"):
+            arguments.positive(f"Trace: {name}", getattr(self, name))
+        if not isinstance(self.stop, Stop):
+            raise SceneError(f"Trace: stop is {self.stop!r}; give Stop(...)")
+        if not isinstance(self.watch, dict) or not all(isinstance(w, Displacement) for w in self.watch.values()):
+            raise SceneError(
+                f"Trace: watch is {self.watch!r}; give displacements by name, {{'tip': Displacement.of(row, axis)}}"
+            )
+
+
+@dataclass(frozen=True, init=False)
+class Law:
+    """A constitutive law for a term of rods, instead of the quadratic one.
+
+    Attributes:
+        density: a `ddg_warp.kernels.densities.Density`, of the package or one's own.
+        values: of its parameters by family: a number, or an array that broadcasts to (rods, edges), or a list with one for each
+            strain; at vertices it is the mean of both edges. What is not given comes from the rod: stiffnesses of its section,
+            strains at rest, viscosity.
+    """
+
+    density: object
+    values: dict
+
+    def __init__(self, density, **values):
+        object.__setattr__(self, "density", density)
+        object.__setattr__(self, "values", deepcopy(values))
+
+
+def laws_of(what: str, section, material, laws) -> dict[str, Law]:
+    """Laws by term: those that a section brings, and those given.
+
+    Raises:
+        SceneError: something else is given.
+    """
+    brought = section.laws(material) if hasattr(section, "laws") else {}
+    if laws is not None and not isinstance(laws, Mapping):
+        raise SceneError(f"{what}: laws = {laws!r}; give a dictionary from terms to Law(density, ...)")
+    for term, law in (laws or {}).items():
+        if not isinstance(law, Law) or not hasattr(law.density, "parameters"):
+            raise SceneError(f"{what}: the law of {term!r} is {law!r}; give Law(density, ...)")
+    return {**brought, **(laws or {})}
+
+
+@dataclass
+class RodBatch:
+    """Rods of one `add_rods` call: same node count and closedness; section, shape and rest shape may differ."""
+
+    points: np.ndarray  # (R, n, 3) [m]
+    section: Stiffness
+    closed: bool
+    natural: object
+    director: np.ndarray | None  # (3,), (R, 3) or (R, edges, 3)
+    twist: bool
+    bend: bool
+    name: str
+    first: int  # index of its first rod
+    laws: Mapping[str, Law] = field(default_factory=dict)  # by term
+    curvature: str = "tangent"  # or "angle"
+
+    @property
+    def by_angle(self) -> bool:
+        """Whether curvature is the turning angle over the length."""
+        return self.curvature == "angle"
+
+    @property
+    def rods(self) -> int:
+        return self.points.shape[0]
+
+    @property
+    def nodes(self) -> int:
+        return self.points.shape[1]
+
+    @property
+    def edges(self) -> int:
+        return self.nodes if self.closed else self.nodes - 1
+
+    def runs(self, rows: np.ndarray) -> list[np.ndarray]:
+        """Rows of its rods in runs so short that what is computed of them stays in the processor's cache."""
+        return np.array_split(rows, -(-len(rows) * self.nodes // RUN))
+
+
+@dataclass(frozen=True)
+class Support:
+    """Dofs held on some rods: nodes (with components), edge angles, or an end frame (`end` is "first" or "last").
+
+    `tangent` and `director` (rods, 3) are those of the end at rest, extrapolated from the rod where they are None.
+    """
+
+    rods: np.ndarray
+    nodes: tuple[int, ...] = ()
+    components: str = "xyz"
+    edges: tuple[int, ...] = ()
+    end: str = ""
+    motion: Motion | None = None
+    tangent: np.ndarray | None = None
+    director: np.ndarray | None = None
+    call: str = "fix"  # what users know it by
+
+
+@dataclass(frozen=True)
+class Load:
+    """A dead force on a node [N], or on an edge a twisting moment or a couple [N m]; times amplitude(t) if given."""
+
+    rods: np.ndarray
+    node: int = 0
+    force: tuple = (0.0, 0.0, 0.0)
+    edge: int | None = None
+    moment: float = 0.0
+    couple: tuple = (0.0, 0.0, 0.0)
+    amplitude: Callable[[float], float] | None = None
+
+
+@dataclass
+class Shell:
+    """A triangle mesh with thickness and material; see `Scene.add_shell`."""
+
+    surface: Surface
+    thickness: np.ndarray
+    material: Material
+    bending: str
+    membrane: str
+    rest: object
+    name: str
+
+    @property
+    def points(self) -> np.ndarray:
+        """Vertices at rest (P, 3) [m]."""
+        return self.surface.points
+
+    @property
+    def triangles(self) -> np.ndarray:
+        """Corners (T, 3)."""
+        return self.surface.triangles
+
+
+@dataclass(frozen=True)
+class ShellSupport:
+    """What is held of a shell: components of vertices, and what the surface does at the mesh edges between them.
+
+    `edges` is "" (free to turn), "clamp" (the normal is held) or "symmetry" (mirrored across the plane with normal `normal`).
+    """
+
+    shell: int
+    vertices: np.ndarray
+    components: str
+    edges: str = ""
+    normal: tuple = (0.0, 0.0, 0.0)
+    motion: Motion | None = None
+    call: str = "hold"  # what users know it by
+
+
+@dataclass(frozen=True)
+class ShellLoad:
+    """Dead forces (V, 3) [N] on vertices of a shell, times amplitude(t) if given."""
+
+    shell: int
+    vertices: np.ndarray
+    force: np.ndarray
+    amplitude: Callable[[float], float] | None = None
+
+
+@dataclass(frozen=True)
+class EdgeCouple:
+    """A couple per length (E,) [N] about boundary edges (E,) of a shell, times amplitude(t) if given."""
+
+    shell: int
+    edges: np.ndarray
+    couple: np.ndarray
+    amplitude: Callable[[float], float] | None = None
+
+
+@dataclass(frozen=True)
+class Pressure:
+    """Pressure [Pa] along the normals of triangles, which follow the surface unless `dead`; times amplitude(t) if given."""
+
+    shell: int
+    triangles: np.ndarray
+    pressure: np.ndarray
+    dead: bool = False
+    amplitude: Callable[[float], float] | None = None
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Rods joined at nodes, (rod, node) each: hinged (positions alone) or rigid (their frames turn together)."""
+
+    members: tuple[tuple[int, int], ...]
+    rigid: bool
+
+
+@dataclass(frozen=True)
+class Magnet:
+    """Magnetisation (E, 3) [A/m] of edges (E,) of each of some rods, along their first and second director and tangent."""
+
+    rods: np.ndarray
+    edges: np.ndarray
+    magnetisation: np.ndarray
+
+
+@dataclass(frozen=True)
+class MagneticField:
+    """B(x, t) = value + gradient (x - origin) [T]: constants, or functions of the time."""
+
+    value: object
+    gradient: object
+    origin: np.ndarray
+    planar: bool  # whether it stays in the plane of x and z
+
+    def at(self, t: float, otherwise: float, error=SolverError) -> np.ndarray:
+        """B at the origin of space, then the rows of the gradient (12,), at t; constants times `otherwise`.
+
+        Raises:
+            SolverError: a function is not finite, or gives no field; names the function and the time.
+        """
+        value, gradient = (
+            arguments.value_at(f"the magnetic {what}", given, t, 3, error) if callable(given) else otherwise * given
+            for what, given in (("field", self.value), ("field's gradient", self.gradient))
+        )
+        self._check(value, gradient, t, error)
+        return np.concatenate([value - gradient @ self.origin, gradient.ravel()])
+
+    def over(self, points: np.ndarray, t: float, otherwise: float) -> np.ndarray:
+        """B at points (n, 3) [T]; see `at`."""
+        field, gradient = np.split(self.at(t, otherwise), [3])
+        return field + points @ gradient.reshape(3, 3).T
+
+    def _check(self, value: np.ndarray, gradient: np.ndarray, t: float, error) -> None:
+        wrong = ""
+        if value.shape != (3,) or gradient.shape != (3, 3):
+            wrong = f"have the shapes {value.shape} and {gradient.shape}; give (3,) and (3, 3)"
+        elif self.planar and np.any(np.append(gradient[[0, 2, 1, 1], [1, 1, 0, 2]], value[1]) != 0.0):
+            wrong = "leave the plane of x and z, in which a scene of dimension 2 stays; give 0 along y"
+        elif abs(np.trace(gradient)) > 1e-9 * np.abs(gradient).max():
+            wrong = f"have a divergence of {np.trace(gradient):g} T/m, and no field has one; the trace of the gradient is zero"
+        elif np.abs(gradient - gradient.T).max() > 1e-9 * np.abs(gradient).max():
+            wrong = "have a curl, which no field has away from its currents; the gradient is symmetric"
+        if wrong:
+            text = f"magnetic_field: value and gradient at t = {t:g} {wrong}"
+            raise error(text, outcome=arguments.PRESCRIBED) if error is SolverError else error(text)
+
+
+@dataclass(frozen=True)
+class Dipoles:
+    """All pairs of edges of some magnetised rods (None: all), no farther apart than `cutoff` [m] at rest, as point dipoles."""
+
+    rods: np.ndarray | None
+    cutoff: float
+
+
+@dataclass(frozen=True)
+class Attachment:
+    """Nodes of a rod that are vertices of a shell; whether edges between them that lie on mesh edges turn with the shell."""
+
+    rod: int
+    nodes: np.ndarray
+    shell: int
+    vertices: np.ndarray
+    glued: bool

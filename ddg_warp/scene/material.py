@@ -1,0 +1,186 @@
+"""Materials and cross-sections of rods: what turns Young's modulus and a radius into EA, EI1, EI2, GJ and inertia."""
+
+from dataclasses import dataclass
+from math import pi
+
+import numpy as np
+
+from ddg_warp import arguments
+from ddg_warp.errors import SceneError
+
+
+@dataclass(frozen=True)
+class Material:
+    """Isotropic linear elastic material.
+
+    Attributes:
+        young: Young's modulus E [Pa].
+        poisson: Poisson's ratio nu, -1 < nu <= 0.5; the shear modulus is E / 2(1 + nu).
+        density: mass density rho [kg/m^3].
+        viscosity: strain-rate damping eta / E [s]: every stiffness k brings a viscosity k * this.
+    """
+
+    young: float
+    poisson: float = 0.5
+    density: float = 1000.0
+    viscosity: float = 0.0
+
+    def __post_init__(self):
+        _require("Material: young", self.young, "it is positive [Pa]", lambda v: v > 0.0)
+        _require("Material: poisson", self.poisson, "it is above -1 and at most 0.5", lambda v: (v > -1.0) & (v <= 0.5))
+        _require("Material: density", self.density, "it is not negative [kg/m^3]", lambda v: v >= 0.0)
+        _require("Material: viscosity", self.viscosity, "it is not negative [s]", lambda v: v >= 0.0)
+
+    @property
+    def shear(self) -> float:
+        """Shear modulus G [Pa]."""
+        return self.young / (2.0 * (1.0 + self.poisson))
+
+
+@dataclass(frozen=True)
+class Stiffness:
+    """Stiffness and inertia of a section, given outright.
+
+    Attributes:
+        EA: stretching stiffness [N].
+        EI1, EI2: bending stiffness [N m^2] in the plane of the tangent and the first (second) director.
+        GJ: twisting stiffness [N m^2].
+        mass_per_length: rho A [kg/m].
+        rotary_inertia: rho (I1 + I2) [kg m], inertia about the tangent per length.
+        radius: of the drawn tube [m].
+        viscosity: strain-rate damping [s], as in `Material`.
+        area: of the section [m^2], which a magnetisation needs; 0 where it is not known.
+    """
+
+    EA: float
+    EI1: float = 0.0
+    EI2: float | None = None
+    GJ: float = 0.0
+    mass_per_length: float = 0.0
+    rotary_inertia: float = 0.0
+    radius: float = 1e-3
+    viscosity: float = 0.0
+    area: float = 0.0
+
+    def stiffness(self, material: Material | None) -> "Stiffness":
+        """This section itself; a material, if given, is ignored."""
+        return self if self.EI2 is not None else Stiffness(**{**self.__dict__, "EI2": self.EI1})
+
+
+def _require(what: str, value, rule: str, holds) -> None:
+    """Refuse what is no finite number, or numbers, that fulfil a rule."""
+    try:
+        numbers = np.asarray(value, float)
+    except (TypeError, ValueError):
+        numbers = np.array(np.nan)
+    if not (np.isfinite(numbers).all() and np.all(holds(numbers))):
+        raise SceneError(f"{what} = {value!r}; {rule}")
+
+
+def _require_sizes(section, *names: str) -> None:
+    for what in names or section.__dict__:
+        value = section.__dict__[what]
+        _require(f"{type(section).__name__}: {what}", value, "it is positive [m]", lambda v: v > 0.0)
+
+
+def _elastic(material: Material, area, i1, i2, torsion) -> Stiffness:
+    return Stiffness(
+        EA=material.young * area,
+        EI1=material.young * i1,
+        EI2=material.young * i2,
+        GJ=material.shear * torsion,
+        mass_per_length=material.density * area,
+        rotary_inertia=material.density * (i1 + i2),
+        radius=np.sqrt(area / pi),
+        viscosity=material.viscosity,
+        area=area,
+    )
+
+
+@dataclass(frozen=True)
+class Circle:
+    """Solid circular section of `radius` [m]; a number, or an array that broadcasts to (rods, edges)."""
+
+    radius: float
+
+    def __post_init__(self):
+        _require_sizes(self)
+
+    def stiffness(self, material: Material) -> Stiffness:
+        """A = pi r^2, I = pi r^4 / 4, J = 2 I."""
+        i = pi * np.asarray(self.radius) ** 4 / 4.0
+        return _elastic(material, pi * np.asarray(self.radius) ** 2, i, i, 2.0 * i)
+
+
+@dataclass(frozen=True)
+class Ellipse:
+    """Solid elliptic section with semi-axes a, b [m] along the first and second director."""
+
+    a: float
+    b: float
+
+    def __post_init__(self):
+        _require_sizes(self)
+
+    def stiffness(self, material: Material) -> Stiffness:
+        """I1 = pi a^3 b / 4, I2 = pi a b^3 / 4, J = pi a^3 b^3 / (a^2 + b^2) (Saint-Venant, exact)."""
+        a, b = np.asarray(self.a), np.asarray(self.b)
+        torsion = pi * a**3 * b**3 / (a * a + b * b)
+        return _elastic(material, pi * a * b, pi * a**3 * b / 4.0, pi * a * b**3 / 4.0, torsion)
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """Solid rectangular section, `width` along the first and `height` along the second director [m]."""
+
+    width: float
+    height: float
+
+    def __post_init__(self):
+        _require_sizes(self)
+
+    def stiffness(self, material: Material) -> Stiffness:
+        """I1 = h w^3 / 12, I2 = w h^3 / 12, J by Saint-Venant's series (Timoshenko and Goodier, section 109)."""
+        w, h = np.asarray(self.width, float), np.asarray(self.height, float)
+        long, short = np.maximum(w, h), np.minimum(w, h)
+        odd = np.arange(1, 40, 2)
+        series = (np.tanh(odd * pi * (long / short)[..., None] / 2.0) / odd**5).sum(-1)
+        torsion = long * short**3 / 3.0 * (1.0 - 192.0 / pi**5 * short / long * series)
+        return _elastic(material, w * h, h * w**3 / 12.0, w * h**3 / 12.0, torsion)
+
+
+@dataclass(frozen=True)
+class Ribbon:
+    """Thin flat section whose cross-section bends along with bending and twist, as that of a strip of plate does.
+
+    Between a rod (narrow) and an inextensible strip (wide), which bend softly by curvature 2. See `kernels.densities.ribbon`.
+
+    Attributes:
+        width: W along the first director [m]; a number, or an array that broadcasts to (rods, edges).
+        thickness: h along the second director [m], less than the width.
+        law: "audoly_neukirch" (exact in uniform bending and twist), "sano_wada" (a simpler form of it), or "sadowsky"
+            (inextensible).
+    """
+
+    width: float
+    thickness: float
+    law: str = "audoly_neukirch"
+
+    def __post_init__(self):
+        _require_sizes(self, "width", "thickness")
+        if not np.all(np.asarray(self.thickness) < self.width):
+            raise SceneError(f"Ribbon: thickness = {self.thickness!r}; it is less than the width, {self.width!r}")
+        arguments.choice("Ribbon: law", self.law, ("audoly_neukirch", "sano_wada", "sadowsky"))
+
+    def stiffness(self, material: Material) -> Stiffness:
+        """I1 = h W^3 / 12, I2 = W h^3 / 12 and J = W h^3 / 3, that of a strip of plate."""
+        w, h = np.asarray(self.width, float), np.asarray(self.thickness, float)
+        return _elastic(material, w * h, h * w**3 / 12.0, w * h**3 / 12.0, w * h**3 / 3.0)
+
+    def laws(self, material: Material) -> dict:
+        """The law of bending and twist, with the curvature sqrt(60 / (1 - nu^2)) h / W^2 at which its regime changes."""
+        from ddg_warp.kernels.densities.ribbon import LAWS
+        from ddg_warp.scene.descriptions import Law
+
+        crossover = np.sqrt(60.0 / (1.0 - material.poisson**2)) * np.asarray(self.thickness) / np.square(self.width)
+        return {"rod_bend_twist": Law(LAWS[self.law], poisson=material.poisson, crossover=crossover)}

@@ -1,0 +1,433 @@
+"""What joins a scene's rods and adds surfaces to them: shells, joints, attachments, and what holds and loads shells."""
+
+import warnings
+from collections.abc import Callable, Iterable
+from copy import deepcopy
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ddg_warp import arguments
+from ddg_warp.errors import SceneError, SceneWarning
+from ddg_warp.geometry.shell_forms import MEMBRANES, MODELS, TURNING
+from ddg_warp.geometry.surface import Surface
+from ddg_warp.scene import validate
+from ddg_warp.scene.descriptions import (
+    Attachment,
+    Dipoles,
+    EdgeCouple,
+    Joint,
+    Magnet,
+    MagneticField,
+    Pressure,
+    Shell,
+    ShellLoad,
+    ShellSupport,
+)
+from ddg_warp.scene.material import Material
+from ddg_warp.scene.meridians import Meridians
+from ddg_warp.scene.motion import Motion
+
+COINCIDE = 1e-6  # how far points that are meant to be one, or in one plane, may be apart, over the largest coordinate
+
+
+@dataclass(kw_only=True, repr=False, eq=False)
+class Structures(Meridians):
+    """The part of a scene that is a net: whatever is not a rod of its own."""
+
+    shells: list[Shell] = field(default_factory=list, init=False)
+    shell_supports: list[ShellSupport] = field(default_factory=list, init=False)
+    shell_loads: list[ShellLoad] = field(default_factory=list, init=False)
+    pressures: list[Pressure] = field(default_factory=list, init=False)
+    edge_couples: list[EdgeCouple] = field(default_factory=list, init=False)
+    joints: list[Joint] = field(default_factory=list, init=False)
+    attachments: list[Attachment] = field(default_factory=list, init=False)
+    magnets: list[Magnet] = field(default_factory=list, init=False)
+    dipoles: list[Dipoles] = field(default_factory=list, init=False)
+    applied_field: MagneticField | None = field(default=None, init=False)
+
+    def add_shell(
+        self,
+        points,
+        triangles,
+        *,
+        thickness,
+        material: Material,
+        bending: str = "midedge_dof",
+        membrane: str = "flat",
+        rest="shape",
+        name: str = "shell",
+    ) -> int:
+        """Add a triangle mesh as a thin shell.
+
+        Args:
+            points: vertices at rest (P, 3) [m].
+            triangles: corners (T, 3), neighbours oriented alike; normals follow the right hand.
+            thickness: one number or one a triangle [m].
+            material: `Material`; its density gives the mass, its viscosity the strain-rate damping.
+            bending: "midedge_dof", "midedge_boundary", "midedge", "hinge" or "isometric"; see `ddg_warp.compile.shells`.
+            membrane: "flat" (constant strain triangles) or "curved" (their sides have the length of the arcs over them, by the
+                normals of bending "midedge_dof"): thin shells that bend far do not lock. For statics, where an iteration costs
+                about twice the time; dynamics refuses it.
+            rest: "shape" takes metric and curvature at rest from the points, "flat" the metric alone; or two arrays
+                (abar (T, 3) [m^2], bbar (T, 3) [m]), first and second fundamental form in the basis of the first two edges.
+            name: shown in reports and output.
+
+        Returns:
+            Index of the shell.
+
+        Raises:
+            SceneError: what is given is no surface; the message names shell and triangle.
+        """
+        surface = Surface(points, triangles, name)
+        if not isinstance(material, Material):
+            raise SceneError(f"shell '{name}': material is {material!r}; give material=Material(...)")
+        if np.any(np.abs(material.poisson) >= 1.0):
+            raise SceneError(f"shell '{name}': Poisson's ratio {material.poisson}; that of a shell is between -1 and 1")
+        arguments.choice(f"shell '{name}': bending", bending, MODELS)
+        arguments.choice(f"shell '{name}': membrane", membrane, MEMBRANES)
+        if isinstance(rest, str):
+            arguments.choice(f"shell '{name}': rest", rest, ("shape", "flat"))
+        else:
+            rest = _forms(f"shell '{name}': rest", rest, len(surface.triangles))
+        try:
+            thickness = np.array(thickness, float)
+        except (TypeError, ValueError):
+            raise SceneError(
+                f"shell '{name}': thickness is {thickness!r}; give one number, or one a triangle [m]"
+            ) from None
+        _warn_of_pieces(surface)
+        self.shells.append(Shell(surface, thickness, deepcopy(material), bending, membrane, rest, name))
+        return len(self.shells) - 1
+
+    def hold(self, shell: int, vertices, components: str = "xyz", motion: Motion | None = None) -> None:
+        """Hold components of vertices of a shell, which `motion` moves; the surface may turn there (simply supported).
+
+        The motion may give every vertex a displacement of its own.
+        """
+        self._hold("hold", shell, vertices, components, motion=motion)
+
+    def clamp_boundary(self, shell: int, vertices, components: str = "xyz", motion: Motion | None = None) -> None:
+        """Hold components of vertices, and the surface's normal at the mesh edges between them, inside the surface, too.
+
+        `motion` moves the components and turns the normals as one body, however many times; it moves no other components, so
+        that with "yz" a clamp that turns can slide along x.
+        """
+        vertices = self._vertices(shell, vertices)
+        surface = self.shells[shell].surface
+        self._need_edges("clamp_boundary", shell, vertices, np.arange(len(surface.edges)), "mesh edge", "hold")
+        self._hold("clamp_boundary", shell, vertices, components, edges="clamp", motion=motion)
+
+    def symmetry(self, shell: int, vertices, axis, motion: Motion | None = None) -> None:
+        """Put vertices on a symmetry plane, which the surface meets at a right angle.
+
+        Args:
+            shell: index.
+            vertices: at the boundary, in one plane.
+            axis: of space that the plane is across, "x", "y" or "z"; or the plane's normal (3,), of any length.
+            motion: a translation that moves the plane along an axis of space.
+
+        Raises:
+            SceneError: the vertices are in no plane, not at the boundary, or the plane can not be moved like that.
+        """
+        if isinstance(axis, str):
+            normal = np.eye(3)["xyz".index(arguments.choice("symmetry: axis", axis, ("x", "y", "z")))]
+        else:
+            normal = np.array(arguments.vector("symmetry: axis, 'x', 'y' or 'z' or the plane's normal,", axis))
+            if not normal.any():
+                raise SceneError("symmetry: the normal is zero; give three numbers that are not, or 'x', 'y' or 'z'")
+            normal /= np.linalg.norm(normal)
+            # to rounding, an axis of space is one
+            axis = "xyz"[np.argmax(np.abs(normal))] if np.sort(np.abs(normal))[1] < 1e-15 else ""
+            normal = np.round(normal) if axis else normal
+        vertices = self._vertices(shell, vertices)
+        surface = self.shells[shell].surface
+        height = surface.points[vertices] @ normal
+        off = np.abs(height - np.median(height))
+        if off.max() > COINCIDE * np.ptp(surface.points, axis=0).max():
+            raise SceneError(
+                f"symmetry: vertex {vertices[np.argmax(off)]} of shell {shell} is {off.max():.3g} m off the plane "
+                f"{axis or 'with this normal at'} = {np.median(height):g} m of the others; choose the vertices of one plane"
+            )
+        self._need_edges("symmetry", shell, vertices, surface.boundary_edges, "boundary edge", "hold")
+        if motion is not None and (not axis or getattr(motion, "turns", False)):
+            raise SceneError(
+                "symmetry: a plane that moves is across an axis of space and does not turn; give 'x', 'y' or 'z' and a translation"
+            )
+        self._hold("symmetry", shell, vertices, axis, edges="symmetry", normal=tuple(normal.tolist()), motion=motion)
+
+    def add_vertex_force(self, shell: int, vertices, force, amplitude: Callable[[float], float] | None = None) -> None:
+        """Dead force [N] on each of some vertices, (3,) or (V, 3). In statics it grows with the load parameter."""
+        vertices = arguments.once("add_vertex_force: vertices", self._vertices(shell, vertices))
+        force = arguments.broadcast("add_vertex_force: force", force, (len(vertices), 3))
+        amplitude = arguments.amplitude("add_vertex_force", amplitude)
+        self.shell_loads.append(ShellLoad(shell, vertices, force, amplitude))
+
+    def add_edge_force(self, shell: int, path, force, amplitude: Callable[[float], float] | None = None) -> None:
+        """Dead force per length (3,) [N/m] along mesh edges, shared out by half the length to either end at rest.
+
+        Args:
+            shell: index.
+            path: vertices, in any order, of a part of the boundary: all boundary edges between them are loaded; or mesh edges, inside
+                the surface, too, as pairs of vertices (E, 2).
+            force: per length [N/m].
+            amplitude: of the time, or None.
+        """
+        surface, edges = self._mesh_edges("add_edge_force", shell, path)
+        force = np.array(arguments.vector("add_edge_force: force", force))
+        half = 0.5 * np.linalg.norm(np.diff(surface.points[surface.edges[edges]], axis=1)[:, 0], axis=1)
+        share = np.bincount(surface.edges[edges].ravel(), np.repeat(half, 2), len(surface.points))
+        vertices = np.flatnonzero(share)
+        amplitude = arguments.amplitude("add_edge_force", amplitude)
+        self.shell_loads.append(ShellLoad(shell, vertices, share[vertices, None] * force, amplitude))
+
+    def add_edge_couple(self, shell: int, path, couple, amplitude: Callable[[float], float] | None = None) -> None:
+        """Couple per length [N] about boundary edges, as long as at rest: an edge moment, which follows the edge.
+
+        It is positive by the right hand about the edge with the surface to its left, so that it makes the surface convex on the side
+        of its normals. It does the work of the angle of the normal at the edge, so that bending needs one there: "midedge_dof" or
+        "midedge_boundary". It has no potential where the edge moves out of its direction.
+
+        Args:
+            shell: index.
+            path: as for `add_edge_force`, of the boundary alone.
+            couple: one number, or one an edge where edges are given as pairs [N].
+            amplitude: of the time, or None.
+
+        Raises:
+            SceneError: an edge inside the surface, or one without an angle.
+        """
+        surface, edges = self._mesh_edges("add_edge_couple", shell, path)
+        bending = self.shells[shell].bending
+        if bending not in TURNING:
+            raise SceneError(
+                f"add_edge_couple: the edges of shell {shell} have no angle with bending {bending!r}; take {' or '.join(TURNING)}"
+            )
+        for edge in edges[~surface.boundary[edges]][:1]:
+            raise SceneError(
+                "add_edge_couple: the edge between the vertices {} and {} is inside the surface; give edges of its boundary".format(
+                    *surface.edges[edge]
+                )
+            )
+        couple = arguments.broadcast("add_edge_couple: couple", couple, edges.shape)
+        self.edge_couples.append(EdgeCouple(shell, edges, couple, arguments.amplitude("add_edge_couple", amplitude)))
+
+    def add_pressure(
+        self, shell: int, pressure, triangles=None, *, dead: bool = False, amplitude: Callable | None = None
+    ) -> None:
+        """Pressure [Pa] on triangles (all by default) along their normals.
+
+        It follows the surface: it has no potential where the boundary moves. Statics takes its exact, unsymmetric derivative; in
+        dynamics its forces are those on the predicted surface. With `dead` it keeps directions and areas of the rest shape.
+        """
+        self._check_shell(shell)
+        count = len(self.shells[shell].triangles)
+        index = slice(None) if triangles is None else triangles
+        index = arguments.once("add_pressure: triangles", arguments.indices("add_pressure: triangles", index, count))
+        bad = index[(index < 0) | (index >= count)]
+        if bad.size:
+            raise SceneError(f"add_pressure: triangle {bad[0]} does not exist; shell {shell} has {count}")
+        pressure = arguments.broadcast("add_pressure: pressure", pressure, index.shape)
+        dead, amplitude = arguments.flag("add_pressure: dead", dead), arguments.amplitude("add_pressure", amplitude)
+        self.pressures.append(Pressure(shell, index, pressure, dead, amplitude))
+
+    def join(self, members: Iterable[tuple[int, int]], rigid: bool = True) -> None:
+        """Join rods at nodes, (rod, node) each: at the same point at rest.
+
+        A rigid joint turns with its own rotation and bends every edge that meets there against it, by half a cell each, so that
+        two collinear rods joined rigidly are one rod. A hinged joint shares the position alone.
+        """
+        pairs = []
+        for member in members if np.iterable(members) else [members]:
+            pair = tuple(member) if np.iterable(member) else ()
+            if len(pair) != 2:
+                raise SceneError(f"join: {member!r} is no member; give (rod, node) each")
+            rods, (node,) = self._on_rods("join", *pair[:1], "node", arguments.index("join: node", pair[1]))
+            pairs.append((int(rods[0]), node))
+        if len(set(pairs)) < 2:
+            raise SceneError(f"join: {pairs}; a joint has two different members at least, (rod, node) each")
+        self.joints.append(Joint(tuple(pairs), arguments.flag("join: rigid", rigid)))
+
+    def attach(self, rod: int, nodes, shell: int, vertices, spin: str = "glued") -> None:
+        """Make nodes of a rod and vertices of a shell one: a stiffener, a rim, a post. They are at the same points at rest.
+
+        Args:
+            rod: index.
+            nodes: of the rod.
+            shell: index.
+            vertices: as many.
+            spin: "glued": every rod edge between two of these nodes that lies on a mesh edge turns about it with the surface and
+                keeps the angle to it that its directors have at rest; of two triangles their mean turns it, so that a fold along
+                the rod costs what it did. "free": nothing holds the rod's spin about its own axis.
+
+        Glue holds the turn about the edge alone. A rod whose edges are not mesh edges (a post, a line from a vertex) stands on a ball
+        joint and may spin; one without twist has no spin. With bending "midedge_dof" the surface's own normal at the edge turns the
+        rod, on any mesh; without it that of the triangles does, which is right where the mesh is alike along the rod. Edges on a
+        symmetry plane do not turn.
+
+        Raises:
+            SceneError: an index out of range, not as many vertices as nodes, another `spin`; at `build`, points that lie apart.
+        """
+        (rod,), nodes = self._on_rods("attach", arguments.index("attach: rod", rod), "node", nodes)
+        vertices = self._vertices(shell, vertices)
+        if len(nodes) != len(vertices):
+            raise SceneError(f"attach: {len(nodes)} nodes of rod {rod} and {len(vertices)} vertices; give as many")
+        glued = arguments.choice("attach: spin", spin, ("glued", "free")) == "glued"
+        self.attachments.append(Attachment(int(rod), np.array(nodes), shell, vertices, glued))
+
+    def magnetize(self, rods, magnetisation, edges=None) -> None:
+        """Give rods a magnetisation that is fixed in the material frame of their edges, as of a hard-magnetic elastomer.
+
+        The moment of an edge is that times its volume at rest, with the area of its section; a `Stiffness` needs one. Magnetised
+        rods are solved together, as joined ones are. Several calls add up.
+
+        Args:
+            rods: one rod or several.
+            magnetisation: along the tangent, a number [A/m]; or along first director, second director and tangent, (3,), or (E, 3)
+                with one an edge. In dimension 2 the first director is across the plane, and the second the tangent, turned by 90
+                degrees from x towards z. Rods without twist have a tangent alone.
+            edges: which; all by default.
+
+        Raises:
+            SceneError: an edge that does not exist, or a component that the rod has no director for.
+        """
+        rods, added = arguments.once("magnetize: rods", self._rods(rods)), []
+        given = arguments.floats(magnetisation)
+        given = given * [0.0, 0.0, 1.0] if given.ndim == 0 else given
+        for batch in self._batches(rods):
+            own = rods[(rods >= batch.first) & (rods < batch.first + batch.rods)]
+            where = f"magnetize: rod {own[0]} ('{batch.name}')"
+            _, chosen = self._on_rods("magnetize", own, "edge", slice(None) if edges is None else edges)
+            chosen = arguments.once(f"{where}: edges", np.array(chosen) % batch.edges)
+            each = arguments.broadcast(f"{where}: magnetisation", given, (len(chosen), 3))
+            if not batch.twist and self.dimension == 3 and each[:, :2].any():
+                raise SceneError(
+                    f"{where} has no twist, and so no directors; give the component along its tangent alone"
+                )
+            if self.dimension == 2 and (each[:, 0].any() or (not batch.bend and each[:, 1].any())):
+                raise SceneError(
+                    f"{where} is magnetised across the plane, or has no bending and so no directors; give 0 along these directors"
+                )
+            if not np.all(np.asarray(batch.section.area) > 0.0):
+                raise SceneError(f"{where}: its section has no area; give Stiffness(..., area=...) [m^2]")
+            added.append(Magnet(own, chosen, each))
+        self.magnets += added
+
+    def magnetic_field(self, value, gradient=None, origin=(0.0, 0.0, 0.0)) -> None:
+        """The magnetic field B = value + gradient (x - origin) that magnetised rods are in.
+
+        Energy -V M . B of every edge, at its middle, with the field at the time that a step balances forces at (the end of a step of
+        implicit Euler's, the middle of one of the midpoint rule). In statics constants grow with the load parameter, which is the
+        time of functions. All worlds are in it; their magnetisations may differ (`Model.set_parameter`).
+
+        Args:
+            value: B at the origin (3,) [T], or a function of the time [s] that gives it.
+            gradient: dB_i/dx_j (3, 3) [T/m], or a function of the time; none by default. It has neither divergence nor curl:
+                its trace is zero and it is symmetric.
+            origin: (3,) [m].
+
+        Raises:
+            SceneError: no such field, or a second one.
+        """
+        if self.applied_field is not None:
+            raise SceneError("magnetic_field: the scene has a field; give one that is the sum of both")
+        origin = np.array(arguments.vector("magnetic_field: origin", origin))
+        value = value if callable(value) else np.array(arguments.vector("magnetic_field: value", value))
+        if not callable(gradient):
+            gradient = np.zeros((3, 3)) if gradient is None else gradient
+            gradient = arguments.broadcast("magnetic_field: gradient", gradient, (3, 3))
+        given = MagneticField(value, gradient, origin, self.dimension == 2)
+        given.at(0.0, 1.0, SceneError)
+        self.applied_field = given
+
+    def add_dipoles(self, rods=None, cutoff: float | None = None) -> None:
+        """Let magnetised edges of rods act on each other as point dipoles in their middles, of the same and of other rods.
+
+        All pairs whose middles are no farther apart than `cutoff` at rest are listed, once and for all, but those that share a node:
+        n edges have n^2 / 2 without it. Two edges that come close attract without bound, and nothing keeps them apart.
+
+        Args:
+            rods: magnetised ones; all that are by default.
+            cutoff: [m]; none by default.
+        """
+        rods = None if rods is None else arguments.once("add_dipoles: rods", self._rods(rods))
+        cutoff = np.inf if cutoff is None else arguments.positive("add_dipoles: cutoff", cutoff, "m")
+        self.dipoles.append(Dipoles(rods, cutoff))
+
+    def _hold(self, call: str, shell, vertices, components, **options) -> None:
+        if options.get("edges") != "symmetry":  # an oblique plane has none
+            arguments.components(call, components)
+        motion, vertices = options.get("motion"), self._vertices(shell, vertices)
+        validate.check_motion(call, motion, planar=False)
+        if motion is not None and motion.count not in (None, len(vertices)):
+            raise SceneError(
+                f"{call}: the motion has {motion.count} displacements of {len(vertices)} vertices; give one for each"
+            )
+        self.shell_supports.append(ShellSupport(shell, vertices, components, call=call, **options))
+
+    def _check_shell(self, shell) -> None:
+        if not 0 <= arguments.index("shell", shell) < len(self.shells):
+            raise SceneError(f"shell {shell} does not exist; the scene has {len(self.shells)} shells so far")
+
+    def _vertices(self, shell, vertices) -> np.ndarray:
+        self._check_shell(shell)
+        count = len(self.shells[shell].points)
+        index = arguments.indices("vertices", vertices, count)
+        bad = index[(index < 0) | (index >= count)]
+        if bad.size:
+            raise SceneError(f"vertex {bad[0]} does not exist: shell {shell} has {count} vertices")
+        return index
+
+    def _mesh_edges(self, call: str, shell: int, path) -> tuple[Surface, np.ndarray]:
+        """The surface of a shell, and its edges that vertices of its boundary, or pairs of vertices, name."""
+        self._check_shell(shell)
+        surface = self.shells[shell].surface
+        if np.ndim(path) == 2 and np.shape(path)[1] == 2 and np.asarray(path).dtype.kind in "iu":
+            edges = surface.edge_between(*np.asarray(path).T)
+            return surface, arguments.once(f"{call}: edges", edges)
+        vertices = self._vertices(shell, path)
+        return surface, self._need_edges(
+            call, shell, vertices, surface.boundary_edges, "boundary edge", "pairs of vertices"
+        )
+
+    def _need_edges(self, call: str, shell: int, vertices, among: np.ndarray, kind: str, instead: str) -> np.ndarray:
+        """The edges between vertices; refuses a vertex that is at none of them."""
+        surface = self.shells[shell].surface
+        edges = np.intersect1d(surface.edges_on(vertices), among)
+        alone = np.setdiff1d(vertices, surface.edges[edges])
+        if alone.size:
+            raise SceneError(
+                f"{call}: no {kind} leads from vertex {alone[0]} of shell {shell} to another of the {len(vertices)} vertices given; "
+                f"choose the ends of edges, or use {instead}"
+            )
+        return edges
+
+
+def _forms(what: str, rest, triangles: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rest forms (abar, bbar), copies."""
+    if not isinstance(rest, list | tuple) or len(rest) != 2:
+        raise SceneError(f"{what} is {rest!r}; it is 'shape', 'flat' or two arrays (abar, bbar)")
+    try:
+        forms = tuple(np.array(values, float) for values in rest)
+    except (TypeError, ValueError):
+        forms = (np.zeros(0),)
+    for values in forms:
+        if values.shape != (triangles, 3) or not np.isfinite(values).all():
+            raise SceneError(f"{what} has shape {values.shape}; both arrays are finite and of shape {(triangles, 3)}")
+    return forms
+
+
+def _warn_of_pieces(surface: Surface) -> None:
+    """Warn of a mesh in pieces some vertices of which lie on each other: it was likely meant to be welded."""
+    pieces = surface.pieces
+    if pieces == 1:
+        return
+    step = COINCIDE * max(1e-300, np.ptp(surface.points, axis=0).max())
+    shared = len(surface.points) - len(np.unique(np.round(surface.points / step), axis=0))
+    if shared:
+        warnings.warn(
+            f"shell '{surface.name}' falls into {pieces} pieces, though {shared} of its vertices lie on others: weld them with "
+            "read_mesh(path, weld=1e-6) or meshes.weld(points, triangles, 1e-6)",
+            SceneWarning,
+            stacklevel=3,
+        )

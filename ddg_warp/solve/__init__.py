@@ -1,0 +1,1 @@
+"""Steps, Newton's method, linear solvers and preconditioners, equilibria, continuation, stability."""

@@ -1,0 +1,1 @@
+"""Of rods on their own, which lie in chains."""

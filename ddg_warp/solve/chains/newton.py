@@ -1,0 +1,208 @@
+"""Projected Newton on chains: every rod has its own loop, line search and outcome, all on the device."""
+
+from dataclasses import dataclass
+
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.errors import SceneError, check_options
+from ddg_warp.kernels import balance, chain, element, geometric, search, step
+from ddg_warp.kernels.islands import Islands
+
+EARLY = 2  # iterations that "progressive" makes by Gauss-Newton: far from a solution the exact matrix is no better
+PSD_MODES = ("auto", "gauss_newton", "project", "progressive", "none")
+MANY = 50_000  # rods from which full blocks of the sweep pay on a GPU; below, small ones reach more multiprocessors
+
+
+@dataclass(frozen=True)
+class NewtonOptions:
+    """How a Newton solve searches and when it stops.
+
+    Attributes:
+        rtol: a dof is in equilibrium where its residual is below rtol times the load scale of its rod or shell (sum of its outer
+            forces; without any, the first residual), in shells times the root of its share of the area, or below what rounding
+            leaves of it; so are sums of residuals over parts. See `ddg_warp.compile.tolerance`.
+        floor_factor: how many rounding units of the forces that meet at a node count as rounding.
+        max_iterations: Newton iterations of one solve.
+        max_halvings: shortenings of one step by the line search.
+        rotation_cap: largest turn of an edge, a joint or the angle of a rod in one update [rad].
+        linear_rtol: reduction of the residual by PCG, in the norm of the preconditioner.
+        psd: the matrix. "gauss_newton": without second derivatives of bending and twist, never indefinite but for
+            compression, which is left out where a pivot is lost. "progressive": from the third iteration on the exact Hessian,
+            and in iterations where it is not positive definite Gauss-Newton without compression: for curved, twisted or
+            compressed rods and long steps, where Gauss-Newton takes many iterations. "project": the exact one with every
+            element made positive semi-definite by its eigenvalues, at twenty times the cost of an iteration. "none": the
+            exact one; where it is indefinite the solve ends with the outcome `indefinite`, and a time step is tried again
+            with a shorter one. "auto": "progressive" for rods that are curved or twisted at rest, else "gauss_newton"; nets
+            keep the stresses' stiffness, compression included, and leave compression out of the next matrix where conjugate
+            gradients meet negative curvature.
+    """
+
+    rtol: float = 1e-6
+    floor_factor: float = 4.0
+    max_iterations: int = 100
+    max_halvings: int = 20
+    rotation_cap: float = 1.0
+    linear_rtol: float = 1e-8
+    psd: str = "auto"
+
+    def __post_init__(self):
+        check_options(self, ("rtol", "floor_factor", "rotation_cap", "linear_rtol"), ("max_iterations", "max_halvings"))
+        if self.psd not in PSD_MODES:
+            raise SceneError(f"psd {self.psd!r}: it is one of {', '.join(PSD_MODES)}")
+
+
+class ChainNewton:
+    """Newton on one group of uncoupled open rods by the chain sweep. Owns what is needed while a solve runs.
+
+    Args:
+        model, group, options: what to solve, and how.
+        linear: scalar type of the linear algebra; that of the model by default.
+        midpoint: whether predicted iterates are midpoints, to which the lagged frames are carried.
+
+    Attributes:
+        x, theta, frame: the iterate and its lagged frames; base: the accepted positions it was reached from.
+        target, target_angle, coefficient: the quadratic of inertia, coefficient * m |x - target|^2 / 2.
+        islands: state of every rod's search; see `kernels.islands`.
+    """
+
+    reuse = False  # whether the matrix of a step's first iterate serves the whole step
+
+    def __init__(self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False):
+        self.group, self.options = group, options
+        self.real, self.linear = model.types.real, linear or model.types.linear
+        self.eps = model.types.eps
+        kind, device = group.kind, model.wp_device
+        vector = wp.types.vector(kind.dim, self.real)
+        nodes, columns = (group.nodes, group.columns), group.columns
+
+        def make(*shape, dtype=self.real):
+            return arrays.allocate(shape, dtype, device)
+
+        twisted = nodes if kind.twist else (1, 1)
+        self.x, self.base, self.target = (make(*nodes, dtype=vector) for _ in range(3))
+        self.theta, self.target_angle = make(*twisted), make(*twisted)
+        self.frame = make(7, *twisted)
+        self.factor = make(kind.factor_rows, *nodes, dtype=self.linear)
+        self.gradient = make(kind.window, *nodes)
+        self.energy = make(2, *nodes)
+        self.stiffness = make(*nodes, dtype=self.linear)
+        self.elimination = make(2 * kind.block**2 + kind.block, *nodes, dtype=self.linear) if not kind.closed else None
+        self.right, self.direction = (make(kind.block, *nodes, dtype=self.linear) for _ in range(2))
+        self.energy_change, self.energy_noise = make(*nodes), make(*nodes, dtype=self.linear)
+        self.islands = Islands(columns, self.real, device)
+        self.without_compression = self.islands.clamped  # rods whose matrix leaves out what compression takes away
+        self.psd = self.automatic_psd() if options.psd == "auto" else options.psd
+        self.exact = self.psd != "gauss_newton" and kind.span == 2  # a rod that only stretches has its Hessian anyway
+        rows = kind.geometric_rows if self.exact else 1
+        self.exact_from = (EARLY if self.psd == "progressive" else 0) if self.exact else None
+        self.geometric = make(rows, *(nodes if self.exact else (1, 1)), dtype=self.linear)
+        self._project = None
+        if self.psd == "project" and self.exact:
+            self.without_compression = wp.full(columns, 1, dtype=int, device=device)
+            self._project = geometric.project_kernel(kind, self.real, self.linear)
+        self.device = device
+        self._evaluate = element.evaluate_kernel(kind, self.real, self.linear, self.exact_from)
+        self._check = balance.check_kernel(kind, self.real, self.linear)
+        self._predict = step.predict_kernel(kind, self.real, self.linear, midpoint)
+        self._sweep, self._threads = None, 32 if columns < MANY else 128
+        if not kind.closed:
+            self._sweep = chain.sweep_kernel(kind, self.real, self.linear, self.exact_from, self.psd == "none")
+        self._adjust = None if kind.closed else search.adjust_kernel(kind, self.real, self.linear)
+
+    def automatic_psd(self) -> str:
+        """The mode of `NewtonOptions.psd` that suits the rods: Gauss-Newton lacks what a natural curvature does to their roll."""
+        group = self.group
+        rest = [f"{term.name}.{name}" for term in group.kind.terms if term.measure.span == 2 for name in term.rest]
+        return "progressive" if any(group.parameters[name].any() for name in rest) else "gauss_newton"
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [*self.kernels_around, (self._sweep, self._threads), self._adjust]
+
+    @property
+    def kernels_around(self) -> list:
+        """Those that do not depend on how the system is solved."""
+        return [self._predict, (self._evaluate, 128), self._check, *([self._project] if self._project else [])]
+
+    def pcg_iterations(self) -> int:
+        """None: the sweep is direct."""
+        return 0
+
+    def predict(self, before) -> None:
+        """Redo the predictor of bent rods from the state `before`, with edges turned; carry frames to midpoints."""
+        wp.launch(
+            self._predict,
+            self.group.columns,
+            [before.x, before.v, self.group.fixed, self.group.count, *self.islands.arrays],
+            [self.base, self.direction, self.x, self.frame],
+            device=self.device,
+        )
+
+    def solve(self, last: wp.array) -> None:
+        """Iterate until no rod is active; can be captured. `last` holds the strains of the last step."""
+        wp.capture_while(self.islands.active, lambda: self.iterate(last))
+
+    def iterate(self, last: wp.array) -> None:
+        """One iteration of every active rod."""
+        self.evaluate(last)
+        self.check()
+        self.sweep()
+
+    def evaluate(self, last: wp.array) -> None:
+        """Energies, gradients and factors of all elements at the iterate."""
+        group = self.group
+        wp.launch(
+            self._evaluate,
+            group.element_threads,
+            [self.x, self.theta, self.frame, last, *self.islands.arrays, *group.parameters.arrays, group.count]
+            + [self.without_compression, int(self.reuse)],
+            [self.factor, self.geometric, self.gradient, self.energy, self.stiffness],
+            device=self.device,
+            block_dim=128,
+        )
+        if self._project:
+            wp.launch(
+                self._project,
+                (group.elements, group.columns),
+                [self.x, group.count, self.islands.status, group.kind.window, self.factor],
+                [self.geometric],
+                device=self.device,
+            )
+
+    def check(self) -> None:
+        """Residuals, the change of the energy, and the rods that are out of equilibrium."""
+        group, options = self.group, self.options
+        wp.launch(
+            self._check,
+            group.node_threads,
+            [self.gradient, self.energy, self.stiffness, group.count, group.mass, group.rotary, *self.islands.arrays]
+            + [self.x, self.theta, self.base, self.direction, self.target, self.target_angle]
+            + [group.gravity, group.load, group.load_angle, int(group.host.loaded), group.fixed, group.length]
+            + [options.rtol, options.floor_factor * self.eps],
+            [self.right, self.energy_change, self.energy_noise],
+            device=self.device,
+        )
+
+    def sweep(self) -> None:
+        """Factor, decide, and take the next step."""
+        group, options = self.group, self.options
+        wp.launch(
+            self._sweep,
+            group.columns,
+            [self.factor, self.geometric, self.right, self.energy_change, self.energy_noise, group.count]
+            + [group.mass, group.rotary, *self.islands.arrays, group.fixed]
+            + [options.floor_factor * self.eps, options.rotation_cap]
+            + [options.max_iterations, options.max_halvings]
+            + [self.x, self.theta, self.base, self.elimination, self.direction],
+            device=self.device,
+            block_dim=self._threads,
+        )
+        wp.launch(
+            self._adjust,
+            group.columns,
+            [group.count, group.fixed, self.direction, *self.islands.arrays],
+            [self.x, self.theta, self.frame, self.base],
+            device=self.device,
+        )

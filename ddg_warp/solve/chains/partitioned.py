@@ -1,0 +1,204 @@
+"""Newton on few, long rods: every node a thread, the system by block cyclic reduction."""
+
+import math
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels import cyclic_reduction, parallel_moves, parallel_search
+from ddg_warp.solve.chains.assembled import AssembledNewton
+from ddg_warp.solve.chains.newton import NewtonOptions
+
+
+class PartitionedNewton(AssembledNewton):
+    """As `ChainNewton`, without a loop of one thread over the nodes of a rod, for open rods.
+
+    An iteration is about 2 log2(n) + 10 launches. Loops of one thread run over sqrt(n) nodes or ranges of nodes.
+    """
+
+    def __init__(self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False):
+        if options.psd == "none":
+            raise SceneError("psd 'none': linear 'partitioned' cannot stop at an indefinite matrix; use 'sweep'")
+        super().__init__(model, group, options, linear, midpoint)
+        kind, device, real = group.kind, model.wp_device, self.real
+        vector, columns = wp.types.vector(kind.dim, real), group.columns
+        self.width = math.isqrt(group.nodes - 1) + 1
+        self.ranges = -(-group.nodes // self.width)
+        self.midpoint = midpoint
+        self.partial = arrays.allocate((4, self.ranges, columns), real, device)
+        self.sums = arrays.allocate((2, self.ranges, columns), vector, device)
+        self.prefix = arrays.allocate((group.nodes, columns), vector, device)
+        self.mean = wp.zeros(columns, dtype=vector, device=device)
+        self.held = arrays.upload(_held_neighbours(group), int, device)
+        self.new_frame = arrays.allocate(self.frame.shape, real, device)
+        self.reduction = CyclicReduction(kind, group.nodes, columns, self.linear, device)
+        self._weigh, self._gauge = parallel_search.sum_kernels(kind, real, self.linear)
+        self._judge, self._take = parallel_search.decide_kernels(kind, real, self.linear)
+        self._moves = parallel_moves.move_kernels(kind, real, self.linear)
+        self._aim, self._renew = parallel_moves.predict_kernels(kind, real, self.linear)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        own = [self._weigh, self._gauge, self._judge, self._take, *self._moves, self._aim, self._renew]
+        around = [kernel for kernel in self.kernels_around if kernel is not self._predict]  # it has its own
+        return [*around, self._assemble, *own, *self.reduction.kernels]
+
+    def predict(self, before) -> None:
+        """Redo the predictor of bent rods from the state `before`, with edges turned; carry frames to midpoints."""
+        group = self.group
+        self._launch(
+            self._aim,
+            group.nodes,
+            [before.x, before.v, group.fixed, group.count, *self.islands.arrays],
+            [self.base, self.direction],
+        )
+        self.move()
+        if self.midpoint and group.kind.twist:
+            wp.launch(self._renew, group.columns, self.islands.arrays, device=self.device)
+            self.move()
+
+    def sweep(self) -> None:
+        """Assemble, decide, solve for a direction and take it."""
+        self.assemble_blocks()
+        self.judge()
+        self.direct()
+        self.take()
+        self.move()
+
+    def judge(self) -> None:
+        """Stop rods, reject their iterates, or ask for a direction."""
+        options = self.options
+        self._launch(
+            self._weigh,
+            self.ranges,
+            [self.right, self.energy_change, self.energy_noise, self.group.count, self.islands.status, self.ranges],
+            [self.partial],
+        )
+        wp.launch(
+            self._judge,
+            self.group.columns,
+            [self.partial, self.ranges, options.floor_factor * self.eps, options.max_iterations, options.max_halvings]
+            + self.islands.arrays,
+            device=self.device,
+        )
+
+    def direct(self) -> None:
+        """Directions by cyclic reduction."""
+        islands = self.islands
+        self.reduction.solve(self.blocks, self.right, self.group.count, islands.wanted, self.direction, islands.bad)
+
+    def take(self) -> None:
+        """Lengths of the steps along the directions."""
+        group = self.group
+        self._launch(
+            self._gauge,
+            self.ranges,
+            [self.right, self.direction, self.x, group.count, self.islands.wanted, self.ranges],
+            [self.base, self.partial],
+        )
+        wp.launch(
+            self._take,
+            group.columns,
+            [self.partial, self.ranges, self.options.rotation_cap, *self.islands.arrays],
+            device=self.device,
+        )
+
+    def move(self) -> None:
+        """Do what is left to do with every rod: a step, straight or with edges turned, or frames of its iterate."""
+        group, islands, (turn, scan, offset, move) = self.group, self.islands, self._moves
+        self._launch(
+            turn,
+            group.nodes,
+            [group.count, islands.todo, self.direction, islands.step_length, self.base, self.x, self.frame],
+            [self.prefix, self.new_frame],
+        )
+        self._launch(scan, self.ranges, [group.count, islands.todo, self.width, self.prefix], [self.sums])
+        wp.launch(
+            offset,
+            group.columns,
+            [group.count, islands.todo, self.width, self.ranges, self.sums],
+            [self.mean],
+            device=self.device,
+        )
+        self._launch(
+            move,
+            group.nodes,
+            [group.count, group.fixed, self.held, *islands.arrays, self.direction]
+            + [self.prefix, self.sums, self.mean, self.width, self.new_frame],
+            [self.x, self.theta, self.frame, self.base],
+        )
+
+    def _launch(self, kernel, size: int, inputs: list, outputs: list) -> None:
+        """One thread for each of `size` parts of every rod."""
+        wp.launch(kernel, (size, self.group.columns), inputs, outputs, device=self.device)
+
+
+class CyclicReduction:
+    """Levels of the block cyclic reduction of open chains of at most `nodes` nodes; see `kernels.cyclic_reduction`."""
+
+    def __init__(self, kind, nodes: int, columns: int, linear, device):
+        self.columns, self.device, self.dofs = columns, device, 2 * kind.block
+        self.blocks = [-(-nodes // 2)]  # of every level
+        while self.blocks[-1] > 1:
+            self.blocks.append(-(-self.blocks[-1] // 2))
+        matrix_rows, right_rows, kept_rows = cyclic_reduction.level_rows(kind)
+
+        def vectors(rows, blocks):
+            return arrays.allocate((rows, blocks, columns), linear, device)
+
+        self.matrices = [vectors(matrix_rows, blocks) for blocks in self.blocks[1:]]
+        self.rights = [vectors(right_rows, blocks) for blocks in self.blocks[1:]]
+        self.kept = [vectors(kept_rows, blocks // 2) for blocks in self.blocks[:-1]]
+        levels = len(self.kept)
+        self._reduce = [cyclic_reduction.reduce_kernel(kind, linear, level == 0) for level in range(levels)]
+        self._last = cyclic_reduction.last_kernel(kind, linear, levels == 0)
+        self._expand = cyclic_reduction.expand_kernel(kind, linear)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [*((kernel, 64) for kernel in self._reduce[:2]), (self._last, 32), self._expand]
+
+    def solve(self, matrix, right, count, wanted, solution: wp.array, bad: wp.array) -> None:
+        """Solution of the wanted columns from the blocks of their nodes; adds the pivots they lose to `bad`."""
+        for level, kernel in enumerate(self._reduce):
+            outputs = [self.matrices[level], self.rights[level], self.kept[level]]
+            wp.launch(
+                kernel,
+                (2 * self.dofs + 1, self.blocks[level + 1], self.columns),
+                [matrix, right, count, wanted, self.blocks[level], 2],
+                [*outputs, bad],
+                device=self.device,
+                block_dim=64,
+            )
+            matrix, right = outputs[:2]
+        wp.launch(
+            self._last,
+            self.columns,
+            [matrix, right, count, wanted],
+            [solution, bad],
+            device=self.device,
+            block_dim=32,
+        )
+        for level in reversed(range(len(self.kept))):
+            wp.launch(
+                self._expand,
+                (self.dofs, self.blocks[level] // 2, self.columns),
+                [self.kept[level], count, wanted, 2 << level],
+                [solution],
+                device=self.device,
+            )
+
+
+def _held_neighbours(group) -> np.ndarray:
+    """The held nodes next to every node, itself included: (before or after, node, column), -1 where there is none."""
+    host, every = group.host, (1 << group.kind.dim) - 1
+    k = np.arange(group.nodes)[:, None]
+    held = ((host.fixed & every) == every) & (k < host.count)
+    before = np.maximum.accumulate(np.where(held, k, -1), axis=0)
+    after = np.minimum.accumulate(np.where(held, k, group.nodes)[::-1], axis=0)[::-1]
+    neighbours = np.stack([before, np.where(after < group.nodes, after, -1)]).astype(np.int32)
+    return np.tile(neighbours, (1, 1, group.worlds))

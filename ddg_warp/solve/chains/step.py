@@ -1,0 +1,133 @@
+"""A time step of a group of rods on their own: predictor, prescribed motion and loads, Newton, end update. See `kernels.step`."""
+
+import numpy as np
+
+from ddg_warp import arrays
+from ddg_warp.errors import SceneError
+from ddg_warp.geometry import polyline
+from ddg_warp.kernels import element, step
+from ddg_warp.solve import energy
+from ddg_warp.solve.chains.newton import ChainNewton
+from ddg_warp.solve.chains.partitioned import PartitionedNewton
+from ddg_warp.solve.chains.pcg import PcgNewton, ProjectiveNewton
+from ddg_warp.solve.chains.prescribed import PrescribedMotion, TimedLoads
+from ddg_warp.solve.choice import automatic
+from ddg_warp.solve.step import PartStep
+
+DIRECT = {"sweep": ChainNewton, "partitioned": PartitionedNewton}  # solvers of open rods by their name
+NET_ONLY = ("multilevel", "chain_multilevel")  # preconditioners of nets
+FOLDED = 1e-5  # how close to opposite [rad] edges that meet are called folded, in messages
+
+
+class ChainStep(PartStep):
+    """Steps the rods of a group in all worlds, each an island."""
+
+    def __init__(self, integrator, model, group, precision=None, counts_of=None):
+        super().__init__(integrator, model, _newton(model, group, integrator, precision), counts_of)
+        self.group, self.index = group, model.groups.index(group)
+        kind, real = group.kind, model.types.real
+        self._begin = step.begin_kernel(kind, real, self.midpoint)
+        self._nodes = step.finish_nodes_kernel(kind, real, self.midpoint)
+        self._frames = step.finish_frames_kernel(kind, real) if kind.twist else None
+        self.energy = energy.ChainEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
+        self.motion = PrescribedMotion(model, group, self.midpoint) if group.moving else None
+        self.loads = TimedLoads(model, group, self.midpoint) if group.host.timed_loads else None
+
+    def attempt(self, before, after) -> None:
+        """One solve of every rod that has not finished the step, from state `before` to `after`."""
+        group, newton = self.group, self.newton
+        self._launch(
+            self._begin,
+            group.node_threads,
+            [before.x, before.v, before.theta, before.omega, before.frame, group.fixed, group.count, group.world]
+            + [self.integrator._dt, self.damping, group.outer, *self.islands.arrays],
+            [newton.x, newton.theta, newton.frame, newton.target, newton.target_angle],
+        )
+        newton.predict(before)
+        self.islands.bent.zero_()
+        if self.motion:
+            self.motion.apply(self.islands, newton.x, newton.frame, newton.theta)
+        if self.loads:
+            self.loads.apply(newton.x, group.load, group.load_angle)
+        newton.solve(before.last)
+        if self.energy:
+            self.energy.judge(before)
+        self._launch(
+            self._nodes,
+            group.node_threads,
+            [newton.x, newton.theta, before.x, before.v, before.theta, before.omega, group.count, *self.islands.arrays],
+            [after.x, after.v, after.theta, after.omega],
+        )
+        if self._frames:
+            self._launch(
+                self._frames,
+                group.element_threads,
+                [after.x, newton.frame, before.frame, group.count, self.islands.moved],
+                [after.frame],
+            )
+        if group.kind.viscous:
+            self.model.strains(group, after, after.last)
+
+    @property
+    def own_kernels(self) -> list:
+        """Kernels of an attempt, without those of the solver."""
+        kernels = [self._begin, self._nodes, *([self._frames] if self._frames else [])]
+        if self.group.kind.viscous:
+            kernels.append(element.strain_kernel(self.group.kind, self.model.types.real))
+        return kernels
+
+    def who(self, column: int) -> str:
+        """The rod of a column."""
+        rod = self._rod(column)
+        return f"rod {rod} ('{self.model.curves.names[rod]}')"
+
+    def rods_of(self, columns: np.ndarray) -> list[int]:
+        """Rods of columns, as the user counts them."""
+        return [self._rod(column) for column in columns]
+
+    def where(self, state, column: int) -> str:
+        """Where the largest residual was, estimated by the element forces that meet there, and what to do."""
+        size = float(self.islands.residual.numpy()[column])
+        direction = np.abs(arrays.download(self.newton.direction)[:, :, column]).max(0)
+        largest = int(np.argmax(np.where(np.isfinite(direction), direction, np.inf)))
+        node = largest - int(self.group.host.first[column % self.group.rods])
+        return f"residual {size:.3g} N at node {node}; {self._remedy(state, column)}"
+
+    def _rod(self, column: int) -> int:
+        return int(self.group.host.rods[column % self.group.rods])
+
+    def _remedy(self, state, column: int) -> str:
+        """What to do about a rod that was given up: edges of its last good state that no step can start from, or advice."""
+        host, closed, rod = self.group.host, self.group.kind.closed, column % self.group.rods
+        x = arrays.download(state.groups[self.index].x)[: host.count[rod], column][None]
+        edges, first = polyline.edge_vectors(x.astype(float), closed), int(host.first[rod])
+        lengths = np.linalg.norm(edges, axis=-1)
+        if not (lengths > 0.0).all():
+            k = int(np.argmin(lengths[0] > 0.0)) - first
+            return f"edge {k} has no length in the last good state; move a node of the state it starts from"
+        if self.group.kind.span == 2:
+            before, after = polyline.ahead(edges / lengths[..., None], closed)
+            k = int(np.argmin(np.sum(before * after, -1)[0]))
+            if np.linalg.norm(before[0, k] + after[0, k]) < FOLDED:
+                k, after = k - first, (k + 1) % lengths.shape[1] - first
+                return (
+                    f"edges {k} and {after} fold back by 180 degrees in the last good state, where curvature is infinite or has no "
+                    f"direction; move node {after} of the state it starts from, or take a smaller dt if it folded on the way"
+                )
+        return self.advice(state)
+
+
+def _newton(model, group, integrator, precision) -> ChainNewton:
+    """The solver of a group that the integrator's `linear` asks for."""
+    linear = automatic(group) if integrator.linear in ("auto", *NET_ONLY) else integrator.linear
+    given = (model, group, integrator.options)
+    last = (precision, integrator.scheme == "implicit_midpoint")
+    if integrator.solver == "projective":
+        return ProjectiveNewton(*given, *last)
+    if linear in DIRECT and group.kind.closed:
+        raise SceneError(
+            f"linear {linear!r}: rod {group.host.rods[0]} is closed; use 'auto' or a preconditioner of PCG"
+        )
+    if linear in DIRECT:
+        return DIRECT[linear](*given, *last)
+    return PcgNewton(*given, linear, *last)

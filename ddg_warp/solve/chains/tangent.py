@@ -1,0 +1,285 @@
+"""What chains contribute to a model's energy and tangent on the host.
+
+Element windows come from the device; B, a constant sparse matrix of 0, 1 and -1 per group, takes dofs to windows. Then
+g = B^T g_window and H = B^T K_window B, for every term and every kind of chain alike.
+"""
+
+import numpy as np
+import warp as wp
+from scipy import sparse
+
+from ddg_warp import arrays
+from ddg_warp.compile.couples import couple_derivatives, couple_forces
+from ddg_warp.compile.tolerance import support_forces
+from ddg_warp.geometry.turning import turned
+from ddg_warp.kernels import element
+from ddg_warp.kernels.islands import Islands
+from ddg_warp.solve.chains.prescribed import PrescribedMotion
+from ddg_warp.solve.rigid import Body
+
+
+class ChainTangent:
+    """The part of one group of rods; dofs are numbered node by node, rod by rod. See `Tangent` for the methods."""
+
+    def __init__(self, model, group, offset: int):
+        self.model, self.group, self.offset = model, group, offset
+        kind, real, device = group.kind, model.types.real, model.wp_device
+        shape = (group.nodes, group.columns)
+        self.size, self.body_count = group.columns * group.nodes * kind.block, group.columns
+        self.incidence = _incidence(group)
+        self.free, self.angle, self.mass = _free(group), _angle(group), _mass(group)
+        self._windows = arrays.allocate((kind.window, *shape), real, device)
+        self._energies = arrays.allocate(shape, real, device)
+        self._hessian = arrays.allocate((kind.window**2, *shape), real, device)
+
+    def data(self, state):
+        """This part of a state."""
+        return state.groups[self.model.groups.index(self.group)]
+
+    def energies(self, state):
+        """(term's name, energies of its elements (worlds, elements))."""
+        for i, term in enumerate(self.group.kind.terms):
+            self._energies.zero_()
+            self._launch(state, i, 0, self._energies)
+            values = arrays.download(self._energies).astype(np.float64)
+            yield term.name, values.T.reshape(self.group.worlds, -1)
+
+    def gradient(self, state) -> np.ndarray:
+        result = np.zeros(self.size)
+        for i in range(len(self.group.kind.terms)):
+            self._windows.zero_()
+            self._launch(state, i, 1, self._windows)
+            window = arrays.download(self._windows).astype(np.float64)
+            result += self.incidence.T @ window.transpose(2, 1, 0).ravel()
+        return result
+
+    def hessian(self, state) -> sparse.csc_matrix:
+        self._hessian.zero_()
+        for i in range(len(self.group.kind.terms)):
+            self._launch(state, i, 2, self._hessian)
+        w = self.group.kind.window
+        values = arrays.download(self._hessian).astype(np.float64).transpose(2, 1, 0).reshape(-1, w, w)
+        values = 0.5 * (values + values.transpose(0, 2, 1))
+        elements = len(values)
+        diagonal = sparse.bsr_matrix((values, np.arange(elements), np.arange(elements + 1)))
+        return self.incidence.T @ (diagonal @ self.incidence)
+
+    def loads(self, factor: float, q: np.ndarray) -> np.ndarray:
+        group, kind, host = self.group, self.group.kind, self.group.host
+        force = np.zeros((group.columns, group.nodes, kind.block))
+        dead = host.mass[..., None] * group.gravity_host + host.load
+        force[..., : kind.dim] = np.tile(dead.transpose(1, 0, 2), (group.worlds, 1, 1)) * factor
+        if kind.twist:
+            force[..., kind.dim] = np.tile(host.load_angle.T, (group.worlds, 1)) * factor
+        x = self.blocks(q)
+        for load, columns in self._timed():
+            scale = load.at(factor, factor)
+            np.add.at(force, (columns, load.k, slice(0, kind.dim)), scale * load.force)
+            if kind.twist:
+                np.add.at(force, (columns, load.k, kind.dim), scale * load.moment)
+            if load.couple.any():
+                edges = x[columns, load.k + 1, : kind.dim] - x[columns, load.k, : kind.dim]
+                pair, about = couple_forces(edges, load.couple)
+                np.add.at(force, (columns, load.k + 1, slice(0, kind.dim)), scale * pair)
+                np.add.at(force, (columns, load.k, slice(0, kind.dim)), -scale * pair)
+                if kind.twist:
+                    np.add.at(force, (columns, load.k, kind.dim), scale * about)
+        return force.ravel()
+
+    def load_stiffness(self, factor: float, q: np.ndarray) -> sparse.csc_matrix | None:
+        rows, cols, values = [], [], []
+
+        def put(i, j, block):
+            rows.append(np.repeat(i, len(j)))
+            cols.append(np.tile(j, len(i)))
+            values.append(block.ravel())
+
+        group, kind = self.group, self.group.kind
+        x = self.blocks(q)
+        for load, columns in self._timed():
+            for column, k in zip(columns, load.k, strict=True) if load.couple.any() else ():
+                scale = -load.at(factor, factor)
+                (block,), (about,) = couple_derivatives(np.diff(x[column, k : k + 2, : kind.dim], axis=0), load.couple)
+                first = (column * group.nodes + k) * kind.block + np.arange(kind.dim)
+                second = first + kind.block
+                for i, j, sign in ((first, first, 1), (second, second, 1), (first, second, -1), (second, first, -1)):
+                    put(i, j, sign * scale * block)
+                if kind.twist:
+                    put(first[:1] + kind.dim, second, scale * about)
+                    put(first[:1] + kind.dim, first, -scale * about)
+        if not rows:
+            return None
+        data = (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols)))
+        return sparse.csc_matrix(data, shape=(self.size, self.size))
+
+    def blocks(self, q: np.ndarray) -> np.ndarray:
+        """Dofs (size,) as (column, node, dofs of a node)."""
+        return q.reshape(self.group.columns, self.group.nodes, self.group.kind.block)
+
+    def _timed(self):
+        """Timed loads with their columns in every world."""
+        for load in self.group.host.timed_loads:
+            for world in range(self.group.worlds):
+                yield load, load.columns + world * self.group.rods
+
+    def dofs(self, state) -> np.ndarray:
+        kind, data = self.group.kind, self.data(state)
+        q = np.zeros((self.group.columns, self.group.nodes, kind.block))
+        q[..., : kind.dim] = arrays.download(data.x).transpose(1, 0, 2)
+        if kind.twist:
+            q[..., kind.dim] = arrays.download(data.theta).T
+        return q.ravel()
+
+    def assign(self, state, q: np.ndarray) -> None:
+        kind, data = self.group.kind, self.data(state)
+        values = self.blocks(q)
+        arrays.assign(data.x, np.ascontiguousarray(values[..., : kind.dim].transpose(1, 0, 2)))
+        if kind.twist:
+            arrays.assign(data.theta, np.ascontiguousarray(values[..., kind.dim].T))
+
+    def move_supports(self, state, before: float, at: float) -> None:
+        """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""
+        group, data = self.group, self.data(state)
+        if group.moving is not None:
+            motion = PrescribedMotion(self.model, group)
+            motion.upload(before, at)
+            islands = Islands(group.columns, self.model.types.real, self.model.wp_device)
+            islands.portion.fill_(1.0)
+            motion.apply(islands, data.x, data.frame, data.theta)
+
+    def edges(self, q: np.ndarray) -> np.ndarray:
+        """Edge vectors of the windows (E, dim), zero where there is none."""
+        return (self.incidence @ q).reshape(-1, self.group.kind.window)[:, : self.group.kind.dim]
+
+    def body_loads(self, outer: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """Sum of the outer forces on every rod, or its largest support force if that is more (columns,) [N]."""
+        columns, nodes, force = self.group.columns, self.group.nodes, ~self.angle
+        total = np.where(self.free & force, np.abs(outer), 0.0).reshape(columns, -1).sum(1)
+        held = np.where(~self.free & force, gradient, 0.0).reshape(columns * nodes, -1)
+        return np.maximum(total, support_forces(held, np.repeat(np.arange(columns), nodes), columns))
+
+    def allowed(self, loads: np.ndarray) -> np.ndarray:
+        """Residuals at rtol = 1 (size,) [N, N m] of rods with such loads; see `ddg_warp.compile.tolerance`."""
+        lengths = np.where(self.angle, np.repeat(np.tile(self.group.host.length, self.group.worlds), self._dofs), 1.0)
+        return np.repeat(loads, self._dofs) * lengths
+
+    def sums(self, loads: np.ndarray, rtol: float, residual: np.ndarray, floor: np.ndarray) -> tuple[bool, float]:
+        """Whether residuals add up to little along the rods from their first node, and the largest excess over rounding."""
+        dim = self.group.kind.dim
+        sums = np.abs(np.cumsum(self.blocks(residual)[..., :dim], axis=1))
+        limit = (rtol * loads)[:, None, None]
+        noise = np.sqrt(np.cumsum(self.blocks(floor)[..., :dim] ** 2, axis=1))
+        return bool((sums <= limit).all()), float((sums - np.maximum(limit, noise)).max())
+
+    @property
+    def _dofs(self) -> int:
+        return self.size // self.group.columns
+
+    def edge_length(self) -> float:
+        """Mean rest length of edges [m]."""
+        return float((self.group.host.length / np.maximum(1, self.group.host.own - 1)).mean())
+
+    def point_dofs(self) -> tuple[np.ndarray, list[int], np.ndarray]:
+        """Rows of `State.points`, axes, and the dofs (rows, axes) of the first world."""
+        group, kind = self.group, self.group.kind
+        k, column, rows = self.model.places(group)
+        dofs = ((column * group.nodes + k) * kind.block)[:, None] + np.arange(kind.dim)
+        return rows, [0, 2] if kind.dim == 2 else [0, 1, 2], dofs
+
+    def bodies(self) -> list[Body]:
+        """Every rod of every world."""
+        group, kind, result = self.group, self.group.kind, []
+        axes = [0, 2] if kind.dim == 2 else [0, 1, 2]
+        for column in range(group.columns):
+            n = group.host.count[column % group.rods]
+            first = self.offset + (column * group.nodes + np.arange(n)) * kind.block
+            nodes = np.full((n, 3), -1)
+            nodes[:, axes] = first[:, None] + np.arange(kind.dim)
+            edges = np.arange((n if kind.closed else n - 1) if kind.twist else 0)
+            ends = np.stack([edges, (edges + 1) % n], axis=1)
+            result.append(Body(nodes, first[edges] + kind.dim, ends, np.zeros((0, 3), int)))
+        return result
+
+    def where(self, dof: int) -> str:
+        """Name of a dof's place."""
+        column, k = divmod(dof // self.group.kind.block, self.group.nodes)
+        rod = int(self.group.host.rods[column % self.group.rods])
+        return f"node {k - int(self.group.host.first[column % self.group.rods])} of rod {rod}"
+
+    def retract(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """q moved along `step`, with edges turned instead of sheared; see `ddg_warp.geometry.turning`."""
+        moved = q + step
+        kind, group = self.group.kind, self.group
+        x, dx = (self.blocks(v)[..., : kind.dim] for v in (q, step))
+        held = ~self.blocks(self.free)[..., : kind.dim]
+        out = self.blocks(moved)
+        for column in range(group.columns):
+            n = group.host.count[column % group.rods]
+            still = np.zeros((n, kind.dim))
+            out[column, :n, : kind.dim] += turned(x[column, :n], dx[column, :n], held[column, :n], still, kind.closed)
+        return moved
+
+    def _launch(self, state, index: int, which: int, out: wp.array) -> None:
+        group, data = self.group, self.data(state)
+        kernel = element.term_kernels(group.kind, index, self.model.types.real)[which]
+        grid = (group.elements, group.columns) + ((group.kind.window,) if which == 2 else ())
+        wp.launch(
+            kernel,
+            grid,
+            [data.x, data.theta, data.frame, data.last, group.still, *group.parameters.arrays, group.count],
+            [out],
+            device=self.model.wp_device,
+        )
+
+
+def _incidence(group) -> sparse.csr_matrix:
+    """B of one group: (window dofs of all elements, dofs)."""
+    kind, n = group.kind, group.nodes
+    count = np.tile(group.host.count, group.worlds)
+    column, k = (a.ravel() for a in np.meshgrid(np.arange(group.columns), np.arange(n), indexing="ij"))
+    size = count[column]
+    rows, cols, values = [], [], []
+
+    def put(mask, window_dof, node, component, sign):
+        element_index = (column * n + k)[mask]
+        rows.append(element_index * kind.window + window_dof)
+        cols.append((column[mask] * n + node[mask]) * kind.block + component)
+        values.append(np.full(len(element_index), sign))
+
+    def at(shift):
+        return (k + shift) % size if kind.closed else np.minimum(k + shift, n - 1)
+
+    for edge in range(kind.span):
+        exists = k < size if kind.closed else k + edge + 1 < size
+        for d in range(kind.dim):
+            put(exists, edge * kind.dim + d, at(edge + 1), d, 1.0)
+            put(exists, edge * kind.dim + d, at(edge), d, -1.0)
+        if kind.twist:
+            put(exists, kind.dim * kind.span + edge, at(edge), kind.dim, 1.0)
+    shape = (group.columns * n * kind.window, group.columns * n * kind.block)
+    return sparse.csr_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(cols))), shape=shape)
+
+
+def _per_dof(group, nodes: np.ndarray, angles: np.ndarray | None) -> np.ndarray:
+    """(size,) from values of nodes and of angles (n, R), repeated for all worlds."""
+    kind = group.kind
+    full = np.repeat(nodes[..., None], kind.block, axis=-1)
+    if kind.twist:
+        full[..., kind.dim] = angles
+    return np.concatenate([full] * group.worlds, axis=1).transpose(1, 0, 2).ravel()
+
+
+def _free(group) -> np.ndarray:
+    host, kind = group.host, group.kind
+    bits = (host.fixed[..., None] >> np.arange(kind.block)) & 1
+    inside = np.arange(group.nodes)[:, None] < host.count
+    free = (bits == 0) & inside[..., None]
+    return np.concatenate([free] * group.worlds, axis=1).transpose(1, 0, 2).ravel()
+
+
+def _angle(group) -> np.ndarray:
+    return _per_dof(group, np.zeros(group.host.mass.shape), np.ones(group.host.mass.shape)) > 0.0
+
+
+def _mass(group) -> np.ndarray:
+    return _per_dof(group, group.host.mass, group.host.rotary)

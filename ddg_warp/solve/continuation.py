@@ -1,0 +1,307 @@
+"""Continuation: paths of equilibria (q, lambda) through limit points, and where they branch.
+
+A path is followed by pseudo-arclength steps (Keller 1977; Riks, Int. J. Solids Struct. 15, 1979): a predictor along the unit tangent,
+then Newton's corrector in the plane across it, on the exact tangent stiffness. Frames are carried on and joint rotations start
+from zero after every iterate; so increments are counted iterate by iterate and nothing refers to angles of an earlier state.
+
+Between two points the sign of the load's rate shows a limit point, and the number of negative eigenvalues a bifurcation, as far
+as the limit point does not account for its change (at one, K t = f l' makes the critical eigenvalue change with l' (f . t)).
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.optimize import brentq
+
+from ddg_warp import arguments
+from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.model import validate
+from ddg_warp.model.state import State
+from ddg_warp.scene.path import BIFURCATION, LIMIT_POINT, Displacement, Path, Point, Stop
+from ddg_warp.solve.corrector import ContinuationOptions, Corrector, Failed
+from ddg_warp.threads import launches
+
+FORK = 1e-2  # work of the load along the path, over its largest along any, at which a stationary load is no limit point
+LEAP = 4.0  # distance of two points over the length between them at which they are not on one path
+BISECTIONS = 12  # of a bifurcation, before one linear interpolation of the critical eigenvalue
+
+
+@launches
+class Continuation:
+    """Follows the equilibria of one model.
+
+    Args:
+        model: of one world.
+        watch: displacements to record by name.
+        options: see `ContinuationOptions`.
+
+    Raises:
+        SceneError: nothing holds the structure, the model has several worlds, or a watched point does not exist.
+    """
+
+    def __init__(self, model, watch: Mapping[str, Displacement] | None = None, **options):
+        for name, displacement in (watch or {}).items():
+            if not isinstance(displacement, Displacement):
+                raise SceneError(f"watch[{name!r}] is {displacement!r}; give Displacement.of(row, axis)")
+        self.model, self.options = model, ContinuationOptions(**options)
+        self.corrector = Corrector(model, watch or {}, self.options)
+        self.tangent, self.watched = self.corrector.tangent, self.corrector.watched
+
+    def trace(
+        self,
+        state: State | None = None,
+        *,
+        start: float = 0.0,
+        direction: int = 1,
+        stop: Stop | None = None,
+    ) -> Path:
+        """Follow the path by arc length.
+
+        Args:
+            state: near the equilibrium at load parameter `start`; the rest state by default. It is not changed.
+            start: load parameter to begin at.
+            direction: +1 with the load growing at first, -1 with it falling.
+            stop: where to end.
+
+        Raises:
+            SolverError: `no_start`, `singular_start` or `step_too_small`; carries the last good state, and the path so far as its
+                `path`.
+        """
+        if direction not in (1, -1):
+            raise SceneError(f"direction = {direction!r}; it is 1, with the load growing at first, or -1")
+        first = self._start(state, start)
+        stop = self._stop(stop)
+        if direction * first.direction[-1] < 0.0:
+            first.direction = -first.direction
+        return self._follow(Path([first]), stop)
+
+    def _start(self, state: State | None, start: float) -> Point:
+        """The first point of a path, near `state`."""
+        if state is not None:
+            validate.check_state("continuation", self.model, state)
+        return self.corrector.start(state or self.model.state(), arguments.number("continuation: start", start))
+
+    def _stop(self, stop: Stop | None) -> Stop:
+        """Where a path ends, checked."""
+        if stop is not None and not isinstance(stop, Stop):
+            raise SceneError(f"stop is {stop!r}; give Stop(...)")
+        if stop is not None and stop.displacement is not None and stop.displacement[0] not in self.watched:
+            raise SceneError(f"stop at {stop.displacement[0]!r}: it is not watched; there is {list(self.watched)}")
+        return stop or Stop()
+
+    def switch(self, bifurcation: Point, *, side: int = 1, step: float | None = None, stop: Stop | None = None) -> Path:
+        """Leave a bifurcation along its critical mode, and follow the other path.
+
+        Args:
+            bifurcation: of a path.
+            side: +1 or -1, the sense of the mode.
+            step: arc length of the first step; that of the options by default.
+            stop: where to end.
+
+        Raises:
+            SolverError: `no_branch`: no equilibrium beside the path was found; try another step.
+            ValueError: the point is no bifurcation.
+        """
+        if not isinstance(bifurcation, Point):
+            raise ValueError(f"switch: {bifurcation!r} is no point of a path; give one of path.bifurcations")
+        if side not in (1, -1):
+            raise SceneError(f"side = {side!r}; it is 1 or -1, the sense of the mode")
+        if bifurcation.kind != BIFURCATION:
+            raise ValueError(f"the point is a {bifurcation.kind}; a path branches at a bifurcation")
+        across = np.append(bifurcation.mode, 0.0)
+        along = self.corrector.dot(across, bifurcation.direction)
+        if abs(along) > (1.0 - 1e-6) * self.corrector.norm(across):  # the path came along the mode
+            across = self.corrector.other(bifurcation)
+            along = self.corrector.dot(across, bifurcation.direction)
+        across -= bifurcation.direction * along
+        across *= side / self.corrector.norm(across)
+        distance = step or self.options.step
+        for _ in range(12):
+            try:
+                point = self.corrector.correct(bifurcation, distance * across, self.corrector.metric * across)
+                break
+            except Failed:
+                distance *= 0.5
+        else:
+            raise self._error("no_branch", Path([bifurcation]), "try another step, or the other side")
+        if self.corrector.dot(point.direction, across) < 0.0:
+            point.direction = -point.direction
+        point.arclength = bifurcation.arclength + distance
+        return self._follow(Path([bifurcation, point]), self._stop(stop))
+
+    def control(
+        self,
+        displacement: str,
+        values: Sequence[float],
+        state: State | None = None,
+        *,
+        start: float = 0.0,
+        max_cuts: int = 10,
+    ) -> Path:
+        """Equilibria at given values of a watched displacement, whatever the load.
+
+        Args:
+            displacement: name of what is watched.
+            values: [m], one after the other.
+            state, start: see `trace`.
+            max_cuts: how often an increment is halved.
+
+        Raises:
+            SolverError: `no_start`, `singular_start`, or `displacement_turns_back`: the displacement cannot grow further along
+                the path.
+        """
+        if displacement not in self.watched:
+            raise SceneError(
+                f"no displacement {displacement!r} is watched; give watch={{{displacement!r}: Displacement...}}"
+            )
+        row = np.append(self.watched[displacement], 0.0)
+        values = arguments.broadcast("control: values", values, np.shape(values) or (1,))
+        here, path = self._start(state, start), Path()
+        for value in values:
+            reached, cuts = here.values[displacement], 0
+            increment = value - reached
+            while reached != value:
+                target = value if abs(value - reached) <= abs(increment) * (1.0 + 1e-12) else reached + increment
+                try:
+                    here = self.corrector.to(here, row, target)
+                    reached = target
+                except Failed:
+                    cuts, increment = cuts + 1, 0.5 * increment
+                    if cuts > max_cuts:
+                        raise self._error(
+                            "displacement_turns_back",
+                            Path([*path.points, here]),
+                            "follow the path by arc length: trace()",
+                        ) from None
+            path.points.append(here)
+        path.outcome = "values"
+        return path
+
+    def _follow(self, path: Path, stop: Stop) -> Path:
+        """Add points to a path until it stops."""
+        options, step = self.options, self.options.step
+        here = path.points[-1]
+        for _ in range(stop.steps):
+            turn = self.tangent.rotation(self.tangent.dofs(here.state), here.direction[:-1])
+            step = min(step, options.max_step, options.rotation_cap / max(1e-300, turn))
+            while True:
+                try:
+                    there = self.corrector.at(here, step)
+                    outcome, row, value = self._bound(here, there, stop) or ("", None, 0.0)
+                    there = self.corrector.to(here, row, value) if outcome else there
+                    self.corrector.follows(here, there)
+                    events = self._events(here, there)
+                    break
+                except Failed as failed:
+                    step *= 0.5
+                    if step < options.min_step:
+                        raise self._error(
+                            "step_too_small",
+                            path,
+                            f"{failed}: the path may end or branch here; begin elsewhere, or take min_step smaller",
+                        ) from None
+            for event in events:
+                path.points.append(event)
+                if event.kind == LIMIT_POINT and len(path.limit_points) == stop.limit_points:
+                    path.outcome = "limit_points"
+                    return path
+            path.points.append(there)
+            if outcome:
+                path.outcome = outcome
+                return path
+            step *= np.clip(np.sqrt(options.iterations / max(1, there.iterations)), 0.5, 1.6)
+            here = there
+        path.outcome = "steps"
+        return path
+
+    def _bound(self, here: Point, there: Point, stop: Stop):
+        """The bound that lies between two points: its name, the functional and its value; None if there is none."""
+        for value in stop.load:
+            if (here.load - value) * (there.load - value) < 0.0 or there.load == value:
+                return "load", np.eye(1, self.tangent.size + 1, self.tangent.size)[0], value
+        if stop.displacement is not None:
+            name, *values = stop.displacement
+            if name not in self.watched:
+                raise SceneError(f"stop at displacement {name!r}: it is not watched")
+            for value in values:
+                if (here.values[name] - value) * (there.values[name] - value) < 0.0 or there.values[name] == value:
+                    return "displacement", np.append(self.watched[name], 0.0), value
+        return None
+
+    def _events(self, here: Point, there: Point) -> list[Point]:
+        """Limit points and bifurcations between two neighbours on a path, in order."""
+        length, found, jump, fold = there.arclength - here.arclength, [], 0, np.inf
+        if here.direction[-1] * there.direction[-1] < 0.0:
+            limit = self._limit_point(here, length)
+            _, _, rate, *_ = self.corrector.system(limit.state, self.tangent.dofs(limit.state), limit.load)
+            limit.negative = min(here.negative, there.negative)
+            free, step = self.corrector.free, limit.direction[:-1]
+            work = rate[free] @ step[free]
+            size = np.sqrt((rate[free] ** 2 / self.corrector.metric[free]).sum()) * self.corrector.norm(limit.direction)
+            found.append(limit)
+            if here.negative == there.negative and abs(work) <= FORK * size:
+                # f . t vanishes, too: the tangent t is the critical mode, as where asymmetric states cross symmetric ones
+                limit.kind, limit.mode = BIFURCATION, step / self.corrector.norm(limit.direction)
+                limit.mode_displacements = self.tangent.at_points(limit.mode)
+            else:
+                fold = limit.arclength - here.arclength
+                sense = np.sign(work)
+                jump = int(sense * there.direction[-1] < 0.0) - int(sense * here.direction[-1] < 0.0)
+        low, count = 0.0, here.negative
+        ends = there.negative - jump if fold < np.inf else there.negative
+        while count != ends:
+            point, low, count = self._bifurcation(here, there, low, count, jump, fold)
+            found.append(point)
+        return sorted(found, key=lambda point: point.arclength)
+
+    def _limit_point(self, here: Point, length: float) -> Point:
+        """Where the load's rate vanishes."""
+
+        def rate(step):
+            return self.corrector.at(here, step).direction[-1] if step > 0.0 else here.direction[-1]
+
+        root = brentq(rate, 0.0, length, xtol=self.options.tolerance * length)
+        point = self.corrector.at(here, max(root, 1e-12 * length))
+        point.kind = LIMIT_POINT
+        return point
+
+    def _bifurcation(self, here: Point, there: Point, low: float, count: int, jump: int, fold: float):
+        """The first change of the number of negative eigenvalues that is not a limit point's; where it is passed, and the count."""
+        length = high = there.arclength - here.arclength
+
+        def point_at(step):
+            return self.corrector.at(here, step, smooth=False) if step > 0.0 else here
+
+        after = there.negative - (jump if length > fold else 0)
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            found = point_at(middle).negative - (jump if middle > fold else 0)
+            if found == count:
+                low = middle
+            else:
+                high, after = middle, found
+        ends = [point_at(step) for step in (low, high)]
+        gap = self.tangent.dofs(ends[1].state) - self.tangent.dofs(ends[0].state)
+        if self.corrector.norm(np.append(gap, 0.0)) > LEAP * (high - low) + 1e-6 * length:
+            raise Failed("leap")  # from one path to another, which does not meet it: where an imperfection parts them
+        a, b = (self.corrector.critical(end)[0] for end in ends)
+        root = low + (high - low) * (a / (a - b) if a * b < 0.0 else 0.5)
+        point = point_at(root)
+        point.kind = BIFURCATION
+        point.negative = min(count, after) + (jump if root > fold else 0)
+        point.mode = self.corrector.critical(point)[1]
+        point.mode_displacements = self.tangent.at_points(point.mode)
+        # the tangent of the path itself, between those beside it
+        along = here.direction + root / length * (there.direction - here.direction)
+        point.direction = along / self.corrector.norm(along)
+        return point, high, after
+
+    def _error(self, outcome: str, path: Path, remedy: str) -> SolverError:
+        last = path.points[-1]
+        error = SolverError(
+            f"the path of equilibria was lost at load parameter {last.load:g} after {len(path)} points: {outcome}; {remedy}",
+            state=last.state,
+            outcome=outcome,
+        )
+        error.path = path
+        return error

@@ -1,0 +1,172 @@
+"""The account of what the implicit midpoint rule makes of the energy, of every lone rod and of the net in every world."""
+
+import math
+
+import numpy as np
+import warp as wp
+
+from ddg_warp.kernels import energy
+from ddg_warp.kernels.net import energy as net_energy
+from ddg_warp.kernels.net import krylov
+from ddg_warp.solve.net.system import Sums
+
+
+def summary(parts: list["_Energy"]) -> dict[str, float]:
+    """What the rule has made and damping has taken [J] of all rods and worlds, and the largest fraction of one that was made."""
+    account = np.concatenate([part.account.numpy() for part in parts], axis=1).astype(float)
+    made, _, held, dissipated = account
+    fraction = np.abs(made) / np.maximum(held + dissipated, np.finfo(float).tiny)
+    return {"made": float(made.sum()), "dissipated": float(dissipated.sum()), "fraction": float(fraction.max())}
+
+
+class _Energy:
+    """Watches the energy of the steps of a part; see `kernels.energy`.
+
+    Args:
+        step: a `ChainStep` or a `NetStep`.
+        count: of its rods in all worlds, or of worlds; rows: how many sums over parts of each are added up.
+        kept: the watch of the step that this one replaces.
+
+    Attributes:
+        account: what was made, its rounding, the largest energy held, and what was dissipated (4, count) [J].
+    """
+
+    def __init__(self, step, count: int, rows: int, kept):
+        self.step, self.model = step, step.model
+        real, self.device = self.model.types.real, self.model.wp_device
+
+        def make(*shape):
+            return wp.zeros(shape, dtype=real, device=self.device)
+
+        self.account = kept.account if kept else make(energy.ROWS, count)
+        self.failed = kept.failed if kept else make(2, count)
+        self.sums = make(rows, energy.ROWS, count)
+        self.rows = self.sums.transpose((1, 0, 2))
+        self.floor = step.newton.options.floor_factor * self.model.types.eps
+        self._judge = energy.judge_kernel(real)
+
+    def _enter(self) -> None:
+        """Enter the steps in the account, or have them fail."""
+        step = self.step
+        wp.launch(
+            self._judge,
+            self.account.shape[1],
+            [self.rows, step.integrator.energy_bound, *step.islands.arrays],
+            [self.account, self.failed],
+            device=self.device,
+        )
+
+    def failure(self, index: int) -> str:
+        """What to tell of a rod or world that was given up."""
+        made, held = self.failed.numpy()[:, index]
+        return (
+            f"the midpoint rule would have {'made' if made > 0.0 else 'lost'} {abs(made):.3g} J of {held:.3g} J; take a smaller dt, "
+            f"scheme='implicit_euler', or a wider energy_bound than {self.step.integrator.energy_bound:g}"
+        )
+
+
+class ChainEnergy(_Energy):
+    """The energy of a group of rods."""
+
+    def __init__(self, step, kept=None):
+        group = step.group
+        self.ranges = 1 if group.kind.serial else max(1, math.isqrt(group.nodes))
+        super().__init__(step, group.columns, self.ranges, kept)
+        self._loads = [group.load, group.load_angle]
+        self._follows = any(np.any(load.couple) for load in group.host.timed_loads)
+        if self._follows:
+            self._loads = [wp.clone(load) for load in self._loads]
+        self._measure = energy.chain_kernel(group.kind, self.model.types.real, step.newton.linear)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [self._measure, self._judge]
+
+    def judge(self, before) -> None:
+        """Judge the step that was solved from the state `before`."""
+        step, group, newton = self.step, self.step.group, self.step.newton
+        if self._follows:
+            step.loads.apply(newton.x, *self._loads)
+        wp.launch(
+            self._measure,
+            (self.ranges, group.columns),
+            [before.x, before.v, before.theta, before.omega, before.frame, newton.x, newton.theta, newton.frame]
+            + [before.last, *step.islands.arrays, *group.parameters.arrays, group.count, group.mass, group.rotary]
+            + [
+                *self._loads,
+                group.load,
+                group.load_angle,
+                int(self._follows),
+                newton.stiffness,
+                step.damping,
+                self.floor,
+                self.ranges,
+            ],
+            [self.rows],
+            device=self.device,
+        )
+        self._enter()
+
+
+class NetEnergy(_Energy):
+    """The energy of a net."""
+
+    def __init__(self, step, kept=None):
+        net, worlds = step.net, step.model.worlds
+        super().__init__(step, worlds, len(net.sets) + 1, kept)
+        real = self.model.types.real
+        counts = [*(part.elements for part in net.sets), net.blocks]
+        self._values = [wp.zeros((energy.ROWS * worlds, n), dtype=real, device=self.device) for n in counts]
+        self._add = [Sums(energy.ROWS * worlds, n, real, self.device) for n in counts]
+        self._out = [self.sums[i].flatten() for i in range(len(counts))]
+        self._elements = [net_energy.element_kernel(part.term, real, step.newton.linear) for part in net.sets]
+        self._load = wp.clone(step.newton.load) if net.host.followers else step.newton.load
+        self._blocks = net_energy.block_kernel(real)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        sums = [(kernel, krylov.THREADS) for add in self._add for kernel in add.kernels]
+        return [*self._elements, self._blocks, self._judge, *sums]
+
+    def judge(self, before, middle) -> None:
+        """Judge the step that was solved from the state `before` with the lagged data of `middle`."""
+        step, net, solver = self.step, self.step.net, self.step.newton
+        for i, (part, own, kernel) in enumerate(zip(net.sets, solver.parts, self._elements, strict=True)):
+            wp.launch(
+                kernel,
+                step.model.worlds * part.elements,
+                [
+                    net.elements(middle, i, q=solver.q, rate=step.islands.rate),
+                    before.q,
+                    own["stiffness"],
+                    self.floor,
+                    *step.islands.arrays,
+                ],
+                [self._values[i]],
+                device=self.device,
+            )
+        if net.host.followers:
+            step.loads.apply(solver.q, self._load)
+        wp.launch(
+            self._blocks,
+            solver.all,
+            [
+                before.q,
+                before.v,
+                solver.q,
+                solver.mass,
+                *step.islands.arrays,
+                step.damping,
+                self._load,
+                solver.load,
+                self.floor,
+            ]
+            + [net.blocks],
+            [self._values[-1]],
+            device=self.device,
+        )
+        for add, values, out in zip(self._add, self._values, self._out, strict=True):
+            add(values, out)
+        self._enter()

@@ -1,0 +1,70 @@
+"""Newton with stresses of its own: few iterations and long steps for thin shells.
+
+Where displacements alone are the unknowns, the turn of an element in an iteration stretches it at second order, and the stress of that
+stretch spoils the next tangent. Here stress and displacement are unknowns together (Hellinger and Reissner), as in the mixed
+integration point method of Magisano, Leonetti and Garcea (Int. J. Numer. Meth. Eng. 109, 2017). Stresses are condensed element by
+element, which leaves the residual r of the displacements and one change in the tangent: the second derivatives of the strains are
+weighted with the stress s of the last linear step instead of the stress of the present strains,
+
+    (J^T C J + s : d2e) d = r ,   s <- psi'(e + J d) .
+
+What it converges to is the same equilibrium, at the same rate. There is no merit function that falls: steps are taken whole, and
+whoever calls this falls back on the search where it does not converge.
+"""
+
+import numpy as np
+
+from ddg_warp.model.state import State
+from ddg_warp.solve.direct import Factorisation, SingularError
+
+MAX_ITERATIONS = 20  # without convergence by then, the load step is too long
+UNBALANCED = 1e-3  # residual over load scale at which a search does not start from an equilibrium
+ROTATION_CAP = 4.0  # rad; no more than a guard against nonsense
+
+
+def newton(solver, state: State, before: float, at: float) -> State | None:
+    """The equilibrium at load parameter `at` from a state that belongs to `before`; None if the iteration does not converge.
+
+    In mode "minimise" only a minimum of the energy is taken. `solver` is an `Equilibrium`; its counters and outcome are updated.
+    """
+    tangent = solver.tangent
+    free = np.flatnonzero(tangent.free)
+    jump = tangent.support_step(state, before, at)
+    q, gradient, stress = tangent.dofs(state), tangent.gradient(state), None
+    first = solver.first_scale(tangent.loads(at, q), gradient)
+    if (np.abs(tangent.loads(before, q) - gradient) > UNBALANCED * solver.allowed(first))[free].any():
+        # a crumpled start, or a rest shape that has changed: stresses of no equilibrium say nothing about the next one
+        stress = [0.0 * part for part in tangent.linear_stress(state, jump)]
+    state, factor, polished = tangent.with_prescribed(state, at), None, False
+    for iteration in range(MAX_ITERATIONS):
+        q = tangent.dofs(state)
+        outer, gradient = tangent.loads(at, q), tangent.gradient(state)
+        hessian = tangent.stiffness(state, at, stress)
+        residual = outer - gradient
+        if not np.isfinite(residual).all() or not np.isfinite(hessian.data).all():
+            return None
+        if iteration:
+            scale = np.maximum(first, solver.load_scale(outer, gradient))
+            excess = solver.excess(residual, gradient, hessian, q, scale)
+            if excess <= 0.0 and (solver.outcome == "converged" or polished):
+                stable = factor.reliable and not factor.negative
+                state.time, solver.stiffness = at, hessian
+                return state if stable or solver.options.mode == "follow" else None
+            polished = excess <= 0.0
+        else:
+            residual = residual - hessian @ jump
+        try:
+            factor = Factorisation(hessian[free][:, free])
+        except SingularError:
+            return None
+        solver.iterations += 1
+        step = np.zeros(tangent.size)
+        step[free] = factor.solve(residual[free])
+        if iteration:
+            step *= min(1.0, ROTATION_CAP / max(1e-300, tangent.rotation(q, step)))
+        else:
+            step += jump
+        stress = tangent.linear_stress(state, step)
+        state = state.copy()
+        tangent.assign(state, q + step)
+    return None

@@ -1,0 +1,276 @@
+"""The chain preconditioner of a net on a device; see `kernels.net.chains` and `joints`."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels.net import chains, joints
+from ddg_warp.solve.net.system import lists
+
+SERIAL = 32  # threads of a block where a thread walks along a chain, so that few chains spread over the multiprocessors
+
+
+class Chains:
+    """The rods of a net as chains between their joints, and the preconditioner they make.
+
+    Args:
+        net: `DeviceNet`; table: its `NetSystem`; linear: type of the linear algebra.
+
+    Raises:
+        SceneError: the net has no rods.
+    """
+
+    def __init__(self, net, table, linear):
+        if not net.host.rods:
+            raise SceneError("preconditioner 'chain' is of nets with rods; this one has none")
+        self.net, self.table, self.device = net, table, net.device
+        rows, columns = table.rows.numpy(), table.columns.numpy()
+        plan = self.plan = ChainPlan(net.host, rows, columns)
+        worlds, device = net.worlds, net.device
+        H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
+
+        def put(values):
+            return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
+
+        self.places = arrays.upload(plan.places.astype(np.int32), int, device)
+        self.count, self.where = put(plan.count), put(plan.where)
+        self.longest, self.width = plan.places.shape[1:]
+        self.columns = worlds * self.width
+        block = 4 if plan.twist else 3
+        self.factors = arrays.allocate((3 * block**2 + block, self.longest, self.columns), linear, device)
+        self.values = arrays.allocate((block, self.longest, max(1, plan.solves) * self.columns), linear, device)
+        self.joints, self.joint_rows = len(plan.pairs), 2 * len(plan.pairs)
+        self.joint_row, self.pairs, self.own = put(plan.joint_row), put(plan.pairs), put(plan.own)
+        self.colour = put(plan.colour)
+        self.starts, self.items = map(put, plan.of_places)
+        self.joint_starts, self.joint_items = map(put, plan.of_joints)
+        self.moved = wp.zeros(max(1, worlds * self.joint_rows), dtype=H, device=device)
+        self.units = wp.array(np.repeat(plan.units, worlds, axis=1).reshape(-1, 3), dtype=H, device=device)
+        self.parts = wp.zeros((3, max(1, worlds * self.joints)), dtype=M, device=device)
+        self._gather, self._factorise, self._load, self._solve, self._finish = chains.chain_kernels(
+            plan.twist, plan.span, linear
+        )
+        self._measure, self._meet = joints.joint_kernels(linear) if self.joints else (None, None)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        own = [self._gather, (self._factorise, SERIAL), self._load, (self._solve, SERIAL), self._finish]
+        return own + ([self._measure, self._meet] if self.joints else [])
+
+    def prepare(self, matrix: wp.array, inverse: wp.array, fixed: wp.array, wanted: wp.array) -> None:
+        """Factors of chains and joints of the worlds that want a direction; `inverse` is that of the diagonal blocks."""
+        table, plan, net = self.table, self.plan, self.net
+        self._launch(
+            self._gather,
+            (self.longest, self.columns),
+            [matrix, self.places, self.count, fixed, wanted, table.positions],
+            [self.factors],
+        )
+        self._launch(self._factorise, self.columns, [self.count, wanted], [self.factors], SERIAL)
+        if not self.joints:
+            return
+        self._eliminate(matrix, fixed, wanted, plan.solves, None, self.units)
+        self._launch(
+            self._measure,
+            net.worlds * self.joints,
+            [matrix, *self._joint_inputs, self.own, self.colour, plan.size, fixed, inverse, wanted]
+            + [net.blocks, table.positions],
+            [self.parts],
+        )
+
+    def apply(self, matrix, residual, fixed, wanted, z: wp.array, dots: wp.array) -> None:
+        """z of the blocks of rods and joints from the residual, where block Jacobi has left its own, and r . z block by block."""
+        net = self.net
+        self._eliminate(matrix, fixed, wanted, 1, residual, None)
+        if self.joints:
+            self._launch(
+                self._meet,
+                net.worlds * self.joints,
+                [matrix, *self._joint_inputs, self.parts, residual, wanted, net.blocks, self.table.positions],
+                [self.moved],
+            )
+            self._eliminate(matrix, fixed, wanted, 1, residual, self.moved)
+        self._launch(
+            self._finish,
+            net.worlds * net.blocks,
+            [residual, self.values, self.where, self.width, self.joint_row, self.joint_rows, self.moved, wanted]
+            + [net.blocks, net.host.nodes],
+            [z, dots],
+        )
+
+    @property
+    def _joint_inputs(self) -> list:
+        values = [self.joint_starts, self.joint_items, self.values, self.where, self.width, self.net.host.nodes]
+        return [self.table.columns, *values, self.pairs]
+
+    def _eliminate(self, matrix, fixed, wanted, solves: int, residual, moved) -> None:
+        """H_II^-1 (r_I - H_IJ z_J) of as many right-hand sides; without `residual` or `moved` that one is zero."""
+        table, net = self.table, self.net
+        self._launch(
+            self._load,
+            (self.longest, solves * self.columns),
+            [matrix, table.columns, self.places, self.count, fixed, self.starts, self.items, self.joint_row]
+            + [self.joint_rows, wanted, net.blocks, table.positions, int(residual is not None)]
+            + [int(moved is not None), self.moved if residual is None else residual]
+            + [self.moved if moved is None else moved],
+            [self.values],
+        )
+        self._launch(self._solve, solves * self.columns, [self.factors, self.count, wanted], [self.values], SERIAL)
+
+    def _launch(self, kernel, dim, inputs: list, outputs: list, threads: int = arrays.THREADS) -> None:
+        wp.launch(kernel, dim, inputs, outputs, device=self.device, block_dim=threads)
+
+
+class ChainPlan:
+    """Chains, joints and their couplings on the host.
+
+    Place k of a rod has its node k and the angle of the edge behind it. Joints take out the nodes where rods meet, the rotations
+    of rigid joints, and the last places of a closed rod, so that what is left couples over two places at most; what acts from afar,
+    as dipoles do, is left out. It falls into chains at rigid joints, not at hinged ones, over which a rod bends. Short chains lie
+    behind each other in columns as long as the longest chain, so that little memory is padding.
+
+    Attributes:
+        twist, span: whether chains have angles, and over how many places they couple.
+        places (rows, longest, columns): node and angle of a place, -1 for none; then positions in H of its blocks with itself and
+            with the next places (node x node, node x angle, angle x node, angle x angle for each; without angles the first).
+        count (columns,): places of a column; where (blocks,): place * columns + column of a block, -1 for none.
+        pairs (joints, 2): blocks of a joint, -1 for none; joint_row (blocks,): 2 joint + which of them, or -1.
+        own (joints, 3): positions of its blocks in H, with each other at last.
+        of_places, of_joints: starts and positions of the couplings of blocks of chains with joints, of rows of joints with chains.
+        colour (joints,); units (solves, 1, 2 joints, 3): movements of joints, of a colour and a dof each, that S is measured with.
+    """
+
+    def __init__(self, host, rows: np.ndarray, columns: np.ndarray):
+        self._blocks = host.blocks
+        if any(part.term.measure.apart for part in host.sets):
+            slots = [part.slots.astype(np.int64) for part in host.sets if not part.term.measure.apart]
+            near = np.concatenate([(s[:, None] * host.blocks + s[None]).ravel() for s in slots])
+            rows = np.where(np.isin(rows.astype(np.int64) * host.blocks + columns, near), rows, -1)
+        used = np.flatnonzero(rows >= 0)
+        self._order = used[np.argsort(rows[used].astype(np.int64) * host.blocks + columns[used])]
+        self._keys = rows[self._order].astype(np.int64) * host.blocks + columns[self._order]
+        lengths = [len(rod.all_nodes) for rod in host.rods]
+        rod = np.repeat(np.arange(len(lengths)), lengths)
+        node = np.concatenate([rod.all_nodes for rod in host.rods])
+        edges = [(r.all_edges, len(r.all_nodes) - len(r.all_edges)) for r in host.rods]
+        angle = np.concatenate([np.append(own, np.full(missing, -1)) for own, missing in edges])
+        place, reach = self._joints(host, node, angle, rod, rows[used], columns[used])
+        node, angle = (np.where((block >= 0) & (self.joint_row[block] < 0), block, -1) for block in (node, angle))
+        kept = (node >= 0) | (angle >= 0)
+        if not kept.any():
+            raise SceneError("preconditioner 'chain': no rod of the net has a node between its joints")
+        goes_on = np.zeros(len(node), bool)  # a chain from the place before
+        for step in (1, 2):
+            goes_on[place[reach == 2] - step + 1] = True
+        goes_on[place[reach == 1]] = True
+        chain = np.cumsum(~goes_on)[kept]
+        self.twist, self.span = bool((angle >= 0).any()), 2 if (reach == 2).any() else 1
+        self._arrange(node[kept], angle[kept], np.unique(chain, return_inverse=True)[1])
+        self._couple(host, rows, columns)
+        self._colour(host, columns)
+
+    def find(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        """Positions of blocks in H, -1 where it has none or one of the two is -1."""
+        keys = row.astype(np.int64) * self._blocks + column
+        at = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+        return np.where((row >= 0) & (column >= 0) & (self._keys[at] == keys), self._order[at], -1)
+
+    def _joints(self, host, node, angle, rod, rows, columns) -> tuple[np.ndarray, ...]:
+        """What is taken out of the rods: `pairs` and `joint_row`. Returns couplings in what is left: later place, distance."""
+        spins = [part.slots[[0, 3]].T for part in host.sets if part.term.measure.spins]
+        turning = np.unique(np.concatenate(spins), axis=0) if spins else np.zeros((0, 2), int)
+        met = np.bincount(node, minlength=host.blocks) > 1
+        met[turning[:, 0]] = True
+        spin = np.full(host.blocks, -1)
+        spin[turning[::-1, 0]] = turning[::-1, 1]
+        others = turning[spin[turning[:, 0]] != turning[:, 1], 1]  # of a second rigid joint at a node
+        place = np.full(host.blocks, -1)
+        at = np.arange(len(node))
+        place[node[~met[node]]] = at[~met[node]]
+        place[angle[angle >= 0]] = at[angle >= 0]
+        a, b = place[rows], place[columns]
+        inside = (b >= 0) & (a > b)
+        inside[inside] = rod[a[inside]] == rod[b[inside]]
+        a, b = a[inside], b[inside]
+        cut = np.unique(a[a - b > 2])
+        shared = np.flatnonzero(met)
+        pairs = [
+            np.column_stack([shared, spin[shared]]),
+            np.column_stack([np.full(len(others), -1), others]),
+            np.column_stack([np.where(met[node[cut]], -1, node[cut]), angle[cut]]),
+        ]
+        self.pairs = np.concatenate(pairs)
+        self.joint_row = np.full(host.blocks, -1)
+        taken = self.pairs.ravel()
+        self.joint_row[taken[taken >= 0]] = np.flatnonzero(taken >= 0)
+        left = ~(np.isin(a, cut) | np.isin(b, cut))
+        return a[left], (a - b)[left]
+
+    def _arrange(self, node, angle, chain) -> None:
+        """Chains in columns: `places`, `count` and `where`."""
+        lengths = np.bincount(chain)
+        begin, column = np.zeros(len(lengths), int), np.zeros(len(lengths), int)
+        filled, longest = [0], lengths.max()
+        for i in np.argsort(-lengths, kind="stable"):
+            if filled[-1] + lengths[i] > longest:
+                filled.append(0)
+            begin[i], column[i] = filled[-1], len(filled) - 1
+            filled[-1] += lengths[i]
+        self.count = np.array(filled)
+        width = len(filled)
+        k = np.arange(len(node)) - np.repeat(np.cumsum(lengths) - lengths, lengths) + begin[chain]
+        c = column[chain]
+        blocks = [node, angle] if self.twist else [node]
+        rows = list(blocks)
+        for s in range(self.span + 1):
+            together = np.append(chain[s:] == chain[: len(chain) - s], np.zeros(s, bool))
+            for p in blocks:
+                for q in blocks:
+                    rows.append(self.find(p, np.where(together, np.roll(q, -s), -1)))
+        self.places = np.full((len(rows), longest, width), -1)
+        self.places[:, k, c] = rows
+        self.where = np.full(self._blocks, -1)
+        for block in blocks:
+            self.where[block[block >= 0]] = (k * width + c)[block >= 0]
+
+    def _couple(self, host, rows, columns) -> None:
+        """Couplings of chains and joints."""
+        real = rows >= 0
+        inside, joint = (np.where(real, of[b], -1) for b, of in ((rows, self.where), (columns, self.joint_row)))
+        there = np.flatnonzero((inside >= 0) & (joint >= 0))
+        starts, items = lists(rows[there], host.blocks)
+        self.of_places = starts, there[items]
+        inside, joint = (np.where(real, of[b], -1) for b, of in ((columns, self.where), (rows, self.joint_row)))
+        there = np.flatnonzero((inside >= 0) & (joint >= 0))
+        starts, items = lists(joint[there], 2 * len(self.pairs))
+        self.of_joints = starts, there[items]
+        a, b = self.pairs.T
+        self.own = np.column_stack([self.find(a, a), self.find(b, b), self.find(a, b)])
+
+    def _colour(self, host, columns) -> None:
+        """Colours of joints, different where they meet at a chain, and the movements to measure with."""
+        joints = len(self.pairs)
+        starts, items = self.of_joints
+        joint = np.repeat(np.arange(2 * joints), np.diff(starts)) // 2
+        k, column = np.divmod(self.where[columns[items]], self.places.shape[2])
+        touch = np.unique(np.column_stack([column, k, joint]), axis=0)
+        neighbours = [set() for _ in range(joints)]
+        for lag in (1, 2, 3):
+            near = (touch[lag:, 0] == touch[:-lag, 0]) & (touch[lag:, 2] != touch[:-lag, 2])
+            for one, other in zip(touch[:-lag][near, 2], touch[lag:][near, 2], strict=True):
+                neighbours[one].add(other)
+                neighbours[other].add(one)
+        self.colour = np.full(joints, -1)
+        for m in range(joints):
+            taken = {self.colour[other] for other in neighbours[m]}
+            self.colour[m] = next(c for c in range(joints) if c not in taken)
+        self.size = 6 if (self.pairs[:, 1] >= 0).any() else 3
+        self.solves = self.size * (self.colour.max(initial=-1) + 1)
+        self.units = np.zeros((self.solves, 1, 2 * joints, 3))
+        for m, colour in enumerate(self.colour):
+            for d in range(self.size):
+                block = self.pairs[m, d // 3]
+                if block >= 0 and not host.fixed[block, d % 3]:
+                    self.units[colour * self.size + d, 0, 2 * m + d // 3, d % 3] = 1.0

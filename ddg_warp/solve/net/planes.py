@@ -1,0 +1,82 @@
+"""Dofs, forces and tangents of nodes on oblique planes, in the frames of `ddg_warp.compile.net.planes`."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp.kernels.net import planes
+
+
+class HostPlanes:
+    """The frames of a net's nodes as one orthogonal matrix, for all worlds."""
+
+    def __init__(self, net, worlds: int):
+        from scipy import sparse
+
+        place, blocks = np.array(list(net.frames)), net.blocks
+        turn = np.tile(np.eye(3), (blocks, 1, 1))
+        turn[place] = list(net.frames.values())
+        one = sparse.bsr_matrix((turn, np.arange(blocks), np.arange(blocks + 1)))
+        self._turn = sparse.block_diag([one] * worlds, format="csr")
+
+    def into(self, values: np.ndarray) -> np.ndarray:
+        """Dofs, forces or steps in space as components in the frames."""
+        return self._turn @ values
+
+    def back(self, values: np.ndarray) -> np.ndarray:
+        """Components in the frames as vectors in space."""
+        return self._turn.T @ values
+
+    def matrix(self, values):
+        """A matrix of dofs in space as one of components in the frames."""
+        return (self._turn @ values @ self._turn.T).tocsc()
+
+
+class DevicePlanes:
+    """The same on the device, for the linear algebra of `NetNewton`."""
+
+    def __init__(self, net, table, real, linear):
+        host, device = net.host, net.device
+        self.net, self.positions = net, table.positions
+        place = np.array(list(host.frames))
+        frames = np.array(list(host.frames.values()))
+        rows, columns = table.rows.numpy(), table.columns.numpy()
+        frame = np.full(host.blocks + 1, -1)  # the last for padding
+        frame[place] = np.arange(len(place))
+        entries = np.column_stack([np.arange(len(rows)), frame[rows], frame[columns]])
+        entries = entries[(entries[:, 1:] >= 0).any(1)]
+
+        def put(values, dtype):
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+        self.where, self.entries = put(place.astype(np.int32), int), put(entries.astype(np.int32), int)
+        self.frames = {kind: put(frames, wp.types.matrix((3, 3), kind)) for kind in {real, linear}}
+        self._force, self._matrix = planes.turn_kernel(real, False), planes.matrix_kernel(linear)
+        self._into, self._back = (planes.turn_kernel(linear, back) for back in (False, True))
+        self.real, self.linear = real, linear
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [self._force, self._matrix, self._into, self._back]
+
+    def forces(self, force: wp.array) -> None:
+        """Turn forces into the frames."""
+        self._turn(self._force, self.real, self.net.every, force)
+
+    def into(self, direction: wp.array, wanted: wp.array) -> None:
+        """Turn the directions of the worlds that want one into the frames."""
+        self._turn(self._into, self.linear, wanted, direction)
+
+    def back(self, direction: wp.array, wanted: wp.array) -> None:
+        """Turn them back into space."""
+        self._turn(self._back, self.linear, wanted, direction)
+
+    def matrix(self, matrix: wp.array, wanted: wp.array) -> None:
+        """Turn H of the worlds that want it."""
+        inputs = [self.entries, self.frames[self.linear], wanted, self.positions]
+        dim = (len(self.entries), self.net.worlds)
+        wp.launch(self._matrix, dim, inputs, [matrix], device=self.net.device)
+
+    def _turn(self, kernel, kind, wanted: wp.array, vectors: wp.array) -> None:
+        inputs = [self.where, self.frames[kind], wanted, self.net.blocks]
+        wp.launch(kernel, (len(self.where), self.net.worlds), inputs, [vectors], device=self.net.device)

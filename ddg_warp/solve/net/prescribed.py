@@ -1,0 +1,189 @@
+"""What is prescribed of a net from outside: motion of supports, loads that change or follow what they act on, a magnetic field."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp.compile.chains import pose_starts
+from ddg_warp.kernels import motion
+from ddg_warp.kernels.measures.magnetised_edge import FIELD
+from ddg_warp.kernels.net import loads
+from ddg_warp.kernels.net.motion import field_kernel, motion_kernels
+from ddg_warp.model.net import NetState
+from ddg_warp.solve.chains.prescribed import poses
+from ddg_warp.solve.net.system import lists
+
+
+class NetMotion:
+    """Motion of held nodes, of held angles of rod edges, and of the normals at clamped mesh edges.
+
+    Poses at both ends of a step come from the host; where supports are in between is found on the device, world by world.
+    """
+
+    def __init__(self, model, midpoint: bool):
+        net, host, device, real = model.net, model.net.host, model.wp_device, model.types.real
+        self.model, self.net = model, net
+        start = pose_starts(model.motions)
+        self.pose = wp.zeros((start[-1], motion.POSE), dtype=real, device=device)
+        self._nodes, self._angles, self._normals, self._turn = motion_kernels(real, midpoint)
+
+        def put(values):
+            return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
+
+        def vectors(values):
+            return wp.array(np.ascontiguousarray(values), dtype=net.vector, device=device)
+
+        motions = np.full((host.blocks, 3), -1)
+        for blocks, index, components, rows in host.moving:
+            motions[blocks] = np.where(components, start[index] + rows[:, None], motions[blocks])
+        blocks = np.flatnonzero((motions >= 0).any(1))
+        self.nodes = put(np.column_stack([blocks, motions[blocks]]))
+        self.rest = vectors(host.rest)
+        edges = [np.column_stack([b - host.nodes, np.full(len(b), start[index])]) for b, index in host.turning]
+        edges = np.concatenate([np.zeros((0, 2), int), *edges])
+        self.edges, self.edge_rest = put(edges), vectors(host.frame[:3, edges[:, 0]].T)
+        self.normals = {}
+        for i in net.turning_data():
+            element, row, index = net.sets[i].turning.T
+            where = put(np.column_stack([element, row, start[index]]))
+            self.normals[i] = (where, vectors(net.sets[i].turning_rest))
+        self.data = net.turning_data()  # with the normals that a solve is about
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        normals = [self._normals, self._turn] if self.normals else []
+        return [self._nodes, *([self._angles] if len(self.edges) else []), *normals]
+
+    def upload(self, t0: float, t1: float) -> None:
+        """Poses of all motions between t0 and t1."""
+        self.pose.assign(poses(self.model, t0, t1))
+
+    def apply(self, islands, q: wp.array, frame: wp.array) -> None:
+        """Put held blocks and normals where the part of the step that a world tries has them; `frame` are lagged."""
+        net = self.net
+        rows = [self.pose, *islands.arrays]
+        self._launch(self._nodes, self.nodes, [self.nodes, self.rest, *rows, net.blocks], [q])
+        if len(self.edges):
+            inputs = [self.edges, self.edge_rest, self.pose, net.ends, frame, *islands.arrays]
+            self._launch(self._angles, self.edges, [*inputs, net.blocks, net.angle_start], [q])
+        for index, (where, rest) in self.normals.items():
+            self._launch(self._normals, where, [where, rest, *rows, net.sets[index].elements], [self.data[index]])
+
+    def turn(self, islands, before: NetState, after: NetState) -> None:
+        """Turn the normals of a state that a part of the step ends in, in the worlds that moved."""
+        for index, (where, rest) in self.normals.items():
+            inputs = [where, rest, self.pose, *islands.arrays, self.net.sets[index].elements]
+            self._launch(self._turn, where, [*inputs, before.data[index]], [after.data[index]])
+
+    def _launch(self, kernel, where: wp.array, inputs: list, outputs: list) -> None:
+        dim = (len(where), self.model.worlds)
+        wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)
+
+
+class NetLoads:
+    """Loads of a net that change or follow what they act on, over the constant ones."""
+
+    def __init__(self, model, midpoint: bool):
+        net, host, device, real = model.net, model.net.host, model.wp_device, model.types.real
+        self.model, self.net, self.midpoint = model, net, midpoint
+        self.constant = wp.array(np.tile(host.load, (model.worlds, 1)), dtype=net.vector, device=device)
+        self._followers = []
+        if not host.followers:
+            return
+
+        def put(values, dtype=int):
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+        press, squeeze, twist, bend, self._spread = loads.follower_kernels(real)
+        kinds = [(press, load, load.pressure, real) for load in host.pressures]
+        kinds += [(squeeze, load, load.pressure, real) for load in host.bands]
+        kinds += [(twist, load, np.tile(load.couple, (len(load.places), 1)), net.vector) for load in host.couples]
+        kinds += [(bend, load, load.values, net.vector) for load in host.edge_couples]
+        for kernel, load, values, dtype in kinds:
+            self._followers.append((kernel, load, values, put(load.places.astype(np.int32)), put(values, dtype)))
+        places = np.concatenate([load.places.ravel() for load in host.followers])
+        self.starts, self.items = (put(v.astype(np.int32)) for v in lists(places, net.blocks))
+        self.total = len(places)
+        self.force = wp.zeros(model.worlds * self.total, dtype=net.vector, device=device)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [*{kernel for kernel, *_ in self._followers}, self._spread] if self._followers else []
+
+    def upload(self, t0: float, t1: float) -> None:
+        """Values at the time that the scheme balances forces at."""
+        at, host = 0.5 * (t0 + t1) if self.midpoint else t1, self.net.host
+        if host.timed:
+            load = host.load.copy()
+            for timed in host.timed:
+                np.add.at(load, timed.blocks, timed.at(at, 1.0) * timed.force)
+            self.constant.assign(np.tile(load, (self.model.worlds, 1)))
+        for _, load, values, _, on_device in self._followers:
+            if load.amplitude is not None:
+                on_device.assign(load.at(at, 1.0) * values)
+
+    def scale(self, dead: np.ndarray, at: float) -> None:
+        """Values of an equilibrium at load parameter `at`, with the loads (blocks, 3) that follow nothing."""
+        self.constant.assign(np.tile(dead, (self.model.worlds, 1)))
+        for _, load, values, _, on_device in self._followers:
+            on_device.assign(load.at(at, at) * values)
+
+    def apply(self, q: wp.array, load: wp.array) -> None:
+        """Write the loads on blocks q."""
+        net, first = self.net, 0
+        if not self._followers:
+            if net.host.timed:
+                wp.copy(load, self.constant)
+            return
+        for kernel, _, _, places, values in self._followers:
+            dim, inputs = (len(places), self.model.worlds), [q, places, values, net.blocks, first, self.total]
+            wp.launch(kernel, dim, inputs, [self.force], device=self.model.wp_device)
+            first += places.size
+        wp.launch(
+            self._spread,
+            self.model.worlds * net.blocks,
+            [self.constant, self.force, self.starts, self.items, net.blocks, self.total],
+            [load],
+            device=self.model.wp_device,
+        )
+
+
+class NetField:
+    """The magnetic field among the data of magnetised edges, at the time that the scheme balances forces at and at the end of a step.
+
+    Attributes:
+        data: of those sets by index, with the field that a solve is about.
+    """
+
+    def __init__(self, model, midpoint: bool):
+        self.model, self.net, self.midpoint = model, model.net, midpoint
+        self.data = model.net.field_data()
+        self._kernel = field_kernel(model.types.real)
+        self._now, self._end = (wp.zeros(FIELD, dtype=model.types.real, device=model.wp_device) for _ in range(2))
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [self._kernel] if self.data else []
+
+    def upload(self, t0: float, t1: float) -> None:
+        """The field of a step."""
+        if not self.data:
+            return
+        field = self.model.scene.applied_field
+        self._now.assign(field.at(0.5 * (t0 + t1) if self.midpoint else t1, 1.0))
+        self._end.assign(field.at(t1, 1.0))
+        for index, data in self.data.items():
+            self._launch(index, self._now, self.net.every, data, data)
+
+    def finish(self, moved: wp.array, before: NetState, after: NetState) -> None:
+        """Put the worlds that `moved` into the field at the end of the step."""
+        for index in self.data:
+            self._launch(index, self._end, moved, before.data[index], after.data[index])
+
+    def _launch(self, index: int, field: wp.array, moved: wp.array, before: wp.array, after: wp.array) -> None:
+        part, first = self.net.sets[index], self.net.sets[index].term.measure.data_size - FIELD
+        inputs = [field, first, part.elements, moved, before]
+        dim = part.elements * self.model.worlds
+        wp.launch(self._kernel, dim, inputs, [after], device=self.model.wp_device)

@@ -1,0 +1,171 @@
+"""Equilibria of large nets: Newton by preconditioned conjugate gradients on the device, without any factorisation.
+
+The loop is that of a time step without its inertia: energies fall, and the matrix is Gauss-Newton's with the stiffness of the
+stresses. Loads follow every iterate and do the work of their mean along a step; their own stiffness is left out of the
+matrix, which costs iterations and no accuracy. No pivot is seen, so that a saddle on which nothing pushes off is not told from a
+minimum: `ddg_warp.solve.stability` tells.
+"""
+
+import math
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.errors import SolverError
+from ddg_warp.kernels import outcome
+from ddg_warp.kernels.net import newton
+from ddg_warp.model.state import State
+from ddg_warp.solve.chains.newton import NewtonOptions
+from ddg_warp.solve.choice import net_preconditioner
+from ddg_warp.solve.graphs import Graphs
+from ddg_warp.solve.net.newton import NetNewton
+from ddg_warp.solve.net.prescribed import NetLoads
+
+FORCING = 1e-4  # smallest reduction of the residual that a direction is solved to: Gauss-Newton errs by more
+FAR = 4.0  # turns of a direction, over the cap of a step, at which it is far enough
+
+
+class StaticNewton(NetNewton):
+    """`NetNewton` without inertia, in the precision of the state: no mass bounds the condition of its matrix."""
+
+    def __init__(self, model, options: NewtonOptions):
+        super().__init__(model, options, net_preconditioner(model.net), model.types.real)
+        self._whole = False  # whether directions may go as far as they like
+        self.gravity.zero_()  # a load like others: `begin` scales them all
+        self.loads, self._there = NetLoads(model, midpoint=False), wp.zeros_like(self.load)
+        self._follow, self._less, self._far = newton.static_kernels(self.real, self.linear)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [*super().kernels, self._follow, self._less, self._far, *self.loads.kernels]
+
+    def begin(self, q: np.ndarray, dead: np.ndarray, at: float, scale: np.ndarray) -> None:
+        """Set out from dofs `q` under dead loads (blocks, 3), those that follow at load parameter `at`; load scales of bodies."""
+        for name in ("status", "iteration", "halvings", "unbalanced", "drowned", "clamped"):
+            getattr(self.islands, name).zero_()
+        for array in (self.q, self.base):
+            array.assign(q.reshape(-1, 3))
+        self.loads.scale(dead, at)
+        wp.copy(self.load, self.loads.constant)
+        wp.copy(self.islands.load_scale, self.allowed.assign(scale.reshape(self.worlds, -1)))
+        self.islands.active.fill_(1)
+
+    def outer_forces(self) -> None:
+        """Loads on the iterate."""
+        follows = bool(self.net.host.followers)
+        if follows:
+            self.loads.apply(self.q, self.load)
+            self.loads.apply(self.base, self._there)
+        super().outer_forces()
+        if follows:
+            self._launch(
+                self._follow,
+                [self.q, self.base, self.load, self._there, self.islands.status, self.net.blocks],
+                [self.change],
+            )
+
+    def cycle(self) -> None:
+        """One iteration of conjugate gradients, whose directions grow: one that would be cut to a fraction is far enough.
+
+        (Steihaug, SIAM J. Numer. Anal. 20, 1983.) Else a flat sheet's first direction, which knows bending alone, costs the most.
+        """
+        super().cycle()
+        if self._whole:
+            return
+        self.measure_turns()
+        if self.planes:
+            self.planes.into(self.direction, self.islands.wanted)
+        wp.launch(
+            self._far,
+            self.worlds,
+            [self.turn, FAR * self.options.rotation_cap],
+            [self.islands.wanted],
+            device=self.device,
+        )
+
+    def follow(self, state, step: wp.array) -> None:
+        """The direction of the free dofs where held ones make a `step`: H d = r - H step, in worlds that want it."""
+        table, blocks = self.system, self.net.blocks
+        self.evaluate(state)
+        self.balance()
+        self.assemble()
+        self._launch(
+            self._cycle[0],
+            [self.matrix, table.columns, table.slices, self.fixed, step, self.islands.wanted, blocks, table.positions],
+            [self.product, self.krylov_dots],
+        )
+        self._launch(self._less, [self.product], [self.right])
+        self._whole = True
+        self.direct()
+        self._whole = False
+
+
+class NetEquilibrium:
+    """Equilibria of a model that is a net alone, for `Equilibrium`, whose tangent and load scale it uses."""
+
+    def __init__(self, owner):
+        model, options = owner.model, owner.options
+        self.owner, self.model, self.net, self.tangent = owner, model, model.net, owner.tangent
+        self.newton = StaticNewton(
+            model,
+            NewtonOptions(
+                rtol=options.rtol,
+                floor_factor=options.floor_factor,
+                max_iterations=options.max_iterations,
+                rotation_cap=options.rotation_cap,
+                linear_rtol=FORCING,
+            ),
+        )
+        self._start = model.net.empty()  # lagged data of a solve
+        self._step = wp.zeros(self.newton.all, dtype=self.newton.right.dtype, device=model.wp_device)
+        self._graphs = Graphs(model, lambda: arrays.load_kernels(self.newton.kernels, model.wp_device))
+
+    def pcg_iterations(self) -> int:
+        """Iterations of conjugate gradients so far, without those that let the free dofs follow supports."""
+        return self.newton.pcg_iterations()
+
+    def following(self, state: State, step: np.ndarray, at: float) -> np.ndarray | None:
+        """How the free dofs follow held ones that make a `step` (size,), by the tangent; None if there is no answer."""
+        self._begin(state, at)
+        self._step.assign(step.reshape(-1, 3))
+        self.newton.islands.wanted.fill_(1)
+        self.newton.forcing.fill_(FORCING)
+        self.newton.goal.fill_(math.inf)
+        self._graphs.replay("follow", lambda: self.newton.follow(self._start, self._step))
+        direction = self.newton.direction.numpy().astype(np.float64).ravel()
+        return direction if np.isfinite(direction).all() else None
+
+    def solve(self, state: State, at: float) -> State:
+        """The equilibrium at load parameter `at` from a state with its supports in place.
+
+        Raises:
+            SolverError: it was not found; names the outcome.
+        """
+        state, owner = state.copy(), self.owner
+        again = self.net.edges or self.model.motions  # what is found is judged by its own frames and forces on supports
+        for _ in range(2 if again else 1):
+            self._begin(state, at)
+            self._graphs.replay("solve", lambda: self.newton.solve(self._start))
+            owner.iterations += int(self.newton.islands.iteration.numpy().sum())
+            wp.copy(state.net.q, self.newton.q)
+            self.model.carry_frames(state)
+            status = int(self.newton.islands.status.numpy().max())
+            q = self.tangent.dofs(state)
+            outer = self.tangent.loads(at, q)
+            residual = outer - self.tangent.gradient(state)
+            if status > outcome.CONVERGED_TO_ROUNDING:
+                name = outcome.NAMES[status]
+                raise SolverError(owner.where(name, residual, at), state=state, outcome=name)
+        owner.outcome = outcome.NAMES[status]
+        state.stable = False if self.newton.islands.clamped.numpy().any() else None
+        return owner.found(state, outer, residual, at)
+
+    def _begin(self, state: State, at: float) -> None:
+        tangent, part = self.tangent, self.tangent.parts[-1]
+        q = tangent.dofs(state)
+        outer, gradient = tangent.loads(at, q), tangent.gradient(state)
+        self.newton.begin(tangent.back(q), part.dead_loads(at), at, self.owner.load_scale(outer, gradient))
+        for name, array in self._start.arrays().items():
+            wp.copy(array, state.net.arrays()[name])

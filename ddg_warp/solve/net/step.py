@@ -1,0 +1,122 @@
+"""A time step of a net: predictor, prescribed motion and loads, Newton, end update, retries. See `kernels.step`."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels.net import elements, frames, newton
+from ddg_warp.model.net import NetState
+from ddg_warp.solve.choice import net_preconditioner
+from ddg_warp.solve.energy import NetEnergy
+from ddg_warp.solve.net.newton import PRECONDITIONERS, NetNewton
+from ddg_warp.solve.net.prescribed import NetField, NetLoads, NetMotion
+from ddg_warp.solve.step import PartStep
+from ddg_warp.solve.tangent import Tangent
+
+
+class NetStep(PartStep):
+    """Steps a model's net in all worlds, each an island."""
+
+    def __init__(self, integrator, model, linear=None, counts_of=None):
+        self.net = model.net
+        host, real = model.net.host, model.types.real
+        options = integrator.options
+        for name, value, only in (
+            ("solver", integrator.solver, ("newton",)),
+            ("linear", integrator.linear, ("auto", *PRECONDITIONERS)),
+            ("psd", options.psd, ("auto",)),
+        ):
+            if value not in only:
+                raise SceneError(f"{name} = {value!r} is of rods on their own; with a net it is {' or '.join(only)}")
+        bare = np.flatnonzero(((host.mass <= 0.0) & ~host.fixed)[: host.nodes].any(1))
+        if bare.size:
+            raise SceneError(
+                f"{Tangent(model).parts[-1].where(3 * int(bare[0]))} is free and has no mass; "
+                "give the material a density, or the section a mass_per_length"
+            )
+        preconditioner = net_preconditioner(model.net) if integrator.linear == "auto" else integrator.linear
+        super().__init__(integrator, model, NetNewton(model, options, preconditioner, linear), counts_of)
+        if counts_of is not None:
+            self.newton.pcg_work = counts_of.newton.pcg_work
+        self._begin, self._finish = newton.step_kernels(real, self.midpoint)
+        self.middle = model.net.empty() if self.midpoint and model.net.edges else None
+        self.energy = NetEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
+        self.motion = NetMotion(model, self.midpoint) if host.moving else None
+        self.loads, self.field = NetLoads(model, self.midpoint), NetField(model, self.midpoint)
+        self._data = (self.motion.data if self.motion else {}) | self.field.data
+
+    def attempt(self, before, after) -> None:
+        """One solve of every world that has not finished the step, from state `before` to `after`."""
+        solver, blocks, islands = self.newton, self.net.blocks, self.islands
+        self._launch(
+            self._begin,
+            solver.all,
+            [
+                before.q,
+                before.v,
+                solver.held,
+                solver.mass,
+                self.integrator._dt,
+                self.damping,
+                solver.outer,
+                *islands.arrays,
+            ]
+            + [blocks],
+            [solver.q, solver.base, solver.target],
+        )
+        start = self._start_frames(before)
+        if self.motion:
+            self.motion.apply(islands, solver.q, start.frame)
+        self.loads.apply(solver.q, solver.load)
+        solver.solve(start)
+        if self.energy:
+            self.energy.judge(before, start)
+        self._launch(
+            self._finish, solver.all, [solver.q, before.q, before.v, *islands.arrays, blocks], [after.q, after.v]
+        )
+        self.net.carry(start, after, kept=before, moved=islands.moved)
+        if self.motion:
+            self.motion.turn(islands, before, after)
+        self.field.finish(islands.moved, before, after)
+        self.net.update_strains(after)
+
+    def _start_frames(self, before):
+        """The state whose lagged data serve the solve: for the midpoint rule carried to the predicted midpoint.
+
+        Frames lagged at the start of the step would spin about their edges by O(h) at the midpoint, unseen by the rotary
+        inertia: the rule would be of first order. Rotations of joints have no inertia and are not predicted, so that those
+        found are of the whole half step. Normals that supports turn, and the magnetic field, are those that the solve is about.
+        """
+        if not (self.midpoint and self.net.edges):
+            return replace(before, data=self._data)
+        middle = NetState(self.newton.q, before.v, self.middle.frame, self.middle.lag, before.last, self._data)
+        self.net.carry(before, middle, moved=self.islands.moved)
+        return middle
+
+    @property
+    def own_kernels(self) -> list:
+        """Kernels of an attempt, without those of the solver."""
+        real, net = self.model.types.real, self.net
+        kernels = [self._begin, self._finish]
+        kernels += [frames.edge_kernel(real)] if net.edges else []
+        kernels += [frames.reset_kernel(real)] if net.host.spins else []
+        for part in net.sets:
+            kernels += [frames.lag_kernel(part.term.measure, real)] if len(part.host.lag) else []
+            kernels += [elements.term_kernels(part.term, real)[3]] if part.term.density.lagged else []
+        return kernels
+
+    def who(self, world: int) -> str:
+        """The net of a world."""
+        return f"the net (world {world})"
+
+    def rods_of(self, worlds: np.ndarray) -> list[int]:
+        """None: what failed is not one rod's."""
+        return []
+
+    def where(self, state, world: int) -> str:
+        """Where the largest residual was, and what to do."""
+        sizes = np.abs(self.newton.right.numpy().reshape(self.model.worlds, -1))[world]
+        worst = int(np.argmax(np.where(np.isfinite(sizes), sizes, np.inf)))
+        place = Tangent(self.model).parts[-1].where(worst)
+        return f"largest residual {sizes[worst]:.3g} N at {place}; {self.advice(state)}"

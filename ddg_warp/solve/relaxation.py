@@ -1,0 +1,87 @@
+"""Dynamic relaxation with kinetic damping: a static solver that needs no tangent that is regular, for where Newton finds no way.
+
+The structure moves from rest under its residual forces, with fictitious masses; whenever its kinetic energy has passed a maximum it
+is stopped and starts again (Barnes, Int. J. Space Struct. 14, 1999). The masses are sums of the magnitudes of the rows of the
+tangent stiffness, which makes explicit steps of length one stable by Gershgorin's theorem, the largest one for all directions of
+a point, as what is soft sideways is stiff once it has turned. It comes near a minimum cheaply and
+from afar, and closes in on it slowly: let `statics.solve` finish.
+"""
+
+import numpy as np
+
+from ddg_warp.errors import SolverError
+from ddg_warp.model.state import State
+from ddg_warp.solve.statics import Equilibrium, StaticsOptions
+
+
+def relax(
+    model,
+    state: State | None = None,
+    *,
+    at: float = 1.0,
+    residual: float = 1e-6,
+    max_steps: int = 20_000,
+    rotation_cap: float = 0.1,
+) -> State:
+    """A state near an equilibrium at load parameter `at`.
+
+    Args:
+        model: what to equilibrate.
+        state: where to begin, with its supports where they are at `at`; the rest state by default. It is not changed.
+        at: load parameter.
+        residual: largest force of a free dof at which to stop, over the sum of the outer forces; moments over an edge length.
+        max_steps: at most.
+        rotation_cap: largest turn of an edge in a step [rad].
+
+    Raises:
+        SolverError: `max_steps` or `non_finite`; carries the state that was reached.
+    """
+    equilibrium = Equilibrium(model, StaticsOptions())
+    tangent = equilibrium.tangent
+    state = tangent.with_prescribed((state or model.state()).copy(), at)
+    state.time = at
+    lever = np.where(tangent.angle, tangent.edge_length(), 1.0)
+    velocity, peak, mass, first = np.zeros(tangent.size), 0.0, None, None
+    for _ in range(max_steps):
+        q = tangent.dofs(state)
+        outer, gradient = tangent.loads(at, q), tangent.gradient(state)
+        force = np.where(tangent.free, outer - gradient, 0.0)
+        if not np.isfinite(force).all():
+            raise SolverError(
+                "relaxation: forces are not finite; begin nearer to rest", state=state, outcome="non_finite"
+            )
+        first = equilibrium.first_scale(outer, gradient) if first is None else first
+        scale = np.maximum(first, equilibrium.load_scale(outer, gradient))
+        if (np.abs(force) <= residual * equilibrium.allowed(scale)).all():
+            return state
+        if mass is None:
+            mass = _masses(tangent, state)
+        velocity = velocity + force / mass
+        kinetic = float(mass @ velocity**2)
+        if kinetic < peak:
+            velocity, peak, mass = np.zeros(tangent.size), 0.0, None  # stiffness has changed on the way: weigh it anew
+            continue
+        peak = kinetic
+        turn = tangent.rotation(q, velocity)
+        if turn > rotation_cap:
+            velocity = velocity * (rotation_cap / turn)
+            peak = float(mass @ velocity**2)
+        tangent.assign(state, q + velocity)
+    worst = int(np.argmax(np.abs(force / lever)))
+    raise SolverError(
+        f"relaxation: max_steps, largest residual {force[worst]:.3g} at {tangent.where(worst)}; allow more steps, or let "
+        "statics.solve go on from the state of this error",
+        state=state,
+        outcome="max_steps",
+    )
+
+
+def _masses(tangent, state) -> np.ndarray:
+    """Fictitious masses of all dofs (size,)."""
+    rows = np.asarray(abs(tangent.hessian(state)).sum(axis=1)).ravel()
+    dofs = tangent.point_dofs()
+    of_points = np.where(dofs >= 0, rows[dofs], 0.0).max(axis=1)
+    for axis in range(3):
+        real = dofs[:, axis] >= 0
+        rows[dofs[real, axis]] = of_points[real]
+    return np.where(rows > 0.0, rows, rows.max())

@@ -1,0 +1,442 @@
+"""Equilibria: load stepping with Newton on the exact tangent.
+
+Every load step holds supports where their motion has them at the load parameter t and scales loads by t. Newton uses the exact
+tangent where it is positive definite; where it is not, mode "minimise" shifts it until it is (so that only minima attract), and
+mode "follow" takes it as it is, with the residual as merit, to follow equilibria that are not stable. Where symmetry makes a search in
+mode "minimise" end at a saddle, it goes on from beside it, along the direction of lowest stiffness. Every state says whether it is
+stable (`State.stable`). Shells try Newton with stresses
+of its own first (`ddg_warp.solve.mixed`), which takes fewer iterations, and fall back on this search. Large nets are solved on
+the device by conjugate gradients instead (`ddg_warp.solve.net.statics`).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from ddg_warp import arguments
+from ddg_warp.compile.precision import lost_in_rounding
+from ddg_warp.errors import SceneError, SolverError, check_options
+from ddg_warp.model import validate
+from ddg_warp.model.state import State
+from ddg_warp.scene import validate as scene_validate
+from ddg_warp.solve import mixed, stability
+from ddg_warp.solve.chains.prescribed import jump_between
+from ddg_warp.solve.choice import static_solver, why_not_pcg
+from ddg_warp.solve.direct import Factorisation, SingularError
+from ddg_warp.solve.net.statics import NetEquilibrium
+from ddg_warp.solve.tangent import Tangent
+from ddg_warp.threads import launches
+
+SOLVERS = ("auto", "direct", "pcg")
+DESCENTS = 8  # from saddles, in one solve
+FIRST_TURN = 0.1  # rad, by which a search leaves a saddle
+
+
+@dataclass(frozen=True)
+class StaticsOptions:
+    """How an equilibrium is searched.
+
+    Attributes:
+        rtol: residual over load scale (sum of the outer forces on a rod or shell, or largest support force) at which a dof is in
+            equilibrium; see `ddg_warp.compile.tolerance`.
+        floor_factor: rounding units of the forces that meet at a dof which count as rounding.
+        max_iterations: Newton iterations of one load step.
+        rotation_cap: largest turn of an edge or change of an angle in one update [rad].
+        mode: "minimise" or "follow".
+        max_cuts: how often a load increment is halved before the search is given up; after one that succeeds the next is doubled,
+            up to its first size.
+        solver: "direct": the exact tangent and its factors, on the host. "pcg": conjugate gradients on the device, for nets that are
+            too large for factors; in mode "minimise" alone, and without a count of unstable directions. "auto": by size.
+    """
+
+    rtol: float = 1e-10
+    floor_factor: float = 16.0
+    max_iterations: int = 100
+    rotation_cap: float = 0.5
+    mode: str = "minimise"
+    max_cuts: int = 10
+    solver: str = "auto"
+
+    def __post_init__(self):
+        check_options(self, ("rtol", "floor_factor", "rotation_cap"), ("max_iterations", "max_cuts"))
+        if self.mode not in ("minimise", "follow"):
+            raise SceneError(f"statics mode {self.mode!r}: it is 'minimise' or 'follow'")
+        if self.solver not in SOLVERS:
+            raise SceneError(f"statics solver {self.solver!r}: it is one of {', '.join(SOLVERS)}")
+        if self.solver == "pcg" and self.mode == "follow":
+            raise SceneError(
+                "statics mode 'follow' passes limit points by the inertia of the tangent, which solver 'pcg' does not know; "
+                "take solver='direct'"
+            )
+
+
+def solve(
+    model, state: State | None = None, *, load_steps: int = 1, start: float = 0.0, end: float = 1.0, **options
+) -> State:
+    """The equilibrium at load parameter `end`, reached from `start` in `load_steps` increments or more.
+
+    Args:
+        model: what to equilibrate.
+        state: where to begin; the rest state by default. It is not changed.
+        load_steps: increments; one that fails is halved.
+        start, end: load parameter, which scales gravity and loads and is the time of motions and amplitudes.
+        options: see `StaticsOptions`.
+
+    Returns:
+        The equilibrium. Its `stable` says whether the tangent stiffness is positive but for rigid modes: True, False (in mode
+        "follow" alone, or by conjugate gradients), or None where it was not asked: by conjugate gradients, which only notice what
+        is unstable, and under loads without a potential. Then `ddg_warp.solve.stability.spectrum` tells.
+
+    Raises:
+        SolverError: no equilibrium was found, or in mode "minimise" none that is stable; carries the last good state.
+        SceneError: nothing holds the rods.
+    """
+    validate.check_model("statics", model)
+    if state is not None:
+        validate.check_state("statics", model, state)
+    for name, value in (("start", start), ("end", end)):
+        arguments.number(f"statics: {name}", value)
+    load_steps = arguments.count("load_steps", load_steps)
+    return Equilibrium(model, StaticsOptions(**options)).load(state or model.state(), load_steps, start, end)
+
+
+@launches
+class Equilibrium:
+    """A static solver of one model; keeps its tangent between solves.
+
+    Attributes:
+        tangent: energy, gradient and Hessian of the model.
+        net: what solves by conjugate gradients, if that is the solver.
+        mixed: whether Newton with stresses of its own is tried first; where it can be, by default.
+        iterations: Newton iterations so far.
+        shift: of the last tangent, over its diagonal, that made it definite; 0 where it was.
+        outcome: of the last solve, `converged` or `converged_to_rounding`.
+        stiffness: the tangent at the last equilibrium (size, size), None by conjugate gradients.
+    """
+
+    def __init__(self, model, options: StaticsOptions | None = None):
+        self.model, self.options = model, options or StaticsOptions()
+        self.tangent = Tangent(model)
+        require_supports(model)
+        lost_in_rounding(model)
+        scene_validate.warn_of_massless(model)
+        self.net = NetEquilibrium(self) if self._solver() == "pcg" else None
+        self.mixed = self.tangent.shells_alone and self.net is None
+        self.iterations, self.shift = 0, 0.0
+        self.outcome, self.stiffness = "", None
+
+    @property
+    def pcg_iterations(self) -> int:
+        """Iterations of conjugate gradients so far."""
+        return self.net.pcg_iterations() if self.net else 0
+
+    def _solver(self) -> str:
+        """The solver that the options ask for, if it can serve this model."""
+        solver, obstacle = self.options.solver, why_not_pcg(self.model)
+        if solver == "pcg" and obstacle:
+            raise SceneError(f"statics solver 'pcg': {obstacle}; take solver='direct'")
+        if solver == "auto":
+            return "direct" if self.options.mode == "follow" else static_solver(self.model)
+        return solver
+
+    def load(self, state: State, load_steps: int, start: float = 0.0, end: float = 1.0) -> State:
+        """Load stepping; see `solve`."""
+        if start == end:
+            return self.solve(state, start, end)
+        at, whole, cuts = start, (end - start) / load_steps, 0
+        state = state.copy()
+        while at != end:
+            increment = whole * 0.5**cuts
+            target = end if abs(end - at) <= abs(increment) * (1.0 + 1e-12) else at + increment
+            try:
+                state = self.solve(state, at, target)
+                at, cuts = target, max(0, cuts - 1)  # what was too much before may do now
+            except SolverError as error:
+                cuts += 1
+                if error.outcome == arguments.PRESCRIBED:
+                    raise
+                if cuts > self.options.max_cuts:
+                    advice = jump_between(self.model, at, target)
+                    raise SolverError(
+                        f"{advice and advice + '; '}{error} (load parameter {at:g} of {end:g} reached, {cuts - 1} increments halved)",
+                        state=state,
+                        outcome=error.outcome,
+                    ) from None
+        state.time = end
+        return state
+
+    def solve(self, state: State, before: float, at: float) -> State:
+        """The equilibrium at load parameter `at`, from a state that belongs to `before`.
+
+        Mode "minimise" leaves a saddle along its lowest mode for the minimum that lies that way; `saddle` is the outcome where after
+        some such descents there still is none. Conjugate gradients see no more than negative curvature on their way, and leave none.
+        """
+        tangent, self.stiffness = self.tangent, None
+        if not tangent.free.any():
+            state = state.copy()
+            tangent.move_supports(state, before, at)
+            state.time, state.stable, self.outcome = at, True, "converged"
+            return state
+        if self.mixed and (found := mixed.newton(self, state, before, at)) is not None:
+            state = found
+        else:
+            state = self._with_supports_moved(state, before, at)
+            if self.net:
+                return self.net.solve(state, at)
+            state = self._descend(state, at)
+        for _ in range(DESCENTS):
+            state.stable = stability.stable(tangent, state, self.stiffness)
+            if state.stable is not False or self.options.mode == "follow":
+                return state
+            beside = self._beside(state, at)
+            if beside is None:
+                state.stable = None
+                return state
+            state = self._descend(beside, at)
+        raise SolverError(
+            f"no stable equilibrium at load parameter {at:g}: saddle, {DESCENTS} descents from saddles led to others; begin from a "
+            "state without symmetry, or take mode='follow' to accept what is unstable",
+            state=state,
+            outcome="saddle",
+        )
+
+    def _beside(self, state: State, at: float) -> State | None:
+        """A state of less energy beside a saddle, along its lowest mode; None if rounding leaves no such difference."""
+        tangent = self.tangent
+        mode = stability.spectrum(self.model, state, 1, "unit", tangent, at).modes[:, 0]
+        q, energies = tangent.dofs(state), tangent.element_energies(state)
+        step = FIRST_TURN * np.sign(mode[np.argmax(np.abs(mode))]) / max(1e-300, tangent.rotation(q, mode)) * mode
+        for _ in range(20):
+            beside = state.copy()
+            tangent.assign(beside, tangent.retract(q, step))
+            moved = tangent.dofs(beside)
+            work = 0.5 * (tangent.loads(at, q) + tangent.loads(at, moved)) @ (moved - q)
+            noise = 64 * self.model.types.eps * np.abs(energies).sum()
+            if (tangent.element_energies(beside) - energies).sum() - work < -noise:
+                return beside
+            step = 0.5 * step
+        return None
+
+    def _descend(self, state: State, at: float) -> State:
+        """The equilibrium at load parameter `at` from a state with its supports in place, by Newton with a line search."""
+        tangent, options = self.tangent, self.options
+        free = tangent.free
+        energies, q = tangent.element_energies(state), tangent.dofs(state)
+        outer = tangent.loads(at, q)
+        gradient = tangent.gradient(state)
+        first, polished = self.first_scale(outer, gradient), False
+        for _ in range(options.max_iterations):
+            residual = outer - gradient
+            hessian = tangent.stiffness(state, at)
+            if not np.isfinite(residual).all() or not np.isfinite(hessian.data).all():
+                raise SolverError(self.where("non_finite", residual, at), state=state, outcome="non_finite")
+            scale = np.maximum(first, self.load_scale(outer, gradient))
+            excess = self.excess(residual, gradient, hessian, q, scale)
+            self.stiffness = hessian
+            if excess <= 0.0 and (self.outcome == "converged" or polished):
+                return self.found(state, outer, residual, at)
+            polished = excess <= 0.0  # the floor is a bound: one more iteration gives what rounding allows
+            self.iterations += 1
+            direction, decrease = self._direction(hessian, residual)
+            shortened = min(1.0, options.rotation_cap / max(1e-300, tangent.rotation(q, direction)))
+            direction, decrease = shortened * direction, shortened * decrease
+            taken, found = 1.0, False
+            merit = np.linalg.norm(self._scaled(residual)[free])
+            for _ in range(30):
+                trial = tangent.retract(q, taken * direction)
+                candidate = state.copy()
+                tangent.assign(candidate, trial)
+                new_gradient = tangent.gradient(candidate)
+                new_energies = tangent.element_energies(candidate)
+                new_outer = tangent.loads(at, trial)
+                change = (new_energies - energies).sum() - 0.5 * (outer + new_outer) @ (trial - q)
+                noise = 64 * self.model.types.eps * (np.abs(energies).sum() + np.abs(gradient) @ np.abs(q))
+                new_merit = np.linalg.norm(self._scaled(new_outer - new_gradient)[free])
+                if not np.isfinite(change) or not np.isfinite(new_merit):
+                    found = False
+                elif options.mode == "follow":
+                    found = new_merit < (1.0 - 1e-4 * taken) * merit or (taken == 1.0 and new_merit < 10.0 * merit)
+                elif taken * decrease > 10.0 * noise:
+                    found = change <= -1e-4 * taken * decrease + noise
+                else:
+                    found = new_merit <= 2.0 * merit
+                if found:
+                    break
+                taken *= 0.5
+            if not found and polished:
+                return self.found(state, outer, residual, at)
+            if not found:
+                raise SolverError(
+                    self.where("line_search_failed", residual, at), state=state, outcome="line_search_failed"
+                )
+            state, q, energies, gradient, outer = (
+                candidate,
+                tangent.dofs(candidate),
+                new_energies,
+                new_gradient,
+                new_outer,
+            )
+        raise SolverError(self.where("max_iterations", outer - gradient, at), state=state, outcome="max_iterations")
+
+    def _hidden(self, outer: np.ndarray, residual: np.ndarray) -> bool:
+        """Whether more than half of the loads is left over, of which rounding does not let the dofs tell."""
+        points = self.tangent.free & ~self.tangent.angle
+        return self.outcome != "converged" and np.abs(residual[points]).sum() > 0.5 * np.abs(outer[points]).sum() > 0.0
+
+    def found(self, state: State, outer: np.ndarray, residual: np.ndarray, at: float) -> State:
+        """The state as the equilibrium at `at`, unless rounding hides its loads and spoils the tangent that would carry them."""
+        if (self.shift > 0.0 or self.net) and self._hidden(outer, residual):
+            raise SolverError(
+                f"no equilibrium at load parameter {at:g}: lost_in_rounding, the stiffest elements make forces as uncertain as "
+                "the loads are large; take better shaped elements, or float64",
+                state=state,
+                outcome="lost_in_rounding",
+            )
+        state.time = at
+        return state
+
+    def _with_supports_moved(self, state: State, before: float, at: float) -> State:
+        """A copy with its supports where they are at `at`, and the free dofs following by the tangent if that is the better guess.
+
+        A support that moves by more than an edge length on its own turns its edge over.
+        """
+        tangent = self.tangent
+        alone = state.copy()
+        step = tangent.support_step(state, before, at)
+        tangent.move_supports(alone, before, at)
+        if not step.any():
+            return alone
+        state = tangent.with_prescribed(state, at)
+        direction = (self.net.following if self.net else self._following)(state, step, at)
+        if direction is None:
+            return alone
+        q = tangent.dofs(state)
+        follow = tangent.advance(state, step + direction, at)
+
+        def potential(candidate):
+            return tangent.element_energies(candidate).sum() - tangent.loads(at, q) @ (tangent.dofs(candidate) - q)
+
+        overturned = tangent.turned_over(q, tangent.dofs(alone))
+        better = overturned or not potential(alone) <= potential(follow)
+        return follow if better and np.isfinite(potential(follow)) else alone
+
+    def _following(self, state: State, step: np.ndarray, at: float) -> np.ndarray | None:
+        """How the free dofs follow held ones that make a `step` (size,), by the tangent; None if there is no answer."""
+        tangent = self.tangent
+        hessian = tangent.stiffness(state, at)
+        if not np.isfinite(hessian.data).all():
+            return None
+        outer = tangent.loads(at, tangent.dofs(state))
+        return self._direction(hessian, outer - tangent.gradient(state) - hessian @ step)[0]
+
+    def load_scale(self, outer: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """What residuals of the bodies are compared with [N]: sums of their outer forces, or the largest support force if more.
+
+        A body without either is compared with the mean of all.
+        """
+        tangent = self.tangent
+        loads = np.concatenate(
+            [part.body_loads(tangent.of(part, outer), tangent.of(part, gradient)) for part in tangent.parts]
+        )
+        return np.where(loads > 0.0, loads, loads.mean())
+
+    def first_scale(self, outer: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """The load scales of the state that a search starts from, or its residual where there are no loads [N].
+
+        A residual is compared with this or with the present load scale: forces of iterates on the way, however large, excuse nothing.
+        """
+        scale = self.load_scale(outer, gradient)
+        return scale if scale.any() else scale + np.abs((outer - gradient)[self.tangent.free]).max(initial=0.0)
+
+    def allowed(self, scale: np.ndarray) -> np.ndarray:
+        """Residuals of all dofs at rtol = 1 (size,) [N, N m], for such load scales; see `ddg_warp.compile.tolerance`."""
+        return np.concatenate([part.allowed(own) for part, own in self._by_part(scale)])
+
+    def _by_part(self, scale: np.ndarray):
+        """The parts of the tangent, each with the scales of its bodies."""
+        at = 0
+        for part in self.tangent.parts:
+            yield part, scale[at : at + part.body_count]
+            at += part.body_count
+
+    def _scaled(self, residual: np.ndarray) -> np.ndarray:
+        """Moments over an edge length, so that they compare with forces."""
+        return np.where(self.tangent.angle, residual / self.tangent.edge_length(), residual)
+
+    def _direction(self, hessian, residual: np.ndarray) -> tuple[np.ndarray, float]:
+        """Newton direction on the free dofs and the decrease of energy it promises."""
+        free = np.flatnonzero(self.tangent.free)
+        matrix, right = hessian[free][:, free], residual[free]
+        solution = self._factor(matrix).solve(right)
+        direction = np.zeros(self.tangent.size)
+        direction[free] = solution
+        return direction, float(right @ solution)
+
+    def _factor(self, matrix) -> Factorisation:
+        """The tangent's factors; shifted until it is definite, or in mode "follow" until it is regular."""
+        diagonal = sparse.diags(np.abs(matrix.diagonal()) + 1e-12 * np.abs(matrix.diagonal()).max())
+        for self.shift in (0.0, *np.geomspace(1e-6, 16.0, 13)):
+            try:
+                factor = Factorisation((matrix + self.shift * diagonal).tocsc())
+            except SingularError:
+                continue
+            if self.options.mode == "follow" or (factor.reliable and not factor.negative):
+                break
+        return factor
+
+    def excess(self, residual, gradient, hessian, q, scale: np.ndarray) -> float:
+        """How far the worst dof, or sum of residuals, is from equilibrium; not positive when all are. `scale`: of the bodies."""
+        tangent, rtol = self.tangent, self.options.rtol
+        free, angle = tangent.free, tangent.angle
+        reach = np.abs(q[free & ~angle]).max(initial=1.0)
+        rounding = self.options.floor_factor * self.model.types.eps
+        floor = rounding * (np.asarray(abs(hessian).sum(axis=1)).ravel() * reach + np.abs(gradient))
+        limit, size = rtol * self.allowed(scale), np.abs(residual)
+        masked = np.where(free, residual, 0.0)
+        sums = [
+            part.sums(own, rtol, tangent.of(part, masked), tangent.of(part, floor))
+            for part, own in self._by_part(scale)
+        ]
+        small = (size <= limit)[free].all() and all(good for good, _ in sums)
+        self.outcome = "converged" if small else "converged_to_rounding"
+        worst = float((size - np.maximum(limit, floor))[free].max())
+        return max(worst, *(excess for _, excess in sums))
+
+    def where(self, outcome: str, residual: np.ndarray, at: float) -> str:
+        """What to tell of a search that failed."""
+        masked = np.where(self.tangent.free, np.abs(self._scaled(residual)), -1.0)
+        worst = int(np.argmax(np.where(np.isfinite(masked), masked, np.inf)))
+        return (
+            f"no equilibrium at load parameter {at:g}: {outcome}, largest residual {residual[worst]:.3g} at "
+            f"{self.tangent.where(worst)}; take more load steps, or hold what can still move freely"
+        )
+
+
+def require_supports(model) -> None:
+    """Refuse a rod that can be shifted as a whole: no node of it holds some component. It may still turn."""
+    for group in model.groups:
+        host, axes = group.host, "xz" if group.kind.dim == 2 else "xyz"
+        held = np.bitwise_or.reduce(host.fixed, axis=0)
+        for d, axis in enumerate(axes):
+            loose = np.flatnonzero((held >> d) & 1 == 0)
+            if loose.size:
+                raise SceneError(
+                    f"rod {host.rods[loose[0]]} is not held along {axis}: a static solve needs supports; "
+                    "add scene.clamp(...) or scene.fix(...)"
+                )
+    if model.net is not None:
+        host = model.net.host
+        for i, shell in enumerate(host.meridians):
+            if not host.fixed[shell.nodes, 2].any():
+                raise SceneError(
+                    f"axisymmetric shell {i} is not held along z: a static solve needs scene.hold_ring(...) or "
+                    "scene.clamp_ring(...)"
+                )
+        spatial = np.setdiff1d(np.arange(host.nodes), [node for shell in host.meridians for node in shell.nodes])
+        loose = np.flatnonzero(~host.holds[spatial].any(0)) if spatial.size else spatial
+        if loose.size:
+            raise SceneError(
+                f"no node of the shells and joined rods is held along {'xyz'[loose[0]]}: a static solve needs supports; "
+                "add scene.hold(...), scene.clamp_boundary(...) or scene.fix(...)"
+            )

@@ -1,0 +1,106 @@
+"""A time step of what one solver advances, a group of rods or the net: attempts, retries, and what became of them."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.errors import SolverError
+from ddg_warp.kernels import outcome, step
+from ddg_warp.solve.chains.prescribed import jump_between
+
+
+class PartStep:
+    """Steps all islands of a solver, each with its own retries; see `kernels.step`.
+
+    A part says how an attempt is made (`attempt`), which kernels that takes (`own_kernels`), and of an island that was given up
+    who it is (`who`), which rods are concerned (`rods_of`) and where it went wrong (`where`).
+
+    Args:
+        integrator, model: what steps what.
+        newton: the solver, with its islands.
+        counts_of: the step that this one replaces, whose islands and counts it takes over.
+
+    Attributes:
+        energy, motion, loads, field: watch of the energy, motion of the supports, loads that change, the magnetic field; None without.
+        rounded: outcome that solves which rounding ends are counted as.
+        tally, work: counts of outcomes and of work; see `kernels.step.advance_kernel`.
+    """
+
+    energy = motion = loads = field = None
+
+    def __init__(self, integrator, model, newton, counts_of: "PartStep | None" = None):
+        self.integrator, self.model, self.newton = integrator, model, newton
+        real, device = model.types.real, model.wp_device
+        self.midpoint = integrator.scheme == "implicit_midpoint"
+        self.rounded = outcome.CONVERGED_TO_ROUNDING
+        self.tally = wp.zeros(len(outcome.NAMES) + 1, dtype=wp.int64, device=device)
+        self.work = wp.zeros(5, dtype=wp.int64, device=device)
+        self.remaining = wp.zeros(1, dtype=int, device=device)
+        self.damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
+        if counts_of is not None:
+            self.tally, self.work, newton.islands = counts_of.tally, counts_of.work, counts_of.newton.islands
+        self._start, self._advance = step.start_kernel(real), step.advance_kernel(real)
+
+    @property
+    def islands(self):
+        """See `kernels.islands`."""
+        return self.newton.islands
+
+    def prescribe(self, t0: float, t1: float) -> None:
+        """Hand the device what supports and loads do between t0 and t1."""
+        for part in filter(None, (self.motion, self.loads, self.field)):
+            part.upload(t0, t1)
+
+    def step(self, before, after) -> None:
+        """Launch a whole step from one state to another; only launches, so that it can be captured."""
+        self._launch(self._start, len(self.islands), self.islands.arrays, [])
+        self._try(before, after)
+        wp.capture_while(self.remaining, lambda: self._try(after, after))
+
+    def _try(self, before, after) -> None:
+        """One solve of every island that has not finished the step, and what is to be done next."""
+        self.attempt(before, after)
+        self.remaining.zero_()
+        limit = self.integrator.retry_limit
+        inputs = [*self.islands.arrays, limit, 0.5 ** (limit // 2), self.rounded]
+        self._launch(self._advance, len(self.islands), inputs, [self.tally, self.work, self.remaining])
+
+    def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)
+
+    def load_modules(self) -> None:
+        """Compile and load every kernel before a capture."""
+        kernels = [self._start, self._advance, *self.own_kernels, *self.newton.kernels]
+        for part in filter(None, (self.motion, self.loads, self.field, self.energy)):
+            kernels += part.kernels
+        arrays.load_kernels(kernels, self.model.wp_device)
+
+    def raise_failures(self, state) -> None:
+        """Raise for islands that were given up.
+
+        Raises:
+            SolverError: names the first, its outcome, where it went wrong and what to do.
+        """
+        if not int(self.tally.numpy()[outcome.MAX_ITERATIONS :].sum()):
+            return
+        failed = np.flatnonzero(self.islands.status.numpy() == outcome.GIVEN_UP)
+        if not failed.size:
+            return
+        first = int(failed[0])
+        name = outcome.NAMES[int(self.islands.reason.numpy()[first])]
+        if self.energy and name == "energy_drift":
+            what = self.energy.failure(first)
+        else:
+            what = self.where(state, first)
+        raise SolverError(
+            f"{self.who(first)} could not be stepped to t = {state.time:g} s: {name} within "
+            f"{self.integrator.retry_limit} retries, {what}",
+            state=state,
+            outcome=name,
+            rods=self.rods_of(failed),
+        )
+
+    def advice(self, state) -> str:
+        """What to do about a step that failed and has no other reason."""
+        jump = jump_between(self.model, state.time - self.integrator._dt_host, state.time)
+        return jump or "take a smaller dt, a looser rtol, or check its loads and supports"

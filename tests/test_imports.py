@@ -1,0 +1,61 @@
+"""Imports run downwards: no folder knows of those above it."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import ddg_warp
+
+PACKAGE = Path(ddg_warp.__file__).parent
+LAYERS = ("geometry", "scene", "compile", "io", "model", "solve", "ask", "run")
+# What a user calls on an object of a lower layer, which imports its answer when it is asked.
+FACADES = {"scene/scene.py": "model", "model/model.py": "ask"}
+
+
+def layer(module: str) -> int:
+    """Of a module of the package, by its name from there; those beside the folders serve all."""
+    folder = module.split(".", maxsplit=1)[0]
+    return LAYERS.index(folder) if folder in LAYERS else -1
+
+
+def imports(path: Path, lazy: bool) -> Iterator[str]:
+    """What a file imports of the package, as it is loaded or `lazy`, inside of functions."""
+    tree = ast.parse(path.read_text())
+    inside = {
+        id(node)
+        for function in ast.walk(tree)
+        if isinstance(function, ast.FunctionDef)
+        for node in ast.walk(function)
+        if node is not function
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (id(node) in inside) == lazy:
+            parts = (node.module or "").split(".")
+            if parts[0] == "ddg_warp":
+                yield from (".".join([*parts[1:], name.name]) for name in node.names)
+
+
+FILES = sorted(path for folder in LAYERS for path in (PACKAGE / folder).rglob("*.py"))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_run_downwards(path):
+    name = str(path.relative_to(PACKAGE))
+    own = LAYERS.index(name.split("/", maxsplit=1)[0])
+    above = [module for module in imports(path, lazy=False) if layer(module) > own]
+    assert not above
+    reach = max(own, LAYERS.index(FACADES[name])) if name in FACADES else own
+    assert not [module for module in imports(path, lazy=True) if layer(module) > reach]
+
+
+def test_every_folder_has_its_place():
+    folders = {path.name for path in PACKAGE.iterdir() if path.is_dir() and not path.name.startswith("__")}
+    assert folders == set(LAYERS)
+
+
+def test_io_and_geometry_know_no_solver():
+    for path in (path for path in FILES if path.relative_to(PACKAGE).parts[0] in ("io", "geometry")):
+        known = {*imports(path, lazy=False), *imports(path, lazy=True)}
+        assert not [module for module in known if layer(module) > LAYERS.index("io")]
