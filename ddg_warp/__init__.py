@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # what editors and type checkers read; at run time see `_HOME
     from ddg_warp.model import rest_shapes
     from ddg_warp.model.model import Model
     from ddg_warp.model.state import State
+    from ddg_warp.run import bench
     from ddg_warp.run.check import Check
     from ddg_warp.run.record import Recorder
     from ddg_warp.scene.descriptions import Dynamics, Law, Statics, Trace
@@ -53,6 +54,7 @@ __all__ = [
     "Stiffness",
     "Stop",
     "Trace",
+    "bench",
     "continuation",
     "inquiry",
     "io",
@@ -87,6 +89,7 @@ _HOME = {
     "Trace": "scene.descriptions",
 }
 _MODULES = {
+    "bench": "run.bench",
     "continuation": "solve.continuation",
     "inquiry": "ask.inquiry",
     "meshes": "geometry.meshes",
