@@ -21,20 +21,29 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.block_band import block_functions, factor_function, substitute_function
+from ddg_warp.kernels.block_band import (
+    block_functions,
+    factor_function,
+    substitute_all_function,
+    substitute_function,
+)
 from ddg_warp.kernels.element import CPU_OPTIONS
 from ddg_warp.kernels.net.joints import coupling_functions
 from ddg_warp.kernels.net.system import product_functions
 
 
 @cache
-def chain_kernels(twist: bool, span: int, linear):
-    """gather(...), factorise(...): H_II; load(...), solve(...): its solutions; finish(...): z of every block and r . z."""
+def chain_kernels(twist: bool, span: int, linear, sides: int):
+    """gather(...), factorise(...): H_II; load(...), solve(...): its solutions; finish(...): z of every block and r . z.
+
+    solve_all(...) takes all movements of a joint, `sides`, at once.
+    """
     nb = 4 if twist else 3
     parts = nb - 2  # blocks of a place: node, and angle of the edge behind it
     H, B, M = wp.types.vector(3, linear), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     _, store, _, put = block_functions(nb, linear)
     factor, substitute = factor_function(nb, span, linear), substitute_function(nb, span, linear)
+    substitute_all = substitute_all_function(nb, span, linear, sides)
     _, free = product_functions(linear)
     multiply, _ = coupling_functions(linear)
 
@@ -174,6 +183,23 @@ def chain_kernels(twist: bool, span: int, linear):
         if wanted[w] == 1:
             _product = substitute(factors, values, values, count[r - w * count.shape[0]], r, s)
 
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def solve_all(
+        factors: wp.array3d(dtype=linear),
+        count: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        values: wp.array3d(dtype=linear),
+    ):
+        """The same for every colour of joints and all of its movements."""
+        s = wp.tid()
+        columns = wanted.shape[0] * count.shape[0]
+        colour = s / columns
+        r = s - colour * columns
+        w = r / count.shape[0]
+        if wanted[w] == 1:
+            first = colour * wp.static(sides) * columns + r
+            substitute_all(factors, values, count[r - w * count.shape[0]], r, first, columns)
+
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def finish(
         residual: wp.array(dtype=H),
@@ -207,4 +233,4 @@ def chain_kernels(twist: bool, span: int, linear):
             z[i] = moved[w * joint_rows + joint_row[b]]
         dots_out[w, b] = wp.dot(residual[i], z[i])
 
-    return gather, factorise, load, solve, finish
+    return gather, factorise, load, solve, solve_all, finish

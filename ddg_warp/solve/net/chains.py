@@ -48,8 +48,8 @@ class Chains:
         self.moved = wp.zeros(max(1, worlds * self.joint_rows), dtype=H, device=device)
         self.units = wp.array(np.repeat(plan.units, worlds, axis=1).reshape(-1, 3), dtype=H, device=device)
         self.parts = wp.zeros((3, max(1, worlds * self.joints)), dtype=M, device=device)
-        self._gather, self._factorise, self._load, self._solve, self._finish = chains.chain_kernels(
-            plan.twist, plan.span, linear
+        self._gather, self._factorise, self._load, self._solve, self._solve_all, self._finish = chains.chain_kernels(
+            plan.twist, plan.span, linear, plan.size
         )
         self._measure, self._meet = joints.joint_kernels(linear) if self.joints else (None, None)
 
@@ -57,7 +57,7 @@ class Chains:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         own = [self._gather, (self._factorise, SERIAL), self._load, (self._solve, SERIAL), self._finish]
-        return own + ([self._measure, self._meet] if self.joints else [])
+        return own + ([(self._solve_all, SERIAL), self._measure, self._meet] if self.joints else [])
 
     def prepare(self, matrix: wp.array, inverse: wp.array, fixed: wp.array, wanted: wp.array) -> None:
         """Factors of chains and joints of the worlds that want a direction; `inverse` is that of the diagonal blocks."""
@@ -117,7 +117,9 @@ class Chains:
             + [self.moved if moved is None else moved],
             [self.values],
         )
-        self._launch(self._solve, solves * self.columns, [self.factors, self.count, wanted], [self.values], SERIAL)
+        kernel, sides = (self._solve, 1) if solves == 1 else (self._solve_all, self.plan.size)
+        threads = solves // sides * self.columns
+        self._launch(kernel, threads, [self.factors, self.count, wanted], [self.values], SERIAL)
 
     def _launch(self, kernel, dim, inputs: list, outputs: list, threads: int = arrays.THREADS) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self.device, block_dim=threads)
