@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # what editors and type checkers read; at run time see `_HOME
     from ddg_warp.model import rest_shapes
     from ddg_warp.model.model import Model
     from ddg_warp.model.state import State
+    from ddg_warp.run import bench
     from ddg_warp.run.check import Check
     from ddg_warp.run.record import Recorder
     from ddg_warp.scene.descriptions import Dynamics, Law, Statics, Trace
@@ -56,6 +57,7 @@ __all__ = [
     "Stop",
     "Trace",
     "Viscous",
+    "bench",
     "continuation",
     "inquiry",
     "io",
@@ -92,6 +94,7 @@ _HOME = {
     "Viscous": "scene.drag",
 }
 _MODULES = {
+    "bench": "run.bench",
     "continuation": "solve.continuation",
     "inquiry": "ask.inquiry",
     "meshes": "geometry.meshes",

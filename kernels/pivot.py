@@ -10,9 +10,13 @@ import warp as wp
 
 
 @cache
-def functions(size: int, real):
-    """factor(A) -> (L, inverse pivots, negative pivots); lower(L, B) = L^-1 B; upper(L, d, Z) = L^-T D^-1 Z; the same for vectors."""
+def functions(size: int, real, sides: int | None = None):
+    """factor(A) -> (L, inverse pivots, negative pivots); lower(L, B) = L^-1 B; upper(L, d, Z) = L^-T D^-1 Z; the same for vectors.
+
+    B and Z have as many columns as a block, or `sides`.
+    """
     H, M = wp.types.vector(size, real), wp.types.matrix((size, size), real)
+    W = wp.types.matrix((size, sides or size), real)
     tiny = wp.constant(real(2.3e-16 if real == wp.float64 else 1.2e-7))
 
     @wp.func
@@ -52,8 +56,8 @@ def functions(size: int, real):
         return L, inverse, lost
 
     @wp.func
-    def lower(L: M, B: M):
-        Z = M()
+    def lower(L: M, B: W):
+        Z = W()
         Z[0] = B[0]
         z1 = B[1] - L[1, 0] * B[0]
         Z[1] = z1
@@ -65,8 +69,8 @@ def functions(size: int, real):
         return Z
 
     @wp.func
-    def upper(L: M, inverse: H, Z: M):
-        U = M()
+    def upper(L: M, inverse: H, Z: W):
+        U = W()
         if wp.static(size == 4):
             u3 = Z[3] * inverse[3]
             u2 = Z[2] * inverse[2] - L[3, 2] * u3

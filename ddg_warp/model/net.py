@@ -190,11 +190,11 @@ class DeviceNet:
             [after.q, self.ends, self.blocks, moved, kept.frame, before.frame],
             [after.frame],
         )
-        for part, same, old, new in zip(self.sets, kept.lag, before.lag, after.lag, strict=True):
-            measure, dim = part.term.measure, self.worlds * part.elements
-            if len(part.host.lag):
-                inputs = [after.q, after.frame, part.slots, part.data, self.blocks, self.angle_start, self.edges]
-                launch(frames.lag_kernel(measure, real), dim, [*inputs, moved, same, old], [new])
+        for index, (part, same, old, new) in enumerate(zip(self.sets, kept.lag, before.lag, after.lag, strict=True)):
+            if part.term.measure.advance:
+                given = self.elements(after, index)
+                given.lag = old
+                launch(frames.lag_kernel(part.term.measure, real), old.shape[1], [given, moved, same], [new])
         self.reset_spins(after.q)
 
     def reset_spins(self, blocks: wp.array) -> None:

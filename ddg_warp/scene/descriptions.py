@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ddg_warp import arguments
-from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.errors import SceneError
 from ddg_warp.geometry.surface import Surface
 from ddg_warp.scene.material import Material, Stiffness
 from ddg_warp.scene.motion import Motion
@@ -246,65 +246,6 @@ class Joint:
 
     members: tuple[tuple[int, int], ...]
     rigid: bool
-
-
-@dataclass(frozen=True)
-class Magnet:
-    """Magnetisation (E, 3) [A/m] of edges (E,) of each of some rods, along their first and second director and tangent."""
-
-    rods: np.ndarray
-    edges: np.ndarray
-    magnetisation: np.ndarray
-
-
-@dataclass(frozen=True)
-class MagneticField:
-    """B(x, t) = value + gradient (x - origin) [T]: constants, or functions of the time."""
-
-    value: object
-    gradient: object
-    origin: np.ndarray
-    planar: bool  # whether it stays in the plane of x and z
-
-    def at(self, t: float, otherwise: float, error=SolverError) -> np.ndarray:
-        """B at the origin of space, then the rows of the gradient (12,), at t; constants times `otherwise`.
-
-        Raises:
-            SolverError: a function is not finite, or gives no field; names the function and the time.
-        """
-        value, gradient = (
-            arguments.value_at(f"the magnetic {what}", given, t, 3, error) if callable(given) else otherwise * given
-            for what, given in (("field", self.value), ("field's gradient", self.gradient))
-        )
-        self._check(value, gradient, t, error)
-        return np.concatenate([value - gradient @ self.origin, gradient.ravel()])
-
-    def over(self, points: np.ndarray, t: float, otherwise: float) -> np.ndarray:
-        """B at points (n, 3) [T]; see `at`."""
-        field, gradient = np.split(self.at(t, otherwise), [3])
-        return field + points @ gradient.reshape(3, 3).T
-
-    def _check(self, value: np.ndarray, gradient: np.ndarray, t: float, error) -> None:
-        wrong = ""
-        if value.shape != (3,) or gradient.shape != (3, 3):
-            wrong = f"have the shapes {value.shape} and {gradient.shape}; give (3,) and (3, 3)"
-        elif self.planar and np.any(np.append(gradient[[0, 2, 1, 1], [1, 1, 0, 2]], value[1]) != 0.0):
-            wrong = "leave the plane of x and z, in which a scene of dimension 2 stays; give 0 along y"
-        elif abs(np.trace(gradient)) > 1e-9 * np.abs(gradient).max():
-            wrong = f"have a divergence of {np.trace(gradient):g} T/m, and no field has one; the trace of the gradient is zero"
-        elif np.abs(gradient - gradient.T).max() > 1e-9 * np.abs(gradient).max():
-            wrong = "have a curl, which no field has away from its currents; the gradient is symmetric"
-        if wrong:
-            text = f"magnetic_field: value and gradient at t = {t:g} {wrong}"
-            raise error(text, outcome=arguments.PRESCRIBED) if error is SolverError else error(text)
-
-
-@dataclass(frozen=True)
-class Dipoles:
-    """All pairs of edges of some magnetised rods (None: all), no farther apart than `cutoff` [m] at rest, as point dipoles."""
-
-    rods: np.ndarray | None
-    cutoff: float
 
 
 @dataclass(frozen=True)

@@ -14,16 +14,14 @@ from ddg_warp.geometry.surface import Surface
 from ddg_warp.scene import validate
 from ddg_warp.scene.descriptions import (
     Attachment,
-    Dipoles,
     EdgeCouple,
     Joint,
-    Magnet,
-    MagneticField,
     Pressure,
     Shell,
     ShellLoad,
     ShellSupport,
 )
+from ddg_warp.scene.magnets import Magnets
 from ddg_warp.scene.material import Material
 from ddg_warp.scene.meridians import Meridians
 from ddg_warp.scene.motion import Motion
@@ -32,7 +30,7 @@ COINCIDE = 1e-6  # how far points that are meant to be one, or in one plane, may
 
 
 @dataclass(kw_only=True, repr=False, eq=False)
-class Structures(Meridians):
+class Structures(Meridians, Magnets):
     """The part of a scene that is a net: whatever is not a rod of its own."""
 
     shells: list[Shell] = field(default_factory=list, init=False)
@@ -42,9 +40,6 @@ class Structures(Meridians):
     edge_couples: list[EdgeCouple] = field(default_factory=list, init=False)
     joints: list[Joint] = field(default_factory=list, init=False)
     attachments: list[Attachment] = field(default_factory=list, init=False)
-    magnets: list[Magnet] = field(default_factory=list, init=False)
-    dipoles: list[Dipoles] = field(default_factory=list, init=False)
-    applied_field: MagneticField | None = field(default=None, init=False)
 
     def add_shell(
         self,
@@ -274,85 +269,6 @@ class Structures(Meridians):
             raise SceneError(f"attach: {len(nodes)} nodes of rod {rod} and {len(vertices)} vertices; give as many")
         glued = arguments.choice("attach: spin", spin, ("glued", "free")) == "glued"
         self.attachments.append(Attachment(int(rod), np.array(nodes), shell, vertices, glued))
-
-    def magnetize(self, rods, magnetisation, edges=None) -> None:
-        """Give rods a magnetisation that is fixed in the material frame of their edges, as of a hard-magnetic elastomer.
-
-        The moment of an edge is that times its volume at rest, with the area of its section; a `Stiffness` needs one. Magnetised
-        rods are solved together, as joined ones are. Several calls add up.
-
-        Args:
-            rods: one rod or several.
-            magnetisation: along the tangent, a number [A/m]; or along first director, second director and tangent, (3,), or (E, 3)
-                with one an edge. In dimension 2 the first director is across the plane, and the second the tangent, turned by 90
-                degrees from x towards z. Rods without twist have a tangent alone.
-            edges: which; all by default.
-
-        Raises:
-            SceneError: an edge that does not exist, or a component that the rod has no director for.
-        """
-        rods, added = arguments.once("magnetize: rods", self._rods(rods)), []
-        given = arguments.floats(magnetisation)
-        given = given * [0.0, 0.0, 1.0] if given.ndim == 0 else given
-        for batch in self._batches(rods):
-            own = rods[(rods >= batch.first) & (rods < batch.first + batch.rods)]
-            where = f"magnetize: rod {own[0]} ('{batch.name}')"
-            _, chosen = self._on_rods("magnetize", own, "edge", slice(None) if edges is None else edges)
-            chosen = arguments.once(f"{where}: edges", np.array(chosen) % batch.edges)
-            each = arguments.broadcast(f"{where}: magnetisation", given, (len(chosen), 3))
-            if not batch.twist and self.dimension == 3 and each[:, :2].any():
-                raise SceneError(
-                    f"{where} has no twist, and so no directors; give the component along its tangent alone"
-                )
-            if self.dimension == 2 and (each[:, 0].any() or (not batch.bend and each[:, 1].any())):
-                raise SceneError(
-                    f"{where} is magnetised across the plane, or has no bending and so no directors; give 0 along these directors"
-                )
-            if not np.all(np.asarray(batch.section.area) > 0.0):
-                raise SceneError(f"{where}: its section has no area; give Stiffness(..., area=...) [m^2]")
-            added.append(Magnet(own, chosen, each))
-        self.magnets += added
-
-    def magnetic_field(self, value, gradient=None, origin=(0.0, 0.0, 0.0)) -> None:
-        """The magnetic field B = value + gradient (x - origin) that magnetised rods are in.
-
-        Energy -V M . B of every edge, at its middle, with the field at the time that a step balances forces at (the end of a step of
-        implicit Euler's, the middle of one of the midpoint rule). In statics constants grow with the load parameter, which is the
-        time of functions. All worlds are in it; their magnetisations may differ (`Model.set_parameter`).
-
-        Args:
-            value: B at the origin (3,) [T], or a function of the time [s] that gives it.
-            gradient: dB_i/dx_j (3, 3) [T/m], or a function of the time; none by default. It has neither divergence nor curl:
-                its trace is zero and it is symmetric.
-            origin: (3,) [m].
-
-        Raises:
-            SceneError: no such field, or a second one.
-        """
-        if self.applied_field is not None:
-            raise SceneError("magnetic_field: the scene has a field; give one that is the sum of both")
-        origin = np.array(arguments.vector("magnetic_field: origin", origin))
-        value = value if callable(value) else np.array(arguments.vector("magnetic_field: value", value))
-        if not callable(gradient):
-            gradient = np.zeros((3, 3)) if gradient is None else gradient
-            gradient = arguments.broadcast("magnetic_field: gradient", gradient, (3, 3))
-        given = MagneticField(value, gradient, origin, self.dimension == 2)
-        given.at(0.0, 1.0, SceneError)
-        self.applied_field = given
-
-    def add_dipoles(self, rods=None, cutoff: float | None = None) -> None:
-        """Let magnetised edges of rods act on each other as point dipoles in their middles, of the same and of other rods.
-
-        All pairs whose middles are no farther apart than `cutoff` at rest are listed, once and for all, but those that share a node:
-        n edges have n^2 / 2 without it. Two edges that come close attract without bound, and nothing keeps them apart.
-
-        Args:
-            rods: magnetised ones; all that are by default.
-            cutoff: [m]; none by default.
-        """
-        rods = None if rods is None else arguments.once("add_dipoles: rods", self._rods(rods))
-        cutoff = np.inf if cutoff is None else arguments.positive("add_dipoles: cutoff", cutoff, "m")
-        self.dipoles.append(Dipoles(rods, cutoff))
 
     def _hold(self, call: str, shell, vertices, components, **options) -> None:
         if options.get("edges") != "symmetry":  # an oblique plane has none

@@ -39,6 +39,8 @@ class Measure:
             three, the vector c = (c11, c12, c22), and C has the blocks c_ij I between its edge vectors i and j.
             `curvature` is None, or `curvature(q, s, w, slope)`, of rod vertices: w slope : d2e as the upper triangle of a
             symmetric matrix, row by row.
+        advance: None, or real -> advance(q, s): the lagged data beside the frames at the end of a step, from the dofs and frames there
+            and what they were.
     """
 
     name: str
@@ -55,6 +57,7 @@ class Measure:
     field: int = 0
     apart: bool = False
     frames: int = 0
+    advance: Callable | None = None
     by_angle: bool = False
 
     @property

@@ -17,6 +17,7 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels import frames
 from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.measures.rod_curvature_twist import rod_curvature_twist
 
@@ -95,6 +96,26 @@ def functions(real, between: bool = False):
     return strains, jacobian, None, None
 
 
+@cache
+def _advance(real):
+    Q, S, _, _ = joint_curvature_twist.types(real)
+    V, L = wp.types.vector(3, real), wp.types.vector(7, real)
+    _, reference_twist, _ = frames.functions(real)
+    turned, _ = rotations(real)
+
+    @wp.func
+    def advance(q: Q, s: S):
+        """The ghost, turned by the joint's rotation, and the angle between its frame and that of the edge."""
+        omega = V(q[4], q[5], q[6])
+        t = wp.normalize(turned(omega, V(s[9], s[10], s[11])))
+        u = turned(omega, V(s[6], s[7], s[8]))
+        u = wp.normalize(u - t * wp.dot(u, t))
+        m = reference_twist(u, V(s[0], s[1], s[2]), t, V(s[3], s[4], s[5]) * s[13], s[12])
+        return L(u[0], u[1], u[2], t[0], t[1], t[2], m)
+
+    return advance
+
+
 joint_curvature_twist = Measure(
     "joint_curvature_twist",
     3,
@@ -106,4 +127,5 @@ joint_curvature_twist = Measure(
     frames=1,
     lag_size=13,
     data_size=1,
+    advance=_advance,
 )

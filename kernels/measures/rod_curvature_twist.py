@@ -179,6 +179,22 @@ def functions(real, between: bool = False):
     return strains, jacobian, None, curvature
 
 
+@cache
+def _advance(real):
+    Q, S, _, _ = rod_curvature_twist.types(real)
+    V, L = wp.types.vector(3, real), wp.types.vector(1, real)
+    _, reference_twist, _ = frames.functions(real)
+
+    @wp.func
+    def advance(q: Q, s: S):
+        """The angle between the reference frames."""
+        return L(
+            reference_twist(V(s[0], s[1], s[2]), V(s[6], s[7], s[8]), V(s[3], s[4], s[5]), V(s[9], s[10], s[11]), s[12])
+        )
+
+    return advance
+
+
 rod_curvature_twist = Measure(
     "rod_curvature_twist",
     3,
@@ -188,4 +204,5 @@ rod_curvature_twist = Measure(
     angles=2,
     frames=2,
     lag_size=13,
+    advance=_advance,
 )

@@ -73,6 +73,22 @@ def _functions(real):
     return strains, jacobian, None, None
 
 
+@cache
+def _advance(real):
+    Q, S, _, _ = rod_surface_angle.types(real)
+    V, L = wp.types.vector(3, real), wp.types.vector(2, real)
+    _, angle_between, _ = frames.functions(real)
+
+    @wp.func
+    def advance(q: Q, s: S):
+        """The angles of both triangles in the frame of the edge."""
+        u = V(s[0], s[1], s[2])
+        t = V(s[3], s[4], s[5])
+        return L(angle_between(u, V(q[3], q[4], q[5]), t, t, s[6]), angle_between(u, V(q[6], q[7], q[8]), t, t, s[7]))
+
+    return advance
+
+
 rod_surface_angle = Measure(
     "rod_surface_angle",
     3,
@@ -83,4 +99,5 @@ rod_surface_angle = Measure(
     frames=1,
     lag_size=8,
     data_size=2,
+    advance=_advance,
 )

@@ -7,9 +7,10 @@ elimination of I leaves the joints with S = H_JJ - H_JI H_II^-1 H_IJ, of which t
 
 (a substructuring method; Smith, Bjorstad and Gropp, Domain Decomposition, 1996, ch. 4). It is symmetric and positive definite, and
 S knows rods only by their ends: the number of iterations does not depend on the nodes of a rod. Columns of S come from solves for
-unit movements of joints; joints that meet on a rod have different colours, those of one colour move at once. (A rod bends on over
-hinged joints, so that there a column also holds a little of what the joints after the next do.) Blocks of S that rounding leaves
-indefinite give way to those of H. All other blocks keep block Jacobi.
+unit movements of joints, V = -H_II^-1 H_IJ; joints that meet on a rod have different colours, those of one colour move at once. (A rod
+bends on over hinged joints, so that there a column also holds a little of what the joints after the next do.) Where no chain meets two
+joints of one colour, z_I = w + V z_J takes no second solve. Blocks of S that rounding leaves indefinite give way to those of H. All
+other blocks keep block Jacobi.
 
 For the gridshell of `scenes.gridshell_dome` at rest under its weight, iterations to a residual of 1e-3 at 2, 8 and 32 edges between
 crossings: block Jacobi 43, 250, 2378; rods that overlap in their joints, added up, 14, 35, 51; this 13, 16, 16.
@@ -21,20 +22,29 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.block_band import block_functions, factor_function, substitute_function
+from ddg_warp.kernels.block_band import (
+    block_functions,
+    factor_function,
+    substitute_all_function,
+    substitute_function,
+)
 from ddg_warp.kernels.element import CPU_OPTIONS
 from ddg_warp.kernels.net.joints import coupling_functions
 from ddg_warp.kernels.net.system import product_functions
 
 
 @cache
-def chain_kernels(twist: bool, span: int, linear):
-    """gather(...), factorise(...): H_II; load(...), solve(...): its solutions; finish(...): z of every block and r . z."""
+def chain_kernels(twist: bool, span: int, linear, sides: int):
+    """gather(...), factorise(...): H_II; load(...), solve(...): its solutions; finish(...): z of every block and r . z.
+
+    solve_all(...) takes all movements of a joint, `sides`, at once; follow(...) adds V z_J.
+    """
     nb = 4 if twist else 3
     parts = nb - 2  # blocks of a place: node, and angle of the edge behind it
     H, B, M = wp.types.vector(3, linear), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     _, store, _, put = block_functions(nb, linear)
     factor, substitute = factor_function(nb, span, linear), substitute_function(nb, span, linear)
+    substitute_all = substitute_all_function(nb, span, linear, sides)
     _, free = product_functions(linear)
     multiply, _ = coupling_functions(linear)
 
@@ -174,6 +184,52 @@ def chain_kernels(twist: bool, span: int, linear):
         if wanted[w] == 1:
             _product = substitute(factors, values, values, count[r - w * count.shape[0]], r, s)
 
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def solve_all(
+        factors: wp.array3d(dtype=linear),
+        count: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        values: wp.array3d(dtype=linear),
+    ):
+        """The same for every colour of joints and all of its movements."""
+        s = wp.tid()
+        columns = wanted.shape[0] * count.shape[0]
+        colour = s / columns
+        r = s - colour * columns
+        w = r / count.shape[0]
+        if wanted[w] == 1:
+            first = colour * wp.static(sides) * columns + r
+            substitute_all(factors, values, count[r - w * count.shape[0]], r, first, columns)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def follow(
+        met: wp.array3d(dtype=int),
+        count: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        responses: wp.array3d(dtype=linear),
+        moved: wp.array(dtype=H),
+        joint_rows: int,
+        values: wp.array3d(dtype=linear),
+    ):
+        """Adds V z_J, with z_J in `moved`; `met` is the joint of each colour that the chain of a place meets, -1 for none."""
+        k, r = wp.tid()
+        columns = wanted.shape[0] * count.shape[0]
+        w = r / count.shape[0]
+        c = r - w * count.shape[0]
+        if wanted[w] != 1 or k >= count[c]:
+            return
+        u = B()
+        for colour in range(met.shape[0]):
+            m = met[colour, k, c]
+            if m >= 0:
+                for d in range(wp.static(sides)):
+                    z = moved[w * joint_rows + 2 * m + d // 3]
+                    s = (colour * wp.static(sides) + d) * columns + r
+                    for i in range(wp.static(nb)):
+                        u[i] = u[i] + responses[i, k, s] * z[d % 3]
+        for i in range(wp.static(nb)):
+            values[i, k, r] = values[i, k, r] + u[i]
+
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def finish(
         residual: wp.array(dtype=H),
@@ -207,4 +263,4 @@ def chain_kernels(twist: bool, span: int, linear):
             z[i] = moved[w * joint_rows + joint_row[b]]
         dots_out[w, b] = wp.dot(residual[i], z[i])
 
-    return gather, factorise, load, solve, finish
+    return gather, factorise, load, solve, solve_all, follow, finish

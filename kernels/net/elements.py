@@ -15,6 +15,7 @@ import warp as wp
 
 from ddg_warp.kernels.element import CPU_OPTIONS
 from ddg_warp.kernels.islands import CLAMPED, SLOT, STATUS
+from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.terms import Term
 
 FRAME = 6  # reals of the reference frame of an edge: first director and tangent
@@ -44,15 +45,11 @@ def elements_type(real):
 
 
 @cache
-def functions(term: Term, real):
-    """gather(given, q, tid) -> (q, s, w, p) of an element; spread(f, slot) -> derivative with respect to the block of a slot."""
+def place_function(measure: Measure, real):
+    """place(given, q, tid) -> (q, s) of an element."""
     Elements = elements_type(real)
-    measure, density = term.measure, term.density
     V = wp.types.vector(3, real)
     Q, S, _, _ = measure.types(real)
-    n = len(measure.strains)
-    P = wp.types.vector(density.parameter_size(n), real)
-    static_size, size = len(term.parameter_names) - 1, density.parameter_size(n)
     nodes, angles, spins, edges = measure.nodes, measure.angles, measure.spins, measure.edges
     frames, own, data_size = measure.frames, measure.lag_size - FRAME * measure.frames, measure.data_size
     points = measure.points
@@ -63,10 +60,9 @@ def functions(term: Term, real):
     # make the hash of every kernel depend on what was built before it
     I = wp.types.vector(max(1, edge_count), int)
     first, second = (I(*(edge[end] for edge in edges)) for end in (0, 1))
-    lagged = density.lagged
 
     @wp.func
-    def gather(given: Elements, q: wp.array(dtype=V), tid: int):
+    def place(given: Elements, q: wp.array(dtype=V), tid: int):
         world = tid / given.elements
         e = tid - world * given.elements
         shift = world * given.blocks
@@ -102,6 +98,35 @@ def functions(term: Term, real):
             column = wp.where(given.data.shape[1] > given.elements, tid, e)
             for c in range(wp.static(data_size)):
                 s[wp.static(FRAME * frames + own) + c] = given.data[c, column]
+        return local, s
+
+    return place
+
+
+@cache
+def functions(term: Term, real):
+    """gather(given, q, tid) -> (q, s, w, p) of an element; spread(f, slot) -> derivative with respect to the block of a slot."""
+    Elements = elements_type(real)
+    measure, density = term.measure, term.density
+    V = wp.types.vector(3, real)
+    Q, _, _, _ = measure.types(real)
+    n = len(measure.strains)
+    P = wp.types.vector(density.parameter_size(n), real)
+    static_size, size = len(term.parameter_names) - 1, density.parameter_size(n)
+    nodes, angles, spins, edges = measure.nodes, measure.angles, measure.spins, measure.edges
+    points, edge_count = measure.points, len(edges)
+    angle_row, spin_row = 3 * edge_count, 3 * edge_count + angles
+    point_row = spin_row + 3 * spins
+    I = wp.types.vector(max(1, edge_count), int)
+    first, second = (I(*(edge[end] for edge in edges)) for end in (0, 1))
+    lagged = density.lagged
+    place = place_function(measure, real)
+
+    @wp.func
+    def gather(given: Elements, q: wp.array(dtype=V), tid: int):
+        local, s = place(given, q, tid)
+        world = tid / given.elements
+        e = tid - world * given.elements
         p = P()
         for i in range(wp.static(static_size)):
             row = i + 1

@@ -1,4 +1,4 @@
-"""Lagged data of a net: frames of rod edges, reference twist of vertices, ghosts of rigid joints, angles of glued triangles.
+"""Lagged data of a net: frames of rod edges, and what measures lag beside these.
 
 Worlds whose flag `moved` is zero take over what is `kept`, untouched.
 """
@@ -8,7 +8,8 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import frames
-from ddg_warp.kernels.measures.joint_curvature_twist import rotations
+from ddg_warp.kernels.measures import Measure
+from ddg_warp.kernels.net.elements import FRAME, elements_type, place_function
 
 
 @cache
@@ -62,133 +63,25 @@ def edge_kernel(real):
 
 
 @cache
-def lag_kernel(measure, real):
-    """Own lagged rows of elements of a measure with frames, which are up to date, as the positions are."""
-    return {
-        "rod_curvature_twist": vertex_kernel,
-        "rod_curvature_twist_angle": vertex_kernel,
-        "joint_curvature_twist": joint_kernel,
-        "joint_curvature_twist_angle": joint_kernel,
-        "rod_surface_angle": surface_kernel,
-    }[measure.name](real)
-
-
-@cache
-def vertex_kernel(real):
-    """Reference twist of rod vertices, whose slots are three nodes and the angles of both edges."""
-    V = wp.types.vector(3, real)
-    row, _ = functions(real)
-    _, reference_twist, _ = frames.functions(real)
+def lag_kernel(measure: Measure, real):
+    """Own lagged rows of elements of a measure, from frames that are up to date, as the dofs are, and the rows of before."""
+    Elements = elements_type(real)
+    place, advance = place_function(measure, real), measure.advance(real)
+    rows = measure.lag_size - FRAME * measure.frames
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def vertices(
-        q: wp.array(dtype=V),
-        frame: wp.array2d(dtype=real),
-        slots: wp.array2d(dtype=int),
-        data: wp.array2d(dtype=real),
-        blocks: int,
-        angle_start: int,
-        edges: int,
-        moved: wp.array(dtype=int),
-        kept: wp.array2d(dtype=real),
-        lag: wp.array2d(dtype=real),
-        lag_out: wp.array2d(dtype=real),
-    ):
+    def lag(given: Elements, moved: wp.array(dtype=int), kept: wp.array2d(dtype=real), lag_out: wp.array2d(dtype=real)):
         tid = wp.tid()
-        count = slots.shape[1]
-        world = tid / count
-        if moved[world] == 0:
-            lag_out[0, tid] = kept[0, tid]
-            return
-        e = tid - world * count
-        a = slots[3, e] - angle_start + world * edges
-        b = slots[4, e] - angle_start + world * edges
-        lag_out[0, tid] = reference_twist(
-            row(frame, 0, a), row(frame, 0, b), row(frame, 3, a), row(frame, 3, b), lag[0, tid]
-        )
-
-    return vertices
-
-
-@cache
-def joint_kernel(real):
-    """Ghost edges of rigid joints, turned by the joint's rotation, and the reference twist to the edges that meet it."""
-    V = wp.types.vector(3, real)
-    row, put = functions(real)
-    _, reference_twist, _ = frames.functions(real)
-    turned, _ = rotations(real)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def joints(
-        q: wp.array(dtype=V),
-        frame: wp.array2d(dtype=real),
-        slots: wp.array2d(dtype=int),
-        data: wp.array2d(dtype=real),
-        blocks: int,
-        angle_start: int,
-        edges: int,
-        moved: wp.array(dtype=int),
-        kept: wp.array2d(dtype=real),
-        lag: wp.array2d(dtype=real),
-        lag_out: wp.array2d(dtype=real),
-    ):
-        tid = wp.tid()
-        count = slots.shape[1]
-        world = tid / count
-        if moved[world] == 0:
-            for c in range(7):
+        if moved[tid / given.elements] == 0:
+            for c in range(wp.static(rows)):
                 lag_out[c, tid] = kept[c, tid]
             return
-        e = tid - world * count
-        omega = q[slots[3, e] + world * blocks]
-        t = wp.normalize(turned(omega, row(lag, 3, tid)))
-        u = turned(omega, row(lag, 0, tid))
-        u = wp.normalize(u - t * wp.dot(u, t))
-        f = slots[2, e] - angle_start + world * edges
-        put(lag_out, 0, tid, u)
-        put(lag_out, 3, tid, t)
-        lag_out[6, tid] = reference_twist(u, row(frame, 0, f), t, row(frame, 3, f) * data[0, e], lag[6, tid])
+        q, s = place(given, given.q, tid)
+        new = advance(q, s)
+        for c in range(wp.static(rows)):
+            lag_out[c, tid] = new[c]
 
-    return joints
-
-
-@cache
-def surface_kernel(real):
-    """Angles of the two triangles beside a glued rod edge in the edge's frame."""
-    V = wp.types.vector(3, real)
-    row, _ = functions(real)
-    _, angle_between, _ = frames.functions(real)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def surfaces(
-        q: wp.array(dtype=V),
-        frame: wp.array2d(dtype=real),
-        slots: wp.array2d(dtype=int),
-        data: wp.array2d(dtype=real),
-        blocks: int,
-        angle_start: int,
-        edges: int,
-        moved: wp.array(dtype=int),
-        kept: wp.array2d(dtype=real),
-        lag: wp.array2d(dtype=real),
-        lag_out: wp.array2d(dtype=real),
-    ):
-        tid = wp.tid()
-        count = slots.shape[1]
-        world = tid / count
-        if moved[world] == 0:
-            for side in range(2):
-                lag_out[side, tid] = kept[side, tid]
-            return
-        e = tid - world * count
-        f = slots[4, e] - angle_start + world * edges
-        u = row(frame, 0, f)
-        t = row(frame, 3, f)
-        for side in range(2):
-            a = q[slots[2 + side, e] + world * blocks] - q[slots[0, e] + world * blocks]
-            lag_out[side, tid] = angle_between(u, a, t, t, lag[side, tid])
-
-    return surfaces
+    return lag
 
 
 @cache

@@ -39,7 +39,9 @@ class Chains:
         self.columns = worlds * self.width
         block = 4 if plan.twist else 3
         self.factors = arrays.allocate((3 * block**2 + block, self.longest, self.columns), linear, device)
-        self.values = arrays.allocate((block, self.longest, max(1, plan.solves) * self.columns), linear, device)
+        self.values = arrays.allocate((block, self.longest, self.columns), linear, device)
+        self.responses = arrays.allocate((block, self.longest, plan.solves * self.columns), linear, device)
+        self.met = None if plan.met is None else arrays.upload(plan.met.astype(np.int32), int, device)
         self.joints, self.joint_rows = len(plan.pairs), 2 * len(plan.pairs)
         self.joint_row, self.pairs, self.own = put(plan.joint_row), put(plan.pairs), put(plan.own)
         self.colour = put(plan.colour)
@@ -48,16 +50,16 @@ class Chains:
         self.moved = wp.zeros(max(1, worlds * self.joint_rows), dtype=H, device=device)
         self.units = wp.array(np.repeat(plan.units, worlds, axis=1).reshape(-1, 3), dtype=H, device=device)
         self.parts = wp.zeros((3, max(1, worlds * self.joints)), dtype=M, device=device)
-        self._gather, self._factorise, self._load, self._solve, self._finish = chains.chain_kernels(
-            plan.twist, plan.span, linear
-        )
+        made = chains.chain_kernels(plan.twist, plan.span, linear, plan.size)
+        self._gather, self._factorise, self._load, self._solve, self._solve_all, self._follow, self._finish = made
         self._measure, self._meet = joints.joint_kernels(linear) if self.joints else (None, None)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         own = [self._gather, (self._factorise, SERIAL), self._load, (self._solve, SERIAL), self._finish]
-        return own + ([self._measure, self._meet] if self.joints else [])
+        own += [self._follow] if self.met is not None else []
+        return own + ([(self._solve_all, SERIAL), self._measure, self._meet] if self.joints else [])
 
     def prepare(self, matrix: wp.array, inverse: wp.array, fixed: wp.array, wanted: wp.array) -> None:
         """Factors of chains and joints of the worlds that want a direction; `inverse` is that of the diagonal blocks."""
@@ -71,11 +73,11 @@ class Chains:
         self._launch(self._factorise, self.columns, [self.count, wanted], [self.factors], SERIAL)
         if not self.joints:
             return
-        self._eliminate(matrix, fixed, wanted, plan.solves, None, self.units)
+        self._eliminate(matrix, fixed, wanted, self.responses, None, self.units)
         self._launch(
             self._measure,
             net.worlds * self.joints,
-            [matrix, *self._joint_inputs, self.own, self.colour, plan.size, fixed, inverse, wanted]
+            [matrix, *self._joint_inputs(self.responses), self.own, self.colour, plan.size, fixed, inverse, wanted]
             + [net.blocks, table.positions],
             [self.parts],
         )
@@ -83,15 +85,31 @@ class Chains:
     def apply(self, matrix, residual, fixed, wanted, z: wp.array, dots: wp.array) -> None:
         """z of the blocks of rods and joints from the residual, where block Jacobi has left its own, and r . z block by block."""
         net = self.net
-        self._eliminate(matrix, fixed, wanted, 1, residual, None)
+        self._eliminate(matrix, fixed, wanted, self.values, residual, None)
         if self.joints:
             self._launch(
                 self._meet,
                 net.worlds * self.joints,
-                [matrix, *self._joint_inputs, self.parts, residual, wanted, net.blocks, self.table.positions],
+                [
+                    matrix,
+                    *self._joint_inputs(self.values),
+                    self.parts,
+                    residual,
+                    wanted,
+                    net.blocks,
+                    self.table.positions,
+                ],
                 [self.moved],
             )
-            self._eliminate(matrix, fixed, wanted, 1, residual, self.moved)
+        if self.met is not None:
+            self._launch(
+                self._follow,
+                (self.longest, self.columns),
+                [self.met, self.count, wanted, self.responses, self.moved, self.joint_rows],
+                [self.values],
+            )
+        elif self.joints:
+            self._eliminate(matrix, fixed, wanted, self.values, residual, self.moved)
         self._launch(
             self._finish,
             net.worlds * net.blocks,
@@ -100,14 +118,13 @@ class Chains:
             [z, dots],
         )
 
-    @property
-    def _joint_inputs(self) -> list:
-        values = [self.joint_starts, self.joint_items, self.values, self.where, self.width, self.net.host.nodes]
-        return [self.table.columns, *values, self.pairs]
+    def _joint_inputs(self, values: wp.array) -> list:
+        chains = [self.joint_starts, self.joint_items, values, self.where, self.width, self.net.host.nodes]
+        return [self.table.columns, *chains, self.pairs]
 
-    def _eliminate(self, matrix, fixed, wanted, solves: int, residual, moved) -> None:
-        """H_II^-1 (r_I - H_IJ z_J) of as many right-hand sides; without `residual` or `moved` that one is zero."""
-        table, net = self.table, self.net
+    def _eliminate(self, matrix, fixed, wanted, values: wp.array, residual, moved) -> None:
+        """H_II^-1 (r_I - H_IJ z_J), of movements one by one or all at once; without `residual` or `moved` that one is zero."""
+        table, net, solves = self.table, self.net, values.shape[2] // self.columns
         self._launch(
             self._load,
             (self.longest, solves * self.columns),
@@ -115,9 +132,10 @@ class Chains:
             + [self.joint_rows, wanted, net.blocks, table.positions, int(residual is not None)]
             + [int(moved is not None), self.moved if residual is None else residual]
             + [self.moved if moved is None else moved],
-            [self.values],
+            [values],
         )
-        self._launch(self._solve, solves * self.columns, [self.factors, self.count, wanted], [self.values], SERIAL)
+        kernel, sides = (self._solve, 1) if values is self.values else (self._solve_all, self.plan.size)
+        self._launch(kernel, solves // sides * self.columns, [self.factors, self.count, wanted], [values], SERIAL)
 
     def _launch(self, kernel, dim, inputs: list, outputs: list, threads: int = arrays.THREADS) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self.device, block_dim=threads)
@@ -140,6 +158,8 @@ class ChainPlan:
         own (joints, 3): positions of its blocks in H, with each other at last.
         of_places, of_joints: starts and positions of the couplings of blocks of chains with joints, of rows of joints with chains.
         colour (joints,); units (solves, 1, 2 joints, 3): movements of joints, of a colour and a dof each, that S is measured with.
+        met (colours, longest, columns): the joint of each colour that the chain of a place meets, -1 for none; None where there are no
+            joints, or one chain meets two of one colour.
     """
 
     def __init__(self, host, rows: np.ndarray, columns: np.ndarray):
@@ -234,6 +254,8 @@ class ChainPlan:
         self.where = np.full(self._blocks, -1)
         for block in blocks:
             self.where[block[block >= 0]] = (k * width + c)[block >= 0]
+        self._chain = np.full((longest, width), -1)
+        self._chain[k, c] = chain
 
     def _couple(self, host, rows, columns) -> None:
         """Couplings of chains and joints."""
@@ -266,6 +288,12 @@ class ChainPlan:
         for m in range(joints):
             taken = {self.colour[other] for other in neighbours[m]}
             self.colour[m] = next(c for c in range(joints) if c not in taken)
+        chain, joint = np.unique(np.column_stack([self._chain[touch[:, 1], touch[:, 0]], touch[:, 2]]), axis=0).T
+        colours = self.colour.max(initial=-1) + 1
+        joints_of = np.full((colours, self._chain.max() + 1), -1)
+        joints_of[self.colour[joint], chain] = joint
+        alone = np.unique(chain * colours + self.colour[joint]).size == chain.size
+        self.met = np.where(self._chain >= 0, joints_of[:, self._chain], -1) if joints and alone else None
         self.size = 6 if (self.pairs[:, 1] >= 0).any() else 3
         self.solves = self.size * (self.colour.max(initial=-1) + 1)
         self.units = np.zeros((self.solves, 1, 2 * joints, 3))

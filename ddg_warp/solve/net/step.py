@@ -113,7 +113,7 @@ class NetStep(PartStep):
         kernels += [frames.edge_kernel(real)] if net.edges else []
         kernels += [frames.reset_kernel(real)] if net.host.spins else []
         for part in net.sets:
-            kernels += [frames.lag_kernel(part.term.measure, real)] if len(part.host.lag) else []
+            kernels += [frames.lag_kernel(part.term.measure, real)] if part.term.measure.advance else []
             kernels += [elements.term_kernels(part.term, real)[3]] if part.term.density.lagged else []
         return kernels
 

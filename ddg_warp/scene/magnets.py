@@ -1,0 +1,155 @@
+"""What a scene says about magnets: magnetised rods, the field that they are in, and pairs that act on each other."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ddg_warp import arguments
+from ddg_warp.errors import SceneError, SolverError
+
+
+@dataclass(frozen=True)
+class Magnet:
+    """Magnetisation (E, 3) [A/m] of edges (E,) of each of some rods, along their first and second director and tangent."""
+
+    rods: np.ndarray
+    edges: np.ndarray
+    magnetisation: np.ndarray
+
+
+@dataclass(frozen=True)
+class MagneticField:
+    """B(x, t) = value + gradient (x - origin) [T]: constants, or functions of the time."""
+
+    value: object
+    gradient: object
+    origin: np.ndarray
+    planar: bool  # whether it stays in the plane of x and z
+
+    def at(self, t: float, otherwise: float, error=SolverError) -> np.ndarray:
+        """B at the origin of space, then the rows of the gradient (12,), at t; constants times `otherwise`.
+
+        Raises:
+            SolverError: a function is not finite, or gives no field; names the function and the time.
+        """
+        value, gradient = (
+            arguments.value_at(f"the magnetic {what}", given, t, 3, error) if callable(given) else otherwise * given
+            for what, given in (("field", self.value), ("field's gradient", self.gradient))
+        )
+        self._check(value, gradient, t, error)
+        return np.concatenate([value - gradient @ self.origin, gradient.ravel()])
+
+    def over(self, points: np.ndarray, t: float, otherwise: float) -> np.ndarray:
+        """B at points (n, 3) [T]; see `at`."""
+        field, gradient = np.split(self.at(t, otherwise), [3])
+        return field + points @ gradient.reshape(3, 3).T
+
+    def _check(self, value: np.ndarray, gradient: np.ndarray, t: float, error) -> None:
+        wrong = ""
+        if value.shape != (3,) or gradient.shape != (3, 3):
+            wrong = f"have the shapes {value.shape} and {gradient.shape}; give (3,) and (3, 3)"
+        elif self.planar and np.any(np.append(gradient[[0, 2, 1, 1], [1, 1, 0, 2]], value[1]) != 0.0):
+            wrong = "leave the plane of x and z, in which a scene of dimension 2 stays; give 0 along y"
+        elif abs(np.trace(gradient)) > 1e-9 * np.abs(gradient).max():
+            wrong = f"have a divergence of {np.trace(gradient):g} T/m, and no field has one; the trace of the gradient is zero"
+        elif np.abs(gradient - gradient.T).max() > 1e-9 * np.abs(gradient).max():
+            wrong = "have a curl, which no field has away from its currents; the gradient is symmetric"
+        if wrong:
+            text = f"magnetic_field: value and gradient at t = {t:g} {wrong}"
+            raise error(text, outcome=arguments.PRESCRIBED) if error is SolverError else error(text)
+
+
+@dataclass(frozen=True)
+class Dipoles:
+    """All pairs of edges of some magnetised rods (None: all), no farther apart than `cutoff` [m] at rest, as point dipoles."""
+
+    rods: np.ndarray | None
+    cutoff: float
+
+
+@dataclass(kw_only=True, repr=False, eq=False)
+class Magnets:
+    """The part of a scene that is magnetic."""
+
+    magnets: list[Magnet] = field(default_factory=list, init=False)
+    dipoles: list[Dipoles] = field(default_factory=list, init=False)
+    applied_field: MagneticField | None = field(default=None, init=False)
+
+    def magnetize(self, rods, magnetisation, edges=None) -> None:
+        """Give rods a magnetisation that is fixed in the material frame of their edges, as of a hard-magnetic elastomer.
+
+        The moment of an edge is that times its volume at rest, with the area of its section; a `Stiffness` needs one. Magnetised
+        rods are solved together, as joined ones are. Several calls add up.
+
+        Args:
+            rods: one rod or several.
+            magnetisation: along the tangent, a number [A/m]; or along first director, second director and tangent, (3,), or (E, 3)
+                with one an edge. In dimension 2 the first director is across the plane, and the second the tangent, turned by 90
+                degrees from x towards z. Rods without twist have a tangent alone.
+            edges: which; all by default.
+
+        Raises:
+            SceneError: an edge that does not exist, or a component that the rod has no director for.
+        """
+        rods, added = arguments.once("magnetize: rods", self._rods(rods)), []
+        given = arguments.floats(magnetisation)
+        given = given * [0.0, 0.0, 1.0] if given.ndim == 0 else given
+        for batch in self._batches(rods):
+            own = rods[(rods >= batch.first) & (rods < batch.first + batch.rods)]
+            where = f"magnetize: rod {own[0]} ('{batch.name}')"
+            _, chosen = self._on_rods("magnetize", own, "edge", slice(None) if edges is None else edges)
+            chosen = arguments.once(f"{where}: edges", np.array(chosen) % batch.edges)
+            each = arguments.broadcast(f"{where}: magnetisation", given, (len(chosen), 3))
+            if not batch.twist and self.dimension == 3 and each[:, :2].any():
+                raise SceneError(
+                    f"{where} has no twist, and so no directors; give the component along its tangent alone"
+                )
+            if self.dimension == 2 and (each[:, 0].any() or (not batch.bend and each[:, 1].any())):
+                raise SceneError(
+                    f"{where} is magnetised across the plane, or has no bending and so no directors; give 0 along these directors"
+                )
+            if not np.all(np.asarray(batch.section.area) > 0.0):
+                raise SceneError(f"{where}: its section has no area; give Stiffness(..., area=...) [m^2]")
+            added.append(Magnet(own, chosen, each))
+        self.magnets += added
+
+    def magnetic_field(self, value, gradient=None, origin=(0.0, 0.0, 0.0)) -> None:
+        """The magnetic field B = value + gradient (x - origin) that magnetised rods are in.
+
+        Energy -V M . B of every edge, at its middle, with the field at the time that a step balances forces at (the end of a step of
+        implicit Euler's, the middle of one of the midpoint rule). In statics constants grow with the load parameter, which is the
+        time of functions. All worlds are in it; their magnetisations may differ (`Model.set_parameter`).
+
+        Args:
+            value: B at the origin (3,) [T], or a function of the time [s] that gives it.
+            gradient: dB_i/dx_j (3, 3) [T/m], or a function of the time; none by default. It has neither divergence nor curl:
+                its trace is zero and it is symmetric.
+            origin: (3,) [m].
+
+        Raises:
+            SceneError: no such field, or a second one.
+        """
+        if self.applied_field is not None:
+            raise SceneError("magnetic_field: the scene has a field; give one that is the sum of both")
+        origin = np.array(arguments.vector("magnetic_field: origin", origin))
+        value = value if callable(value) else np.array(arguments.vector("magnetic_field: value", value))
+        if not callable(gradient):
+            gradient = np.zeros((3, 3)) if gradient is None else gradient
+            gradient = arguments.broadcast("magnetic_field: gradient", gradient, (3, 3))
+        given = MagneticField(value, gradient, origin, self.dimension == 2)
+        given.at(0.0, 1.0, SceneError)
+        self.applied_field = given
+
+    def add_dipoles(self, rods=None, cutoff: float | None = None) -> None:
+        """Let magnetised edges of rods act on each other as point dipoles in their middles, of the same and of other rods.
+
+        All pairs whose middles are no farther apart than `cutoff` at rest are listed, once and for all, but those that share a node:
+        n edges have n^2 / 2 without it. Two edges that come close attract without bound, and nothing keeps them apart.
+
+        Args:
+            rods: magnetised ones; all that are by default.
+            cutoff: [m]; none by default.
+        """
+        rods = None if rods is None else arguments.once("add_dipoles: rods", self._rods(rods))
+        cutoff = np.inf if cutoff is None else arguments.positive("add_dipoles: cutoff", cutoff, "m")
+        self.dipoles.append(Dipoles(rods, cutoff))
