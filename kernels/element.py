@@ -381,6 +381,29 @@ def term_kernels(kind: ChainKind, index: int, real, reverse: bool = False):
 
 
 @cache
+def left_out_function(term: Term, real):
+    """left_out(root, e, p, w, jacobian): the negative part of psi'', which F leaves out: w J^T psi'' J - F^T F, packed; or None."""
+    if not term.density.coupled or term.density.quadratic:
+        return None
+    n, size = len(term.measure.strains), term.measure.size
+    _, _, E, J = term.measure.types(real)
+    R, P = wp.types.matrix((n, n), real), wp.types.vector(term.density.parameter_size(n), real)
+    G = wp.types.vector(size * (size + 1) // 2, real)
+    psi_of = term.density.laws(real, n)[2]
+
+    @wp.func
+    def left_out(root: R, e: E, p: P, w: real, jacobian: J):
+        m = wp.transpose(jacobian) * ((psi_of(e, p) * w - wp.transpose(root) * root) * jacobian)
+        g = G()
+        for i in range(wp.static(size)):
+            for j in range(i, wp.static(size)):
+                g[i * wp.static(size) - i * (i - 1) // 2 + j - i] = m[i, j]  # `packed_index`
+        return g
+
+    return left_out
+
+
+@cache
 def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool):
     """evaluate_at of one term: writes its factor rows; returns its energy, derivative with respect to the window, stiffness.
 
@@ -393,28 +416,16 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool):
     energy_of, slope_of, root_of = term.density.functions(real, n)
     load, local, short, spread = term_functions(kind, index, real)
     _, row, tension_row, _ = kind.places()[index]
-    E, P = wp.types.vector(n, real), wp.types.vector(term.density.parameter_size(n), real)
+    E = wp.types.vector(n, real)
     has_tension, dim = term.measure.tensions > 0, kind.dim
     bends = curved and term.measure.span == 2
-    softens = term.density.coupled and not term.density.quadratic  # the root leaves out what is negative of psi''
+    left_out = left_out_function(term, real)
     dofs = [*range(dim * term.measure.span), *(dim * kind.span + i for i in range(term.measure.angles))]
     places = tuple(packed_index(kind.window, dofs[i], dofs[j]) for i in range(size) for j in range(i, size))
     where = wp.types.vector(len(places), int)(*places)
 
     if term.density.coupled:
         R, J = wp.types.matrix((n, n), real), wp.types.matrix((n, size), real)
-        G = wp.types.vector(len(places), real)
-        psi_of = term.density.laws(real, n)[2]
-
-        @wp.func
-        def left_out(root: R, e: E, p: P, w: real, jacobian: J):
-            """w J^T psi'' J less F^T F, packed."""
-            m = wp.transpose(jacobian) * ((psi_of(e, p) * w - wp.transpose(root) * root) * jacobian)
-            g = G()
-            for i in range(wp.static(size)):
-                for j in range(i, wp.static(size)):
-                    g[i * wp.static(size) - i * (i - 1) // 2 + j - i] = m[i, j]  # `packed_index`
-            return g
 
         @wp.func
         def row_of(root: R, jacobian: J, m: int, i: int):
@@ -480,7 +491,7 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool):
         if wp.static(bends):
             if exact:
                 second = curvature_of(q, short(s), w, slope)
-                if wp.static(softens):
+                if wp.static(left_out is not None):
                     second = second + left_out(root, e, p, w, jacobian)
                 for i in range(wp.static(len(places))):
                     geometric[where[i], k, r] = linear(second[i])

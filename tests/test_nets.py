@@ -437,7 +437,7 @@ def test_massless_vertices_are_refused(device):
         ddg.Integrator(scene.build(device))
 
 
-@pytest.mark.parametrize("given", [{"solver": "projective"}, {"linear": "sweep"}, {"psd": "none"}])
+@pytest.mark.parametrize("given", [{"solver": "projective"}, {"linear": "sweep"}, {"psd": "none"}, {"psd": "project"}])
 def test_options_of_chains_are_refused(device, given):
     with pytest.raises(ddg.SceneError, match="is of rods on their own"):
         ddg.Integrator(sheet(2).build(device), **given)

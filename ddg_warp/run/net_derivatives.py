@@ -5,6 +5,7 @@ Every element of the sample has blocks of its own, so that a change of one block
 
     hessian      B^T H B with H the local Hessian and B from blocks to local dofs = differences of the gradient
     factor       F^T F + C = w (de/dq)^T (ds/dq) + the positive part of the geometric stiffness, derivatives by differences
+    exact        of measures with second derivatives: F^T F + C + these = the Hessian
     invariance   a rotation of blocks, frames and prescribed normals keeps the energy; of shells of revolution, a shift along the axis
 """
 
@@ -68,8 +69,10 @@ class NetSample:
         shapes = [(len(self.measure.strains), ELEMENTS)] * 2
         return tuple(self._launch(3, wp.float64, shapes, extra=(1,), **changed))
 
-    def evaluate(self, real) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Factor (n, 3 slots, E), geometric stiffness (tensions, E), gradient (slots, E, 3) and energy (E,) of the fused kernel."""
+    def evaluate(self, real, exact: bool = False) -> tuple[np.ndarray, ...]:
+        """Factor (n, 3 slots, E), geometric stiffness (tensions, E), second derivatives (packed, E), gradient (slots, E, 3) and
+        energy (E,) of the fused kernel; `exact` asks for the third, with compression in the second.
+        """
         n, slots = len(self.measure.strains), self.measure.slots
         vector = wp.types.vector(3, real)
 
@@ -79,17 +82,18 @@ class NetSample:
         out = [
             zeros(n * slots, ELEMENTS, dtype=vector),
             zeros(max(1, self.measure.tensions), ELEMENTS),
+            zeros(max(1, self.measure.packed), ELEMENTS),
             zeros(slots, ELEMENTS, dtype=vector),
             zeros(2, ELEMENTS),
             zeros(ELEMENTS),
         ]
         search = Islands(1, real, self.device)
-        search.clamped.fill_(1)
-        kernel = net_elements.evaluate_kernel(self.term, real, real)
+        search.clamped.fill_(0 if exact else 1)
+        kernel = net_elements.evaluate_kernel(self.term, real, real, 0 if exact else None)
         wp.launch(kernel, ELEMENTS, [self._elements(real), *search.arrays], out, device=self.device)
-        factor, tension, gradient, energy = (array.numpy().astype(float) for array in out[:4])
+        factor, tension, second, gradient, energy = (array.numpy().astype(float) for array in out[:5])
         rows = factor.reshape(n, slots, ELEMENTS, 3).transpose(0, 1, 3, 2).reshape(n, 3 * slots, ELEMENTS)
-        return rows, tension[: self.measure.tensions], gradient, energy[1]
+        return rows, tension[: self.measure.tensions], second, gradient, energy[1]
 
     def reverse(self, which: int, seed: np.ndarray, real) -> dict[str, np.ndarray]:
         """Reverse mode of the energy (which = 0) or gradient (1) kernel, by input."""
@@ -379,7 +383,7 @@ def symmetry(case: NetCase) -> float:
 
 
 def evaluate(case: NetCase) -> float:
-    _, _, force, energy = case.sample.evaluate(case.real)
+    *_, force, energy = case.sample.evaluate(case.real)
     return max(_relative(force, case.sample.gradient()), _relative(energy, case.sample.energy()))
 
 
@@ -402,12 +406,16 @@ def factor(case: NetCase) -> float:
         values, vectors = np.linalg.eigh(blocks.transpose(2, 0, 1))
         blocks = np.einsum("eik,ek,ejk->eij", vectors, np.maximum(values, 0.0), vectors)
         expected += _on_edges(sample, blocks)
-    return _relative(_gauss_newton(case), expected)
+    return _relative(_newton(case), expected)
 
 
 def definite(case: NetCase) -> float:
-    values = np.linalg.eigvalsh(np.moveaxis(_gauss_newton(case), -1, 0))
+    values = np.linalg.eigvalsh(np.moveaxis(_newton(case), -1, 0))
     return float(max(0.0, -values.min()) / values.max())
+
+
+def exact(case: NetCase) -> float:
+    return _relative(_newton(case, True), case.sample.hessian(wp.float64)) if case.term.measure.packed else 0.0
 
 
 def rest(case: NetCase) -> float:
@@ -464,6 +472,7 @@ CHECKS = {
         evaluate,
         factor,
         definite,
+        exact,
         rest,
         invariance,
         nonzero,
@@ -478,15 +487,22 @@ def _flat(values: np.ndarray) -> np.ndarray:
     return values.transpose(0, 2, 1).reshape(-1, values.shape[1])
 
 
-def _gauss_newton(case: NetCase) -> np.ndarray:
-    """F^T F + C (3 slots, 3 slots, E) of what the evaluate kernel writes."""
-    rows, tension, _, _ = case.sample.evaluate(case.real)
+def _newton(case: NetCase, exact: bool = False) -> np.ndarray:
+    """F^T F + C, or the exact matrix (3 slots, 3 slots, E), of what the evaluate kernel writes."""
+    rows, tension, second, *_ = case.sample.evaluate(case.real, exact)
     result = np.einsum("mae,mbe->abe", rows, rows)
     if len(tension) == 1:
         result += _on_edges(case.sample, tension[0][:, None, None])
     if len(tension) == 3:
         blocks = np.array([[tension[0], tension[1]], [tension[1], tension[2]]]).transpose(2, 0, 1)
         result += _on_edges(case.sample, blocks)
+    if exact:
+        size = case.term.measure.size
+        i, j = np.triu_indices(size)
+        local = np.zeros((ELEMENTS, size, size))
+        local[:, i, j] = local[:, j, i] = second.T
+        incidence = case.sample.incidence
+        result += np.einsum("ia,eij,jb->abe", incidence, local, incidence)
     return result
 
 

@@ -37,8 +37,8 @@ class Measure:
             `tension` is None, or `tension(q, w, slope) -> (c, shift)` with the second derivative of the strains,
             w slope : d2e = C + w J^T diag(shift) J. One edge has one tension, a scalar c with C = c I. A triangle has
             three, the vector c = (c11, c12, c22), and C has the blocks c_ij I between its edge vectors i and j.
-            `curvature` is None, or `curvature(q, s, w, slope)`, of rod vertices: w slope : d2e as the upper triangle of a
-            symmetric matrix, row by row.
+            `curvature` is None, or `curvature(q, s, w, slope)`, of rod vertices and rigid joints: w slope : d2e as the upper
+            triangle of a symmetric matrix, row by row.
         advance: None, or real -> advance(q, s): the lagged data beside the frames at the end of a step, from the dofs and frames there
             and what they were.
     """
@@ -74,6 +74,11 @@ class Measure:
     def slots(self) -> int:
         """Nodes, angles and rotation vectors of the stencil."""
         return self.nodes + self.angles + self.spins
+
+    @property
+    def packed(self) -> int:
+        """Reals of its second derivatives, contracted with stresses: an upper triangle; 0 where they are left to reverse mode."""
+        return self.size * (self.size + 1) // 2 if self.functions(wp.float64)[3] else 0
 
     @property
     def twists(self) -> bool:

@@ -9,6 +9,15 @@ half cells, in series, twist exactly as its cell and bend as it up to the square
 With phi the rotation of space, a row of the rod's Jacobian (a with respect to the ghost's edge t, b to its angle) turns into
 t x a + b t, and with the left Jacobian T(omega) of the exponential map (d phi = T d omega) into T^T of that.
 
+Second derivatives, contracted with moments: a rotation phi moves the ghost's edge by phi x t and its angle by t . phi. With the rod's
+Hessian in these and with (phi . t) (phi . a), as t x a turns with the ghost, that is a quadratic form in phi. Along a line in omega
+with direction d, phi = T d changes at the rate
+
+    (omega . d) (p' omega x d + q' omega x (omega x d)) + q d x (omega x d),   T = I + p [omega] + q [omega]^2,
+
+where ' is the derivative by |omega| over |omega|, so that the work of t x a + b t on it is added. (That the rod's frames spin at a
+rate as they are transported drops out: the ghost's is as new, z = 0, and dz = t x (phi x t) / 2 is at right angles to phi x t.)
+
 Dofs: edge from the joint outwards (3), its angle, omega (3). Lagged data: frame (u, t) of the edge; (u, t) of the ghost, reference
 twist. Data: +1 where the rod's edge starts at the joint, -1 where it ends there: seen backwards, t and theta change their sign.
 """
@@ -24,7 +33,9 @@ from ddg_warp.kernels.measures.rod_curvature_twist import rod_curvature_twist
 
 @cache
 def rotations(real):
-    """turned(omega, v) = exp(omega) v, and transposed(omega, v) = T(omega)^T v with T the left Jacobian of exp."""
+    """turned(omega, v) = exp(omega) v; transposed(omega, v) = T(omega)^T v, and tangent(omega) = T, the left Jacobian of exp;
+    bent(omega, c), the symmetric part of d(T^T c) / d omega.
+    """
     V = wp.types.vector(3, real)
     small = wp.constant(real(1.0e-3))
 
@@ -53,7 +64,27 @@ def rotations(real):
         across = wp.cross(omega, v)
         return v - across * c + wp.cross(omega, across) * d
 
-    return turned, transposed
+    @wp.func
+    def tangent(omega: V):
+        _s, c, d = coefficients(wp.dot(omega, omega))
+        w = wp.skew(omega)
+        return wp.identity(n=3, dtype=real) + w * c + (w * w) * d
+
+    @wp.func
+    def bent(omega: V, moment: V):
+        square = wp.dot(omega, omega)
+        s, c, d = coefficients(square)
+        dc = real(-1.0) / real(12.0) + square / real(180.0)
+        dd = real(-1.0) / real(60.0) + square / real(1260.0)
+        if square > small:
+            dc = (s - real(2.0) * c) / square
+            dd = (c - real(3.0) * d) / square
+        across = wp.cross(moment, omega)
+        g = across * dc + wp.cross(across, omega) * dd - moment * d
+        m = wp.outer(omega, g) * real(0.5)
+        return m + wp.transpose(m) + wp.identity(n=3, dtype=real) * (d * wp.dot(moment, omega))
+
+    return turned, transposed, tangent, bent
 
 
 @cache
@@ -61,9 +92,10 @@ def functions(real, between: bool = False):
     """Functions of the measure, `between` as for a rod's vertex."""
     Q, S, E, _ = joint_curvature_twist.types(real)
     R, T, _, _ = rod_curvature_twist.types(real)
-    V = wp.types.vector(3, real)
-    rod_strains, rod_jacobian, *_ = rod_curvature_twist.functions(real, between)
-    turned, transposed = rotations(real)
+    V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
+    H = wp.types.vector(28, real)
+    rod_strains, rod_jacobian, _, rod_curvature = rod_curvature_twist.functions(real, between)
+    turned, transposed, tangent, bent = rotations(real)
 
     @wp.func
     def vertex(q: Q, s: S):
@@ -93,7 +125,73 @@ def functions(real, between: bool = False):
         e, j = rod_jacobian(r, lag, w)
         return e, wp.matrix_from_rows(row(j[0], t, omega, sign), row(j[1], t, omega, sign), row(j[2], t, omega, sign))
 
-    return strains, jacobian, None, None
+    @wp.func
+    def curvature(q: Q, s: S, w: real, slope: E):
+        r, lag, t, omega, sign = vertex(q, s)
+        _e, j = rod_jacobian(r, lag, w)
+        f = (slope * w) * j
+        h = rod_curvature(r, lag, w, slope)
+        gg = M()  # of the ghost's edge (g) and angle (a), and of the edge (e) and its angle (b)
+        ge = M()
+        ee = M()
+        ga = V()
+        gb = V()
+        ea = V()
+        eb = V()
+        for i in range(3):
+            for k in range(3):
+                if k >= i:
+                    gg[i, k] = h[i * 8 - i * (i - 1) // 2 + k - i]  # `packed_index`
+                    ee[i, k] = h[(i + 3) * 8 - (i + 3) * (i + 2) // 2 + k - i]
+                else:
+                    gg[i, k] = h[k * 8 - k * (k - 1) // 2 + i - k]
+                    ee[i, k] = h[(k + 3) * 8 - (k + 3) * (k + 2) // 2 + i - k]
+                ge[i, k] = h[i * 8 - i * (i - 1) // 2 + 3 + k - i]
+            ga[i] = h[i * 8 - i * (i - 1) // 2 + 6 - i]
+            gb[i] = h[i * 8 - i * (i - 1) // 2 + 7 - i]
+            ea[i] = h[(i + 3) * 8 - (i + 3) * (i + 2) // 2 + 3 - i]
+            eb[i] = h[(i + 3) * 8 - (i + 3) * (i + 2) // 2 + 4 - i]
+        x = wp.skew(t)
+        a = V(f[0], f[1], f[2])
+        mixed = wp.outer(x * ga + a * real(0.5), t)
+        spin = mixed + wp.transpose(mixed) + wp.outer(t, t) * h[33] - x * (gg * x)
+        turn = tangent(omega)
+        back = wp.transpose(turn)
+        oo = back * (spin * turn) + bent(omega, wp.cross(t, a) + t * f[6])
+        oe = back * (x * ge + wp.outer(t, ea))
+        ob = back * (x * gb) * sign
+        return H(
+            ee[0, 0],
+            ee[0, 1],
+            ee[0, 2],
+            sign * eb[0],
+            oe[0, 0],
+            oe[1, 0],
+            oe[2, 0],
+            ee[1, 1],
+            ee[1, 2],
+            sign * eb[1],
+            oe[0, 1],
+            oe[1, 1],
+            oe[2, 1],
+            ee[2, 2],
+            sign * eb[2],
+            oe[0, 2],
+            oe[1, 2],
+            oe[2, 2],
+            h[35],
+            ob[0],
+            ob[1],
+            ob[2],
+            oo[0, 0],
+            oo[0, 1],
+            oo[0, 2],
+            oo[1, 1],
+            oo[1, 2],
+            oo[2, 2],
+        )
+
+    return strains, jacobian, None, curvature
 
 
 @cache
@@ -101,7 +199,7 @@ def _advance(real):
     Q, S, _, _ = joint_curvature_twist.types(real)
     V, L = wp.types.vector(3, real), wp.types.vector(7, real)
     _, reference_twist, _ = frames.functions(real)
-    turned, _ = rotations(real)
+    turned, *_ = rotations(real)
 
     @wp.func
     def advance(q: Q, s: S):

@@ -13,8 +13,8 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.element import CPU_OPTIONS
-from ddg_warp.kernels.islands import CLAMPED, SLOT, STATUS
+from ddg_warp.kernels.element import CPU_OPTIONS, left_out_function
+from ddg_warp.kernels.islands import CLAMPED, ITERATION, SLOT, STATUS
 from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.terms import Term
 
@@ -269,24 +269,30 @@ def term_kernels(term: Term, real, reverse: bool = False):
 
 
 @cache
-def evaluate_kernel(term: Term, real, linear):
+def evaluate_kernel(term: Term, real, linear, exact_from: int | None = None):
     """The kernel of a Newton iteration: energy, gradient and Gauss-Newton factor of one term, written a slot.
 
     Factor rows are vectors [strain * slots + slot][element]; `tension_out` holds the scalars of the geometric stiffness; in
-    worlds that are `projected` they are made positive semi-definite (an edge under compression, a triangle by the eigenvalues of
+    worlds that are `clamped` they are made positive semi-definite (an edge under compression, a triangle by the eigenvalues of
     its two-by-two stress, leaves out the negative part). Energies go to the half of `energy_out` that the line search does not
     hold. `stiffness_out` is the largest that a strain has against moving the element.
+
+    Of terms whose measure has second derivatives `second_out` holds, from iteration `exact_from` on, what F and the geometric
+    stiffness leave out of the exact Hessian, packed over the local dofs; before, and in `clamped` worlds, it is not written.
     """
     Elements = elements_type(real)
     measure, density = term.measure, term.density
     V, F = wp.types.vector(3, real), wp.types.vector(3, linear)
     Q, S, E, _ = measure.types(real)
     n, tensions = len(measure.strains), measure.tensions
-    _, jacobian_of, tension_of, _ = measure.functions(real)
+    _, jacobian_of, tension_of, curvature_of = measure.functions(real)
     energy_of, slope_of, root_of = density.functions(real, n)
     gather, spread = functions(term, real)
     slots_count, coupled = measure.slots, density.coupled
     C = wp.types.vector(3, real)
+    begin, packed = exact_from or 0, measure.packed if exact_from is not None else 0
+    left_out = left_out_function(term, real) if packed else None
+    options = CPU_OPTIONS | {"max_unroll": packed} if packed else CPU_OPTIONS
 
     @wp.func
     def definite(c: C):
@@ -304,13 +310,14 @@ def evaluate_kernel(term: Term, real, linear):
         scale = high / (high - low)
         return C((c[0] - low) * scale, c[1] * scale, (c[2] - low) * scale)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=options)
     def evaluate(
         given: Elements,
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         factor_out: wp.array2d(dtype=F),
         tension_out: wp.array2d(dtype=linear),
+        second_out: wp.array2d(dtype=linear),
         gradient_out: wp.array2d(dtype=V),
         energy_out: wp.array2d(dtype=real),
         stiffness_out: wp.array(dtype=linear),
@@ -356,5 +363,12 @@ def evaluate_kernel(term: Term, real, linear):
                     u = spread(jacobian[m] * (root[m] * weight), i)
                     factor_out[m * wp.static(slots_count) + i, tid] = F(linear(u[0]), linear(u[1]), linear(u[2]))
         stiffness_out[tid] = linear(stiffest)
+        if wp.static(packed > 0):
+            if flags[ITERATION, world] >= wp.static(begin) and flags[CLAMPED, world] == 0:
+                second = curvature_of(x, s, w, slope)
+                if wp.static(left_out is not None):
+                    second = second + left_out(root * weight, e, p, w, jacobian)
+                for i in range(wp.static(packed)):
+                    second_out[i, tid] = linear(second[i])
 
     return evaluate

@@ -154,13 +154,13 @@ def solver_kernels(linear):
         rho_out: wp.array(dtype=linear),
         first_out: wp.array(dtype=linear),
         iterations_out: wp.array(dtype=int),
-        projected_out: wp.array(dtype=int),
+        negative_out: wp.array(dtype=int),
         busy_out: wp.array(dtype=int),
     ):
         w = wp.tid()
         if wanted[w] == 0:
             return
-        projected_out[w] = 0
+        negative_out[w] = 0
         rho_out[w] = total[w]
         first_out[w] = total[w]
         iterations_out[w] = 0
@@ -249,17 +249,17 @@ def solver_kernels(linear):
         limit: int,
         rho: wp.array(dtype=linear),
         iterations: wp.array(dtype=int),
-        projected: wp.array(dtype=int),
+        negative: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
         busy_out: wp.array(dtype=int),
     ):
-        """Whether a world goes on, by the residual in the norm of the preconditioner."""
+        """Whether a world goes on, by the residual in the norm of the preconditioner; `negative` notes negative curvature."""
         w = wp.tid()
         if wanted[w] != 1:
             return
         iterations[w] = iterations[w] + 1
         if not curvature[w] > linear(0.0):
-            projected[w] = 1
+            negative[w] = 1
         lost = ends(curvature[w], rho[w])
         rho[w] = total[w]
         if lost or iterations[w] >= limit:

@@ -11,7 +11,8 @@ import warp as wp
 
 from ddg_warp.kernels.drag import block_inertia
 from ddg_warp.kernels.element import CPU_OPTIONS
-from ddg_warp.kernels.islands import DROWNED, LOAD_SCALE, STATUS, UNBALANCED
+from ddg_warp.kernels.islands import CLAMPED, COEFFICIENT, DROWNED, ITERATION, LOAD_SCALE, STATUS, UNBALANCED, WANTED
+from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.terms import Term
 
 SLICE = 32  # rows of a slice of H
@@ -190,13 +191,14 @@ def balance_kernels(real, linear, drag: bool = False):
 
 @cache
 def contributions(linear):
-    """What a set adds to H: its factor rows, geometric stiffness, and the items of each position."""
+    """What a set adds to H: its factor rows, geometric stiffness, second derivatives, and the items of each position."""
     H = wp.types.vector(3, linear)
 
     @wp.struct
     class Contributions:
         factor: wp.array2d(dtype=H)
         tension: wp.array2d(dtype=linear)
+        second: wp.array2d(dtype=linear)
         starts: wp.array(dtype=int)
         items: wp.array(dtype=int)
         elements: int
@@ -205,8 +207,48 @@ def contributions(linear):
 
 
 @cache
-def sum_function(term: Term, linear):
-    """add(contributions, position, world): F^T F and geometric stiffness of one set.
+def second_function(measure: Measure, linear):
+    """block(second, e, a, b): what the packed second derivatives of an element (`Measure.packed`) are between two of its slots.
+
+    A node sees the edge that ends in it with weight 1 and that which starts in it with -1, angles and rotations see themselves.
+    """
+    size, angles = measure.size, 3 * len(measure.edges)
+    spins = angles + measure.angles
+    own = [*range(angles, spins), *range(spins, size, 3)]  # first dofs of angles and rotations
+    ends = [{edge[end]: 3 * i for i, edge in enumerate(measure.edges)} for end in (0, 1)]
+    M, I = wp.types.matrix((3, 3), linear), wp.types.vector(measure.slots, int)
+    minus, plus = (
+        I(*(end.get(node, -1) for node in range(measure.nodes)), *more)
+        for end, more in zip(ends, ([-1] * len(own), own), strict=True)
+    )
+
+    @wp.func
+    def part(second: wp.array2d(dtype=linear), e: int, p: int, q: int):
+        """Between the dofs from p and those from q on: three of an edge or a rotation, one of an angle; -1 for none."""
+        m = M()
+        if p >= 0 and q >= 0:
+            for i in range(3):
+                for j in range(3):
+                    if (i == 0 or p < wp.static(angles) or p >= wp.static(spins)) and (
+                        j == 0 or q < wp.static(angles) or q >= wp.static(spins)
+                    ):
+                        low = wp.min(p + i, q + j)
+                        m[i, j] = second[low * wp.static(size) - low * (low - 1) / 2 + wp.abs(p + i - q - j), e]
+        return m
+
+    @wp.func
+    def block(second: wp.array2d(dtype=linear), e: int, a: int, b: int):
+        m = part(second, e, plus[a], plus[b]) + part(second, e, minus[a], minus[b])
+        return m - part(second, e, plus[a], minus[b]) - part(second, e, minus[a], plus[b])
+
+    return block
+
+
+@cache
+def sum_function(term: Term, linear, exact: bool):
+    """add(contributions, position, world, late): F^T F and geometric stiffness of one set.
+
+    If `exact`, also the second derivatives, where it is `late` enough for these.
 
     An item is (element * slots + row's slot) * slots + column's slot.
     """
@@ -214,6 +256,7 @@ def sum_function(term: Term, linear):
     M, Contributions = wp.types.matrix((3, 3), linear), contributions(linear)
     n, slots, tensions = len(measure.strains), measure.slots, measure.tensions
     edges = measure.edges[:2]  # geometric stiffness is between the first two
+    second_of = second_function(measure, linear) if exact else None
 
     @wp.func
     def weight(edge_first: int, edge_second: int, slot: int):
@@ -237,7 +280,7 @@ def sum_function(term: Term, linear):
         return c
 
     @wp.func
-    def add(own: Contributions, at: int, w: int):
+    def add(own: Contributions, at: int, w: int, late: bool):
         m = M()
         for index in range(own.starts[at], own.starts[at + 1]):
             item = own.items[index]
@@ -252,6 +295,9 @@ def sum_function(term: Term, linear):
                 c = geometric(own.tension, e, a, b)
                 for d in range(3):
                     m[d, d] = m[d, d] + c
+            if wp.static(exact):
+                if late:
+                    m += second_of(own.second, e, a, b)
         return m
 
     return add
@@ -261,21 +307,27 @@ SETS = 6  # sets that one launch sums
 
 
 @cache
-def assemble_kernel(terms: tuple[Term, ...], real, linear, begins: bool, drag: bool = False):
-    """H of up to `SETS` sets, a thread a position, with inertia and drag where it `begins`; else it adds to what is there."""
+def assemble_kernel(
+    terms: tuple[Term, ...], real, linear, begins: bool, exact_from: tuple[int | None, ...], drag: bool = False
+):
+    """H of up to `SETS` sets, a thread a position, with inertia and drag where it `begins`; else it adds to what is there.
+
+    `exact_from` says of each set from which iteration on it has second derivatives, one for all, or None where it has none.
+    """
     M, Mass = wp.types.matrix((3, 3), linear), mass_type(real, drag)
     Contributions = contributions(linear)
-    sums = tuple(sum_function(term, linear) for term in terms)
+    sums = tuple(sum_function(term, linear, first is not None) for term, first in zip(terms, exact_from, strict=True))
+    begin = next((first for first in exact_from if first is not None), 0)
     count = len(terms)
     last = count - 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def assemble(
         mass: Mass,
-        coefficient: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         rows: wp.array(dtype=int),
         columns: wp.array(dtype=int),
-        wanted: wp.array(dtype=int),
         positions: int,
         own0: Contributions,
         own1: Contributions,
@@ -287,8 +339,10 @@ def assemble_kernel(terms: tuple[Term, ...], real, linear, begins: bool, drag: b
     ):
         p = wp.tid()
         w = p / positions
-        if wanted[w] == 0:
+        if flags[WANTED, w] == 0:
             return
+        # what is wanted has been counted as an iteration since it was evaluated
+        late = flags[ITERATION, w] > wp.static(begin) and flags[CLAMPED, w] == 0
         at = p - w * positions
         row = rows[at]
         if row < 0:
@@ -297,9 +351,9 @@ def assemble_kernel(terms: tuple[Term, ...], real, linear, begins: bool, drag: b
         if wp.static(begins):
             if row == columns[at]:
                 if wp.static(drag):
-                    inertia = mass[w, row].mass * coefficient[w]
+                    inertia = mass[w, row].mass * scalars[COEFFICIENT, w]
                 else:
-                    inertia = mass[row] * coefficient[w]
+                    inertia = mass[row] * scalars[COEFFICIENT, w]
                 for d in range(3):
                     m[d, d] = linear(inertia[d])
                 if wp.static(drag):
@@ -311,17 +365,17 @@ def assemble_kernel(terms: tuple[Term, ...], real, linear, begins: bool, drag: b
             for i in range(3):
                 for j in range(3):
                     m[i, j] = matrix[3 * i + j, p]
-        m += wp.static(sums[0])(own0, at, w)
+        m += wp.static(sums[0])(own0, at, w, late)
         if wp.static(count > 1):
-            m += wp.static(sums[min(1, last)])(own1, at, w)
+            m += wp.static(sums[min(1, last)])(own1, at, w, late)
         if wp.static(count > 2):
-            m += wp.static(sums[min(2, last)])(own2, at, w)
+            m += wp.static(sums[min(2, last)])(own2, at, w, late)
         if wp.static(count > 3):
-            m += wp.static(sums[min(3, last)])(own3, at, w)
+            m += wp.static(sums[min(3, last)])(own3, at, w, late)
         if wp.static(count > 4):
-            m += wp.static(sums[min(4, last)])(own4, at, w)
+            m += wp.static(sums[min(4, last)])(own4, at, w, late)
         if wp.static(count > 5):
-            m += wp.static(sums[min(5, last)])(own5, at, w)
+            m += wp.static(sums[min(5, last)])(own5, at, w, late)
         for i in range(3):
             for j in range(3):
                 matrix[3 * i + j, p] = m[i, j]

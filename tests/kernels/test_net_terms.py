@@ -39,8 +39,8 @@ def test_derivative(device, precision, term, check):
 
 
 def test_nothing_is_left_out():
-    """Terms of nets meet the checks of chains but `rigid`, of which `invariance` is the whole, and `exact`, of rods' vertices."""
-    assert set(derivatives.CHECKS) - set(net_derivatives.CHECKS) == {"rigid", "exact"}
+    """Terms of nets meet the checks of chains but `rigid`, of which `invariance` is the whole."""
+    assert set(derivatives.CHECKS) - set(net_derivatives.CHECKS) == {"rigid"}
     assert set(net_derivatives.CHECKS) < set(derivatives.CHECKS)
 
 

@@ -101,7 +101,15 @@ class Problem:
     """One Newton iteration at a random state of two worlds, dense."""
 
     def __init__(
-        self, scene, device, stretch=1.0, precision="float64", preconditioner="block_jacobi", noise=0.02, seed=3
+        self,
+        scene,
+        device,
+        stretch=1.0,
+        precision="float64",
+        preconditioner="block_jacobi",
+        noise=0.02,
+        seed=3,
+        psd="auto",
     ):
         random = np.random.default_rng(seed)
         self.model = scene.build(device, precision, worlds=2)
@@ -111,7 +119,7 @@ class Problem:
         free = np.tile(~net.host.fixed, (2, 1))
         q[:] = q * stretch + noise * random.normal(size=q.shape) * free
         self.state.net.q.assign(q)
-        newton = self.newton = NetNewton(self.model, NewtonOptions(), preconditioner)
+        newton = self.newton = NetNewton(self.model, NewtonOptions(psd=psd), preconditioner)
         wp.copy(newton.q, self.state.net.q)
         wp.copy(newton.base, self.state.net.q)
         newton.target.assign(q + 5.0 * noise * random.normal(size=q.shape) * free)

@@ -33,9 +33,10 @@ class NewtonOptions:
             compressed rods and long steps, where Gauss-Newton takes many iterations. "project": the exact one with every
             element made positive semi-definite by its eigenvalues, at twenty times the cost of an iteration. "none": the
             exact one; where it is indefinite the solve ends with the outcome `indefinite`, and a time step is tried again
-            with a shorter one. "auto": "progressive" for rods that are curved or twisted at rest, else "gauss_newton"; nets
-            keep the stresses' stiffness, compression included, and leave compression out of the next matrix where conjugate
-            gradients meet negative curvature.
+            with a shorter one. "auto": "progressive" for rods that are curved or twisted at rest, on their own or in nets, else
+            "gauss_newton". Nets take these two. Their exact Hessian is that of rods and rigid joints; second derivatives of shells'
+            bending, of glue and of magnets are left out. It is indefinite where conjugate gradients meet negative curvature; by
+            "gauss_newton" nets go on with the direction found so far, and leave compression out of the next matrix.
     """
 
     rtol: float = 1e-6

@@ -7,10 +7,11 @@ import warp as wp
 
 from ddg_warp.compile.tolerance import outer_forces
 from ddg_warp.errors import SceneError
+from ddg_warp.kernels import pcg
 from ddg_warp.kernels.drag import block_inertia
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.net import elements, krylov, newton, system
-from ddg_warp.solve.chains.newton import NewtonOptions
+from ddg_warp.solve.chains.newton import EARLY, NewtonOptions
 from ddg_warp.solve.net.chains import Chains
 from ddg_warp.solve.net.multilevel import Multilevel
 from ddg_warp.solve.net.planes import DevicePlanes
@@ -19,6 +20,7 @@ from ddg_warp.solve.net.tolerance import Allowed
 
 PRECONDITIONERS = ("block_jacobi", "chain", "multilevel", "chain_multilevel")
 SPARE = 0.5  # of the tolerance, what the last linear solve of a step may leave
+STRAIGHT = 1e-9  # turn between edges of a rod at rest that may be rounding [rad]
 LOOSEST = 0.1  # largest reduction of the residual that a direction is solved to (Eisenstat and Walker's forcing term)
 
 
@@ -84,7 +86,10 @@ class NetNewton:
         self.forcing, self.rho, self.rho_first, self.total, self.curvature = scalars(5, self.linear)
         self.busy = make(1, int)
         self.pcg_work = make(1, wp.int64)
-        self.parts = [self._part(part, make, H) for part in net.sets]
+        self.psd = self.automatic_psd() if options.psd == "auto" else options.psd
+        exact = [self.psd == "progressive" and part.term.measure.packed > 0 for part in net.sets]
+        self.exact_from = tuple(EARLY if wanted else None for wanted in exact)
+        self.parts = [self._part(*given, make, H) for given in zip(net.sets, exact, strict=True)]
         ends = host.edges
         self.ends = wp.array(np.ascontiguousarray(ends, np.int32), dtype=int, device=device)
         # curvature is linear in the angles of mesh edges: they need no cap, which would shorten the steps of all else
@@ -98,9 +103,14 @@ class NetNewton:
         self._largest = Sums(worlds, turning, self.real, device, largest=True)
         lengths = host.edge_lengths
         self.arm, self.longest = float(lengths.mean()), float(lengths.max())
-        self._evaluate = [elements.evaluate_kernel(part.term, self.real, self.linear) for part in net.sets]
+        self._evaluate = [
+            elements.evaluate_kernel(part.term, self.real, self.linear, first)
+            for part, first in zip(net.sets, self.exact_from, strict=True)
+        ]
+        self._repeat = pcg.repeat_kernel(self.real, False) if any(exact) else None
+        self.negative = make(worlds, int)
         self._outer, self._collect, self._settle = system.balance_kernels(self.real, self.linear, drag)
-        self._assembly = Assembly(net, self.system, self.parts, self.real, self.linear, drag)
+        self._assembly = Assembly(net, self.system, self.parts, self.real, self.linear, self.exact_from, drag)
         self._judge, self._measure, self._rotate, self._take, self._move = newton.search_kernels(self.real, self.linear)
         self._invert, self._start, self._begin, *self._cycle = krylov.solver_kernels(self.linear)
         self._compare, self._confirm = krylov.confirm_kernels(self.real, self.linear)
@@ -114,12 +124,19 @@ class NetNewton:
         self.levels = Multilevel(*given) if preconditioner in ("multilevel", "chain_multilevel") else None
         self._limit = max(200, 100 * math.isqrt(blocks))
 
-    def _part(self, part, make, H) -> dict:
+    def automatic_psd(self) -> str:
+        """The mode that suits the rods; see `ChainNewton.automatic_psd`. Curvature that is rounding counts as none."""
+        bending = [part for part in self.net.sets if part.term.measure.packed]
+        turns = (part.parameters[name] * part.parameters["measure"] for part in bending for name in part.term.rest)
+        return "progressive" if any(np.abs(turn).max() > STRAIGHT for turn in turns) else "gauss_newton"
+
+    def _part(self, part, exact: bool, make, H) -> dict:
         """What the elements of a set write."""
         measure, count = part.term.measure, self.worlds * part.elements
         return {
             "factor": make((len(measure.strains) * measure.slots, count), H),
             "tension": make((max(1, measure.tensions), count), self.linear),
+            "second": make((measure.packed, count) if exact else (1, 1), self.linear),
             "gradient": make((measure.slots, count), self.net.vector),
             "energy": make((2, count), self.real),
             "stiffness": make(count, self.linear),
@@ -129,7 +146,7 @@ class NetNewton:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         own = [self._outer, self._collect, self._settle, self._judge, self._measure, self._rotate, self._take]
-        own += self.allowed.kernels
+        own += [*self.allowed.kernels, *([self._repeat] if self._repeat else [])]
         cycle = [self._move, self._invert, self._start, self._begin, *self._cycle, self._compare, self._confirm]
         parts = [k for part in (self.chains, self.levels, self.planes) if part for k in part.kernels]
         evaluate = [(kernel, 128) for kernel in self._evaluate]
@@ -164,7 +181,7 @@ class NetNewton:
                 kernel,
                 self.worlds * part.elements,
                 [self.net.elements(state, index, self.q, self.islands.rate), *self.islands.arrays],
-                [own["factor"], own["tension"], own["gradient"], own["energy"], own["stiffness"]],
+                [own["factor"], own["tension"], own["second"], own["gradient"], own["energy"], own["stiffness"]],
                 device=self.device,
                 block_dim=128,
             )
@@ -228,7 +245,7 @@ class NetNewton:
 
     def assemble(self) -> None:
         """H of the worlds that want a direction."""
-        self._assembly(self.mass, self.islands.coefficient, self.islands.wanted, self.matrix)
+        self._assembly(self.mass, self.islands, self.matrix)
         if self.planes:
             self.planes.matrix(self.matrix, self.islands.wanted)
 
@@ -256,10 +273,17 @@ class NetNewton:
             self._begin,
             self.worlds,
             [self.total],
-            [self.islands.wanted, self.rho, self.rho_first, self.iterations, self.islands.clamped, self.busy],
+            [self.islands.wanted, self.rho, self.rho_first, self.iterations, self._indefinite, self.busy],
             device=self.device,
         )
         wp.capture_while(self.busy, self.reduce)
+        if self._repeat:  # what was indefinite comes again, without second derivatives and compression
+            wp.launch(self._repeat, self.worlds, [1, *self.islands.arrays, self.negative], device=self.device)
+
+    @property
+    def _indefinite(self) -> wp.array:
+        """Where conjugate gradients note negative curvature: the iterate comes again, or the next one leaves out compression."""
+        return self.negative if self._repeat else self.islands.clamped
 
     def reduce(self) -> None:
         """Iterate until the residual is small in the norm of the preconditioner, and go on where the tolerance says that it is not."""
@@ -325,7 +349,7 @@ class NetNewton:
             test,
             self.worlds,
             [self.total, self.curvature, self.rho_first, self.forcing, self._limit],
-            [self.rho, self.iterations, self.islands.clamped, self.islands.wanted, self.busy],
+            [self.rho, self.iterations, self._indefinite, self.islands.wanted, self.busy],
             device=self.device,
         )
 

@@ -116,6 +116,7 @@ class NetEquilibrium:
                 max_iterations=options.max_iterations,
                 rotation_cap=options.rotation_cap,
                 linear_rtol=FORCING,
+                psd="gauss_newton",
             ),
         )
         self._start = model.net.empty()  # lagged data of a solve

@@ -26,7 +26,7 @@ class NetStep(PartStep):
         for name, value, only in (
             ("solver", integrator.solver, ("newton",)),
             ("linear", integrator.linear, ("auto", *PRECONDITIONERS)),
-            ("psd", options.psd, ("auto",)),
+            ("psd", options.psd, ("auto", "gauss_newton", "progressive")),
         ):
             if value not in only:
                 raise SceneError(f"{name} = {value!r} is of rods on their own; with a net it is {' or '.join(only)}")

@@ -94,34 +94,35 @@ class Assembly:
     """Sums H from what the elements of all sets write, `system.SETS` sets a launch.
 
     Args:
-        written: of each set, the arrays "factor" and "tension".
+        written: of each set, the arrays "factor", "tension" and "second".
+        exact_from: of each set, the iteration from which on second derivatives are written, or None.
         drag: whether blocks have more than a mass.
     """
 
-    def __init__(self, net, table: NetSystem, written: list[dict], real, linear, drag: bool):
+    def __init__(self, net, table: NetSystem, written: list[dict], real, linear, exact_from: tuple, drag: bool):
         self.net, self.table, self.kernels, self._own = net, table, [], []
         Contributions = system.contributions(linear)
         for first in range(0, len(net.sets), system.SETS):
-            sets = net.sets[first : first + system.SETS]
+            sets, late = (of[first : first + system.SETS] for of in (net.sets, exact_from))
             terms = tuple(part.term for part in sets)
-            self.kernels.append(system.assemble_kernel(terms, real, linear, first == 0, drag))
+            self.kernels.append(system.assemble_kernel(terms, real, linear, first == 0, late, drag))
             own = []
             for i in range(first, first + len(sets)):
                 data = Contributions()
-                data.factor, data.tension = written[i]["factor"], written[i]["tension"]
+                data.factor, data.tension, data.second = (written[i][name] for name in ("factor", "tension", "second"))
                 data.starts, data.items = table.adds[i]
                 data.elements = net.sets[i].elements
                 own.append(data)
             self._own.append(own + [own[-1]] * (system.SETS - len(own)))
 
-    def __call__(self, mass, coefficient, wanted, matrix: wp.array) -> None:
+    def __call__(self, mass: wp.array, islands, matrix: wp.array) -> None:
         """Write H (9, positions of all worlds) of the worlds that want it."""
         table = self.table
         for kernel, own in zip(self.kernels, self._own, strict=True):
             wp.launch(
                 kernel,
                 self.net.worlds * table.positions,
-                [mass, coefficient, table.rows, table.columns, wanted, table.positions, *own],
+                [mass, *islands.arrays, table.rows, table.columns, table.positions, *own],
                 [matrix],
                 device=self.net.device,
             )
