@@ -45,3 +45,22 @@ def test_twist_turns_directors_right_handed(device, joined):
 def test_planar_curvature_turns_x_towards_z(device):
     tip = at_rest(device, (np.full(31, RATE),), dimension=2, director=None).points()[-1]
     np.testing.assert_allclose(tip, (np.sin(RATE) * X + (1.0 - np.cos(RATE)) * Z) / RATE, atol=1e-3)
+
+
+@pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
+@pytest.mark.parametrize(
+    ("dimension", "curvature"),
+    [(3, "tangent"), (2, "tangent"), *(pytest.param(d, "angle", marks=pytest.mark.slow) for d in (2, 3))],
+)
+def test_any_shape_it_is_built_in_is_free_of_stress(device, dimension, curvature, closed):
+    """Bent and twisted at random, as its natural shape; stresses of strains that are one too large are of order one."""
+    random, angle = np.random.default_rng(5), np.linspace(0.0, 2.0 * np.pi, 7)[:-1, None]
+    points = np.concatenate([np.cos(angle), np.sin(angle), np.sin(angle)], -1) + 0.1 * random.normal(size=(6, 3))
+    if dimension == 2:
+        points[:, 1] = 0.0
+    scene = ddg.Scene(dimension=dimension)
+    section = ddg.Stiffness(EA=2.0, EI1=0.9, EI2=0.7 if dimension == 3 else 0.9, GJ=0.8)
+    scene.add_rod(points, section=section, closed=closed, natural="shape", curvature=curvature)
+    model = scene.build(device, "float64")
+    for stress in model.stresses(model.state()).values():
+        np.testing.assert_allclose(np.concatenate([np.ravel(values) for values in stress]), 0.0, atol=1e-13)

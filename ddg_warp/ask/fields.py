@@ -82,7 +82,7 @@ def cell_fields(model, state, names: Sequence[str]) -> dict[str, np.ndarray]:
 
 
 def _curvatures(term, strains: np.ndarray) -> dict[str, np.ndarray]:
-    if term.measure.name.startswith("curvature_binormal"):  # a vector in space
+    if term.measure.vector:
         return {"curvature_1": np.linalg.norm(strains, axis=-1)}
     return {
         name: strains[..., i]

@@ -1,290 +1,179 @@
 """The derivative table: every derivative of every term against something else that computes it.
 
-The state is random and nothing in it is zero (see `Sample`). References are central differences, always taken in
-float64, or automatic differentiation of another kernel; errors are relative to the largest reference. e are the
-strains, w the rest measure and q the window of an element:
+The state is random and nothing in it is zero (see `ddg_warp.run.samples`). References are central differences, always taken in float64,
+or automatic differentiation of another kernel; errors are relative to the largest reference. e are the strains, w the rest measure
+and q the local dofs of an element:
 
     gradient     w J^T psi' scattered to dofs = reverse mode of the energy kernel
-    reverse      reverse mode of the gradient kernel, seeded with v, = differences of v . gradient in x and theta
+    reverse      reverse mode of the gradient kernel, seeded with v, = differences of v . gradient in the dofs
     parameters   the same in every row of the parameter buffer, element by element
-    lagged       the same in the lagged frames, the strains of the last step and 1/h
-    hessian      Hessian kernel = differences of the gradient on the window
+    lagged       the same in the lagged frames, the strains of the last step and 1/h, row by row along a random direction
+    hessian      Hessian kernel = differences of the gradient by the local dofs
     symmetry     Hessian kernel = its transpose
     evaluate     energy and gradient of the fused kernel = sum over the terms' own kernels
-    factor       F^T F + c of the chain = w J^T (d stress / dq) + max(N, 0)/|e| (I - t t^T), derivatives by differences
-    definite     F^T F + c has no negative eigenvalue
-    exact        F^T F + c, compression included, and the geometric stiffness = Hessian kernels of all terms
-    rest         no force in the rest shape
+    factor       F^T F + C of the fused kernel = w J^T psi'' J without what is negative of psi'', and the geometric stiffness under
+                 tension, derivatives by differences
+    definite     F^T F + C has no negative eigenvalue
+    exact        F^T F + C, compression included, and the second derivatives that measures of rods have = Hessian kernels
+    rest         no force where strains are those of rest; of a law of rods without any, in straight rods
     invariance   a rigid motion keeps the energy when the lagged data turn too, or when angles make up for the frames
-    rigid        the gradient is orthogonal to translations and infinitesimal rotations
-    nonzero      every dof feels a force, so that no zero passes for agreement
+    rigid        the gradient of a chain is orthogonal to translations and infinitesimal rotations
+    nonzero      every dof that the energy depends on feels a force, so that no zero passes for agreement
     downcast     energy and gradient feel a relative change of 2^-30 in every input, which no float32 can hold
 """
 
-from dataclasses import dataclass
-from functools import cached_property
-
 import numpy as np
-import warp as wp
 
-from ddg_warp import arrays
-from ddg_warp.compile.precision import PRECISIONS
-from ddg_warp.kernels import element
-from ddg_warp.kernels.element import ChainKind
 from ddg_warp.kernels.terms import ALL, REGISTRY, Term
-from ddg_warp.run.samples import Sample, is_vector, rotation
-from ddg_warp.scene.descriptions import Law
-from ddg_warp.scene.material import Stiffness
-from ddg_warp.scene.scene import Scene
+from ddg_warp.run.chain_samples import Chain, chain_of
+from ddg_warp.run.element_samples import Elements
+from ddg_warp.run.samples import Sample, rotation
 
 TRAP = 2.0**-30
 
 
-def chain_of(term: Term, closed: bool) -> ChainKind:
-    """The chain that a rod with this term is: bending first, then stretch, both damped or neither."""
-    known = ("planar_bend", "planar_stretch") if term.measure.dim == 2 else ("rod_bend_twist", "rod_stretch")
-    bending, stretch = (REGISTRY[name].damped(term.density.lagged) for name in known)
-    terms = (term, stretch) if term.measure.span == 2 else (bending, term)
-    return ChainKind(term.measure.dim, terms[0].measure.angles > 0, closed, terms)
-
-
-def _rest_scene(term: Term, kind: ChainKind) -> Scene:
-    """A rod of that kind, at rest in a random shape; straight where the measure, or the law, knows no other."""
-    random = np.random.default_rng(5)
-    angle = np.linspace(0.0, 2.0 * np.pi, 7)[:-1, None]
-    points = np.concatenate([np.cos(angle), np.sin(angle), np.sin(angle)], -1) + 0.1 * random.normal(size=(6, 3))
-    if any(map(is_vector, kind.terms)) or not term.rest:
-        points = np.cumsum(random.uniform(0.5, 1.5, size=(6, 1)), axis=0) * random.normal(size=3)
-    if kind.dim == 2:
-        points[:, 1] = 0.0
-    bending = 0.7 if kind.twist else 0.9
-    viscosity = 0.4 if term.density.lagged else 0.0
-    section = Stiffness(EA=2.0, EI1=0.9, EI2=bending, GJ=0.8, mass_per_length=1.0, viscosity=viscosity)
-    scene = Scene(dimension=kind.dim)
-    brought = {"stiffness", *(known.family for known in term.parameters if known.rest or known.default is not None)}
-    own = term.density.undamped or term.density
-    values = {known.family: 0.5 for known in term.parameters if known.family not in brought}
-    laws = {term.name: Law(own, **values)}
-    natural = "shape" if term.rest else "straight"
-    curvature = "angle" if any(one.measure.by_angle for one in kind.terms) else "tangent"
-    options = {"natural": natural, "twist": kind.twist, "curvature": curvature, "laws": laws}
-    scene.add_rod(points, section=section, closed=kind.closed, **options)
-    return scene
-
-
-@dataclass
-class Case:
-    """A term in a chain, at a sample state, in one precision."""
-
-    term: Term
-    kind: ChainKind
-    precision: str
-    device: str
-
-    @property
-    def real(self):
-        """The scalar type under test."""
-        return PRECISIONS[self.precision].real
-
-    @property
-    def index(self) -> int:
-        """Place of the term in its chain."""
-        return self.kind.terms.index(self.term)
-
-    @cached_property
-    def sample(self) -> Sample:
-        """The random state."""
-        return Sample(self.kind, self.device, exact_in_float32=self.real == wp.float32)
-
-    @cached_property
-    def seed(self) -> np.ndarray:
-        """Weights v of the window gradient (window, n, R)."""
-        return np.random.default_rng(7).normal(size=(self.kind.window, *self.sample.shape))
-
-    @cached_property
-    def gradient(self) -> np.ndarray:
-        """Window gradient (window, n, R) in the precision under test."""
-        return self.sample.gradient(self.index, self.real)
-
-    @cached_property
-    def reverse(self) -> dict[str, np.ndarray]:
-        """Reverse mode of v . gradient."""
-        return self.sample.reverse(self.index, 1, self.seed, self.real)
-
-    @cached_property
-    def gradient_derivative(self) -> np.ndarray:
-        """Differences of the window gradient (window, window, n, R)."""
-        return self.sample.window_derivative(lambda **data: self.sample.gradient(self.index, **data))
-
-    def difference(self, name: str, where) -> np.ndarray:
-        """Differences of v . gradient of every element (n, R) along data[name][where]."""
-        return self.sample.difference(
-            lambda **data: (self.seed * self.sample.gradient(self.index, **data)).sum(0), name, where
-        )
-
-
 def relative(value, reference) -> float:
-    """Largest difference over the largest reference."""
-    return float(np.abs(value - reference).max() / np.abs(reference).max())
+    """Largest difference over the largest reference; nothing where both are zero."""
+    error = np.abs(value - reference).max()
+    return 0.0 if error == 0.0 else float(error / max(np.abs(reference).max(), 1e-100))
 
 
-def gradient(case: Case) -> float:
-    sample = case.sample
-    adjoint = sample.reverse(case.index, 0, np.ones(sample.shape), case.real)
-    scattered = sample.scatter(case.gradient)
-    return relative(scattered, np.concatenate([adjoint["x"], adjoint["theta"][..., None]], -1)[..., : case.kind.block])
+def largest(errors) -> float:
+    """Of all errors; not a number where one is not."""
+    return float(np.max(list(errors)))
 
 
-def reverse(case: Case) -> float:
-    product = np.einsum("inr,ijnr->jnr", case.seed, case.gradient_derivative)
-    adjoint = np.concatenate([case.reverse["x"], case.reverse["theta"][..., None]], -1)[..., : case.kind.block]
-    return relative(adjoint, case.sample.scatter(product))
+def gradient(sample: Sample) -> float:
+    adjoint = sample.reverse(0, np.ones(sample.shape))
+    return relative(sample.scatter(sample.gradient(sample.real)), adjoint["q"])
 
 
-def parameters(case: Case) -> float:
-    first = case.kind.places()[case.index][0]
-    return max(
-        relative(case.reverse["buffer"][row], case.difference("buffer", (row,)))
-        for row in range(first, first + len(case.term.parameter_names))
-    )
+def reverse(sample: Sample) -> float:
+    product = np.einsum("i...,ij...->j...", sample.seed, sample.gradient_derivative)
+    return relative(sample.adjoint["q"], sample.scatter(product))
 
 
-def lagged(case: Case) -> float:
-    errors = [0.0]
-    if case.term.measure.lag_size:
-        expected = np.zeros((7, *case.sample.shape))
-        for c, k in np.ndindex(7, case.sample.shape[0]):
-            expected[c, k] = case.difference("frame", (c, k)).sum(0)
-        errors.append(relative(case.reverse["frame"], expected))
-    if case.term.density.lagged:
-        first = case.kind.places()[case.index][3]
-        for row in range(first, first + len(case.term.measure.strains)):
-            errors.append(relative(case.reverse["last"][row], case.difference("last", (row,))))
-        errors.append(relative(case.reverse["rate"], case.difference("rate", ...).sum(0)))
-    return max(errors)
+def parameters(sample: Sample) -> float:
+    slopes = sample.adjoint["buffer"]
+    rows = [(row, sample.difference(sample.seeded, "buffer", (row,))) for row in sample.parameter_rows()]
+    return largest(relative(slopes[row], reference) for row, reference in rows)
 
 
-def hessian(case: Case) -> float:
-    return relative(case.sample.hessian(case.index, case.real), case.gradient_derivative)
+def lagged(sample: Sample) -> float:
+    errors, random = [], np.random.default_rng(9)
+    for name in sample.adjoint.keys() - {"q", "buffer"}:
+        found = []
+        for row, slope in enumerate(np.atleast_2d(sample.adjoint[name])):
+            along = np.where(slope < 0.0, -1.0, 1.0) * random.uniform(0.5, 1.5, size=slope.shape)  # nothing cancels
+            where = (row,) if sample.data[name].ndim > 1 else ...
+            found.append(((slope * along).sum(), sample.difference(sample.seeded, name, where, along).sum()))
+        errors.append(relative(*np.array(found).T))
+    return largest(errors)
 
 
-def symmetry(case: Case) -> float:
-    value = case.sample.hessian(case.index, case.real)
+def hessian(sample: Sample) -> float:
+    return relative(sample.hessian(sample.real), sample.gradient_derivative)
+
+
+def symmetry(sample: Sample) -> float:
+    value = sample.hessian(sample.real)
     return relative(value, value.swapaxes(0, 1))
 
 
-def evaluate(case: Case) -> float:
-    sample, terms = case.sample, range(len(case.kind.terms))
-    _, force, energy, _ = sample.evaluate(case.real)
-    return max(
-        relative(force, sum(sample.gradient(i) for i in terms)), relative(energy, sum(sample.energy(i) for i in terms))
+def evaluate(sample: Sample) -> float:
+    _, force, energy = sample.evaluate()
+    forces, energies = (sum(values) for values in zip(*((p.gradient(), p.energy()) for p in sample.parts), strict=True))
+    return largest((relative(force, forces), relative(energy, energies)))
+
+
+def factor(sample: Sample) -> float:
+    return relative(sample.evaluate()[0], sum(map(_gauss_newton, sample.parts)))
+
+
+def _gauss_newton(sample: Sample) -> np.ndarray:
+    """w J^T psi'' J without what is negative of psi'', and the geometric stiffness under tension (local, local, *shape)."""
+    measure, w = sample.measure, sample.data["buffer"][sample.first]
+    J, S = (
+        np.moveaxis(sample.local_derivative(lambda i=i, **data: sample.strains(**data)[i]), (0, 1), (-2, -1))
+        for i in range(2)
     )
+    strain, stress = sample.strains()
+    inverse = np.linalg.pinv(J, 1e-9)
+    curvature = J @ inverse @ S @ inverse  # of the strains that the dofs reach
+    if measure.field:  # of a direction n in a field -s what is positive of the curvature along the sphere, -n . s
+        curvature = -(strain[:3] * stress[:3]).sum(0)[:, None, None] * np.diag(np.arange(6) < 3)
+    matrix = w * np.moveaxis(J.swapaxes(-2, -1) @ _positive(curvature) @ J, (-2, -1), (0, 1))
+    if measure.tensions == 3:
+        blocks = w * np.array([[stress[0], 0.5 * stress[1]], [0.5 * stress[1], stress[2]]])
+    elif measure.tensions and measure.revolved:  # the law's root leaves out what stress around the axis adds
+        blocks = w * stress[None, :1]
+    elif measure.tensions:
+        return np.where(stress[0] > 0.0, sample.gradient_derivative, matrix)
+    else:
+        return matrix
+    return matrix + sample.on_edges(_positive(np.moveaxis(blocks, -1, 0)))
 
 
-def factor(case: Case) -> float:
-    sample, kind = case.sample, case.kind
-    strain_rate, stress_rate = (
-        sample.window_derivative(lambda i=i, **data: sample.strains(**data)[i]) for i in range(2)
-    )
-    stress = sample.strains()[1]
-    expected = np.zeros((kind.window, kind.window, *sample.shape))
-    for term, (first, *_, row) in zip(kind.terms, kind.places(), strict=True):
-        rows = slice(row, row + len(term.measure.strains))
-        w = sample.data["buffer"][first]
-        stiff = raised(strain_rate[rows], stress_rate[rows]) if term.density.coupled else stress_rate[rows]
-        expected += w * np.einsum("minr,mjnr->ijnr", strain_rate[rows], stiff)
-        if term.measure.tensions:
-            edge = np.moveaxis(sample.edges(), -1, 0)
-            length = np.linalg.norm(edge, axis=0)
-            across = np.eye(kind.dim)[..., None, None] - edge * edge[:, None] / length**2
-            expected[: kind.dim, : kind.dim] += np.maximum(stress[row], 0.0) / length * across
-    return relative(_gauss_newton(case), expected)
+def _positive(matrix: np.ndarray) -> np.ndarray:
+    """Symmetric matrices (..., n, n) without what is negative."""
+    values, vectors = np.linalg.eigh(matrix)
+    return (vectors * np.maximum(values, 0.0)[..., None, :]) @ vectors.swapaxes(-2, -1)
 
 
-def raised(strain_rate: np.ndarray, stress_rate: np.ndarray) -> np.ndarray:
-    """psi'' de/dq (m, window, n, R) without what is negative of psi'', which is in the exact matrix alone."""
-    J, S = (np.moveaxis(rate, (0, 1), (-2, -1)) for rate in (strain_rate, stress_rate))
-    values, vectors = np.linalg.eigh(S @ np.linalg.pinv(J))
-    raised = (vectors * np.maximum(values, 0.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-    return np.moveaxis(raised @ J, (-2, -1), (0, 1))
-
-
-def definite(case: Case) -> float:
-    values = np.linalg.eigvalsh(np.moveaxis(_gauss_newton(case), (0, 1), (-2, -1)))
+def definite(sample: Sample) -> float:
+    values = np.linalg.eigvalsh(np.moveaxis(sample.evaluate()[0], (0, 1), (-2, -1)))
     return float(max(0.0, -values.min()) / values.max())
 
 
-def exact(case: Case) -> float:
-    expected = sum(case.sample.hessian(i, wp.float64) for i in range(len(case.kind.terms)))
-    return relative(_gauss_newton(case, exact=True), expected)
+def exact(sample: Sample) -> float:
+    return relative(sample.evaluate(exact=True)[0], sum(part.hessian() for part in sample.parts))
 
 
-def rest(case: Case) -> float:
-    model = _rest_scene(case.term, case.kind).build(device=case.device, precision=case.precision)
-    group, data = model.groups[0], model.state().groups[0]
-    out = arrays.allocate((group.kind.window, group.nodes, group.columns), case.real, case.device)
-    still = wp.full(group.columns, 1.0, dtype=case.real, device=case.device)
-    wp.launch(
-        element.term_kernels(group.kind, group.kind.terms.index(case.term), case.real, reverse=True)[1],
-        (group.elements, group.columns),
-        [data.x, data.theta, data.frame, data.last, still, *group.parameters.arrays, group.count],
-        [out],
-        device=case.device,
-    )
-    return float(np.abs(arrays.download(out)).max())  # moduli and lengths of the scene are of order one
+def rest(sample: Sample) -> float:
+    force = sample.gradient(sample.real, **sample.at_rest())
+    return float(np.abs(force).max() / np.abs(sample.gradient()).max())
 
 
-def invariance(case: Case) -> float:
-    sample = case.sample.isotropic()
-    turn = rotation(case.kind.dim, 0.4)
-    moved = sample.turned(turn)
-    before = sample.energy(case.index, case.real).sum()
-    errors = [relative(sample.energy(case.index, case.real, **moved).sum(), before)]
-    if case.kind.twist:
-        # lagged frames stay, angles make up for what the transport turns them differently
-        angles = sample.data["theta"] + sample.frame_lead(turn)
-        kept = {"x": moved["x"], "theta": angles}
-        errors.append(relative(sample.energy(case.index, case.real, **kept).sum(), before))
-    return max(errors)
+def invariance(sample: Sample) -> float:
+    sample = sample.isotropic()
+    before = sample.energy(sample.real)
+    moved = sample.moved(rotation(sample.measure.dim, 0.4))
+    return largest(relative(sample.energy(sample.real, **data), before) for data in moved)
 
 
-def rigid(case: Case) -> float:
-    sample = case.sample.isotropic()
-    force = sample.scatter(sample.gradient(case.index, case.real))
-    adjoint = sample.reverse(case.index, 0, np.ones(sample.shape), case.real)
-    worst = np.abs(force[..., : case.kind.dim].sum(0)).max() / np.abs(force).max()
+def rigid(sample: Chain) -> float:
+    sample = sample.isotropic()
+    force = sample.scatter(sample.gradient(sample.real))
+    adjoint = sample.reverse(0, np.ones(sample.shape))
+    errors = [np.abs(force[..., : sample.measure.dim].sum((0, 1))).max() / np.abs(force).max()]
     for velocity, last in sample.rotations():
-        work = (force * velocity).sum() + (adjoint["last"] * last).sum()
-        size = np.abs(force * velocity).sum() + np.abs(adjoint["last"] * last).sum()
-        worst = max(worst, abs(work) / size)
-    return float(worst)
+        work, more = force * velocity, adjoint["last"] * last
+        errors.append(abs(work.sum() + more.sum()) / (np.abs(work).sum() + np.abs(more).sum()))
+    return largest(errors)
 
 
-def nonzero(case: Case) -> float:
+def nonzero(sample: Sample) -> float:
     """Share of the dofs without a force."""
-    size = np.abs(case.sample.scatter(case.gradient))
-    used = np.arange(case.kind.block) < (case.kind.dim if not case.term.measure.angles else case.kind.block)
-    felt = size[..., used] > 1e-6 * size.max()
-    return float(1.0 - felt[case.sample.has_dof[..., : case.kind.block][..., used]].mean())
+    size = np.abs(sample.scatter(sample.gradient(sample.real)))
+    return float(1.0 - (size > 1e-6 * size.max())[sample.felt].mean())
 
 
-def downcast(case: Case) -> float:
-    sample, worst = case.sample, 0.0
-    for which, seed in enumerate((np.ones(sample.shape), case.seed)):
+def downcast(sample: Sample) -> float:
+    errors = []
+    for which, seed in enumerate((np.ones(sample.shape), sample.seed)):
         value = (sample.energy, sample.gradient)[which]
-        adjoint = sample.reverse(case.index, which, seed, case.real)
-        before = value(case.index)
-        for name, values in sample.data.items():
-            slope = adjoint[name] * values
-            for row in range(len(values)) if name in ("buffer", "last") else [...]:
-                size = np.abs(slope[row]).sum()
+        adjoint, before = sample.reverse(which, seed), value()
+        for name, slopes in adjoint.items():
+            for row in range(len(slopes)) if name in ("buffer", "last") else [...]:
+                slope = slopes[row] * sample.data[name][row]
+                size = np.abs(slope).sum()
                 if size == 0.0:
                     continue  # not an input of this term
-                scaled = values.copy()
+                scaled = sample.data[name].copy()
                 scaled[row] *= 1.0 + TRAP
-                change = (seed * (value(case.index, **{name: scaled}) - before)).sum()
-                worst = max(worst, abs(change - TRAP * slope[row].sum()) / (TRAP * size))
-    return worst
+                change = (seed * (value(**{name: scaled}) - before)).sum()
+                errors.append(abs(change - TRAP * slope.sum()) / (TRAP * size))
+    return largest(errors)
 
 
 # name -> (error, tolerance in float64, tolerance in float32 or None where that says nothing)
@@ -307,14 +196,28 @@ CHECKS = {
 }
 
 
-def checks_of(term: Term, closed: bool, precision: str) -> list[str]:
-    """Checks that make sense: a rod that is straight at rest has no rest shape when closed."""
-    straight = is_vector(term) or not term.rest
-    return [
-        name
-        for name, (_, _, single) in CHECKS.items()
-        if not (name == "rest" and straight and closed) and not (precision == "float32" and single is None)
-    ]
+def samples_of(
+    term: Term, precision: str = "float64", device: str = "cpu", chains: tuple[bool, ...] = (False, True)
+) -> list[Sample]:
+    """The states that a term is checked at: in open and closed `chains`, or as indexed elements.
+
+    Raises:
+        ValueError: a measure in the plane that is not of rods.
+    """
+    if term.measure in {known.measure for known in REGISTRY.values()}:
+        return [Chain(term, chain_of(term, closed), precision, device) for closed in chains]
+    if term.measure.dim != 3:
+        raise ValueError(f"{term.name}: of the plane are measures of rods alone; give {term.measure.name} dim = 3")
+    return [Elements(term, None, precision, device)]
+
+
+def checks_of(sample: Sample) -> list[str]:
+    """Checks that make sense: closed rods without rest strains have no rest shape, nor have dipoles."""
+    left_out = set() if isinstance(sample, Chain) else {"rigid"} | (set() if sample.measure.packed else {"exact"})
+    if not sample.term.rest and sample.chain != "open":
+        left_out.add("rest")
+    single = sample.precision == "float32"
+    return [name for name, check in CHECKS.items() if name not in left_out and not (single and check[2] is None)]
 
 
 def table(
@@ -331,46 +234,20 @@ def table(
         device: Warp device.
         chains: of terms of chains, which are tried: open ones (False), closed ones (True), or both.
     """
-    from ddg_warp.run import net_derivatives
-
-    rows = []
-    for one in [ALL[term] if isinstance(term, str) else term] if term else ALL.values():
-        if not on_chains(one):
-            case = net_derivatives.NetCase(one, precision, device)
-            rows += [
-                _row(one.key, "net", name, error(case), precision) for name, error in net_derivatives.CHECKS.items()
-            ]
-            continue
-        for closed in chains:
-            case = Case(one, chain_of(one, closed), precision, device)
-            for check in checks_of(one, closed, precision):
-                rows.append(_row(one.key, "closed" if closed else "open", check, CHECKS[check][0](case), precision))
-    return [row for row in rows if row["tolerance"] is not None]
+    terms = ALL.values() if term is None else [ALL[term] if isinstance(term, str) else term]
+    samples = (sample for one in terms for sample in samples_of(one, precision, device, chains))
+    return [row(sample, check) for sample in samples for check in checks_of(sample)]
 
 
-def on_chains(term: Term) -> bool:
-    """Whether a term runs along rods of their own."""
-    return term.measure.name in {known.measure.name for known in REGISTRY.values()}
-
-
-def _row(term: str, chain: str, check: str, error: float, precision: str) -> dict:
-    tolerance = CHECKS[check][1 if precision == "float64" else 2]
-    passed = tolerance is not None and bool(error <= tolerance)
-    return {"term": term, "chain": chain, "check": check, "error": error, "tolerance": tolerance, "passed": passed}
-
-
-def _gauss_newton(case: Case, exact: bool = False) -> np.ndarray:
-    """F^T F + c, or the exact matrix, on the windows (window, window, n, R), from what the evaluate kernel writes."""
-    kind = case.kind
-    rows, _, _, geometric = case.sample.evaluate(case.real, exact)
-    edge_row, tension_row = kind.vertex_strains * kind.window, kind.factor_rows - kind.tensions
-    vertex = rows[:edge_row].reshape(kind.vertex_strains, kind.window, *case.sample.shape)
-    edge = rows[edge_row:tension_row].reshape(kind.edge_strains, kind.dim, *case.sample.shape)
-    result = np.einsum("minr,mjnr->ijnr", vertex, vertex)
-    result[: kind.dim, : kind.dim] += np.einsum("minr,mjnr->ijnr", edge, edge)
-    result[: kind.dim, : kind.dim] += np.eye(kind.dim)[..., None, None] * rows[tension_row:].sum(0)
-    if exact:
-        i, j = np.triu_indices(kind.window)
-        result[i, j] += geometric
-        result[j[i != j], i[i != j]] += geometric[i != j]
-    return result
+def row(sample: Sample, check: str) -> dict:
+    """One row of the table."""
+    error, *tolerances = CHECKS[check]
+    found, tolerance = error(sample), tolerances[sample.precision == "float32"]
+    return {
+        "term": sample.term.key,
+        "chain": sample.chain,
+        "check": check,
+        "error": found,
+        "tolerance": tolerance,
+        "passed": bool(found <= tolerance),
+    }

@@ -11,6 +11,7 @@ are pointwise quantities, so a density and its parameters do not depend on the m
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import warp as wp
 
 
@@ -32,7 +33,10 @@ class Measure:
         apart: whether it couples what may be far apart along a rod, which preconditioners of chains leave out.
         frames: how many of the angles belong to edges with a reference frame, which the lagged data begin with.
         by_angle: whether a rod's curvature is its turning angle over the length, instead of 2 tan(phi/2).
-        strains: names and units of the strains.
+        revolved: whether elements are of the meridian of a surface of revolution, in the plane y = 0.
+        vectors: rows of the lagged data behind the frames, and of the constant data after these, at which a vector of space begins,
+            three reals that turn with the element. (Frames turn too, and the field.)
+        strains: names and units of the strains; those of a vector of space end in _x, _y, _z.
         functions: real -> (strains, jacobian, tension, curvature). `strains(q, s, w) -> E`; `jacobian(q, s, w) -> (E, J)`;
             `tension` is None, or `tension(q, w, slope) -> (c, shift)` with the second derivative of the strains,
             w slope : d2e = C + w J^T diag(shift) J. One edge has one tension, a scalar c with C = c I. A triangle has
@@ -41,6 +45,10 @@ class Measure:
             triangle of a symmetric matrix, row by row.
         advance: None, or real -> advance(q, s): the lagged data beside the frames at the end of a step, from the dofs and frames there
             and what they were.
+        sample: None, or (random, count) -> of the elements that `ddg_warp.run.derivatives` tries the measure at what is to be chosen:
+            nodes (nodes, 3), about which theirs lie; data (data_size, count); frame (6, frames * count), the first ones of all
+            elements first; lag (rows, count), behind the frames; felt (slots, count), which of them the strains depend on. Else
+            nodes lie unit steps along x, z and y in turns apart, data between 0.5 and 1.5, frames are 25 degrees old, lag is large.
     """
 
     name: str
@@ -59,6 +67,9 @@ class Measure:
     frames: int = 0
     advance: Callable | None = None
     by_angle: bool = False
+    revolved: bool = False
+    vectors: tuple[int, ...] = ()
+    sample: Callable | None = None
 
     @property
     def size(self) -> int:
@@ -86,6 +97,11 @@ class Measure:
         return self.strains[-1].startswith("twist")
 
     @property
+    def vector(self) -> bool:
+        """Whether the strains are the components of a vector in space."""
+        return [name.split()[0][-2:] for name in self.strains] == ["_x", "_y", "_z"]
+
+    @property
     def span(self) -> int:
         """Edges of a chain stencil: 1 for an edge, 2 for a vertex."""
         return len(self.edges)
@@ -98,3 +114,13 @@ class Measure:
             wp.types.vector(len(self.strains), real),
             wp.types.matrix((len(self.strains), self.size), real),
         )
+
+
+def lagged_frames(random: np.random.Generator, edges: np.ndarray) -> np.ndarray:
+    """Reference frames (u, t) (6, ...) of edges (..., 3), with tangents 25 degrees from theirs at random; for samples."""
+    t = edges / np.linalg.norm(edges, axis=-1, keepdims=True)
+    across, director = np.cross(t, random.normal(size=t.shape)), random.normal(size=t.shape)
+    t = t + across / np.linalg.norm(across, axis=-1, keepdims=True) * np.tan(np.radians(25.0))
+    frame = np.stack([np.cross(t, director), t])
+    frame /= np.linalg.norm(frame, axis=-1, keepdims=True)
+    return np.moveaxis(frame, -1, 1).reshape(6, *t.shape[:-1])

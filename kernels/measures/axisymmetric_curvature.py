@@ -19,6 +19,7 @@ Derivatives: K' = 1 + K^2 / 4 in phi, phi' = (-z, x) / (x^2 + z^2), sin(phi)' = 
 
 from functools import cache
 
+import numpy as np
 import warp as wp
 
 from ddg_warp.kernels.measures import Measure
@@ -88,5 +89,16 @@ def _rim_functions(real):
     return strains, jacobian, None, None
 
 
-axisymmetric_curvature = Measure("axisymmetric_curvature", 3, ((0, 1), (1, 2)), NAMES, _functions, data_size=2)
-axisymmetric_rim = Measure("axisymmetric_rim", 3, ((0, 1),), NAMES, _rim_functions, data_size=7)
+def _rim_sample(random, count: int) -> dict:
+    """Clamps a little off the radius."""
+    data, angle = random.uniform(0.5, 1.5, size=(7, count)), random.uniform(0.0, 0.3, count)
+    data[[0, 2]] = np.cos(angle), np.sin(angle)
+    return {"data": data}
+
+
+axisymmetric_curvature = Measure(
+    "axisymmetric_curvature", 3, ((0, 1), (1, 2)), NAMES, _functions, data_size=2, revolved=True
+)
+axisymmetric_rim = Measure(
+    "axisymmetric_rim", 3, ((0, 1),), NAMES, _rim_functions, data_size=7, revolved=True, sample=_rim_sample
+)

@@ -52,4 +52,5 @@ axisymmetric_metric = Measure(
     _functions,
     tensions=1,
     points=1,
+    revolved=True,
 )

@@ -12,6 +12,7 @@ energy k w alpha^2 / 2 with w = |e|^2 / A_e, A_e a third of the one triangle's r
 
 from functools import cache
 
+import numpy as np
 import warp as wp
 
 from ddg_warp.kernels.measures import Measure
@@ -91,4 +92,14 @@ def _functions(real):
     return strains, jacobian, None, None
 
 
-edge_tilt = Measure("edge_tilt", 3, ((0, 1), (0, 2)), ("angle [rad]",), _functions, data_size=4)
+def _sample(random, count: int) -> dict:
+    """A clamp and a symmetry plane in turns, with normals some 25 degrees away."""
+    kind = 2.0 + np.arange(count) % 2
+    normal = np.where(kind[:, None] > 2.5, [0.1, 0.2, 1.0], [0.2, -1.0, 0.1]) + 0.2 * random.normal(size=(count, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return {"data": np.vstack([kind, normal.T])}
+
+
+edge_tilt = Measure(
+    "edge_tilt", 3, ((0, 1), (0, 2)), ("angle [rad]",), _functions, data_size=4, vectors=(1,), sample=_sample
+)

@@ -24,10 +24,11 @@ twist. Data: +1 where the rod's edge starts at the joint, -1 where it ends there
 
 from functools import cache
 
+import numpy as np
 import warp as wp
 
 from ddg_warp.kernels import frames
-from ddg_warp.kernels.measures import Measure
+from ddg_warp.kernels.measures import Measure, lagged_frames
 from ddg_warp.kernels.measures.rod_curvature_twist import rod_curvature_twist
 
 
@@ -214,6 +215,17 @@ def _advance(real):
     return advance
 
 
+def _sample(random, count: int) -> dict:
+    """Edges along x of rods that run either way, and ghosts, twisted by several turns."""
+    sign, along = np.where(np.arange(count) % 2, 1.0, -1.0), np.eye(3)[:1]
+    ghost = lagged_frames(random, np.repeat(along, count, axis=0))
+    return {
+        "frame": lagged_frames(random, sign[:, None] * along),
+        "lag": np.concatenate([ghost, 6.0 * random.normal(size=(1, count))]),
+        "data": sign[None],
+    }
+
+
 joint_curvature_twist = Measure(
     "joint_curvature_twist",
     3,
@@ -226,4 +238,6 @@ joint_curvature_twist = Measure(
     lag_size=13,
     data_size=1,
     advance=_advance,
+    vectors=(0, 3),  # of the ghost
+    sample=_sample,
 )

@@ -30,8 +30,10 @@ is 65 % too high for a cylinder across them and 186 % for twist, on irregular me
 2 on every mesh. A free edge without angle takes no moment of its triangle's normal, an error of order 1; an angle there mends it.
 """
 
-from functools import cache
+from dataclasses import replace
+from functools import cache, partial
 
+import numpy as np
 import warp as wp
 
 from ddg_warp.kernels.measures import Measure
@@ -189,9 +191,37 @@ def _functions(measure_of):
 _EDGES = ((0, 1), (0, 2), (1, 3), (2, 4), (0, 5))
 _STRAINS = ("b11 [m]", "b12 [m]", "b22 [m]")
 
+
+def _sample(angles: int, random, count: int) -> dict:
+    """Edges of every kind; of a symmetry the plane contains the normal, more or less, which a clamp prescribes."""
+    some = [[0, 1, 2], [1, 2, 3], [2, 3, 0], [3, 0, 1], [1, 1, 1], [0, 1, 1], [1, 3, 1], [1, 2, 0]]
+    kinds = np.resize(some, (count, 3)).T
+    vectors = np.where((kinds == 3)[..., None], [1.0, 0.2, -0.1], [0.2, -0.1, 1.0])
+    vectors = vectors + 0.2 * random.normal(size=vectors.shape)
+    vectors /= np.linalg.norm(vectors, axis=-1, keepdims=True)
+    signs = np.sign(random.normal(size=(angles, count)))
+    return {
+        "nodes": 0.1 * np.array([[0, 0, 0], [10, 0, 0], [4, 9, 0], [13, 11, 3], [-7, 6, 3], [5, -8, 3]]),
+        "data": np.concatenate([kinds, vectors.transpose(0, 2, 1).reshape(9, count), signs]),
+        "felt": np.concatenate([kinds >= 0, kinds == 1, (kinds <= 1)[:angles]]),  # corners behind edges are neighbours'
+    }
+
+
 midedge_curvature = Measure(
-    "midedge_curvature", 3, _EDGES, _STRAINS, _functions(lambda: midedge_curvature), data_size=12
+    "midedge_curvature",
+    3,
+    _EDGES,
+    _STRAINS,
+    _functions(lambda: midedge_curvature),
+    data_size=12,
+    vectors=(3, 6, 9),
+    sample=partial(_sample, 0),
 )
-midedge_curvature_dof = Measure(
-    "midedge_curvature_dof", 3, _EDGES, _STRAINS, _functions(lambda: midedge_curvature_dof), angles=3, data_size=15
+midedge_curvature_dof = replace(
+    midedge_curvature,
+    name="midedge_curvature_dof",
+    functions=_functions(lambda: midedge_curvature_dof),
+    angles=3,
+    data_size=15,
+    sample=partial(_sample, 3),
 )

@@ -14,11 +14,11 @@ An isometric bending of a smooth surface leaves strains of third order in the le
 have the strains of `triangle_metric`. Stencil and data are those of `midedge_curvature_dof`; w is the rest area [m^2].
 """
 
+from dataclasses import replace
 from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.measures.midedge_curvature import midedge_curvature_dof
 
 
@@ -75,13 +75,10 @@ def _functions(real):
     return strains, jacobian, tension, None
 
 
-midedge_metric = Measure(
-    "midedge_metric",
-    3,
-    midedge_curvature_dof.edges,
-    ("a11/2 [m^2]", "a12/2 [m^2]", "a22/2 [m^2]"),
-    _functions,
-    angles=3,
-    data_size=15,
+midedge_metric = replace(
+    midedge_curvature_dof,
+    name="midedge_metric",
+    strains=("a11/2 [m^2]", "a12/2 [m^2]", "a22/2 [m^2]"),
+    functions=_functions,
     tensions=3,
 )

@@ -24,6 +24,7 @@ runs it backwards, 0 without xi, which may then be any angle.
 
 from functools import cache
 
+import numpy as np
 import warp as wp
 
 from ddg_warp.kernels import frames
@@ -89,6 +90,15 @@ def _advance(real):
     return advance
 
 
+def _sample(random, count: int) -> dict:
+    """Both triangles count, or one alone; xi of either sign, or none."""
+    share, sign = random.uniform(0.2, 0.8, count), np.arange(count) % 3 - 1.0
+    share[count // 2] = 0.0
+    felt = np.ones((6, count), bool)
+    felt[3], felt[5] = share > 0.0, sign != 0.0
+    return {"data": np.stack([share, sign]), "felt": felt}
+
+
 rod_surface_angle = Measure(
     "rod_surface_angle",
     3,
@@ -100,4 +110,5 @@ rod_surface_angle = Measure(
     lag_size=8,
     data_size=2,
     advance=_advance,
+    sample=_sample,
 )

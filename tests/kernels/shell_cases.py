@@ -9,9 +9,7 @@ from scipy import sparse
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import Delaunay
 
-from ddg_warp.kernels.terms import AXISYMMETRIC, SHELLS
-
-TERMS = SHELLS | AXISYMMETRIC
+from ddg_warp.kernels.terms import SHELLS
 
 
 @dataclass
@@ -27,25 +25,10 @@ class Elements:
     def evaluate(self, precision="float64", device="cpu") -> dict[str, np.ndarray]:
         """energy (N, 1), gradient, strain, stress, jacobian, root and tension of the elements."""
         real = wp.float32 if precision == "float32" else wp.float64
-        run, shapes = _kernels(self.name, real)[0], _shapes(self.name)
+        run, shapes = _kernel(self.name, real), _shapes(self.name)
         out = [wp.zeros((len(self.q), *shape), dtype=real, device=device) for shape in shapes.values()]
         wp.launch(run, len(self.q), self._inputs(real, device), out, device=device)
         return {name: array.numpy().astype(float) for name, array in zip(shapes, out, strict=True)}
-
-    def hessian(self, precision="float64", device="cpu") -> np.ndarray:
-        """Reverse mode of the gradient (N, size, size)."""
-        return self._reverse(1, (TERMS[self.name].measure.size,) * 2, precision, device)
-
-    def reverse(self, precision="float64", device="cpu") -> np.ndarray:
-        """Reverse mode of the energy (N, size)."""
-        return self._reverse(2, (TERMS[self.name].measure.size,), precision, device)
-
-    def _reverse(self, which, shape, precision, device):
-        real = wp.float32 if precision == "float32" else wp.float64
-        out = wp.zeros((len(self.q), *shape), dtype=real, device=device)
-        launch = (len(self.q), *shape[1:])
-        wp.launch(_kernels(self.name, real)[which], launch, self._inputs(real, device), [out], device=device)
-        return out.numpy().astype(float)
 
     def changed(self, **changes) -> "Elements":
         """The same elements with other arrays."""
@@ -58,21 +41,21 @@ class Elements:
 
 
 def _types(name, real):
-    term = TERMS[name]
+    term = SHELLS[name]
     Q, S, _, _ = term.measure.types(real)
     return Q, S, wp.types.vector(term.density.parameter_size(len(term.measure.strains)), real)
 
 
 def _shapes(name):
-    n, size = len(TERMS[name].measure.strains), TERMS[name].measure.size
+    n, size = len(SHELLS[name].measure.strains), SHELLS[name].measure.size
     vectors = {"energy": (1,), "gradient": (size,), "strain": (n,), "stress": (n,)}
     return {**vectors, "jacobian": (n, size), "root": (n, n), "tension": (3,)}
 
 
 @cache
-def _kernels(name, real):
-    """Kernels of a term on arrays of local dofs: everything of first order, and the columns of the Hessian."""
-    term = TERMS[name]
+def _kernel(name, real):
+    """Kernel of a term on arrays of local dofs: everything of first order."""
+    term = SHELLS[name]
     n, size, coupled, tensions = (
         len(term.measure.strains),
         term.measure.size,
@@ -83,19 +66,6 @@ def _kernels(name, real):
     E = wp.types.vector(n, real)
     strains_of, jacobian_of, tension_of, _ = term.measure.functions(real)
     energy_of, slope_of, root_of = term.density.functions(real, n)
-
-    @wp.func
-    def energy_at(q: Q, s: S, w: real, p: P):
-        return w * energy_of(strains_of(q, s, w), p)
-
-    @wp.func
-    def gradient_at(q: Q, s: S, w: real, p: P):
-        e, jacobian = jacobian_of(q, s, w)
-        return (slope_of(e, p) * w) * jacobian
-
-    @wp.func
-    def along(q: Q, s: S, w: real, p: P, v: Q):
-        return wp.dot(gradient_at(q, s, w, p), v)
 
     @wp.kernel(module="unique", enable_backward=False)
     def first(
@@ -112,11 +82,11 @@ def _kernels(name, real):
         tension_out: wp.array2d(dtype=real),
     ):
         k = wp.tid()
-        energy_out[k, 0] = energy_at(q[k], s[k], w[k], p[k])
-        g = gradient_at(q[k], s[k], w[k], p[k])
         strain = strains_of(q[k], s[k], w[k])
+        energy_out[k, 0] = w[k] * energy_of(strain, p[k])
         e, jacobian = jacobian_of(q[k], s[k], w[k])
         slope = slope_of(e, p[k])
+        g = (slope * w[k]) * jacobian
         root = root_of(e, p[k], E())
         for i in range(wp.static(size)):
             gradient_out[k, i] = g[i]
@@ -135,36 +105,7 @@ def _kernels(name, real):
             for m in range(3):
                 tension_out[k, m] = blocks[m]
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def second(
-        q: wp.array(dtype=Q),
-        s: wp.array(dtype=S),
-        w: wp.array(dtype=real),
-        p: wp.array(dtype=P),
-        hessian_out: wp.array3d(dtype=real),
-    ):
-        k, column = wp.tid()
-        v = Q()
-        v[column] = real(1.0)
-        dq, _ds, _dw, _dp, _dv = wp.grad(along)(q[k], s[k], w[k], p[k], v)
-        for i in range(wp.static(size)):
-            hessian_out[k, i, column] = dq[i]
-
-    # by itself: a function called forwards in a kernel before wp.grad takes it there has no reverse in Warp 1.19, it is zero
-    @wp.kernel(module="unique", enable_backward=False)
-    def reverse(
-        q: wp.array(dtype=Q),
-        s: wp.array(dtype=S),
-        w: wp.array(dtype=real),
-        p: wp.array(dtype=P),
-        reverse_out: wp.array2d(dtype=real),
-    ):
-        k = wp.tid()
-        dq, _ds, _dw, _dp = wp.grad(energy_at)(q[k], s[k], w[k], p[k])
-        for i in range(wp.static(size)):
-            reverse_out[k, i] = dq[i]
-
-    return first, second, reverse
+    return first
 
 
 def gather(elements, positions, angles=None) -> Elements:
@@ -288,18 +229,3 @@ class Surface:
         self.edge_triangles[self.triangle_edges, side] = np.arange(len(self.triangles))[:, None]
         self.edge_opposite[self.triangle_edges, side] = self.triangles
         self.boundary = (self.edge_triangles < 0).any(1)
-
-
-def differences(elements, what, device, step=1e-5):
-    """Central differences of what(evaluate) in q, last axis."""
-    columns = []
-    for i in range(elements.q.shape[1]):
-        shift = step * np.eye(elements.q.shape[1])[i]
-        ahead, back = (elements.changed(q=elements.q + side * shift).evaluate(device=device)[what] for side in (1, -1))
-        columns.append((ahead - back) / (2.0 * step))
-    return np.stack(columns, -1)
-
-
-def error(value, reference):
-    """Largest difference over the largest reference."""
-    return np.abs(value - reference).max() / np.abs(reference).max()

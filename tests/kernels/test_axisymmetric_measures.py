@@ -1,96 +1,24 @@
-"""Measures of shells of revolution: derivatives against automatic differentiation and differences, exact shapes, pressure."""
+"""Shells of revolution beyond the derivative table (test_terms): the exact Hessian of the membrane, exact shapes, pressure."""
 
 import numpy as np
 import pytest
-from first_terms import first_of_their_kind
-from shell_cases import TERMS, Elements, differences, error
 
 import ddg_warp as ddg
 from ddg_warp.compile.axisymmetric import NetBand
 from ddg_warp.kernels.terms import AXISYMMETRIC
+from ddg_warp.run.derivatives import relative, samples_of
 from ddg_warp.solve.tangent import Tangent
 
-PRECISIONS = {"float64": 1e-13, "float32": 2e-5}
-COUNT = 8
 STATIC = [name for name in AXISYMMETRIC if "damped" not in name]
-FIRST = first_of_their_kind(AXISYMMETRIC)
-# Each has kernels of its own in each precision: every day those of every measure and density in float64.
-EVERY_TERM = pytest.mark.parametrize(
-    ("name", "precision"),
-    [
-        pytest.param(name, precision, marks=() if precision == "float64" and name in FIRST else pytest.mark.slow)
-        for precision in PRECISIONS
-        for name in AXISYMMETRIC
-    ],
-)
-
-
-def sample(name: str) -> Elements:
-    """Random elements at which no dof that counts, no strain that can be other, and no parameter is zero; exact in float32."""
-    term, random = AXISYMMETRIC[name], np.random.default_rng(7)
-    measure = term.measure
-    edges = [1.0, 0.3, -0.7, 0.8, 0.2, 0.9][: 3 * len(measure.edges)]
-    q = np.concatenate([edges, [2.0, 0.1, 0.5][: 3 * measure.points]]) + 0.15 * random.normal(
-        size=(COUNT, measure.size)
-    )
-    s = random.uniform(0.6, 1.4, size=(COUNT, max(1, measure.data_size)))
-    if measure.name == "axisymmetric_rim":
-        angle = random.uniform(0.0, 0.3, COUNT)
-        s[:, 0], s[:, 2] = np.cos(angle), np.sin(angle)
-    p = random.uniform(0.6, 1.4, size=(COUNT, term.density.parameter_size(3)))
-    for i, parameter in enumerate(term.density.parameters(3)):
-        p[:, i] *= 0.4 if parameter.family == "rest" else {"poisson": 0.3, "metric_12": 0.3}.get(parameter.name, 1.0)
-    w = random.uniform(0.6, 1.4, size=COUNT)
-    q, s, w, p = (values.astype(np.float32).astype(float) for values in (q, s, w, p))
-    if measure.name == "axisymmetric_rim":
-        s[:, :3:2] /= np.linalg.norm(s[:, :3:2], axis=1, keepdims=True)
-    return Elements(name, q, s, w, p)
-
-
-@EVERY_TERM
-def test_gradient(device, name, precision):
-    """w J^T psi' = reverse mode of the energy = central differences of it; heights alone and y have no say."""
-    elements = sample(name)
-    exact, at = elements.evaluate(device=device), elements.evaluate(precision, device)
-    reverse = elements.reverse(device=device)
-    assert error(at["gradient"], reverse) < PRECISIONS[precision]
-    assert error(exact["gradient"], differences(elements, "energy", device)[:, 0]) < 1e-9
-    silent = [i for i in range(elements.q.shape[1]) if i % 3 == 1] + [5] * TERMS[name].measure.points
-    felt = np.setdiff1d(np.arange(elements.q.shape[1]), silent)
-    assert not exact["gradient"][:, silent].any()
-    assert np.abs(exact["gradient"][:, felt]).min() > 1e-5 * np.abs(exact["gradient"]).max()
-
-
-@pytest.mark.parametrize("name", STATIC)
-def test_jacobian(device, name):
-    """Rows of J = central differences of the strains."""
-    elements = sample(name)
-    at, reference = elements.evaluate(device=device), differences(elements, "strain", device)
-    for strain in (0, 2):
-        assert error(at["jacobian"][:, strain], reference[:, strain]) < 1e-9
-    assert not at["jacobian"][:, 1].any()
-
-
-@EVERY_TERM
-def test_hessian(device, name, precision):
-    """Reverse mode of the gradient = central differences of it, and symmetric."""
-    elements = sample(name)
-    hessian = elements.hessian(precision, device)
-    assert error(hessian, differences(elements, "gradient", device)) < (1e-8 if precision == "float64" else 1e-4)
-    assert error(hessian, hessian.swapaxes(1, 2)) < 10.0 * PRECISIONS[precision]
 
 
 def test_tension_completes_the_hessian(device):
-    """w J^T (psi'' + diag(shift)) J + c I on the edge is the exact Hessian of the membrane; y, which is held, left out."""
-    elements = sample("axisymmetric_stretch")
-    at = elements.evaluate(device=device)
-    radius = elements.q[:, 3] + 0.5 * elements.q[:, 0]
-    curvature = np.einsum("kli,klj->kij", at["root"], at["root"])
-    curvature[:, 2, 2] += at["stress"][:, 2] / radius**2
-    whole = np.einsum("k,kmi,kmn,knj->kij", elements.w, at["jacobian"], curvature, at["jacobian"])
-    for i in (0, 2):
-        whole[:, i, i] += elements.w * at["stress"][:, 0]
-    assert error(whole, elements.hessian(device=device)) < 1e-13
+    """With what stress s around the axis adds, w s / r^2 times the square of d(r^2 / 2), it is exact; y, which is held, left out."""
+    (sample,) = samples_of(AXISYMMETRIC["axisymmetric_stretch"], device=device)
+    whole, radial = sample.evaluate(exact=True)[0], [0, 3]  # r is the mean of both nodes'
+    whole[np.ix_(radial, radial)] += 0.25 * sample.data["buffer"][0] * sample.strains()[1][2]
+    read = np.ix_([0, 2, 3, 5], [0, 2, 3, 5])
+    assert relative(whole[read], sample.hessian()[read]) < 1e-13
 
 
 def test_curvatures_of_a_sphere(device):
@@ -99,11 +27,10 @@ def test_curvatures_of_a_sphere(device):
     angle = start + d * np.arange(3)
     x = 2.0 * np.column_stack([np.sin(angle), 0.0 * angle, -np.cos(angle)])
     chord = 4.0 * np.sin(0.5 * d)
-    node = Elements(
-        "axisymmetric_bend", np.diff(x, axis=0).reshape(1, 6), np.array([[chord, x[1, 0]]]), np.ones(1), np.ones((1, 8))
-    )
-    strain = node.evaluate(device=device)["strain"][0]
-    np.testing.assert_allclose(strain, [0.5 / np.cos(0.5 * d), 0.0, 0.5 * np.cos(0.5 * d)], rtol=1e-13)
+    (sample,) = samples_of(AXISYMMETRIC["axisymmetric_bend"], device=device)
+    constants = np.repeat([[chord], [x[1, 0]]], 8, axis=1)
+    strain = sample.strains(q=np.repeat(x, 8, axis=0), constants=constants)[0]
+    np.testing.assert_allclose(strain[:, 0], [0.5 / np.cos(0.5 * d), 0.0, 0.5 * np.cos(0.5 * d)], rtol=1e-13)
 
 
 def cap(reverse, device):

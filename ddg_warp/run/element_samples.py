@@ -1,0 +1,179 @@
+"""Indexed elements at a random state where nothing is zero, and what the kernels of nets make of them; for the derivative table."""
+
+from functools import cached_property
+
+import numpy as np
+import warp as wp
+
+from ddg_warp.kernels.islands import Islands
+from ddg_warp.kernels.measures import lagged_frames
+from ddg_warp.kernels.net import elements as net_elements
+from ddg_warp.kernels.terms import Term
+from ddg_warp.run.samples import Sample, random_parameters, random_strains
+
+
+class Elements(Sample):
+    """Eight indexed elements. Every block is of one element, so that a change of it is seen by that element alone.
+
+    Attributes:
+        data: q (blocks, 3), frame, lag, last, rate, buffer (rows, E), constants (data, E); see `Measure.sample`.
+        slots: blocks of each element (slots, E): nodes of all elements first, then angles, then rotation vectors.
+        felt: which dofs the energy depends on, as q.
+    """
+
+    COUNT = 8
+    INPUTS = ("q", "frame", "lag", "last", "rate", "buffer")
+
+    def __init__(self, term: Term, *arguments):
+        measure = term.measure
+        self.shape, self.first, self.rows, self.parts = (self.COUNT,), 0, slice(0, len(measure.strains)), [self]
+        self.slots = np.arange(measure.slots * self.COUNT).reshape(-1, self.COUNT)
+        self.angle_start = measure.nodes * self.COUNT
+        self.angle_end = self.angle_start + measure.angles * self.COUNT
+        self.vectors = [slice(0, self.angle_start), slice(self.angle_end, None)]
+        self.given = measure.sample(np.random.default_rng(13), self.COUNT) if measure.sample else {}
+        super().__init__(term, *arguments)
+
+    def random_state(self) -> dict[str, np.ndarray]:
+        """See the class."""
+        random, measure, count, given = np.random.default_rng(11), self.measure, self.COUNT, self.given
+        steps = np.eye(3)[2 * (np.arange(measure.nodes) - 1) % 3]  # the first to a radius that is positive
+        nodes = given.get("nodes", [2.0, 0.0, 0.0] + np.cumsum(steps, axis=0))
+        x = np.array(nodes)[:, None] + 0.1 * random.normal(size=(measure.nodes, count, 3))
+        q = 0.4 * random.normal(size=(self.slots.size, 3))
+        q[: self.angle_start] = x.reshape(-1, 3)
+        q[self.angle_start : self.angle_end, 1:] = 0.0
+        edges = [x[b] - x[a] for a, b in measure.edges[: measure.frames]]
+        frame = [lagged_frames(random, edge) for edge in edges] or [np.zeros((6, 1))]
+        own = max(1, measure.lag_size - 6 * measure.frames)
+        return {
+            "q": q,
+            "frame": given.get("frame", np.concatenate(frame, axis=1)),
+            "lag": given.get("lag", 6.0 * random.normal(size=(own, count))),
+            "last": random_strains(self.term, random, (len(measure.strains), count)),
+            "rate": random.uniform(0.6, 1.4, size=1),
+            "buffer": random_parameters(self.term, random, (count,)),
+            "constants": given.get("data", random.uniform(0.5, 1.5, size=(max(1, measure.data_size), count))),
+        }
+
+    @property
+    def felt(self) -> np.ndarray:
+        """Which dofs the energy depends on."""
+        felt = np.repeat(self.given.get("felt", np.ones_like(self.slots)).reshape(-1, 1) > 0, 3, axis=1)
+        felt[self.angle_start : self.angle_end, 1:] = False
+        felt[:, 1] &= not self.measure.revolved  # y of a meridian
+        return felt
+
+    def evaluate(self, exact: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """F^T F + C (local, local, E), gradient and energies of the fused kernel; `exact`: with compression and second derivatives."""
+        n, slots, count, real = len(self.measure.strains), self.measure.slots, self.COUNT, self.real
+        vector, tensions, packed = wp.types.vector(3, real), self.measure.tensions, self.measure.packed
+        shapes = [
+            (n * slots, count),
+            (max(1, tensions), count),
+            (max(1, packed), count),
+            (slots, count),
+            (2, count),
+            count,
+        ]
+        types = [vector, real, real, vector, real, real]
+        out = [wp.zeros(s, dtype=t, device=self.device) for s, t in zip(shapes, types, strict=True)]
+        search = Islands(1, real, self.device)
+        search.clamped.fill_(0 if exact else 1)
+        kernel = net_elements.evaluate_kernel(self.term, real, real, 0 if exact and packed else None)
+        wp.launch(kernel, count, [self._elements(real), *search.arrays], out, device=self.device)
+        factor, tension, second, gradient, energy = (array.numpy().astype(float) for array in out[:5])
+        rows = factor.reshape(n, slots, count, 3).transpose(0, 1, 3, 2).reshape(n, 3 * slots, count)
+        matrix = np.einsum("mae,mbe->abe", rows, rows)
+        if tensions:
+            at = [[0]] if tensions == 1 else [[0, 1], [1, 2]]
+            matrix += self.on_edges(np.moveaxis(tension[at], -1, 0))
+        if exact and packed:
+            i, j = np.triu_indices(self.measure.size)
+            local = np.zeros((count, self.measure.size, self.measure.size))
+            local[:, i, j] = local[:, j, i] = second.T
+            matrix += np.einsum("ia,eij,jb->abe", self.incidence, local, self.incidence)
+        return matrix, _flat(gradient), energy[1]
+
+    def reverse(self, which: int, seed: np.ndarray) -> dict[str, np.ndarray]:
+        """Reverse mode of the energy (which = 0) or gradient (1) kernel, by input."""
+        given, dtype = self._elements(self.real), wp.types.vector(3, self.real) if which else self.real
+        if which:
+            seed = seed.reshape(-1, 3, self.COUNT).transpose(0, 2, 1)
+        seeds = wp.array(np.ascontiguousarray(seed), dtype=dtype, device=self.device)
+        wp.launch(
+            net_elements.term_kernels(self.term, self.real, reverse=True)[which],
+            self.COUNT,
+            [given],
+            [wp.zeros_like(seeds, requires_grad=True)],
+            adjoint=True,
+            adj_inputs=[net_elements.elements_type(self.real)()],
+            adj_outputs=[seeds],
+            device=self.device,
+        )
+        values = {name: getattr(given, name).grad.numpy().astype(float) for name in self.INPUTS}
+        return {name: v.reshape(self.data[name].shape) for name, v in values.items()}
+
+    def scatter(self, local: np.ndarray) -> np.ndarray:
+        """From the local dofs (local, E) to all (blocks, 3)."""
+        return local.reshape(-1, 3, self.COUNT).transpose(0, 2, 1).reshape(-1, 3)
+
+    def local_derivative(self, function) -> np.ndarray:
+        """Derivative of what function(**data) gives per element (m, E), by its local dofs (m, local, E)."""
+        columns = [self.difference(function, "q", (row, d)) for row in self.slots for d in range(3)]
+        return np.stack(columns, axis=1)
+
+    def on_edges(self, blocks: np.ndarray) -> np.ndarray:
+        """The matrix (E, n, n) times I between the first n edge vectors, in local dofs (local, local, E)."""
+        incidence = self.incidence[: 3 * blocks.shape[1]]
+        return np.einsum("ia,eij,jb->abe", incidence, np.kron(blocks, np.eye(3)), incidence)
+
+    @cached_property
+    def incidence(self) -> np.ndarray:
+        """Matrix from the slots of an element to the dofs of the measure (size, 3 slots)."""
+        measure = self.measure
+        axes, slot = np.eye(3), np.eye(measure.slots)
+        edges = [np.kron(slot[b] - slot[a], axes) for a, b in measure.edges]
+        angles, spins = np.split(slot[measure.nodes :], [measure.angles])
+        return np.concatenate(
+            [*edges, np.kron(angles, axes[:1]), np.kron(spins, axes), np.kron(slot[: measure.points], axes)]
+        )
+
+    def _elements(self, real, **changed):
+        """What kernels read; see `kernels.net.elements.elements_type`."""
+        data, given = {**self.data, **changed}, net_elements.elements_type(real)()
+
+        def put(values, dtype):
+            return wp.array(
+                np.ascontiguousarray(values), dtype=dtype, device=self.device, requires_grad=dtype is not int
+            )
+
+        for name in self.INPUTS:
+            values = data[name].ravel() if name == "buffer" else data[name]
+            setattr(given, name, put(values, wp.types.vector(3, real) if name == "q" else real))
+        table = [(row * self.COUNT, 1, 0) for row in range(len(data["buffer"]))]
+        given.table, given.slots = put(np.array(table, np.int32), int), put(self.slots.astype(np.int32), int)
+        given.data, given.blocks = put(data["constants"], real), self.slots.size
+        given.angle_start, given.elements = self.angle_start, self.COUNT
+        return given
+
+    def _launch(self, which: int, real, **changed):
+        """What the energy (0), gradient (1), Hessian (2) or strain (3) kernel gives."""
+        measure, count, device = self.measure, self.COUNT, self.device
+        n, size = len(measure.strains), measure.size
+        shape = [(count,), (measure.slots, count), (count, size, size), (n, count)][which]
+        dtype = wp.types.vector(3, real) if which == 1 else real
+        out = [wp.zeros(shape, dtype=dtype, device=device) for _ in range(2 if which == 3 else 1)]
+        extra = [[], [], [wp.zeros((n, count), dtype=real, device=device)], [1]][which]
+        kernel = net_elements.term_kernels(self.term, real, reverse=True)[which]
+        grid = (count, size) if which == 2 else count
+        wp.launch(kernel, grid, [self._elements(real, **changed), *extra], out, device=device)
+        found = [array.numpy().astype(float) for array in out]
+        if which == 2:
+            return np.einsum("ia,eij,jb->abe", self.incidence, found[0], self.incidence)
+        return _flat(found[0]) if which == 1 else tuple(found) if which == 3 else found[0]
+
+
+def _flat(values: np.ndarray) -> np.ndarray:
+    """(slots, E, 3) as (3 slots, E)."""
+    return values.transpose(0, 2, 1).reshape(-1, values.shape[1])
