@@ -51,7 +51,7 @@ def test_imports_run_downwards(path):
 
 
 def test_every_folder_has_its_place():
-    folders = {path.name for path in PACKAGE.iterdir() if path.is_dir() and not path.name.startswith("__")}
+    folders = {path.relative_to(PACKAGE).parts[0] for path in PACKAGE.glob("*/**/*.py")}
     assert folders == set(LAYERS)
 
 

@@ -64,7 +64,7 @@ def test_curvature_is_positive_towards_the_normal():
     np.testing.assert_allclose(measured, expected, atol=2e-3 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("bending", ["midedge_dof", "midedge", "hinge"])
+@pytest.mark.parametrize("bending", ["midedge_dof", pytest.param("midedge", marks=pytest.mark.slow), "hinge"])
 @pytest.mark.parametrize("size", [0.9, 1.1])
 def test_growth_alone_changes_the_size(device, bending, size):
     """A metric size^2 times as large is met by a surface `size` times as large, and no other shell notices."""

@@ -64,7 +64,8 @@ def test_derivatives(device, name, damped):
         assert row["passed"], row
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n != NAMES[0] else ()) for n in NAMES])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
 def test_the_exact_matrix_holds_where_the_law_is_not_convex(device, name):
     """Twist beyond the crossover softens the ribbon: the factor leaves that out, the exact matrix does not."""
     term = replace(REGISTRY["rod_bend_twist"], density=LAWS[name])

@@ -80,10 +80,11 @@ class Group:
         """What float32 makes of every rod over a step of s [s]; see `precision.float32_errors`."""
         host = self.host
         values = {name: array[:, : self.rods] for name, array in self.parameters.values.items()}
-        mass = host.mass.sum(0) / host.count
+        mass, length = host.mass.sum(0) / host.count, host.length
         if self.kind.drag:
             mass = mass + s * drag.least(host.drag.T) * host.length / host.count
-        return precision.float32_errors(self.kind, mass, host.length, values, s)
+            length = np.where(host.fixed.any(0), length, np.inf)  # over long steps a free rod has nothing but drag
+        return precision.float32_errors(self.kind, mass, length, values, s)
 
 
 class Moving:

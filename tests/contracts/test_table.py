@@ -9,8 +9,8 @@ from objects import OBJECTS
 from questions import QUESTIONS, Variant
 from table import REFUSED, answer, cells, expected
 
-# A precision needs kernels of its own of whatever a cell touches: a rod and a shell stand for the others in mixed precision.
-MIXED = ("rod", "shell, midedge_dof")
+# A precision needs kernels of its own of whatever a cell touches: a rod stands for the others in mixed precision.
+MIXED = ("rod",)
 # Every damped term has kernels of its own, too: these are what strain-rate damping is asked of.
 DAMPED = ("rod", "rods joined rigidly", "shell, hinge")
 # Has kernels of its own beside those of "rods alone and joined", whose every cell it is to answer alike.

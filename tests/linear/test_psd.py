@@ -56,6 +56,7 @@ def test_none_is_the_exact_hessian(device, name, closed):
         assert np.abs(elastic(gauss_newton, column) - expected).max() > 0.01 * np.abs(expected).max()
 
 
+@pytest.mark.slow
 @EVERY_CHAIN
 def test_project_is_positive_semi_definite(device, name, closed):
     """At 0.6 of the rest length, bent, where the exact Hessian is not; the projected one lies above it, element by element."""
@@ -120,7 +121,7 @@ def order(sizes: list[float]) -> float:
 
 
 @pytest.mark.parametrize("solver", [ChainNewton, PcgNewton])
-@pytest.mark.parametrize("psd", ["progressive", "none"])
+@pytest.mark.parametrize("psd", ["progressive", pytest.param("none", marks=pytest.mark.slow)])
 def test_exact_newton_converges_quadratically(device, solver, psd):
     sizes, plain = errors(*bent(solver, device, psd)), errors(*bent(solver, device, "gauss_newton"))
     print(psd, order(sizes), sizes, order(plain), plain)
