@@ -154,3 +154,27 @@ def test_the_bound(device):
     soft = 7800.0 * np.pi * r**2 / (n + 1) / s**2 + 2e11 * np.pi * r**4 / 4.0 / n * np.pi**4
     assert rounding(model, s)[0] == pytest.approx(2.0**-24 * stiff / soft, rel=1e-6)
     assert rounding(model, s)[0] > FLOAT32_LOST > FLOAT32_LIMIT
+
+
+def test_solver_that_takes_over_leaves_out_compression_where_it_must(device):
+    """Buckling in one long step, after a short one that float32 carried: float64 takes over and goes as it would on its own."""
+    found = {}
+    for precision in ("mixed", "float64"):
+        scene = ddg.Scene(gravity=(0.0, 0.0, -1e-3))
+        points = np.linspace([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], 12)
+        section = ddg.Stiffness(EA=1e6, EI1=1.0, GJ=1.0, mass_per_length=1e-6, rotary_inertia=1e-9)
+        rod = scene.add_rod(points, section=section)
+        scene.clamp_end(rod)
+        scene.add_force(rod, -1, (-50.0, 0.0, 0.0))  # twenty times the load of Euler
+        integrator = ddg.Integrator(scene.build(device, precision))
+        bent = points * [0.9999, 1.0, 1.0] + [0.0, 0.0, 1e-4] * np.arange(12)[:, None] ** 2
+        state = integrator.step(integrator.model.state(points=bent), 1e-7)
+        assert integrator.statistics()["linear"] == ["float32" if precision == "mixed" else "float64"]
+        state = integrator.step(state, 1.0)
+        statistics = integrator.statistics()
+        assert statistics["linear"] == ["float64"]
+        assert set(statistics["outcomes"]) <= {"converged", "converged_to_rounding"}
+        assert integrator._chains[0].newton.islands.clamped.numpy().tolist() == [1]
+        found[precision] = statistics["newton_iterations"]["max"], np.abs(state.points()[-1])
+    assert found["mixed"][0] <= 1.5 * found["float64"][0]
+    np.testing.assert_allclose(found["mixed"][1], found["float64"][1], atol=1e-6)

@@ -18,7 +18,7 @@ class PartStep:
     Args:
         integrator, model: what steps what.
         newton: the solver, with its islands.
-        counts_of: the step that this one replaces, whose islands and counts it takes over.
+        counts_of: the step that this one replaces, whose counts and state of the islands it takes over.
 
     Attributes:
         energy, motion, loads, field, drag: watch of the energy, motion of the supports, loads that change, the magnetic field, drag;
@@ -39,7 +39,9 @@ class PartStep:
         self.remaining = wp.zeros(1, dtype=int, device=device)
         self.damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
         if counts_of is not None:
-            self.tally, self.work, newton.islands = counts_of.tally, counts_of.work, counts_of.newton.islands
+            self.tally, self.work = counts_of.tally, counts_of.work
+            for own, found in zip(newton.islands.arrays, counts_of.newton.islands.arrays, strict=True):
+                wp.copy(own, found)  # solvers hold rows of their own arrays
         self._start, self._advance = step.start_kernel(real), step.advance_kernel(real)
 
     @property

@@ -203,7 +203,7 @@ class NetDrag:
     def __init__(self, model, midpoint: bool = False):
         net, host, device, real = model.net, model.net.host, model.wp_device, model.types.real
         self.model, self.net, self.midpoint = model, net, midpoint
-        self.kernels = [*drag.net_kernels(real)]
+        self._resist, self._settle = drag.net_kernels(real)
         ends, angles, coefficients = host.drag
         places = np.stack([*ends, np.where(angles < 0, host.blocks, angles)], -1).ravel()
         starts, items = lists(places, host.blocks + 1)
@@ -220,6 +220,11 @@ class NetDrag:
         self.moves = put(host.mass + felt, net.vector)
         self.flow = put(flow_at(model.scene, 0.0)[None], net.vector)
 
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [self._resist, *([self._settle] if self.midpoint else [])]
+
     def upload(self, t0: float, t1: float) -> None:
         """The flow at the time that the scheme balances forces at."""
         if callable(self.model.scene.flow):
@@ -228,7 +233,7 @@ class NetDrag:
     def resist(self, before, solver, islands) -> None:
         """Write inertia and drag of a solve from the state `before`, once its iterate is predicted."""
         self._launch(
-            self.kernels[0],
+            self._resist,
             [before.q, before.v, solver.q if self.midpoint else before.q, solver.q, self.mass, self.ends]
             + [self.coefficients, self.starts, self.items, self.flow, solver.outer, *islands.arrays]
             + [self.net.blocks, self.net.host.nodes],
@@ -251,7 +256,7 @@ class NetDrag:
         """Rates of what has no inertia in the state `after`."""
         if self.midpoint:
             self._launch(
-                self.kernels[1],
+                self._settle,
                 [solver.q, solver.mass, *islands.arrays, self.net.blocks, after.q],
                 [after.v],
             )

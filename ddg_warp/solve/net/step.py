@@ -59,17 +59,8 @@ class NetStep(PartStep):
         self._launch(
             self._begin,
             solver.all,
-            [
-                before.q,
-                before.v,
-                solver.held,
-                self.drag.moves if self.drag else solver.mass,
-                self.integrator._dt,
-                self.damping,
-                solver.outer,
-                *islands.arrays,
-            ]
-            + [blocks],
+            [before.q, before.v, solver.held, self.drag.moves if self.drag else solver.mass]
+            + [self.integrator._dt, self.damping, solver.outer, *islands.arrays, blocks],
             [solver.q, solver.base, solver.target],
         )
         start = self._start_frames(before)
