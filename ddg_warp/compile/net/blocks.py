@@ -76,17 +76,18 @@ class _Builder:
         self.ends: list[np.ndarray] = []
 
     def add_rods(self, piece: Piece) -> None:
-        """Number the nodes and angles of rods."""
+        """Number the nodes and angles of rods as chains have them: the first of all rods, then the second, ..."""
         (rods, n, _), closed, (before, after) = piece.x.shape, piece.kind.closed, piece.ghosts
-        nodes = self._number(piece.x.reshape(-1, 3)).reshape(rods, n)
+        nodes = self._number(piece.x.swapaxes(0, 1).reshape(-1, 3)).reshape(n, rods).T
         edges = n - (0 if closed else 1)
         angles = np.zeros((rods, 0), int)
         if piece.kind.twist:
-            angles = self.rod_edges + np.arange(rods * edges).reshape(rods, edges)
+            angles = self.rod_edges + np.arange(rods * edges).reshape(edges, rods).T
             self.rod_edges += angles.size
-            self.frames.append(np.concatenate([v.reshape(-1, 3).T for v in (piece.director, piece.tangent)]))
-            self.stiffness.append(np.array([np.broadcast_to(v, angles.shape).ravel() for v in piece.stiffness]))
-            self.ends.append(np.stack([nodes[:, :edges], np.roll(nodes, -1, axis=1)[:, :edges]], -1).reshape(-1, 2))
+            self.frames.append(np.concatenate([v.T.reshape(3, -1) for v in (piece.director, piece.tangent)]))
+            self.stiffness.append(np.array([np.broadcast_to(v, angles.shape).T.ravel() for v in piece.stiffness]))
+            ends = np.stack([nodes[:, :edges], np.roll(nodes, -1, axis=1)[:, :edges]], -1)
+            self.ends.append(ends.swapaxes(0, 1).reshape(-1, 2))
         self.numbers.append((nodes, angles))
         own, own_edges = nodes[:, before : n - after], angles[:, before : edges - after]
         for row, rod in enumerate(piece.rods.tolist()):

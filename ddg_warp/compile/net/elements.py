@@ -51,7 +51,7 @@ def _joint_places(scene, net: Net) -> list[tuple[int, int, list]]:
 
 
 def _rod_sets(net: Net, joints) -> list[NetSet]:
-    """Stretch and bending of the rods, in their order; vertices at rigid joints are left to these."""
+    """Stretch and bending of the rods, numbered as their nodes are; vertices at rigid joints are left to these."""
     skipped = np.array([rod.rod * net.nodes + node for node, _, members in joints for rod, _, _ in members], int)
     alike: dict[int, list[NetRod]] = {}
     for rod in net.rods:
@@ -64,7 +64,7 @@ def _rod_sets(net: Net, joints) -> list[NetSet]:
         for term in kind.terms:
             span = term.measure.span
             count = n if kind.closed else n - span
-            row, k = np.indices((len(rods), count)).reshape(2, -1)
+            k, row = np.indices((count, len(rods))).reshape(2, -1)
             if span == 2:
                 joined = np.isin(piece.rods[row] * net.nodes + nodes[row, (k + 1) % n], skipped)
                 row, k = row[~joined], k[~joined]
@@ -80,14 +80,7 @@ def _rod_sets(net: Net, joints) -> list[NetSet]:
             sets.append(
                 NetSet(term, np.array(slots), lag, np.zeros((0, len(k))), values, np.array([piece.rods[row], k]))
             )
-    return [_by_rod(part) for part in _gather_sets(sets)]
-
-
-def _by_rod(part: NetSet) -> NetSet:
-    """The same elements in the order of their rods."""
-    order = np.argsort(part.owner[0], kind="stable")
-    slots, lag, data, owner = (values[:, order] for values in (part.slots, part.lag, part.data, part.owner))
-    return NetSet(part.term, slots, lag, data, {name: values[order] for name, values in part.parameters.items()}, owner)
+    return _gather_sets(sets)
 
 
 def _joint_sets(net: Net, joints) -> list[NetSet]:
@@ -105,12 +98,14 @@ def _half_cells(net: Net, members: list, by_angle: bool) -> NetSet:
     term = JOINTS[term_key("rigid_joint", by_angle)]
     node, spin, rods, k, sign = zip(*members, strict=True)
     node, spin, k, sign = map(np.array, (node, spin, k, sign))
-    first, edges = np.array([(rod.all_edges[0], len(rod.all_edges)) for rod in rods]).T
+    edges = np.array([len(rod.all_edges) for rod in rods])
     closed = np.array([rod.piece.kind.closed for rod in rods])
     across = (k - sign).astype(int)  # the rod's edge on the other side of the node; at an end there is none
     across = np.where(closed, across % edges, across)
     inside = (across >= 0) & (across < edges)
-    here, there = (first - net.nodes + e for e in (k, np.where(inside, across, (k + sign).astype(int))))
+    beside = np.where(inside, across, (k + sign).astype(int))
+    angles, others = (np.array([rod.all_edges[e] for rod, e in zip(rods, of, strict=True)]) for of in (k, beside))
+    here, there = angles - net.nodes, others - net.nodes
     frames, tangents = net.frame[:3].T, net.frame[3:].T
     lengths = polyline.length(np.diff(net.rest[net.ends], axis=1)[:, 0])
     ends = [(frames[e], tangents[e], lengths[e]) for e in (there, here)]
@@ -125,7 +120,7 @@ def _half_cells(net: Net, members: list, by_angle: bool) -> NetSet:
             rest[:, i] = natural * [1.0, sign[i], 1.0]
     lag = np.concatenate([director.T, (along * tangent).T, [twist]])
     parameters = term.bind(measure=half, stiffness=[*net.stiffness[:, here]], rest=[*rest])
-    slots = np.array([node, net.ends[here, np.where(sign > 0, 1, 0)], first + k, spin])
+    slots = np.array([node, net.ends[here, np.where(sign > 0, 1, 0)], angles, spin])
     return NetSet(term, slots, lag, sign[None], parameters, np.array([[rod.rod for rod in rods], k]))
 
 
