@@ -35,90 +35,33 @@ from ddg_warp.kernels.net.system import product_functions
 
 @cache
 def chain_kernels(twist: bool, span: int, linear, sides: int):
-    """gather(...), factorise(...): H_II; load(...), solve(...): its solutions; finish(...): z of every block and r . z.
+    """factorise(...): H_II; load(...), solve(...): its solutions; finish(...): z of every block and r . z.
 
     solve_all(...) takes all movements of a joint, `sides`, at once; follow(...) adds V z_J.
     """
     nb = 4 if twist else 3
-    parts = nb - 2  # blocks of a place: node, and angle of the edge behind it
-    H, B, M = wp.types.vector(3, linear), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
-    _, store, _, put = block_functions(nb, linear)
+    parts = nb - 2  # blocks of a place: node, and angle of the edge ahead
+    H, B = wp.types.vector(3, linear), wp.types.vector(nb, linear)
+    _, _, _, put = block_functions(nb, linear)
     factor, substitute = factor_function(nb, span, linear), substitute_function(nb, span, linear)
     substitute_all = substitute_all_function(nb, span, linear, sides)
     _, free = product_functions(linear)
     multiply, _ = coupling_functions(linear)
 
-    @wp.func
-    def free_of(places: wp.array3d(dtype=int), fixed: wp.array(dtype=wp.uint8), k: int, c: int):
-        """1 at the free dofs of a place, 0 at held ones and where it has none."""
-        f = B()
-        node = places[0, k, c]
-        if node >= 0:
-            v = free(fixed[node])
-            for d in range(3):
-                f[d] = v[d]
-        if wp.static(twist):
-            angle = places[1, k, c]
-            if angle >= 0:
-                v = free(fixed[angle])
-                f[3] = v[0]
-        return f
-
-    @wp.func
-    def block_of(matrix: wp.array2d(dtype=linear), places: wp.array3d(dtype=int), row: int, k: int, c: int, first: int):
-        m = M()
-        p = places[row, k, c]
-        if p >= 0:
-            for i in range(3):
-                for j in range(3):
-                    m[i, j] = matrix[3 * i + j, p + first]
-        if wp.static(twist):
-            p = places[row + 1, k, c]
-            if p >= 0:
-                for i in range(3):
-                    m[i, 3] = matrix[3 * i, p + first]
-            p = places[row + 2, k, c]
-            if p >= 0:
-                for j in range(3):
-                    m[3, j] = matrix[j, p + first]
-            p = places[row + 3, k, c]
-            if p >= 0:
-                m[3, 3] = matrix[0, p + first]
-        return m
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def gather(
-        matrix: wp.array2d(dtype=linear),
-        places: wp.array3d(dtype=int),
-        count: wp.array(dtype=int),
-        fixed: wp.array(dtype=wp.uint8),
-        wanted: wp.array(dtype=int),
-        positions: int,
-        blocks_out: wp.array3d(dtype=linear),
-    ):
-        """Blocks of H_II on free dofs, those of the identity on others."""
-        k, r = wp.tid()
-        w = r / count.shape[0]
-        c = r - w * count.shape[0]
-        if wanted[w] == 0 or k >= count[c]:
-            return
-        here = free_of(places, fixed, k, c)
-        for s in range(wp.static(span + 1)):
-            m = M()
-            if k + s < count[c]:
-                m = block_of(matrix, places, wp.static(parts) + s * wp.static(parts**2), k, c, w * positions)
-                m = wp.cw_mul(m, wp.outer(here, free_of(places, fixed, k + s, c)))
-            if s == 0:
-                m += wp.diag(B(linear(1.0)) - here)
-            store(blocks_out, s * wp.static(nb**2), k, r, m)
-
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def factorise(count: wp.array(dtype=int), wanted: wp.array(dtype=int), blocks: wp.array3d(dtype=linear)):
-        """Factors in the place of the blocks; lost and negative pivots become positive ones, so that the solves stay definite."""
+    def factorise(
+        blocks: wp.array3d(dtype=linear),
+        count: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        factors: wp.array3d(dtype=linear),
+        lost: wp.array(dtype=int),
+    ):
+        """Lost and negative pivots become positive ones, so that the solves stay definite, and are noted."""
         r = wp.tid()
         w = r / count.shape[0]
         if wanted[w] != 0:
-            _lost = factor(blocks, blocks, count[r - w * count.shape[0]], r)
+            if factor(blocks, factors, count[r - w * count.shape[0]], r) > 0:
+                lost[w] = 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def load(
@@ -263,4 +206,4 @@ def chain_kernels(twist: bool, span: int, linear, sides: int):
             z[i] = moved[w * joint_rows + joint_row[b]]
         dots_out[w, b] = wp.dot(residual[i], z[i])
 
-    return gather, factorise, load, solve, solve_all, follow, finish
+    return factorise, load, solve, solve_all, follow, finish

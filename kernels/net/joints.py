@@ -93,6 +93,7 @@ def joint_kernels(linear):
         blocks: int,
         positions: int,
         parts_out: wp.array2d(dtype=M),
+        lost: wp.array(dtype=int),
     ):
         i = wp.tid()
         joints = pairs.shape[0]
@@ -120,6 +121,7 @@ def joint_kernels(linear):
             aa = wp.cw_mul(block(matrix, own[m, 0] + first) + linear(0.5) * (aa + wp.transpose(aa)), wp.outer(f, f))
             P, definite = invert(aa, f)
             if not definite:
+                lost[w] = 1
                 P = inverse[a + w * blocks]
         if b >= 0:
             for d in range(3):
@@ -140,6 +142,7 @@ def joint_kernels(linear):
             bb = block(matrix, own[m, 1] + first) + linear(0.5) * (bb + wp.transpose(bb)) - wp.transpose(ab) * Q
             R, definite = invert(wp.cw_mul(bb, wp.outer(f, f)), f)
             if not definite:
+                lost[w] = 1
                 R = inverse[b + w * blocks]
         parts_out[0, i] = P
         parts_out[1, i] = Q

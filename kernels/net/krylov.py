@@ -113,6 +113,9 @@ def solver_kernels(linear):
         if wanted[w] == 0:
             return
         k = i - w * blocks
+        if diagonal[k] < 0:  # chains see to it
+            inverse_out[i] = M()
+            return
         p = diagonal[k] + w * positions
         f = free(fixed[k])
         m = M()

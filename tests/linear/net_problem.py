@@ -137,7 +137,7 @@ class Problem:
         return self
 
     def matrix(self, world: int) -> np.ndarray:
-        """H of a world, from its slices."""
+        """H of a world, from its slices and bands; what bands hold of held dofs is the identity."""
         table, N = self.newton.system, self.blocks
         rows, columns = table.rows.numpy(), table.columns.numpy()
         values = self.newton.matrix.numpy().reshape(9, 2, -1)[:, world]
@@ -146,7 +146,30 @@ class Problem:
         H = np.zeros((N, 3, N, 3))
         for p in np.flatnonzero(~padding):
             H[rows[p], :, columns[p]] += values[:, p].reshape(3, 3)
-        return H.reshape(3 * N, 3 * N)
+        H = H.reshape(3 * N, 3 * N)
+        chains = self.newton.chains
+        if chains is None or not chains.banded:
+            return H
+        plan, bands = chains.plan, chains.bands.numpy()[:, :, world * chains.width :]
+        nb = 4 if plan.twist else 3
+        node, angle = plan.places[0], plan.places[1] if plan.twist else None
+        free = self.free()
+
+        def dofs(k, c):
+            own = [*(3 * node[k, c] + np.arange(3))] if node[k, c] >= 0 else [-1] * 3
+            return np.array(own + ([3 * angle[k, c] if angle[k, c] >= 0 else -1] if plan.twist else []))
+
+        for c, count in enumerate(plan.count):
+            for k in range(count):
+                for s in range(min(plan.span + 1, count - k)):
+                    block = bands[s * nb**2 : (s + 1) * nb**2, k, c].reshape(nb, nb)
+                    one, other = dofs(k, c), dofs(k + s, c)
+                    there = np.outer((one >= 0) & free[one], (other >= 0) & free[other])
+                    i, j = np.nonzero(there)
+                    np.add.at(H, (one[i], other[j]), block[i, j])
+                    if s:
+                        np.add.at(H, (other[j], one[i]), block[i, j])
+        return H
 
     def exact(self, world: int) -> np.ndarray:
         """Exact Hessian of the elastic energy, and inertia."""

@@ -78,7 +78,15 @@ def _rod_sets(net: Net, joints) -> list[NetSet]:
                 slots += [edges[row, k], edges[row, (k + 1) % n]]
                 lag = piece.reference_twist[row, k][None]
             sets.append(
-                NetSet(term, np.array(slots), lag, np.zeros((0, len(k))), values, np.array([piece.rods[row], k]))
+                NetSet(
+                    term,
+                    np.array(slots),
+                    lag,
+                    np.zeros((0, len(k))),
+                    values,
+                    np.array([piece.rods[row], k]),
+                    along=True,
+                )
             )
     return _gather_sets(sets)
 
@@ -187,5 +195,5 @@ def _gather_sets(sets: list[NetSet]) -> list[NetSet]:
         }
         first = np.cumsum([0] + [len(s) for s in same])
         normals = [s.normals + [[at], [0], [0]] for s, at in zip(same, first, strict=False)]
-        result.append(NetSet(term, *join[:3], parameters, join[3], np.concatenate(normals, axis=1)))
+        result.append(NetSet(term, *join[:3], parameters, join[3], np.concatenate(normals, axis=1), same[0].along))
     return result

@@ -53,7 +53,8 @@ class NetSet:
 
     `owner` (2, E) is the rod or shell of each element, and its place in it: edge, vertex, triangle or hinge. `normals` (3, n) are
     element, first row of the data and support, counted over those of shells and then of rings, of every direction among the data
-    that a support gives: the normal at a mesh edge, or the tangent of a meridian.
+    that a support gives: the normal at a mesh edge, or the tangent of a meridian. Those `along` rods have the slots of as many nodes
+    in a row as their measure spans edges, and one more, then the angles of these edges.
     """
 
     term: object
@@ -63,6 +64,7 @@ class NetSet:
     parameters: dict[str, np.ndarray]
     owner: np.ndarray
     normals: np.ndarray = field(default_factory=lambda: np.zeros((3, 0), int))
+    along: bool = False
 
     def __len__(self) -> int:
         return self.slots.shape[1]

@@ -34,6 +34,8 @@ class NetNewton:
         drag: whether a block has more than a mass; see `kernels.drag`.
     """
 
+    banded = True  # whether chains keep their part of H, which holds on free dofs alone
+
     def __init__(
         self, model, options: NewtonOptions, preconditioner: str = "block_jacobi", linear=None, drag: bool = False
     ):
@@ -47,7 +49,10 @@ class NetNewton:
         self.worlds, self.all = worlds, worlds * blocks
         V, H = net.vector, wp.types.vector(3, self.linear)
         M = wp.types.matrix((3, 3), self.linear)
-        self.system = NetSystem(net)
+        self.chains = None
+        if preconditioner in ("chain", "chain_multilevel"):
+            self.chains = Chains(net, self.banded and preconditioner == "chain" and not host.frames)
+        self.system = NetSystem(net, self.chains and self.chains.kept)
 
         def make(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=device)
@@ -107,7 +112,10 @@ class NetNewton:
             elements.evaluate_kernel(part.term, self.real, self.linear, first)
             for part, first in zip(net.sets, self.exact_from, strict=True)
         ]
-        self._repeat = pcg.repeat_kernel(self.real, False) if any(exact) else None
+        if self.chains:
+            self.chains.bind(self.system, self.parts, self.real, self.linear, self.exact_from, drag)
+        self._direct = self.chains is not None and self.chains.exact
+        self._repeat = pcg.repeat_kernel(self.real, False) if any(exact) or self._direct else None
         self.negative = make(worlds, int)
         self._outer, self._collect, self._settle = system.balance_kernels(self.real, self.linear, drag)
         self._assembly = Assembly(net, self.system, self.parts, self.real, self.linear, self.exact_from, drag)
@@ -119,9 +127,8 @@ class NetNewton:
         outer = outer_forces(host, gravity)
         self.outer = self.allowed.assign(self.allowed.bodies.loads(outer)[None])
         self._worst = Sums(worlds, self.allowed.ratio.shape[1], self.real, device, largest=True)
-        given = net, self.system, self.linear
-        self.chains = Chains(*given) if preconditioner in ("chain", "chain_multilevel") else None
-        self.levels = Multilevel(*given) if preconditioner in ("multilevel", "chain_multilevel") else None
+        several = preconditioner in ("multilevel", "chain_multilevel")
+        self.levels = Multilevel(net, self.system, self.linear) if several else None
         self._limit = max(200, 100 * math.isqrt(blocks))
 
     def automatic_psd(self) -> str:
@@ -248,22 +255,36 @@ class NetNewton:
         self._assembly(self.mass, self.islands, self.matrix)
         if self.planes:
             self.planes.matrix(self.matrix, self.islands.wanted)
+        if self.chains:
+            self.chains.assemble(self.matrix, self.mass, self.fixed, self.islands)
 
     def direct(self) -> None:
+        """Directions: by elimination where that is exact, else by conjugate gradients."""
+        table, wanted = self.system, self.islands.wanted
+        if not self._direct or self.chains.joints:
+            self._launch(
+                self._invert,
+                [self.matrix, table.diagonal, self.fixed, wanted, self.net.blocks, table.positions],
+                [self.inverse],
+            )
+        if self._direct:
+            self.negative.zero_()
+            self.chains.prepare(self.matrix, self.inverse, self.fixed, wanted, self.negative)
+            self.chains.apply(self.matrix, self.right, self.fixed, wanted, self.direction, self.krylov_dots)
+        else:
+            self.iterate_pcg()
+        if self._repeat:  # what was indefinite comes again, without second derivatives and compression
+            wp.launch(self._repeat, self.worlds, [1, *self.islands.arrays, self.negative], device=self.device)
+
+    def iterate_pcg(self) -> None:
         """Directions by conjugate gradients."""
-        table, blocks = self.system, self.net.blocks
-        self._launch(
-            self._invert,
-            [self.matrix, table.diagonal, self.fixed, self.islands.wanted, blocks, table.positions],
-            [self.inverse],
-        )
         self._launch(
             self._start,
-            [self.right, self.inverse, self.islands.wanted, blocks],
+            [self.right, self.inverse, self.islands.wanted, self.net.blocks],
             [self.rest, self.direction, self.p, self.krylov_dots],
         )
         if self.chains:
-            self.chains.prepare(self.matrix, self.inverse, self.fixed, self.islands.wanted)
+            self.chains.prepare(self.matrix, self.inverse, self.fixed, self.islands.wanted, self._unread[0])
         if self.levels:
             self.levels.prepare(self.matrix, self.fixed, self.islands.wanted)
         self.precondition(self.p)
@@ -277,8 +298,6 @@ class NetNewton:
             device=self.device,
         )
         wp.capture_while(self.busy, self.reduce)
-        if self._repeat:  # what was indefinite comes again, without second derivatives and compression
-            wp.launch(self._repeat, self.worlds, [1, *self.islands.arrays, self.negative], device=self.device)
 
     @property
     def _indefinite(self) -> wp.array:
@@ -327,6 +346,8 @@ class NetNewton:
             ],
             [self.product, self.krylov_dots],
         )
+        if self.chains:
+            self.chains.times(self.p, self.fixed, self.islands.wanted, self.product, self.krylov_dots)
         self._sum_linear(self.krylov_dots, self.curvature)
         self._launch(
             advance,

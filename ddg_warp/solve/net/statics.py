@@ -29,6 +29,8 @@ FAR = 4.0  # turns of a direction, over the cap of a step, at which it is far en
 class StaticNewton(NetNewton):
     """`NetNewton` without inertia, in the precision of the state: no mass bounds the condition of its matrix."""
 
+    banded = False  # also what held dofs do to others is asked for
+
     def __init__(self, model, options: NewtonOptions):
         super().__init__(model, options, net_preconditioner(model.net), model.types.real)
         self._whole = False  # whether directions may go as far as they like

@@ -11,18 +11,23 @@ from ddg_warp.kernels.net.system import SLICE
 class NetSystem:
     """Sparsity and lists of a net, once for all worlds.
 
+    Args:
+        net: `DeviceNet`.
+        kept: blocks (N,) bool between which chains keep what elements along rods add; see `kernels.net.chains`. None: none.
+
     Attributes:
         positions: entries of H in a world, padding included.
-        rows, columns: block of each position, -1 in the padding; slices: start of each slice; diagonal: position of each H_ii.
+        rows, columns: block of each position, -1 in the padding; slices: start of each slice; diagonal: position of each H_ii, -1
+            of those that chains keep.
         meets: of each set, (starts, items) of the blocks; adds: (starts, items) of the positions.
     """
 
-    def __init__(self, net):
+    def __init__(self, net, kept: np.ndarray | None = None):
         blocks, device = net.blocks, net.device
-        slots = [part.host.slots.astype(np.int32) for part in net.sets]
-        every = np.arange(blocks, dtype=np.int32)
-        row = np.concatenate([*(np.repeat(s.T, len(s), axis=1).ravel() for s in slots), every])
-        column = np.concatenate([*(np.tile(s.T, len(s)).ravel() for s in slots), every])
+        pairs = [_pairs(part.host, kept) for part in net.sets]
+        own = np.flatnonzero(~kept) if kept is not None else np.arange(blocks)
+        row = np.concatenate([*(rows for rows, *_ in pairs), own]).astype(np.int32)
+        column = np.concatenate([*(columns for _, columns, _ in pairs), own]).astype(np.int32)
         order = lists(column, blocks)[1]
         order = order[lists(row[order], blocks)[1]]  # by rows and, of one row, by columns
         row, column = row[order], column[order]
@@ -46,13 +51,32 @@ class NetSystem:
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
 
         self.rows, self.columns, self.slices = put(rows), put(columns), put(slices)
-        self.diagonal = put(place[inverse[len(inverse) - blocks :]])
-        self.entries = len(row)
+        diagonal = np.full(blocks, -1)
+        diagonal[row[row == column]] = place[row == column]
+        self.diagonal, self.entries = put(diagonal), len(row)
         at, self.adds, self.meets = 0, [], []
-        for s in slots:
-            own, at = slice(at, at + len(s) * s.size), at + len(s) * s.size
-            self.adds.append(tuple(map(put, lists(place[inverse[own]], self.positions))))
-            self.meets.append(tuple(map(put, lists(s.T.ravel(), blocks))))
+        for part, (rows, _, which) in zip(net.sets, pairs, strict=True):
+            targets, at = place[inverse[at : at + len(rows)]], at + len(rows)
+            starts, items = lists(targets, self.positions)
+            self.adds.append((put(starts), put(items if which is None else which[items])))
+            self.meets.append(tuple(map(put, lists(part.host.slots.T.ravel(), blocks))))
+
+
+def _pairs(part, kept) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Rows and columns of what the elements of a set add to H, and which of all pairs of slots they are; None: all in order.
+
+    A pair is (element * slots + row's slot) * slots + column's slot.
+    """
+    slots = part.slots.T.astype(np.int32)
+    n, which = slots.shape[1], None
+    if part.along and kept is not None:
+        free = ~kept[slots]
+        some = np.flatnonzero(free.any(1))
+        pair = free[some, :, None] | free[some, None, :]
+        element, row, column = np.nonzero(pair)
+        which = (some[element] * n + row) * n + column
+        return slots[some[element], row], slots[some[element], column], which
+    return np.repeat(slots, n, axis=1).ravel(), np.tile(slots, n).ravel(), which
 
 
 def lists(target: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,363 @@
+"""H of a net between the places of its chains: what elements along rods add, in blocks D, E and F as `kernels.block_band` has them.
+
+A place of a chain has a node and the angle of the edge ahead of it, a block of -1 where it has none. Blocks of H that belong to two
+places of a chain lie here, not among the positions of `kernels.net.system`, which hold all others; what other elements, such as
+joints, add between two places is taken from there.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.block_band import block_functions
+from ddg_warp.kernels.element import CPU_OPTIONS
+from ddg_warp.kernels.islands import CLAMPED, COEFFICIENT, ITERATION, WANTED
+from ddg_warp.kernels.net.system import mass_type, product_functions, second_function
+from ddg_warp.kernels.terms import Term
+
+
+@cache
+def along_type(linear):
+    """What a set along rods adds: its factor rows, geometric stiffness, second derivatives; and its elements at each place.
+
+    Entry (i, k, c) of `at` is the element whose node i is at that place, -1 for none.
+    """
+    H = wp.types.vector(3, linear)
+
+    @wp.struct
+    class Along:
+        factor: wp.array2d(dtype=H)
+        tension: wp.array2d(dtype=linear)
+        second: wp.array2d(dtype=linear)
+        at: wp.array3d(dtype=int)
+        elements: int
+
+    return Along
+
+
+@cache
+def place_functions(twist: bool, linear):
+    """free_of(...) of a place: 1 at its free dofs, else 0; block_of(...): its block with another place from positions of H."""
+    nb = 4 if twist else 3
+    B, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
+    _, free = product_functions(linear)
+
+    @wp.func
+    def free_of(places: wp.array3d(dtype=int), fixed: wp.array(dtype=wp.uint8), k: int, c: int):
+        f = B()
+        node = places[0, k, c]
+        if node >= 0:
+            v = free(fixed[node])
+            for d in range(3):
+                f[d] = v[d]
+        if wp.static(twist):
+            angle = places[1, k, c]
+            if angle >= 0:
+                v = free(fixed[angle])
+                f[3] = v[0]
+        return f
+
+    @wp.func
+    def block_of(matrix: wp.array2d(dtype=linear), places: wp.array3d(dtype=int), row: int, k: int, c: int, first: int):
+        m = M()
+        p = places[row, k, c]
+        if p >= 0:
+            for i in range(3):
+                for j in range(3):
+                    m[i, j] = matrix[3 * i + j, p + first]
+        if wp.static(twist):
+            p = places[row + 1, k, c]
+            if p >= 0:
+                for i in range(3):
+                    m[i, 3] = matrix[3 * i, p + first]
+            p = places[row + 2, k, c]
+            if p >= 0:
+                for j in range(3):
+                    m[3, j] = matrix[j, p + first]
+            p = places[row + 3, k, c]
+            if p >= 0:
+                m[3, 3] = matrix[0, p + first]
+        return m
+
+    return free_of, block_of
+
+
+@cache
+def sum_function(terms: tuple[Term, ...], twist: bool, linear, exact: tuple[bool, ...]):
+    """add(along..., k, c, w, late) -> D, E, F of what the last of the terms, and by calling itself those before, add at a place."""
+    term, curved = terms[-1], exact[-1]
+    measure, nb = term.measure, 4 if twist else 3
+    B, M, Along = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear), along_type(linear)
+    n, slots, nodes, angles, tensions = (
+        len(measure.strains),
+        measure.slots,
+        measure.nodes,
+        measure.angles,
+        measure.tensions,
+    )
+    second_of = second_function(measure, linear) if curved else None
+    before = sum_function(terms[:-1], twist, linear, exact[:-1]) if len(terms) > 1 else None
+    which, first = len(terms) - 1, len(terms) == 1
+
+    @wp.func
+    def row(own: Along, m: int, i: int, e: int):
+        """Factor row of a strain at node i of its element and the angle of the edge ahead."""
+        v = B()
+        u = own.factor[m * wp.static(slots) + i, e]
+        for d in range(3):
+            v[d] = u[d]
+        if wp.static(twist and angles > 0):
+            if i < wp.static(angles):
+                u = own.factor[m * wp.static(slots) + wp.static(nodes) + i, e]
+                v[3] = u[0]
+        return v
+
+    @wp.func
+    def between(own: Along, i: int, j: int, e: int):
+        """Second derivatives between nodes i and j and the angles ahead of them."""
+        m = M()
+        u = second_of(own.second, e, i, j)
+        for a in range(3):
+            for b in range(3):
+                m[a, b] = u[a, b]
+        if wp.static(twist and angles > 0):
+            if j < wp.static(angles):
+                u = second_of(own.second, e, i, wp.static(nodes) + j)
+                for a in range(3):
+                    m[a, 3] = u[a, 0]
+            if i < wp.static(angles):
+                u = second_of(own.second, e, wp.static(nodes) + i, j)
+                for b in range(3):
+                    m[3, b] = u[0, b]
+                if j < wp.static(angles):
+                    u = second_of(own.second, e, wp.static(nodes) + i, wp.static(nodes) + j)
+                    m[3, 3] = u[0, 0]
+        return m
+
+    @wp.func
+    def stretched(own: Along, e: int):
+        """Geometric stiffness of an edge."""
+        m = M()
+        for d in range(3):
+            m[d, d] = own.tension[0, e]
+        return m
+
+    @wp.func
+    def own_sum(own: Along, k: int, c: int, w: int, late: bool):
+        D = M()
+        E = M()
+        F = M()
+        for i in range(wp.static(nodes)):
+            e = own.at[i, k, c]
+            if e >= 0:
+                e += w * own.elements
+                for m in range(wp.static(n)):
+                    a = row(own, m, i, e)
+                    D += wp.outer(a, a)
+                    if i + 1 < wp.static(nodes):
+                        E += wp.outer(a, row(own, m, i + 1, e))
+                    if i + 2 < wp.static(nodes):
+                        F += wp.outer(a, row(own, m, i + 2, e))
+                if wp.static(tensions > 0):
+                    T = stretched(own, e)
+                    D += T
+                    if i == 0:
+                        E -= T
+                if wp.static(curved):
+                    if late:
+                        D += between(own, i, i, e)
+                        if i + 1 < wp.static(nodes):
+                            E += between(own, i, i + 1, e)
+                        if i + 2 < wp.static(nodes):
+                            F += between(own, i, i + 2, e)
+        return D, E, F
+
+    @wp.func
+    def add(
+        own0: Along, own1: Along, own2: Along, own3: Along, own4: Along, own5: Along, k: int, c: int, w: int, late: bool
+    ):
+        own = own0
+        if wp.static(which == 1):
+            own = own1
+        if wp.static(which == 2):
+            own = own2
+        if wp.static(which == 3):
+            own = own3
+        if wp.static(which == 4):
+            own = own4
+        if wp.static(which == 5):
+            own = own5
+        D, E, F = own_sum(own, k, c, w, late)
+        if wp.static(not first):
+            D1, E1, F1 = before(own0, own1, own2, own3, own4, own5, k, c, w, late)
+            D += D1
+            E += E1
+            F += F1
+        return D, E, F
+
+    return add
+
+
+@cache
+def band_kernels(
+    terms: tuple[Term, ...], twist: bool, span: int, real, linear, exact_from: tuple[int | None, ...], drag: bool
+):
+    """assemble(...): blocks on free dofs, those of the identity on others; clear(...): positions of H that they took over;
+    times(...): what they add to H p, and to p . H p.
+
+    `exact_from` says of each term from which iteration on it has second derivatives, one for all, or None where it has none. Without
+    terms all blocks are taken from positions of H.
+    """
+    nb = 4 if twist else 3
+    parts = nb - 2  # blocks of a place: node, and angle of the edge ahead
+    H, B, M, Mass = (
+        wp.types.vector(3, linear),
+        wp.types.vector(nb, linear),
+        wp.types.matrix((nb, nb), linear),
+        mass_type(real, drag),
+    )
+    Along = along_type(linear)
+    load, store, _, _ = block_functions(nb, linear)
+    free_of, block_of = place_functions(twist, linear)
+    add = sum_function(terms, twist, linear, tuple(first is not None for first in exact_from)) if terms else None
+    begin = next((first for first in exact_from if first is not None), 0)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def assemble(
+        matrix: wp.array2d(dtype=linear),
+        mass: Mass,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        places: wp.array3d(dtype=int),
+        chain: wp.array2d(dtype=int),
+        count: wp.array(dtype=int),
+        fixed: wp.array(dtype=wp.uint8),
+        diagonal: wp.array(dtype=int),
+        positions: int,
+        own0: Along,
+        own1: Along,
+        own2: Along,
+        own3: Along,
+        own4: Along,
+        own5: Along,
+        blocks_out: wp.array3d(dtype=linear),
+    ):
+        """Nodes and angles that have no position of their own have their inertia and drag from here."""
+        k, r = wp.tid()
+        w = r / count.shape[0]
+        c = r - w * count.shape[0]
+        if flags[WANTED, w] == 0 or k >= count[c]:
+            return
+        D = M()
+        E = M()
+        F = M()
+        if wp.static(add is not None):
+            # what is wanted has been counted as an iteration since it was evaluated
+            late = flags[ITERATION, w] > wp.static(begin) and flags[CLAMPED, w] == 0
+            D, E, F = add(own0, own1, own2, own3, own4, own5, k, c, w, late)
+            for part in range(wp.static(parts)):
+                at = places[part, k, c]
+                if at >= 0:
+                    if diagonal[at] < 0:
+                        for d in range(3):
+                            if part == 0 or d == 0:
+                                if wp.static(drag):
+                                    inertia = mass[w, at].mass[d] * scalars[COEFFICIENT, w]
+                                else:
+                                    inertia = mass[at][d] * scalars[COEFFICIENT, w]
+                                D[3 * part + d, 3 * part + d] = D[3 * part + d, 3 * part + d] + linear(inertia)
+                        if wp.static(drag):
+                            resistance = mass[w, at].resistance
+                            for i in range(3):
+                                for j in range(3):
+                                    if part == 0 or i + j == 0:
+                                        D[3 * part + i, 3 * part + j] = D[3 * part + i, 3 * part + j] + linear(
+                                            resistance[i, j]
+                                        )
+        here = free_of(places, fixed, k, c)
+        if places.shape[0] > wp.static(parts):
+            D += block_of(matrix, places, wp.static(parts), k, c, w * positions)
+        D = wp.cw_mul(D, wp.outer(here, here)) + wp.diag(B(linear(1.0)) - here)
+        store(blocks_out, 0, k, r, D)
+        if k + 1 < count[c] and chain[k + 1, c] == chain[k, c]:
+            if places.shape[0] > wp.static(parts):
+                E += block_of(matrix, places, wp.static(parts + parts**2), k, c, w * positions)
+            E = wp.cw_mul(E, wp.outer(here, free_of(places, fixed, k + 1, c)))
+        else:
+            E = M()
+        store(blocks_out, wp.static(nb**2), k, r, E)
+        if wp.static(span == 2):
+            if k + 2 < count[c] and chain[k + 2, c] == chain[k, c]:
+                if places.shape[0] > wp.static(parts):
+                    F += block_of(matrix, places, wp.static(parts + 2 * parts**2), k, c, w * positions)
+                F = wp.cw_mul(F, wp.outer(here, free_of(places, fixed, k + 2, c)))
+            else:
+                F = M()
+            store(blocks_out, wp.static(2 * nb**2), k, r, F)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def clear(
+        taken: wp.array(dtype=int), wanted: wp.array(dtype=int), positions: int, matrix: wp.array2d(dtype=linear)
+    ):
+        i, w = wp.tid()
+        if wanted[w] != 0:
+            for j in range(9):
+                matrix[j, taken[i] + w * positions] = linear(0.0)
+
+    @wp.func
+    def value(v: wp.array(dtype=H), places: wp.array3d(dtype=int), k: int, c: int, shift: int):
+        u = B()
+        node = places[0, k, c]
+        if node >= 0:
+            x = v[node + shift]
+            for d in range(3):
+                u[d] = x[d]
+        if wp.static(twist):
+            angle = places[1, k, c]
+            if angle >= 0:
+                x = v[angle + shift]
+                u[3] = x[0]
+        return u
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def times(
+        bands: wp.array3d(dtype=linear),
+        places: wp.array3d(dtype=int),
+        count: wp.array(dtype=int),
+        fixed: wp.array(dtype=wp.uint8),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        p: wp.array(dtype=H),
+        product: wp.array(dtype=H),
+        dots: wp.array2d(dtype=linear),
+    ):
+        k, r = wp.tid()
+        w = r / count.shape[0]
+        c = r - w * count.shape[0]
+        if wanted[w] != 1 or k >= count[c]:
+            return
+        shift = w * blocks
+        here = value(p, places, k, c, shift)
+        y = load(bands, 0, k, r) * here
+        if k + 1 < count[c]:
+            y += load(bands, wp.static(nb**2), k, r) * value(p, places, k + 1, c, shift)
+        if k > 0:
+            y += value(p, places, k - 1, c, shift) * load(bands, wp.static(nb**2), k - 1, r)
+        if wp.static(span == 2):
+            if k + 2 < count[c]:
+                y += load(bands, wp.static(2 * nb**2), k, r) * value(p, places, k + 2, c, shift)
+            if k > 1:
+                y += value(p, places, k - 2, c, shift) * load(bands, wp.static(2 * nb**2), k - 2, r)
+        y = wp.cw_mul(y, free_of(places, fixed, k, c))
+        node = places[0, k, c]
+        if node >= 0:
+            v = H(y[0], y[1], y[2])
+            product[node + shift] = product[node + shift] + v
+            dots[w, node] = dots[w, node] + wp.dot(H(here[0], here[1], here[2]), v)
+        if wp.static(twist):
+            angle = places[1, k, c]
+            if angle >= 0:
+                product[angle + shift] = product[angle + shift] + H(y[3], linear(0.0), linear(0.0))
+                dots[w, angle] = dots[w, angle] + here[3] * y[3]
+
+    return assemble, clear, times
