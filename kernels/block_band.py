@@ -238,26 +238,40 @@ def factor_function(nb: int, span: int, linear):
         minus = M()  # what the nodes before take from the block of this node, of its coupling, and of the next node
         minus_couple = M()
         minus_next = M()
+        # what the next node has is read before this one is dealt with; see `substitute_function`
+        D = load(blocks, 0, 0, r)
+        E = load(blocks, wp.static(nb2), 0, r)
+        F = M()
+        if wp.static(span == 2):
+            F = load(blocks, wp.static(2 * nb2), 0, r)
         for j in range(n):
-            A = load(blocks, 0, j, r) - minus
-            L, inverse, bad = factor(A)
+            ahead = wp.min(j + 1, n - 1)
+            D_ahead = load(blocks, 0, ahead, r)
+            E_ahead = load(blocks, wp.static(nb2), ahead, r)
+            F_ahead = M()
+            if wp.static(span == 2):
+                F_ahead = load(blocks, wp.static(2 * nb2), ahead, r)
+            L, inverse, bad = factor(D - minus)
             lost += bad
             B = M()
             if j < n - 1:
-                B = load(blocks, wp.static(nb2), j, r) - minus_couple
+                B = E - minus_couple
             Zb = lower(L, B)
             store(out, 0, j, r, upper(L, inverse, Zb))
             minus = minus_next + congruence(Zb, inverse, Zb)
             if wp.static(span == 2):
                 C = M()
                 if j < n - 2:
-                    C = load(blocks, wp.static(2 * nb2), j, r)
+                    C = F
                 Zc = lower(L, C)
                 store(out, wp.static(nb2), j, r, upper(L, inverse, Zc))
                 minus_couple = congruence(Zb, inverse, Zc)
                 minus_next = congruence(Zc, inverse, Zc)
             store(out, wp.static(2 * nb2), j, r, L)
             put(out, wp.static(3 * nb2), j, r, inverse)
+            D = D_ahead
+            E = E_ahead
+            F = F_ahead
         return lost
 
     return factorise
@@ -287,13 +301,13 @@ def factor_kernel(kind: ChainKind, linear):
 
 
 @cache
-def substitute_function(nb: int, span: int, linear):
-    """substitute(factor, v, out, n, r, s): out = (L D L^T)^-1 v along a chain; returns v . out.
+def substitute_function(nb: int, span: int, linear, dotted: bool = False):
+    """substitute(factor, v, out, n, r, s): out = (L D L^T)^-1 v along a chain; returns v . out if it is `dotted`.
 
     The factors lie in column r, the vectors in column s.
     """
     nb2 = nb**2
-    H = wp.types.vector(nb, linear)
+    H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     load, _, vector, put = block_functions(nb, linear)
     _, _, _, lower_vector, upper_vector, _ = pivot.functions(nb, linear)
 
@@ -306,30 +320,60 @@ def substitute_function(nb: int, span: int, linear):
         r: int,
         s: int,
     ):
+        # What the next node takes is read before this one is dealt with: a thread that walks waits for memory most of the time.
         before = H()
         before2 = H()
+        U = load(factor, 0, 0, r)
+        V = M()
+        if wp.static(span == 2):
+            V = load(factor, wp.static(nb2), 0, r)
+        here = vector(v, 0, 0, s)
         for j in range(n):
-            # z = D^-1 (v - E^T z_before - ...): with U = D^-1 E stored, E^T D^-1 w = U^T w
-            w = vector(v, 0, j, s) - before
-            put(out, 0, j, s, w)
-            before = before2 + w * load(factor, 0, j, r)
+            ahead = wp.min(j + 1, n - 1)
+            U_ahead = load(factor, 0, ahead, r)
+            V_ahead = M()
             if wp.static(span == 2):
-                before2 = w * load(factor, wp.static(nb2), j, r)
+                V_ahead = load(factor, wp.static(nb2), ahead, r)
+            here_ahead = vector(v, 0, ahead, s)
+            # z = D^-1 (v - E^T z_before - ...): with U = D^-1 E stored, E^T D^-1 w = U^T w
+            w = here - before
+            put(out, 0, j, s, w)
+            before = before2 + w * U
+            if wp.static(span == 2):
+                before2 = w * V
+            U = U_ahead
+            V = V_ahead
+            here = here_ahead
         e1 = H()
         e2 = H()
         total = linear(0.0)
+        L = load(factor, wp.static(2 * nb2), n - 1, r)
+        inverse = vector(factor, wp.static(3 * nb2), n - 1, r)
+        here = vector(out, 0, n - 1, s)
         for i in range(n):
             j = n - 1 - i
-            L = load(factor, wp.static(2 * nb2), j, r)
-            inverse = vector(factor, wp.static(3 * nb2), j, r)
-            u = upper_vector(L, inverse, lower_vector(L, vector(out, 0, j, s)))
-            u -= load(factor, 0, j, r) * e1
+            ahead = wp.max(j - 1, 0)
+            U_ahead = load(factor, 0, ahead, r)
+            V_ahead = M()
             if wp.static(span == 2):
-                u -= load(factor, wp.static(nb2), j, r) * e2
-            total += wp.dot(vector(v, 0, j, s), u)
+                V_ahead = load(factor, wp.static(nb2), ahead, r)
+            L_ahead = load(factor, wp.static(2 * nb2), ahead, r)
+            inverse_ahead = vector(factor, wp.static(3 * nb2), ahead, r)
+            here_ahead = vector(out, 0, ahead, s)
+            u = upper_vector(L, inverse, lower_vector(L, here))
+            u -= U * e1
+            if wp.static(span == 2):
+                u -= V * e2
+            if wp.static(dotted):
+                total += wp.dot(vector(v, 0, j, s), u)
             put(out, 0, j, s, u)
             e2 = e1
             e1 = u
+            U = U_ahead
+            V = V_ahead
+            L = L_ahead
+            inverse = inverse_ahead
+            here = here_ahead
         return total
 
     return substitute
@@ -401,6 +445,6 @@ def direct_kernel(kind: ChainKind, linear):
     ):
         r = wp.tid()
         if wanted[r] != 0:
-            _decrement = substitute(factor, right, solution, count[r], r, r)
+            _total = substitute(factor, right, solution, count[r], r, r)
 
     return direct

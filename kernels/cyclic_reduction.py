@@ -16,21 +16,24 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import pivot
-from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind
+from ddg_warp.kernels.element import CPU_OPTIONS
 
 
-def level_rows(kind: ChainKind) -> tuple[int, int, int]:
-    """Rows of a level's matrix (A00, A01, A11, B00, B01, B10, B11), of its right-hand side, and of what it keeps."""
-    return 7 * kind.block**2, 2 * kind.block, 8 * kind.block**2 + 2 * kind.block
+def level_rows(nb: int) -> tuple[int, int, int]:
+    """Rows of a level's matrix (A00, A01, A11, B00, B01, B10, B11), of its right-hand side, and of what it keeps.
+
+    `nb` are the dofs of a node, here and below.
+    """
+    return 7 * nb**2, 2 * nb, 8 * nb**2 + 2 * nb
 
 
 @cache
-def _block_functions(kind: ChainKind, linear, first: bool):
+def _block_functions(nb: int, linear, first: bool):
     """factor, solve, own_column, right_side of diagonal blocks, and column, product of a coupling X, from nodes or a level.
 
     X is the coupling B_i, or its transpose where it is `turned`, so that one code serves both neighbours of a block.
     """
-    nb, nb2 = kind.block, kind.block**2
+    nb2 = nb**2
     H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     factor_block, lower, _, lower_vector, upper_vector, congruence = pivot.functions(nb, linear)
 
@@ -156,15 +159,15 @@ def _block_functions(kind: ChainKind, linear, first: bool):
 
 
 @cache
-def reduce_kernel(kind: ChainKind, linear, first: bool):
+def reduce_kernel(nb: int, linear, first: bool):
     """One level: the even blocks take what the odd ones leave, and keep what the odd ones' solution needs.
 
     Thread c of a block has column c of its matrix, then the right-hand side, then the columns of its coupling. Each factors both
     neighbours for itself, one after the other in a loop that is not unrolled: that keeps them in registers.
     """
-    nb, nb2 = kind.block, kind.block**2
+    nb2 = nb**2
     H = wp.types.vector(nb, linear)
-    factor, solve, own_column, right_side, column, product = _block_functions(kind, linear, first)
+    factor, solve, own_column, right_side, column, product = _block_functions(nb, linear, first)
 
     @wp.func
     def put(A: wp.array3d(dtype=linear), row: int, stride: int, k: int, r: int, v: H):
@@ -179,13 +182,15 @@ def reduce_kernel(kind: ChainKind, linear, first: bool):
         wanted: wp.array(dtype=int),
         blocks: int,
         neighbours: int,
+        start_column: int,
         matrix_out: wp.array3d(dtype=linear),
         right_out: wp.array3d(dtype=linear),
         kept_out: wp.array3d(dtype=linear),
         bad: wp.array(dtype=int),
     ):
-        """`blocks` of the level; `neighbours` is 2, which the compiler must not know."""
+        """`blocks` of the level; `neighbours` is 2, which the compiler must not know. Threads begin at column `start_column`."""
         c, j, r = wp.tid()
+        c += start_column
         if wanted[r] == 0:
             return
         n = blocks
@@ -248,10 +253,9 @@ def reduce_kernel(kind: ChainKind, linear, first: bool):
 
 
 @cache
-def last_kernel(kind: ChainKind, linear, first: bool):
+def last_kernel(nb: int, linear, first: bool):
     """Solution of the one block that is left: the first two nodes of a rod."""
-    nb = kind.block
-    factor, solve, _, right_side, *_ = _block_functions(kind, linear, first)
+    factor, solve, _, right_side, *_ = _block_functions(nb, linear, first)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def last(
@@ -282,9 +286,9 @@ def last_kernel(kind: ChainKind, linear, first: bool):
 
 
 @cache
-def expand_kernel(kind: ChainKind, linear):
+def expand_kernel(nb: int, linear):
     """Solution of a level's odd blocks from that of its even ones; a thread for a component."""
-    nb, nb2 = kind.block, kind.block**2
+    nb2 = nb**2
 
     @wp.func
     def product(kept: wp.array3d(dtype=linear), row: int, j: int, x: wp.array3d(dtype=linear), k: int, n: int, r: int):

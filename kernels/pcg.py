@@ -25,7 +25,7 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
     H = wp.types.vector(nb, linear)
     load, _, vector, put = block_functions(nb, linear)
     times = product_function(kind, linear)
-    substitute = substitute_function(nb, kind.span, linear)
+    substitute = substitute_function(nb, kind.span, linear, dotted=True)
     factor, _, _, lower_vector, upper_vector, _ = pivot.functions(nb, linear)
     eps = wp.constant(linear(1.0e-15 if linear == wp.float64 else 1.0e-7))
     by_chain = preconditioner == "chain"

@@ -75,6 +75,6 @@ def bytes_per_node(model, group) -> int:
     constant = 2 * real + 1
     if automatic(group) == "partitioned":
         iterate += kind.dim + (7 if kind.twist else 0) + 2
-        solver += 3 * nb**2 + nb + sum(cyclic_reduction.level_rows(kind)) // 2
+        solver += 3 * nb**2 + nb + sum(cyclic_reduction.level_rows(nb)) // 2
         constant += 8
     return 2 * state * real + iterate * real + solver * linear + constant

@@ -21,9 +21,12 @@ def automatic(group) -> str:
     """Name of the solver: "chain" (PCG) for closed rods, "partitioned" for few and long open ones on CUDA, else "sweep"."""
     if group.kind.closed:
         return "chain"
-    if group.device.is_cuda and group.nodes >= LONG and group.columns <= FEW:
-        return "partitioned"
-    return "sweep"
+    return "partitioned" if long_and_few(group.nodes, group.columns, group.device) else "sweep"
+
+
+def long_and_few(nodes: int, columns: int, device) -> bool:
+    """Whether chains of at most as many nodes are solved by cyclic reduction, many threads a chain."""
+    return device.is_cuda and nodes >= LONG and columns <= FEW
 
 
 # Nodes from which on equilibria of a net take conjugate gradients, without and with CUDA. Where membrane forces carry the loads these

@@ -203,7 +203,7 @@ def band_kernels(
     terms: tuple[Term, ...], twist: bool, span: int, real, linear, exact_from: tuple[int | None, ...], drag: bool
 ):
     """assemble(...): blocks on free dofs, those of the identity on others; clear(...): positions of H that they took over;
-    times(...): what they add to H p, and to p . H p.
+    product(...): H p on free dofs, and p . H p block by block.
 
     `exact_from` says of each term from which iteration on it has second derivatives, one for all, or None where it has none. Without
     terms all blocks are taken from positions of H.
@@ -217,7 +217,8 @@ def band_kernels(
         mass_type(real, drag),
     )
     Along = along_type(linear)
-    load, store, _, _ = block_functions(nb, linear)
+    _, store, _, _ = block_functions(nb, linear)
+    times, free = product_functions(linear)
     free_of, block_of = place_functions(twist, linear)
     add = sum_function(terms, twist, linear, tuple(first is not None for first in exact_from)) if terms else None
     begin = next((first for first in exact_from if first is not None), 0)
@@ -306,6 +307,7 @@ def band_kernels(
 
     @wp.func
     def value(v: wp.array(dtype=H), places: wp.array3d(dtype=int), k: int, c: int, shift: int):
+        """Of a vector of blocks, what belongs to a place."""
         u = B()
         node = places[0, k, c]
         if node >= 0:
@@ -319,45 +321,71 @@ def band_kernels(
                 u[3] = x[0]
         return u
 
+    @wp.func
+    def along(bands: wp.array3d(dtype=linear), row: int, first: int, count: int, k: int, r: int, u: B):
+        """`count` rows of a block, from `first` on, times a vector."""
+        y = H()
+        for i in range(3):
+            if i < count:
+                for j in range(wp.static(nb)):
+                    y[i] = y[i] + bands[row + (first + i) * wp.static(nb) + j, k, r] * u[j]
+        return y
+
+    @wp.func
+    def back(bands: wp.array3d(dtype=linear), row: int, first: int, count: int, k: int, r: int, u: B):
+        """The same of its transpose."""
+        y = H()
+        for i in range(3):
+            if i < count:
+                for j in range(wp.static(nb)):
+                    y[i] = y[i] + bands[row + j * wp.static(nb) + first + i, k, r] * u[j]
+        return y
+
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def times(
-        bands: wp.array3d(dtype=linear),
-        places: wp.array3d(dtype=int),
-        count: wp.array(dtype=int),
+    def product(
+        matrix: wp.array2d(dtype=linear),
+        columns: wp.array(dtype=int),
+        slices: wp.array(dtype=int),
         fixed: wp.array(dtype=wp.uint8),
+        p: wp.array(dtype=H),
         wanted: wp.array(dtype=int),
         blocks: int,
-        p: wp.array(dtype=H),
-        product: wp.array(dtype=H),
-        dots: wp.array2d(dtype=linear),
+        positions: int,
+        bands: wp.array3d(dtype=linear),
+        places: wp.array3d(dtype=int),
+        where: wp.array(dtype=int),
+        count: wp.array(dtype=int),
+        nodes: int,
+        product_out: wp.array(dtype=H),
+        dots_out: wp.array2d(dtype=linear),
     ):
-        k, r = wp.tid()
-        w = r / count.shape[0]
-        c = r - w * count.shape[0]
-        if wanted[w] != 1 or k >= count[c]:
+        i = wp.tid()
+        w = i / blocks
+        if wanted[w] != 1:
             return
+        b = i - w * blocks
         shift = w * blocks
-        here = value(p, places, k, c, shift)
-        y = load(bands, 0, k, r) * here
-        if k + 1 < count[c]:
-            y += load(bands, wp.static(nb**2), k, r) * value(p, places, k + 1, c, shift)
-        if k > 0:
-            y += value(p, places, k - 1, c, shift) * load(bands, wp.static(nb**2), k - 1, r)
-        if wp.static(span == 2):
-            if k + 2 < count[c]:
-                y += load(bands, wp.static(2 * nb**2), k, r) * value(p, places, k + 2, c, shift)
-            if k > 1:
-                y += value(p, places, k - 2, c, shift) * load(bands, wp.static(2 * nb**2), k - 2, r)
-        y = wp.cw_mul(y, free_of(places, fixed, k, c))
-        node = places[0, k, c]
-        if node >= 0:
-            v = H(y[0], y[1], y[2])
-            product[node + shift] = product[node + shift] + v
-            dots[w, node] = dots[w, node] + wp.dot(H(here[0], here[1], here[2]), v)
-        if wp.static(twist):
-            angle = places[1, k, c]
-            if angle >= 0:
-                product[angle + shift] = product[angle + shift] + H(y[3], linear(0.0), linear(0.0))
-                dots[w, angle] = dots[w, angle] + here[3] * y[3]
+        y = times(matrix, columns, slices, p, b, w * positions, shift)
+        at = where[b]
+        if at >= 0:
+            k = at / count.shape[0]
+            c = at - k * count.shape[0]
+            r = w * count.shape[0] + c
+            n = count[c]
+            first = wp.where(b < nodes, 0, 3)
+            size = wp.where(b < nodes, 3, 1)
+            y += along(bands, 0, first, size, k, r, value(p, places, k, c, shift))
+            if k + 1 < n:
+                y += along(bands, wp.static(nb**2), first, size, k, r, value(p, places, k + 1, c, shift))
+            if k > 0:
+                y += back(bands, wp.static(nb**2), first, size, k - 1, r, value(p, places, k - 1, c, shift))
+            if wp.static(span == 2):
+                if k + 2 < n:
+                    y += along(bands, wp.static(2 * nb**2), first, size, k, r, value(p, places, k + 2, c, shift))
+                if k > 1:
+                    y += back(bands, wp.static(2 * nb**2), first, size, k - 2, r, value(p, places, k - 2, c, shift))
+        y = wp.cw_mul(y, free(fixed[b]))
+        product_out[i] = y
+        dots_out[w, b] = wp.dot(p[i], y)
 
-    return assemble, clear, times
+    return assemble, clear, product

@@ -37,7 +37,8 @@ from ddg_warp.kernels.net.system import product_functions
 def chain_kernels(twist: bool, span: int, linear, sides: int):
     """factorise(...): H_II; load(...), solve(...): its solutions; finish(...): z of every block and r . z.
 
-    solve_all(...) takes all movements of a joint, `sides`, at once; follow(...) adds V z_J.
+    solve_all(...) takes all movements of a joint, `sides`, at once; follow(...) adds V z_J. Between worlds and their columns are
+    spread(...) and note(...).
     """
     nb = 4 if twist else 3
     parts = nb - 2  # blocks of a place: node, and angle of the edge ahead
@@ -127,6 +128,20 @@ def chain_kernels(twist: bool, span: int, linear, sides: int):
         if wanted[w] == 1:
             _product = substitute(factors, values, values, count[r - w * count.shape[0]], r, s)
 
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def spread(wanted: wp.array(dtype=int), columns: int, wanted_out: wp.array(dtype=int)):
+        """For `kernels.cyclic_reduction`: which columns are wanted."""
+        r = wp.tid()
+        wanted_out[r] = wp.where(wanted[r / columns] == 1, 1, 0)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def note(columns: int, bad: wp.array(dtype=int), lost: wp.array(dtype=int)):
+        """Which worlds lost pivots; starts counting them anew."""
+        r = wp.tid()
+        if bad[r] > 0:
+            lost[r / columns] = 1
+        bad[r] = 0
+
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def solve_all(
         factors: wp.array3d(dtype=linear),
@@ -206,4 +221,4 @@ def chain_kernels(twist: bool, span: int, linear, sides: int):
             z[i] = moved[w * joint_rows + joint_row[b]]
         dots_out[w, b] = wp.dot(residual[i], z[i])
 
-    return factorise, load, solve, solve_all, follow, finish
+    return factorise, load, solve, solve_all, follow, finish, spread, note

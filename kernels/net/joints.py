@@ -45,6 +45,17 @@ def joint_kernels(linear):
     invert = inverse_function(linear)
 
     @wp.func
+    def inverse_or(m: M, instead: M, f: H):
+        """Inverse on the free dofs f of a matrix, of another one if it is not definite, or of that one's diagonal; whether it is."""
+        inverse, definite = invert(wp.cw_mul(m, wp.outer(f, f)), f)
+        if not definite:
+            inverse, good = invert(wp.cw_mul(instead, wp.outer(f, f)), f)
+            if not good:
+                for d in range(3):
+                    inverse[d, d] = f[d] / wp.max(wp.abs(instead[d, d]), linear(1.0e-30))
+        return inverse, definite
+
+    @wp.func
     def pull(
         matrix: wp.array2d(dtype=linear),
         columns: wp.array(dtype=int),
@@ -88,9 +99,7 @@ def joint_kernels(linear):
         colour: wp.array(dtype=int),
         size: int,
         fixed: wp.array(dtype=wp.uint8),
-        inverse: wp.array(dtype=M),
         wanted: wp.array(dtype=int),
-        blocks: int,
         positions: int,
         parts_out: wp.array2d(dtype=M),
         lost: wp.array(dtype=int),
@@ -118,11 +127,10 @@ def joint_kernels(linear):
                 for e in range(3):
                     aa[e, d] = y[e]
             f = free(fixed[a])
-            aa = wp.cw_mul(block(matrix, own[m, 0] + first) + linear(0.5) * (aa + wp.transpose(aa)), wp.outer(f, f))
-            P, definite = invert(aa, f)
+            here = block(matrix, own[m, 0] + first)
+            P, definite = inverse_or(here + linear(0.5) * (aa + wp.transpose(aa)), here, f)
             if not definite:
                 lost[w] = 1
-                P = inverse[a + w * blocks]
         if b >= 0:
             for d in range(3):
                 shift = (colour[m] * size + 3 + d) * all_columns + w * width
@@ -139,11 +147,10 @@ def joint_kernels(linear):
                     ab += block(matrix, own[m, 2] + first)
                 ab = wp.cw_mul(ab, wp.outer(free(fixed[a]), f))
                 Q = P * ab
-            bb = block(matrix, own[m, 1] + first) + linear(0.5) * (bb + wp.transpose(bb)) - wp.transpose(ab) * Q
-            R, definite = invert(wp.cw_mul(bb, wp.outer(f, f)), f)
+            turned = block(matrix, own[m, 1] + first)
+            R, definite = inverse_or(turned + linear(0.5) * (bb + wp.transpose(bb)) - wp.transpose(ab) * Q, turned, f)
             if not definite:
                 lost[w] = 1
-                R = inverse[b + w * blocks]
         parts_out[0, i] = P
         parts_out[1, i] = Q
         parts_out[2, i] = R

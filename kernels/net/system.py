@@ -11,7 +11,17 @@ import warp as wp
 
 from ddg_warp.kernels.drag import block_inertia
 from ddg_warp.kernels.element import CPU_OPTIONS
-from ddg_warp.kernels.islands import CLAMPED, COEFFICIENT, DROWNED, ITERATION, LOAD_SCALE, STATUS, UNBALANCED, WANTED
+from ddg_warp.kernels.islands import (
+    CLAMPED,
+    COEFFICIENT,
+    DROWNED,
+    ITERATION,
+    LOAD_SCALE,
+    SLOT,
+    STATUS,
+    UNBALANCED,
+    WANTED,
+)
 from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.terms import Term
 
@@ -25,114 +35,40 @@ def mass_type(real, drag: bool):
 
 
 @cache
-def balance_kernels(real, linear, drag: bool = False):
-    """outer(...): loads, inertia, drag at every block; collect(...): forces of a set; settle(...): residual, whether it balances."""
+def meeting_type(real, linear):
+    """What the elements of a set bring to the blocks that they meet at; an item is element * slots + slot."""
+    V = wp.types.vector(3, real)
+
+    @wp.struct
+    class Meeting:
+        gradient: wp.array2d(dtype=V)
+        energy: wp.array2d(dtype=real)
+        stiffness: wp.array(dtype=linear)
+        starts: wp.array(dtype=int)
+        items: wp.array(dtype=int)
+        slots: int
+        elements: int
+
+    return Meeting
+
+
+@cache
+def balance_kernel(real, linear, drag: bool = False):
+    """balance(...): the residual of every block and whether it balances, the change of its energy along the step from `base`."""
     V, H, Mass = wp.types.vector(3, real), wp.types.vector(3, linear), mass_type(real, drag)
+    F, Meeting = wp.types.matrix((3, 3), real), meeting_type(real, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def outer(
+    def balance(
         q: wp.array(dtype=V),
         base: wp.array(dtype=V),
         target: wp.array(dtype=V),
         mass: Mass,
         gravity: wp.array(dtype=V),
         load: wp.array(dtype=V),
-        coefficient: wp.array(dtype=real),
-        status: wp.array(dtype=int),
-        blocks: int,
-        nodes: int,
-        force_out: wp.array(dtype=V),
-        size_out: wp.array(dtype=real),
-        stiffness_out: wp.array(dtype=linear),
-        change_out: wp.array2d(dtype=real),
-        noise_out: wp.array2d(dtype=real),
-    ):
-        """Starts the sums of a block: loads, gravity and inertia, and their work along the step from `base`."""
-        i = wp.tid()
-        w = i / blocks
-        if status[w] != 0:
-            return
-        k = i - w * blocks
-        f = load[i]
-        if wp.static(drag):
-            m = mass[w, k].mass
-        else:
-            m = mass[k]
-        if k < nodes:
-            f += wp.cw_mul(m, gravity[0])
-        c = coefficient[w]
-        away = q[i] - target[i]
-        inertia = wp.cw_mul(m, away) * c
-        u = q[i] - base[i]
-        work = wp.dot(u, inertia - wp.cw_mul(m, u) * (real(0.5) * c) - f)
-        if wp.static(drag):
-            resistance = mass[w, k].resistance
-            held_back = resistance * (q[i] - mass[w, k].carried)
-            inertia += held_back
-            work += wp.dot(u, held_back - resistance * u * real(0.5))
-        force_out[i] = f - inertia
-        size_out[i] = wp.max(wp.abs(f))
-        stiffness_out[i] = linear(c * wp.max(m))
-        if wp.static(drag):
-            stiffness_out[i] = linear(c * wp.max(m) + wp.max(wp.get_diag(mass[w, k].resistance)))
-        change_out[w, k] = work
-        noise_out[w, k] = wp.abs(work)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def collect(
-        gradient: wp.array2d(dtype=V),
-        energy: wp.array2d(dtype=real),
-        element_stiffness: wp.array(dtype=linear),
-        starts: wp.array(dtype=int),
-        items: wp.array(dtype=int),
-        slots: int,
-        elements: int,
-        status: wp.array(dtype=int),
-        slot: wp.array(dtype=int),
-        blocks: int,
-        force: wp.array(dtype=V),
-        size: wp.array(dtype=real),
-        stiffness: wp.array(dtype=linear),
-        change: wp.array2d(dtype=real),
-        noise: wp.array2d(dtype=real),
-    ):
-        """Adds the forces of a set; an item is element * slots + slot. The first slot of an element brings its energy."""
-        i = wp.tid()
-        w = i / blocks
-        if status[w] != 0:
-            return
-        k = i - w * blocks
-        f = V()
-        large = real(0.0)
-        stiff = linear(0.0)
-        more = real(0.0)
-        rounding = real(0.0)
-        accepted = slot[w]
-        for at in range(starts[k], starts[k + 1]):
-            item = items[at]
-            e = item / slots
-            s = item - e * slots
-            e += w * elements
-            g = gradient[s, e]
-            f += g
-            large += wp.max(wp.abs(g))
-            stiff += element_stiffness[e]
-            if s == 0:
-                new = energy[1 - accepted, e]
-                more += new - energy[accepted, e]
-                rounding += wp.abs(new)
-        force[i] = force[i] - f
-        size[i] = size[i] + large
-        stiffness[i] = stiffness[i] + stiff
-        change[w, k] = change[w, k] + more
-        noise[w, k] = noise[w, k] + rounding
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def settle(
-        q: wp.array(dtype=V),
-        force: wp.array(dtype=V),
-        size: wp.array(dtype=real),
-        stiffness: wp.array(dtype=linear),
+        sets: wp.array(dtype=Meeting),
+        oblique: wp.array(dtype=int),
+        frames: wp.array(dtype=F),
         fixed: wp.array(dtype=wp.uint8),
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
@@ -147,46 +83,99 @@ def balance_kernels(real, linear, drag: bool = False):
         least_out: wp.array(dtype=real),
         ratio_out: wp.array2d(dtype=real),
         square_out: wp.array2d(dtype=real),
-        noise: wp.array2d(dtype=real),
+        change_out: wp.array2d(dtype=real),
+        noise_out: wp.array2d(dtype=real),
     ):
-        """Residual of free dofs, and its squares with moments over the length `arm`; see `kernels.balance` for the criterion.
+        """Loads, gravity and inertia, then the forces of all sets; the first slot of an element brings its energy.
 
+        Residuals are those of free dofs, their squares with moments over the length `arm`; see `kernels.balance` for the criterion.
         `allowed` is what the residual of a block may be at rtol = 1, over `load_scale`, and `ratio_out` how often it is that; see
-        `ddg_warp.compile.tolerance`.
-        What rounding leaves of an edge vector follows from the coordinates of both its ends, `longest` apart at most.
+        `ddg_warp.compile.tolerance`. What rounding leaves of an edge vector follows from the coordinates of both its ends, `longest`
+        apart at most. `oblique` is the number of a block's frame among `frames`, -1 without; empty where no block has one.
         """
         i = wp.tid()
         w = i / blocks
         if flags[STATUS, w] != 0:
             return
         k = i - w * blocks
-        f = force[i]
+        x = q[i]
+        force = load[i]
+        if wp.static(drag):
+            m = mass[w, k].mass
+        else:
+            m = mass[k]
+        if k < nodes:
+            force += wp.cw_mul(m, gravity[0])
+        c = scalars[COEFFICIENT, w]
+        inertia = wp.cw_mul(m, x - target[i]) * c
+        u = x - base[i]
+        change = wp.dot(u, inertia - wp.cw_mul(m, u) * (real(0.5) * c) - force)
+        stiff = c * wp.max(m)
+        if wp.static(drag):
+            resistance = mass[w, k].resistance
+            held_back = resistance * (x - mass[w, k].carried)
+            inertia += held_back
+            change += wp.dot(u, held_back - resistance * u * real(0.5))
+            stiff += wp.max(wp.get_diag(resistance))
+        size = wp.max(wp.abs(force))
+        force -= inertia
+        noise = wp.abs(change)
+        accepted = flags[SLOT, w]
+        for j in range(sets.shape[0]):
+            own = sets[j]
+            f = V()
+            large = real(0.0)
+            stiffness = linear(0.0)
+            more = real(0.0)
+            rounding = real(0.0)
+            for at in range(own.starts[k], own.starts[k + 1]):
+                item = own.items[at]
+                e = item / own.slots
+                s = item - e * own.slots
+                e += w * own.elements
+                g = own.gradient[s, e]
+                f += g
+                large += wp.max(wp.abs(g))
+                stiffness += own.stiffness[e]
+                if s == 0:
+                    new = own.energy[1 - accepted, e]
+                    more += new - own.energy[accepted, e]
+                    rounding += wp.abs(new)
+            force -= f
+            size += large
+            stiff += real(stiffness)
+            change += more
+            noise += rounding
+        if oblique.shape[0] > 0:
+            if oblique[k] >= 0:
+                force = frames[oblique[k]] * force
         mask = int(fixed[k])
         length = wp.where(k < nodes, real(1.0), arm)
-        reach = wp.max(wp.abs(q[i])) + longest
+        reach = wp.max(wp.abs(x)) + longest
         if k >= nodes:
             reach += real(1.0)
         limit = rtol * scalars[LOAD_SCALE, w] * allowed[i]
-        least = floor * (real(stiffness[i]) * reach + size[i])
+        least = floor * (stiff * reach + size)
         least_out[i] = least
         r = H()
         square = real(0.0)
         ratio = real(0.0)
         for d in range(3):
             if ((mask >> d) & 1) == 0:
-                ratio = wp.max(ratio, wp.abs(f[d]) / allowed[i])
-                r[d] = linear(f[d])
-                square += f[d] * f[d] / (length * length)
-                if not wp.abs(f[d]) <= limit:
+                ratio = wp.max(ratio, wp.abs(force[d]) / allowed[i])
+                r[d] = linear(force[d])
+                square += force[d] * force[d] / (length * length)
+                if not wp.abs(force[d]) <= limit:
                     flags[DROWNED, w] = 1
-                    if not wp.abs(f[d]) <= least:
+                    if not wp.abs(force[d]) <= least:
                         flags[UNBALANCED, w] = 1
         right_out[i] = r
         ratio_out[w, k] = ratio
         square_out[w, k] = square
-        noise[w, k] = noise[w, k] + real(0.5) * size[i] * reach
+        change_out[w, k] = change
+        noise_out[w, k] = noise + real(0.5) * size * reach
 
-    return outer, collect, settle
+    return balance
 
 
 @cache

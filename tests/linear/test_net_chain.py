@@ -10,6 +10,7 @@ import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.scenes import gridshell_dome
 from ddg_warp.solve.choice import net_preconditioner
+from ddg_warp.solve.net import chains as net_chains
 
 STEEL = ddg.Material(young=2.1e11, poisson=0.3, density=7850.0)
 DAILY_IN_FLOAT64 = pytest.mark.parametrize("precision", ["float64", pytest.param("mixed", marks=pytest.mark.slow)])
@@ -70,8 +71,11 @@ def dense(problem: Problem, world: int) -> np.ndarray:
     return np.where(np.outer(free, free), result, 0.0)
 
 
+@pytest.mark.parametrize("reduces", [False, True])
 @pytest.mark.parametrize("scene", [branches, ring_and_spokes, frame_and_sheet])
-def test_is_the_elimination_of_chains_and_joints(device, scene):
+def test_is_the_elimination_of_chains_and_joints(device, monkeypatch, scene, reduces):
+    """Whether a thread walks along each chain, or many reduce it cyclically."""
+    monkeypatch.setattr(net_chains, "long_and_few", lambda *_: reduces)
     problem = Problem(scene(), device, 1.02, preconditioner="chain")
     problem.newton.islands.clamped.fill_(1)
     problem.iterate(0.1)

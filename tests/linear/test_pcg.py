@@ -186,7 +186,7 @@ def test_factorisation_and_substitution(device, name, closed):
     """Solves with the open part of the chain: the couplings across the seam left out."""
     problem = Problem(name, closed, device)
     newton, kind = problem.newton, problem.kind
-    substitute = block_band.substitute_function(kind.block, kind.span, newton.linear)
+    substitute = block_band.substitute_function(kind.block, kind.span, newton.linear, dotted=True)
 
     @wp.kernel(module="unique", enable_backward=False)
     def solve(

@@ -7,9 +7,10 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import cyclic_reduction, parallel_moves, parallel_search
+from ddg_warp.kernels import parallel_moves, parallel_search
 from ddg_warp.solve.chains.assembled import AssembledNewton
 from ddg_warp.solve.chains.newton import NewtonOptions
+from ddg_warp.solve.reduction import CyclicReduction
 
 
 class PartitionedNewton(AssembledNewton):
@@ -33,7 +34,7 @@ class PartitionedNewton(AssembledNewton):
         self.mean = wp.zeros(columns, dtype=vector, device=device)
         self.held = arrays.upload(_held_neighbours(group), int, device)
         self.new_frame = arrays.allocate(self.frame.shape, real, device)
-        self.reduction = CyclicReduction(kind, group.nodes, columns, self.linear, device)
+        self.reduction = CyclicReduction(kind.block, group.nodes, columns, self.linear, device)
         self._weigh, self._gauge = parallel_search.sum_kernels(kind, real, self.linear)
         self._judge, self._take = parallel_search.decide_kernels(kind, real, self.linear)
         self._moves = parallel_moves.move_kernels(kind, real, self.linear)
@@ -134,63 +135,6 @@ class PartitionedNewton(AssembledNewton):
     def _launch(self, kernel, size: int, inputs: list, outputs: list) -> None:
         """One thread for each of `size` parts of every rod."""
         wp.launch(kernel, (size, self.group.columns), inputs, outputs, device=self.device)
-
-
-class CyclicReduction:
-    """Levels of the block cyclic reduction of open chains of at most `nodes` nodes; see `kernels.cyclic_reduction`."""
-
-    def __init__(self, kind, nodes: int, columns: int, linear, device):
-        self.columns, self.device, self.dofs = columns, device, 2 * kind.block
-        self.blocks = [-(-nodes // 2)]  # of every level
-        while self.blocks[-1] > 1:
-            self.blocks.append(-(-self.blocks[-1] // 2))
-        matrix_rows, right_rows, kept_rows = cyclic_reduction.level_rows(kind)
-
-        def vectors(rows, blocks):
-            return arrays.allocate((rows, blocks, columns), linear, device)
-
-        self.matrices = [vectors(matrix_rows, blocks) for blocks in self.blocks[1:]]
-        self.rights = [vectors(right_rows, blocks) for blocks in self.blocks[1:]]
-        self.kept = [vectors(kept_rows, blocks // 2) for blocks in self.blocks[:-1]]
-        levels = len(self.kept)
-        self._reduce = [cyclic_reduction.reduce_kernel(kind, linear, level == 0) for level in range(levels)]
-        self._last = cyclic_reduction.last_kernel(kind, linear, levels == 0)
-        self._expand = cyclic_reduction.expand_kernel(kind, linear)
-
-    @property
-    def kernels(self) -> list:
-        """Kernels to load before a capture."""
-        return [*((kernel, 64) for kernel in self._reduce[:2]), (self._last, 32), self._expand]
-
-    def solve(self, matrix, right, count, wanted, solution: wp.array, bad: wp.array) -> None:
-        """Solution of the wanted columns from the blocks of their nodes; adds the pivots they lose to `bad`."""
-        for level, kernel in enumerate(self._reduce):
-            outputs = [self.matrices[level], self.rights[level], self.kept[level]]
-            wp.launch(
-                kernel,
-                (2 * self.dofs + 1, self.blocks[level + 1], self.columns),
-                [matrix, right, count, wanted, self.blocks[level], 2],
-                [*outputs, bad],
-                device=self.device,
-                block_dim=64,
-            )
-            matrix, right = outputs[:2]
-        wp.launch(
-            self._last,
-            self.columns,
-            [matrix, right, count, wanted],
-            [solution, bad],
-            device=self.device,
-            block_dim=32,
-        )
-        for level in reversed(range(len(self.kept))):
-            wp.launch(
-                self._expand,
-                (self.dofs, self.blocks[level] // 2, self.columns),
-                [self.kept[level], count, wanted, 2 << level],
-                [solution],
-                device=self.device,
-            )
 
 
 def _held_neighbours(group) -> np.ndarray:

@@ -8,7 +8,9 @@ from ddg_warp.errors import SceneError
 from ddg_warp.kernels.net import chains, joints
 from ddg_warp.kernels.net.bands import along_type, band_kernels
 from ddg_warp.kernels.net.system import SETS
+from ddg_warp.solve.choice import long_and_few
 from ddg_warp.solve.net.system import lists
+from ddg_warp.solve.reduction import CyclicReduction
 
 SERIAL = 32  # threads of a block where a thread walks along a chain, so that few chains spread over the multiprocessors
 
@@ -53,9 +55,16 @@ class Chains:
         self.columns = worlds * self.width
         block = 4 if plan.twist else 3
         self.factors = arrays.allocate((3 * block**2 + block, self.longest, self.columns), linear, device)
-        alone = not self.banded or self.exact  # nobody asks for the blocks once they are factored
-        bands = self.factors.shape if alone else (3 * block**2, self.longest, self.columns)
-        self.bands = self.factors if alone else arrays.allocate(bands, linear, device)
+        self.reduction = None
+        if long_and_few(self.longest, self.columns, wp.get_device(device)):
+            self.reduction = CyclicReduction(block, self.longest, self.columns, linear, device)
+            self._all = put(np.tile(plan.count, worlds))
+            self._wanted, self._bad = (put(np.zeros(self.columns)) for _ in range(2))
+            self.bands = self.factors
+        elif not self.banded or self.exact:  # nobody asks for the blocks once they are factored
+            self.bands = self.factors
+        else:
+            self.bands = arrays.allocate((3 * block**2, self.longest, self.columns), linear, device)
         self.values = arrays.allocate((block, self.longest, self.columns), linear, device)
         self.responses = arrays.allocate((block, self.longest, plan.solves * self.columns), linear, device)
         self.coupled = len(plan.of_places[1]) > 0
@@ -73,21 +82,29 @@ class Chains:
         sets = self.along if self.banded else []
         terms = tuple(net.sets[i].term for i in sets)
         late = tuple(exact_from[i] for i in sets)
-        self._assemble, self._clear, self._times = band_kernels(terms, plan.twist, plan.span, real, linear, late, drag)
+        self._assemble, self._clear, self._product = band_kernels(
+            terms, plan.twist, plan.span, real, linear, late, drag
+        )
         own = [self._elements(i, written[i], linear) for i in sets] or [along_type(linear)()]
         self._own = own + own[-1:] * (SETS - len(own))
         made = chains.chain_kernels(plan.twist, plan.span, linear, plan.size)
-        self._factorise, self._load, self._solve, self._solve_all, self._follow, self._finish = made
+        self._factorise, self._load, self._solve, self._solve_all, self._follow, self._finish, *self._columns = made
         self._measure, self._meet = joints.joint_kernels(linear) if self.joints else (None, None)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [self._assemble, (self._factorise, SERIAL), self._load, (self._solve, SERIAL), self._finish]
+        own = [self._assemble, self._load, self._finish]
+        if self.reduction:
+            own += [*self._columns, *self.reduction.kernels]
+        else:
+            own += [
+                (kernel, SERIAL) for kernel in (self._factorise, self._solve, *([self._solve_all] * bool(self.joints)))
+            ]
         own += [self._clear] if self.banded and self.taken.size else []
-        own += [self._times] if self.banded and not self.exact else []
+        own += [self._product] if self.banded and not self.exact else []
         own += [self._follow] if self.met is not None else []
-        return own + ([(self._solve_all, SERIAL), self._measure, self._meet] if self.joints else [])
+        return own + ([self._measure, self._meet] if self.joints else [])
 
     def assemble(self, matrix: wp.array, mass: wp.array, fixed: wp.array, islands) -> None:
         """Blocks of the chains of the worlds that want a direction."""
@@ -103,23 +120,23 @@ class Chains:
             inputs = [self.taken, islands.wanted, table.positions]
             self._launch(self._clear, (self.taken.size, self.net.worlds), inputs, [matrix])
 
-    def times(self, p: wp.array, fixed: wp.array, wanted: wp.array, product: wp.array, dots: wp.array) -> None:
-        """Add what the bands make of p, and p . H p block by block."""
-        if self.banded:
-            self._launch(
-                self._times,
-                (self.longest, self.columns),
-                [self.bands, self.places, self.count, fixed, wanted, self.net.blocks, p],
-                [product, dots],
-            )
+    def product(self, matrix, p: wp.array, fixed, wanted, product: wp.array, dots: wp.array) -> None:
+        """H p with what the bands make of p, and p . H p block by block."""
+        table, net = self.table, self.net
+        self._launch(
+            self._product,
+            net.worlds * net.blocks,
+            [matrix, table.columns, table.slices, fixed, p, wanted, net.blocks, table.positions]
+            + [self.bands, self.places, self.where, self.count, net.host.nodes],
+            [product, dots],
+        )
 
-    def prepare(self, matrix: wp.array, inverse: wp.array, fixed: wp.array, wanted: wp.array, lost: wp.array) -> None:
-        """Factors of chains and joints of the worlds that want a direction; `inverse` is that of the diagonal blocks.
-
-        Raises `lost` in worlds where one of them is indefinite.
-        """
+    def prepare(self, matrix: wp.array, fixed: wp.array, wanted: wp.array, lost: wp.array) -> None:
+        """Factors of chains and joints of the worlds that want a direction; raises `lost` where one of them is indefinite."""
         table, plan, net = self.table, self.plan, self.net
-        self._launch(self._factorise, self.columns, [self.bands, self.count, wanted], [self.factors, lost], SERIAL)
+        self._lost, self._reduced = lost, False
+        if not self.reduction:
+            self._launch(self._factorise, self.columns, [self.bands, self.count, wanted], [self.factors, lost], SERIAL)
         if not self.joints:
             return
         if self.coupled:
@@ -127,8 +144,8 @@ class Chains:
         self._launch(
             self._measure,
             net.worlds * self.joints,
-            [matrix, *self._joint_inputs(self.responses), self.own, self.colour, plan.size, fixed, inverse, wanted]
-            + [net.blocks, table.positions],
+            [matrix, *self._joint_inputs(self.responses), self.own, self.colour, plan.size, fixed, wanted]
+            + [table.positions],
             [self.parts, lost],
         )
 
@@ -184,8 +201,23 @@ class Chains:
             + [self.moved if moved is None else moved],
             [values],
         )
+        if self.reduction:
+            self._reduce(values, wanted)
+            return
         kernel, sides = (self._solve, 1) if values is self.values else (self._solve_all, self.plan.size)
         self._launch(kernel, solves // sides * self.columns, [self.factors, self.count, wanted], [values], SERIAL)
+
+    def _reduce(self, values: wp.array, wanted: wp.array) -> None:
+        """H_II^-1 of values by cyclic reduction, which eliminates anew once after every `prepare`."""
+        spread, note = self._columns
+        self._launch(spread, self.columns, [wanted, self.width], [self._wanted])
+        for first in range(0, values.shape[2], self.columns):
+            part = values[:, :, first : first + self.columns]
+            given = self.bands, part, self._all, self._wanted, part, self._bad
+            self.reduction.solve(*given, again=self._reduced)
+            if not self._reduced:
+                self._launch(note, self.columns, [self.width], [self._bad, self._lost])
+            self._reduced = True
 
     def _elements(self, index: int, written: dict, linear):
         """What the elements of a set write, and where they are."""

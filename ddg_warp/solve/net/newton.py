@@ -63,9 +63,8 @@ class NetNewton:
         def scalars(count=1, dtype=None):
             return [make(worlds, dtype or self.real) for _ in range(count)]
 
-        self.q, self.base, self.target, self.force = (make(self.all, V) for _ in range(4))
+        self.q, self.base, self.target = (make(self.all, V) for _ in range(3))
         self.load = wp.array(np.tile(host.load, (worlds, 1)), dtype=V, device=device)
-        self.size, self.stiffness = make(self.all, self.real), make(self.all, self.linear)
         self.change, self.noise, self.square, self.dots = (make((worlds, blocks), self.real) for _ in range(4))
         self.mass = (
             make((worlds, blocks), block_inertia(self.real)) if drag else wp.array(host.mass, dtype=V, device=device)
@@ -117,7 +116,8 @@ class NetNewton:
         self._direct = self.chains is not None and self.chains.exact
         self._repeat = pcg.repeat_kernel(self.real, False) if any(exact) or self._direct else None
         self.negative = make(worlds, int)
-        self._outer, self._collect, self._settle = system.balance_kernels(self.real, self.linear, drag)
+        self._balance, self._sets = system.balance_kernel(self.real, self.linear, drag), self._meetings()
+        self._no_frames = [make(0, int), make(0, wp.types.matrix((3, 3), self.real))]
         self._assembly = Assembly(net, self.system, self.parts, self.real, self.linear, self.exact_from, drag)
         self._judge, self._measure, self._rotate, self._take, self._move = newton.search_kernels(self.real, self.linear)
         self._invert, self._start, self._begin, *self._cycle = krylov.solver_kernels(self.linear)
@@ -149,10 +149,21 @@ class NetNewton:
             "stiffness": make(count, self.linear),
         }
 
+    def _meetings(self) -> wp.array:
+        """What the elements of all sets bring to the blocks."""
+        sets = []
+        for part, own, (starts, items) in zip(self.net.sets, self.parts, self.system.meets, strict=True):
+            meeting = system.meeting_type(self.real, self.linear)()
+            meeting.gradient, meeting.energy, meeting.stiffness = own["gradient"], own["energy"], own["stiffness"]
+            meeting.starts, meeting.items = starts, items
+            meeting.slots, meeting.elements = part.term.measure.slots, part.elements
+            sets.append(meeting)
+        return wp.array(sets, dtype=system.meeting_type(self.real, self.linear), device=self.device)
+
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [self._outer, self._collect, self._settle, self._judge, self._measure, self._rotate, self._take]
+        own = [self._balance, self._judge, self._measure, self._rotate, self._take]
         own += [*self.allowed.kernels, *([self._repeat] if self._repeat else [])]
         cycle = [self._move, self._invert, self._start, self._begin, *self._cycle, self._compare, self._confirm]
         parts = [k for part in (self.chains, self.levels, self.planes) if part for k in part.kernels]
@@ -195,43 +206,16 @@ class NetNewton:
 
     def balance(self) -> None:
         """Residuals, the change of the energy, and the worlds that are out of equilibrium."""
-        net, options, islands, blocks = self.net, self.options, self.islands, self.net.blocks
-        self.outer_forces()
-        for part, own, (starts, items) in zip(net.sets, self.parts, self.system.meets, strict=True):
-            self._launch(
-                self._collect,
-                [own["gradient"], own["energy"], own["stiffness"], starts, items, part.term.measure.slots]
-                + [part.elements, self.islands.status, self.islands.slot, blocks],
-                [self.force, self.size, self.stiffness, self.change, self.noise],
-            )
-        if self.planes:
-            self.planes.forces(self.force)
+        net, options, islands, planes = self.net, self.options, self.islands, self.planes
+        frames = [planes.of_blocks, planes.frames[self.real]] if planes else self._no_frames
         self._launch(
-            self._settle,
-            [self.q, self.force, self.size, self.stiffness, self.fixed, *self.islands.arrays]
-            + [self.allowed.blocks, blocks, net.host.nodes, self.arm, self.longest]
+            self._balance,
+            [self.q, self.base, self.target, self.mass, self.gravity, self.load, self._sets, *frames, self.fixed]
+            + [*islands.arrays, self.allowed.blocks, net.blocks, net.host.nodes, self.arm, self.longest]
             + [options.rtol, options.floor_factor * self.eps],
-            [self.right, self.allowed.least, self.allowed.ratio, self.square, self.noise],
+            [self.right, self.allowed.least, self.allowed.ratio, self.square, self.change, self.noise],
         )
         self.allowed.sum_up(self.right, options.rtol, islands, islands.unbalanced, islands.drowned)
-
-    def outer_forces(self) -> None:
-        """Begin the sums at every block: loads, gravity and inertia."""
-        self._launch(
-            self._outer,
-            [
-                self.q,
-                self.base,
-                self.target,
-                self.mass,
-                self.gravity,
-                self.load,
-                self.islands.coefficient,
-                self.islands.status,
-            ]
-            + [self.net.blocks, self.net.host.nodes],
-            [self.force, self.size, self.stiffness, self.change, self.noise],
-        )
 
     def judge(self) -> None:
         """Stop worlds, reject their iterates, or ask for a direction."""
@@ -260,16 +244,10 @@ class NetNewton:
 
     def direct(self) -> None:
         """Directions: by elimination where that is exact, else by conjugate gradients."""
-        table, wanted = self.system, self.islands.wanted
-        if not self._direct or self.chains.joints:
-            self._launch(
-                self._invert,
-                [self.matrix, table.diagonal, self.fixed, wanted, self.net.blocks, table.positions],
-                [self.inverse],
-            )
+        wanted = self.islands.wanted
         if self._direct:
             self.negative.zero_()
-            self.chains.prepare(self.matrix, self.inverse, self.fixed, wanted, self.negative)
+            self.chains.prepare(self.matrix, self.fixed, wanted, self.negative)
             self.chains.apply(self.matrix, self.right, self.fixed, wanted, self.direction, self.krylov_dots)
         else:
             self.iterate_pcg()
@@ -278,13 +256,19 @@ class NetNewton:
 
     def iterate_pcg(self) -> None:
         """Directions by conjugate gradients."""
+        table, blocks = self.system, self.net.blocks
+        self._launch(
+            self._invert,
+            [self.matrix, table.diagonal, self.fixed, self.islands.wanted, blocks, table.positions],
+            [self.inverse],
+        )
         self._launch(
             self._start,
-            [self.right, self.inverse, self.islands.wanted, self.net.blocks],
+            [self.right, self.inverse, self.islands.wanted, blocks],
             [self.rest, self.direction, self.p, self.krylov_dots],
         )
         if self.chains:
-            self.chains.prepare(self.matrix, self.inverse, self.fixed, self.islands.wanted, self._unread[0])
+            self.chains.prepare(self.matrix, self.fixed, self.islands.wanted, self._unread[0])
         if self.levels:
             self.levels.prepare(self.matrix, self.fixed, self.islands.wanted)
         self.precondition(self.p)
@@ -329,25 +313,13 @@ class NetNewton:
 
     def cycle(self) -> None:
         """One iteration of conjugate gradients."""
-        table, blocks = self.system, self.net.blocks
-        product, advance, turn, test = self._cycle
+        blocks = self.net.blocks
+        _, advance, turn, test = self._cycle
         self.busy.zero_()
-        self._launch(
-            product,
-            [
-                self.matrix,
-                table.columns,
-                table.slices,
-                self.fixed,
-                self.p,
-                self.islands.wanted,
-                blocks,
-                table.positions,
-            ],
-            [self.product, self.krylov_dots],
-        )
-        if self.chains:
-            self.chains.times(self.p, self.fixed, self.islands.wanted, self.product, self.krylov_dots)
+        if self.chains and self.chains.banded:
+            self.chains.product(self.matrix, self.p, self.fixed, self.islands.wanted, self.product, self.krylov_dots)
+        else:
+            self.multiply(self.p)
         self._sum_linear(self.krylov_dots, self.curvature)
         self._launch(
             advance,
@@ -372,6 +344,24 @@ class NetNewton:
             [self.total, self.curvature, self.rho_first, self.forcing, self._limit],
             [self.rho, self.iterations, self._indefinite, self.islands.wanted, self.busy],
             device=self.device,
+        )
+
+    def multiply(self, p: wp.array) -> None:
+        """H p on free dofs where none of H lies in bands, and p . H p block by block."""
+        table = self.system
+        self._launch(
+            self._cycle[0],
+            [
+                self.matrix,
+                table.columns,
+                table.slices,
+                self.fixed,
+                p,
+                self.islands.wanted,
+                self.net.blocks,
+                table.positions,
+            ],
+            [self.product, self.krylov_dots],
         )
 
     def take(self) -> None:

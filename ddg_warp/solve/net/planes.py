@@ -49,19 +49,16 @@ class DevicePlanes:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
         self.where, self.entries = put(place.astype(np.int32), int), put(entries.astype(np.int32), int)
+        self.of_blocks = put(frame[:-1].astype(np.int32), int)
         self.frames = {kind: put(frames, wp.types.matrix((3, 3), kind)) for kind in {real, linear}}
-        self._force, self._matrix = planes.turn_kernel(real, False), planes.matrix_kernel(linear)
+        self._matrix = planes.matrix_kernel(linear)
         self._into, self._back = (planes.turn_kernel(linear, back) for back in (False, True))
         self.real, self.linear = real, linear
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [self._force, self._matrix, self._into, self._back]
-
-    def forces(self, force: wp.array) -> None:
-        """Turn forces into the frames."""
-        self._turn(self._force, self.real, self.net.every, force)
+        return [self._matrix, self._into, self._back]
 
     def into(self, direction: wp.array, wanted: wp.array) -> None:
         """Turn the directions of the worlds that want one into the frames."""

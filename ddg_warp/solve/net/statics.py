@@ -54,13 +54,13 @@ class StaticNewton(NetNewton):
         wp.copy(self.islands.load_scale, self.allowed.assign(scale.reshape(self.worlds, -1)))
         self.islands.active.fill_(1)
 
-    def outer_forces(self) -> None:
-        """Loads on the iterate."""
+    def balance(self) -> None:
+        """Residuals under the loads on the iterate, which do the work of their mean along a step."""
         follows = bool(self.net.host.followers)
         if follows:
             self.loads.apply(self.q, self.load)
             self.loads.apply(self.base, self._there)
-        super().outer_forces()
+        super().balance()
         if follows:
             self._launch(
                 self._follow,
@@ -89,15 +89,10 @@ class StaticNewton(NetNewton):
 
     def follow(self, state, step: wp.array) -> None:
         """The direction of the free dofs where held ones make a `step`: H d = r - H step, in worlds that want it."""
-        table, blocks = self.system, self.net.blocks
         self.evaluate(state)
         self.balance()
         self.assemble()
-        self._launch(
-            self._cycle[0],
-            [self.matrix, table.columns, table.slices, self.fixed, step, self.islands.wanted, blocks, table.positions],
-            [self.product, self.krylov_dots],
-        )
+        self.multiply(step)
         self._launch(self._less, [self.product], [self.right])
         self._whole = True
         self.direct()

@@ -1,0 +1,66 @@
+"""Block cyclic reduction on a device: few, long chains solved by many threads each."""
+
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.kernels import cyclic_reduction
+
+
+class CyclicReduction:
+    """Levels of the block cyclic reduction of open chains of at most `nodes` nodes of `nb` dofs; see `kernels.cyclic_reduction`."""
+
+    def __init__(self, nb: int, nodes: int, columns: int, linear, device):
+        self.columns, self.device, self.dofs = columns, device, 2 * nb
+        self.blocks = [-(-nodes // 2)]  # of every level
+        while self.blocks[-1] > 1:
+            self.blocks.append(-(-self.blocks[-1] // 2))
+        matrix_rows, right_rows, kept_rows = cyclic_reduction.level_rows(nb)
+
+        def vectors(rows, blocks):
+            return arrays.allocate((rows, blocks, columns), linear, device)
+
+        self.matrices = [vectors(matrix_rows, blocks) for blocks in self.blocks[1:]]
+        self.rights = [vectors(right_rows, blocks) for blocks in self.blocks[1:]]
+        self.kept = [vectors(kept_rows, blocks // 2) for blocks in self.blocks[:-1]]
+        levels = len(self.kept)
+        self._reduce = [cyclic_reduction.reduce_kernel(nb, linear, level == 0) for level in range(levels)]
+        self._last = cyclic_reduction.last_kernel(nb, linear, levels == 0)
+        self._expand = cyclic_reduction.expand_kernel(nb, linear)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [*((kernel, 64) for kernel in self._reduce[:2]), (self._last, 32), self._expand]
+
+    def solve(self, matrix, right, count, wanted, solution: wp.array, bad: wp.array, again: bool = False) -> None:
+        """Solution of the wanted columns from the blocks of their nodes; adds the pivots they lose to `bad`.
+
+        `again` is for another right-hand side of the same matrix. The solution may take the place of the right-hand side.
+        """
+        for level, kernel in enumerate(self._reduce):
+            outputs = [self.matrices[level], self.rights[level], self.kept[level]]
+            wp.launch(
+                kernel,
+                (1 if again else 2 * self.dofs + 1, self.blocks[level + 1], self.columns),
+                [matrix, right, count, wanted, self.blocks[level], 2, self.dofs if again else 0],
+                [*outputs, bad],
+                device=self.device,
+                block_dim=64,
+            )
+            matrix, right = outputs[:2]
+        wp.launch(
+            self._last,
+            self.columns,
+            [matrix, right, count, wanted],
+            [solution, bad],
+            device=self.device,
+            block_dim=32,
+        )
+        for level in reversed(range(len(self.kept))):
+            wp.launch(
+                self._expand,
+                (self.dofs, self.blocks[level] // 2, self.columns),
+                [self.kept[level], count, wanted, 2 << level],
+                [solution],
+                device=self.device,
+            )
