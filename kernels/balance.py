@@ -123,7 +123,7 @@ def check_kernel(kind: ChainKind, real, linear):
     V, Inertia = wp.types.vector(dim, real), inertia_type(kind, real)
     _, behind, balance = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
-    until = until_function(kind)
+    until = until_function(kind.serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def check(

@@ -64,7 +64,7 @@ def chain_kernels(kind: ChainKind, real):
     half = edge_function(dim, real)
     _, behind, _ = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
-    until = until_function(kind)
+    until = until_function(kind.serial)
 
     @wp.func
     def of_edge(

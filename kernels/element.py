@@ -141,16 +141,16 @@ def drag_structure(dim: int, real):
 
 
 @cache
-def until_function(kind: ChainKind):
-    """until(k, n): where the nodes end that a thread takes that starts at node k < n.
+def until_function(serial: bool):
+    """until(k, n): where what a thread takes ends that starts at k < n; if `serial`, it takes all, nodes of a rod or blocks of a net.
 
-    A CPU thread takes all nodes: for each of its threads Warp reads all arguments again, some 200 words, which takes as long as the
-    balance of a node. On CUDA the loop has one turn, which the compiler sees if nothing but k bounds it.
+    For each thread of the CPU's Warp reads all arguments again, some 200 words, which takes as long as the balance of a node. On CUDA
+    the loop has one turn, which the compiler sees if nothing but k bounds it.
     """
 
     @wp.func
     def until(k: int, n: int):
-        if wp.static(kind.serial):
+        if wp.static(serial):
             return n
         return k + 1
 
@@ -521,7 +521,7 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
     `active`, which the sweep then raises.
     """
     V = wp.types.vector(kind.dim, real)
-    until = until_function(kind)
+    until = until_function(kind.serial)
     _, window, lagged, _ = gather_functions(kind, real)
     curved, begin = exact_from is not None, exact_from or 0
     # Not a loop over the terms: what depends on a loop variable, wp.static(each[i]), Warp resolves by generating all code of a kernel

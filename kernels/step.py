@@ -40,7 +40,7 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
     length, restart = attempt_functions(real, midpoint)
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
-    until = until_function(kind)
+    until = until_function(kind.serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def begin(
@@ -160,7 +160,7 @@ def start_kernel(real):
 def finish_nodes_kernel(kind: ChainKind, real, midpoint: bool):
     """Positions, angles and their velocities at the end of the step, of the rods that converged."""
     V, twist = wp.types.vector(kind.dim, real), kind.twist
-    until = until_function(kind)
+    until = until_function(kind.serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def finish(
@@ -228,7 +228,7 @@ def finish_frames_kernel(kind: ChainKind, real):
     """
     V, X = wp.types.vector(kind.dim, real), wp.types.vector(3, real)
     along, *_ = gather_functions(kind, real)
-    until = until_function(kind)
+    until = until_function(kind.serial)
     transport, reference_twist, _ = frames.functions(real)
     closed = kind.closed
 

@@ -10,7 +10,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.block_band import block_functions
-from ddg_warp.kernels.element import CPU_OPTIONS
+from ddg_warp.kernels.element import CPU_OPTIONS, until_function
 from ddg_warp.kernels.islands import CLAMPED, COEFFICIENT, ITERATION, WANTED
 from ddg_warp.kernels.net.system import mass_type, product_functions, second_function
 from ddg_warp.kernels.terms import Term
@@ -200,7 +200,14 @@ def sum_function(terms: tuple[Term, ...], twist: bool, linear, exact: tuple[bool
 
 @cache
 def band_kernels(
-    terms: tuple[Term, ...], twist: bool, span: int, real, linear, exact_from: tuple[int | None, ...], drag: bool
+    terms: tuple[Term, ...],
+    twist: bool,
+    span: int,
+    real,
+    linear,
+    exact_from: tuple[int | None, ...],
+    drag: bool,
+    serial: bool,
 ):
     """assemble(...): blocks on free dofs, those of the identity on others; clear(...): positions of H that they took over;
     product(...): H p on free dofs, and p . H p block by block.
@@ -216,7 +223,7 @@ def band_kernels(
         wp.types.matrix((nb, nb), linear),
         mass_type(real, drag),
     )
-    Along = along_type(linear)
+    Along, until = along_type(linear), until_function(serial)
     _, store, _, _ = block_functions(nb, linear)
     times, free = product_functions(linear)
     free_of, block_of = place_functions(twist, linear)
@@ -244,57 +251,58 @@ def band_kernels(
         blocks_out: wp.array3d(dtype=linear),
     ):
         """Nodes and angles that have no position of their own have their inertia and drag from here."""
-        k, r = wp.tid()
+        start, r = wp.tid()
         w = r / count.shape[0]
         c = r - w * count.shape[0]
-        if flags[WANTED, w] == 0 or k >= count[c]:
+        if flags[WANTED, w] == 0 or start >= count[c]:
             return
-        D = M()
-        E = M()
-        F = M()
-        if wp.static(add is not None):
-            # what is wanted has been counted as an iteration since it was evaluated
-            late = flags[ITERATION, w] > wp.static(begin) and flags[CLAMPED, w] == 0
-            D, E, F = add(own0, own1, own2, own3, own4, own5, k, c, w, late)
-            for part in range(wp.static(parts)):
-                at = places[part, k, c]
-                if at >= 0:
-                    if diagonal[at] < 0:
-                        for d in range(3):
-                            if part == 0 or d == 0:
-                                if wp.static(drag):
-                                    inertia = mass[w, at].mass[d] * scalars[COEFFICIENT, w]
-                                else:
-                                    inertia = mass[at][d] * scalars[COEFFICIENT, w]
-                                D[3 * part + d, 3 * part + d] = D[3 * part + d, 3 * part + d] + linear(inertia)
-                        if wp.static(drag):
-                            resistance = mass[w, at].resistance
-                            for i in range(3):
-                                for j in range(3):
-                                    if part == 0 or i + j == 0:
-                                        D[3 * part + i, 3 * part + j] = D[3 * part + i, 3 * part + j] + linear(
-                                            resistance[i, j]
-                                        )
-        here = free_of(places, fixed, k, c)
-        if places.shape[0] > wp.static(parts):
-            D += block_of(matrix, places, wp.static(parts), k, c, w * positions)
-        D = wp.cw_mul(D, wp.outer(here, here)) + wp.diag(B(linear(1.0)) - here)
-        store(blocks_out, 0, k, r, D)
-        if k + 1 < count[c] and chain[k + 1, c] == chain[k, c]:
-            if places.shape[0] > wp.static(parts):
-                E += block_of(matrix, places, wp.static(parts + parts**2), k, c, w * positions)
-            E = wp.cw_mul(E, wp.outer(here, free_of(places, fixed, k + 1, c)))
-        else:
+        for k in range(start, until(start, count[c])):
+            D = M()
             E = M()
-        store(blocks_out, wp.static(nb**2), k, r, E)
-        if wp.static(span == 2):
-            if k + 2 < count[c] and chain[k + 2, c] == chain[k, c]:
+            F = M()
+            if wp.static(add is not None):
+                # what is wanted has been counted as an iteration since it was evaluated
+                late = flags[ITERATION, w] > wp.static(begin) and flags[CLAMPED, w] == 0
+                D, E, F = add(own0, own1, own2, own3, own4, own5, k, c, w, late)
+                for part in range(wp.static(parts)):
+                    at = places[part, k, c]
+                    if at >= 0:
+                        if diagonal[at] < 0:
+                            for d in range(3):
+                                if part == 0 or d == 0:
+                                    if wp.static(drag):
+                                        inertia = mass[w, at].mass[d] * scalars[COEFFICIENT, w]
+                                    else:
+                                        inertia = mass[at][d] * scalars[COEFFICIENT, w]
+                                    D[3 * part + d, 3 * part + d] = D[3 * part + d, 3 * part + d] + linear(inertia)
+                            if wp.static(drag):
+                                resistance = mass[w, at].resistance
+                                for i in range(3):
+                                    for j in range(3):
+                                        if part == 0 or i + j == 0:
+                                            D[3 * part + i, 3 * part + j] = D[3 * part + i, 3 * part + j] + linear(
+                                                resistance[i, j]
+                                            )
+            here = free_of(places, fixed, k, c)
+            if places.shape[0] > wp.static(parts):
+                D += block_of(matrix, places, wp.static(parts), k, c, w * positions)
+            D = wp.cw_mul(D, wp.outer(here, here)) + wp.diag(B(linear(1.0)) - here)
+            store(blocks_out, 0, k, r, D)
+            if k + 1 < count[c] and chain[k + 1, c] == chain[k, c]:
                 if places.shape[0] > wp.static(parts):
-                    F += block_of(matrix, places, wp.static(parts + 2 * parts**2), k, c, w * positions)
-                F = wp.cw_mul(F, wp.outer(here, free_of(places, fixed, k + 2, c)))
+                    E += block_of(matrix, places, wp.static(parts + parts**2), k, c, w * positions)
+                E = wp.cw_mul(E, wp.outer(here, free_of(places, fixed, k + 1, c)))
             else:
-                F = M()
-            store(blocks_out, wp.static(2 * nb**2), k, r, F)
+                E = M()
+            store(blocks_out, wp.static(nb**2), k, r, E)
+            if wp.static(span == 2):
+                if k + 2 < count[c] and chain[k + 2, c] == chain[k, c]:
+                    if places.shape[0] > wp.static(parts):
+                        F += block_of(matrix, places, wp.static(parts + 2 * parts**2), k, c, w * positions)
+                    F = wp.cw_mul(F, wp.outer(here, free_of(places, fixed, k + 2, c)))
+                else:
+                    F = M()
+                store(blocks_out, wp.static(2 * nb**2), k, r, F)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def clear(

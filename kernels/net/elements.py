@@ -13,7 +13,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.element import CPU_OPTIONS, left_out_function
+from ddg_warp.kernels.element import CPU_OPTIONS, left_out_function, until_function
 from ddg_warp.kernels.islands import CLAMPED, ITERATION, SLOT, STATUS
 from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.terms import Term
@@ -269,7 +269,7 @@ def term_kernels(term: Term, real, reverse: bool = False):
 
 
 @cache
-def evaluate_kernel(term: Term, real, linear, exact_from: int | None = None):
+def evaluate_kernel(term: Term, real, linear, exact_from: int | None = None, serial: bool = False):
     """The kernel of a Newton iteration: energy, gradient and Gauss-Newton factor of one term, written a slot.
 
     Factor rows are vectors [strain * slots + slot][element]; `tension_out` holds the scalars of the geometric stiffness; in
@@ -280,7 +280,7 @@ def evaluate_kernel(term: Term, real, linear, exact_from: int | None = None):
     Of terms whose measure has second derivatives `second_out` holds, from iteration `exact_from` on, what F and the geometric
     stiffness leave out of the exact Hessian, packed over the local dofs; before, and in `clamped` worlds, it is not written.
     """
-    Elements = elements_type(real)
+    Elements, until = elements_type(real), until_function(serial)
     measure, density = term.measure, term.density
     V, F = wp.types.vector(3, real), wp.types.vector(3, linear)
     Q, S, E, _ = measure.types(real)
@@ -322,53 +322,54 @@ def evaluate_kernel(term: Term, real, linear, exact_from: int | None = None):
         energy_out: wp.array2d(dtype=real),
         stiffness_out: wp.array(dtype=linear),
     ):
-        tid = wp.tid()
-        world = tid / given.elements
-        if flags[STATUS, world] != 0:
-            return
-        x, s, w, p = gather(given, given.q, tid)
-        e, jacobian = jacobian_of(x, s, w)
-        slope = slope_of(e, p)
-        energy_out[1 - flags[SLOT, world], tid] = w * energy_of(e, p)
-        f = (slope * w) * jacobian
-        for i in range(wp.static(slots_count)):
-            gradient_out[i, tid] = spread(f, i)
-        shift = E()
-        if wp.static(tensions == 1):
-            c, shift = tension_of(x, w, slope)
-            if c < real(0.0) and flags[CLAMPED, world] != 0:
-                c = real(0.0)
-                shift = E()
-            tension_out[0, tid] = linear(c)
-        if wp.static(tensions == 3):
-            c3, _shift = tension_of(x, w, slope)
-            if flags[CLAMPED, world] != 0:
-                c3 = definite(c3)
-            for i in range(3):
-                tension_out[i, tid] = linear(c3[i])
-        root = root_of(e, p, shift)
-        weight = wp.sqrt(w)
-        stiffest = real(0.0)
-        if wp.static(coupled):
-            rows = root * jacobian
-            for m in range(wp.static(n)):
-                stiffest = wp.max(stiffest, w * wp.dot(rows[m], rows[m]))
-                for i in range(wp.static(slots_count)):
-                    v = spread(rows[m] * weight, i)
-                    factor_out[m * wp.static(slots_count) + i, tid] = F(linear(v[0]), linear(v[1]), linear(v[2]))
-        else:
-            for m in range(wp.static(n)):
-                stiffest = wp.max(stiffest, w * root[m] * root[m] * wp.dot(jacobian[m], jacobian[m]))
-                for i in range(wp.static(slots_count)):
-                    u = spread(jacobian[m] * (root[m] * weight), i)
-                    factor_out[m * wp.static(slots_count) + i, tid] = F(linear(u[0]), linear(u[1]), linear(u[2]))
-        stiffness_out[tid] = linear(stiffest)
-        if wp.static(packed > 0):
-            if flags[ITERATION, world] >= wp.static(begin) and flags[CLAMPED, world] == 0:
-                second = curvature_of(x, s, w, slope)
-                if wp.static(left_out is not None):
-                    second = second + left_out(root * weight, e, p, w, jacobian)
-                for i in range(wp.static(packed)):
-                    second_out[i, tid] = linear(second[i])
+        start = wp.tid()
+        for tid in range(start, until(start, stiffness_out.shape[0])):
+            world = tid / given.elements
+            if flags[STATUS, world] != 0:
+                continue
+            x, s, w, p = gather(given, given.q, tid)
+            e, jacobian = jacobian_of(x, s, w)
+            slope = slope_of(e, p)
+            energy_out[1 - flags[SLOT, world], tid] = w * energy_of(e, p)
+            f = (slope * w) * jacobian
+            for i in range(wp.static(slots_count)):
+                gradient_out[i, tid] = spread(f, i)
+            shift = E()
+            if wp.static(tensions == 1):
+                c, shift = tension_of(x, w, slope)
+                if c < real(0.0) and flags[CLAMPED, world] != 0:
+                    c = real(0.0)
+                    shift = E()
+                tension_out[0, tid] = linear(c)
+            if wp.static(tensions == 3):
+                c3, _shift = tension_of(x, w, slope)
+                if flags[CLAMPED, world] != 0:
+                    c3 = definite(c3)
+                for i in range(3):
+                    tension_out[i, tid] = linear(c3[i])
+            root = root_of(e, p, shift)
+            weight = wp.sqrt(w)
+            stiffest = real(0.0)
+            if wp.static(coupled):
+                rows = root * jacobian
+                for m in range(wp.static(n)):
+                    stiffest = wp.max(stiffest, w * wp.dot(rows[m], rows[m]))
+                    for i in range(wp.static(slots_count)):
+                        v = spread(rows[m] * weight, i)
+                        factor_out[m * wp.static(slots_count) + i, tid] = F(linear(v[0]), linear(v[1]), linear(v[2]))
+            else:
+                for m in range(wp.static(n)):
+                    stiffest = wp.max(stiffest, w * root[m] * root[m] * wp.dot(jacobian[m], jacobian[m]))
+                    for i in range(wp.static(slots_count)):
+                        u = spread(jacobian[m] * (root[m] * weight), i)
+                        factor_out[m * wp.static(slots_count) + i, tid] = F(linear(u[0]), linear(u[1]), linear(u[2]))
+            stiffness_out[tid] = linear(stiffest)
+            if wp.static(packed > 0):
+                if flags[ITERATION, world] >= wp.static(begin) and flags[CLAMPED, world] == 0:
+                    second = curvature_of(x, s, w, slope)
+                    if wp.static(left_out is not None):
+                        second = second + left_out(root * weight, e, p, w, jacobian)
+                    for i in range(wp.static(packed)):
+                        second_out[i, tid] = linear(second[i])
 
     return evaluate

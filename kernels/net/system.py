@@ -10,7 +10,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.drag import block_inertia
-from ddg_warp.kernels.element import CPU_OPTIONS
+from ddg_warp.kernels.element import CPU_OPTIONS, until_function
 from ddg_warp.kernels.islands import (
     CLAMPED,
     COEFFICIENT,
@@ -53,12 +53,13 @@ def meeting_type(real, linear):
 
 
 @cache
-def balance_kernel(real, linear, drag: bool = False):
+def balance_kernel(real, linear, drag: bool, serial: bool):
     """balance(...): the residual of every block and whether it balances, the change of its energy along the step from `base`."""
     V, H, Mass = wp.types.vector(3, real), wp.types.vector(3, linear), mass_type(real, drag)
+    until = until_function(serial)
     F, Meeting = wp.types.matrix((3, 3), real), meeting_type(real, linear)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def balance(
         q: wp.array(dtype=V),
         base: wp.array(dtype=V),
@@ -93,87 +94,88 @@ def balance_kernel(real, linear, drag: bool = False):
         `ddg_warp.compile.tolerance`. What rounding leaves of an edge vector follows from the coordinates of both its ends, `longest`
         apart at most. `oblique` is the number of a block's frame among `frames`, -1 without; empty where no block has one.
         """
-        i = wp.tid()
-        w = i / blocks
-        if flags[STATUS, w] != 0:
-            return
-        k = i - w * blocks
-        x = q[i]
-        force = load[i]
-        if wp.static(drag):
-            m = mass[w, k].mass
-        else:
-            m = mass[k]
-        if k < nodes:
-            force += wp.cw_mul(m, gravity[0])
-        c = scalars[COEFFICIENT, w]
-        inertia = wp.cw_mul(m, x - target[i]) * c
-        u = x - base[i]
-        change = wp.dot(u, inertia - wp.cw_mul(m, u) * (real(0.5) * c) - force)
-        stiff = c * wp.max(m)
-        if wp.static(drag):
-            resistance = mass[w, k].resistance
-            held_back = resistance * (x - mass[w, k].carried)
-            inertia += held_back
-            change += wp.dot(u, held_back - resistance * u * real(0.5))
-            stiff += wp.max(wp.get_diag(resistance))
-        size = wp.max(wp.abs(force))
-        force -= inertia
-        noise = wp.abs(change)
-        accepted = flags[SLOT, w]
-        for j in range(sets.shape[0]):
-            own = sets[j]
-            f = V()
-            large = real(0.0)
-            stiffness = linear(0.0)
-            more = real(0.0)
-            rounding = real(0.0)
-            for at in range(own.starts[k], own.starts[k + 1]):
-                item = own.items[at]
-                e = item / own.slots
-                s = item - e * own.slots
-                e += w * own.elements
-                g = own.gradient[s, e]
-                f += g
-                large += wp.max(wp.abs(g))
-                stiffness += own.stiffness[e]
-                if s == 0:
-                    new = own.energy[1 - accepted, e]
-                    more += new - own.energy[accepted, e]
-                    rounding += wp.abs(new)
-            force -= f
-            size += large
-            stiff += real(stiffness)
-            change += more
-            noise += rounding
-        if oblique.shape[0] > 0:
-            if oblique[k] >= 0:
-                force = frames[oblique[k]] * force
-        mask = int(fixed[k])
-        length = wp.where(k < nodes, real(1.0), arm)
-        reach = wp.max(wp.abs(x)) + longest
-        if k >= nodes:
-            reach += real(1.0)
-        limit = rtol * scalars[LOAD_SCALE, w] * allowed[i]
-        least = floor * (stiff * reach + size)
-        least_out[i] = least
-        r = H()
-        square = real(0.0)
-        ratio = real(0.0)
-        for d in range(3):
-            if ((mask >> d) & 1) == 0:
-                ratio = wp.max(ratio, wp.abs(force[d]) / allowed[i])
-                r[d] = linear(force[d])
-                square += force[d] * force[d] / (length * length)
-                if not wp.abs(force[d]) <= limit:
-                    flags[DROWNED, w] = 1
-                    if not wp.abs(force[d]) <= least:
-                        flags[UNBALANCED, w] = 1
-        right_out[i] = r
-        ratio_out[w, k] = ratio
-        square_out[w, k] = square
-        change_out[w, k] = change
-        noise_out[w, k] = noise + real(0.5) * size * reach
+        start = wp.tid()
+        for i in range(start, until(start, q.shape[0])):
+            w = i / blocks
+            if flags[STATUS, w] != 0:
+                continue
+            k = i - w * blocks
+            x = q[i]
+            force = load[i]
+            if wp.static(drag):
+                m = mass[w, k].mass
+            else:
+                m = mass[k]
+            if k < nodes:
+                force += wp.cw_mul(m, gravity[0])
+            c = scalars[COEFFICIENT, w]
+            inertia = wp.cw_mul(m, x - target[i]) * c
+            u = x - base[i]
+            change = wp.dot(u, inertia - wp.cw_mul(m, u) * (real(0.5) * c) - force)
+            stiff = c * wp.max(m)
+            if wp.static(drag):
+                resistance = mass[w, k].resistance
+                held_back = resistance * (x - mass[w, k].carried)
+                inertia += held_back
+                change += wp.dot(u, held_back - resistance * u * real(0.5))
+                stiff += wp.max(wp.get_diag(resistance))
+            size = wp.max(wp.abs(force))
+            force -= inertia
+            noise = wp.abs(change)
+            accepted = flags[SLOT, w]
+            for j in range(sets.shape[0]):
+                own = sets[j]
+                f = V()
+                large = real(0.0)
+                stiffness = linear(0.0)
+                more = real(0.0)
+                rounding = real(0.0)
+                for at in range(own.starts[k], own.starts[k + 1]):
+                    item = own.items[at]
+                    e = item / own.slots
+                    s = item - e * own.slots
+                    e += w * own.elements
+                    g = own.gradient[s, e]
+                    f += g
+                    large += wp.max(wp.abs(g))
+                    stiffness += own.stiffness[e]
+                    if s == 0:
+                        new = own.energy[1 - accepted, e]
+                        more += new - own.energy[accepted, e]
+                        rounding += wp.abs(new)
+                force -= f
+                size += large
+                stiff += real(stiffness)
+                change += more
+                noise += rounding
+            if oblique.shape[0] > 0:
+                if oblique[k] >= 0:
+                    force = frames[oblique[k]] * force
+            mask = int(fixed[k])
+            length = wp.where(k < nodes, real(1.0), arm)
+            reach = wp.max(wp.abs(x)) + longest
+            if k >= nodes:
+                reach += real(1.0)
+            limit = rtol * scalars[LOAD_SCALE, w] * allowed[i]
+            least = floor * (stiff * reach + size)
+            least_out[i] = least
+            r = H()
+            square = real(0.0)
+            ratio = real(0.0)
+            for d in range(3):
+                if ((mask >> d) & 1) == 0:
+                    ratio = wp.max(ratio, wp.abs(force[d]) / allowed[i])
+                    r[d] = linear(force[d])
+                    square += force[d] * force[d] / (length * length)
+                    if not wp.abs(force[d]) <= limit:
+                        flags[DROWNED, w] = 1
+                        if not wp.abs(force[d]) <= least:
+                            flags[UNBALANCED, w] = 1
+            right_out[i] = r
+            ratio_out[w, k] = ratio
+            square_out[w, k] = square
+            change_out[w, k] = change
+            noise_out[w, k] = noise + real(0.5) * size * reach
 
     return balance
 

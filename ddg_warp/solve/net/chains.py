@@ -33,6 +33,7 @@ class Chains:
         if not net.host.rods:
             raise SceneError("preconditioner 'chain' is of nets with rods; this one has none")
         self.net, self.device = net, net.device
+        self.serial = wp.get_device(net.device).is_cpu
         self.plan = ChainPlan(net.host)
         self.along = [i for i, part in enumerate(net.sets) if part.host.along]
         self.banded = banded and len(self.along) <= SETS
@@ -83,7 +84,7 @@ class Chains:
         terms = tuple(net.sets[i].term for i in sets)
         late = tuple(exact_from[i] for i in sets)
         self._assemble, self._clear, self._product = band_kernels(
-            terms, plan.twist, plan.span, real, linear, late, drag
+            terms, plan.twist, plan.span, real, linear, late, drag, self.serial
         )
         own = [self._elements(i, written[i], linear) for i in sets] or [along_type(linear)()]
         self._own = own + own[-1:] * (SETS - len(own))
@@ -111,7 +112,7 @@ class Chains:
         table = self.table
         self._launch(
             self._assemble,
-            (self.longest, self.columns),
+            (1 if self.serial else self.longest, self.columns),
             [matrix, mass, *islands.arrays, self.places, self.chain, self.count, fixed, table.diagonal, table.positions]
             + self._own,
             [self.bands],

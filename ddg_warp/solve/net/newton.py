@@ -46,6 +46,9 @@ class NetNewton:
         self.real, self.linear = model.types.real, linear or model.types.linear
         self.eps = model.types.eps
         worlds, blocks, host, device = net.worlds, net.blocks, net.host, net.device
+        serial = self.serial = wp.get_device(
+            device
+        ).is_cpu  # whether a thread takes all elements or blocks; see `until_function`
         self.worlds, self.all = worlds, worlds * blocks
         V, H = net.vector, wp.types.vector(3, self.linear)
         M = wp.types.matrix((3, 3), self.linear)
@@ -108,7 +111,7 @@ class NetNewton:
         lengths = host.edge_lengths
         self.arm, self.longest = float(lengths.mean()), float(lengths.max())
         self._evaluate = [
-            elements.evaluate_kernel(part.term, self.real, self.linear, first)
+            elements.evaluate_kernel(part.term, self.real, self.linear, first, serial)
             for part, first in zip(net.sets, self.exact_from, strict=True)
         ]
         if self.chains:
@@ -116,7 +119,7 @@ class NetNewton:
         self._direct = self.chains is not None and self.chains.exact
         self._repeat = pcg.repeat_kernel(self.real, False) if any(exact) or self._direct else None
         self.negative = make(worlds, int)
-        self._balance, self._sets = system.balance_kernel(self.real, self.linear, drag), self._meetings()
+        self._balance, self._sets = system.balance_kernel(self.real, self.linear, drag, serial), self._meetings()
         self._no_frames = [make(0, int), make(0, wp.types.matrix((3, 3), self.real))]
         self._assembly = Assembly(net, self.system, self.parts, self.real, self.linear, self.exact_from, drag)
         self._judge, self._measure, self._rotate, self._take, self._move = newton.search_kernels(self.real, self.linear)
@@ -197,7 +200,7 @@ class NetNewton:
         for index, (part, own, kernel) in enumerate(zip(self.net.sets, self.parts, self._evaluate, strict=True)):
             wp.launch(
                 kernel,
-                self.worlds * part.elements,
+                1 if self.serial else self.worlds * part.elements,
                 [self.net.elements(state, index, self.q, self.islands.rate), *self.islands.arrays],
                 [own["factor"], own["tension"], own["second"], own["gradient"], own["energy"], own["stiffness"]],
                 device=self.device,
@@ -208,12 +211,14 @@ class NetNewton:
         """Residuals, the change of the energy, and the worlds that are out of equilibrium."""
         net, options, islands, planes = self.net, self.options, self.islands, self.planes
         frames = [planes.of_blocks, planes.frames[self.real]] if planes else self._no_frames
-        self._launch(
+        wp.launch(
             self._balance,
+            1 if self.serial else self.all,
             [self.q, self.base, self.target, self.mass, self.gravity, self.load, self._sets, *frames, self.fixed]
             + [*islands.arrays, self.allowed.blocks, net.blocks, net.host.nodes, self.arm, self.longest]
             + [options.rtol, options.floor_factor * self.eps],
             [self.right, self.allowed.least, self.allowed.ratio, self.square, self.change, self.noise],
+            device=self.device,
         )
         self.allowed.sum_up(self.right, options.rtol, islands, islands.unbalanced, islands.drowned)
 
