@@ -68,7 +68,9 @@ class NetNewton:
 
         self.q, self.base, self.target = (make(self.all, V) for _ in range(3))
         self.load = wp.array(np.tile(host.load, (worlds, 1)), dtype=V, device=device)
-        self.change, self.noise, self.square, self.dots = (make((worlds, blocks), self.real) for _ in range(4))
+        self._weights, self._weight = make((3, worlds, blocks), self.real), make((3, worlds), self.real)
+        self.change, self.noise, self.square = (self._weights[i] for i in range(3))
+        self.dots = make((worlds, blocks), self.real)
         self.mass = (
             make((worlds, blocks), block_inertia(self.real)) if drag else wp.array(host.mass, dtype=V, device=device)
         )
@@ -87,8 +89,7 @@ class NetNewton:
         self.krylov_dots = make((worlds, blocks), self.linear)
         self.islands = Islands(worlds, self.real, device)
         self.iterations, self.stalled = flags(2)
-        self.sum_change, self.sum_noise, self.sum_square, self.best = scalars(4)
-        self.decrease, self.turn, self.worst, self.goal = scalars(4)
+        self.best, self.decrease, self.turn, self.worst, self.goal = scalars(5)
         self.goal.fill_(math.inf)
         self.forcing, self.rho, self.rho_first, self.total, self.curvature = scalars(5, self.linear)
         self.busy = make(1, int)
@@ -107,6 +108,7 @@ class NetNewton:
         turning = len(ends) + len(spins)
         self.turns = make((worlds, turning), self.real)
         self._sum, self._sum_linear = (Sums(worlds, blocks, dtype, device) for dtype in (self.real, self.linear))
+        self._sum_weights = Sums(3 * worlds, blocks, self.real, device)
         self._largest = Sums(worlds, turning, self.real, device, largest=True)
         lengths = host.edge_lengths
         self.arm, self.longest = float(lengths.mean()), float(lengths.max())
@@ -171,7 +173,7 @@ class NetNewton:
         cycle = [self._move, self._invert, self._start, self._begin, *self._cycle, self._compare, self._confirm]
         parts = [k for part in (self.chains, self.levels, self.planes) if part for k in part.kernels]
         evaluate = [(kernel, 128) for kernel in self._evaluate]
-        sums = (self._sum, self._sum_linear, self._largest, self._worst)
+        sums = (self._sum, self._sum_linear, self._sum_weights, self._largest, self._worst)
         sums = [(k, krylov.THREADS) for part in sums for k in part.kernels]
         return [*own, *cycle, *evaluate, *self._assembly.kernels, *parts, *sums]
 
@@ -225,14 +227,12 @@ class NetNewton:
     def judge(self) -> None:
         """Stop worlds, reject their iterates, or ask for a direction."""
         options = self.options
-        self._sum(self.change, self.sum_change)
-        self._sum(self.noise, self.sum_noise)
-        self._sum(self.square, self.sum_square)
+        self._sum_weights(self._weights.reshape((3 * self.worlds, -1)), self._weight.flatten())
         self._worst(self.allowed.ratio, self.worst)
         wp.launch(
             self._judge,
             self.worlds,
-            [self.sum_change, self.sum_noise, self.sum_square, self.worst, options.rtol]
+            [*(self._weight[i] for i in range(3)), self.worst, options.rtol]
             + [options.floor_factor * self.eps]
             + [options.max_iterations, options.max_halvings, LOOSEST, options.linear_rtol, SPARE]
             + [*self.islands.arrays, self.best, self.stalled, self.forcing, self.goal],
