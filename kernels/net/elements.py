@@ -268,11 +268,46 @@ def term_kernels(term: Term, real, reverse: bool = False):
     return energy, gradient, hessian, strains, linear_stress
 
 
+def factor_type(linear, local: bool):
+    """Rows of factors: of the local dofs, or vectors a slot."""
+    return wp.array2d(dtype=linear if local else wp.types.vector(3, linear))
+
+
 @cache
-def evaluate_kernel(term: Term, real, linear, exact_from: int | None = None, serial: bool = False):
+def part_function(measure: Measure, real):
+    """part(f, row, slot, e): of rows of local dofs that begin at `row`, what belongs to a slot of element e.
+
+    For measures where one edge at most ends, and one starts, in a node; see `Measure.ends`.
+    """
+    V, I = wp.types.vector(3, real), wp.types.vector(measure.slots, int)
+    plus, minus = (I(*of) for of in measure.ends)
+    first = 3 * len(measure.edges)
+    spins = first + measure.angles
+
+    @wp.func
+    def part(f: wp.array2d(dtype=real), row: int, slot: int, e: int):
+        v = V()
+        p = plus[slot]
+        m = minus[slot]
+        if p >= wp.static(first) and p < wp.static(spins):
+            v[0] = f[row + p, e]
+        else:
+            for d in range(3):
+                if p >= 0:
+                    v[d] = f[row + p + d, e]
+                if m >= 0:
+                    v[d] = v[d] - f[row + m + d, e]
+        return v
+
+    return part
+
+
+@cache
+def evaluate_kernel(term: Term, real, linear, exact_from: int | None = None, local: bool = False, serial: bool = False):
     """The kernel of a Newton iteration: energy, gradient and Gauss-Newton factor of one term, written a slot.
 
-    Factor rows are vectors [strain * slots + slot][element]; `tension_out` holds the scalars of the geometric stiffness; in
+    Factor rows are vectors [strain * slots + slot][element], or if `local` reals [strain * size + dof][element], as the gradient, which
+    then is of the local dofs, too; `tension_out` holds the scalars of the geometric stiffness; in
     worlds that are `clamped` they are made positive semi-definite (an edge under compression, a triangle by the eigenvalues of
     its two-by-two stress, leaves out the negative part). Energies go to the half of `energy_out` that the line search does not
     hold. `stiffness_out` is the largest that a strain has against moving the element.
@@ -293,6 +328,19 @@ def evaluate_kernel(term: Term, real, linear, exact_from: int | None = None, ser
     begin, packed = exact_from or 0, measure.packed if exact_from is not None else 0
     left_out = left_out_function(term, real) if packed else None
     options = CPU_OPTIONS | {"max_unroll": packed} if packed else CPU_OPTIONS
+    Factor, Gradient = factor_type(linear, local), wp.array2d(dtype=real if local else V)
+    size = measure.size
+
+    @wp.func
+    def put(factor: Factor, m: int, row: Q, e: int):
+        """Row m of the factor."""
+        if wp.static(local):
+            for i in range(wp.static(size)):
+                factor[m * wp.static(size) + i, e] = linear(row[i])
+        else:
+            for i in range(wp.static(slots_count)):
+                v = spread(row, i)
+                factor[m * wp.static(slots_count) + i, e] = F(linear(v[0]), linear(v[1]), linear(v[2]))
 
     @wp.func
     def definite(c: C):
@@ -315,10 +363,10 @@ def evaluate_kernel(term: Term, real, linear, exact_from: int | None = None, ser
         given: Elements,
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
-        factor_out: wp.array2d(dtype=F),
+        factor_out: Factor,
         tension_out: wp.array2d(dtype=linear),
         second_out: wp.array2d(dtype=linear),
-        gradient_out: wp.array2d(dtype=V),
+        gradient_out: Gradient,
         energy_out: wp.array2d(dtype=real),
         stiffness_out: wp.array(dtype=linear),
     ):
@@ -332,8 +380,12 @@ def evaluate_kernel(term: Term, real, linear, exact_from: int | None = None, ser
             slope = slope_of(e, p)
             energy_out[1 - flags[SLOT, world], tid] = w * energy_of(e, p)
             f = (slope * w) * jacobian
-            for i in range(wp.static(slots_count)):
-                gradient_out[i, tid] = spread(f, i)
+            if wp.static(local):
+                for i in range(wp.static(size)):
+                    gradient_out[i, tid] = f[i]
+            else:
+                for i in range(wp.static(slots_count)):
+                    gradient_out[i, tid] = spread(f, i)
             shift = E()
             if wp.static(tensions == 1):
                 c, shift = tension_of(x, w, slope)
@@ -354,15 +406,11 @@ def evaluate_kernel(term: Term, real, linear, exact_from: int | None = None, ser
                 rows = root * jacobian
                 for m in range(wp.static(n)):
                     stiffest = wp.max(stiffest, w * wp.dot(rows[m], rows[m]))
-                    for i in range(wp.static(slots_count)):
-                        v = spread(rows[m] * weight, i)
-                        factor_out[m * wp.static(slots_count) + i, tid] = F(linear(v[0]), linear(v[1]), linear(v[2]))
+                    put(factor_out, m, rows[m] * weight, tid)
             else:
                 for m in range(wp.static(n)):
                     stiffest = wp.max(stiffest, w * root[m] * root[m] * wp.dot(jacobian[m], jacobian[m]))
-                    for i in range(wp.static(slots_count)):
-                        u = spread(jacobian[m] * (root[m] * weight), i)
-                        factor_out[m * wp.static(slots_count) + i, tid] = F(linear(u[0]), linear(u[1]), linear(u[2]))
+                    put(factor_out, m, jacobian[m] * (root[m] * weight), tid)
             stiffness_out[tid] = linear(stiffest)
             if wp.static(packed > 0):
                 if flags[ITERATION, world] >= wp.static(begin) and flags[CLAMPED, world] == 0:

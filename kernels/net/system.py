@@ -23,6 +23,7 @@ from ddg_warp.kernels.islands import (
     WANTED,
 )
 from ddg_warp.kernels.measures import Measure
+from ddg_warp.kernels.net.elements import factor_type, part_function
 from ddg_warp.kernels.terms import Term
 
 SLICE = 32  # rows of a slice of H
@@ -36,95 +37,208 @@ def mass_type(real, drag: bool):
 
 @cache
 def meeting_type(real, linear):
-    """What the elements of a set bring to the blocks that they meet at; an item is element * slots + slot."""
+    """What the elements of a set bring to the blocks that they meet at; an item is element * `ITEM` + slot.
+
+    The gradient is that of the slots; or `along`, of the local dofs, of which the `ends` (`Measure.ends`) belong to a slot.
+    """
     V = wp.types.vector(3, real)
 
     @wp.struct
     class Meeting:
         gradient: wp.array2d(dtype=V)
+        along: wp.array2d(dtype=real)
+        ends: wp.array2d(dtype=int)
         energy: wp.array2d(dtype=real)
         stiffness: wp.array(dtype=linear)
         starts: wp.array(dtype=int)
         items: wp.array(dtype=int)
-        slots: int
+        nodes: int
         elements: int
 
     return Meeting
 
 
 @cache
+def given_type(real, drag: bool):
+    """What the balance of blocks reads beside the elements.
+
+    `allowed` is what the residual of a block may be at rtol = 1, over `load_scale`; see `ddg_warp.compile.tolerance`. Moments are
+    compared over the length `arm`. What rounding leaves of an edge vector follows from the coordinates of both its ends, `longest`
+    apart at most.
+    """
+    V, Mass = wp.types.vector(3, real), mass_type(real, drag)
+
+    @wp.struct
+    class Given:
+        q: wp.array(dtype=V)
+        base: wp.array(dtype=V)
+        target: wp.array(dtype=V)
+        mass: Mass
+        gravity: wp.array(dtype=V)
+        load: wp.array(dtype=V)
+        fixed: wp.array(dtype=wp.uint8)
+        allowed: wp.array(dtype=real)
+        blocks: int
+        nodes: int
+        arm: real
+        longest: real
+        rtol: real
+        floor: real
+
+    return Given
+
+
+@cache
+def found_type(real, linear):
+    """What the balance of blocks writes: residuals of free dofs, what rounding leaves there, how often they are what they may be, their
+    squares, the change of the energy along the step from `base`, and its rounding."""
+    H = wp.types.vector(3, linear)
+
+    @wp.struct
+    class Found:
+        right: wp.array(dtype=H)
+        least: wp.array(dtype=real)
+        ratio: wp.array2d(dtype=real)
+        square: wp.array2d(dtype=real)
+        change: wp.array2d(dtype=real)
+        noise: wp.array2d(dtype=real)
+
+    return Found
+
+
+@cache
+def residual_functions(real, linear, drag: bool):
+    """outer(...): loads, gravity, inertia and drag of a block; settle(...): its residual, and whether that balances."""
+    V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
+    Given, Found = given_type(real, drag), found_type(real, linear)
+
+    @wp.func
+    def outer(given: Given, i: int, k: int, w: int, c: real):
+        """Force; its size and stiffness, the work along the step."""
+        x = given.q[i]
+        force = given.load[i]
+        if wp.static(drag):
+            m = given.mass[w, k].mass
+        else:
+            m = given.mass[k]
+        if k < given.nodes:
+            force += wp.cw_mul(m, given.gravity[0])
+        inertia = wp.cw_mul(m, x - given.target[i]) * c
+        u = x - given.base[i]
+        change = wp.dot(u, inertia - wp.cw_mul(m, u) * (real(0.5) * c) - force)
+        stiff = c * wp.max(m)
+        if wp.static(drag):
+            resistance = given.mass[w, k].resistance
+            held_back = resistance * (x - given.mass[w, k].carried)
+            inertia += held_back
+            change += wp.dot(u, held_back - resistance * u * real(0.5))
+            stiff += wp.max(wp.get_diag(resistance))
+        return force - inertia, wp.max(wp.abs(force)), stiff, change
+
+    @wp.func
+    def settle(
+        given: Given,
+        found: Found,
+        flags: wp.array2d(dtype=int),
+        load_scale: real,
+        i: int,
+        k: int,
+        w: int,
+        force: V,
+        size: real,
+        stiff: real,
+        change: real,
+        noise: real,
+    ):
+        """See `kernels.balance` for the criterion."""
+        mask = int(given.fixed[k])
+        length = wp.where(k < given.nodes, real(1.0), given.arm)
+        reach = wp.max(wp.abs(given.q[i])) + given.longest
+        if k >= given.nodes:
+            reach += real(1.0)
+        limit = given.rtol * load_scale * given.allowed[i]
+        least = given.floor * (stiff * reach + size)
+        found.least[i] = least
+        r = H()
+        square = real(0.0)
+        ratio = real(0.0)
+        for d in range(3):
+            if ((mask >> d) & 1) == 0:
+                ratio = wp.max(ratio, wp.abs(force[d]) / given.allowed[i])
+                r[d] = linear(force[d])
+                square += force[d] * force[d] / (length * length)
+                if not wp.abs(force[d]) <= limit:
+                    flags[DROWNED, w] = 1
+                    if not wp.abs(force[d]) <= least:
+                        flags[UNBALANCED, w] = 1
+        found.right[i] = r
+        found.ratio[w, k] = ratio
+        found.square[w, k] = square
+        found.change[w, k] = change
+        found.noise[w, k] = noise + real(0.5) * size * reach
+
+    return outer, settle
+
+
+ITEM = 16  # in an item, an element of a set counts as much, and its slots one each
+
+
+@cache
 def balance_kernel(real, linear, drag: bool, serial: bool):
-    """balance(...): the residual of every block and whether it balances, the change of its energy along the step from `base`."""
-    V, H, Mass = wp.types.vector(3, real), wp.types.vector(3, linear), mass_type(real, drag)
+    """balance(...) of the blocks `some`, or, where these are none, of all."""
+    V, Meeting = wp.types.vector(3, real), meeting_type(real, linear)
+    Given, Found, F = given_type(real, drag), found_type(real, linear), wp.types.matrix((3, 3), real)
     until = until_function(serial)
-    F, Meeting = wp.types.matrix((3, 3), real), meeting_type(real, linear)
+    outer, settle = residual_functions(real, linear, drag)
+
+    @wp.func
+    def force_of(own: Meeting, slot: int, e: int):
+        if own.ends.shape[0] == 0:
+            return own.gradient[slot, e]
+        f = V()
+        plus = own.ends[slot, 0]
+        minus = own.ends[slot, 1]
+        if slot >= own.nodes:
+            f[0] = own.along[plus, e]
+        else:
+            for d in range(3):
+                if plus >= 0:
+                    f[d] = own.along[plus + d, e]
+                if minus >= 0:
+                    f[d] = f[d] - own.along[minus + d, e]
+        return f
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def balance(
-        q: wp.array(dtype=V),
-        base: wp.array(dtype=V),
-        target: wp.array(dtype=V),
-        mass: Mass,
-        gravity: wp.array(dtype=V),
-        load: wp.array(dtype=V),
+        given: Given,
+        some: wp.array(dtype=int),
         sets: wp.array(dtype=Meeting),
         oblique: wp.array(dtype=int),
         frames: wp.array(dtype=F),
-        fixed: wp.array(dtype=wp.uint8),
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
-        allowed: wp.array(dtype=real),
-        blocks: int,
-        nodes: int,
-        arm: real,
-        longest: real,
-        rtol: real,
-        floor: real,
-        right_out: wp.array(dtype=H),
-        least_out: wp.array(dtype=real),
-        ratio_out: wp.array2d(dtype=real),
-        square_out: wp.array2d(dtype=real),
-        change_out: wp.array2d(dtype=real),
-        noise_out: wp.array2d(dtype=real),
+        count: int,
+        total: int,
+        found: Found,
     ):
-        """Loads, gravity and inertia, then the forces of all sets; the first slot of an element brings its energy.
+        """`count` blocks in each world, in all worlds `total`. The first slot of an element brings its energy.
 
-        Residuals are those of free dofs, their squares with moments over the length `arm`; see `kernels.balance` for the criterion.
-        `allowed` is what the residual of a block may be at rtol = 1, over `load_scale`, and `ratio_out` how often it is that; see
-        `ddg_warp.compile.tolerance`. What rounding leaves of an edge vector follows from the coordinates of both its ends, `longest`
-        apart at most. `oblique` is the number of a block's frame among `frames`, -1 without; empty where no block has one.
+        `oblique` is the number of a block's frame among `frames`, -1 without; empty where no block has one.
         """
         start = wp.tid()
-        for i in range(start, until(start, q.shape[0])):
-            w = i / blocks
+        for j in range(start, until(start, total)):
+            w = j / count
             if flags[STATUS, w] != 0:
                 continue
-            k = i - w * blocks
-            x = q[i]
-            force = load[i]
-            if wp.static(drag):
-                m = mass[w, k].mass
-            else:
-                m = mass[k]
-            if k < nodes:
-                force += wp.cw_mul(m, gravity[0])
-            c = scalars[COEFFICIENT, w]
-            inertia = wp.cw_mul(m, x - target[i]) * c
-            u = x - base[i]
-            change = wp.dot(u, inertia - wp.cw_mul(m, u) * (real(0.5) * c) - force)
-            stiff = c * wp.max(m)
-            if wp.static(drag):
-                resistance = mass[w, k].resistance
-                held_back = resistance * (x - mass[w, k].carried)
-                inertia += held_back
-                change += wp.dot(u, held_back - resistance * u * real(0.5))
-                stiff += wp.max(wp.get_diag(resistance))
-            size = wp.max(wp.abs(force))
-            force -= inertia
+            k = j - w * count
+            if some.shape[0] > 0:
+                k = some[k]
+            i = k + w * given.blocks
+            force, size, stiff, change = outer(given, i, k, w, scalars[COEFFICIENT, w])
             noise = wp.abs(change)
             accepted = flags[SLOT, w]
-            for j in range(sets.shape[0]):
-                own = sets[j]
+            for n in range(sets.shape[0]):
+                own = sets[n]
                 f = V()
                 large = real(0.0)
                 stiffness = linear(0.0)
@@ -132,14 +246,13 @@ def balance_kernel(real, linear, drag: bool, serial: bool):
                 rounding = real(0.0)
                 for at in range(own.starts[k], own.starts[k + 1]):
                     item = own.items[at]
-                    e = item / own.slots
-                    s = item - e * own.slots
-                    e += w * own.elements
-                    g = own.gradient[s, e]
+                    slot = item % wp.static(ITEM)
+                    e = item // wp.static(ITEM) + w * own.elements
+                    g = force_of(own, slot, e)
                     f += g
                     large += wp.max(wp.abs(g))
                     stiffness += own.stiffness[e]
-                    if s == 0:
+                    if slot == 0:
                         new = own.energy[1 - accepted, e]
                         more += new - own.energy[accepted, e]
                         rounding += wp.abs(new)
@@ -151,43 +264,19 @@ def balance_kernel(real, linear, drag: bool, serial: bool):
             if oblique.shape[0] > 0:
                 if oblique[k] >= 0:
                     force = frames[oblique[k]] * force
-            mask = int(fixed[k])
-            length = wp.where(k < nodes, real(1.0), arm)
-            reach = wp.max(wp.abs(x)) + longest
-            if k >= nodes:
-                reach += real(1.0)
-            limit = rtol * scalars[LOAD_SCALE, w] * allowed[i]
-            least = floor * (stiff * reach + size)
-            least_out[i] = least
-            r = H()
-            square = real(0.0)
-            ratio = real(0.0)
-            for d in range(3):
-                if ((mask >> d) & 1) == 0:
-                    ratio = wp.max(ratio, wp.abs(force[d]) / allowed[i])
-                    r[d] = linear(force[d])
-                    square += force[d] * force[d] / (length * length)
-                    if not wp.abs(force[d]) <= limit:
-                        flags[DROWNED, w] = 1
-                        if not wp.abs(force[d]) <= least:
-                            flags[UNBALANCED, w] = 1
-            right_out[i] = r
-            ratio_out[w, k] = ratio
-            square_out[w, k] = square
-            change_out[w, k] = change
-            noise_out[w, k] = noise + real(0.5) * size * reach
+            settle(given, found, flags, scalars[LOAD_SCALE, w], i, k, w, force, size, stiff, change, noise)
 
     return balance
 
 
 @cache
-def contributions(linear):
-    """What a set adds to H: its factor rows, geometric stiffness, second derivatives, and the items of each position."""
-    H = wp.types.vector(3, linear)
+def contributions(linear, local: bool):
+    """What a set adds to H: its factor rows (see `factor_type`), geometric stiffness, second derivatives, items of each position."""
+    Factor = factor_type(linear, local)
 
     @wp.struct
     class Contributions:
-        factor: wp.array2d(dtype=H)
+        factor: Factor
         tension: wp.array2d(dtype=linear)
         second: wp.array2d(dtype=linear)
         starts: wp.array(dtype=int)
@@ -199,19 +288,11 @@ def contributions(linear):
 
 @cache
 def second_function(measure: Measure, linear):
-    """block(second, e, a, b): what the packed second derivatives of an element (`Measure.packed`) are between two of its slots.
-
-    A node sees the edge that ends in it with weight 1 and that which starts in it with -1, angles and rotations see themselves.
-    """
+    """block(second, e, a, b): what the packed second derivatives of an element (`Measure.packed`) are between two of its slots."""
     size, angles = measure.size, 3 * len(measure.edges)
     spins = angles + measure.angles
-    own = [*range(angles, spins), *range(spins, size, 3)]  # first dofs of angles and rotations
-    ends = [{edge[end]: 3 * i for i, edge in enumerate(measure.edges)} for end in (0, 1)]
     M, I = wp.types.matrix((3, 3), linear), wp.types.vector(measure.slots, int)
-    minus, plus = (
-        I(*(end.get(node, -1) for node in range(measure.nodes)), *more)
-        for end, more in zip(ends, ([-1] * len(own), own), strict=True)
-    )
+    plus, minus = (I(*of) for of in measure.ends)
 
     @wp.func
     def part(second: wp.array2d(dtype=linear), e: int, p: int, q: int):
@@ -236,7 +317,7 @@ def second_function(measure: Measure, linear):
 
 
 @cache
-def sum_function(term: Term, linear, exact: bool):
+def sum_function(term: Term, linear, exact: bool, local: bool):
     """add(contributions, position, world, late): F^T F and geometric stiffness of one set.
 
     If `exact`, also the second derivatives, where it is `late` enough for these.
@@ -244,10 +325,19 @@ def sum_function(term: Term, linear, exact: bool):
     An item is (element * slots + row's slot) * slots + column's slot.
     """
     measure = term.measure
-    M, Contributions = wp.types.matrix((3, 3), linear), contributions(linear)
-    n, slots, tensions = len(measure.strains), measure.slots, measure.tensions
+    M, Contributions = wp.types.matrix((3, 3), linear), contributions(linear, local)
+    n, slots, size, tensions = len(measure.strains), measure.slots, measure.size, measure.tensions
     edges = measure.edges[:2]  # geometric stiffness is between the first two
     second_of = second_function(measure, linear) if exact else None
+    part = part_function(measure, linear) if local else None
+
+    @wp.func
+    def row(own: Contributions, m: int, slot: int, e: int):
+        """What a row of the factor has for a slot."""
+        if wp.static(local):
+            return part(own.factor, m * wp.static(size), slot, e)
+        else:
+            return own.factor[m * wp.static(slots) + slot, e]
 
     @wp.func
     def weight(edge_first: int, edge_second: int, slot: int):
@@ -281,7 +371,7 @@ def sum_function(term: Term, linear, exact: bool):
             a = pair - e * wp.static(slots)
             e += w * own.elements
             for i in range(wp.static(n)):
-                m += wp.outer(own.factor[i * wp.static(slots) + a, e], own.factor[i * wp.static(slots) + b, e])
+                m += wp.outer(row(own, i, a, e), row(own, i, b, e))
             if wp.static(tensions > 0):
                 c = geometric(own.tension, e, a, b)
                 for d in range(3):
@@ -299,18 +389,28 @@ SETS = 6  # sets that one launch sums
 
 @cache
 def assemble_kernel(
-    terms: tuple[Term, ...], real, linear, begins: bool, exact_from: tuple[int | None, ...], drag: bool = False
+    terms: tuple[Term, ...],
+    real,
+    linear,
+    begins: bool,
+    exact_from: tuple[int | None, ...],
+    local: tuple[bool, ...],
+    drag: bool = False,
 ):
     """H of up to `SETS` sets, a thread a position, with inertia and drag where it `begins`; else it adds to what is there.
 
-    `exact_from` says of each set from which iteration on it has second derivatives, one for all, or None where it has none.
+    `exact_from` says of each set from which iteration on it has second derivatives, one for all, or None where it has none; `local`,
+    how its factor is written.
     """
     M, Mass = wp.types.matrix((3, 3), linear), mass_type(real, drag)
-    Contributions = contributions(linear)
-    sums = tuple(sum_function(term, linear, first is not None) for term, first in zip(terms, exact_from, strict=True))
+    sums = tuple(
+        sum_function(term, linear, first is not None, own)
+        for term, first, own in zip(terms, exact_from, local, strict=True)
+    )
     begin = next((first for first in exact_from if first is not None), 0)
     count = len(terms)
     last = count - 1
+    Own0, Own1, Own2, Own3, Own4, Own5 = (contributions(linear, local[min(i, last)]) for i in range(SETS))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def assemble(
@@ -320,12 +420,12 @@ def assemble_kernel(
         rows: wp.array(dtype=int),
         columns: wp.array(dtype=int),
         positions: int,
-        own0: Contributions,
-        own1: Contributions,
-        own2: Contributions,
-        own3: Contributions,
-        own4: Contributions,
-        own5: Contributions,
+        own0: Own0,
+        own1: Own1,
+        own2: Own2,
+        own3: Own3,
+        own4: Own4,
+        own5: Own5,
         matrix: wp.array2d(dtype=linear),
     ):
         p = wp.tid()

@@ -6,7 +6,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.net import chains, joints
-from ddg_warp.kernels.net.bands import along_type, band_kernels
+from ddg_warp.kernels.net.bands import along_type, band_kernels, place_kernel
 from ddg_warp.kernels.net.system import SETS
 from ddg_warp.solve.choice import long_and_few
 from ddg_warp.solve.net.system import lists
@@ -86,8 +86,13 @@ class Chains:
         self._assemble, self._clear, self._product = band_kernels(
             terms, plan.twist, plan.span, real, linear, late, drag, self.serial
         )
-        own = [self._elements(i, written[i], linear) for i in sets] or [along_type(linear)()]
+        own = [self._elements(i, written[i], real, linear) for i in sets] or [along_type(real, linear)()]
         self._own = own + own[-1:] * (SETS - len(own))
+        if self.banded:
+            self._balance = place_kernel(terms, plan.twist, real, linear, drag, self.serial)
+            apart = np.zeros(net.blocks, np.uint8)
+            apart[self.elsewhere()] = 1
+            self._apart = wp.array(apart, dtype=wp.uint8, device=device)
         made = chains.chain_kernels(plan.twist, plan.span, linear, plan.size)
         self._factorise, self._load, self._solve, self._solve_all, self._follow, self._finish, *self._columns = made
         self._measure, self._meet = joints.joint_kernels(linear) if self.joints else (None, None)
@@ -102,10 +107,28 @@ class Chains:
             own += [
                 (kernel, SERIAL) for kernel in (self._factorise, self._solve, *([self._solve_all] * bool(self.joints)))
             ]
+        own += [self._balance] if self.banded else []
         own += [self._clear] if self.banded and self.taken.size else []
         own += [self._product] if self.banded and not self.exact else []
         own += [self._follow] if self.met is not None else []
         return own + ([self._measure, self._meet] if self.joints else [])
+
+    def elsewhere(self) -> np.ndarray:
+        """Blocks that are not at a place, or at which elements meet that do not run along rods."""
+        found = self.plan.where < 0
+        for part in self.net.sets:
+            if not part.host.along:
+                found[part.host.slots.ravel()] = True
+        return np.flatnonzero(found)
+
+    def balance(self, given, islands, found) -> None:
+        """Residuals of all blocks but those `elsewhere`."""
+        self._launch(
+            self._balance,
+            (1 if self.serial else self.longest, self.columns),
+            [given, self.places, self.count, self._apart, *islands.arrays, *self._own],
+            [found],
+        )
 
     def assemble(self, matrix: wp.array, mass: wp.array, fixed: wp.array, islands) -> None:
         """Blocks of the chains of the worlds that want a direction."""
@@ -220,10 +243,11 @@ class Chains:
                 self._launch(note, self.columns, [self.width], [self._bad, self._lost])
             self._reduced = True
 
-    def _elements(self, index: int, written: dict, linear):
+    def _elements(self, index: int, written: dict, real, linear):
         """What the elements of a set write, and where they are."""
-        part, own = self.net.sets[index], along_type(linear)()
-        own.factor, own.tension, own.second = (written[name] for name in ("factor", "tension", "second"))
+        part, own = self.net.sets[index], along_type(real, linear)()
+        for name, array in written.items():
+            setattr(own, name, array)
         own.at = arrays.upload(self.plan.elements(self.net.host, part.host).astype(np.int32), int, self.device)
         own.elements = part.elements
         return own

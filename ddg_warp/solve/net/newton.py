@@ -97,7 +97,9 @@ class NetNewton:
         self.psd = self.automatic_psd() if options.psd == "auto" else options.psd
         exact = [self.psd == "progressive" and part.term.measure.packed > 0 for part in net.sets]
         self.exact_from = tuple(EARLY if wanted else None for wanted in exact)
-        self.parts = [self._part(*given, make, H) for given in zip(net.sets, exact, strict=True)]
+        banded = self.chains is not None and self.chains.banded
+        self.local = tuple(banded and part.host.along for part in net.sets)  # whether derivatives are of the local dofs
+        self.parts = [self._part(*given, make, H) for given in zip(net.sets, exact, self.local, strict=True)]
         ends = host.edges
         self.ends = wp.array(np.ascontiguousarray(ends, np.int32), dtype=int, device=device)
         # curvature is linear in the angles of mesh edges: they need no cap, which would shorten the steps of all else
@@ -113,8 +115,8 @@ class NetNewton:
         lengths = host.edge_lengths
         self.arm, self.longest = float(lengths.mean()), float(lengths.max())
         self._evaluate = [
-            elements.evaluate_kernel(part.term, self.real, self.linear, first, serial)
-            for part, first in zip(net.sets, self.exact_from, strict=True)
+            elements.evaluate_kernel(part.term, self.real, self.linear, *kind, serial)
+            for part, *kind in zip(net.sets, self.exact_from, self.local, strict=True)
         ]
         if self.chains:
             self.chains.bind(self.system, self.parts, self.real, self.linear, self.exact_from, drag)
@@ -123,7 +125,9 @@ class NetNewton:
         self.negative = make(worlds, int)
         self._balance, self._sets = system.balance_kernel(self.real, self.linear, drag, serial), self._meetings()
         self._no_frames = [make(0, int), make(0, wp.types.matrix((3, 3), self.real))]
-        self._assembly = Assembly(net, self.system, self.parts, self.real, self.linear, self.exact_from, drag)
+        self._assembly = Assembly(
+            net, self.system, self.parts, self.real, self.linear, self.exact_from, self.local, drag
+        )
         self._judge, self._measure, self._rotate, self._take, self._move = newton.search_kernels(self.real, self.linear)
         self._invert, self._start, self._begin, *self._cycle = krylov.solver_kernels(self.linear)
         self._compare, self._confirm = krylov.confirm_kernels(self.real, self.linear)
@@ -131,6 +135,12 @@ class NetNewton:
         self._unread = flags(2)
         outer = outer_forces(host, gravity)
         self.outer = self.allowed.assign(self.allowed.bodies.loads(outer)[None])
+        some = self.chains.elsewhere() if banded else np.zeros(0, int)
+        self._some, self._rest = (
+            wp.array(some.astype(np.int32), dtype=int, device=device),
+            len(some) if banded else blocks,
+        )
+        self._given, self._found = self._balance_arguments(drag)
         self._worst = Sums(worlds, self.allowed.ratio.shape[1], self.real, device, largest=True)
         several = preconditioner in ("multilevel", "chain_multilevel")
         self.levels = Multilevel(net, self.system, self.linear) if several else None
@@ -142,27 +152,46 @@ class NetNewton:
         turns = (part.parameters[name] * part.parameters["measure"] for part in bending for name in part.term.rest)
         return "progressive" if any(np.abs(turn).max() > STRAIGHT for turn in turns) else "gauss_newton"
 
-    def _part(self, part, exact: bool, make, H) -> dict:
+    def _part(self, part, exact: bool, local: bool, make, H) -> dict:
         """What the elements of a set write."""
         measure, count = part.term.measure, self.worlds * part.elements
+        rows, factor, gradient = (
+            (measure.size, self.linear, self.real) if local else (measure.slots, H, self.net.vector)
+        )
         return {
-            "factor": make((len(measure.strains) * measure.slots, count), H),
+            "factor": make((len(measure.strains) * rows, count), factor),
             "tension": make((max(1, measure.tensions), count), self.linear),
             "second": make((measure.packed, count) if exact else (1, 1), self.linear),
-            "gradient": make((measure.slots, count), self.net.vector),
+            "gradient": make((rows, count), gradient),
             "energy": make((2, count), self.real),
             "stiffness": make(count, self.linear),
         }
 
+    def _balance_arguments(self, drag: bool) -> tuple:
+        """What the balance reads and writes."""
+        given, found = system.given_type(self.real, drag)(), system.found_type(self.real, self.linear)()
+        for name in ("q", "base", "target", "mass", "gravity", "load", "fixed", "arm", "longest"):
+            setattr(given, name, getattr(self, name))
+        given.allowed, given.blocks, given.nodes = self.allowed.blocks, self.net.blocks, self.net.host.nodes
+        given.rtol, given.floor = self.options.rtol, self.options.floor_factor * self.eps
+        for name in ("right", "square", "change", "noise"):
+            setattr(found, name, getattr(self, name))
+        found.least, found.ratio = self.allowed.least, self.allowed.ratio
+        return given, found
+
     def _meetings(self) -> wp.array:
         """What the elements of all sets bring to the blocks."""
         sets = []
-        for part, own, (starts, items) in zip(self.net.sets, self.parts, self.system.meets, strict=True):
-            meeting = system.meeting_type(self.real, self.linear)()
-            meeting.gradient, meeting.energy, meeting.stiffness = own["gradient"], own["energy"], own["stiffness"]
-            meeting.starts, meeting.items = starts, items
-            meeting.slots, meeting.elements = part.term.measure.slots, part.elements
+        nothing = [wp.zeros((1, 1), dtype=kind, device=self.device) for kind in (self.net.vector, self.real)]
+        for part, own, local, meets in zip(self.net.sets, self.parts, self.local, self.system.meets, strict=True):
+            meeting, measure = system.meeting_type(self.real, self.linear)(), part.term.measure
+            meeting.gradient, meeting.along = (nothing[0], own["gradient"]) if local else (own["gradient"], nothing[1])
+            ends = np.transpose(measure.ends).astype(np.int32) if local else np.zeros((0, 2), np.int32)
+            meeting.ends = wp.array(ends, dtype=int, device=self.device)
+            meeting.energy, meeting.stiffness, (meeting.starts, meeting.items) = own["energy"], own["stiffness"], meets
+            meeting.nodes, meeting.elements = measure.nodes, part.elements
             sets.append(meeting)
+        self._meeting = sets  # an array of structures holds no arrays alive
         return wp.array(sets, dtype=system.meeting_type(self.real, self.linear), device=self.device)
 
     @property
@@ -211,18 +240,18 @@ class NetNewton:
 
     def balance(self) -> None:
         """Residuals, the change of the energy, and the worlds that are out of equilibrium."""
-        net, options, islands, planes = self.net, self.options, self.islands, self.planes
+        islands, planes, total = self.islands, self.planes, self.worlds * self._rest
+        if self.chains and self.chains.banded:
+            self.chains.balance(self._given, islands, self._found)
         frames = [planes.of_blocks, planes.frames[self.real]] if planes else self._no_frames
         wp.launch(
             self._balance,
-            1 if self.serial else self.all,
-            [self.q, self.base, self.target, self.mass, self.gravity, self.load, self._sets, *frames, self.fixed]
-            + [*islands.arrays, self.allowed.blocks, net.blocks, net.host.nodes, self.arm, self.longest]
-            + [options.rtol, options.floor_factor * self.eps],
-            [self.right, self.allowed.least, self.allowed.ratio, self.square, self.change, self.noise],
+            min(1, total) if self.serial else total,
+            [self._given, self._some, self._sets, *frames, *islands.arrays, self._rest, total],
+            [self._found],
             device=self.device,
         )
-        self.allowed.sum_up(self.right, options.rtol, islands, islands.unbalanced, islands.drowned)
+        self.allowed.sum_up(self.right, self.options.rtol, islands, islands.unbalanced, islands.drowned)
 
     def judge(self) -> None:
         """Stop worlds, reject their iterates, or ask for a direction."""

@@ -59,7 +59,9 @@ class NetSystem:
             targets, at = place[inverse[at : at + len(rows)]], at + len(rows)
             starts, items = lists(targets, self.positions)
             self.adds.append((put(starts), put(items if which is None else which[items])))
-            self.meets.append(tuple(map(put, lists(part.host.slots.T.ravel(), blocks))))
+            starts, items = lists(part.host.slots.T.ravel(), blocks)
+            element, slot = np.divmod(items, len(part.host.slots))
+            self.meets.append((put(starts), put(element * system.ITEM + slot)))
 
 
 def _pairs(part, kept) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
@@ -120,19 +122,21 @@ class Assembly:
     Args:
         written: of each set, the arrays "factor", "tension" and "second".
         exact_from: of each set, the iteration from which on second derivatives are written, or None.
+        local: of each set, whether its factor is of the local dofs.
         drag: whether blocks have more than a mass.
     """
 
-    def __init__(self, net, table: NetSystem, written: list[dict], real, linear, exact_from: tuple, drag: bool):
+    def __init__(
+        self, net, table: NetSystem, written: list[dict], real, linear, exact_from: tuple, local: tuple, drag: bool
+    ):
         self.net, self.table, self.kernels, self._own = net, table, [], []
-        Contributions = system.contributions(linear)
         for first in range(0, len(net.sets), system.SETS):
-            sets, late = (of[first : first + system.SETS] for of in (net.sets, exact_from))
+            sets, late, own_dofs = (of[first : first + system.SETS] for of in (net.sets, exact_from, local))
             terms = tuple(part.term for part in sets)
-            self.kernels.append(system.assemble_kernel(terms, real, linear, first == 0, late, drag))
+            self.kernels.append(system.assemble_kernel(terms, real, linear, first == 0, late, own_dofs, drag))
             own = []
             for i in range(first, first + len(sets)):
-                data = Contributions()
+                data = system.contributions(linear, local[i])()
                 data.factor, data.tension, data.second = (written[i][name] for name in ("factor", "tension", "second"))
                 data.starts, data.items = table.adds[i]
                 data.elements = net.sets[i].elements
