@@ -28,13 +28,13 @@ from ddg_warp.kernels.block_band import (
     substitute_all_function,
     substitute_function,
 )
-from ddg_warp.kernels.element import CPU_OPTIONS
+from ddg_warp.kernels.element import CPU_OPTIONS, until_function
 from ddg_warp.kernels.net.joints import coupling_functions
 from ddg_warp.kernels.net.system import product_functions
 
 
 @cache
-def chain_kernels(twist: bool, span: int, linear, sides: int):
+def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool):
     """factorise(...): H_II; load(...), solve(...): its solutions; finish(...): z of every block and r . z.
 
     solve_all(...) takes all movements of a joint, `sides`, at once; follow(...) adds V z_J. Between worlds and their columns are
@@ -47,6 +47,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int):
     factor, substitute = factor_function(nb, span, linear), substitute_function(nb, span, linear)
     substitute_all = substitute_all_function(nb, span, linear, sides)
     _, free = product_functions(linear)
+    until = until_function(serial)
     multiply, _ = coupling_functions(linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -64,7 +65,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int):
             if factor(blocks, factors, count[r - w * count.shape[0]], r) > 0:
                 lost[w] = 1
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def load(
         matrix: wp.array2d(dtype=linear),
         columns: wp.array(dtype=int),
@@ -85,33 +86,34 @@ def chain_kernels(twist: bool, span: int, linear, sides: int):
         values_out: wp.array3d(dtype=linear),
     ):
         """r_I (if `own`) - H_IJ z_J (if `joined`), with z_J in `moved`."""
-        k, s = wp.tid()
+        start, s = wp.tid()
         worlds = wanted.shape[0]
         q = s / (worlds * count.shape[0])
         r = s - q * worlds * count.shape[0]
         w = r / count.shape[0]
         c = r - w * count.shape[0]
-        if wanted[w] != 1 or k >= count[c]:
+        if wanted[w] != 1 or start >= count[c]:
             return
-        u = B()
-        for part in range(wp.static(parts)):
-            at = places[part, k, c]
-            if at >= 0:
-                v = H()
-                if own != 0:
-                    v = residual[at + w * blocks]
-                if joined != 0:
-                    for index in range(starts[at], starts[at + 1]):
-                        p = items[index]
-                        j = joint_row[columns[p]]
-                        v -= multiply(matrix, p + w * positions, moved[(q * worlds + w) * joint_rows + j])
-                v = wp.cw_mul(v, free(fixed[at]))
-                if part == 0:
-                    for d in range(3):
-                        u[d] = v[d]
-                else:
-                    u[wp.static(nb - 1)] = v[0]
-        put(values_out, 0, k, s, u)
+        for k in range(start, until(start, count[c])):
+            u = B()
+            for part in range(wp.static(parts)):
+                at = places[part, k, c]
+                if at >= 0:
+                    v = H()
+                    if own != 0:
+                        v = residual[at + w * blocks]
+                    if joined != 0:
+                        for index in range(starts[at], starts[at + 1]):
+                            p = items[index]
+                            j = joint_row[columns[p]]
+                            v -= multiply(matrix, p + w * positions, moved[(q * worlds + w) * joint_rows + j])
+                    v = wp.cw_mul(v, free(fixed[at]))
+                    if part == 0:
+                        for d in range(3):
+                            u[d] = v[d]
+                    else:
+                        u[wp.static(nb - 1)] = v[0]
+            put(values_out, 0, k, s, u)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def solve(
@@ -188,7 +190,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int):
         for i in range(wp.static(nb)):
             values[i, k, r] = values[i, k, r] + u[i]
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def finish(
         residual: wp.array(dtype=H),
         values: wp.array3d(dtype=linear),
@@ -204,21 +206,22 @@ def chain_kernels(twist: bool, span: int, linear, sides: int):
         dots_out: wp.array2d(dtype=linear),
     ):
         """z of blocks of rods and joints beside what block Jacobi left there, and r . z."""
-        i = wp.tid()
-        w = i / blocks
-        if wanted[w] != 1:
-            return
-        b = i - w * blocks
-        at = where[b]
-        if at >= 0:
-            k = at / width
-            r = w * width + at - k * width
-            if b < nodes:
-                z[i] = H(values[0, k, r], values[1, k, r], values[2, k, r])
-            else:
-                z[i] = H(values[wp.static(nb - 1), k, r], linear(0.0), linear(0.0))
-        if joint_row[b] >= 0:
-            z[i] = moved[w * joint_rows + joint_row[b]]
-        dots_out[w, b] = wp.dot(residual[i], z[i])
+        start = wp.tid()
+        for i in range(start, until(start, z.shape[0])):
+            w = i / blocks
+            if wanted[w] != 1:
+                continue
+            b = i - w * blocks
+            at = where[b]
+            if at >= 0:
+                k = at / width
+                r = w * width + at - k * width
+                if b < nodes:
+                    z[i] = H(values[0, k, r], values[1, k, r], values[2, k, r])
+                else:
+                    z[i] = H(values[wp.static(nb - 1), k, r], linear(0.0), linear(0.0))
+            if joint_row[b] >= 0:
+                z[i] = moved[w * joint_rows + joint_row[b]]
+            dots_out[w, b] = wp.dot(residual[i], z[i])
 
     return factorise, load, solve, solve_all, follow, finish, spread, note

@@ -6,6 +6,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import outcome
+from ddg_warp.kernels.element import CPU_OPTIONS, until_function
 from ddg_warp.kernels.islands import (
     ACTIVE,
     CAUTIOUS,
@@ -31,10 +32,11 @@ STALLED = 8  # iterations without progress, where energies drown in rounding, th
 
 
 @cache
-def search_kernels(real, linear):
+def search_kernels(real, linear, serial: bool):
     """judge(...) of an iterate, measure(...) and take(...) of a direction, move(...) of the blocks."""
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     balanced, decide = judge_functions(False, real)
+    until = until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def judge(
@@ -106,7 +108,7 @@ def search_kernels(real, linear):
         else:
             flags[TODO, w] = 1
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def measure(
         right: wp.array(dtype=H),
         direction: wp.array(dtype=H),
@@ -115,12 +117,13 @@ def search_kernels(real, linear):
         dots_out: wp.array2d(dtype=real),
     ):
         """r . d block by block."""
-        i = wp.tid()
-        w = i / blocks
-        if wanted[w] != 0:
-            dots_out[w, i - w * blocks] = real(wp.dot(right[i], direction[i]))
+        start = wp.tid()
+        for i in range(start, until(start, right.shape[0])):
+            w = i / blocks
+            if wanted[w] != 0:
+                dots_out[w, i - w * blocks] = real(wp.dot(right[i], direction[i]))
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def rotate(
         q: wp.array(dtype=V),
         direction: wp.array(dtype=H),
@@ -131,21 +134,22 @@ def search_kernels(real, linear):
         turn_out: wp.array2d(dtype=real),
     ):
         """Squared turn of every edge, then of the angles and joints `spins`, by a whole step."""
-        i = wp.tid()
-        count = ends.shape[0] + spins.shape[0]
-        w = i / count
-        if wanted[w] == 0:
-            return
-        k = i - w * count
-        if k >= ends.shape[0]:
-            angle = direction[spins[k - ends.shape[0]] + w * blocks]
-            turn_out[w, k] = real(wp.dot(angle, angle))
-            return
-        a = ends[k, 0] + w * blocks
-        b = ends[k, 1] + w * blocks
-        e = q[b] - q[a]
-        d = direction[b] - direction[a]
-        turn_out[w, k] = real(wp.dot(d, d)) / wp.length_sq(e)
+        start = wp.tid()
+        for i in range(start, until(start, turn_out.shape[0] * turn_out.shape[1])):
+            count = ends.shape[0] + spins.shape[0]
+            w = i / count
+            if wanted[w] == 0:
+                continue
+            k = i - w * count
+            if k >= ends.shape[0]:
+                angle = direction[spins[k - ends.shape[0]] + w * blocks]
+                turn_out[w, k] = real(wp.dot(angle, angle))
+                continue
+            a = ends[k, 0] + w * blocks
+            b = ends[k, 1] + w * blocks
+            e = q[b] - q[a]
+            d = direction[b] - direction[a]
+            turn_out[w, k] = real(wp.dot(d, d)) / wp.length_sq(e)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def take(
@@ -172,7 +176,7 @@ def search_kernels(real, linear):
         flags[TODO, w] = 2
         wp.atomic_add(work, 0, wp.int64(iterations[w]))
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def move(
         direction: wp.array(dtype=H),
         step_length: wp.array(dtype=real),
@@ -182,26 +186,28 @@ def search_kernels(real, linear):
         q: wp.array(dtype=V),
     ):
         """A first step (2) goes from the iterate, which becomes the base; a shortened one (1) from the base."""
-        i = wp.tid()
-        w = i / blocks
-        what = todo[w]
-        if what == 0:
-            return
-        if what == 2:
-            base[i] = q[i]
-        d = direction[i]
-        q[i] = base[i] + V(real(d[0]), real(d[1]), real(d[2])) * step_length[w]
+        start = wp.tid()
+        for i in range(start, until(start, q.shape[0])):
+            w = i / blocks
+            what = todo[w]
+            if what == 0:
+                continue
+            if what == 2:
+                base[i] = q[i]
+            d = direction[i]
+            q[i] = base[i] + V(real(d[0]), real(d[1]), real(d[2])) * step_length[w]
 
     return judge, measure, rotate, take, move
 
 
 @cache
-def step_kernels(real, midpoint: bool):
+def step_kernels(real, midpoint: bool, serial: bool):
     """begin(...) and finish(...) of a time step; see `kernels.step` for the schemes."""
     length, restart = attempt_functions(real, midpoint)
+    until = until_function(serial)
     V = wp.types.vector(3, real)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def begin(
         q0: wp.array(dtype=V),
         v0: wp.array(dtype=V),
@@ -218,30 +224,31 @@ def step_kernels(real, midpoint: bool):
         target_out: wp.array(dtype=V),
     ):
         """Starts a solve from the predictor; dofs without mass, whose rates mean nothing, start from where they are."""
-        i = wp.tid()
-        w = i / blocks
-        k = i - w * blocks
-        if k == 0:
-            flags[MOVED, w] = wp.where(scalars[PROGRESS, w] < real(1.0), 1, 0)
-        if scalars[PROGRESS, w] >= real(1.0):
-            return
-        s = length(scalars, w, dt[w])
-        rate = real(1.0) / s
-        coefficient = rate * (rate + damping[0])
-        if k == 0:
-            restart(flags, scalars, w, rate, coefficient, outer[w])
-        mask = int(fixed[k])
-        here = q0[i]
-        v = v0[i]
-        target_out[i] = here + v * (rate / coefficient)
-        if flags[CAUTIOUS, w] == 0:
-            for d in range(3):
-                if ((mask >> d) & 1) == 0 and mass[k][d] > real(0.0):
-                    here[d] = here[d] + s * v[d]
-        q_out[i] = here
-        base_out[i] = here
+        start = wp.tid()
+        for i in range(start, until(start, q_out.shape[0])):
+            w = i / blocks
+            k = i - w * blocks
+            if k == 0:
+                flags[MOVED, w] = wp.where(scalars[PROGRESS, w] < real(1.0), 1, 0)
+            if scalars[PROGRESS, w] >= real(1.0):
+                continue
+            s = length(scalars, w, dt[w])
+            rate = real(1.0) / s
+            coefficient = rate * (rate + damping[0])
+            if k == 0:
+                restart(flags, scalars, w, rate, coefficient, outer[w])
+            mask = int(fixed[k])
+            here = q0[i]
+            v = v0[i]
+            target_out[i] = here + v * (rate / coefficient)
+            if flags[CAUTIOUS, w] == 0:
+                for d in range(3):
+                    if ((mask >> d) & 1) == 0 and mass[k][d] > real(0.0):
+                        here[d] = here[d] + s * v[d]
+            q_out[i] = here
+            base_out[i] = here
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def finish(
         q: wp.array(dtype=V),
         q0: wp.array(dtype=V),
@@ -253,24 +260,25 @@ def step_kernels(real, midpoint: bool):
         v_out: wp.array(dtype=V),
     ):
         """Blocks and their velocities at the end of the step, of the worlds that converged."""
-        i = wp.tid()
-        w = i / blocks
-        start = q0[i]
-        v = v0[i]
-        end = start
-        ahead = scalars[PROGRESS, w] < real(1.0) and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
-        if i == w * blocks:
-            flags[MOVED, w] = wp.where(ahead, 1, 0)
-        if ahead:
-            end = q[i]
-            change = (end - start) * scalars[RATE, w]
-            if wp.static(midpoint):
-                end = real(2.0) * end - start
-                v = real(2.0) * change - v
-            else:
-                v = change
-        q_out[i] = end
-        v_out[i] = v
+        first = wp.tid()
+        for i in range(first, until(first, q_out.shape[0])):
+            w = i / blocks
+            start = q0[i]
+            v = v0[i]
+            end = start
+            ahead = scalars[PROGRESS, w] < real(1.0) and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
+            if i == w * blocks:
+                flags[MOVED, w] = wp.where(ahead, 1, 0)
+            if ahead:
+                end = q[i]
+                change = (end - start) * scalars[RATE, w]
+                if wp.static(midpoint):
+                    end = real(2.0) * end - start
+                    v = real(2.0) * change - v
+                else:
+                    v = change
+            q_out[i] = end
+            v_out[i] = v
 
     return begin, finish
 

@@ -395,14 +395,15 @@ def assemble_kernel(
     begins: bool,
     exact_from: tuple[int | None, ...],
     local: tuple[bool, ...],
-    drag: bool = False,
+    drag: bool,
+    serial: bool,
 ):
     """H of up to `SETS` sets, a thread a position, with inertia and drag where it `begins`; else it adds to what is there.
 
     `exact_from` says of each set from which iteration on it has second derivatives, one for all, or None where it has none; `local`,
     how its factor is written.
     """
-    M, Mass = wp.types.matrix((3, 3), linear), mass_type(real, drag)
+    M, Mass, until = wp.types.matrix((3, 3), linear), mass_type(real, drag), until_function(serial)
     sums = tuple(
         sum_function(term, linear, first is not None, own)
         for term, first, own in zip(terms, exact_from, local, strict=True)
@@ -428,48 +429,49 @@ def assemble_kernel(
         own5: Own5,
         matrix: wp.array2d(dtype=linear),
     ):
-        p = wp.tid()
-        w = p / positions
-        if flags[WANTED, w] == 0:
-            return
-        # what is wanted has been counted as an iteration since it was evaluated
-        late = flags[ITERATION, w] > wp.static(begin) and flags[CLAMPED, w] == 0
-        at = p - w * positions
-        row = rows[at]
-        if row < 0:
-            return  # padding stays zero
-        m = M()
-        if wp.static(begins):
-            if row == columns[at]:
-                if wp.static(drag):
-                    inertia = mass[w, row].mass * scalars[COEFFICIENT, w]
-                else:
-                    inertia = mass[row] * scalars[COEFFICIENT, w]
-                for d in range(3):
-                    m[d, d] = linear(inertia[d])
-                if wp.static(drag):
-                    resistance = mass[w, row].resistance
-                    for i in range(3):
-                        for j in range(3):
-                            m[i, j] = m[i, j] + linear(resistance[i, j])
-        else:
+        start = wp.tid()
+        for p in range(start, until(start, matrix.shape[1])):
+            w = p / positions
+            if flags[WANTED, w] == 0:
+                continue
+            # what is wanted has been counted as an iteration since it was evaluated
+            late = flags[ITERATION, w] > wp.static(begin) and flags[CLAMPED, w] == 0
+            at = p - w * positions
+            row = rows[at]
+            if row < 0:
+                continue  # padding stays zero
+            m = M()
+            if wp.static(begins):
+                if row == columns[at]:
+                    if wp.static(drag):
+                        inertia = mass[w, row].mass * scalars[COEFFICIENT, w]
+                    else:
+                        inertia = mass[row] * scalars[COEFFICIENT, w]
+                    for d in range(3):
+                        m[d, d] = linear(inertia[d])
+                    if wp.static(drag):
+                        resistance = mass[w, row].resistance
+                        for i in range(3):
+                            for j in range(3):
+                                m[i, j] = m[i, j] + linear(resistance[i, j])
+            else:
+                for i in range(3):
+                    for j in range(3):
+                        m[i, j] = matrix[3 * i + j, p]
+            m += wp.static(sums[0])(own0, at, w, late)
+            if wp.static(count > 1):
+                m += wp.static(sums[min(1, last)])(own1, at, w, late)
+            if wp.static(count > 2):
+                m += wp.static(sums[min(2, last)])(own2, at, w, late)
+            if wp.static(count > 3):
+                m += wp.static(sums[min(3, last)])(own3, at, w, late)
+            if wp.static(count > 4):
+                m += wp.static(sums[min(4, last)])(own4, at, w, late)
+            if wp.static(count > 5):
+                m += wp.static(sums[min(5, last)])(own5, at, w, late)
             for i in range(3):
                 for j in range(3):
-                    m[i, j] = matrix[3 * i + j, p]
-        m += wp.static(sums[0])(own0, at, w, late)
-        if wp.static(count > 1):
-            m += wp.static(sums[min(1, last)])(own1, at, w, late)
-        if wp.static(count > 2):
-            m += wp.static(sums[min(2, last)])(own2, at, w, late)
-        if wp.static(count > 3):
-            m += wp.static(sums[min(3, last)])(own3, at, w, late)
-        if wp.static(count > 4):
-            m += wp.static(sums[min(4, last)])(own4, at, w, late)
-        if wp.static(count > 5):
-            m += wp.static(sums[min(5, last)])(own5, at, w, late)
-        for i in range(3):
-            for j in range(3):
-                matrix[3 * i + j, p] = m[i, j]
+                    matrix[3 * i + j, p] = m[i, j]
 
     return assemble
 

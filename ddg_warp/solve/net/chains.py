@@ -93,7 +93,7 @@ class Chains:
             apart = np.zeros(net.blocks, np.uint8)
             apart[self.elsewhere()] = 1
             self._apart = wp.array(apart, dtype=wp.uint8, device=device)
-        made = chains.chain_kernels(plan.twist, plan.span, linear, plan.size)
+        made = chains.chain_kernels(plan.twist, plan.span, linear, plan.size, self.serial)
         self._factorise, self._load, self._solve, self._solve_all, self._follow, self._finish, *self._columns = made
         self._measure, self._meet = joints.joint_kernels(linear) if self.joints else (None, None)
 
@@ -203,7 +203,7 @@ class Chains:
             self._eliminate(matrix, fixed, wanted, self.values, residual, self.moved)
         self._launch(
             self._finish,
-            net.worlds * net.blocks,
+            1 if self.serial else net.worlds * net.blocks,
             [residual, self.values, self.where, self.width, self.joint_row, self.joint_rows, self.moved, wanted]
             + [net.blocks, net.host.nodes],
             [z, dots],
@@ -218,7 +218,7 @@ class Chains:
         table, net, solves = self.table, self.net, values.shape[2] // self.columns
         self._launch(
             self._load,
-            (self.longest, solves * self.columns),
+            (1 if self.serial else self.longest, solves * self.columns),
             [matrix, table.columns, self.places, self.count, fixed, self.starts, self.items, self.joint_row]
             + [self.joint_rows, wanted, net.blocks, table.positions, int(residual is not None)]
             + [int(moved is not None), self.moved if residual is None else residual]
@@ -337,6 +337,8 @@ class ChainPlan:
 
     def find(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
         """Positions of blocks in H, -1 where it has none or one of the two is -1."""
+        if not len(self._keys):
+            return np.full(len(row), -1)
         keys = row.astype(np.int64) * self._blocks + column
         at = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
         return np.where((row >= 0) & (column >= 0) & (self._keys[at] == keys), self._order[at], -1)

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import warp as wp
 
+from ddg_warp import arrays
 from ddg_warp.compile.tolerance import outer_forces
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels import pcg
@@ -126,9 +127,11 @@ class NetNewton:
         self._balance, self._sets = system.balance_kernel(self.real, self.linear, drag, serial), self._meetings()
         self._no_frames = [make(0, int), make(0, wp.types.matrix((3, 3), self.real))]
         self._assembly = Assembly(
-            net, self.system, self.parts, self.real, self.linear, self.exact_from, self.local, drag
+            net, self.system, self.parts, self.real, self.linear, self.exact_from, self.local, drag, serial
         )
-        self._judge, self._measure, self._rotate, self._take, self._move = newton.search_kernels(self.real, self.linear)
+        self._judge, self._measure, self._rotate, self._take, self._move = newton.search_kernels(
+            self.real, self.linear, serial
+        )
         self._invert, self._start, self._begin, *self._cycle = krylov.solver_kernels(self.linear)
         self._compare, self._confirm = krylov.confirm_kernels(self.real, self.linear)
         self.allowed = Allowed(net, self.real, self.linear)
@@ -229,13 +232,12 @@ class NetNewton:
     def evaluate(self, state) -> None:
         """Energies, gradients and factors of all elements at the iterate."""
         for index, (part, own, kernel) in enumerate(zip(self.net.sets, self.parts, self._evaluate, strict=True)):
-            wp.launch(
+            self._sweep(
                 kernel,
-                1 if self.serial else self.worlds * part.elements,
+                self.worlds * part.elements,
                 [self.net.elements(state, index, self.q, self.islands.rate), *self.islands.arrays],
                 [own["factor"], own["tension"], own["second"], own["gradient"], own["energy"], own["stiffness"]],
-                device=self.device,
-                block_dim=128,
+                threads=128,
             )
 
     def balance(self) -> None:
@@ -244,12 +246,11 @@ class NetNewton:
         if self.chains and self.chains.banded:
             self.chains.balance(self._given, islands, self._found)
         frames = [planes.of_blocks, planes.frames[self.real]] if planes else self._no_frames
-        wp.launch(
+        self._sweep(
             self._balance,
-            min(1, total) if self.serial else total,
+            total,
             [self._given, self._some, self._sets, *frames, *islands.arrays, self._rest, total],
             [self._found],
-            device=self.device,
         )
         self.allowed.sum_up(self.right, self.options.rtol, islands, islands.unbalanced, islands.drowned)
 
@@ -401,7 +402,7 @@ class NetNewton:
     def take(self) -> None:
         """Lengths of the steps along the directions."""
         blocks = self.net.blocks
-        self._launch(self._measure, [self.right, self.direction, self.islands.wanted, blocks], [self.dots])
+        self._sweep(self._measure, self.all, [self.right, self.direction, self.islands.wanted, blocks], [self.dots])
         self._sum(self.dots, self.decrease)
         self.measure_turns()
         wp.launch(
@@ -416,22 +417,27 @@ class NetNewton:
         """Largest turn that the directions make, squared; these are in space then."""
         if self.planes:
             self.planes.back(self.direction, self.islands.wanted)
-        wp.launch(
+        self._sweep(
             self._rotate,
             self.turns.size,
             [self.q, self.direction, self.ends, self.spins, self.islands.wanted, self.net.blocks],
             [self.turns],
-            device=self.device,
         )
         self._largest(self.turns, self.turn)
 
     def move(self) -> None:
         """Take the step that is to be taken."""
-        self._launch(
+        self._sweep(
             self._move,
+            self.all,
             [self.direction, self.islands.step_length, self.islands.todo, self.net.blocks],
             [self.base, self.q],
         )
+
+    def _sweep(self, kernel, count: int, inputs: list, outputs: list, threads: int = arrays.THREADS) -> None:
+        """Of a kernel that goes over so many things: one thread for each, or on the CPU one for all."""
+        dim = min(1, count) if self.serial else count
+        wp.launch(kernel, dim, inputs, outputs, device=self.device, block_dim=threads)
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
         """One thread for each block of every world."""

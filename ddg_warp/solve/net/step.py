@@ -45,7 +45,7 @@ class NetStep(PartStep):
         super().__init__(integrator, model, solver, counts_of)
         if counts_of is not None:
             self.newton.pcg_work = counts_of.newton.pcg_work
-        self._begin, self._finish = newton.step_kernels(real, self.midpoint)
+        self._begin, self._finish = newton.step_kernels(real, self.midpoint, solver.serial)
         self.middle = model.net.empty() if self.midpoint and model.net.edges else None
         self.drag = NetDrag(model, self.midpoint) if host.drag else None
         self.energy = NetEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
@@ -58,7 +58,7 @@ class NetStep(PartStep):
         solver, blocks, islands = self.newton, self.net.blocks, self.islands
         self._launch(
             self._begin,
-            solver.all,
+            1 if solver.serial else solver.all,
             [before.q, before.v, solver.held, self.drag.moves if self.drag else solver.mass]
             + [self.integrator._dt, self.damping, solver.outer, *islands.arrays, blocks],
             [solver.q, solver.base, solver.target],
@@ -72,9 +72,8 @@ class NetStep(PartStep):
         solver.solve(start)
         if self.energy:
             self.energy.judge(before, start)
-        self._launch(
-            self._finish, solver.all, [solver.q, before.q, before.v, *islands.arrays, blocks], [after.q, after.v]
-        )
+        dim = 1 if solver.serial else solver.all
+        self._launch(self._finish, dim, [solver.q, before.q, before.v, *islands.arrays, blocks], [after.q, after.v])
         if self.drag:
             self.drag.settle(after, solver, islands)
         self.net.carry(start, after, kept=before, moved=islands.moved)

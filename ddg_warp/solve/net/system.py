@@ -13,25 +13,27 @@ class NetSystem:
 
     Args:
         net: `DeviceNet`.
-        kept: blocks (N,) bool between which chains keep what elements along rods add; see `kernels.net.chains`. None: none.
+        kept: blocks (N,) bool between which chains keep what elements along rods add, see `kernels.net.bands`; entries of held blocks
+            then are left out. None: all is here.
 
     Attributes:
         positions: entries of H in a world, padding included.
         rows, columns: block of each position, -1 in the padding; slices: start of each slice; diagonal: position of each H_ii, -1
-            of those that chains keep.
+            of those that chains keep, and of held ones then.
         meets: of each set, (starts, items) of the blocks; adds: (starts, items) of the positions.
     """
 
     def __init__(self, net, kept: np.ndarray | None = None):
         blocks, device = net.blocks, net.device
-        pairs = [_pairs(part.host, kept) for part in net.sets]
-        own = np.flatnonzero(~kept) if kept is not None else np.arange(blocks)
+        out = None if kept is None else net.host.fixed.all(1)
+        pairs = [_pairs(part.host, kept, out) for part in net.sets]
+        own = np.arange(blocks) if kept is None else np.flatnonzero(~(kept | out))
         row = np.concatenate([*(rows for rows, *_ in pairs), own]).astype(np.int32)
         column = np.concatenate([*(columns for _, columns, _ in pairs), own]).astype(np.int32)
         order = lists(column, blocks)[1]
         order = order[lists(row[order], blocks)[1]]  # by rows and, of one row, by columns
         row, column = row[order], column[order]
-        first = np.append(True, (np.diff(row) != 0) | (np.diff(column) != 0))
+        first = (np.diff(row, prepend=-1) != 0) | (np.diff(column, prepend=-1) != 0)
         inverse = np.empty(len(order), int)
         inverse[order] = np.cumsum(first) - 1
         row, column = row[first], column[first]
@@ -64,21 +66,22 @@ class NetSystem:
             self.meets.append((put(starts), put(element * system.ITEM + slot)))
 
 
-def _pairs(part, kept) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+def _pairs(part, kept, out) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Rows and columns of what the elements of a set add to H, and which of all pairs of slots they are; None: all in order.
 
     A pair is (element * slots + row's slot) * slots + column's slot.
     """
     slots = part.slots.T.astype(np.int32)
-    n, which = slots.shape[1], None
-    if part.along and kept is not None:
-        free = ~kept[slots]
-        some = np.flatnonzero(free.any(1))
-        pair = free[some, :, None] | free[some, None, :]
-        element, row, column = np.nonzero(pair)
-        which = (some[element] * n + row) * n + column
-        return slots[some[element], row], slots[some[element], column], which
-    return np.repeat(slots, n, axis=1).ravel(), np.tile(slots, n).ravel(), which
+    n = slots.shape[1]
+    if kept is None:
+        return np.repeat(slots, n, axis=1).ravel(), np.tile(slots, n).ravel(), None
+    wanted = ~out[slots]
+    other = wanted & ~kept[slots] if part.along else wanted
+    some = np.flatnonzero(other.any(1))
+    pair = wanted[some, :, None] & wanted[some, None, :] & (other[some, :, None] | other[some, None, :])
+    element, row, column = np.nonzero(pair)
+    which = (some[element] * n + row) * n + column
+    return slots[some[element], row], slots[some[element], column], which
 
 
 def lists(target: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -124,16 +127,27 @@ class Assembly:
         exact_from: of each set, the iteration from which on second derivatives are written, or None.
         local: of each set, whether its factor is of the local dofs.
         drag: whether blocks have more than a mass.
+        serial: whether a thread takes all positions.
     """
 
     def __init__(
-        self, net, table: NetSystem, written: list[dict], real, linear, exact_from: tuple, local: tuple, drag: bool
+        self,
+        net,
+        table: NetSystem,
+        written: list[dict],
+        real,
+        linear,
+        exact_from: tuple,
+        local: tuple,
+        drag: bool,
+        serial: bool,
     ):
+        self.serial = serial
         self.net, self.table, self.kernels, self._own = net, table, [], []
         for first in range(0, len(net.sets), system.SETS):
             sets, late, own_dofs = (of[first : first + system.SETS] for of in (net.sets, exact_from, local))
             terms = tuple(part.term for part in sets)
-            self.kernels.append(system.assemble_kernel(terms, real, linear, first == 0, late, own_dofs, drag))
+            self.kernels.append(system.assemble_kernel(terms, real, linear, first == 0, late, own_dofs, drag, serial))
             own = []
             for i in range(first, first + len(sets)):
                 data = system.contributions(linear, local[i])()
@@ -149,7 +163,7 @@ class Assembly:
         for kernel, own in zip(self.kernels, self._own, strict=True):
             wp.launch(
                 kernel,
-                self.net.worlds * table.positions,
+                1 if self.serial else self.net.worlds * table.positions,
                 [mass, *islands.arrays, table.rows, table.columns, table.positions, *own],
                 [matrix],
                 device=self.net.device,

@@ -17,6 +17,7 @@ class Allowed:
     def __init__(self, net, real, linear):
         self.net, self.bodies, self._real = net, net.host.bodies, real
         worlds, device = net.worlds, net.device
+        self.serial = wp.get_device(device).is_cpu
 
         def put(values):
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
@@ -26,7 +27,7 @@ class Allowed:
 
         self.blocks, self.least = make(worlds * net.blocks), make(worlds * net.blocks)
         self.ratio = make((worlds, net.blocks + sum(len(level.weight) for level in self.bodies.levels)))
-        self.kernels = [parts.part_kernel(real, linear, leaf) for leaf in (True, False)]
+        self.kernels = [parts.part_kernel(real, linear, leaf, self.serial) for leaf in (True, False)]
         self._levels = []
         for level in self.bodies.levels:
             n = len(level.weight)
@@ -56,7 +57,7 @@ class Allowed:
         for starts, items, limit, sums, squares in self._levels:
             wp.launch(
                 kernel,
-                (limit.shape[1], self.net.worlds),
+                (1 if self.serial else limit.shape[1], self.net.worlds),
                 [value, rounding, starts, items, below, limit, place, rtol, islands.load_scale, islands.status],
                 [sums, squares, self.ratio, unbalanced, drowned],
                 device=self.net.device,
