@@ -51,23 +51,39 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
     V, H, M = wp.types.vector(dim, real), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     factor_block, lower, upper, lower_vector, upper_vector, congruence = pivot.functions(nb, linear)
     *_, shorter = search_functions(kind, real, linear)
-    angle = nb - 1
+    angle, rows = nb - 1, kind.factor_rows
+    Rows, Kept = wp.types.vector(rows, linear), wp.types.vector(2 * nb2 + nb, linear)
     vertex_rows, edge_rows, tensions = kind.vertex_strains, kind.edge_strains, kind.tensions
     exact, begin = exact_from is not None, exact_from or 0
     aa, ab, ac, bb, bc, cc = geometric.block_functions(kind, linear)
 
     @wp.func
-    def part(F: wp.array3d(dtype=linear), row: int, k: int, r: int):
-        v = H()
-        for d in range(wp.static(dim)):
-            v[d] = F[row + d, k, r]
+    def rows_of(F: wp.array3d(dtype=linear), k: int, r: int):
+        """What the elements that begin at a node have written."""
+        v = Rows()
+        for i in range(wp.static(rows)):
+            v[i] = F[i, k, r]
         return v
 
     @wp.func
-    def with_angle(F: wp.array3d(dtype=linear), row: int, k: int, r: int, v: H):
+    def right_of(right: wp.array3d(dtype=linear), k: int, r: int):
+        v = H()
+        for i in range(wp.static(nb)):
+            v[i] = right[i, k, r]
+        return v
+
+    @wp.func
+    def part(F: Rows, row: int):
+        v = H()
+        for d in range(wp.static(dim)):
+            v[d] = F[row + d]
+        return v
+
+    @wp.func
+    def with_angle(F: Rows, row: int, v: H):
         u = v
         if wp.static(twist):
-            u[wp.static(angle)] = F[row, k, r]
+            u[wp.static(angle)] = F[row]
         return u
 
     @wp.func
@@ -84,11 +100,19 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
                 Y[row + i * wp.static(nb) + j, k, r] = m[i, j]
 
     @wp.func
-    def times(Y: wp.array3d(dtype=linear), row: int, k: int, r: int, e: H):
+    def kept(Y: wp.array3d(dtype=linear), k: int, r: int):
+        """What the elimination of a node has left."""
+        v = Kept()
+        for i in range(wp.static(2 * nb2 + nb)):
+            v[i] = Y[i, k, r]
+        return v
+
+    @wp.func
+    def times(Y: Kept, row: int, e: H):
         v = H()
         for i in range(wp.static(nb)):
             for j in range(wp.static(nb)):
-                v[i] = v[i] + Y[row + i * wp.static(nb) + j, k, r] * e[j]
+                v[i] = v[i] + Y[row + i * wp.static(nb) + j] * e[j]
         return v
 
     # what exceeds 255 registers goes to shared memory: 8 % on an H200
@@ -148,15 +172,39 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
         noise = real(0.0)  # rounding of `change`
         newton = real(0.0)  # r^T H^-1 r
         lost_here = int(0)
+        # What the next node has is read before this one is dealt with: a thread that walks waits for memory most of the time.
+        f = rows_of(F, 0, r)
+        rj = right_of(right, 0, r)
+        mask = fixed[0, r]
+        more = energy_change[0, r]
+        rounding = energy_noise[0, r]
+        own = real(0.0)
+        spin = real(0.0)
+        if wp.static(not drag):
+            own = mass[0, r]
+        if wp.static(twist):
+            spin = rotary[0, r]
         for j in range(n):
+            ahead = wp.min(j + 1, n - 1)
+            f_ahead = rows_of(F, ahead, r)
+            r_ahead = right_of(right, ahead, r)
+            mask_ahead = fixed[ahead, r]
+            more_ahead = energy_change[ahead, r]
+            rounding_ahead = energy_noise[ahead, r]
+            own_ahead = real(0.0)
+            spin_ahead = real(0.0)
+            if wp.static(not drag):
+                own_ahead = mass[ahead, r]
+            if wp.static(twist):
+                spin_ahead = rotary[ahead, r]
             if wp.static(span == 2):
                 if j < n - 2:
                     for m in range(wp.static(vertex_rows)):
                         row = m * wp.static(window)
-                        a = part(F, row, j, r)
-                        C = part(F, row + wp.static(dim), j, r)
-                        A = with_angle(F, row + wp.static(2 * dim), j, r, -a)
-                        B = with_angle(F, row + wp.static(2 * dim + 1), j, r, a - C)
+                        a = part(f, row)
+                        C = part(f, row + wp.static(dim))
+                        A = with_angle(f, row + wp.static(2 * dim), -a)
+                        B = with_angle(f, row + wp.static(2 * dim + 1), a - C)
                         Waa += wp.outer(A, A)
                         Wab += wp.outer(A, B)
                         Wac += wp.outer(A, C)
@@ -174,13 +222,13 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
             if j < n - 1:
                 edge_row = wp.static(vertex_rows * window)
                 for m in range(wp.static(edge_rows)):
-                    t = part(F, edge_row + m * wp.static(dim), j, r)
+                    t = part(f, edge_row + m * wp.static(dim))
                     S = wp.outer(t, t)
                     Waa += S
                     Wab -= S
                     Wbb += S
                 for m in range(wp.static(tensions)):
-                    T = positions(F[edge_row + wp.static(edge_rows * dim) + m, j, r])
+                    T = positions(f[edge_row + wp.static(edge_rows * dim) + m])
                     Waa += T
                     Wab -= T
                     Wbb += T
@@ -191,19 +239,15 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
                     for i in range(wp.static(dim)):
                         Waa[d, i] = Waa[d, i] + linear(resistance[d, i])
             else:
-                inertia = linear(c * mass[j, r])
+                inertia = linear(c * own)
             for d in range(wp.static(dim)):
                 Waa[d, d] = Waa[d, d] + inertia
             if wp.static(twist):
-                Waa[wp.static(angle), wp.static(angle)] = Waa[wp.static(angle), wp.static(angle)] + linear(
-                    c * rotary[j, r]
-                )
-            rj = with_angle(right, wp.static(angle), j, r, part(right, 0, j, r))
+                Waa[wp.static(angle), wp.static(angle)] = Waa[wp.static(angle), wp.static(angle)] + linear(c * spin)
             worst = wp.max(worst, wp.max(wp.abs(rj)))
             if not first:
-                change += energy_change[j, r]
-                noise += real(energy_noise[j, r])
-            mask = fixed[j, r]
+                change += more
+                noise += real(rounding)
             if mask != wp.uint8(0):
                 free = H()
                 for d in range(wp.static(nb)):
@@ -239,6 +283,13 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
             Wac = M()
             Wbc = M()
             Wcc = M()
+            f = f_ahead
+            rj = r_ahead
+            mask = mask_ahead
+            more = more_ahead
+            rounding = rounding_ahead
+            own = own_ahead
+            spin = spin_ahead
 
         scalars[RESIDUAL, r] = real(worst)
         if first:
@@ -261,9 +312,9 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
             return
         if not first and finite:
             expected = taken * scalars[DECREMENT, r]
-            rounding = floor * noise
-            if expected > real(10.0) * rounding:
-                accept = change <= real(-1.0e-4) * expected + rounding
+            drowning = floor * noise
+            if expected > real(10.0) * drowning:
+                accept = change <= real(-1.0e-4) * expected + drowning
             else:
                 accept = newton <= scalars[DECREMENT, r]
         if not accept:
@@ -302,15 +353,25 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
         e2 = H()
         rotation = real(0.0)
         x_ahead = V()
+        left = kept(Y, n - 1, r)
+        here = x[n - 1, r]
+        turned = real(0.0)
+        if wp.static(twist):
+            turned = theta[n - 1, r]
         for i in range(n):
             j = n - 1 - i
-            step = -times(Y, 0, j, r, e1)
+            before = wp.max(j - 1, 0)
+            left_before = kept(Y, before, r)
+            here_before = x[before, r]
+            turned_before = real(0.0)
+            if wp.static(twist):
+                turned_before = theta[before, r]
+            step = -times(left, 0, e1)
             if wp.static(span == 2):
-                step -= times(Y, wp.static(nb2), j, r, e2)
+                step -= times(left, wp.static(nb2), e2)
             for d in range(wp.static(nb)):
-                step[d] = step[d] + Y[wp.static(2 * nb2) + d, j, r]
+                step[d] = step[d] + left[wp.static(2 * nb2) + d]
                 direction[d, j, r] = step[d]
-            here = x[j, r]
             dx = V()
             bent = V()
             for d in range(wp.static(dim)):
@@ -321,9 +382,12 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
             x_ahead = here
             x[j, r] = here + dx
             if wp.static(twist):
-                theta[j, r] = theta[j, r] + real(step[wp.static(angle)])
+                theta[j, r] = turned + real(step[wp.static(angle)])
             e2 = e1
             e1 = step
+            left = left_before
+            here = here_before
+            turned = turned_before
         whole = real(1.0)
         if rotation > rotation_cap * rotation_cap:
             whole = rotation_cap / wp.sqrt(rotation)

@@ -161,19 +161,19 @@ def residual_functions(real, linear, drag: bool):
         found.least[i] = least
         r = H()
         square = real(0.0)
-        ratio = real(0.0)
+        largest = real(0.0)
         for d in range(3):
             if ((mask >> d) & 1) == 0:
-                ratio = wp.max(ratio, wp.abs(force[d]) / given.allowed[i])
+                largest = wp.max(largest, wp.abs(force[d]))
                 r[d] = linear(force[d])
-                square += force[d] * force[d] / (length * length)
+                square += force[d] * force[d]
                 if not wp.abs(force[d]) <= limit:
                     flags[DROWNED, w] = 1
                     if not wp.abs(force[d]) <= least:
                         flags[UNBALANCED, w] = 1
         found.right[i] = r
-        found.ratio[w, k] = ratio
-        found.square[w, k] = square
+        found.ratio[w, k] = largest / given.allowed[i]
+        found.square[w, k] = square / (length * length)
         found.change[w, k] = change
         found.noise[w, k] = noise + real(0.5) * size * reach
 
