@@ -30,7 +30,7 @@ EXACT_RTOL = 1e-12  # of the reference, which rounding ends
 DEVIATION = 1e-5  # largest error of a node [m per m of rod]
 NEVER = 10**9  # steps between readings of the outcomes
 SHOWN = (
-    "study rods nodes solver precision linear rtol ms_per_step ns_per_node_iteration newton_mean newton_max outcomes retries "
+    "study island rods nodes solver precision linear rtol ms_per_step ns_per_node_iteration newton_mean newton_max outcomes retries "
     "lost_pivots residual error failure"
 ).split()
 
@@ -49,6 +49,7 @@ class Case:
         axis: Direction of the straight rods.
         warm_up, blocks, block: Steps before the clock, blocks, steps of a block.
         tip: Published x and z of the tip [m] after `tip_step` steps; without, one rod solved to rounding is the measure.
+        island: Whether all share one Newton loop: each root is joined to a stub that is held.
     """
 
     study: str
@@ -67,6 +68,7 @@ class Case:
     block: int = 10
     tip: tuple | None = None
     tip_step: int = 0
+    island: bool = False
 
     def scene(self) -> ddg.Scene:
         """The rods, apart by five radii."""
@@ -74,8 +76,14 @@ class Case:
         points += np.linspace(0.0, self.length, self.nodes)[:, None] * np.array(self.axis)
         points[:, :, 1] += 5.0 * self.radius * np.arange(self.rods)[:, None]
         scene = ddg.Scene(gravity=self.gravity)
-        material = ddg.Material(young=1e7, poisson=0.5, density=1000.0)
-        scene.clamp(scene.add_rods(points, section=ddg.Circle(radius=self.radius), material=material), edges=[0])
+        kind = {"section": ddg.Circle(self.radius), "material": ddg.Material(young=1e7, poisson=0.5, density=1000.0)}
+        long = scene.add_rods(points, **kind)
+        scene.clamp(long, edges=[0])
+        if self.island:
+            stubs = scene.add_rods(points[:, :3] - points[:, 2:3] + points[:, :1], **kind)
+            scene.clamp(stubs, edges=[0, 1])
+            for one, other in zip(long, stubs, strict=True):
+                scene.join([(int(one), 0), (int(other), -1)], rigid=False)
         return scene
 
 
@@ -103,16 +111,18 @@ def cpu_cases(quick: bool) -> list[Case]:
             replace(PUBLISHED, rods=4, blocks=2),
             *(replace(few, study="rods", rods=rods) for rods in (1, 4)),
             *(replace(few, study="nodes", rods=4, nodes=nodes) for nodes in (12, 25)),
+            replace(few, study="island", rods=4, island=True),
         ]
     return [
         PUBLISHED,
+        *(replace(growth, study="island", rods=100, island=island, block=20) for island in (False, True)),
         *(replace(growth, study="rods", rods=rods) for rods in (1, 3, 10, 30, 100, 300, 1000)),
         *(replace(growth, study="nodes", nodes=nodes) for nodes in (12, 25, 50, 100, 200, 400)),
     ]
 
 
 def cuda_cases(quick: bool) -> list[Case]:
-    """Rods in every precision at two tolerances, and nodes a rod."""
+    """Rods in every precision at two tolerances, nodes a rod, and rods in one island beside the same on their own."""
     counts = (1, 10) if quick else (1, 100, 1_000, 10_000, 100_000)
     base = Case("rods", 1, 64, warm_up=4, blocks=2, block=4) if quick else Case("rods", 1, 64)
     cases = [
@@ -121,6 +131,12 @@ def cuda_cases(quick: bool) -> list[Case]:
         for rods in counts
         if precision != "float32" or rods <= 10_000
         for rtol in (8e-7, 1e-8)  # the first leaves a residual below 1e-7 N
+    ]
+    sizes = ((4, 64, 1.0),) if quick else ((10_000, 64, 1.0), (121, 961, 9.6))
+    cases += [
+        replace(base, study="island", rods=rods, nodes=nodes, length=length, precision="mixed", rtol=8e-7, island=island)
+        for rods, nodes, length in sizes
+        for island in (False, True)
     ]
     nodes = (16, 32) if quick else (16, 32, 64, 128, 256, 512)
     many = 10 if quick else 1_000
@@ -152,17 +168,17 @@ def clock_of(device) -> Callable[[], float]:
 
 def shapes(case: Case, state) -> np.ndarray:
     """Each rod as seen from its first node, (R, n, 3) [m]."""
-    points = state.points().reshape(case.rods, case.nodes, 3)
+    points = state.points()[: case.rods * case.nodes].reshape(case.rods, case.nodes, 3)
     return points - points[:, :1]
 
 
 def largest_residual(integrator: ddg.Integrator, state) -> float:
-    """Largest residual of a dof [N or N m] that the last step left: evaluates its last iterates once more.
+    """Largest residual of a dof [N or N m] that the last step left: evaluates the last iterates of rods on their own once more.
 
-    The solver keeps the residual that it last took a step from. Rods that rest at an earlier state are taken up again by
+    Their solver keeps the residual that it last took a step from. Rods that rest at an earlier state are taken up again by
     this, so it comes after everything else.
     """
-    worst = []
+    worst = [] if integrator._net is None else [np.abs(integrator._net.newton.right.numpy()).max()]
     for chain in integrator._chains:
         newton = chain.newton
         newton.islands.status.zero_()
@@ -228,6 +244,7 @@ def run(case: Case, device) -> tuple[dict, np.ndarray]:
     typical, nodes = float(np.median(times)), case.rods * case.nodes
     row = {
         "study": case.study,
+        "island": case.island,
         "rods": case.rods,
         "nodes": case.nodes,
         "solver": case.solver,
@@ -246,7 +263,7 @@ def run(case: Case, device) -> tuple[dict, np.ndarray]:
         "lost_pivots": statistics["lost_pivots"],
         "build_s": built - began,
         "first_two_steps_s": first,
-        "bytes_per_node": bytes_per_node(model, model.groups[0]),
+        "bytes_per_node": bytes_per_node(model, model.groups[0]) if model.groups else None,
         "measured_bytes_per_node": memory / nodes,
         "failure": failure,
     }
@@ -261,7 +278,7 @@ def measure(case: Case, device, exact: dict) -> dict:
         error = np.abs(found[:, -1, [0, 2]] - case.tip).max()
     else:
         # The rods are alike and apart, so that one of them, in float64 and swept to rounding, stands for all.
-        alone = replace(case, study="", rods=1, solver="sweep", precision="float64", rtol=EXACT_RTOL)
+        alone = replace(case, study="", rods=1, island=False, solver="sweep", precision="float64", rtol=EXACT_RTOL)
         if alone not in exact:
             exact[alone] = run(alone, device)[1]
         error = np.linalg.norm(found - exact[alone], axis=2).max()
