@@ -1,4 +1,4 @@
-"""Every Warp kernel of ddg_warp. Read `measures/edge_stretch.py`, then `element.py`, then `chain.py`."""
+"""Every Warp kernel of ddg_warp. Read `measures/edge_stretch.py`, then `element.py`, then `solve/sweep.py`."""
 
 import os
 

@@ -184,6 +184,12 @@ def block_inertia(real):
 
 
 @cache
+def mass_type(real, drag: bool):
+    """Masses of the dofs of blocks, of all worlds; with drag, inertia and drag (worlds, blocks)."""
+    return wp.array2d(dtype=block_inertia(real)) if drag else wp.array(dtype=wp.types.vector(3, real))
+
+
+@cache
 def net_kernels(real):
     """The same of the blocks of a net."""
     V, M, P = wp.types.vector(3, real), wp.types.matrix((3, 3), real), wp.types.vector(ROWS, real)

@@ -134,7 +134,9 @@ def cuda_cases(quick: bool) -> list[Case]:
     ]
     sizes = ((4, 64, 1.0),) if quick else ((10_000, 64, 1.0), (121, 961, 9.6))
     cases += [
-        replace(base, study="island", rods=rods, nodes=nodes, length=length, precision="mixed", rtol=8e-7, island=island)
+        replace(
+            base, study="island", rods=rods, nodes=nodes, length=length, precision="mixed", rtol=8e-7, island=island
+        )
         for rods, nodes, length in sizes
         for island in (False, True)
     ]

@@ -1,6 +1,6 @@
 """The report of a model: terms, elements, dofs, solver, kernels, memory, and what the scene does without."""
 
-from ddg_warp.kernels import cyclic_reduction
+from ddg_warp.kernels.solve import cyclic_reduction
 from ddg_warp.kernels.terms import ALL
 from ddg_warp.solve.choice import automatic, net_preconditioner
 from ddg_warp.solve.net.system import NetSystem

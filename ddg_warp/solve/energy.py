@@ -7,7 +7,7 @@ import warp as wp
 
 from ddg_warp.kernels import energy
 from ddg_warp.kernels.net import energy as net_energy
-from ddg_warp.kernels.net import krylov
+from ddg_warp.kernels.solve import krylov
 from ddg_warp.solve.net.system import Sums
 
 

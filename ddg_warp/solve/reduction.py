@@ -3,11 +3,11 @@
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels import cyclic_reduction
+from ddg_warp.kernels.solve import cyclic_reduction
 
 
 class CyclicReduction:
-    """Levels of the block cyclic reduction of open chains of at most `nodes` nodes of `nb` dofs; see `kernels.cyclic_reduction`."""
+    """Levels of the reduction of open chains of at most `nodes` nodes of `nb` dofs; see `kernels.solve.cyclic_reduction`."""
 
     def __init__(self, nb: int, nodes: int, columns: int, linear, device):
         self.columns, self.device, self.dofs = columns, device, 2 * nb

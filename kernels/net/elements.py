@@ -286,18 +286,19 @@ def part_function(measure: Measure, real):
 
     @wp.func
     def part(f: wp.array2d(dtype=real), row: int, slot: int, e: int):
-        v = V()
+        up = V()
+        down = V()
         p = plus[slot]
         m = minus[slot]
         if p >= wp.static(first) and p < wp.static(spins):
-            v[0] = f[row + p, e]
+            up[0] = f[row + p, e]
         else:
             for d in range(3):
                 if p >= 0:
-                    v[d] = f[row + p + d, e]
+                    up[d] = f[row + p + d, e]
                 if m >= 0:
-                    v[d] = v[d] - f[row + m + d, e]
-        return v
+                    down[d] = f[row + m + d, e]
+        return up - down
 
     return part
 

@@ -7,8 +7,8 @@ import warp as wp
 from ddg_warp.kernels.element import CPU_OPTIONS
 from ddg_warp.kernels.energy import DISSIPATED, DRIFT, HELD, ROUNDING, balance_function
 from ddg_warp.kernels.islands import PROGRESS, RATE
+from ddg_warp.kernels.matrix.sliced import mass_type
 from ddg_warp.kernels.net.elements import elements_type, functions
-from ddg_warp.kernels.net.system import mass_type
 from ddg_warp.kernels.terms import Term
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from ddg_warp.kernels import pivot
+from ddg_warp.kernels.solve import pivot
 
 SIZES = pytest.mark.parametrize("size", [2, 3, 4])
 REALS = pytest.mark.parametrize("real", [wp.float64, wp.float32], ids=["float64", "float32"])

@@ -40,7 +40,7 @@ def solved(problem: Problem, forcing: float) -> np.ndarray:
 
 
 def dense(problem: Problem, world: int) -> np.ndarray:
-    """Elimination of rods between joints, then of single joints, by the formulas of `kernels.net.chains` with dense matrices."""
+    """Elimination of rods between joints, then of single joints, by the formulas of `kernels.solve.elimination` with dense matrices."""
     host, free = problem.net.host, problem.free()
     H = np.where(np.outer(free, free), problem.matrix(world), np.diag(~free))
     pairs = problem.newton.chains.plan.pairs

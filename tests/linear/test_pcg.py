@@ -6,7 +6,8 @@ import warp as wp
 
 import ddg_warp as ddg
 from ddg_warp import arrays
-from ddg_warp.kernels import block_band, pcg
+from ddg_warp.kernels.matrix import block_band
+from ddg_warp.kernels.solve import pcg
 from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.chains.pcg import PcgNewton
 

@@ -3,12 +3,12 @@
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels import block_band
+from ddg_warp.kernels.matrix import block_band
 from ddg_warp.solve.chains.newton import ChainNewton, NewtonOptions
 
 
 class AssembledNewton(ChainNewton):
-    """As `ChainNewton`, with the matrix of every node in memory; see `kernels.block_band`.
+    """As `ChainNewton`, with the matrix of every node in memory; see `kernels.matrix.block_band`.
 
     Attributes:
         blocks: D, E and F of every node, (3 block^2, nodes, columns).

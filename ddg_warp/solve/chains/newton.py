@@ -6,8 +6,10 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError, check_options
-from ddg_warp.kernels import balance, chain, element, geometric, search, step
+from ddg_warp.kernels import balance, element, search, step
 from ddg_warp.kernels.islands import Islands
+from ddg_warp.kernels.matrix import geometric
+from ddg_warp.kernels.solve import sweep
 
 EARLY = 2  # iterations that "progressive" makes by Gauss-Newton: far from a solution the exact matrix is no better
 PSD_MODES = ("auto", "gauss_newton", "project", "progressive", "none")
@@ -113,7 +115,7 @@ class ChainNewton:
         self._predict = step.predict_kernel(kind, self.real, self.linear, midpoint)
         self._sweep, self._threads = None, 32 if columns < MANY else 128
         if not kind.closed:
-            self._sweep = chain.sweep_kernel(kind, self.real, self.linear, self.exact_from, self.psd == "none")
+            self._sweep = sweep.sweep_kernel(kind, self.real, self.linear, self.exact_from, self.psd == "none")
         self._adjust = None if kind.closed else search.adjust_kernel(kind, self.real, self.linear)
 
     def automatic_psd(self) -> str:

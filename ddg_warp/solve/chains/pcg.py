@@ -4,7 +4,9 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import block_band, judge, pcg
+from ddg_warp.kernels import judge
+from ddg_warp.kernels.matrix import block_band
+from ddg_warp.kernels.solve import pcg
 from ddg_warp.solve.chains.assembled import AssembledNewton
 from ddg_warp.solve.chains.newton import NewtonOptions
 

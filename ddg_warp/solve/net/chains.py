@@ -1,13 +1,14 @@
-"""The chain preconditioner of a net on a device; see `kernels.net.chains` and `joints`."""
+"""The chain preconditioner of a net on a device; see `kernels.solve.elimination` and `joints`."""
 
 import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.net import chains, joints
-from ddg_warp.kernels.net.bands import along_type, band_kernels, place_kernel
-from ddg_warp.kernels.net.system import SETS
+from ddg_warp.kernels.matrix.bands import band_kernels
+from ddg_warp.kernels.matrix.sliced import SETS
+from ddg_warp.kernels.net.places import along_type, place_kernel
+from ddg_warp.kernels.solve import elimination, joints
 from ddg_warp.solve.choice import long_and_few
 from ddg_warp.solve.net.system import lists
 from ddg_warp.solve.reduction import CyclicReduction
@@ -93,7 +94,7 @@ class Chains:
             apart = np.zeros(net.blocks, np.uint8)
             apart[self.elsewhere()] = 1
             self._apart = wp.array(apart, dtype=wp.uint8, device=device)
-        made = chains.chain_kernels(plan.twist, plan.span, linear, plan.size, self.serial)
+        made = elimination.chain_kernels(plan.twist, plan.span, linear, plan.size, self.serial)
         self._factorise, self._load, self._solve, self._solve_all, self._follow, self._finish, *self._columns = made
         self._measure, self._meet = joints.joint_kernels(linear) if self.joints else (None, None)
 

@@ -1,10 +1,10 @@
-"""The multilevel preconditioner of a net on a device; see `kernels.net.levels`."""
+"""The multilevel preconditioner of a net on a device; see `kernels.solve.levels`."""
 
 import numpy as np
 import warp as wp
 
-from ddg_warp.kernels.net import levels
-from ddg_warp.kernels.net.levels import GROUP, PIECE
+from ddg_warp.kernels.solve import levels
+from ddg_warp.kernels.solve.levels import GROUP, PIECE
 
 
 class Multilevel:

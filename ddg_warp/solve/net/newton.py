@@ -8,10 +8,10 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.compile.tolerance import outer_forces
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import pcg
 from ddg_warp.kernels.drag import block_inertia
 from ddg_warp.kernels.islands import Islands
-from ddg_warp.kernels.net import elements, krylov, newton, system
+from ddg_warp.kernels.net import balance, elements, newton
+from ddg_warp.kernels.solve import krylov, pcg
 from ddg_warp.solve.chains.newton import EARLY, NewtonOptions
 from ddg_warp.solve.net.chains import Chains
 from ddg_warp.solve.net.multilevel import Multilevel
@@ -30,7 +30,7 @@ class NetNewton:
 
     Args:
         preconditioner: of conjugate gradients: "block_jacobi", "chain" (rods between their joints are eliminated, see
-            `kernels.net.chains`), "multilevel" (see `kernels.net.levels`), or "chain_multilevel", both.
+            `kernels.solve.elimination`), "multilevel" (see `kernels.solve.levels`), or "chain_multilevel", both.
         linear: scalar type of the linear algebra; that of the model by default.
         drag: whether a block has more than a mass; see `kernels.drag`.
     """
@@ -124,7 +124,7 @@ class NetNewton:
         self._direct = self.chains is not None and self.chains.exact
         self._repeat = pcg.repeat_kernel(self.real, False) if any(exact) or self._direct else None
         self.negative = make(worlds, int)
-        self._balance, self._sets = system.balance_kernel(self.real, self.linear, drag, serial), self._meetings()
+        self._balance, self._sets = balance.balance_kernel(self.real, self.linear, drag, serial), self._meetings()
         self._no_frames = [make(0, int), make(0, wp.types.matrix((3, 3), self.real))]
         self._assembly = Assembly(
             net, self.system, self.parts, self.real, self.linear, self.exact_from, self.local, drag, serial
@@ -172,7 +172,7 @@ class NetNewton:
 
     def _balance_arguments(self, drag: bool) -> tuple:
         """What the balance reads and writes."""
-        given, found = system.given_type(self.real, drag)(), system.found_type(self.real, self.linear)()
+        given, found = balance.given_type(self.real, drag)(), balance.found_type(self.real, self.linear)()
         for name in ("q", "base", "target", "mass", "gravity", "load", "fixed", "arm", "longest"):
             setattr(given, name, getattr(self, name))
         given.allowed, given.blocks, given.nodes = self.allowed.blocks, self.net.blocks, self.net.host.nodes
@@ -187,7 +187,7 @@ class NetNewton:
         sets = []
         nothing = [wp.zeros((1, 1), dtype=kind, device=self.device) for kind in (self.net.vector, self.real)]
         for part, own, local, meets in zip(self.net.sets, self.parts, self.local, self.system.meets, strict=True):
-            meeting, measure = system.meeting_type(self.real, self.linear)(), part.term.measure
+            meeting, measure = balance.meeting_type(self.real, self.linear)(), part.term.measure
             meeting.gradient, meeting.along = (nothing[0], own["gradient"]) if local else (own["gradient"], nothing[1])
             ends = np.transpose(measure.ends).astype(np.int32) if local else np.zeros((0, 2), np.int32)
             meeting.ends = wp.array(ends, dtype=int, device=self.device)
@@ -195,7 +195,7 @@ class NetNewton:
             meeting.nodes, meeting.elements = measure.nodes, part.elements
             sets.append(meeting)
         self._meeting = sets  # an array of structures holds no arrays alive
-        return wp.array(sets, dtype=system.meeting_type(self.real, self.linear), device=self.device)
+        return wp.array(sets, dtype=balance.meeting_type(self.real, self.linear), device=self.device)
 
     @property
     def kernels(self) -> list:

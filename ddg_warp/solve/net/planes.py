@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp.kernels.net import planes
+from ddg_warp.kernels.matrix import planes
 
 
 class HostPlanes:

@@ -1,11 +1,13 @@
-"""The sparse system of a net on a device: what meets at each block, and H in slices; see `kernels.net.system`."""
+"""The sparse system of a net on a device: what meets at each block, and H in slices; see `kernels.matrix.sliced`."""
 
 import numpy as np
 import warp as wp
 
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.net import krylov, system
-from ddg_warp.kernels.net.system import SLICE
+from ddg_warp.kernels.matrix import sliced
+from ddg_warp.kernels.matrix.sliced import SLICE
+from ddg_warp.kernels.net.balance import ITEM
+from ddg_warp.kernels.solve import krylov
 
 
 class NetSystem:
@@ -13,8 +15,8 @@ class NetSystem:
 
     Args:
         net: `DeviceNet`.
-        kept: blocks (N,) bool between which chains keep what elements along rods add, see `kernels.net.bands`; entries of held blocks
-            then are left out. None: all is here.
+        kept: blocks (N,) bool between which chains keep what elements along rods add, see `kernels.matrix.bands`; entries of held
+            blocks then are left out. None: all is here.
 
     Attributes:
         positions: entries of H in a world, padding included.
@@ -63,7 +65,7 @@ class NetSystem:
             self.adds.append((put(starts), put(items if which is None else which[items])))
             starts, items = lists(part.host.slots.T.ravel(), blocks)
             element, slot = np.divmod(items, len(part.host.slots))
-            self.meets.append((put(starts), put(element * system.ITEM + slot)))
+            self.meets.append((put(starts), put(element * ITEM + slot)))
 
 
 def _pairs(part, kept, out) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
@@ -120,7 +122,7 @@ class Sums:
 
 
 class Assembly:
-    """Sums H from what the elements of all sets write, `system.SETS` sets a launch.
+    """Sums H from what the elements of all sets write, `sliced.SETS` sets a launch.
 
     Args:
         written: of each set, the arrays "factor", "tension" and "second".
@@ -144,18 +146,18 @@ class Assembly:
     ):
         self.serial = serial
         self.net, self.table, self.kernels, self._own = net, table, [], []
-        for first in range(0, len(net.sets), system.SETS):
-            sets, late, own_dofs = (of[first : first + system.SETS] for of in (net.sets, exact_from, local))
+        for first in range(0, len(net.sets), sliced.SETS):
+            sets, late, own_dofs = (of[first : first + sliced.SETS] for of in (net.sets, exact_from, local))
             terms = tuple(part.term for part in sets)
-            self.kernels.append(system.assemble_kernel(terms, real, linear, first == 0, late, own_dofs, drag, serial))
+            self.kernels.append(sliced.assemble_kernel(terms, real, linear, first == 0, late, own_dofs, drag, serial))
             own = []
             for i in range(first, first + len(sets)):
-                data = system.contributions(linear, local[i])()
+                data = sliced.contributions(linear, local[i])()
                 data.factor, data.tension, data.second = (written[i][name] for name in ("factor", "tension", "second"))
                 data.starts, data.items = table.adds[i]
                 data.elements = net.sets[i].elements
                 own.append(data)
-            self._own.append(own + [own[-1]] * (system.SETS - len(own)))
+            self._own.append(own + [own[-1]] * (sliced.SETS - len(own)))
 
     def __call__(self, mass: wp.array, islands, matrix: wp.array) -> None:
         """Write H (9, positions of all worlds) of the worlds that want it."""

@@ -1,48 +1,22 @@
-"""H of a net between the places of its chains: what elements along rods add, in blocks D, E and F as `kernels.block_band` has them.
+"""H of a net between the places of its chains: what elements along rods add, in blocks D, E and F as `matrix.block_band` has them.
 
 A place of a chain has a node and the angle of the edge ahead of it, a block of -1 where it has none. Blocks of H that belong to two
-places of a chain lie here, not among the positions of `kernels.net.system`, which hold all others; what other elements, such as
-joints, add between two places is taken from there.
+places of a chain lie here, not among the positions of `matrix.sliced`, which hold all others; what other elements, such as joints, add
+between two places is taken from there.
 """
 
 from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.block_band import block_functions
+from ddg_warp.kernels.drag import mass_type
 from ddg_warp.kernels.element import CPU_OPTIONS, until_function
-from ddg_warp.kernels.islands import CLAMPED, COEFFICIENT, ITERATION, LOAD_SCALE, SLOT, STATUS, WANTED
+from ddg_warp.kernels.islands import CLAMPED, COEFFICIENT, ITERATION, WANTED
+from ddg_warp.kernels.matrix.block_band import block_functions
+from ddg_warp.kernels.matrix.sliced import product_functions, second_function
 from ddg_warp.kernels.net.elements import part_function
-from ddg_warp.kernels.net.system import (
-    found_type,
-    given_type,
-    mass_type,
-    product_functions,
-    residual_functions,
-    second_function,
-)
+from ddg_warp.kernels.net.places import along_type
 from ddg_warp.kernels.terms import Term
-
-
-@cache
-def along_type(real, linear):
-    """What a set along rods writes, of the local dofs; and its elements at each place.
-
-    Entry (i, k, c) of `at` is the element whose node i is at that place, -1 for none.
-    """
-
-    @wp.struct
-    class Along:
-        gradient: wp.array2d(dtype=real)
-        energy: wp.array2d(dtype=real)
-        stiffness: wp.array(dtype=linear)
-        factor: wp.array2d(dtype=linear)
-        tension: wp.array2d(dtype=linear)
-        second: wp.array2d(dtype=linear)
-        at: wp.array3d(dtype=int)
-        elements: int
-
-    return Along
 
 
 @cache
@@ -207,158 +181,6 @@ def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tupl
         return D, E, F
 
     return add
-
-
-@cache
-def force_function(terms: tuple[Term, ...], real, linear):
-    """collect(along..., k, c, w, accepted) of the last of the terms, and by calling itself of those before: what meets at a place.
-
-    Returns forces on its node, their sizes and stiffnesses, the same of the angle ahead, the change of the energy of the elements that
-    begin there, and the size of that.
-    """
-    measure, which, first = terms[-1].measure, len(terms) - 1, len(terms) == 1
-    V, Along = wp.types.vector(3, real), along_type(real, linear)
-    nodes, angles = measure.nodes, measure.angles
-    part = part_function(measure, real)
-    before = None if first else force_function(terms[:-1], real, linear)
-
-    @wp.func
-    def collect(
-        own0: Along,
-        own1: Along,
-        own2: Along,
-        own3: Along,
-        own4: Along,
-        own5: Along,
-        k: int,
-        c: int,
-        w: int,
-        accepted: int,
-    ):
-        own = own0
-        if wp.static(which == 1):
-            own = own1
-        if wp.static(which == 2):
-            own = own2
-        if wp.static(which == 3):
-            own = own3
-        if wp.static(which == 4):
-            own = own4
-        if wp.static(which == 5):
-            own = own5
-        force = V()
-        size = real(0.0)
-        stiff = real(0.0)
-        moment = real(0.0)
-        size_too = real(0.0)
-        stiff_too = real(0.0)
-        change = real(0.0)
-        noise = real(0.0)
-        if wp.static(not first):
-            force, size, stiff, moment, size_too, stiff_too, change, noise = before(
-                own0, own1, own2, own3, own4, own5, k, c, w, accepted
-            )
-        for i in range(wp.static(nodes)):
-            e = own.at[i, k, c]
-            if e >= 0:
-                e += w * own.elements
-                f = part(own.gradient, 0, i, e)
-                stiffness = real(own.stiffness[e])
-                force += f
-                size += wp.max(wp.abs(f))
-                stiff += stiffness
-                if i == 0:
-                    new = own.energy[1 - accepted, e]
-                    change += new - own.energy[accepted, e]
-                    noise += wp.abs(new)
-                if wp.static(angles > 0):
-                    if i < wp.static(angles):
-                        m = own.gradient[wp.static(measure.size - angles) + i, e]
-                        moment += m
-                        size_too += wp.abs(m)
-                        stiff_too += stiffness
-        return force, size, stiff, moment, size_too, stiff_too, change, noise
-
-    return collect
-
-
-@cache
-def place_kernel(terms: tuple[Term, ...], twist: bool, real, linear, drag: bool, serial: bool):
-    """balance(...) of the nodes and angles of places, but for those `elsewhere`; see `kernels.net.system`."""
-    Along, Given, Found = along_type(real, linear), given_type(real, drag), found_type(real, linear)
-    V, until = wp.types.vector(3, real), until_function(serial)
-    outer, settle = residual_functions(real, linear, drag)
-    collect = force_function(terms, real, linear)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def balance(
-        given: Given,
-        places: wp.array3d(dtype=int),
-        count: wp.array(dtype=int),
-        elsewhere: wp.array(dtype=wp.uint8),
-        flags: wp.array2d(dtype=int),
-        scalars: wp.array2d(dtype=real),
-        own0: Along,
-        own1: Along,
-        own2: Along,
-        own3: Along,
-        own4: Along,
-        own5: Along,
-        found: Found,
-    ):
-        start, r = wp.tid()
-        w = r / count.shape[0]
-        c = r - w * count.shape[0]
-        if flags[STATUS, w] != 0 or start >= count[c]:
-            return
-        load_scale = scalars[LOAD_SCALE, w]
-        coefficient = scalars[COEFFICIENT, w]
-        accepted = flags[SLOT, w]
-        for k in range(start, until(start, count[c])):
-            f, size, stiff, moment, size_too, stiff_too, change, noise = collect(
-                own0, own1, own2, own3, own4, own5, k, c, w, accepted
-            )
-            node = places[0, k, c]
-            if node >= 0:
-                if elsewhere[node] == wp.uint8(0):
-                    i = node + w * given.blocks
-                    force, large, rigid, work = outer(given, i, node, w, coefficient)
-                    settle(
-                        given,
-                        found,
-                        flags,
-                        load_scale,
-                        i,
-                        node,
-                        w,
-                        force - f,
-                        large + size,
-                        rigid + stiff,
-                        work + change,
-                        wp.abs(work) + noise,
-                    )
-            if wp.static(twist):
-                angle = places[1, k, c]
-                if angle >= 0:
-                    if elsewhere[angle] == wp.uint8(0):
-                        j = angle + w * given.blocks
-                        turning, large_too, rigid_too, work_too = outer(given, j, angle, w, coefficient)
-                        settle(
-                            given,
-                            found,
-                            flags,
-                            load_scale,
-                            j,
-                            angle,
-                            w,
-                            turning - V(moment, real(0.0), real(0.0)),
-                            large_too + size_too,
-                            rigid_too + stiff_too,
-                            work_too,
-                            wp.abs(work_too),
-                        )
-
-    return balance
 
 
 @cache

@@ -10,7 +10,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.element import CPU_OPTIONS
-from ddg_warp.kernels.net.system import product_functions
+from ddg_warp.kernels.matrix.sliced import product_functions
 
 TILE = 4096  # entries that one block of threads sums
 TILES = 1024  # largest number of such blocks in a world

@@ -4,8 +4,8 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.net.krylov import inverse_function
-from ddg_warp.kernels.net.system import product_functions
+from ddg_warp.kernels.matrix.sliced import product_functions
+from ddg_warp.kernels.solve.krylov import inverse_function
 
 
 @cache

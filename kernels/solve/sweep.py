@@ -14,7 +14,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels import geometric, outcome, pivot
+from ddg_warp.kernels import outcome
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, inertia_type
 from ddg_warp.kernels.islands import (
     ACTIVE,
@@ -35,7 +35,9 @@ from ddg_warp.kernels.islands import (
     TODO,
 )
 from ddg_warp.kernels.judge import judge_functions
+from ddg_warp.kernels.matrix import geometric
 from ddg_warp.kernels.search import PLACE, RELAG, TURNED, search_functions
+from ddg_warp.kernels.solve import pivot
 
 
 @cache

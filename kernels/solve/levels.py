@@ -14,7 +14,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.net.system import product_functions
+from ddg_warp.kernels.matrix.sliced import product_functions
 
 GROUP = 8  # members of a group
 PIECE = 32  # blocks of H that one thread sums

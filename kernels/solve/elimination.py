@@ -22,15 +22,15 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.block_band import (
+from ddg_warp.kernels.element import CPU_OPTIONS, until_function
+from ddg_warp.kernels.matrix.block_band import (
     block_functions,
     factor_function,
     substitute_all_function,
     substitute_function,
 )
-from ddg_warp.kernels.element import CPU_OPTIONS, until_function
-from ddg_warp.kernels.net.joints import coupling_functions
-from ddg_warp.kernels.net.system import product_functions
+from ddg_warp.kernels.matrix.sliced import product_functions
+from ddg_warp.kernels.solve.joints import coupling_functions
 
 
 @cache
@@ -132,7 +132,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def spread(wanted: wp.array(dtype=int), columns: int, wanted_out: wp.array(dtype=int)):
-        """For `kernels.cyclic_reduction`: which columns are wanted."""
+        """For `kernels.solve.cyclic_reduction`: which columns are wanted."""
         r = wp.tid()
         wanted_out[r] = wp.where(wanted[r / columns] == 1, 1, 0)
 

@@ -1,0 +1,1 @@
+"""Hessians as blocks: bands of rods, slices of nets."""
