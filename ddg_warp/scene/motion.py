@@ -131,21 +131,3 @@ class Motion:
     def turn(self, t: float, vectors: np.ndarray) -> np.ndarray:
         """Where vectors of the rest state (n, 3) point at t."""
         return vectors @ self.rotation(self.turned(t)).T
-
-    def director_angle(self, t0: float, t1: float, rest: np.ndarray, frame: np.ndarray, edge: np.ndarray, angle: float):
-        """Angle at t1 of the director `rest` (3,) of the rest state, from an edge's transported reference director [rad].
-
-        Args:
-            frame: lagged director and tangent of the edge (6,); edge: its present vector (3,) [m].
-            angle: the angle at t0, whose branch is kept.
-        """
-        t = edge / np.linalg.norm(edge)
-        u0, t_old = frame[:3], frame[3:]
-        b = np.cross(t_old, t)
-        c = t_old @ t
-        u = u0 * c + np.cross(b, u0) + b * (b @ u0) / (1.0 + c)
-        a0, a1 = self.turned(t0), self.turned(t1)
-        d = self.rotation(a1) @ rest
-        new = np.arctan2(np.cross(u, d) @ t, u @ d)
-        expected = angle + (self._unit @ t) * (a1 - a0)
-        return new - 2.0 * np.pi * np.round((new - expected) / (2.0 * np.pi))

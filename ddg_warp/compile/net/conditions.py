@@ -64,7 +64,7 @@ def hold(scene, net: Net) -> None:
     for support in scene.ring_supports:
         nodes = net.meridians[support.shell].nodes[support.nodes]
         claims.mark(nodes, np.arange(len(nodes)), support)
-    frames_of_planes(net, normals, (claims.poses > STILL).any(1))
+    frames_of_planes(net, normals, (net.poses > STILL).any(1))
 
 
 class _Claims:
@@ -72,7 +72,6 @@ class _Claims:
 
     def __init__(self, net: Net, motions: list):
         self.net, self.motions, self.start = net, motions, pose_starts(motions)
-        self.poses = np.full((net.blocks, 3), FREE)
 
     def mark(self, nodes: np.ndarray, rows: np.ndarray, support, edges: np.ndarray = _NONE) -> None:
         """Hold nodes, the `rows` of their displacements where a motion has one for each, and angles of edges."""
@@ -90,16 +89,10 @@ class _Claims:
         pose = first + rows
         for d in components:
             self._take(nodes, d, pose)
-        known = self.poses[edges, 0] if edges.size else edges
         self._take(edges, 0, np.full(len(edges), first))
-        if index >= 0:
-            net.moving.append((nodes, index, np.isin(np.arange(3), components), rows))
-            edges = edges[known == FREE]  # an angle is counted on from where it is: once
-            if len(edges):
-                net.turning.append((np.unique(edges), index))
 
     def _take(self, blocks: np.ndarray, component: int, pose: np.ndarray) -> None:
-        before = self.poses[blocks, component]
+        before = self.net.poses[blocks, component]
         for i in np.flatnonzero((before != FREE) & (before != pose))[:1]:
             block, axis = blocks[i], f" along {'xyz'[component]}"
             where = "the point at ({:g}, {:g}, {:g}) m".format(*self.net.rest[block])
@@ -107,7 +100,7 @@ class _Claims:
                 if block in rod.all_edges:
                     where, axis = f"edge {int(np.argmax(rod.all_edges == block)) - rod.first} of rod {rod.rod}", ""
             raise SceneError(disagreement(where, axis, min(before[i], pose[i]) == STILL))
-        self.poses[blocks, component] = pose
+        self.net.poses[blocks, component] = pose
 
 
 def load(scene, net: Net) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ddg_warp.compile import axisymmetric
 from ddg_warp.compile import shells as shell_terms
-from ddg_warp.compile.chains import Piece
+from ddg_warp.compile.chains import STILL, Piece
 from ddg_warp.compile.net.loads import NetCouple, NetEdgeCouple, NetLoad, NetPressure
 from ddg_warp.compile.precision import float32_error, float32_errors
 from ddg_warp.compile.tolerance import Bodies
@@ -93,8 +93,7 @@ class Net:
         mass: of every dof (N, 3) [kg, kg m^2]; fixed: held dofs (N, 3).
         load: dead forces (N, 3); timed: those that change; pressures, bands, couples, edge_couples: loads that follow what they act on.
         held: what each support of `scene.supports`, then of `scene.shell_supports` and `scene.ring_supports`, holds here.
-        moving: (blocks, motion, components (3,) bool, rows of its displacements) of nodes with a motion.
-        turning: (angle blocks, motion) of rod edges.
+        poses: of each dof the pose that moves it, `STILL` where it is held still, `FREE` where it is free (N, 3); see `pose_starts`.
         frames: orthonormal rows (3, 3) that the held components of a node on an oblique plane refer to; see `compile.net.planes`.
     """
 
@@ -111,11 +110,10 @@ class Net:
     mass: np.ndarray
     fixed: np.ndarray
     load: np.ndarray
+    poses: np.ndarray
     timed: list[NetLoad] = field(default_factory=list)
     pressures: list[NetPressure] = field(default_factory=list)
     held: list[NetHeld] = field(default_factory=list)
-    moving: list[tuple[np.ndarray, int, np.ndarray, np.ndarray]] = field(default_factory=list)
-    turning: list[tuple[np.ndarray, int]] = field(default_factory=list)
     meridians: list[axisymmetric.NetMeridian] = field(default_factory=list)
     bands: list[axisymmetric.NetBand] = field(default_factory=list)
     couples: list[NetCouple] = field(default_factory=list)
@@ -134,6 +132,24 @@ class Net:
         for block, frame in self.frames.items():
             result[block] = (np.abs(frame[self.fixed[block]]) > 1e-9).any(0)
         return result
+
+    @property
+    def moves(self) -> bool:
+        """Whether something is moved."""
+        return bool((self.poses > STILL).any())
+
+    @property
+    def moving(self) -> np.ndarray:
+        """Nodes that move, and the pose of each of their components, -1 for none (n, 4)."""
+        blocks = np.flatnonzero((self.poses[: self.nodes] > STILL).any(1))
+        return np.column_stack([blocks, np.maximum(self.poses[blocks], STILL)])
+
+    @property
+    def turning(self) -> np.ndarray:
+        """Rod edges whose angle is held by what moves, and its pose (e, 2)."""
+        poses = self.poses[self.nodes : self.nodes + self.rod_edges, 0]
+        edges = np.flatnonzero(poses > STILL)
+        return np.column_stack([edges, poses[edges]])
 
     @property
     def followers(self) -> list:

@@ -36,15 +36,8 @@ class NetMotion:
         def vectors(values):
             return wp.array(np.ascontiguousarray(values), dtype=net.vector, device=device)
 
-        motions = np.full((host.blocks, 3), -1)
-        for blocks, index, components, rows in host.moving:
-            motions[blocks] = np.where(components, start[index] + rows[:, None], motions[blocks])
-        blocks = np.flatnonzero((motions >= 0).any(1))
-        self.nodes = put(np.column_stack([blocks, motions[blocks]]))
-        self.rest = vectors(host.rest)
-        edges = [np.column_stack([b - host.nodes, np.full(len(b), start[index])]) for b, index in host.turning]
-        edges = np.concatenate([np.zeros((0, 2), int), *edges])
-        self.edges, self.edge_rest = put(edges), vectors(host.frame[:3, edges[:, 0]].T)
+        self.nodes, self.rest = put(host.moving), vectors(host.rest)
+        self.edges, self.edge_rest = put(host.turning), vectors(host.frame[:3, host.turning[:, 0]].T)
         self.normals = {}
         for i in net.turning_data():
             element, row, index = net.sets[i].turning.T

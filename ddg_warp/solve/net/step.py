@@ -49,7 +49,7 @@ class NetStep(PartStep):
         self.middle = model.net.empty() if self.midpoint and model.net.edges else None
         self.drag = NetDrag(model, self.midpoint) if host.drag else None
         self.energy = NetEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
-        self.motion = NetMotion(model, self.midpoint) if host.moving else None
+        self.motion = NetMotion(model, self.midpoint) if host.moves else None
         self.loads, self.field = NetLoads(model, self.midpoint), NetField(model, self.midpoint)
         self._data = (self.motion.data if self.motion else {}) | self.field.data
 

@@ -8,8 +8,10 @@ from scipy import sparse
 
 from ddg_warp.compile.tolerance import largest_excess
 from ddg_warp.geometry.turning import turned
+from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.net import elements
 from ddg_warp.solve.net.planes import HostPlanes
+from ddg_warp.solve.net.prescribed import NetMotion
 from ddg_warp.solve.rigid import Body
 
 
@@ -173,23 +175,12 @@ class NetTangent:
 
     def move_supports(self, state, before: float, at: float) -> None:
         """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""
-        host = self.host
-        q = state.net.q.numpy().astype(np.float64).reshape(self.net.worlds, -1, 3)
-        for blocks, motion, components, rows in host.moving:
-            target = self.model.motions[motion].place(at, host.rest[blocks], rows)
-            q[:, blocks] = np.where(components, target, q[:, blocks])
-        if host.turning:
-            frame = state.net.frame.numpy().astype(np.float64).reshape(6, self.net.worlds, -1)
-            for blocks, index in host.turning:
-                motion = self.model.motions[index]
-                for block in blocks:
-                    f = block - host.nodes
-                    for world in range(self.net.worlds):
-                        x = q[world][host.ends[f]]
-                        q[world, block, 0] = motion.director_angle(
-                            before, at, host.frame[:3, f], frame[:, world, f], x[1] - x[0], q[world, block, 0]
-                        )
-        state.net.q.assign(q.reshape(-1, 3))
+        if self.host.moves:
+            motion = NetMotion(self.model, midpoint=False)
+            motion.upload(before, at)
+            islands = Islands(self.net.worlds, self.model.types.real, self.model.wp_device)
+            islands.portion.fill_(1.0)
+            motion.apply(islands, state.net.q, state.net.frame)
         self.prescribe(state, at)
 
     def prescribe(self, state, at: float) -> None:
