@@ -95,7 +95,7 @@ def test_many_rods(tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     with open(tmp_path / "rods_cpu.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert {row["study"] for row in rows} == {"published", "rods", "nodes"}
+    assert {row["study"] for row in rows} == {"published", "rods", "nodes", "island"}
     assert set(COLUMNS) <= set(rows[0])
     header = next(line for line in done.stdout.splitlines() if line.startswith("study "))
     assert set(COLUMNS) <= set(header.split())

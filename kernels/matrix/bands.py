@@ -15,7 +15,7 @@ from ddg_warp.kernels.islands import CLAMPED, COEFFICIENT, ITERATION, WANTED
 from ddg_warp.kernels.matrix.block_band import block_functions
 from ddg_warp.kernels.matrix.sliced import product_functions, second_function
 from ddg_warp.kernels.net.elements import part_function
-from ddg_warp.kernels.net.places import along_type
+from ddg_warp.kernels.net.places import along_type, one_function
 from ddg_warp.kernels.terms import Term
 
 
@@ -81,7 +81,7 @@ def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tupl
     )
     second_of = second_function(measure, linear) if curved else None
     before = sum_function(terms[:-1], twist, real, linear, exact[:-1]) if len(terms) > 1 else None
-    which, first = len(terms) - 1, len(terms) == 1
+    first, one = len(terms) == 1, one_function(len(terms) - 1, real, linear)
     part = part_function(measure, linear)
 
     @wp.func
@@ -161,17 +161,7 @@ def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tupl
     def add(
         own0: Along, own1: Along, own2: Along, own3: Along, own4: Along, own5: Along, k: int, c: int, w: int, late: bool
     ):
-        own = own0
-        if wp.static(which == 1):
-            own = own1
-        if wp.static(which == 2):
-            own = own2
-        if wp.static(which == 3):
-            own = own3
-        if wp.static(which == 4):
-            own = own4
-        if wp.static(which == 5):
-            own = own5
+        own = one(own0, own1, own2, own3, own4, own5)
         D, E, F = own_sum(own, k, c, w, late)
         if wp.static(not first):
             D1, E1, F1 = before(own0, own1, own2, own3, own4, own5, k, c, w, late)

@@ -36,13 +36,35 @@ def along_type(real, linear):
 
 
 @cache
+def one_function(which: int, real, linear):
+    """one(...): of up to six sets, that of number `which`."""
+    Along = along_type(real, linear)
+
+    @wp.func
+    def one(own0: Along, own1: Along, own2: Along, own3: Along, own4: Along, own5: Along):
+        if wp.static(which == 1):
+            return own1
+        if wp.static(which == 2):
+            return own2
+        if wp.static(which == 3):
+            return own3
+        if wp.static(which == 4):
+            return own4
+        if wp.static(which == 5):
+            return own5
+        return own0
+
+    return one
+
+
+@cache
 def force_function(terms: tuple[Term, ...], real, linear):
     """collect(along..., k, c, w, accepted) of the last of the terms, and by calling itself of those before: what meets at a place.
 
     Returns forces on its node, their sizes and stiffnesses, the same of the angle ahead, the change of the energy of the elements that
     begin there, and the size of that.
     """
-    measure, which, first = terms[-1].measure, len(terms) - 1, len(terms) == 1
+    measure, first, one = terms[-1].measure, len(terms) == 1, one_function(len(terms) - 1, real, linear)
     V, Along = wp.types.vector(3, real), along_type(real, linear)
     nodes, angles = measure.nodes, measure.angles
     part = part_function(measure, real)
@@ -61,17 +83,7 @@ def force_function(terms: tuple[Term, ...], real, linear):
         w: int,
         accepted: int,
     ):
-        own = own0
-        if wp.static(which == 1):
-            own = own1
-        if wp.static(which == 2):
-            own = own2
-        if wp.static(which == 3):
-            own = own3
-        if wp.static(which == 4):
-            own = own4
-        if wp.static(which == 5):
-            own = own5
+        own = one(own0, own1, own2, own3, own4, own5)
         force = V()
         size = real(0.0)
         stiff = real(0.0)

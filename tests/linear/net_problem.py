@@ -127,17 +127,21 @@ class Problem:
         newton.islands.rate.fill_(1.0)
         newton.islands.wanted.fill_(1)
 
-    def iterate(self, forcing: float):
+    def assemble(self):
         newton = self.newton
         newton.evaluate(self.state.net)
         newton.balance()
         newton.assemble()
+        return self
+
+    def iterate(self, forcing: float):
+        newton = self.assemble().newton
         newton.forcing.fill_(forcing)
         newton.direct()
         return self
 
     def matrix(self, world: int) -> np.ndarray:
-        """H of a world, from its slices and bands; what bands hold of held dofs is the identity."""
+        """H of a world, from its slices and bands, if these have not been factored in place; of held dofs they hold the identity."""
         table, N = self.newton.system, self.blocks
         rows, columns = table.rows.numpy(), table.columns.numpy()
         values = self.newton.matrix.numpy().reshape(9, 2, -1)[:, world]

@@ -170,8 +170,35 @@ def rod_on_a_held_sheet() -> ddg.Scene:
 @DAILY_IN_FLOAT64
 @pytest.mark.parametrize("scene", [bent_frame, star, rod_on_a_held_sheet])
 def test_nets_with_one_joint_at_most_are_solved_at_once(device, scene, precision):
+    """By elimination alone: H d = r."""
     problem = Problem(scene(), device, 1.02, precision, "chain")
-    assert solved(problem, 1e-8 if precision == "float64" else 1e-3).max() <= (1 if precision == "float64" else 2)
+    problem.newton.islands.clamped.fill_(1)
+    matrices, newton, free = [problem.assemble().matrix(world) for world in range(2)], problem.newton, problem.free()
+    newton.direct()
+    assert newton.chains.exact and newton.pcg_iterations() == 0
+    right, direction = (v.numpy().astype(float).reshape(2, -1) for v in (newton.right, newton.direction))
+    for world in range(2):
+        expected = np.zeros(free.size)
+        expected[free] = np.linalg.solve(matrices[world][np.ix_(free, free)], right[world][free])
+        tolerance = (1e-9 if precision == "float64" else 2e-3) * np.abs(expected).max()
+        np.testing.assert_allclose(direction[world], expected, rtol=0.0, atol=tolerance)
+
+
+@pytest.mark.parametrize("scene", [bent_frame, star])
+def test_elimination_notes_indefinite_matrices(device, scene):
+    """Rods and cables pressed to 0.7 of their length: the same iterate is to come again without compression, and is definite then."""
+    problem = Problem(scene(), device, 0.7, preconditioner="chain")
+    islands = problem.newton.islands
+    islands.coefficient.fill_(1e-3)
+    islands.iteration.fill_(1)
+    problem.iterate(0.1)
+    assert problem.newton.chains.exact
+    assert islands.clamped.numpy().tolist() == [1, 1]
+    assert islands.iteration.numpy().tolist() == islands.wanted.numpy().tolist() == [0, 0]
+    islands.wanted.fill_(1)
+    problem.iterate(0.1)
+    assert islands.wanted.numpy().tolist() == [1, 1]
+    assert (problem.newton.right.numpy() * problem.newton.direction.numpy()).sum() > 0.0
 
 
 @pytest.mark.parametrize("rigid", [True, False])
