@@ -282,6 +282,7 @@ class NetNewton:
         wanted = self.islands.wanted
         if self._direct:
             self.negative.zero_()
+            self.forcing.zero_()  # what is left is rounding
             self.chains.prepare(self.matrix, self.fixed, wanted, self.negative)
             self.chains.apply(self.matrix, self.right, self.fixed, wanted, self.direction, self.krylov_dots)
         else:
