@@ -9,7 +9,6 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.element import CPU_OPTIONS
 from ddg_warp.kernels.matrix.sliced import product_functions
 
 TILE = 4096  # entries that one block of threads sums
@@ -44,27 +43,18 @@ def sum_kernels(real, largest: bool = False):
 
 @cache
 def serial_sum_kernel(real, largest: bool = False):
-    """The same by one thread a row, for the CPU, which has one; four sums side by side, each of which waits for its own last term."""
-    V = wp.types.vector(4, real)
+    """The same by one thread a row, for the CPU, which has one."""
 
-    @wp.func
-    def joined(a: real, b: real):
-        if wp.static(largest):
-            return wp.max(a, b)
-        else:
-            return a + b
-
-    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+    @wp.kernel(module="unique", enable_backward=False)
     def total(values: wp.array2d(dtype=real), sum_out: wp.array(dtype=real)):
         w = wp.tid()
-        n = values.shape[1]
-        s = V()
-        for i in range(n / 4):
-            for j in range(4):
-                s[j] = joined(s[j], values[w, 4 * i + j])
-        for i in range(n / 4 * 4, n):
-            s[0] = joined(s[0], values[w, i])
-        sum_out[w] = joined(joined(s[0], s[1]), joined(s[2], s[3]))
+        s = real(0.0)
+        for i in range(values.shape[1]):
+            if wp.static(largest):
+                s = wp.max(s, values[w, i])
+            else:
+                s += values[w, i]
+        sum_out[w] = s
 
     return total
 
