@@ -54,6 +54,8 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
     factor_block, lower, upper, lower_vector, upper_vector, congruence = pivot.functions(nb, linear)
     *_, shorter = search_functions(kind, real, linear)
     angle, rows = nb - 1, kind.factor_rows
+    # in float64 twice as many registers are more than a GPU has: 10 % slower on an H200
+    ahead = kind.serial or linear == wp.float32
     Rows, Kept = wp.types.vector(rows, linear), wp.types.vector(2 * nb2 + nb, linear)
     vertex_rows, edge_rows, tensions = kind.vertex_strains, kind.edge_strains, kind.tensions
     exact, begin = exact_from is not None, exact_from or 0
@@ -61,10 +63,11 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
 
     @wp.func
     def rows_of(F: wp.array3d(dtype=linear), k: int, r: int):
-        """What the elements that begin at a node have written."""
+        """What the elements that begin at a node have written, if that is read ahead."""
         v = Rows()
-        for i in range(wp.static(rows)):
-            v[i] = F[i, k, r]
+        if wp.static(ahead):
+            for i in range(wp.static(rows)):
+                v[i] = F[i, k, r]
         return v
 
     @wp.func
@@ -75,17 +78,24 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
         return v
 
     @wp.func
-    def part(F: Rows, row: int):
+    def entry(f: Rows, F: wp.array3d(dtype=linear), row: int, k: int, r: int):
+        if wp.static(ahead):
+            return f[row]
+        else:
+            return F[row, k, r]
+
+    @wp.func
+    def part(f: Rows, F: wp.array3d(dtype=linear), row: int, k: int, r: int):
         v = H()
         for d in range(wp.static(dim)):
-            v[d] = F[row + d]
+            v[d] = entry(f, F, row + d, k, r)
         return v
 
     @wp.func
-    def with_angle(F: Rows, row: int, v: H):
+    def with_angle(f: Rows, F: wp.array3d(dtype=linear), row: int, k: int, r: int, v: H):
         u = v
         if wp.static(twist):
-            u[wp.static(angle)] = F[row]
+            u[wp.static(angle)] = entry(f, F, row, k, r)
         return u
 
     @wp.func
@@ -103,18 +113,26 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
 
     @wp.func
     def kept(Y: wp.array3d(dtype=linear), k: int, r: int):
-        """What the elimination of a node has left."""
+        """What the elimination of a node has left, if that is read ahead."""
         v = Kept()
-        for i in range(wp.static(2 * nb2 + nb)):
-            v[i] = Y[i, k, r]
+        if wp.static(ahead):
+            for i in range(wp.static(2 * nb2 + nb)):
+                v[i] = Y[i, k, r]
         return v
 
     @wp.func
-    def times(Y: Kept, row: int, e: H):
+    def left_at(left: Kept, Y: wp.array3d(dtype=linear), row: int, k: int, r: int):
+        if wp.static(ahead):
+            return left[row]
+        else:
+            return Y[row, k, r]
+
+    @wp.func
+    def times(left: Kept, Y: wp.array3d(dtype=linear), row: int, k: int, r: int, e: H):
         v = H()
         for i in range(wp.static(nb)):
             for j in range(wp.static(nb)):
-                v[i] = v[i] + Y[row + i * wp.static(nb) + j] * e[j]
+                v[i] = v[i] + left_at(left, Y, row + i * wp.static(nb) + j, k, r) * e[j]
         return v
 
     # what exceeds 255 registers goes to shared memory: 8 % on an H200
@@ -187,26 +205,26 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
         if wp.static(twist):
             spin = rotary[0, r]
         for j in range(n):
-            ahead = wp.min(j + 1, n - 1)
-            f_ahead = rows_of(F, ahead, r)
-            r_ahead = right_of(right, ahead, r)
-            mask_ahead = fixed[ahead, r]
-            more_ahead = energy_change[ahead, r]
-            rounding_ahead = energy_noise[ahead, r]
+            next = wp.min(j + 1, n - 1)
+            f_ahead = rows_of(F, next, r)
+            r_ahead = right_of(right, next, r)
+            mask_ahead = fixed[next, r]
+            more_ahead = energy_change[next, r]
+            rounding_ahead = energy_noise[next, r]
             own_ahead = real(0.0)
             spin_ahead = real(0.0)
             if wp.static(not drag):
-                own_ahead = mass[ahead, r]
+                own_ahead = mass[next, r]
             if wp.static(twist):
-                spin_ahead = rotary[ahead, r]
+                spin_ahead = rotary[next, r]
             if wp.static(span == 2):
                 if j < n - 2:
                     for m in range(wp.static(vertex_rows)):
                         row = m * wp.static(window)
-                        a = part(f, row)
-                        C = part(f, row + wp.static(dim))
-                        A = with_angle(f, row + wp.static(2 * dim), -a)
-                        B = with_angle(f, row + wp.static(2 * dim + 1), a - C)
+                        a = part(f, F, row, j, r)
+                        C = part(f, F, row + wp.static(dim), j, r)
+                        A = with_angle(f, F, row + wp.static(2 * dim), j, r, -a)
+                        B = with_angle(f, F, row + wp.static(2 * dim + 1), j, r, a - C)
                         Waa += wp.outer(A, A)
                         Wab += wp.outer(A, B)
                         Wac += wp.outer(A, C)
@@ -224,13 +242,13 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
             if j < n - 1:
                 edge_row = wp.static(vertex_rows * window)
                 for m in range(wp.static(edge_rows)):
-                    t = part(f, edge_row + m * wp.static(dim))
+                    t = part(f, F, edge_row + m * wp.static(dim), j, r)
                     S = wp.outer(t, t)
                     Waa += S
                     Wab -= S
                     Wbb += S
                 for m in range(wp.static(tensions)):
-                    T = positions(f[edge_row + wp.static(edge_rows * dim) + m])
+                    T = positions(entry(f, F, edge_row + wp.static(edge_rows * dim) + m, j, r))
                     Waa += T
                     Wab -= T
                     Wbb += T
@@ -368,11 +386,11 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
             turned_before = real(0.0)
             if wp.static(twist):
                 turned_before = theta[before, r]
-            step = -times(left, 0, e1)
+            step = -times(left, Y, 0, j, r, e1)
             if wp.static(span == 2):
-                step -= times(left, wp.static(nb2), e2)
+                step -= times(left, Y, wp.static(nb2), j, r, e2)
             for d in range(wp.static(nb)):
-                step[d] = step[d] + left[wp.static(2 * nb2) + d]
+                step[d] = step[d] + left_at(left, Y, wp.static(2 * nb2) + d, j, r)
                 direction[d, j, r] = step[d]
             dx = V()
             bent = V()
