@@ -52,3 +52,9 @@ def load_kernels(kernels, device) -> None:
     for entry in kernels:
         kernel, threads = entry if isinstance(entry, tuple) else (entry, THREADS)
         kernel.module.load(device, block_dim=threads if cuda else 1)
+
+
+def sweep(kernel, count: int, inputs: list, outputs: list, device, threads: int = THREADS) -> None:
+    """Launch a kernel that goes over `count` things: a thread for each, on the CPU one for all; see `element.until_function`."""
+    dim = min(1, count) if wp.get_device(device).is_cpu else count
+    wp.launch(kernel, dim, inputs, outputs, device=device, block_dim=threads)

@@ -10,9 +10,10 @@ from ddg_warp.compile.tolerance import outer_forces
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.drag import block_inertia
 from ddg_warp.kernels.islands import Islands
-from ddg_warp.kernels.net import balance, elements, newton
+from ddg_warp.kernels.net import elements, newton
 from ddg_warp.kernels.solve import krylov, pcg
 from ddg_warp.solve.chains.newton import EARLY, NewtonOptions
+from ddg_warp.solve.net.balance import Balance
 from ddg_warp.solve.net.chains import Chains
 from ddg_warp.solve.net.multilevel import Multilevel
 from ddg_warp.solve.net.planes import DevicePlanes
@@ -47,9 +48,7 @@ class NetNewton:
         self.real, self.linear = model.types.real, linear or model.types.linear
         self.eps = model.types.eps
         worlds, blocks, host, device = net.worlds, net.blocks, net.host, net.device
-        serial = self.serial = wp.get_device(
-            device
-        ).is_cpu  # whether a thread takes all elements or blocks; see `until_function`
+        serial = self.serial = wp.get_device(device).is_cpu  # see `until_function`
         self.worlds, self.all = worlds, worlds * blocks
         V, H = net.vector, wp.types.vector(3, self.linear)
         M = wp.types.matrix((3, 3), self.linear)
@@ -124,8 +123,6 @@ class NetNewton:
         self._direct = self.chains is not None and self.chains.exact
         self._repeat = pcg.repeat_kernel(self.real, False) if any(exact) or self._direct else None
         self.negative = make(worlds, int)
-        self._balance, self._sets = balance.balance_kernel(self.real, self.linear, drag, serial), self._meetings()
-        self._no_frames = [make(0, int), make(0, wp.types.matrix((3, 3), self.real))]
         self._assembly = Assembly(
             net, self.system, self.parts, self.real, self.linear, self.exact_from, self.local, drag, serial
         )
@@ -138,12 +135,7 @@ class NetNewton:
         self._unread = flags(2)
         outer = outer_forces(host, gravity)
         self.outer = self.allowed.assign(self.allowed.bodies.loads(outer)[None])
-        some = self.chains.elsewhere() if banded else np.zeros(0, int)
-        self._some, self._rest = (
-            wp.array(some.astype(np.int32), dtype=int, device=device),
-            len(some) if banded else blocks,
-        )
-        self._given, self._found = self._balance_arguments(drag)
+        self._balance = Balance(self, drag)
         self._worst = Sums(worlds, self.allowed.ratio.shape[1], self.real, device, largest=True)
         several = preconditioner in ("multilevel", "chain_multilevel")
         self.levels = Multilevel(net, self.system, self.linear) if several else None
@@ -161,46 +153,23 @@ class NetNewton:
         rows, factor, gradient = (
             (measure.size, self.linear, self.real) if local else (measure.slots, H, self.net.vector)
         )
+
+        def lay(rows, dtype):
+            return arrays.allocate((rows, count), dtype, self.device)
+
         return {
-            "factor": make((len(measure.strains) * rows, count), factor),
-            "tension": make((max(1, measure.tensions), count), self.linear),
-            "second": make((measure.packed, count) if exact else (1, 1), self.linear),
-            "gradient": make((rows, count), gradient),
-            "energy": make((2, count), self.real),
+            "factor": lay(len(measure.strains) * rows, factor),
+            "tension": lay(max(1, measure.tensions), self.linear),
+            "second": lay(measure.packed, self.linear) if exact else make((1, 1), self.linear),
+            "gradient": lay(rows, gradient),
+            "energy": lay(2, self.real),
             "stiffness": make(count, self.linear),
         }
-
-    def _balance_arguments(self, drag: bool) -> tuple:
-        """What the balance reads and writes."""
-        given, found = balance.given_type(self.real, drag)(), balance.found_type(self.real, self.linear)()
-        for name in ("q", "base", "target", "mass", "gravity", "load", "fixed", "arm", "longest"):
-            setattr(given, name, getattr(self, name))
-        given.allowed, given.blocks, given.nodes = self.allowed.blocks, self.net.blocks, self.net.host.nodes
-        given.rtol, given.floor = self.options.rtol, self.options.floor_factor * self.eps
-        for name in ("right", "square", "change", "noise"):
-            setattr(found, name, getattr(self, name))
-        found.least, found.ratio = self.allowed.least, self.allowed.ratio
-        return given, found
-
-    def _meetings(self) -> wp.array:
-        """What the elements of all sets bring to the blocks."""
-        sets = []
-        nothing = [wp.zeros((1, 1), dtype=kind, device=self.device) for kind in (self.net.vector, self.real)]
-        for part, own, local, meets in zip(self.net.sets, self.parts, self.local, self.system.meets, strict=True):
-            meeting, measure = balance.meeting_type(self.real, self.linear)(), part.term.measure
-            meeting.gradient, meeting.along = (nothing[0], own["gradient"]) if local else (own["gradient"], nothing[1])
-            ends = np.transpose(measure.ends).astype(np.int32) if local else np.zeros((0, 2), np.int32)
-            meeting.ends = wp.array(ends, dtype=int, device=self.device)
-            meeting.energy, meeting.stiffness, (meeting.starts, meeting.items) = own["energy"], own["stiffness"], meets
-            meeting.nodes, meeting.elements = measure.nodes, part.elements
-            sets.append(meeting)
-        self._meeting = sets  # an array of structures holds no arrays alive
-        return wp.array(sets, dtype=balance.meeting_type(self.real, self.linear), device=self.device)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [self._balance, self._judge, self._measure, self._rotate, self._take]
+        own = [*self._balance.kernels, self._judge, self._measure, self._rotate, self._take]
         own += [*self.allowed.kernels, *([self._repeat] if self._repeat else [])]
         cycle = [self._move, self._invert, self._start, self._begin, *self._cycle, self._compare, self._confirm]
         parts = [k for part in (self.chains, self.levels, self.planes) if part for k in part.kernels]
@@ -232,26 +201,19 @@ class NetNewton:
     def evaluate(self, state) -> None:
         """Energies, gradients and factors of all elements at the iterate."""
         for index, (part, own, kernel) in enumerate(zip(self.net.sets, self.parts, self._evaluate, strict=True)):
-            self._sweep(
+            arrays.sweep(
                 kernel,
                 self.worlds * part.elements,
                 [self.net.elements(state, index, self.q, self.islands.rate), *self.islands.arrays],
                 [own["factor"], own["tension"], own["second"], own["gradient"], own["energy"], own["stiffness"]],
-                threads=128,
+                self.device,
+                128,
             )
 
     def balance(self) -> None:
         """Residuals, the change of the energy, and the worlds that are out of equilibrium."""
-        islands, planes, total = self.islands, self.planes, self.worlds * self._rest
-        if self.chains and self.chains.banded:
-            self.chains.balance(self._given, islands, self._found)
-        frames = [planes.of_blocks, planes.frames[self.real]] if planes else self._no_frames
-        self._sweep(
-            self._balance,
-            total,
-            [self._given, self._some, self._sets, *frames, *islands.arrays, self._rest, total],
-            [self._found],
-        )
+        islands = self.islands
+        self._balance()
         self.allowed.sum_up(self.right, self.options.rtol, islands, islands.unbalanced, islands.drowned)
 
     def judge(self) -> None:
@@ -403,7 +365,9 @@ class NetNewton:
     def take(self) -> None:
         """Lengths of the steps along the directions."""
         blocks = self.net.blocks
-        self._sweep(self._measure, self.all, [self.right, self.direction, self.islands.wanted, blocks], [self.dots])
+        arrays.sweep(
+            self._measure, self.all, [self.right, self.direction, self.islands.wanted, blocks], [self.dots], self.device
+        )
         self._sum(self.dots, self.decrease)
         self.measure_turns()
         wp.launch(
@@ -418,27 +382,24 @@ class NetNewton:
         """Largest turn that the directions make, squared; these are in space then."""
         if self.planes:
             self.planes.back(self.direction, self.islands.wanted)
-        self._sweep(
+        arrays.sweep(
             self._rotate,
             self.turns.size,
             [self.q, self.direction, self.ends, self.spins, self.islands.wanted, self.net.blocks],
             [self.turns],
+            self.device,
         )
         self._largest(self.turns, self.turn)
 
     def move(self) -> None:
         """Take the step that is to be taken."""
-        self._sweep(
+        arrays.sweep(
             self._move,
             self.all,
             [self.direction, self.islands.step_length, self.islands.todo, self.net.blocks],
             [self.base, self.q],
+            self.device,
         )
-
-    def _sweep(self, kernel, count: int, inputs: list, outputs: list, threads: int = arrays.THREADS) -> None:
-        """Of a kernel that goes over so many things: one thread for each, or on the CPU one for all."""
-        dim = min(1, count) if self.serial else count
-        wp.launch(kernel, dim, inputs, outputs, device=self.device, block_dim=threads)
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
         """One thread for each block of every world."""
