@@ -11,10 +11,12 @@ LARGE = 4096  # nodes of a net, those of rods apart, from which on fewer, longer
 
 # Block Jacobi takes iterations that grow with the square of a rod's edges between joints (a gridshell, residual 1e-3: 250 at 8, 2378 at
 # 32), the chain preconditioner takes 16 whatever their number, at about twice the time of an iteration on the CPU. On a GPU a chain is
-# serial, and its launches count (tools/results/nets_cuda.csv).
+# serial, and its launches count: an iteration of block Jacobi takes 41 us on an H200, one with chains of 8, 32 and 128 places takes
+# 84, 144 and 330 us (tools/results/nets_cuda.csv).
 BETWEEN = 4  # nodes of a rod between joints from which on chains pay
-PLACES = 10  # places of a chain that take as long as an iteration of block Jacobi, on a GPU
-LAUNCHES = 4  # iterations of block Jacobi that take as long as the launches of one with chains, on a GPU
+PLACES = 20  # places of a chain that take as long as an iteration of block Jacobi, on a GPU
+REDUCED = 240  # places that take as long as the cyclic reduction of few, long chains
+LAUNCHES = 1  # iterations of block Jacobi that take as long as what else one with chains launches, on a GPU
 
 
 def automatic(group) -> str:
@@ -65,7 +67,8 @@ def net_preconditioner(net) -> str:
     between, places = (max(_longest_run(~at[rod.all_nodes]) for rod in host.rods) for at in (joints | rigid, rigid))
     pays = between >= BETWEEN
     if pays and net.device.is_cuda:
-        pays = 0.25 * between**2 > LAUNCHES + places / PLACES
+        reduced = long_and_few(places, len(host.rods) * net.worlds, net.device)
+        pays = 0.25 * between**2 > LAUNCHES + (min(places, REDUCED) if reduced else places) / PLACES
     rest = host.nodes - len(np.unique(own)) if pays else host.nodes
     names = ["chain"] * pays + ["multilevel"] * (rest >= LARGE)
     return "_".join(names) or "block_jacobi"
