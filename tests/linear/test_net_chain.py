@@ -312,3 +312,30 @@ def truss() -> ddg.Scene:
 def test_what_has_no_chains_is_refused(device, scene, linear, message):
     with pytest.raises(ddg.SceneError, match=message):
         ddg.Integrator(scene().build(device), linear=linear)
+
+
+@pytest.mark.parametrize("psd", ["gauss_newton", "progressive"])
+@pytest.mark.parametrize("scene", [branches, ring_and_spokes, frame_and_sheet, hinged_grid])
+def test_places_and_bands_hold_what_lists_and_slices_hold(device, scene, psd):
+    """Residuals, what rounding leaves of them, changes of energy and H on free dofs, with elements along rods in either form."""
+    found = []
+    for preconditioner in ("block_jacobi", "chain"):
+        problem = Problem(scene(), device, 1.02, preconditioner=preconditioner, psd=psd)
+        newton, islands = problem.newton, problem.newton.islands
+        random = np.random.default_rng(5)
+        newton.base.assign(newton.q.numpy() + 0.01 * random.normal(size=(newton.all, 3)))
+        islands.load_scale.fill_(1.0)
+        islands.iteration.fill_(3)  # late enough for second derivatives
+        for own in newton.parts:
+            own["energy"].fill_(0.25)  # of the accepted iterate
+        problem.assemble()
+        free = problem.free()
+        vectors = (newton.right, newton.allowed.least, newton.allowed.ratio, newton.square, newton.change, newton.noise)
+        found.append([*(v.numpy().astype(float) for v in vectors)])
+        found[-1] += [problem.matrix(world)[np.ix_(free, free)] for world in range(2)]
+        flags = islands.unbalanced.numpy().tolist(), islands.drowned.numpy().tolist()
+        assert flags == ([1, 1], [1, 1])
+    assert problem.newton.chains.banded and any(problem.newton.local)
+    for by_lists, by_places in zip(*found, strict=True):
+        assert np.abs(by_lists).max() > 0.0
+        np.testing.assert_allclose(by_places, by_lists, rtol=1e-11, atol=1e-12 * np.abs(by_lists).max())
