@@ -21,24 +21,15 @@ from ddg_warp.kernels.terms import Term
 
 @cache
 def place_functions(twist: bool, linear):
-    """free_of(...) of a place: 1 at its free dofs, else 0; block_of(...): its block with another place from positions of H."""
+    """free_of(held): by bits, 1 at the free dofs of a place, else 0; block_of(...): its block with another one from positions of H."""
     nb = 4 if twist else 3
     B, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
-    _, free = product_functions(linear)
 
     @wp.func
-    def free_of(places: wp.array3d(dtype=int), fixed: wp.array(dtype=wp.uint8), k: int, c: int):
+    def free_of(held: wp.uint8):
         f = B()
-        node = places[0, k, c]
-        if node >= 0:
-            v = free(fixed[node])
-            for d in range(3):
-                f[d] = v[d]
-        if wp.static(twist):
-            angle = places[1, k, c]
-            if angle >= 0:
-                v = free(fixed[angle])
-                f[3] = v[0]
+        for d in range(wp.static(nb)):
+            f[d] = linear(1 - ((int(held) >> d) & 1))
         return f
 
     @wp.func
@@ -214,7 +205,7 @@ def band_kernels(
         places: wp.array3d(dtype=int),
         chain: wp.array2d(dtype=int),
         count: wp.array(dtype=int),
-        fixed: wp.array(dtype=wp.uint8),
+        held: wp.array2d(dtype=wp.uint8),
         diagonal: wp.array(dtype=int),
         positions: int,
         own0: Along,
@@ -225,7 +216,10 @@ def band_kernels(
         own5: Along,
         blocks_out: wp.array3d(dtype=linear),
     ):
-        """Nodes and angles that have no position of their own have their inertia and drag from here."""
+        """Nodes and angles that have no position of their own have their inertia and drag from here.
+
+        Bits of `held` are dofs of a place that are held, or that it does not have.
+        """
         start, r = wp.tid()
         w = r / count.shape[0]
         c = r - w * count.shape[0]
@@ -258,15 +252,18 @@ def band_kernels(
                                             D[3 * part + i, 3 * part + j] = D[3 * part + i, 3 * part + j] + linear(
                                                 resistance[i, j]
                                             )
-            here = free_of(places, fixed, k, c)
+            here = held[k, c]
             if places.shape[0] > wp.static(parts):
                 D += block_of(matrix, places, wp.static(parts), k, c, w * positions)
-            D = wp.cw_mul(D, wp.outer(here, here)) + wp.diag(B(linear(1.0)) - here)
+            if here != wp.uint8(0):
+                f = free_of(here)
+                D = wp.cw_mul(D, wp.outer(f, f)) + wp.diag(B(linear(1.0)) - f)
             store(blocks_out, 0, k, r, D)
             if k + 1 < count[c] and chain[k + 1, c] == chain[k, c]:
                 if places.shape[0] > wp.static(parts):
                     E += block_of(matrix, places, wp.static(parts + parts**2), k, c, w * positions)
-                E = wp.cw_mul(E, wp.outer(here, free_of(places, fixed, k + 1, c)))
+                if (here | held[k + 1, c]) != wp.uint8(0):
+                    E = wp.cw_mul(E, wp.outer(free_of(here), free_of(held[k + 1, c])))
             else:
                 E = M()
             store(blocks_out, wp.static(nb**2), k, r, E)
@@ -274,7 +271,8 @@ def band_kernels(
                 if k + 2 < count[c] and chain[k + 2, c] == chain[k, c]:
                     if places.shape[0] > wp.static(parts):
                         F += block_of(matrix, places, wp.static(parts + 2 * parts**2), k, c, w * positions)
-                    F = wp.cw_mul(F, wp.outer(here, free_of(places, fixed, k + 2, c)))
+                    if (here | held[k + 2, c]) != wp.uint8(0):
+                        F = wp.cw_mul(F, wp.outer(free_of(here), free_of(held[k + 2, c])))
                 else:
                     F = M()
                 store(blocks_out, wp.static(2 * nb**2), k, r, F)

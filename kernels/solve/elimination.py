@@ -23,13 +23,13 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.element import CPU_OPTIONS, until_function
+from ddg_warp.kernels.matrix.bands import place_functions
 from ddg_warp.kernels.matrix.block_band import (
     block_functions,
     factor_function,
     substitute_all_function,
     substitute_function,
 )
-from ddg_warp.kernels.matrix.sliced import product_functions
 from ddg_warp.kernels.solve.joints import coupling_functions
 
 
@@ -46,7 +46,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool):
     _, _, _, put = block_functions(nb, linear)
     factor, substitute = factor_function(nb, span, linear), substitute_function(nb, span, linear)
     substitute_all = substitute_all_function(nb, span, linear, sides)
-    _, free = product_functions(linear)
+    free_of, _ = place_functions(twist, linear)
     until = until_function(serial)
     multiply, _ = coupling_functions(linear)
 
@@ -71,7 +71,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool):
         columns: wp.array(dtype=int),
         places: wp.array3d(dtype=int),
         count: wp.array(dtype=int),
-        fixed: wp.array(dtype=wp.uint8),
+        held: wp.array2d(dtype=wp.uint8),
         starts: wp.array(dtype=int),
         items: wp.array(dtype=int),
         joint_row: wp.array(dtype=int),
@@ -107,12 +107,13 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool):
                             p = items[index]
                             j = joint_row[columns[p]]
                             v -= multiply(matrix, p + w * positions, moved[(q * worlds + w) * joint_rows + j])
-                    v = wp.cw_mul(v, free(fixed[at]))
                     if part == 0:
                         for d in range(3):
                             u[d] = v[d]
                     else:
                         u[wp.static(nb - 1)] = v[0]
+            if held[k, c] != wp.uint8(0):
+                u = wp.cw_mul(u, free_of(held[k, c]))
             put(values_out, 0, k, s, u)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

@@ -53,6 +53,7 @@ class Chains:
 
         self.places = arrays.upload(plan.places.astype(np.int32), int, device)
         self.chain, self.count, self.where = put(plan.chain), put(plan.count), put(plan.where)
+        self.held = arrays.upload(plan.held(net.host), wp.uint8, device)
         self.longest, self.width = plan.chain.shape
         self.columns = worlds * self.width
         block = 4 if plan.twist else 3
@@ -131,13 +132,14 @@ class Chains:
             [found],
         )
 
-    def assemble(self, matrix: wp.array, mass: wp.array, fixed: wp.array, islands) -> None:
+    def assemble(self, matrix: wp.array, mass: wp.array, islands) -> None:
         """Blocks of the chains of the worlds that want a direction."""
         table = self.table
         self._launch(
             self._assemble,
             (1 if self.serial else self.longest, self.columns),
-            [matrix, mass, *islands.arrays, self.places, self.chain, self.count, fixed, table.diagonal, table.positions]
+            [matrix, mass, *islands.arrays, self.places, self.chain, self.count, self.held]
+            + [table.diagonal, table.positions]
             + self._own,
             [self.bands],
         )
@@ -165,7 +167,7 @@ class Chains:
         if not self.joints:
             return
         if self.coupled:
-            self._eliminate(matrix, fixed, wanted, self.responses, None, self.units)
+            self._eliminate(matrix, wanted, self.responses, None, self.units)
         self._launch(
             self._measure,
             net.worlds * self.joints,
@@ -174,10 +176,10 @@ class Chains:
             [self.parts, lost],
         )
 
-    def apply(self, matrix, residual, fixed, wanted, z: wp.array, dots: wp.array) -> None:
+    def apply(self, matrix, residual, wanted, z: wp.array, dots: wp.array) -> None:
         """z of the blocks of rods and joints from the residual, where block Jacobi has left its own, and r . z block by block."""
         net = self.net
-        self._eliminate(matrix, fixed, wanted, self.values, residual, None)
+        self._eliminate(matrix, wanted, self.values, residual, None)
         if self.joints:
             self._launch(
                 self._meet,
@@ -201,7 +203,7 @@ class Chains:
                 [self.values],
             )
         elif self.coupled:
-            self._eliminate(matrix, fixed, wanted, self.values, residual, self.moved)
+            self._eliminate(matrix, wanted, self.values, residual, self.moved)
         self._launch(
             self._finish,
             1 if self.serial else net.worlds * net.blocks,
@@ -214,13 +216,13 @@ class Chains:
         chains = [self.joint_starts, self.joint_items, values, self.where, self.width, self.net.host.nodes]
         return [self.table.columns, *chains, self.pairs]
 
-    def _eliminate(self, matrix, fixed, wanted, values: wp.array, residual, moved) -> None:
+    def _eliminate(self, matrix, wanted, values: wp.array, residual, moved) -> None:
         """H_II^-1 (r_I - H_IJ z_J), of movements one by one or all at once; without `residual` or `moved` that one is zero."""
         table, net, solves = self.table, self.net, values.shape[2] // self.columns
         self._launch(
             self._load,
             (1 if self.serial else self.longest, solves * self.columns),
-            [matrix, table.columns, self.places, self.count, fixed, self.starts, self.items, self.joint_row]
+            [matrix, table.columns, self.places, self.count, self.held, self.starts, self.items, self.joint_row]
             + [self.joint_rows, wanted, net.blocks, table.positions, int(residual is not None)]
             + [int(moved is not None), self.moved if residual is None else residual]
             + [self.moved if moved is None else moved],
@@ -334,6 +336,14 @@ class ChainPlan:
             row, column = self._at[:, first + (k + i) % n]
             there = row >= 0
             at[row[there], column[there]] = np.flatnonzero(there)
+        return result
+
+    def held(self, host) -> np.ndarray:
+        """Bits of the dofs of places that are held, or that they do not have (longest, columns)."""
+        result = np.zeros(self.chain.shape, np.uint8)
+        for part, components in zip(self.places[: len(self._dofs)], (3, 1), strict=False):
+            missing = (part < 0)[..., None] | host.fixed[part, :components]
+            result |= (missing << (3 * (components == 1) + np.arange(components))).sum(-1).astype(np.uint8)
         return result
 
     def find(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:

@@ -237,7 +237,7 @@ class NetNewton:
         if self.planes:
             self.planes.matrix(self.matrix, self.islands.wanted)
         if self.chains:
-            self.chains.assemble(self.matrix, self.mass, self.fixed, self.islands)
+            self.chains.assemble(self.matrix, self.mass, self.islands)
 
     def direct(self) -> None:
         """Directions: by elimination where that is exact, else by conjugate gradients."""
@@ -246,7 +246,7 @@ class NetNewton:
             self.negative.zero_()
             self.forcing.zero_()  # what is left is rounding
             self.chains.prepare(self.matrix, self.fixed, wanted, self.negative)
-            self.chains.apply(self.matrix, self.right, self.fixed, wanted, self.direction, self.krylov_dots)
+            self.chains.apply(self.matrix, self.right, wanted, self.direction, self.krylov_dots)
         else:
             self.iterate_pcg()
         if self._repeat:  # what was indefinite comes again, without second derivatives and compression
@@ -305,7 +305,7 @@ class NetNewton:
     def precondition(self, z: wp.array) -> None:
         """What chains and levels make of z, which holds the residual times the inverses of the diagonal blocks."""
         if self.chains:
-            self.chains.apply(self.matrix, self.rest, self.fixed, self.islands.wanted, z, self.krylov_dots)
+            self.chains.apply(self.matrix, self.rest, self.islands.wanted, z, self.krylov_dots)
         if self.levels:
             self.levels.apply(self.rest, self.fixed, self.islands.wanted, z, self.krylov_dots)
 
