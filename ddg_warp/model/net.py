@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import warp as wp
 
+from ddg_warp import arrays
 from ddg_warp.compile.net.net import Net
 from ddg_warp.kernels.net import elements, frames
 from ddg_warp.model.parameters import ParameterTable
@@ -46,7 +47,7 @@ class DeviceSet:
     def __init__(self, host, worlds: int, device, real, motions: np.ndarray):
         self.host, self.term, self.worlds, self.device = host, host.term, worlds, device
         self.elements = len(host)
-        self.slots = wp.array(np.ascontiguousarray(host.slots, np.int32), dtype=int, device=device)
+        self.slots = arrays.upload(host.slots.astype(np.int32), int, device)
         data = host.data if host.data.size else np.zeros((1, 1))
         self.data = wp.array(np.ascontiguousarray(data), dtype=real, device=device)
         short = {name: _short(np.asarray(p, float))[None] for name, p in host.parameters.items()}
