@@ -39,8 +39,7 @@ def contributions(linear, local: bool):
 @cache
 def second_function(measure: Measure, linear):
     """block(second, e, a, b): what the packed second derivatives of an element (`Measure.packed`) are between two of its slots."""
-    size, angles = measure.size, 3 * len(measure.edges)
-    spins = angles + measure.angles
+    size, (angles, spins, _) = measure.size, measure.starts
     M, I = wp.types.matrix((3, 3), linear), wp.types.vector(measure.slots, int)
     plus, minus = (I(*of) for of in measure.ends)
 

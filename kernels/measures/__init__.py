@@ -87,15 +87,21 @@ class Measure:
         return self.nodes + self.angles + self.spins
 
     @property
+    def starts(self) -> tuple[int, int, int]:
+        """First local dofs of angles, of rotation vectors, and of points."""
+        angles = self.dim * len(self.edges)
+        spins = angles + self.angles
+        return angles, spins, spins + 3 * self.spins
+
+    @property
     def ends(self) -> tuple[list[int], list[int]]:
         """Of each slot, the first local dof that it sees with weight 1, and with -1, -1 for none.
 
         A node sees the edge that ends in it and that which starts in it, of which there is one each at most, angles and rotations
         see themselves.
         """
-        angles = 3 * len(self.edges)
-        spins = angles + self.angles
-        own = [*range(angles, spins), *range(spins, self.size, 3)]
+        angles, spins, points = self.starts
+        own = [*range(angles, spins), *range(spins, points, 3)]
         minus, plus = ({edge[end]: 3 * i for i, edge in enumerate(self.edges)} for end in (0, 1))
         nodes = range(self.nodes)
         return [*(plus.get(n, -1) for n in nodes), *own], [*(minus.get(n, -1) for n in nodes), *([-1] * len(own))]

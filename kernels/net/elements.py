@@ -45,21 +45,25 @@ def elements_type(real):
 
 
 @cache
+def edge_ends(measure: Measure):
+    """First and second node of the edges of a stencil.
+
+    These are constants of Warp's, which a loop variable may index: wp.static of one would be resolved only when a kernel is built, and
+    so make the hash of every kernel depend on what was built before it.
+    """
+    I = wp.types.vector(max(1, len(measure.edges)), int)
+    return tuple(I(*(edge[end] for edge in measure.edges)) for end in (0, 1))
+
+
+@cache
 def place_function(measure: Measure, real):
     """place(given, q, tid) -> (q, s) of an element."""
     Elements = elements_type(real)
     V = wp.types.vector(3, real)
     Q, S, _, _ = measure.types(real)
-    nodes, angles, spins, edges = measure.nodes, measure.angles, measure.spins, measure.edges
+    nodes, angles, spins, edge_count = measure.nodes, measure.angles, measure.spins, len(measure.edges)
     frames, own, data_size = measure.frames, measure.lag_size - FRAME * measure.frames, measure.data_size
-    points = measure.points
-    angle_row, spin_row = 3 * len(edges), 3 * len(edges) + angles
-    point_row = spin_row + 3 * spins
-    edge_count = len(edges)
-    # constants of Warp's, which a loop variable may index: wp.static of one would be resolved only when a kernel is built, and so
-    # make the hash of every kernel depend on what was built before it
-    I = wp.types.vector(max(1, edge_count), int)
-    first, second = (I(*(edge[end] for edge in edges)) for end in (0, 1))
+    points, (angle_row, spin_row, point_row), (first, second) = measure.points, measure.starts, edge_ends(measure)
 
     @wp.func
     def place(given: Elements, q: wp.array(dtype=V), tid: int):
@@ -113,12 +117,8 @@ def functions(term: Term, real):
     n = len(measure.strains)
     P = wp.types.vector(density.parameter_size(n), real)
     static_size, size = len(term.parameter_names) - 1, density.parameter_size(n)
-    nodes, angles, spins, edges = measure.nodes, measure.angles, measure.spins, measure.edges
-    points, edge_count = measure.points, len(edges)
-    angle_row, spin_row = 3 * edge_count, 3 * edge_count + angles
-    point_row = spin_row + 3 * spins
-    I = wp.types.vector(max(1, edge_count), int)
-    first, second = (I(*(edge[end] for edge in edges)) for end in (0, 1))
+    nodes, angles, spins, edge_count = measure.nodes, measure.angles, measure.spins, len(measure.edges)
+    points, (angle_row, spin_row, point_row), (first, second) = measure.points, measure.starts, edge_ends(measure)
     lagged = density.lagged
     place = place_function(measure, real)
 
@@ -281,8 +281,7 @@ def part_function(measure: Measure, real):
     """
     V, I = wp.types.vector(3, real), wp.types.vector(measure.slots, int)
     plus, minus = (I(*of) for of in measure.ends)
-    first = 3 * len(measure.edges)
-    spins = first + measure.angles
+    first, spins, _ = measure.starts
 
     @wp.func
     def part(f: wp.array2d(dtype=real), row: int, slot: int, e: int):
