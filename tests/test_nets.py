@@ -8,6 +8,8 @@ from scipy import sparse
 from scipy.sparse.linalg import eigsh
 
 import ddg_warp as ddg
+from ddg_warp.compile.net import blocks
+from ddg_warp.compile.net.blocks import compile_net
 from ddg_warp.geometry import meshes
 from ddg_warp.scenes import gridshell_dome
 from ddg_warp.solve.tangent import Tangent
@@ -493,3 +495,28 @@ def test_float32_gives_way_where_it_cannot_carry_the_rods(device):
         other, _ = steps(exact, 2, dt)
         moved = np.abs(other.points() - exact.state().points()).max()
         assert np.abs(state.points() - other.points()).max() < 1e-5 * moved
+
+
+def test_the_numbering_of_rods_means_nothing(device, monkeypatch):
+    """Rod by rod, as on a CPU, or node by node, as on a GPU: a ring, curled rods with a ghost at their clamps and a stiffened sheet."""
+    found = []
+    for wanted in (False, True):
+        monkeypatch.setattr(blocks, "compile_net", lambda scene, along, wanted=wanted: compile_net(scene, wanted))
+        (scene, *_), t = stiffened(), np.linspace(0.0, 1.0, 12, endpoint=False)
+        circle = np.stack([np.cos(2 * np.pi * t), np.sin(2 * np.pi * t), 0 * t], 1)
+        kind = {"section": ddg.Circle(0.02), "material": RUBBER}
+        ring = scene.add_rod(circle + [3.0, 0.0, 0.0], closed=True, **kind)
+        curl = np.stack([t, 0.2 * np.sin(4 * t), 0.1 * t**2], 1)
+        spokes = scene.add_rods(np.stack([curl + [4.0, 0.0, 0.0], curl * [1.0, 1.0, -1.0] + [4.0, 0.0, 0.0]]), **kind)
+        scene.clamp_end(int(spokes[0]), "last")
+        scene.join([(ring, 0), *((int(spoke), 0) for spoke in spokes)])
+        scene.add_couple(ring, 3, (0.0, 0.2, 0.1))
+        model = scene.build(device, "float64", worlds=2)
+        model.set_parameter("rod_bend_twist", "stiffness_1", np.array([0.02, 0.03]))
+        state, _ = steps(model, 5, 0.01, rtol=1e-12)
+        moments = model.stresses(state)["rod_bend_twist"]
+        energies = [np.asarray(value) for value in model.energies(state).values()]
+        found.append([state.points(), state.directors(), *energies, *(m for m in moments if m is not None)])
+    for one, other in zip(*found, strict=True):
+        assert np.abs(one).max() > 0.0
+        np.testing.assert_allclose(other, one, rtol=1e-8, atol=1e-9 * np.abs(one).max())

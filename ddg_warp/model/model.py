@@ -57,7 +57,7 @@ class Model:
         turning = [s.motion is not None and s.motion.turns for s in supports]
         place = {id(motion): i for i, motion in enumerate(self.motions)}
         motions = [place[id(s.motion)] if turns else -1 for s, turns in zip(supports, turning, strict=True)]
-        net = compile_net(self.scene)
+        net = compile_net(self.scene, along=self.wp_device.is_cpu)
         return DeviceNet(net, self.worlds, self.wp_device, self.types.real, np.array(motions, int))
 
     def __repr__(self) -> str:

@@ -20,8 +20,12 @@ from ddg_warp.scene import drag
 from ddg_warp.scene.structures import COINCIDE
 
 
-def compile_net(scene) -> Net | None:
+def compile_net(scene, along: bool = False) -> Net | None:
     """The net of a scene, None if it has none.
+
+    Args:
+        along: whether nodes, angles and elements are numbered rod by rod, as suits a CPU, which walks along them. Else come the first
+            of all rods, then the second, ...: neighbouring threads of a GPU then touch neighbouring memory.
 
     Raises:
         SceneError: something cannot be joined, held or loaded as described; the message names it.
@@ -31,7 +35,7 @@ def compile_net(scene) -> Net | None:
         return None
     if scene.shells and scene.dimension == 2:
         raise SceneError("a scene with shells has dimension 3; leave dimension=2 to rods")
-    builder, ghosts, laws = _Builder(scene), Ghosts(scene), drag.Laws(scene)
+    builder, ghosts, laws = _Builder(scene, along), Ghosts(scene), drag.Laws(scene)
     for batch in scene.batches:
         if chosen[batch.first : batch.first + batch.rods].any():
             if scene.dimension == 2:
@@ -62,8 +66,8 @@ def _spatial(batch):
 class _Builder:
     """Collects raw nodes and elements, then merges what is shared."""
 
-    def __init__(self, scene):
-        self.scene = scene
+    def __init__(self, scene, along: bool):
+        self.scene, self.along = scene, along
         self.points: list[np.ndarray] = []
         self.count = 0
         self.rods: dict[int, NetRod] = {}
@@ -76,18 +80,24 @@ class _Builder:
         self.ends: list[np.ndarray] = []
 
     def add_rods(self, piece: Piece) -> None:
-        """Number the nodes and angles of rods as chains have them: the first of all rods, then the second, ..."""
+        """Number the nodes and angles of rods."""
         (rods, n, _), closed, (before, after) = piece.x.shape, piece.kind.closed, piece.ghosts
-        nodes = self._number(piece.x.swapaxes(0, 1).reshape(-1, 3)).reshape(n, rods).T
+        order = "C" if self.along else "F"
+
+        def rows(values):
+            """Those of all rods (R, n, c), in the order of their numbers."""
+            return (values if self.along else values.swapaxes(0, 1)).reshape(-1, values.shape[-1])
+
+        nodes = self._number(rows(piece.x)).reshape(rods, n, order=order)
         edges = n - (0 if closed else 1)
         angles = np.zeros((rods, 0), int)
         if piece.kind.twist:
-            angles = self.rod_edges + np.arange(rods * edges).reshape(edges, rods).T
+            angles = self.rod_edges + np.arange(rods * edges).reshape(rods, edges, order=order)
             self.rod_edges += angles.size
-            self.frames.append(np.concatenate([v.T.reshape(3, -1) for v in (piece.director, piece.tangent)]))
-            self.stiffness.append(np.array([np.broadcast_to(v, angles.shape).T.ravel() for v in piece.stiffness]))
-            ends = np.stack([nodes[:, :edges], np.roll(nodes, -1, axis=1)[:, :edges]], -1)
-            self.ends.append(ends.swapaxes(0, 1).reshape(-1, 2))
+            stiffness = np.stack([np.broadcast_to(v, angles.shape) for v in piece.stiffness], -1)
+            self.frames.append(np.concatenate([rows(piece.director).T, rows(piece.tangent).T]))
+            self.stiffness.append(rows(stiffness).T)
+            self.ends.append(rows(np.stack([nodes[:, :edges], np.roll(nodes, -1, axis=1)[:, :edges]], -1)))
         self.numbers.append((nodes, angles))
         own, own_edges = nodes[:, before : n - after], angles[:, before : edges - after]
         for row, rod in enumerate(piece.rods.tolist()):
@@ -165,7 +175,7 @@ class _Builder:
             ],
         )
         net.fixed[nodes : nodes + angles, 1:] = True
-        net.sets = net_elements.element_sets(scene, net)
+        net.sets = net_elements.element_sets(scene, net, self.along)
         conditions.add_masses(scene, net)
         conditions.hold(scene, net)
         conditions.load(scene, net)

@@ -16,10 +16,10 @@ from ddg_warp.geometry import polyline, shell_forms
 from ddg_warp.kernels.terms import JOINTS, term_key
 
 
-def element_sets(scene, net: Net) -> list[NetSet]:
-    """Elements of a net by term; marks the dofs that none of them has."""
+def element_sets(scene, net: Net, along: bool) -> list[NetSet]:
+    """Elements of a net by term, numbered `along` rods or not (`compile_net`); marks the dofs that none of them has."""
     joints = _joint_places(scene, net)
-    rods = [*_rod_sets(net, joints), *_joint_sets(net, joints), *glue_sets(scene, net)]
+    rods = [*_rod_sets(net, joints, along), *_joint_sets(net, joints), *glue_sets(scene, net)]
     magnets = magnet_sets(scene, net) if scene.magnets else []
     return _gather_sets([*rods, *magnets, *_shell_sets(net, scene), *_meridian_sets(net, scene)])
 
@@ -50,7 +50,7 @@ def _joint_places(scene, net: Net) -> list[tuple[int, int, list]]:
     return result
 
 
-def _rod_sets(net: Net, joints) -> list[NetSet]:
+def _rod_sets(net: Net, joints, along: bool) -> list[NetSet]:
     """Stretch and bending of the rods, numbered as their nodes are; vertices at rigid joints are left to these."""
     skipped = np.array([rod.rod * net.nodes + node for node, _, members in joints for rod, _, _ in members], int)
     alike: dict[int, list[NetRod]] = {}
@@ -64,7 +64,7 @@ def _rod_sets(net: Net, joints) -> list[NetSet]:
         for term in kind.terms:
             span = term.measure.span
             count = n if kind.closed else n - span
-            k, row = np.indices((count, len(rods))).reshape(2, -1)
+            k, row = np.indices((count, len(rods))).reshape(2, -1, order="F" if along else "C")
             if span == 2:
                 joined = np.isin(piece.rods[row] * net.nodes + nodes[row, (k + 1) % n], skipped)
                 row, k = row[~joined], k[~joined]
