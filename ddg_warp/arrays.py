@@ -54,7 +54,16 @@ def load_kernels(kernels, device) -> None:
         kernel.module.load(device, block_dim=threads if cuda else 1)
 
 
+def serial(device) -> bool:
+    """Whether one thread takes all of what kernels go over, rather than one each; see `kernels.element.until_function`."""
+    return wp.get_device(device).is_cpu
+
+
+def takers(count: int, device) -> int:
+    """How many threads take `count` things."""
+    return min(1, count) if serial(device) else count
+
+
 def sweep(kernel, count: int, inputs: list, outputs: list, device, threads: int = THREADS) -> None:
-    """Launch a kernel that goes over `count` things: a thread for each, on the CPU one for all; see `element.until_function`."""
-    dim = min(1, count) if wp.get_device(device).is_cpu else count
-    wp.launch(kernel, dim, inputs, outputs, device=device, block_dim=threads)
+    """Launch a kernel that goes over `count` things."""
+    wp.launch(kernel, takers(count, device), inputs, outputs, device=device, block_dim=threads)

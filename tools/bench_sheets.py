@@ -94,7 +94,7 @@ def floors(newton) -> dict[str, float]:
     blocks, real = newton.all, 8 if newton.real is wp.float64 else 4
     matrix = 9 * linear * newton.system.entries * newton.worlds
     geometry = blocks * 3 * real
-    data = sum(4 * part.slots.size + real * part.buffer.size for part in net.sets)
+    data = sum(4 * part.slots.size + real * part.parameters.buffer.size for part in net.sets)
     vectors = blocks * 3 * linear
     return {"assembly": matrix + geometry + data, "iteration": matrix + 9 * vectors + 9 * linear * blocks}
 
@@ -168,7 +168,7 @@ def measure(bending: str, cells: int, device, quick: bool, linear: str) -> dict:
         "newton_mean": statistics["newton_iterations"]["mean"],
         "solves": solves,
         "outcomes": ", ".join(f"{count} {name}" for name, count in statistics["outcomes"].items()),
-        "residual": float(np.sqrt(newton.sum_square.numpy().max())),
+        "residual": float(np.sqrt(newton.square.numpy().sum(-1).max())),
         "build_s": built,
     }
 

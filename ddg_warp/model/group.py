@@ -19,7 +19,7 @@ class Group:
     """
 
     def __init__(self, host: ChainGroup, scene, worlds: int, device, real):
-        kind = replace(host.kind, serial=wp.get_device(device).is_cpu)
+        kind = replace(host.kind, serial=arrays.serial(device))
         vector = wp.types.vector(kind.dim, real)
         self.host, self.kind, self.worlds, self.device = host, kind, worlds, device
         self.rods = len(host.rods)
@@ -27,7 +27,7 @@ class Group:
         self.columns = self.rods * worlds
         self.elements = self.nodes if kind.closed else self.nodes - 1
         self.node_threads, self.element_threads = (
-            (1 if kind.serial else along, self.columns) for along in (self.nodes, self.elements)
+            (arrays.takers(along, device), self.columns) for along in (self.nodes, self.elements)
         )
 
         def put(values, dtype):

@@ -28,7 +28,7 @@ class Balance:
         self.given, self.found = given, found
         self._meetings = list(self._meeting_of_sets())  # an array of structures keeps nothing alive
         self.sets = wp.array(self._meetings, dtype=balance.meeting_type(real, linear), device=net.device)
-        some = self.chains.elsewhere() if self.chains else np.arange(0)
+        some = self.chains.elsewhere if self.chains else np.arange(0)
         self.some = wp.array(some.astype(np.int32), dtype=int, device=net.device)
         self.count = len(some) if self.chains else net.blocks
         if newton.planes:
@@ -36,7 +36,7 @@ class Balance:
         else:
             types = int, wp.types.matrix((3, 3), real)
             self._frames = [wp.zeros(0, dtype=dtype, device=net.device) for dtype in types]
-        self.kernels = [balance.balance_kernel(real, linear, drag, newton.serial)]
+        self.kernels = [balance.balance_kernel(real, linear, drag, arrays.serial(net.device))]
 
     def _meeting_of_sets(self):
         """What the elements of each set bring to the blocks."""

@@ -1,5 +1,7 @@
 """The chain preconditioner of a net on a device; see `kernels.solve.elimination` and `joints`."""
 
+from functools import cached_property
+
 import numpy as np
 import warp as wp
 
@@ -34,7 +36,6 @@ class Chains:
         if not net.host.rods:
             raise SceneError("preconditioner 'chain' is of nets with rods; this one has none")
         self.net, self.device = net, net.device
-        self.serial = wp.get_device(net.device).is_cpu
         self.plan = ChainPlan(net.host)
         self.along = [i for i, part in enumerate(net.sets) if part.host.along]
         self.banded = banded and len(self.along) <= SETS
@@ -45,7 +46,7 @@ class Chains:
         self.table, net, plan = table, self.net, self.plan
         plan.bind(net.host, table.rows.numpy(), table.columns.numpy(), self.kept)
         self.exact = self.banded and plan.complete
-        worlds, device = net.worlds, net.device
+        worlds, device, serial = net.worlds, net.device, arrays.serial(net.device)
         H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
 
         def put(values):
@@ -71,9 +72,7 @@ class Chains:
         self.values = arrays.allocate((block, self.longest, self.columns), linear, device)
         self.responses = arrays.allocate((block, self.longest, plan.solves * self.columns), linear, device)
         self.coupled = len(plan.of_places[1]) > 0
-        self.met = (
-            None if plan.met is None or not self.coupled else arrays.upload(plan.met.astype(np.int32), int, device)
-        )
+        self.met = None if plan.met is None else arrays.upload(plan.met.astype(np.int32), int, device)
         self.joints, self.joint_rows = len(plan.pairs), 2 * len(plan.pairs)
         self.joint_row, self.pairs, self.own = put(plan.joint_row), put(plan.pairs), put(plan.own)
         self.colour, self.taken = put(plan.colour), put(plan.taken)
@@ -86,16 +85,16 @@ class Chains:
         terms = tuple(net.sets[i].term for i in sets)
         late = tuple(exact_from[i] for i in sets)
         self._assemble, self._clear, self._product = band_kernels(
-            terms, plan.twist, plan.span, real, linear, late, drag, self.serial
+            terms, plan.twist, plan.span, real, linear, late, drag, serial
         )
         own = [self._elements(i, written[i], real, linear) for i in sets] or [along_type(real, linear)()]
         self._own = own + own[-1:] * (SETS - len(own))
         if self.banded:
-            self._balance = place_kernel(terms, plan.twist, real, linear, drag, self.serial)
+            self._balance = place_kernel(terms, plan.twist, real, linear, drag, serial)
             apart = np.zeros(net.blocks, np.uint8)
-            apart[self.elsewhere()] = 1
+            apart[self.elsewhere] = 1
             self._apart = wp.array(apart, dtype=wp.uint8, device=device)
-        made = elimination.chain_kernels(plan.twist, plan.span, linear, plan.size, self.serial)
+        made = elimination.chain_kernels(plan.twist, plan.span, linear, plan.size, serial)
         self._factorise, self._load, self._solve, self._solve_all, self._follow, self._finish, *self._columns = made
         self._measure, self._meet = joints.joint_kernels(linear) if self.joints else (None, None)
 
@@ -106,15 +105,15 @@ class Chains:
         if self.reduction:
             own += [*self._columns, *self.reduction.kernels]
         else:
-            own += [
-                (kernel, SERIAL) for kernel in (self._factorise, self._solve, *([self._solve_all] * bool(self.joints)))
-            ]
+            own += [(self._factorise, SERIAL), (self._solve, SERIAL)]
+            own += [(self._solve_all, SERIAL)] if self.coupled else []
         own += [self._balance] if self.banded else []
         own += [self._clear] if self.banded and self.taken.size else []
         own += [self._product] if self.banded and not self.exact else []
         own += [self._follow] if self.met is not None else []
         return own + ([self._measure, self._meet] if self.joints else [])
 
+    @cached_property
     def elsewhere(self) -> np.ndarray:
         """Blocks that are not at a place, or at which elements meet that do not run along rods."""
         found = self.plan.where < 0
@@ -127,7 +126,7 @@ class Chains:
         """Residuals of all blocks but those `elsewhere`."""
         self._launch(
             self._balance,
-            (1 if self.serial else self.longest, self.columns),
+            (arrays.takers(self.longest, self.device), self.columns),
             [given, self.places, self.count, self._apart, *islands.arrays, *self._own],
             [found],
         )
@@ -137,7 +136,7 @@ class Chains:
         table = self.table
         self._launch(
             self._assemble,
-            (1 if self.serial else self.longest, self.columns),
+            (arrays.takers(self.longest, self.device), self.columns),
             [matrix, mass, *islands.arrays, self.places, self.chain, self.count, self.held]
             + [table.diagonal, table.positions]
             + self._own,
@@ -206,7 +205,7 @@ class Chains:
             self._eliminate(matrix, wanted, self.values, residual, self.moved)
         self._launch(
             self._finish,
-            1 if self.serial else net.worlds * net.blocks,
+            arrays.takers(net.worlds * net.blocks, self.device),
             [residual, self.values, self.where, self.width, self.joint_row, self.joint_rows, self.moved, wanted]
             + [net.blocks, net.host.nodes],
             [z, dots],
@@ -221,7 +220,7 @@ class Chains:
         table, net, solves = self.table, self.net, values.shape[2] // self.columns
         self._launch(
             self._load,
-            (1 if self.serial else self.longest, solves * self.columns),
+            (arrays.takers(self.longest, self.device), solves * self.columns),
             [matrix, table.columns, self.places, self.count, self.held, self.starts, self.items, self.joint_row]
             + [self.joint_rows, wanted, net.blocks, table.positions, int(residual is not None)]
             + [int(moved is not None), self.moved if residual is None else residual]

@@ -48,7 +48,7 @@ class NetNewton:
         self.real, self.linear = model.types.real, linear or model.types.linear
         self.eps = model.types.eps
         worlds, blocks, host, device = net.worlds, net.blocks, net.host, net.device
-        serial = self.serial = wp.get_device(device).is_cpu  # see `until_function`
+        serial = arrays.serial(device)
         self.worlds, self.all = worlds, worlds * blocks
         V, H = net.vector, wp.types.vector(3, self.linear)
         M = wp.types.matrix((3, 3), self.linear)
@@ -124,7 +124,7 @@ class NetNewton:
         self._repeat = pcg.repeat_kernel(self.real, False) if any(exact) or self._direct else None
         self.negative = make(worlds, int)
         self._assembly = Assembly(
-            net, self.system, self.parts, self.real, self.linear, self.exact_from, self.local, drag, serial
+            net, self.system, self.parts, self.real, self.linear, self.exact_from, self.local, drag
         )
         self._judge, self._measure, self._rotate, self._take, self._move = newton.search_kernels(
             self.real, self.linear, serial

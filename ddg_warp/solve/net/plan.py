@@ -29,13 +29,14 @@ class ChainPlan:
             between joints, or between chains.
         own (joints, 3): positions of its blocks in H, with each other at last.
         of_places, of_joints: starts and positions of the couplings of blocks of chains with joints, of rows of joints with chains.
-        colour (joints,); units (solves, 1, 2 joints, 3): movements of joints, of a colour and a dof each, that S is measured with.
-        met (colours, longest, columns): the joint of each colour that the chain of a place meets, -1 for none; None where there are no
-            joints, or one chain meets two of one colour.
+        colour (joints,); units (solves, 1, 2 joints, 3): movements of joints, of a colour and a dof each, that S is measured with;
+            none where no chain meets a joint.
+        met (colours, longest, columns): the joint of each colour that the chain of a place meets, -1 for none; None where none meets
+            any, or one chain meets two of one colour.
     """
 
     def __init__(self, host):
-        self._blocks = host.blocks
+        self._blocks, self._held = host.blocks, host.fixed.all(1)
         lengths = [len(rod.all_nodes) for rod in host.rods]
         self._first = dict(zip((rod.rod for rod in host.rods), np.cumsum([0, *lengths[:-1]]), strict=True))
         self._length = dict(zip((rod.rod for rod in host.rods), lengths, strict=True))
@@ -71,7 +72,7 @@ class ChainPlan:
         self._positions()
         self._couple(host, np.where(near, rows, -1), columns)
         chains = self._colour(host, columns)
-        self._take(host, rows, columns, near, kept)
+        self._take(rows, columns, near, kept)
         self.complete &= not (np.bincount(chains) > 1).any()
 
     def elements(self, host, part) -> np.ndarray:
@@ -104,7 +105,6 @@ class ChainPlan:
     def _joints(self, host, node, angle, rod) -> tuple[np.ndarray, np.ndarray]:
         """What is taken out of the rods: `pairs` and `joint_row`. Returns couplings in what is left: later place, distance."""
         spins = [part.slots[[0, 3]].T for part in host.sets if part.term.measure.spins]
-        held = host.fixed.all(1)
         turning = np.unique(np.concatenate(spins), axis=0) if spins else np.zeros((0, 2), int)
         met = np.bincount(node, minlength=host.blocks) > 1
         met[turning[:, 0]] = True
@@ -119,7 +119,7 @@ class ChainPlan:
         cut = np.unique(a[a - b > 2])
         shared = np.flatnonzero(met)
         pairs = [
-            np.column_stack([np.where(held[shared], -1, shared), spin[shared]]),
+            np.column_stack([np.where(self._held[shared], -1, shared), spin[shared]]),
             np.column_stack([np.full(len(others), -1), others]),
             np.column_stack([np.where(met[node[cut]], -1, node[cut]), angle[cut]]),
         ]
@@ -167,7 +167,7 @@ class ChainPlan:
         self.places = np.full((len(rows), *self.chain.shape), -1)
         self.places[:, self._k, self._c] = rows
 
-    def _take(self, host, rows, columns, near, kept) -> None:
+    def _take(self, rows, columns, near, kept) -> None:
         """What bands take over (`taken`), and whether that is all (`complete`)."""
         self.taken, self.complete = np.zeros(0, int), False
         if kept is None:
@@ -179,14 +179,13 @@ class ChainPlan:
         same &= self.chain[k[a], c[a]] == self.chain[k[b], c[b]]
         self.taken = np.flatnonzero(same)
         joint = np.where(self.joint_row >= 0, self.joint_row // 2, -1)
-        free = ~host.fixed.all(1)
+        free = ~self._held
         between = (joint[a] != joint[b]) & (rows >= 0) & free[a] & free[b] & ~(kept[a] | kept[b])
         self.complete = not (both & ~same).any() and not (free & ~kept & (joint < 0)).any() and not between.any()
 
     def _couple(self, host, rows, columns) -> None:
         """Couplings of chains and joints, of what is not held."""
-        held = host.fixed.all(1)
-        real = (rows >= 0) & ~(held[rows] | held[columns])
+        real = (rows >= 0) & ~(self._held[rows] | self._held[columns])
         inside, joint = (np.where(real, of[b], -1) for b, of in ((rows, self.where), (columns, self.joint_row)))
         there = np.flatnonzero((inside >= 0) & (joint >= 0))
         starts, items = lists(rows[there], host.blocks)
@@ -220,11 +219,11 @@ class ChainPlan:
         joints_of = np.full((colours, self.chain.max() + 1), -1)
         joints_of[self.colour[joint], chain] = joint
         alone = np.unique(chain * colours + self.colour[joint]).size == chain.size
-        self.met = np.where(self.chain >= 0, joints_of[:, self.chain], -1) if joints and alone else None
+        self.met = np.where(self.chain >= 0, joints_of[:, self.chain], -1) if len(chain) and alone else None
         self.size = 6 if (self.pairs[:, 1] >= 0).any() else 3
-        self.solves = self.size * (self.colour.max(initial=-1) + 1)
+        self.solves = self.size * colours if len(chain) else 0
         self.units = np.zeros((self.solves, 1, 2 * joints, 3))
-        for m, colour in enumerate(self.colour):
+        for m, colour in enumerate(self.colour) if self.solves else ():
             for d in range(self.size):
                 block = self.pairs[m, d // 3]
                 if block >= 0 and not host.fixed[block, d % 3]:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ddg_warp import arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.net import elements, frames, newton
 from ddg_warp.model.net import NetState
@@ -45,7 +46,7 @@ class NetStep(PartStep):
         super().__init__(integrator, model, solver, counts_of)
         if counts_of is not None:
             self.newton.pcg_work = counts_of.newton.pcg_work
-        self._begin, self._finish = newton.step_kernels(real, self.midpoint, solver.serial)
+        self._begin, self._finish = newton.step_kernels(real, self.midpoint, arrays.serial(model.wp_device))
         self.middle = model.net.empty() if self.midpoint and model.net.edges else None
         self.drag = NetDrag(model, self.midpoint) if host.drag else None
         self.energy = NetEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
@@ -56,12 +57,13 @@ class NetStep(PartStep):
     def attempt(self, before, after) -> None:
         """One solve of every world that has not finished the step, from state `before` to `after`."""
         solver, blocks, islands = self.newton, self.net.blocks, self.islands
-        self._launch(
+        arrays.sweep(
             self._begin,
-            1 if solver.serial else solver.all,
+            solver.all,
             [before.q, before.v, solver.held, self.drag.moves if self.drag else solver.mass]
             + [self.integrator._dt, self.damping, solver.outer, *islands.arrays, blocks],
             [solver.q, solver.base, solver.target],
+            self.model.wp_device,
         )
         start = self._start_frames(before)
         if self.motion:
@@ -72,8 +74,8 @@ class NetStep(PartStep):
         solver.solve(start)
         if self.energy:
             self.energy.judge(before, start)
-        dim = 1 if solver.serial else solver.all
-        self._launch(self._finish, dim, [solver.q, before.q, before.v, *islands.arrays, blocks], [after.q, after.v])
+        inputs = [solver.q, before.q, before.v, *islands.arrays, blocks]
+        arrays.sweep(self._finish, solver.all, inputs, [after.q, after.v], self.model.wp_device)
         if self.drag:
             self.drag.settle(after, solver, islands)
         self.net.carry(start, after, kept=before, moved=islands.moved)

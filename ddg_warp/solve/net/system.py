@@ -3,6 +3,7 @@
 import numpy as np
 import warp as wp
 
+from ddg_warp import arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.matrix import sliced
 from ddg_warp.kernels.matrix.sliced import SLICE
@@ -129,7 +130,6 @@ class Assembly:
         exact_from: of each set, the iteration from which on second derivatives are written, or None.
         local: of each set, whether its factor is of the local dofs.
         drag: whether blocks have more than a mass.
-        serial: whether a thread takes all positions.
     """
 
     def __init__(
@@ -142,9 +142,8 @@ class Assembly:
         exact_from: tuple,
         local: tuple,
         drag: bool,
-        serial: bool,
     ):
-        self.serial = serial
+        serial = arrays.serial(net.device)
         self.net, self.table, self.kernels, self._own = net, table, [], []
         for first in range(0, len(net.sets), sliced.SETS):
             sets, late, own_dofs = (of[first : first + sliced.SETS] for of in (net.sets, exact_from, local))
@@ -163,10 +162,10 @@ class Assembly:
         """Write H (9, positions of all worlds) of the worlds that want it."""
         table = self.table
         for kernel, own in zip(self.kernels, self._own, strict=True):
-            wp.launch(
+            arrays.sweep(
                 kernel,
-                1 if self.serial else self.net.worlds * table.positions,
+                self.net.worlds * table.positions,
                 [mass, *islands.arrays, table.rows, table.columns, table.positions, *own],
                 [matrix],
-                device=self.net.device,
+                self.net.device,
             )

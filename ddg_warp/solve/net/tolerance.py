@@ -3,6 +3,7 @@
 import numpy as np
 import warp as wp
 
+from ddg_warp import arrays
 from ddg_warp.kernels.net import parts
 
 
@@ -17,7 +18,6 @@ class Allowed:
     def __init__(self, net, real, linear):
         self.net, self.bodies, self._real = net, net.host.bodies, real
         worlds, device = net.worlds, net.device
-        self.serial = wp.get_device(device).is_cpu
 
         def put(values):
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
@@ -27,18 +27,18 @@ class Allowed:
 
         self.blocks, self.least = make(worlds * net.blocks), make(worlds * net.blocks)
         self.ratio = make((worlds, net.blocks + sum(len(level.weight) for level in self.bodies.levels)))
-        self.kernels = [parts.part_kernel(real, linear, leaf, self.serial) for leaf in (True, False)]
+        self.kernels = [parts.part_kernel(real, linear, leaf, arrays.serial(device)) for leaf in (True, False)]
         self._levels = []
         for level in self.bodies.levels:
             n = len(level.weight)
-            arrays = (
+            own = (
                 put(level.starts),
                 put(level.items),
                 make((worlds, n)),
                 make(worlds * n, net.vector),
                 make(worlds * n),
             )
-            self._levels.append(arrays)
+            self._levels.append(own)
 
     def assign(self, loads: np.ndarray) -> wp.array:
         """Take the loads of bodies (worlds or 1, bodies) [N]; load scales of the worlds: 1, or 0 where there are none."""
@@ -57,7 +57,7 @@ class Allowed:
         for starts, items, limit, sums, squares in self._levels:
             wp.launch(
                 kernel,
-                (1 if self.serial else limit.shape[1], self.net.worlds),
+                (arrays.takers(limit.shape[1], self.net.device), self.net.worlds),
                 [value, rounding, starts, items, below, limit, place, rtol, islands.load_scale, islands.status],
                 [sums, squares, self.ratio, unbalanced, drowned],
                 device=self.net.device,
