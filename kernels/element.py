@@ -13,7 +13,6 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels import frames
 from ddg_warp.kernels.islands import ACTIVE, ITERATION, RATE, SLOT, STALE, STATUS
 from ddg_warp.kernels.measures.turning import packed_index
 from ddg_warp.kernels.terms import Term
@@ -516,9 +515,8 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
 
     Compression lowers the stiffness across an edge, which can make the matrix indefinite: `clamped` rods do without that.
     With `reuse` the factor is written once a step, at the first iterate. Energies go to the slot that the line search does not
-    hold (`1 - slot[r]`). `turned` is raised where an edge has turned by more than 90 degrees from its lagged tangent, or the
-    reference twist nears a jump. `stiffness` is the largest a term has against moving its first edge [N/m]. Thread (0, 0) clears
-    `active`, which the sweep then raises.
+    hold (`1 - slot[r]`). `stale` is raised where frames have to be renewed before the next step. `stiffness` is the largest a term
+    has against moving its first edge [N/m]. Thread (0, 0) clears `active`, which the sweep then raises.
     """
     V = wp.types.vector(kind.dim, real)
     until = until_function(kind.serial)
@@ -530,9 +528,8 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
     W = wp.types.vector(kind.window, real)
     evaluate_first, evaluate_last = (evaluate_functions(kind, at, real, linear, curved) for at in (0, -1))
     options = CPU_OPTIONS | {"max_unroll": kind.geometric_rows} if curved else CPU_OPTIONS
-    X = wp.types.vector(3, real)
-    transport, reference_twist, _ = frames.functions(real)
-    size, twist, closed = kind.window, kind.twist, kind.closed
+    stale = next((term.measure.stale(real) for term in kind.terms if term.measure.stale), None)
+    size, closed = kind.window, kind.closed
 
     # three blocks a multiprocessor: 168 registers instead of 170 are worth 30 % at 100,000 rods on an H200
     @wp.kernel(
@@ -590,25 +587,9 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
             stiffness_out[k, r] = linear(stiffest)
             for i in range(wp.static(size)):
                 gradient_out[i, k, r] = f[i]
-            if wp.static(twist):
-                if whole:
-                    e = X(q[0], q[1], q[2])
-                    f1 = X(q[3], q[4], q[5])
-                    te0 = X(s[3], s[4], s[5])
-                    tf0 = X(s[9], s[10], s[11])
-                    along_e = wp.dot(e, te0)
-                    along_f = wp.dot(f1, tf0)
-                    far = real(0.81)  # squared cosine of the turn from which the reference twist can matter
-                    if along_e * wp.abs(along_e) < far * wp.length_sq(e) or along_f * wp.abs(
-                        along_f
-                    ) < far * wp.length_sq(f1):
-                        te = wp.normalize(e)
-                        tf = wp.normalize(f1)
-                        ue = transport(X(s[0], s[1], s[2]), te0, te)
-                        uf = transport(X(s[6], s[7], s[8]), tf0, tf)
-                        m = reference_twist(ue, uf, te, tf, s[12])
-                        if wp.min(along_e, along_f) < real(0.0) or wp.abs(m - s[12]) > real(1.5):
-                            flags[STALE, r] = 1
+            if wp.static(stale is not None):
+                if whole and stale(q, s):
+                    flags[STALE, r] = 1
 
     return evaluate
 

@@ -31,3 +31,27 @@ def functions(real):
         return d * wp.cos(angle) + wp.cross(t, d) * wp.sin(angle)
 
     return transport, reference_twist, rotate
+
+
+@cache
+def stale_function(real):
+    """stale(e, f, ue, te, uf, tf, lagged): whether edges e and f ask for newer frames than (ue, te) and (uf, tf).
+
+    They do where one has turned by more than 90 degrees from its lagged tangent, or their reference twist nears a jump.
+    """
+    V = wp.types.vector(3, real)
+    transport, reference_twist, _ = functions(real)
+
+    @wp.func
+    def stale(e: V, f: V, ue: V, te: V, uf: V, tf: V, lagged: real):
+        along_e = wp.dot(e, te)
+        along_f = wp.dot(f, tf)
+        far = real(0.81)  # squared cosine of the turn from which the reference twist can matter
+        if along_e * wp.abs(along_e) >= far * wp.length_sq(e) and along_f * wp.abs(along_f) >= far * wp.length_sq(f):
+            return False
+        t = wp.normalize(e)
+        s = wp.normalize(f)
+        m = reference_twist(transport(ue, te, t), transport(uf, tf, s), t, s, lagged)
+        return wp.min(along_e, along_f) < real(0.0) or wp.abs(m - lagged) > real(1.5)
+
+    return stale

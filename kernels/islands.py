@@ -32,8 +32,10 @@ FLAGS = (
     "reason",  # outcome of the solve that made it be given up
     "bent",  # whether the predictor has to turn edges
     "moved",  # whether this part of it succeeded
-    # in the first column, whether any island is still active
+    # in the first column, whether any island is still active, turns the edges of a step, or renews its frames
     "active",
+    "turning",
+    "renewing",
 )
 SCALARS = (
     # the quadratic of inertia, coefficient * m |x - target|^2 / 2, and the reciprocal of the step that the solve is about
@@ -50,7 +52,8 @@ SCALARS = (
     "portion",
 )
 (STATUS, ITERATION, UNBALANCED, DROWNED, SLOT, HALVINGS, WANTED, TODO, PLACED, STALE) = range(10)
-(CLAMPED, LOST, BAD, CAUTIOUS, RETRIES, REASON, BENT, MOVED, ACTIVE) = range(10, len(FLAGS))
+(CLAMPED, LOST, BAD, CAUTIOUS, RETRIES, REASON, BENT, MOVED) = range(10, 18)
+ACTIVE, TURNING, RENEWING = range(18, len(FLAGS))
 (COEFFICIENT, RATE, LOAD_SCALE, RESIDUAL, STEP_LENGTH, DECREMENT, MERIT, ANGLE_CHANGE, PROGRESS, PORTION) = range(10)
 
 
@@ -59,6 +62,7 @@ class Islands:
 
     Attributes:
         arrays: `flags` and `scalars`, for kernels.
+        signals: the rows whose first entry alone counts.
     """
 
     def __init__(self, count: int, real, device):
@@ -69,7 +73,8 @@ class Islands:
         for names, array in zip((FLAGS, SCALARS), self.arrays, strict=True):
             for row, name in enumerate(names):
                 setattr(self, name, array[row])
-        self.active = self.active[:1]
+        self.signals = self.arrays[0][ACTIVE:]
+        self.active, self.turning, self.renewing = (self.signals[row, :1] for row in range(3))
 
     def __len__(self) -> int:
         return self.arrays[0].shape[1]

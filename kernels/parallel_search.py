@@ -24,9 +24,8 @@ from ddg_warp.kernels.islands import (
     WANTED,
 )
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
-from ddg_warp.kernels.search import PLACE, TURNED
-
-STRAIGHT = 4  # beside PLACE and RELAG, what is to be done with a rod: move its nodes along the direction
+from ddg_warp.kernels.search import PLACE, STRAIGHT
+from ddg_warp.kernels.turns import TURNED
 
 
 @cache

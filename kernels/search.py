@@ -7,9 +7,9 @@ import warp as wp
 from ddg_warp.kernels import frames
 from ddg_warp.kernels.element import ChainKind, gather_functions
 from ddg_warp.kernels.islands import ANGLE_CHANGE, PLACED, STEP_LENGTH, TODO
+from ddg_warp.kernels.turns import excess_function, place_function
 
-PLACE, RELAG = 1, 2  # what a sweep leaves to `adjust`
-TURNED = 0.1  # largest turn of an edge in a step that is still taken straight [rad]; its stretch is TURNED^2 / 2
+PLACE, RELAG, STRAIGHT = 1, 2, 4  # what is left to be done with an iterate: turn edges, renew frames, move straight
 
 
 @cache
@@ -19,6 +19,7 @@ def move_functions(kind: ChainKind, real, linear):
     V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
     transport, *_ = frames.functions(real)
     along, *_ = gather_functions(kind, real)
+    excess_of = excess_function(dim, real)
 
     @wp.func
     def step_of(direction: wp.array3d(dtype=linear), j: int, r: int):
@@ -31,17 +32,9 @@ def move_functions(kind: ChainKind, real, linear):
     def excess(base: wp.array2d(dtype=V), direction: wp.array3d(dtype=linear), amount: real, j: int, n: int, r: int):
         """Edge j turned and lengthened by its step, less the same edge with its step added."""
         ahead = along(j + 1, n)
-        e = base[ahead, r] - base[j, r]
-        de = (step_of(direction, ahead, r) - step_of(direction, j, r)) * amount
-        length = wp.length(e)
-        t = e / length
-        stretch = wp.dot(t, de)
-        across = (de - t * stretch) / length
-        angle = wp.length(across)
-        sinc = real(1.0)
-        if angle > real(0.0):
-            sinc = wp.sin(angle) / angle
-        return (t * wp.cos(angle) + across * sinc) * wp.max(length + stretch, real(0.1) * length) - e - de
+        return excess_of(
+            base[ahead, r] - base[j, r], (step_of(direction, ahead, r) - step_of(direction, j, r)) * amount
+        )
 
     @wp.func
     def put(
@@ -99,6 +92,41 @@ def search_functions(kind: ChainKind, real, linear):
     along, *_ = gather_functions(kind, real)
     closed = kind.closed
 
+    @wp.struct
+    class Rod:
+        x: wp.array2d(dtype=V)
+        base: wp.array2d(dtype=V)
+        direction: wp.array3d(dtype=linear)
+        fixed: wp.array2d(dtype=wp.uint8)
+        amount: real
+        count: int
+        closed: int
+        r: int
+
+    @wp.func
+    def edge(rod: Rod, j: int):
+        return rod.base[along(j + 1, rod.count), rod.r] - rod.base[along(j, rod.count), rod.r]
+
+    @wp.func
+    def step(rod: Rod, j: int):
+        here = step_of(rod.direction, along(j, rod.count), rod.r)
+        return (step_of(rod.direction, along(j + 1, rod.count), rod.r) - here) * rod.amount
+
+    @wp.func
+    def anchored(rod: Rod, j: int):
+        return (int(rod.fixed[along(j, rod.count), rod.r]) & wp.static(every)) == wp.static(every)
+
+    @wp.func
+    def added(rod: Rod, j: int):
+        k = along(j, rod.count)
+        return rod.x[k, rod.r] - rod.base[k, rod.r] - step_of(rod.direction, k, rod.r) * rod.amount
+
+    @wp.func
+    def put_node(rod: Rod, j: int, shift: V):
+        put(rod.x, rod.base, rod.direction, rod.fixed, rod.amount, shift, along(j, rod.count), rod.r)
+
+    place_rod = place_function(dim, real, Rod, edge, step, anchored, added, put_node)
+
     @wp.func
     def place(
         x: wp.array2d(dtype=V),
@@ -109,59 +137,17 @@ def search_functions(kind: ChainKind, real, linear):
         n: int,
         r: int,
     ):
-        """x = base moved along the direction, with edges turned instead of sheared.
-
-        A straight step stretches an edge that it turns, to second order, which in a nearly inextensible rod limits steps to
-        small turns. Turned edges are summed from held nodes; what misses between two of them is spread over the edges between.
-        """
-        first = int(0)
-        while first < n and (int(fixed[first, r]) & wp.static(every)) != wp.static(every):
-            first += 1
-        free = first == n
-        if free:
-            first = 0
-        put(x, base, direction, fixed, amount, V(), first, r)
-        nodes = n - first
-        if wp.static(closed):
-            nodes = n + 1
-        i = int(0)
-        while i < nodes - 1:
-            # the next held node, or the end
-            stop = i + 1
-            miss = excess(base, direction, amount, along(first + i, n), n, r)
-            while stop < nodes - 1 and (int(fixed[along(first + stop, n), r]) & wp.static(every)) != wp.static(every):
-                miss += excess(base, direction, amount, along(first + stop, n), n, r)
-                stop += 1
-            held = wp.static(closed) and stop == nodes - 1
-            if (int(fixed[along(first + stop, n), r]) & wp.static(every)) == wp.static(every):
-                held = True
-            slope = V()
-            if held:
-                slope = miss / real(stop - i)
-            shift = V()
-            for j in range(i + 1, stop + 1):
-                shift += excess(base, direction, amount, along(first + j - 1, n), n, r) - slope
-                if not (wp.static(closed) and j == nodes - 1):
-                    put(x, base, direction, fixed, amount, shift, along(first + j, n), r)
-            i = stop
-        back = V()
-        if not wp.static(closed):
-            for i in range(first):
-                j = first - 1 - i
-                back -= excess(base, direction, amount, j, n, r)
-                put(x, base, direction, fixed, amount, back, j, r)
-        if free:
-            # nothing holds the rod: leave the mean of its nodes where the straight step takes it
-            mean = V()
-            for j in range(n):
-                mean += x[j, r] - base[j, r] - step_of(direction, j, r) * amount
-            mean /= real(n)
-            for j in range(n):
-                back_j = x[j, r]
-                for d in range(wp.static(dim)):
-                    if ((int(fixed[j, r]) >> d) & 1) == 0:
-                        back_j[d] = back_j[d] - mean[d]
-                x[j, r] = back_j
+        """x = base moved along the direction, with edges turned instead of sheared."""
+        rod = Rod()
+        rod.x = x
+        rod.base = base
+        rod.direction = direction
+        rod.fixed = fixed
+        rod.amount = amount
+        rod.count = n
+        rod.closed = wp.static(int(closed))
+        rod.r = r
+        place_rod(rod)
 
     @wp.func
     def turn_angles(theta: wp.array2d(dtype=real), direction: wp.array3d(dtype=linear), amount: real, n: int, r: int):

@@ -31,7 +31,8 @@ from ddg_warp.kernels.islands import (
     STATUS,
     attempt_functions,
 )
-from ddg_warp.kernels.search import TURNED, search_functions
+from ddg_warp.kernels.search import search_functions
+from ddg_warp.kernels.turns import TURNED
 
 
 @cache

@@ -303,7 +303,7 @@ def test_one_bad_world_does_not_stop_the_others(device, scheme):
     alone = steps(scene.build(device, "float64"), 4, 0.02, scheme)[0].points()
     (np.testing.assert_array_equal if device == "cpu" else np.testing.assert_allclose)(state.points()[1], alone)
     np.testing.assert_array_equal(state.points()[0], points[0])
-    with pytest.raises(ddg.SolverError, match=r"world 0.*non_finite.*smaller dt"):
+    with pytest.raises(ddg.SolverError, match=r"world 0.*non_finite.*edge 0 of rod 0 has no length"):
         integrator.check(state)
 
 
@@ -439,7 +439,7 @@ def test_massless_vertices_are_refused(device):
         ddg.Integrator(scene.build(device))
 
 
-@pytest.mark.parametrize("given", [{"solver": "projective"}, {"linear": "sweep"}, {"psd": "none"}, {"psd": "project"}])
+@pytest.mark.parametrize("given", [{"linear": "sweep"}, {"psd": "project"}])
 def test_options_of_chains_are_refused(device, given):
     with pytest.raises(ddg.SceneError, match="is of rods on their own"):
         ddg.Integrator(sheet(2).build(device), **given)

@@ -8,6 +8,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.compile.net.net import Net
 from ddg_warp.kernels.net import elements, frames
+from ddg_warp.kernels.search import RELAG
 from ddg_warp.model.parameters import ParameterTable
 
 
@@ -105,21 +106,24 @@ class DeviceNet:
         self.still = wp.zeros(worlds, dtype=real, device=device)
         self.every = wp.full(worlds, 1, dtype=int, device=device)
 
+    def _zeros(self, rows: int, columns: int) -> wp.array:
+        return wp.zeros((max(1, rows), max(1, columns)), dtype=self.real, device=self.device)
+
+    def lagged(self) -> tuple[wp.array, list[wp.array]]:
+        """Arrays of frames, and of the own lagged rows of every set, not yet filled."""
+        counts = [(len(part.host.lag), part.elements) for part in self.sets]
+        own = [self._zeros(rows, self.worlds * elements if rows else 1) for rows, elements in counts]
+        return self._zeros(6, self.worlds * self.edges), own
+
     def empty(self) -> NetState:
         """Arrays of a state, not yet filled."""
-
-        def zeros(rows, columns):
-            return wp.zeros((max(1, rows), max(1, columns)), dtype=self.real, device=self.device)
-
         blocks = self.worlds * self.blocks
         q, v = (wp.zeros(blocks, dtype=self.vector, device=self.device) for _ in range(2))
-        state = NetState(q, v, zeros(6, self.worlds * self.edges))
+        state = NetState(q, v, *self.lagged())
         for part in self.sets:
             count = self.worlds * part.elements
-            rows = len(part.host.lag)
-            state.lag.append(zeros(rows, count if rows else 1))
             strains = len(part.term.measure.strains) if part.term.density.lagged else 0
-            state.last.append(zeros(strains, count if strains else 1))
+            state.last.append(self._zeros(strains, count if strains else 1))
         state.data = self.turning_data() | self.field_data()
         return state
 
@@ -177,26 +181,43 @@ class DeviceNet:
         Worlds that have not `moved` take over those of `kept` instead. The states may be the same. Launches alone, so that it
         can be captured.
         """
-        real = self.real
-        if not self.edges:
-            return
-        kept, moved = kept or before, moved or self.every
+        if self.edges:
+            self._carry(before, after, after.q, kept or before, moved or self.every, 1, 0)
+            self.reset_spins(after.q)
 
-        def launch(kernel, dim, inputs, outputs):
-            wp.launch(kernel, dim, inputs, outputs, device=self.device)
+    def renew(self, state: NetState, q: wp.array, todo: wp.array) -> None:
+        """Lagged data of `state` as of dofs q of a solve, in worlds whose `todo` asks for it; strains stay what they are."""
+        self._carry(state, state, q, state, todo, RELAG, 1)
 
-        launch(
-            frames.edge_kernel(real),
+    def _carry(self, before, after, q: wp.array, kept, moved: wp.array, wanted: int, within: int) -> None:
+        """See `kernels.net.frames`."""
+        wp.launch(
+            frames.edge_kernel(self.real),
             self.worlds * self.edges,
-            [after.q, self.ends, self.blocks, moved, kept.frame, before.frame],
+            [q, self.ends, self.blocks, moved, wanted, kept.frame, before.frame],
             [after.frame],
+            device=self.device,
         )
         for index, (part, same, old, new) in enumerate(zip(self.sets, kept.lag, before.lag, after.lag, strict=True)):
             if part.term.measure.advance:
-                given = self.elements(after, index)
+                given = self.elements(after, index, q)
                 given.lag = old
-                launch(frames.lag_kernel(part.term.measure, real), old.shape[1], [given, moved, same], [new])
-        self.reset_spins(after.q)
+                wp.launch(
+                    frames.lag_kernel(part.term.measure, self.real),
+                    old.shape[1],
+                    [given, moved, wanted, within, same],
+                    [new],
+                    device=self.device,
+                )
+
+    @property
+    def carries(self) -> list:
+        """Kernels of `carry`, to load before a capture."""
+        real = self.real
+        measures = [part.term.measure for part in self.sets if part.term.measure.advance] if self.edges else []
+        kernels = [frames.lag_kernel(measure, real) for measure in measures]
+        kernels += [frames.edge_kernel(real)] if self.edges else []
+        return kernels + ([frames.reset_kernel(real)] if self.edges and self.host.spins else [])
 
     def reset_spins(self, blocks: wp.array) -> None:
         """Zero the rotations of joints, or their rates."""

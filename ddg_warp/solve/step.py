@@ -5,8 +5,11 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SolverError
+from ddg_warp.geometry import polyline
 from ddg_warp.kernels import outcome, step
 from ddg_warp.solve.chains.prescribed import jump_between
+
+FOLDED = 1e-5  # how close to opposite [rad] edges that meet are called folded, in messages
 
 
 class PartStep:
@@ -101,6 +104,29 @@ class PartStep:
             state=state,
             outcome=name,
             rods=self.rods_of(failed),
+        )
+
+    def dead_end(self, x: np.ndarray, first: int, kind, of: str = "") -> str:
+        """What to do about a rod whose edges no step can start from, at nodes x (n, dim) of the last good state; empty for others.
+
+        Args:
+            first: ghosts before its first node; kind: its `ChainKind`; of: what to call it behind an edge.
+        """
+        edges = polyline.edge_vectors(x[None].astype(float), kind.closed)
+        lengths = np.linalg.norm(edges, axis=-1)
+        if not (lengths > 0.0).all():
+            k = int(np.argmin(lengths[0] > 0.0)) - first
+            return f"edge {k}{of} has no length in the last good state; move a node of the state it starts from"
+        if kind.span < 2:
+            return ""
+        before, after = polyline.ahead(edges / lengths[..., None], kind.closed)
+        k = int(np.argmin(np.sum(before * after, -1)[0]))
+        if np.linalg.norm(before[0, k] + after[0, k]) >= FOLDED:
+            return ""
+        k, after = k - first, (k + 1) % lengths.shape[1] - first
+        return (
+            f"edges {k} and {after}{of} fold back by 180 degrees in the last good state, where curvature is infinite or has no "
+            f"direction; move node {after} of the state it starts from, or take a smaller dt if it folded on the way"
         )
 
     def advice(self, state) -> str:

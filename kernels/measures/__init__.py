@@ -45,6 +45,7 @@ class Measure:
             triangle of a symmetric matrix, row by row.
         advance: None, or real -> advance(q, s): the lagged data beside the frames at the end of a step, from the dofs and frames there
             and what they were.
+        stale: None, or real -> stale(q, s): whether frames have to be renewed before the next step of a solve.
         sample: None, or (random, count) -> of the elements that `ddg_warp.run.derivatives` tries the measure at what is to be chosen:
             nodes (nodes, 3), about which theirs lie; data (data_size, count); frame (6, frames * count), the first ones of all
             elements first; lag (rows, count), behind the frames; felt (slots, count), which of them the strains depend on. Else
@@ -66,6 +67,7 @@ class Measure:
     apart: bool = False
     frames: int = 0
     advance: Callable | None = None
+    stale: Callable | None = None
     by_angle: bool = False
     revolved: bool = False
     vectors: tuple[int, ...] = ()

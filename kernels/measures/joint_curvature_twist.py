@@ -215,6 +215,24 @@ def _advance(real):
     return advance
 
 
+@cache
+def _stale(real):
+    Q, S, _, _ = joint_curvature_twist.types(real)
+    V = wp.types.vector(3, real)
+    stale_of = frames.stale_function(real)
+    turned, *_ = rotations(real)
+
+    @wp.func
+    def stale(q: Q, s: S):
+        """Of the ghost, which turns with its frame, and the edge seen outwards."""
+        omega = V(q[4], q[5], q[6])
+        u = turned(omega, V(s[6], s[7], s[8]))
+        t = turned(omega, V(s[9], s[10], s[11]))
+        return stale_of(t, V(q[0], q[1], q[2]), u, t, V(s[0], s[1], s[2]), V(s[3], s[4], s[5]) * s[13], s[12])
+
+    return stale
+
+
 def _sample(random, count: int) -> dict:
     """Edges along x of rods that run either way, and ghosts, twisted by several turns."""
     sign, along = np.where(np.arange(count) % 2, 1.0, -1.0), np.eye(3)[:1]
@@ -238,6 +256,7 @@ joint_curvature_twist = Measure(
     lag_size=13,
     data_size=1,
     advance=_advance,
+    stale=_stale,
     vectors=(0, 3),  # of the ghost
     sample=_sample,
 )

@@ -195,6 +195,27 @@ def _advance(real):
     return advance
 
 
+@cache
+def _stale(real):
+    Q, S, _, _ = rod_curvature_twist.types(real)
+    V = wp.types.vector(3, real)
+    stale_of = frames.stale_function(real)
+
+    @wp.func
+    def stale(q: Q, s: S):
+        return stale_of(
+            V(q[0], q[1], q[2]),
+            V(q[3], q[4], q[5]),
+            V(s[0], s[1], s[2]),
+            V(s[3], s[4], s[5]),
+            V(s[6], s[7], s[8]),
+            V(s[9], s[10], s[11]),
+            s[12],
+        )
+
+    return stale
+
+
 rod_curvature_twist = Measure(
     "rod_curvature_twist",
     3,
@@ -205,4 +226,5 @@ rod_curvature_twist = Measure(
     frames=2,
     lag_size=13,
     advance=_advance,
+    stale=_stale,
 )

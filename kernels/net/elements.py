@@ -14,7 +14,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.element import CPU_OPTIONS, left_out_function, until_function
-from ddg_warp.kernels.islands import CLAMPED, ITERATION, SLOT, STATUS
+from ddg_warp.kernels.islands import CLAMPED, ITERATION, SLOT, STALE, STATUS
 from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.terms import Term
 
@@ -312,6 +312,8 @@ def evaluate_kernel(term: Term, real, linear, exact_from: int | None = None, loc
     its two-by-two stress, leaves out the negative part). Energies go to the half of `energy_out` that the line search does not
     hold. `stiffness_out` is the largest that a strain has against moving the element.
 
+    `stale` is raised in worlds where frames have to be renewed before the next step.
+
     Of terms whose measure has second derivatives `second_out` holds, from iteration `exact_from` on, what F and the geometric
     stiffness leave out of the exact Hessian, packed over the local dofs; before, and in `clamped` worlds, it is not written.
     """
@@ -327,6 +329,7 @@ def evaluate_kernel(term: Term, real, linear, exact_from: int | None = None, loc
     C = wp.types.vector(3, real)
     begin, packed = exact_from or 0, measure.packed if exact_from is not None else 0
     left_out = left_out_function(term, real) if packed else None
+    stale = measure.stale(real) if measure.stale else None
     options = CPU_OPTIONS | {"max_unroll": packed} if packed else CPU_OPTIONS
     Factor, Gradient = factor_type(linear, local), wp.array2d(dtype=real if local else V)
     size = measure.size
@@ -376,6 +379,9 @@ def evaluate_kernel(term: Term, real, linear, exact_from: int | None = None, loc
             if flags[STATUS, world] != 0:
                 continue
             x, s, w, p = gather(given, given.q, tid)
+            if wp.static(stale is not None):
+                if stale(x, s):
+                    flags[STALE, world] = 1
             e, jacobian = jacobian_of(x, s, w)
             slope = slope_of(e, p)
             energy_out[1 - flags[SLOT, world], tid] = w * energy_of(e, p)

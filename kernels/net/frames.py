@@ -1,6 +1,6 @@
 """Lagged data of a net: frames of rod edges, and what measures lag beside these.
 
-Worlds whose flag `moved` is zero take over what is `kept`, untouched.
+Worlds in which `moved` is not `wanted` take over what is `kept`, untouched.
 """
 
 from functools import cache
@@ -42,6 +42,7 @@ def edge_kernel(real):
         ends: wp.array2d(dtype=int),
         blocks: int,
         moved: wp.array(dtype=int),
+        wanted: int,
         kept: wp.array2d(dtype=real),
         frame: wp.array2d(dtype=real),
         frame_out: wp.array2d(dtype=real),
@@ -49,7 +50,7 @@ def edge_kernel(real):
         f = wp.tid()
         count = ends.shape[0]
         world = f / count
-        if moved[world] == 0:
+        if moved[world] != wanted:
             for c in range(6):
                 frame_out[c, f] = kept[c, f]
             return
@@ -64,22 +65,34 @@ def edge_kernel(real):
 
 @cache
 def lag_kernel(measure: Measure, real):
-    """Own lagged rows of elements of a measure, from frames that are up to date, as the dofs are, and the rows of before."""
+    """Own lagged rows of elements of a measure, from frames that are up to date, as the dofs are, and the rows of before.
+
+    Within a solve (`within`), whose joints go on from the rotations they have, ghosts stay as they are.
+    """
     Elements = elements_type(real)
     place, advance = place_function(measure, real), measure.advance(real)
     rows = measure.lag_size - FRAME * measure.frames
+    ghosts = 3 * len(measure.vectors) if measure.spins else 0
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def lag(given: Elements, moved: wp.array(dtype=int), kept: wp.array2d(dtype=real), lag_out: wp.array2d(dtype=real)):
+    def lag(
+        given: Elements,
+        moved: wp.array(dtype=int),
+        wanted: int,
+        within: int,
+        kept: wp.array2d(dtype=real),
+        lag_out: wp.array2d(dtype=real),
+    ):
         tid = wp.tid()
-        if moved[tid / given.elements] == 0:
+        if moved[tid / given.elements] != wanted:
             for c in range(wp.static(rows)):
                 lag_out[c, tid] = kept[c, tid]
             return
         q, s = place(given, given.q, tid)
         new = advance(q, s)
         for c in range(wp.static(rows)):
-            lag_out[c, tid] = new[c]
+            if within == 0 or c >= wp.static(ghosts):
+                lag_out[c, tid] = new[c]
 
     return lag
 

@@ -18,24 +18,32 @@ from ddg_warp.kernels.islands import (
     MOVED,
     PROGRESS,
     RATE,
+    RENEWING,
     STATUS,
     STEP_LENGTH,
     TODO,
+    TURNING,
     UNBALANCED,
     WANTED,
     attempt_functions,
 )
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
+from ddg_warp.kernels.search import PLACE, RELAG, STRAIGHT
+from ddg_warp.kernels.turns import TURNED
 
 POLISH = 1e-3  # reduction to which a direction must have been solved before rounding excuses what it leaves
 STALLED = 8  # iterations without progress, where energies drown in rounding, that a world is given
 
 
 @cache
-def search_kernels(real, linear, serial: bool):
-    """judge(...) of an iterate, measure(...) and take(...) of a direction, move(...) of the blocks."""
+def search_kernels(real, linear, serial: bool, turns: bool, renews: bool):
+    """judge(...) of an iterate, measure(...) and take(...) of a direction, move(...) of the blocks.
+
+    Args:
+        turns: whether there are rods, whose edges turn; renews: whether there are frames, which may have to be renewed.
+    """
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
-    balanced, decide = judge_functions(False, real)
+    balanced, decide = judge_functions(renews, real)
     until = until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -81,7 +89,8 @@ def search_kernels(real, linear, serial: bool):
             return
         before = scalars[MERIT, w]
         first = flags[ITERATION, w] == 0
-        drowns = not first and scalars[STEP_LENGTH, w] * scalars[DECREMENT, w] <= real(10.0) * noise[w] * floor
+        expected = scalars[STEP_LENGTH, w] * scalars[DECREMENT, w]  # none of the step that renews frames
+        drowns = not first and expected > real(0.0) and expected <= real(10.0) * noise[w] * floor
         what = decide(change[w], noise[w] * floor, square[w], worst[w], max_iterations, max_halvings, flags, scalars, w)
         if what == wp.static(STOP):
             return
@@ -105,8 +114,14 @@ def search_kernels(real, linear, serial: bool):
                 eta = wp.min(eta, real(wp.static(POLISH)))
             forcing[w] = linear(eta)
             flags[WANTED, w] = 1
-        else:
-            flags[TODO, w] = 1
+            return
+        flags[TODO, w] = what
+        if wp.static(renews):
+            if what == wp.static(RELAG):
+                flags[RENEWING, 0] = 1
+        if wp.static(turns):
+            if what == wp.static(PLACE):
+                flags[TURNING, 0] = 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def measure(
@@ -173,7 +188,11 @@ def search_kernels(real, linear, serial: bool):
             whole = rotation_cap / wp.sqrt(turn[w])
         scalars[STEP_LENGTH, w] = whole
         scalars[DECREMENT, w] = decrease[w]
-        flags[TODO, w] = 2
+        flags[TODO, w] = wp.static(STRAIGHT)
+        if wp.static(turns):
+            if turn[w] > real(wp.static(TURNED**2)):
+                flags[TODO, w] = wp.static(PLACE)
+                flags[TURNING, 0] = 1
         wp.atomic_add(work, 0, wp.int64(iterations[w]))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -181,23 +200,38 @@ def search_kernels(real, linear, serial: bool):
         direction: wp.array(dtype=H),
         step_length: wp.array(dtype=real),
         todo: wp.array(dtype=int),
+        halvings: wp.array(dtype=int),
         blocks: int,
         base: wp.array(dtype=V),
         q: wp.array(dtype=V),
     ):
-        """A first step (2) goes from the iterate, which becomes the base; a shortened one (1) from the base."""
+        """Straight along the direction: a first step from the iterate, which becomes the base, a shortened one from the base."""
         start = wp.tid()
         for i in range(start, until(start, q.shape[0])):
             w = i / blocks
-            what = todo[w]
-            if what == 0:
+            if todo[w] != wp.static(PLACE) and todo[w] != wp.static(STRAIGHT):
                 continue
-            if what == 2:
+            if halvings[w] == 0:
                 base[i] = q[i]
             d = direction[i]
             q[i] = base[i] + V(real(d[0]), real(d[1]), real(d[2])) * step_length[w]
 
     return judge, measure, rotate, take, move
+
+
+@cache
+def freeze_kernel():
+    """freeze(...): where a direction is wanted of a matrix that is `done`, flags say that none is; others are done now."""
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def freeze(flags: wp.array2d(dtype=int), done: wp.array(dtype=int)):
+        w = wp.tid()
+        if done[w] != 0:
+            flags[WANTED, w] = 0
+        elif flags[WANTED, w] != 0:
+            done[w] = 1
+
+    return freeze
 
 
 @cache

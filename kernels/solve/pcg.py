@@ -13,8 +13,9 @@ from ddg_warp.kernels import outcome
 from ddg_warp.kernels.element import ChainKind
 from ddg_warp.kernels.islands import CLAMPED, DECREMENT, ITERATION, LOST, SLOT, STATUS, STEP_LENGTH, WANTED
 from ddg_warp.kernels.matrix.block_band import block_functions, product_function, substitute_function
-from ddg_warp.kernels.search import TURNED, search_functions
+from ddg_warp.kernels.search import search_functions
 from ddg_warp.kernels.solve import pivot
+from ddg_warp.kernels.turns import TURNED
 
 PRECONDITIONERS = ("jacobi", "block_jacobi", "chain")
 

@@ -36,8 +36,9 @@ from ddg_warp.kernels.islands import (
 )
 from ddg_warp.kernels.judge import judge_functions
 from ddg_warp.kernels.matrix import geometric
-from ddg_warp.kernels.search import PLACE, RELAG, TURNED, search_functions
+from ddg_warp.kernels.search import PLACE, RELAG, search_functions
 from ddg_warp.kernels.solve import pivot
+from ddg_warp.kernels.turns import TURNED
 
 
 @cache

@@ -20,7 +20,8 @@ refuse("Integrator", {
     "multilevel rods": (lambda: ddg.Integrator(model(), linear="multilevel"), "'multilevel'", "nets", "auto"),
     "chain_multilevel rods": (lambda: ddg.Integrator(model(), linear="chain_multilevel"), "nets", "auto"),
     "sweep of a net": (lambda: ddg.Integrator(model("net"), linear="sweep"), "'sweep'", "with a net"),
-    "projective net": (lambda: ddg.Integrator(model("net"), solver="projective"), "'projective'", "with a net"),
+    "psd of a projective net": (lambda: ddg.Integrator(model("net"), psd="none", solver="projective"), "'none'", "projective"),
+    "psd none of a sheet": (lambda: ddg.Integrator(model("hinge"), psd="none"), "'none'", "left out", "progressive"),
     "psd none of PCG": (lambda: ddg.Integrator(model(), psd="none", linear="jacobi"), "psd", "jacobi", "chain"),
     "psd of projective": (lambda: ddg.Integrator(model(), psd="project", solver="projective"), "psd", "projective", "gauss_newton"),
 })

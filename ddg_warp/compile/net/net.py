@@ -13,6 +13,7 @@ from ddg_warp.compile import axisymmetric
 from ddg_warp.compile import shells as shell_terms
 from ddg_warp.compile.chains import STILL, Piece
 from ddg_warp.compile.net.loads import NetCouple, NetEdgeCouple, NetLoad, NetPressure
+from ddg_warp.compile.net.outwards import Outwards, outwards
 from ddg_warp.compile.precision import float32_error, float32_errors
 from ddg_warp.compile.tolerance import Bodies
 from ddg_warp.geometry import shell_forms
@@ -167,6 +168,14 @@ class Net:
                 angles = rod.all_edges if rod.all_edges.size else np.full(len(coefficients), -1)
                 found.append((ends, angles, coefficients.T))
         return tuple(np.concatenate(parts, -1) for parts in zip(*found, strict=True)) if found else None
+
+    @cached_property
+    def outwards(self) -> Outwards:
+        """The order in which steps that turn edges place its rods."""
+        held = self.fixed.all(1)
+        for shell in (*self.shells, *self.meridians):
+            held[shell.nodes] = True
+        return outwards([rod.all_nodes for rod in self.rods], held)
 
     @cached_property
     def bodies(self) -> Bodies:

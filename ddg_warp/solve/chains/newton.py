@@ -13,6 +13,8 @@ from ddg_warp.kernels.solve import sweep
 
 EARLY = 2  # iterations that "progressive" makes by Gauss-Newton: far from a solution the exact matrix is no better
 PSD_MODES = ("auto", "gauss_newton", "project", "progressive", "none")
+FROZEN = ("auto", "gauss_newton")  # modes of the matrix that serves a whole step
+FROZEN_ONLY = "psd {!r}: the solver 'projective' freezes the matrix of 'gauss_newton'"
 MANY = 50_000  # rods from which full blocks of the sweep pay on a GPU; below, small ones reach more multiprocessors
 
 
@@ -36,9 +38,10 @@ class NewtonOptions:
             element made positive semi-definite by its eigenvalues, at twenty times the cost of an iteration. "none": the
             exact one; where it is indefinite the solve ends with the outcome `indefinite`, and a time step is tried again
             with a shorter one. "auto": "progressive" for rods that are curved or twisted at rest, on their own or in nets, else
-            "gauss_newton". Nets take these two. Their exact Hessian is that of rods and rigid joints; second derivatives of shells'
-            bending, of glue and of magnets are left out. It is indefinite where conjugate gradients meet negative curvature; by
-            "gauss_newton" nets go on with the direction found so far, and leave compression out of the next matrix.
+            "gauss_newton". Nets take all but "project". Their exact Hessian is that of rods and rigid joints; second derivatives of
+            shells' bending, of glue and of magnets are left out, which "none" refuses. It is indefinite where a pivot is lost, or
+            conjugate gradients meet negative curvature; by "gauss_newton" nets go on with the direction found so far, and leave
+            compression out of the next matrix.
     """
 
     rtol: float = 1e-6

@@ -8,7 +8,7 @@ from ddg_warp.kernels import judge
 from ddg_warp.kernels.matrix import block_band
 from ddg_warp.kernels.solve import pcg
 from ddg_warp.solve.chains.assembled import AssembledNewton
-from ddg_warp.solve.chains.newton import NewtonOptions
+from ddg_warp.solve.chains.newton import FROZEN, FROZEN_ONLY, NewtonOptions
 
 
 class PcgNewton(AssembledNewton):
@@ -149,8 +149,8 @@ class ProjectiveNewton(PcgNewton):
     reuse = True
 
     def __init__(self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False):
-        if options.psd not in ("auto", "gauss_newton"):
-            raise SceneError(f"psd {options.psd!r}: the solver 'projective' freezes the matrix of 'gauss_newton'")
+        if options.psd not in FROZEN:
+            raise SceneError(FROZEN_ONLY.format(options.psd))
         super().__init__(model, group, options, "chain", linear, midpoint)
         self._direct = block_band.direct_kernel(group.kind, self.linear)
 

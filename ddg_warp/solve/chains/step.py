@@ -4,7 +4,6 @@ import numpy as np
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.geometry import polyline
 from ddg_warp.kernels import element, step
 from ddg_warp.solve import energy
 from ddg_warp.solve.chains.newton import ChainNewton
@@ -16,7 +15,6 @@ from ddg_warp.solve.step import PartStep
 
 DIRECT = {"sweep": ChainNewton, "partitioned": PartitionedNewton}  # solvers of open rods by their name
 NET_ONLY = ("multilevel", "chain_multilevel")  # preconditioners of nets
-FOLDED = 1e-5  # how close to opposite [rad] edges that meet are called folded, in messages
 
 
 class ChainStep(PartStep):
@@ -103,23 +101,9 @@ class ChainStep(PartStep):
 
     def _remedy(self, state, column: int) -> str:
         """What to do about a rod that was given up: edges of its last good state that no step can start from, or advice."""
-        host, closed, rod = self.group.host, self.group.kind.closed, column % self.group.rods
-        x = arrays.download(state.groups[self.index].x)[: host.count[rod], column][None]
-        edges, first = polyline.edge_vectors(x.astype(float), closed), int(host.first[rod])
-        lengths = np.linalg.norm(edges, axis=-1)
-        if not (lengths > 0.0).all():
-            k = int(np.argmin(lengths[0] > 0.0)) - first
-            return f"edge {k} has no length in the last good state; move a node of the state it starts from"
-        if self.group.kind.span == 2:
-            before, after = polyline.ahead(edges / lengths[..., None], closed)
-            k = int(np.argmin(np.sum(before * after, -1)[0]))
-            if np.linalg.norm(before[0, k] + after[0, k]) < FOLDED:
-                k, after = k - first, (k + 1) % lengths.shape[1] - first
-                return (
-                    f"edges {k} and {after} fold back by 180 degrees in the last good state, where curvature is infinite or has no "
-                    f"direction; move node {after} of the state it starts from, or take a smaller dt if it folded on the way"
-                )
-        return self.advice(state)
+        host, kind, rod = self.group.host, self.group.kind, column % self.group.rods
+        x = arrays.download(state.groups[self.index].x)[: host.count[rod], column]
+        return self.dead_end(x, int(host.first[rod]), kind) or self.advice(state)
 
 
 def _newton(model, group, integrator, precision) -> ChainNewton:

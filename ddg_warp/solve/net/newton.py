@@ -12,13 +12,15 @@ from ddg_warp.kernels.drag import block_inertia
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.net import elements, newton
 from ddg_warp.kernels.solve import krylov, pcg
-from ddg_warp.solve.chains.newton import EARLY, NewtonOptions
+from ddg_warp.solve.chains.newton import EARLY, FROZEN, FROZEN_ONLY, NewtonOptions
 from ddg_warp.solve.net.balance import Balance
 from ddg_warp.solve.net.chains import Chains
+from ddg_warp.solve.net.frozen import Frozen
 from ddg_warp.solve.net.multilevel import Multilevel
 from ddg_warp.solve.net.planes import DevicePlanes
 from ddg_warp.solve.net.system import Assembly, NetSystem, Sums
 from ddg_warp.solve.net.tolerance import Allowed
+from ddg_warp.solve.net.turns import Turns
 
 PRECONDITIONERS = ("block_jacobi", "chain", "multilevel", "chain_multilevel")
 SPARE = 0.5  # of the tolerance, what the last linear solve of a step may leave
@@ -34,13 +36,22 @@ class NetNewton:
             `kernels.solve.elimination`), "multilevel" (see `kernels.solve.levels`), or "chain_multilevel", both.
         linear: scalar type of the linear algebra; that of the model by default.
         drag: whether a block has more than a mass; see `kernels.drag`.
+        reuse: whether the matrix of a step's first iterate serves the whole step.
     """
 
     banded = True  # whether chains keep their part of H, which holds on free dofs alone
 
     def __init__(
-        self, model, options: NewtonOptions, preconditioner: str = "block_jacobi", linear=None, drag: bool = False
+        self,
+        model,
+        options: NewtonOptions,
+        preconditioner: str = "block_jacobi",
+        linear=None,
+        drag: bool = False,
+        reuse: bool = False,
     ):
+        if reuse and options.psd not in FROZEN:
+            raise SceneError(FROZEN_ONLY.format(options.psd))
         if preconditioner not in PRECONDITIONERS:
             raise SceneError(f"preconditioner {preconditioner!r}: of a net it is one of {', '.join(PRECONDITIONERS)}")
         net = model.net
@@ -94,9 +105,12 @@ class NetNewton:
         self.forcing, self.rho, self.rho_first, self.total, self.curvature = scalars(5, self.linear)
         self.busy = make(1, int)
         self.pcg_work = make(1, wp.int64)
+        self.frozen = Frozen(self.islands) if reuse else None
         self.psd = self.automatic_psd() if options.psd == "auto" else options.psd
-        exact = [self.psd == "progressive" and part.term.measure.packed > 0 for part in net.sets]
-        self.exact_from = tuple(EARLY if wanted else None for wanted in exact)
+        if self.psd == "none":
+            self._require_exact()
+        exact = [self.psd != "gauss_newton" and part.term.measure.packed > 0 for part in net.sets]
+        self.exact_from = tuple((0 if self.psd == "none" else EARLY) if wanted else None for wanted in exact)
         banded = self.chains is not None and self.chains.banded
         self.local = tuple(banded and part.host.along for part in net.sets)  # whether derivatives are of the local dofs
         self.parts = [self._part(*given, make, H) for given in zip(net.sets, exact, self.local, strict=True)]
@@ -108,7 +122,7 @@ class NetNewton:
         spins = spins[~np.isin(spins, capless)]
         self.spins = wp.array(spins.astype(np.int32), dtype=int, device=device)
         turning = len(ends) + len(spins)
-        self.turns = make((worlds, turning), self.real)
+        self.squares = make((worlds, turning), self.real)
         self._sum, self._sum_linear = (Sums(worlds, blocks, dtype, device) for dtype in (self.real, self.linear))
         self._sum_weights = Sums(3 * worlds, blocks, self.real, device)
         self._largest = Sums(worlds, turning, self.real, device, largest=True)
@@ -121,13 +135,16 @@ class NetNewton:
         if self.chains:
             self.chains.bind(self.system, self.parts, self.real, self.linear, self.exact_from, drag)
         self._direct = self.chains is not None and self.chains.exact
-        self._repeat = pcg.repeat_kernel(self.real, False) if any(exact) or self._direct else None
+        fails = self.psd == "none"
+        repeats = not reuse and (fails or any(exact) or self._direct)
+        self._repeat = pcg.repeat_kernel(self.real, fails) if repeats else None
         self.negative = make(worlds, int)
         self._assembly = Assembly(
             net, self.system, self.parts, self.real, self.linear, self.exact_from, self.local, drag
         )
+        self.turns = Turns(self) if host.rods else None
         self._judge, self._measure, self._rotate, self._take, self._move = newton.search_kernels(
-            self.real, self.linear, serial
+            self.real, self.linear, serial, bool(host.rods), bool(net.edges)
         )
         self._invert, self._start, self._begin, *self._cycle = krylov.solver_kernels(self.linear)
         self._compare, self._confirm = krylov.confirm_kernels(self.real, self.linear)
@@ -141,9 +158,18 @@ class NetNewton:
         self.levels = Multilevel(net, self.system, self.linear) if several else None
         self._limit = max(200, 100 * math.isqrt(blocks))
 
+    def _require_exact(self) -> None:
+        """Refuse the exact Hessian where it leaves out what a measure has no second derivatives for."""
+        for part in self.net.sets:
+            if not (part.term.measure.packed or part.term.measure.tensions):
+                raise SceneError(
+                    f"psd 'none': second derivatives of {part.term.name} are left out of the matrix of a net; "
+                    "use 'auto', 'gauss_newton' or 'progressive'"
+                )
+
     def automatic_psd(self) -> str:
         """The mode that suits the rods; see `ChainNewton.automatic_psd`. Curvature that is rounding counts as none."""
-        bending = [part for part in self.net.sets if part.term.measure.packed]
+        bending = [part for part in self.net.sets if part.term.measure.packed and not self.frozen]
         turns = (part.parameters[name] * part.parameters["measure"] for part in bending for name in part.term.rest)
         return "progressive" if any(np.abs(turn).max() > STRAIGHT for turn in turns) else "gauss_newton"
 
@@ -172,10 +198,12 @@ class NetNewton:
         own = [*self._balance.kernels, self._judge, self._measure, self._rotate, self._take]
         own += [*self.allowed.kernels, *([self._repeat] if self._repeat else [])]
         cycle = [self._move, self._invert, self._start, self._begin, *self._cycle, self._compare, self._confirm]
-        parts = [k for part in (self.chains, self.levels, self.planes) if part for k in part.kernels]
+        parts = [k for part in (self.chains, self.levels, self.planes, self.turns) if part for k in part.kernels]
+        parts += self.net.carries
         evaluate = [(kernel, 128) for kernel in self._evaluate]
         sums = (self._sum, self._sum_linear, self._sum_weights, self._largest, self._worst)
         sums = [(k, krylov.THREADS) for part in sums for k in part.kernels]
+        own += self.frozen.kernels if self.frozen else []
         return [*own, *cycle, *evaluate, *self._assembly.kernels, *parts, *sums]
 
     def pcg_iterations(self) -> int:
@@ -184,15 +212,18 @@ class NetNewton:
 
     def solve(self, state) -> None:
         """Iterate until no world is active, with the lagged data of `state`; can be captured."""
+        if self.frozen:
+            self.frozen.begin()
         wp.capture_while(self.islands.active, lambda: self.iterate(state))
 
     def iterate(self, state) -> None:
         """One iteration of every active world."""
-        self.islands.active.zero_()
+        self.islands.signals.zero_()
         self.evaluate(state)
         self.balance()
         self.judge()
-        self.move()  # where a step has been shortened
+        if self.net.edges:
+            wp.capture_if(self.islands.renewing, lambda: self.net.renew(state, self.q, self.islands.todo))
         self.assemble()
         self.direct()
         self.take()
@@ -233,11 +264,12 @@ class NetNewton:
 
     def assemble(self) -> None:
         """H of the worlds that want a direction."""
-        self._assembly(self.mass, self.islands, self.matrix)
+        anew = self.frozen.first() if self.frozen else self.islands
+        self._assembly(self.mass, anew, self.matrix)
         if self.planes:
-            self.planes.matrix(self.matrix, self.islands.wanted)
+            self.planes.matrix(self.matrix, anew.wanted)
         if self.chains:
-            self.chains.assemble(self.matrix, self.mass, self.islands)
+            self.chains.assemble(self.matrix, self.mass, anew)
 
     def direct(self) -> None:
         """Directions: by elimination where that is exact, else by conjugate gradients."""
@@ -245,19 +277,24 @@ class NetNewton:
         if self._direct:
             self.negative.zero_()
             self.forcing.zero_()  # what is left is rounding
-            self.chains.prepare(self.matrix, self.fixed, wanted, self.negative)
+            self.chains.prepare(self.matrix, self.fixed, self._anew, self.negative)
             self.chains.apply(self.matrix, self.right, wanted, self.direction, self.krylov_dots)
         else:
             self.iterate_pcg()
         if self._repeat:  # what was indefinite comes again, without second derivatives and compression
             wp.launch(self._repeat, self.worlds, [1, *self.islands.arrays, self.negative], device=self.device)
 
+    @property
+    def _anew(self) -> wp.array:
+        """Worlds whose matrix is new."""
+        return (self.frozen.islands if self.frozen else self.islands).wanted
+
     def iterate_pcg(self) -> None:
         """Directions by conjugate gradients."""
         table, blocks = self.system, self.net.blocks
         self._launch(
             self._invert,
-            [self.matrix, table.diagonal, self.fixed, self.islands.wanted, blocks, table.positions],
+            [self.matrix, table.diagonal, self.fixed, self._anew, blocks, table.positions],
             [self.inverse],
         )
         self._launch(
@@ -266,9 +303,9 @@ class NetNewton:
             [self.rest, self.direction, self.p, self.krylov_dots],
         )
         if self.chains:
-            self.chains.prepare(self.matrix, self.fixed, self.islands.wanted, self._unread[0])
+            self.chains.prepare(self.matrix, self.fixed, self._anew, self._unread[0])
         if self.levels:
-            self.levels.prepare(self.matrix, self.fixed, self.islands.wanted)
+            self.levels.prepare(self.matrix, self.fixed, self._anew)
         self.precondition(self.p)
         self._sum_linear(self.krylov_dots, self.total)
         self.busy.zero_()
@@ -384,22 +421,25 @@ class NetNewton:
             self.planes.back(self.direction, self.islands.wanted)
         arrays.sweep(
             self._rotate,
-            self.turns.size,
+            self.squares.size,
             [self.q, self.direction, self.ends, self.spins, self.islands.wanted, self.net.blocks],
-            [self.turns],
+            [self.squares],
             self.device,
         )
-        self._largest(self.turns, self.turn)
+        self._largest(self.squares, self.turn)
 
     def move(self) -> None:
-        """Take the step that is to be taken."""
+        """Take the step that is to be taken, or the part of it that the search has left."""
+        islands = self.islands
         arrays.sweep(
             self._move,
             self.all,
-            [self.direction, self.islands.step_length, self.islands.todo, self.net.blocks],
+            [self.direction, islands.step_length, islands.todo, islands.halvings, self.net.blocks],
             [self.base, self.q],
             self.device,
         )
+        if self.turns:
+            wp.capture_if(islands.turning, self.turns.place)
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
         """One thread for each block of every world."""

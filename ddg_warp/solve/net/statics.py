@@ -45,7 +45,7 @@ class StaticNewton(NetNewton):
 
     def begin(self, q: np.ndarray, dead: np.ndarray, at: float, scale: np.ndarray) -> None:
         """Set out from dofs `q` under dead loads (blocks, 3), those that follow at load parameter `at`; load scales of bodies."""
-        for name in ("status", "iteration", "halvings", "unbalanced", "drowned", "clamped"):
+        for name in ("status", "iteration", "halvings", "unbalanced", "drowned", "clamped", "stale"):
             getattr(self.islands, name).zero_()
         for array in (self.q, self.base):
             array.assign(q.reshape(-1, 3))
@@ -148,6 +148,8 @@ class NetEquilibrium:
             self._graphs.replay("solve", lambda: self.newton.solve(self._start))
             owner.iterations += int(self.newton.islands.iteration.numpy().sum())
             wp.copy(state.net.q, self.newton.q)
+            for name in ("frame", *(f"lag_{i}" for i in range(len(self.net.sets)))):
+                wp.copy(state.net.arrays()[name], self._start.arrays()[name])  # renewed on the way, perhaps
             self.model.carry_frames(state)
             status = int(self.newton.islands.status.numpy().max())
             q = self.tangent.dofs(state)

@@ -3,10 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.net import elements, frames, newton
+from ddg_warp.kernels.net import elements, newton
 from ddg_warp.model.net import NetState
 from ddg_warp.scene import drag
 from ddg_warp.solve.choice import net_preconditioner
@@ -25,9 +26,8 @@ class NetStep(PartStep):
         host, real = model.net.host, model.types.real
         options = integrator.options
         for name, value, only in (
-            ("solver", integrator.solver, ("newton",)),
             ("linear", integrator.linear, ("auto", *PRECONDITIONERS)),
-            ("psd", options.psd, ("auto", "gauss_newton", "progressive")),
+            ("psd", options.psd, ("auto", "gauss_newton", "progressive", "none")),
         ):
             if value not in only:
                 raise SceneError(f"{name} = {value!r} is of rods on their own; with a net it is {' or '.join(only)}")
@@ -42,12 +42,13 @@ class NetStep(PartStep):
                 "give the material a density, the section a mass_per_length, or the rod drag along and across"
             )
         preconditioner = net_preconditioner(model.net) if integrator.linear == "auto" else integrator.linear
-        solver = NetNewton(model, options, preconditioner, linear, host.drag is not None)
+        reuse = integrator.solver == "projective"
+        solver = NetNewton(model, options, preconditioner, linear, host.drag is not None, reuse)
         super().__init__(integrator, model, solver, counts_of)
         if counts_of is not None:
             self.newton.pcg_work = counts_of.newton.pcg_work
         self._begin, self._finish = newton.step_kernels(real, self.midpoint, arrays.serial(model.wp_device))
-        self.middle = model.net.empty() if self.midpoint and model.net.edges else None
+        self._lagged = model.net.lagged() if model.net.edges else None
         self.drag = NetDrag(model, self.midpoint) if host.drag else None
         self.energy = NetEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.motion = NetMotion(model, self.midpoint) if host.moves else None
@@ -65,6 +66,8 @@ class NetStep(PartStep):
             [solver.q, solver.base, solver.target],
             self.model.wp_device,
         )
+        if solver.turns:
+            solver.turns.predict()
         start = self._start_frames(before)
         if self.motion:
             self.motion.apply(islands, solver.q, start.frame)
@@ -85,27 +88,29 @@ class NetStep(PartStep):
         self.net.update_strains(after)
 
     def _start_frames(self, before):
-        """The state whose lagged data serve the solve: for the midpoint rule carried to the predicted midpoint.
+        """The state whose lagged data serve the solve, which may renew them: for the midpoint rule carried to the predicted midpoint.
 
         Frames lagged at the start of the step would spin about their edges by O(h) at the midpoint, unseen by the rotary
         inertia: the rule would be of first order. Rotations of joints have no inertia and are not predicted, so that those
         found are of the whole half step. Normals that supports turn, and the magnetic field, are those that the solve is about.
         """
-        if not (self.midpoint and self.net.edges):
+        if not self.net.edges:
             return replace(before, data=self._data)
-        middle = NetState(self.newton.q, before.v, self.middle.frame, self.middle.lag, before.last, self._data)
-        self.net.carry(before, middle, moved=self.islands.moved)
-        return middle
+        frame, lag = self._lagged
+        start = NetState(self.newton.q, before.v, frame, lag, before.last, self._data)
+        if self.midpoint:
+            self.net.carry(before, start, moved=self.islands.moved)
+            return start
+        for own, array in zip((frame, *lag), (before.frame, *before.lag), strict=True):
+            wp.copy(own, array)
+        return start
 
     @property
     def own_kernels(self) -> list:
         """Kernels of an attempt, without those of the solver."""
         real, net = self.model.types.real, self.net
         kernels = [self._begin, self._finish]
-        kernels += [frames.edge_kernel(real)] if net.edges else []
-        kernels += [frames.reset_kernel(real)] if net.host.spins else []
         for part in net.sets:
-            kernels += [frames.lag_kernel(part.term.measure, real)] if part.term.measure.advance else []
             kernels += [elements.term_kernels(part.term, real)[3]] if part.term.density.lagged else []
         return kernels
 
@@ -122,4 +127,10 @@ class NetStep(PartStep):
         sizes = np.abs(self.newton.right.numpy().reshape(self.model.worlds, -1))[world]
         worst = int(np.argmax(np.where(np.isfinite(sizes), sizes, np.inf)))
         place = Tangent(self.model).parts[-1].where(worst)
-        return f"largest residual {sizes[worst]:.3g} N at {place}; {self.advice(state)}"
+        return f"largest residual {sizes[worst]:.3g} N at {place}; {self._remedy(state, world)}"
+
+    def _remedy(self, state, world: int) -> str:
+        """What to do about a world that was given up: edges of its last good state that no step can start from, or advice."""
+        x = state.net.q.numpy().reshape(self.model.worlds, -1, 3)[world]
+        found = (self.dead_end(x[r.all_nodes], r.first, r.piece.kind, f" of rod {r.rod}") for r in self.net.host.rods)
+        return next(filter(None, found), "") or self.advice(state)

@@ -31,7 +31,7 @@ class NetTangent:
         self._anchored = host.fixed[: host.nodes].copy()
         for shell in host.shells:
             self._anchored[shell.nodes] = True
-        self._order = _outwards(host.rods, self._anchored.any(1))
+        self._order = [host.rods[i] for level in host.outwards.levels for i in level]
 
     @cached_property
     def _pattern(self) -> tuple[list, np.ndarray, np.ndarray]:
@@ -286,17 +286,6 @@ class NetTangent:
             [out],
             device=self.net.device,
         )
-
-
-def _outwards(rods, anchored: np.ndarray) -> list:
-    """Rods in an order in which each meets a held node, or one before it, if that is possible."""
-    reached, order, left = anchored.copy(), [], list(rods)
-    while left:
-        rod = next((rod for rod in left if reached[rod.all_nodes].any()), left[0])
-        left = [other for other in left if other is not rod]
-        order.append(rod)
-        reached[rod.all_nodes] = True
-    return order
 
 
 def _tiled(slots: np.ndarray, blocks: int, worlds: int) -> np.ndarray:

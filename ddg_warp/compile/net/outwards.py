@@ -1,0 +1,60 @@
+"""The order in which steps that turn edges place the rods of a net: from what is held outwards."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Outwards:
+    """Rods of a net with their nodes one after the other, ghosts included; R rods with P places.
+
+    Attributes:
+        nodes: block at each place (P,); start: first place of each rod, and the end (R + 1,).
+        anchored: places whose nodes are held, belong to a shell, or are placed with rods of an earlier level (P,) bool.
+        levels: rods that are placed at the same time; no two of them meet but at anchors.
+    """
+
+    nodes: np.ndarray
+    start: np.ndarray
+    anchored: np.ndarray
+    levels: list[np.ndarray]
+
+
+def outwards(rods: list[np.ndarray], held: np.ndarray) -> Outwards:
+    """The order for rods with these nodes (blocks), of which some are `held` (N,) bool.
+
+    Each rod meets an anchor, if one can be reached; of rods that nothing holds the first of all that are connected goes before.
+    """
+    count = np.array([len(rod) for rod in rods], int)
+    start = np.concatenate([[0], np.cumsum(count)])
+    nodes, rod = np.concatenate([np.zeros(0, int), *rods]), np.repeat(np.arange(len(rods)), count)
+    reached, anchored, levels = held.copy(), np.zeros(len(nodes), bool), []
+    place = np.arange(len(nodes))  # of rods that are left
+    while place.size:
+        at, own = nodes[place], rod[place]
+        ready = np.bincount(own[reached[at]], minlength=len(rods)) > 0
+        if not ready.any():
+            ready[_first_connected(at, own, len(held), len(rods))] = True
+        # rods that meet at a node that is not reached go one after the other, the first one first
+        free = ready[own] & ~reached[at]
+        taker = np.full(len(held), len(rods))
+        np.minimum.at(taker, at[free], own[free])
+        ready[own[free & (taker[at] != own)]] = False
+        chosen = ready[own]
+        anchored[place[chosen]] = reached[at[chosen]]
+        reached[at[chosen]] = True
+        levels.append(np.flatnonzero(ready))
+        place = place[~chosen]
+    return Outwards(nodes, start, anchored, levels)
+
+
+def _first_connected(nodes: np.ndarray, rod: np.ndarray, blocks: int, rods: int) -> np.ndarray:
+    """The first rod of each part of what is connected, from pairs of a node and a rod."""
+    from scipy import sparse
+    from scipy.sparse.csgraph import connected_components
+
+    graph = sparse.coo_matrix((np.ones(len(nodes)), (rod, rods + nodes)), shape=(rods + blocks, rods + blocks))
+    of_rods = connected_components(graph, directed=False)[1][:rods]
+    left = np.unique(rod)
+    return left[np.unique(of_rods[left], return_index=True)[1]]

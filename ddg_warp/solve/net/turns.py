@@ -1,0 +1,63 @@
+"""Steps of a net that turn the edges of its rods, on a device; see `kernels.turns`."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.kernels.net.turns import turn_kernels
+
+
+class Turns:
+    """What a `NetNewton` does where its steps turn edges far: from what holds them, rods are placed outwards, level by level."""
+
+    def __init__(self, newton):
+        self.newton, self.net = newton, newton.net
+        host, device = self.net.host, self.net.device
+        plan = host.outwards
+
+        def put(values):
+            return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
+
+        self._bend, self._aim, self._place = turn_kernels(newton.real, newton.linear)
+        self._levels = [put(level) for level in plan.levels]
+        self._rods = [
+            *map(put, (plan.start, plan.nodes)),
+            arrays.upload(plan.anchored.astype(np.uint8), wp.uint8, device),
+            put([rod.piece.kind.closed for rod in host.rods]),
+        ]
+        self._ends = put(np.concatenate([_ends(rod) for rod in host.rods]))
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [self._bend, self._aim, self._place]
+
+    def predict(self) -> None:
+        """Turn the edges of predictors that turn them far, instead of stretching them."""
+        newton, net = self.newton, self.net
+        islands = newton.islands
+        islands.turning.zero_()
+        inputs = [newton.q, newton.base, self._ends, net.blocks, *islands.arrays]
+        wp.launch(self._bend, (len(self._ends), net.worlds), inputs, [], device=net.device)
+        wp.capture_if(islands.turning, self._redo)
+
+    def _redo(self) -> None:
+        newton, net = self.newton, self.net
+        inputs = [newton.q, newton.base, newton.islands.todo, net.blocks]
+        wp.launch(self._aim, newton.all, inputs, [newton.direction], device=net.device)
+        self.place()
+
+    def place(self) -> None:
+        """Nodes of rods, once the straight step has moved everything."""
+        newton, net = self.newton, self.net
+        islands = newton.islands
+        for level in self._levels:
+            inputs = [level, *self._rods, newton.base, newton.direction, newton.held]
+            inputs += [islands.step_length, islands.todo, net.blocks]
+            wp.launch(self._place, (len(level), net.worlds), inputs, [newton.q], device=net.device)
+
+
+def _ends(rod) -> np.ndarray:
+    """Nodes of the edges of a rod (E, 2)."""
+    pairs = np.column_stack([rod.all_nodes, np.roll(rod.all_nodes, -1)])
+    return pairs if rod.piece.kind.closed else pairs[:-1]

@@ -1,0 +1,238 @@
+"""Steps of nets do what those of lone rods do: they turn edges, renew frames, and can keep the matrix of the first iterate."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import ddg_warp as ddg
+from ddg_warp.compile.net.outwards import outwards
+from ddg_warp.geometry import meshes
+from ddg_warp.kernels.search import RELAG
+from ddg_warp.solve.net.newton import NetNewton, NewtonOptions
+
+RUBBER = ddg.Material(young=1e7, poisson=0.5, density=1000.0)
+WIRE = ddg.Material(young=1e9, poisson=0.5, density=1000.0)
+
+
+def line(start, end, nodes: int) -> np.ndarray:
+    return np.linspace(start, end, nodes)
+
+
+def cantilever(joined: bool, radius: float, material, natural="straight", points=None) -> ddg.Scene:
+    """A rod held at its first edge; part of a net where a held stub is joined to its first node."""
+    scene = ddg.Scene(gravity=(0.0, -2.9, -9.81))
+    points = line((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 32) if points is None else points
+    options = {"section": ddg.Circle(radius), "material": material}
+    rod = scene.add_rod(points, natural=natural, **options)
+    scene.clamp(rod, edges=[0])
+    if joined:
+        back = points[0] - points[1]
+        stub = scene.add_rod(points[0] + back * np.arange(3)[::-1, None], **options)
+        scene.clamp(stub, edges=[0, 1])
+        scene.join([(rod, 0), (stub, -1)], rigid=False)
+    return scene
+
+
+def curl() -> np.ndarray:
+    t = np.linspace(0.0, 1.0, 32)
+    return np.stack([0.1 * np.cos(6.0 * t) - 0.1, 0.1 * np.sin(6.0 * t), 0.1 * t], -1)
+
+
+def advance(scene, device, dt, count, velocities=None, **options):
+    """Points after so many steps, and the integrator's statistics."""
+    model = scene.build(device, "float64")
+    integrator, state = ddg.Integrator(model, **options), model.state(velocities=velocities)
+    for _ in range(count):
+        state = integrator.step(state, dt)
+    return state.points(), integrator.statistics()
+
+
+@pytest.mark.parametrize(
+    ("radius", "material", "points", "dt", "count"),
+    [
+        (2e-3, RUBBER, None, 0.3, 6),  # straight steps take 15.8 iterations for 7.7
+        (5e-4, WIRE, None, 0.1, 10),  # 27 for 11
+        (1e-4, WIRE, curl(), 1.0 / 60.0, 20),
+    ],
+    ids=["rubber", "wire", "curl"],
+)
+def test_joined_rods_turn_their_edges_as_alone(device, radius, material, points, dt, count):
+    """Long steps of stiff, thin rods: the same motion in about as many iterations, without retries."""
+    natural = "straight" if points is None else "shape"
+    (alone, one), (joined, other) = (
+        advance(cantilever(own, radius, material, natural, points), device, dt, count) for own in (False, True)
+    )
+    np.testing.assert_allclose(joined[:32], alone, atol=1e-7)
+    assert np.abs(alone - cantilever(False, radius, material, natural, points).batches[0].points[0]).max() > 0.1
+    assert one["retries"] == other["retries"] == 0
+    assert other["newton_iterations"]["mean"] < 1.25 * one["newton_iterations"]["mean"]
+
+
+def whip(joined: bool) -> ddg.Scene:
+    return cantilever(joined, 2e-3, RUBBER)
+
+
+def test_predictors_turn_edges(device):
+    """A rod that swings by 0.4 rad a step is predicted unstretched: first iterates cost little more than when it rests."""
+    rates = np.zeros((35, 3))
+    rates[:32, 2] = 40.0 * np.linspace(0.0, 1.0, 32)
+    (alone, one), (joined, other) = (
+        advance(whip(own), device, 0.01, 3, rates[: 35 if own else 32]) for own in (False, True)
+    )
+    np.testing.assert_allclose(joined[:32], alone, atol=1e-6)
+    assert other["newton_iterations"]["mean"] <= 1.25 * one["newton_iterations"]["mean"]
+
+
+def tree() -> ddg.Scene:
+    """Rods of both ways joined rigidly and by hinges at angles, twisted and curved at rest."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
+    options = {"section": ddg.Rectangle(6e-3, 4e-3), "material": RUBBER, "natural": (1.0, 0.5, 2.0)}
+    trunk = scene.add_rod(line((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), 7), **options)
+    one = scene.add_rod(line((0.5, 0.0, 0.0), (0.8, 0.3, 0.1), 5), **options)
+    two = scene.add_rod(line((0.8, -0.2, 0.2), (0.5, 0.0, 0.0), 6), **options)
+    three = scene.add_rod(line((0.8, 0.3, 0.1), (1.0, 0.3, 0.4), 4), **options)
+    scene.join([(trunk, -1), (one, 0), (two, -1)], rigid=True)
+    scene.join([(one, -1), (three, 0)], rigid=False)
+    scene.clamp_end(trunk)
+    return scene
+
+
+@pytest.mark.parametrize("turn", [0.3, 2.0])
+def test_renewed_frames_change_no_energy(device, turn):
+    """In the middle of a solve, edges and joints turned far: strains stay what they are; other worlds keep their frames.
+
+    The lagged tangents are those of the iterate then, up to rounding.
+    """
+    model = tree().build(device, "float64", worlds=2)
+    net, state = model.net, model.net.rest()
+    newton = NetNewton(model, NewtonOptions())
+    random = np.random.default_rng(3)
+    q = np.array(state.q.numpy().reshape(2, -1, 3), float)
+    nodes, spins = net.host.nodes, net.host.spins
+    # turned about an axis by an angle that grows along x, with angles and rotations of joints at random
+    angle = turn * q[:, :nodes, :1]
+    y, z = q[:, :nodes, 1:2] + 0.2, q[:, :nodes, 2:3]
+    q[:, :nodes, 1:] = np.concatenate(
+        [np.cos(angle) * y - np.sin(angle) * z, np.sin(angle) * y + np.cos(angle) * z], -1
+    )
+    q[:, nodes : -spins or None, 0] += random.normal(size=q[:, nodes : -spins or None, 0].shape)
+    q[:, -spins:] = 0.3 * turn * random.normal(size=(2, spins, 3))
+    newton.q.assign(q.reshape(-1, 3))
+
+    def energies():
+        found = []
+        for i, part in enumerate(net.sets):
+            strain = wp.zeros((len(part.term.measure.strains), 2 * part.elements), dtype=net.real, device=net.device)
+            state.q.assign(newton.q)
+            net.strains(state, i, strain)
+            found.append(strain.numpy())
+        return np.concatenate([values.ravel() for values in found])
+
+    before, frames = energies(), state.frame.numpy().copy()
+    todo = wp.array([RELAG, 0], dtype=int, device=net.device)
+    net.renew(state, newton.q, todo)
+    after = energies()
+    assert np.abs(before).max() > 1.0
+    np.testing.assert_allclose(after, before, atol=1e-10 * np.abs(before).max())
+    edges = net.edges
+    np.testing.assert_array_equal(state.frame.numpy()[:, edges:], frames[:, edges:])
+    first, second = net.host.ends.T
+    tangent = q[0, second] - q[0, first]
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    np.testing.assert_allclose(state.frame.numpy()[3:, :edges].T, tangent, atol=1e-12)
+    assert np.abs(frames[3:, :edges].T - tangent).max() > 0.1
+
+
+def spun(joined: bool, turns: float) -> ddg.Scene:
+    """A rod in the shape of an L whose root is turned about by so many turns a second."""
+    corner = np.array(
+        [[0.0, 0.0, 0.0], [0.0, 0.0, 0.1], [0.0, 0.0, 0.2], [0.1, 0.0, 0.25], [0.2, 0.0, 0.25], [0.3, 0.0, 0.25]]
+    )
+    scene = cantilever(joined, 2e-2, RUBBER, "shape", corner)
+    scene.supports.clear()
+    motion = ddg.Motion(angle=lambda t: 2.0 * np.pi * turns * t, axis=(0.6, 0.0, 0.8))
+    scene.clamp(0, edges=[0], motion=motion)
+    if joined:
+        scene.clamp(1, edges=[0, 1], motion=motion)
+    return scene
+
+
+def test_whipped_rods_move_as_alone(device):
+    """Thrown about so that edges turn over within steps, which are halved; without new frames the joined rod is off by 0.09 m."""
+    s = np.linspace(0.0, 1.0, 32)
+    rates = np.zeros((35, 3))
+    rates[:32, 1:] = np.stack([50.0 * s, 60.0 * s**3 * np.sin(20.0 * s)], -1)
+    (alone, one), (joined, other) = (
+        advance(whip(own), device, 0.02, 5, rates[: 35 if own else 32]) for own in (False, True)
+    )
+    np.testing.assert_allclose(joined[:32], alone, atol=1e-6)
+    assert other["retries"] <= one["retries"]
+
+
+def test_joined_rods_turn_by_more_than_a_right_angle_in_a_step(device):
+    """120 degrees a step, from which frames are renewed within the solve: edges follow as alone, and twist is not lost."""
+    (alone, one), (joined, other) = (advance(spun(own, 1.0 / 3.0), device, 1.0, 3) for own in (False, True))
+    np.testing.assert_allclose(joined[:6], alone, atol=1e-6)
+    assert one["retries"] == other["retries"]
+
+
+def frame() -> ddg.Scene:
+    """A portal frame of rigid joints that is pushed sideways."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
+    options = {"section": ddg.Circle(5e-3), "material": RUBBER}
+    left = scene.add_rod(line((0.0, 0.0, 0.0), (0.0, 0.0, 0.3), 8), **options)
+    top = scene.add_rod(line((0.0, 0.0, 0.3), (0.3, 0.0, 0.3), 8), **options)
+    right = scene.add_rod(line((0.3, 0.0, 0.0), (0.3, 0.0, 0.3), 8), **options)
+    scene.join([(left, -1), (top, 0)], rigid=True)
+    scene.join([(right, -1), (top, -1)], rigid=True)
+    scene.clamp_end([left, right])
+    scene.add_force(top, 4, (0.05, 0.02, 0.0))
+    return scene
+
+
+def sheet() -> ddg.Scene:
+    points, triangles = meshes.rectangle(5, 5, (1.0, 1.0), "alternating")
+    scene = ddg.Scene()
+    scene.add_shell(points, triangles, thickness=1e-2, material=ddg.Material(1e6, 0.3, 1000.0))
+    scene.hold(0, [0, 5])
+    return scene
+
+
+@pytest.mark.parametrize("linear", ["auto", "block_jacobi"])
+@pytest.mark.parametrize("scene", [whip, frame, tree, sheet], ids=["stub", "frame", "tree", "sheet"])
+def test_projective_finds_what_newton_does(device, scene, linear):
+    """By one matrix a step: the same states, in more iterations, since it converges linearly."""
+    made = scene(True) if scene is whip else scene()
+    options = {"rtol": 1e-9, "linear": linear}
+    expected, newton = advance(made, device, 1.0 / 120.0, 10, **options)
+    found, projective = advance(made, device, 1.0 / 120.0, 10, solver="projective", **options)
+    np.testing.assert_allclose(found, expected, atol=1e-8)
+    assert projective["retries"] == 0
+    assert projective["newton_iterations"]["mean"] > newton["newton_iterations"]["mean"]
+
+
+@pytest.mark.parametrize("scene", [frame, tree])
+def test_exact_hessian_of_nets(device, scene):
+    """psd 'none': the same states; where nothing buckles it converges as fast as 'progressive', at least."""
+    expected, progressive = advance(scene(), device, 1.0 / 120.0, 10, rtol=1e-9, psd="progressive")
+    found, exact = advance(scene(), device, 1.0 / 120.0, 10, rtol=1e-9, psd="none")
+    np.testing.assert_allclose(found, expected, atol=1e-8)
+    assert exact["newton_iterations"]["mean"] <= progressive["newton_iterations"]["mean"]
+
+
+def test_outwards_meets_every_rod_once_from_what_is_held():
+    """A held grid, a chain that hangs from it, and two loose rods: who is placed when, and where it is anchored."""
+    grid = [np.array([0, 1, 2, 3]), np.array([4, 5, 6, 7]), np.array([8, 1, 5, 9]), np.array([10, 2, 6, 11])]
+    chain = [np.array([3, 12, 13]), np.array([14, 13])]
+    loose = [np.array([20, 21]), np.array([21, 22])]
+    held = np.zeros(23, bool)
+    held[[0, 4, 7, 8]] = True
+    plan = outwards([*grid, *chain, *loose], held)
+    assert sorted(np.concatenate(plan.levels)) == list(range(8))
+    level = {rod: i for i, rods in enumerate(plan.levels) for rod in rods}
+    assert level[0] == level[1] == 0
+    assert level[2] == level[3] == level[4] == 1
+    assert level[5] == 2
+    assert level[7] == level[6] + 1
+    anchored = [set(plan.nodes[a:b][plan.anchored[a:b]]) for a, b in zip(plan.start, plan.start[1:], strict=False)]
+    assert anchored == [{0}, {4, 7}, {8, 1, 5}, {2, 6}, {3}, {13}, set(), {21}]
