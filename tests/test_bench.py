@@ -110,6 +110,30 @@ def test_many_rods(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("tool", "options", "rows"), [("nets", ["--edges", "4"], 10), ("sheets", ["--quick", "--bending", "hinge"], 1)]
+)
+def test_nets_and_sheets_are_timed(tmp_path, tool, options, rows):
+    command = [
+        sys.executable,
+        str(ROOT / f"tools/bench_{tool}.py"),
+        "--device",
+        "cpu",
+        *options,
+        "--out",
+        str(tmp_path),
+    ]
+    subprocess.run(command, capture_output=True, text=True, check=True)
+    with open(tmp_path / f"{tool}_cpu.csv", newline="") as file:
+        found = list(csv.DictReader(file))
+    assert len(found) == rows
+    for row in found:
+        assert float(row["ms_per_step"]) > 0.0
+        assert row["outcomes"].endswith("converged")
+        assert tool == "sheets" or 0.0 < float(row["error"]) < 1e-6
+
+
+@pytest.mark.slow
 def test_builds_are_timed(tmp_path):
     command = [sys.executable, str(ROOT / "tools/bench_rods.py"), "--build", "--quick", "--out", str(tmp_path)]
     subprocess.run(command, capture_output=True, text=True, check=True)

@@ -236,3 +236,15 @@ def test_outwards_meets_every_rod_once_from_what_is_held():
     assert level[7] == level[6] + 1
     anchored = [set(plan.nodes[a:b][plan.anchored[a:b]]) for a, b in zip(plan.start, plan.start[1:], strict=False)]
     assert anchored == [{0}, {4, 7}, {8, 1, 5}, {2, 6}, {3}, {13}, set(), {21}]
+
+
+@pytest.mark.parametrize("scene", [whip, frame, sheet], ids=["stub", "frame", "sheet"])
+def test_report_says_how_a_net_is_solved(device, scene):
+    """By elimination alone where it is exact; the memory of H is that of what lies in bands and of what does not."""
+    model = (scene(True) if scene is whip else scene()).build(device, "float64")
+    newton = ddg.Integrator(model)._net.newton
+    lines = model.report()
+    assert ("exact" in lines) == newton._direct
+    bands = 3 * 16 * newton.chains.longest * newton.chains.columns if newton.chains else 0
+    assert f"{8 * (newton.matrix.size + bands) / 1e6:.3g} MB" in lines
+    assert f"H: {newton.system.entries} blocks" in lines

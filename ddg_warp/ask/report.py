@@ -3,6 +3,7 @@
 from ddg_warp.kernels.solve import cyclic_reduction
 from ddg_warp.kernels.terms import ALL
 from ddg_warp.solve.choice import automatic, net_preconditioner
+from ddg_warp.solve.net.chains import Chains
 from ddg_warp.solve.net.system import NetSystem
 
 SOLVERS = {
@@ -45,8 +46,9 @@ def report(model) -> str:
 def net_lines(model) -> list[str]:
     """What the net holds: dofs, terms, the matrix."""
     host, net = model.net.host, model.net
-    table = NetSystem(net)
-    linear = model.types.linear
+    name, linear = net_preconditioner(net), model.types.linear
+    chains = Chains(net, name == "chain" and not host.frames) if name.startswith("chain") else None
+    table = NetSystem(net, chains and chains.kept)
     lines = [
         f"net: {len(host.shells)} shells of {sum(len(s.surface.triangles) for s in host.shells)} triangles, "
         f"{len(host.rods)} rods; {host.nodes} nodes, {host.angles} angles, {host.spins} rigid joints, "
@@ -57,10 +59,19 @@ def net_lines(model) -> list[str]:
         lines.append(f"  {part.term.name}: {part.elements * model.worlds} elements, {measure} x {density}")
     if host.drag:
         lines.append(f"  drag on {host.drag[0].shape[1]} edges of rods, implicit")
-    size = 9 * table.positions * model.worlds * (4 if linear.__name__ == "float32" else 8)
+    reals, solver, bands = 9 * table.positions, f"PCG ({name})", ""
+    if chains and chains.banded:
+        chains.plan.bind(host, table.rows.numpy(), table.columns.numpy(), chains.kept)
+        solver = "elimination along rods, exact" if chains.plan.complete else solver
+        places, block = chains.plan.chain.size, 4 if chains.plan.twist else 3
+        reals, bands = (
+            reals + 3 * block**2 * places,
+            f" and {int(chains.plan.count.sum())} places of rods in bands of {block} x {block}",
+        )
+    size = reals * model.worlds * (4 if linear.__name__ == "float32" else 8)
     lines.append(
-        f"  solver: PCG ({net_preconditioner(model.net)}), one Newton loop a world, linear algebra in {linear.__name__}; "
-        f"H: {table.entries} blocks of 3 x 3, {size / 1e6:.3g} MB"
+        f"  solver: {solver}, one Newton loop a world, linear algebra in {linear.__name__}; "
+        f"H: {table.entries} blocks of 3 x 3{bands}, {size / 1e6:.3g} MB"
     )
     return lines
 
