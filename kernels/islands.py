@@ -32,10 +32,9 @@ FLAGS = (
     "reason",  # outcome of the solve that made it be given up
     "bent",  # whether the predictor has to turn edges
     "moved",  # whether this part of it succeeded
-    # in the first column, whether any island is still active, turns the edges of a step, or renews its frames
+    # in the first column, whether any island is still active, and whether one turns the edges of a step or renews its frames
     "active",
     "turning",
-    "renewing",
 )
 SCALARS = (
     # the quadratic of inertia, coefficient * m |x - target|^2 / 2, and the reciprocal of the step that the solve is about
@@ -53,7 +52,7 @@ SCALARS = (
 )
 (STATUS, ITERATION, UNBALANCED, DROWNED, SLOT, HALVINGS, WANTED, TODO, PLACED, STALE) = range(10)
 (CLAMPED, LOST, BAD, CAUTIOUS, RETRIES, REASON, BENT, MOVED) = range(10, 18)
-ACTIVE, TURNING, RENEWING = range(18, len(FLAGS))
+ACTIVE, TURNING = range(18, len(FLAGS))
 (COEFFICIENT, RATE, LOAD_SCALE, RESIDUAL, STEP_LENGTH, DECREMENT, MERIT, ANGLE_CHANGE, PROGRESS, PORTION) = range(10)
 
 
@@ -74,7 +73,7 @@ class Islands:
             for row, name in enumerate(names):
                 setattr(self, name, array[row])
         self.signals = self.arrays[0][ACTIVE:]
-        self.active, self.turning, self.renewing = (self.signals[row, :1] for row in range(3))
+        self.active, self.turning = (self.signals[row, :1] for row in range(2))
 
     def __len__(self) -> int:
         return self.arrays[0].shape[1]

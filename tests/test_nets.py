@@ -511,6 +511,7 @@ def test_the_numbering_of_rods_means_nothing(device, monkeypatch):
         scene.clamp_end(int(spokes[0]), "last")
         scene.join([(ring, 0), *((int(spoke), 0) for spoke in spokes)])
         scene.add_couple(ring, 3, (0.0, 0.2, 0.1))
+        scene.add_couple(0, 2, (0.02, 0.01, 0.0))  # the stiffener, against its glue
         model = scene.build(device, "float64", worlds=2)
         model.set_parameter("rod_bend_twist", "stiffness_1", np.array([0.02, 0.03]))
         state, _ = steps(model, 5, 0.01, rtol=1e-12)

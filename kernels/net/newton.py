@@ -18,7 +18,6 @@ from ddg_warp.kernels.islands import (
     MOVED,
     PROGRESS,
     RATE,
-    RENEWING,
     STATUS,
     STEP_LENGTH,
     TODO,
@@ -28,7 +27,7 @@ from ddg_warp.kernels.islands import (
     attempt_functions,
 )
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
-from ddg_warp.kernels.search import PLACE, RELAG, STRAIGHT
+from ddg_warp.kernels.search import PLACE, STRAIGHT
 from ddg_warp.kernels.turns import TURNED
 
 POLISH = 1e-3  # reduction to which a direction must have been solved before rounding excuses what it leaves
@@ -116,12 +115,8 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool):
             flags[WANTED, w] = 1
             return
         flags[TODO, w] = what
-        if wp.static(renews):
-            if what == wp.static(RELAG):
-                flags[RENEWING, 0] = 1
         if wp.static(turns):
-            if what == wp.static(PLACE):
-                flags[TURNING, 0] = 1
+            flags[TURNING, 0] = 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def measure(

@@ -222,12 +222,12 @@ class NetNewton:
         self.evaluate(state)
         self.balance()
         self.judge()
-        if self.net.edges:
-            wp.capture_if(self.islands.renewing, lambda: self.net.renew(state, self.q, self.islands.todo))
         self.assemble()
         self.direct()
         self.take()
         self.move()
+        if self.turns:
+            wp.capture_if(self.islands.turning, lambda: self.turns.turn(state))
 
     def evaluate(self, state) -> None:
         """Energies, gradients and factors of all elements at the iterate."""
@@ -438,8 +438,6 @@ class NetNewton:
             [self.base, self.q],
             self.device,
         )
-        if self.turns:
-            wp.capture_if(islands.turning, self.turns.place)
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
         """One thread for each block of every world."""

@@ -101,8 +101,10 @@ class NetStep(PartStep):
         if self.midpoint:
             self.net.carry(before, start, moved=self.islands.moved)
             return start
-        for own, array in zip((frame, *lag), (before.frame, *before.lag), strict=True):
-            wp.copy(own, array)
+        wp.copy(frame, before.frame)
+        for part, own, given in zip(self.net.sets, lag, before.lag, strict=True):
+            if part.term.measure.advance:
+                wp.copy(own, given)
         return start
 
     @property

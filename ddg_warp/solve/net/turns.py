@@ -1,4 +1,4 @@
-"""Steps of a net that turn the edges of its rods, on a device; see `kernels.turns`."""
+"""What the rods of a net need where their edges turn far: steps that turn them, and newer frames; see `kernels.turns`."""
 
 import numpy as np
 import warp as wp
@@ -8,7 +8,7 @@ from ddg_warp.kernels.net.turns import turn_kernels
 
 
 class Turns:
-    """What a `NetNewton` does where its steps turn edges far: from what holds them, rods are placed outwards, level by level."""
+    """Turned edges of a `NetNewton`: from what holds them, rods are placed outwards, level by level."""
 
     def __init__(self, newton):
         self.newton, self.net = newton, newton.net
@@ -46,6 +46,12 @@ class Turns:
         inputs = [newton.q, newton.base, newton.islands.todo, net.blocks]
         wp.launch(self._aim, newton.all, inputs, [newton.direction], device=net.device)
         self.place()
+
+    def turn(self, state) -> None:
+        """Place the nodes of rods whose edges turn, and renew the frames that `state` lags where that is to be done."""
+        self.place()
+        if self.net.edges:
+            self.net.renew(state, self.newton.q, self.newton.islands.todo)
 
     def place(self) -> None:
         """Nodes of rods, once the straight step has moved everything."""
