@@ -99,7 +99,7 @@ def _elements(model, state) -> Iterator[tuple]:
     for group, data in zip(model.groups, state.groups, strict=True):
         strains, stresses = (np.moveaxis(v, 0, -1) for v in group_strains(model, group, data))
         row = np.full((group.nodes + 2, group.rods), -1)
-        k, column, index = model.places(group)
+        k, column, index = model.order.places(group)
         row[k, column] = index
         for term, place in zip(group.kind.terms, group.kind.places(), strict=True):
             n, span = len(term.measure.strains), term.measure.span

@@ -139,10 +139,10 @@ def drag(model, state) -> Drag:
             inertia, u = NetDrag(model).at(state.net, state.time)
             force = np.einsum("wkij,wkj->wki", inertia["resistance"], u - v)
         power += (force * v).sum((1, 2))
-        _, places = model.net_rows
+        _, places = model.order.net_rows
         turns = force[:, model.net.angle_start :, 0]
         blocks = force / np.maximum(1, np.bincount(places, minlength=force.shape[1]))[:, None]
-    force, moment = model.gather_nodes(forces, blocks), model.gather_edges(moments, turns)
+    force, moment = model.order.nodes(forces, blocks), model.order.edges(moments, turns)
     return Drag(force, moment, power if model.worlds > 1 else float(power[0]))
 
 

@@ -1,20 +1,17 @@
 """Model: a scene frozen for a device. Constant arrays, terms, dof map, and what can be asked of a state."""
 
-from functools import cached_property
-
 import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.compile import axisymmetric
 from ddg_warp.compile.chains import compile_chains, scene_motions
 from ddg_warp.compile.precision import choose, warn_of_rounding
 from ddg_warp.errors import SceneError
-from ddg_warp.geometry import polyline
 from ddg_warp.io import Curves, Surfaces
 from ddg_warp.kernels import element, step
 from ddg_warp.model import glue, validate
 from ddg_warp.model.group import Group
+from ddg_warp.model.order import Order
 from ddg_warp.model.state import GroupState, State
 from ddg_warp.threads import launches
 
@@ -32,6 +29,7 @@ class Model:
         precision: scalar types.
         worlds: number of independent copies.
         allow_rounding: whether what float32 loses in rounding is stepped and solved nevertheless.
+        order: of its points and edges, as the user counts them.
     """
 
     def __init__(
@@ -47,6 +45,7 @@ class Model:
         self.groups = [Group(chain, scene, worlds, self.wp_device, self.types.real) for chain in self.chains]
         self.net = self._build_net() if needs_net(scene) else None
         self.allow_rounding = allow_rounding
+        self.order = Order(self)
         warn_of_rounding(self, scene.analysis)
 
     def _build_net(self):
@@ -82,64 +81,20 @@ class Model:
         """Name of the precision."""
         return self.types.name
 
-    @cached_property
+    @property
     def curves(self) -> Curves:
         """Rods, then meridians of axisymmetric shells, as thick as these."""
-        batches, shells = self.scene.batches, self.scene.axisymmetric_shells
-        if not batches and not shells:
-            none = np.zeros(0, int)
-            return Curves(none, none.astype(bool), np.zeros(0), np.zeros(0, object), none)
-        counts = np.concatenate([*(np.full(b.rods, b.nodes) for b in batches), *([len(s.points)] for s in shells)])
-        radius = [np.broadcast_to(_node_radius(b), (b.rods, b.nodes)).ravel() for b in batches]
-        radius += [0.5 * axisymmetric.at_nodes(shell.thickness, len(shell.points)) for shell in shells]
-        single = np.ones(len(shells), int)
-        return Curves(
-            counts=counts,
-            closed=np.concatenate([*(np.full(b.rods, b.closed) for b in batches), single == 0]),
-            radius=np.concatenate(radius),
-            names=np.array([*(b.name for b in batches for _ in range(b.rods)), *(s.name for s in shells)], object),
-            batch=np.repeat(_alike([*batches, *shells]), [*(b.rods for b in batches), *single]),
-        )
+        return self.order.curves
 
-    @cached_property
+    @property
     def surfaces(self) -> Surfaces | None:
         """Shells as triangles among the rows of `State.points`; None without."""
-        if not self.scene.shells:
-            return None
-        shells, rods = self.net.host.shells, int(self.curves.counts.sum())
-        points = np.cumsum([0] + [len(shell.nodes) for shell in shells])
-        triangles = np.cumsum([0] + [len(shell.surface.triangles) for shell in shells])
-        return Surfaces(
-            triangles=np.concatenate([s.surface.triangles + rods + at for s, at in zip(shells, points, strict=False)]),
-            first=triangles[:-1],
-            names=np.array([shell.name for shell in self.scene.shells], dtype=object),
-            thickness=np.concatenate([shell.plate.thickness for shell in shells]),
-        )
-
-    @cached_property
-    def net_rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of `State.points` that the net fills, and the blocks that fill them."""
-        if self.net is None:
-            return np.zeros(0, int), np.zeros(0, int)
-        start = np.concatenate([[0], np.cumsum(self.curves.counts)])
-        host = self.net.host
-        rows = [start[rod.rod] + np.arange(len(rod.nodes)) for rod in host.rods]
-        first = len(start) - 1 - len(host.meridians)
-        rows += [start[first + i] + np.arange(len(shell.nodes)) for i, shell in enumerate(host.meridians)]
-        blocks = [part.nodes for part in (*host.rods, *host.meridians, *host.shells)]
-        vertices = sum(len(shell.nodes) for shell in host.shells)
-        return np.concatenate([*rows, start[-1] + np.arange(vertices)]).astype(int), np.concatenate(blocks)
-
-    def places(self, group: Group) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of a group's nodes: place along the rod with ghosts, column, row of `State.points`."""
-        start = np.concatenate([[0], np.cumsum(self.curves.counts)])
-        return _user_index(group, group.host.own, start)
+        return self.order.surfaces
 
     @property
     def points_count(self) -> int:
         """Rows of `State.points` in one world."""
-        vertices = 0 if self.net is None else sum(len(shell.nodes) for shell in self.net.host.shells)
-        return int(self.curves.counts.sum()) + vertices
+        return self.order.points_count
 
     def report(self) -> str:
         """What is in the model, what it costs, and what is left out."""
@@ -269,25 +224,25 @@ class Model:
         for group, data in zip(self.groups, state.groups, strict=True):
             x = np.concatenate([group.host.x] * self.worlds, axis=1)
             if points is not None:
-                self._scatter_nodes(group, points, x, "points")
+                self.order.put_nodes(group, points, x, "points")
             arrays.assign(data.x, x)
             if velocities is not None:
                 v = np.zeros_like(x)
-                self._scatter_nodes(group, velocities, v, "velocities")
+                self.order.put_nodes(group, velocities, v, "velocities")
                 arrays.assign(data.v, v)
             if group.kind.twist:
                 arrays.assign(data.frame, np.concatenate([group.host.frame] * self.worlds, axis=-1))
                 if spins is not None:
                     omega = np.zeros((group.nodes, group.columns))
-                    self._scatter_edges(group, spins, omega)
+                    self.order.put_edges(group, spins, omega)
                     arrays.assign(data.omega, omega)
         if self.net is not None:
             state.net = self.net.rest()
             for values, array, what in ((points, state.net.q, "points"), (velocities, state.net.v, "velocities")):
                 if values is not None:
-                    array.assign(self._scatter_net(values, array.numpy(), what))
+                    array.assign(self.order.put_blocks(values, array.numpy(), what))
             if spins is not None:
-                values, start = self._edge_values(spins)
+                values, start = self.order.spins(spins)
                 rates = state.net.v.numpy().reshape(self.worlds, -1, 3)
                 for rod in self.net.host.rods:
                     rates[:, rod.edges, 0] = values[..., start[rod.rod] + np.arange(len(rod.edges))]
@@ -298,48 +253,6 @@ class Model:
             glue.follow(self.net, state.net, angles=points is not None, rates=velocities is not None and spins is None)
         self.update_strains(state)
         return state
-
-    def _scatter_nodes(self, group: Group, values, out: np.ndarray, what: str) -> None:
-        """Put values in the user's order (P, 3) into (node, column, dim) of a group."""
-        values = self._point_values(values, what)
-        axes = [0, 2] if group.kind.dim == 2 else [0, 1, 2]
-        k, column, index = self.places(group)
-        for world in range(self.worlds):
-            own = values if values.ndim == 2 else values[world]
-            out[k, column + world * group.rods] = own[index][:, axes]
-
-    def _scatter_net(self, values, blocks: np.ndarray, what: str) -> np.ndarray:
-        """Blocks (worlds N, 3) with values in the user's order (P, 3) put in."""
-        values = self._point_values(values, what)
-        out = blocks.astype(float).reshape(self.worlds, -1, 3)
-        rows, places = self.net_rows
-        out[:, places] = (values if values.ndim == 3 else values[None])[:, rows]
-        return out.reshape(-1, 3)
-
-    def _point_values(self, values, what: str) -> np.ndarray:
-        values, count = _numbers(what, values), self.points_count
-        if values.shape not in ((count, 3), (self.worlds, count, 3)):
-            raise ValueError(f"{what} have shape {values.shape}; they are ({count}, 3), or one such array a world")
-        if not np.isfinite(values).all():
-            raise ValueError(f"{what}: node {int(np.argwhere(~np.isfinite(values))[0][-2])} is not finite")
-        return values
-
-    def _scatter_edges(self, group: Group, values, out: np.ndarray) -> None:
-        values, start = self._edge_values(values)
-        own = group.host.own - (0 if group.kind.closed else 1)
-        k, column, index = _user_index(group, own, start)
-        for world in range(self.worlds):
-            out[k, column + world * group.rods] = (values if values.ndim == 1 else values[world])[index]
-
-    def _edge_values(self, values) -> tuple[np.ndarray, np.ndarray]:
-        """Spins in the user's order, checked, and where the edges of each rod begin."""
-        counts = self.curves.counts - np.where(self.curves.closed, 0, 1)
-        values = _numbers("spins", values)
-        if values.shape not in ((counts.sum(),), (self.worlds, counts.sum())):
-            raise ValueError(f"spins have shape {values.shape}; they are ({counts.sum()},), or one such array a world")
-        if not np.isfinite(values).all():
-            raise ValueError(f"spins: edge {int(np.argwhere(~np.isfinite(values))[0][-1])} is not finite")
-        return values, np.concatenate([[0], np.cumsum(counts)])
 
     def empty_state(self) -> State:
         """Arrays of a state, not yet filled."""
@@ -422,64 +335,6 @@ class Model:
             device=self.wp_device,
         )
 
-    def gather_nodes(self, values: list[np.ndarray], blocks: wp.array | None = None) -> np.ndarray:
-        """From arrays (node, column, dim) of groups and blocks of the net (worlds N, 3) to the user's order, in three dimensions."""
-        start = np.concatenate([[0], np.cumsum(self.curves.counts)])
-        out = np.zeros((self.worlds, self.points_count, 3))
-        if blocks is not None:
-            rows, places = self.net_rows
-            out[:, rows] = np.asarray(blocks.numpy() if isinstance(blocks, wp.array) else blocks).reshape(
-                self.worlds, -1, 3
-            )[:, places]
-        for group, value in zip(self.groups, values, strict=True):
-            axes = [0, 2] if group.kind.dim == 2 else [0, 1, 2]
-            k, column, index = _user_index(group, group.host.own, start)
-            for world in range(self.worlds):
-                out[world][index[:, None], axes] = value[k, column + world * group.rods]
-        return out[0] if self.worlds == 1 else out
-
-    def gather_angles(self, state: State) -> np.ndarray | None:
-        """Angles of all edges of rods; see `State.angles`."""
-        net = None
-        if self.net is not None and self.net.edges:
-            net = state.net.q.numpy().reshape(self.worlds, -1, 3)[:, self.net.angle_start :, 0]
-        return self.gather_edges([arrays.download(data.theta) for data in state.groups], net)
-
-    def gather_edges(self, values: list[np.ndarray], net: np.ndarray | None = None, width: int = 0):
-        """From arrays (node, column) of every group and values of the net's rod edges (worlds, edges) to the user's order."""
-        if not any(group.kind.twist for group in self.groups) and net is None:
-            return None
-        counts = self.curves.counts - np.where(self.curves.closed, 0, 1)
-        start = np.concatenate([[0], np.cumsum(counts)])
-        out = np.zeros((self.worlds, start[-1], *([width] if width else [])))
-        for group, value in zip(self.groups, values, strict=True):
-            if group.kind.twist:
-                own = group.host.own - (0 if group.kind.closed else 1)
-                k, column, index = _user_index(group, own, start)
-                for world in range(self.worlds):
-                    out[world][index] = value[k, column + world * group.rods]
-        for rod in self.net.host.rods if net is not None else ():
-            rows = start[rod.rod] + np.arange(len(rod.edges))
-            out[:, rows] = net[:, rod.edges - self.net.angle_start]
-        return out[0] if self.worlds == 1 else out
-
-    def gather_directors(self, state: State) -> np.ndarray | None:
-        """First material directors of a state; see `State.directors`."""
-        values, net = [], None
-        if self.net is not None and self.net.edges:
-            frame = np.moveaxis(state.net.frame.numpy().reshape(6, self.worlds, -1), 0, -1)
-            angle = state.net.q.numpy().reshape(self.worlds, -1, 3)[:, self.net.angle_start :][:, : self.net.edges, 0]
-            u, t = frame[..., :3], frame[..., 3:]
-            net = polyline.material_directors(u, t, angle)
-        for group, data in zip(self.groups, state.groups, strict=True):
-            if not group.kind.twist:
-                values.append(np.zeros(0))
-                continue
-            frame, theta = arrays.download(data.frame), arrays.download(data.theta)
-            u, t = np.moveaxis(frame[0:3], 0, -1), np.moveaxis(frame[3:6], 0, -1)
-            values.append(polyline.material_directors(u, t, theta))
-        return self.gather_edges(values, net, 3)
-
 
 def _device(name):
     """A Warp device by its name; by default CUDA if there is one."""
@@ -490,41 +345,6 @@ def _device(name):
         raise SceneError(f"device is {name!r}; there is {known}") from None
 
 
-def _numbers(what: str, values) -> np.ndarray:
-    try:
-        return np.asarray(values, float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{what} are no array of numbers: {values!r}") from None
-
-
 def needs_net(scene) -> bool:
     """Whether a scene has anything but rods on their own."""
     return bool(scene.shells or scene.joints or scene.attachments or scene.magnets or scene.axisymmetric_shells)
-
-
-def _node_radius(batch) -> np.ndarray:
-    radius = np.asarray(batch.section.radius, float)
-    if radius.ndim == 0 or radius.shape[-1] == 1:
-        return radius
-    return 0.5 * (np.concatenate([radius[..., :1], radius], -1) + np.concatenate([radius, radius[..., -1:]], -1))
-
-
-def _alike(parts) -> list[int]:
-    """Number of the first part with the same name and stiffness; of shells of revolution their own."""
-    seen: dict = {}
-    keys = [(part.name, _hashable(part.section)) if hasattr(part, "section") else id(part) for part in parts]
-    return [seen.setdefault(key, len(seen)) for key in keys]
-
-
-def _hashable(section) -> tuple:
-    """The numbers of a section, to be compared."""
-    return tuple(
-        np.asarray(value, dtype=object if value is None else float).tobytes() for value in vars(section).values()
-    )
-
-
-def _user_index(group: Group, own: np.ndarray, start: np.ndarray):
-    """For nodes or edges of a group's rods: place along the rod with ghosts, column, place in the user's order."""
-    column = np.repeat(np.arange(group.rods), own)
-    at = np.arange(own.sum()) - np.repeat(np.concatenate([[0], np.cumsum(own)[:-1]]), own)
-    return at + group.host.first[column], column, at + start[group.host.rods[column]]

@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
+from ddg_warp.geometry import polyline
 from ddg_warp.threads import launches
 
 
@@ -63,19 +64,37 @@ class State:
 
     def points(self) -> np.ndarray:
         """Positions (P, 3) [m], or (worlds, P, 3): nodes in the order of `model.curves` (rods, meridians), then vertices."""
-        return self.model.gather_nodes([arrays.download(group.x) for group in self.groups], self.net and self.net.q)
+        return self.model.order.nodes([arrays.download(group.x) for group in self.groups], self.net and self.net.q)
 
     def velocities(self) -> np.ndarray:
         """Velocities of nodes, ordered as `points` [m/s]."""
-        return self.model.gather_nodes([arrays.download(group.v) for group in self.groups], self.net and self.net.v)
+        return self.model.order.nodes([arrays.download(group.v) for group in self.groups], self.net and self.net.v)
 
     def angles(self) -> np.ndarray | None:
         """Angles theta of edges [rad] (edges,) or (worlds, edges); None if no rod has twist."""
-        return self.model.gather_angles(self)
+        model = self.model
+        net = None
+        if model.net is not None and model.net.edges:
+            net = self.net.q.numpy().reshape(model.worlds, -1, 3)[:, model.net.angle_start :, 0]
+        return model.order.edges([arrays.download(data.theta) for data in self.groups], net)
 
     def directors(self) -> np.ndarray | None:
         """First material director of every edge (edges, 3) or (worlds, edges, 3); None if no rod has twist."""
-        return self.model.gather_directors(self)
+        model = self.model
+        values, net = [], None
+        if model.net is not None and model.net.edges:
+            frame = np.moveaxis(self.net.frame.numpy().reshape(6, model.worlds, -1), 0, -1)
+            angle = self.net.q.numpy().reshape(model.worlds, -1, 3)[:, model.net.angle_start :][:, : model.net.edges, 0]
+            u, t = frame[..., :3], frame[..., 3:]
+            net = polyline.material_directors(u, t, angle)
+        for group, data in zip(model.groups, self.groups, strict=True):
+            if not group.kind.twist:
+                values.append(np.zeros(0))
+                continue
+            frame, theta = arrays.download(data.frame), arrays.download(data.theta)
+            u, t = np.moveaxis(frame[0:3], 0, -1), np.moveaxis(frame[3:6], 0, -1)
+            values.append(polyline.material_directors(u, t, theta))
+        return model.order.edges(values, net, 3)
 
     def copy(self) -> "State":
         """An independent copy."""

@@ -182,7 +182,7 @@ class ChainTangent:
     def point_dofs(self) -> tuple[np.ndarray, list[int], np.ndarray]:
         """Rows of `State.points`, axes, and the dofs (rows, axes) of the first world."""
         group, kind = self.group, self.group.kind
-        k, column, rows = self.model.places(group)
+        k, column, rows = self.model.order.places(group)
         dofs = ((column * group.nodes + k) * kind.block)[:, None] + np.arange(kind.dim)
         return rows, [0, 2] if kind.dim == 2 else [0, 1, 2], dofs
 

@@ -238,7 +238,7 @@ class NetTangent:
 
     def point_dofs(self) -> tuple[np.ndarray, list[int], np.ndarray]:
         """Rows of `State.points`, axes, and the dofs (rows, axes) of the first world."""
-        rows, blocks = self.model.net_rows
+        rows, blocks = self.model.order.net_rows
         return rows, [0, 1, 2], 3 * blocks[:, None] + np.arange(3)
 
     def bodies(self) -> list[Body]:

@@ -1,0 +1,187 @@
+"""The user's order of what a model holds: nodes and edges of rods, meridians and shells, and where groups and the net keep them."""
+
+from functools import cached_property
+
+import numpy as np
+import warp as wp
+
+from ddg_warp.compile import axisymmetric
+from ddg_warp.io import Curves, Surfaces
+from ddg_warp.model.group import Group
+
+
+class Order:
+    """Nodes of rods in the order they were added, of meridians, then vertices of shells; edges of rods and meridians likewise."""
+
+    def __init__(self, model):
+        self.model = model
+
+    @cached_property
+    def curves(self) -> Curves:
+        """Rods, then meridians of axisymmetric shells, as thick as these."""
+        batches, shells = self.model.scene.batches, self.model.scene.axisymmetric_shells
+        if not batches and not shells:
+            none = np.zeros(0, int)
+            return Curves(none, none.astype(bool), np.zeros(0), np.zeros(0, object), none)
+        counts = np.concatenate([*(np.full(b.rods, b.nodes) for b in batches), *([len(s.points)] for s in shells)])
+        radius = [np.broadcast_to(_node_radius(b), (b.rods, b.nodes)).ravel() for b in batches]
+        radius += [0.5 * axisymmetric.at_nodes(shell.thickness, len(shell.points)) for shell in shells]
+        single = np.ones(len(shells), int)
+        return Curves(
+            counts=counts,
+            closed=np.concatenate([*(np.full(b.rods, b.closed) for b in batches), single == 0]),
+            radius=np.concatenate(radius),
+            names=np.array([*(b.name for b in batches for _ in range(b.rods)), *(s.name for s in shells)], object),
+            batch=np.repeat(_alike([*batches, *shells]), [*(b.rods for b in batches), *single]),
+        )
+
+    @cached_property
+    def surfaces(self) -> Surfaces | None:
+        """Shells as triangles among the rows of `State.points`; None without."""
+        if not self.model.scene.shells:
+            return None
+        shells, rods = self.model.net.host.shells, int(self.curves.counts.sum())
+        points = np.cumsum([0] + [len(shell.nodes) for shell in shells])
+        triangles = np.cumsum([0] + [len(shell.surface.triangles) for shell in shells])
+        return Surfaces(
+            triangles=np.concatenate([s.surface.triangles + rods + at for s, at in zip(shells, points, strict=False)]),
+            first=triangles[:-1],
+            names=np.array([shell.name for shell in self.model.scene.shells], dtype=object),
+            thickness=np.concatenate([shell.plate.thickness for shell in shells]),
+        )
+
+    @cached_property
+    def net_rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of `State.points` that the net fills, and the blocks that fill them."""
+        if self.model.net is None:
+            return np.zeros(0, int), np.zeros(0, int)
+        start = np.concatenate([[0], np.cumsum(self.curves.counts)])
+        host = self.model.net.host
+        rows = [start[rod.rod] + np.arange(len(rod.nodes)) for rod in host.rods]
+        first = len(start) - 1 - len(host.meridians)
+        rows += [start[first + i] + np.arange(len(shell.nodes)) for i, shell in enumerate(host.meridians)]
+        blocks = [part.nodes for part in (*host.rods, *host.meridians, *host.shells)]
+        vertices = sum(len(shell.nodes) for shell in host.shells)
+        return np.concatenate([*rows, start[-1] + np.arange(vertices)]).astype(int), np.concatenate(blocks)
+
+    def places(self, group: Group) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of a group's nodes: place along the rod with ghosts, column, row of `State.points`."""
+        start = np.concatenate([[0], np.cumsum(self.curves.counts)])
+        return _user_index(group, group.host.own, start)
+
+    @property
+    def points_count(self) -> int:
+        """Rows of `State.points` in one world."""
+        vertices = 0 if self.model.net is None else sum(len(shell.nodes) for shell in self.model.net.host.shells)
+        return int(self.curves.counts.sum()) + vertices
+
+    def put_nodes(self, group: Group, values, out: np.ndarray, what: str) -> None:
+        """Put values in the user's order (P, 3) into (node, column, dim) of a group."""
+        values = self._points(values, what)
+        axes = [0, 2] if group.kind.dim == 2 else [0, 1, 2]
+        k, column, index = self.places(group)
+        for world in range(self.model.worlds):
+            own = values if values.ndim == 2 else values[world]
+            out[k, column + world * group.rods] = own[index][:, axes]
+
+    def put_blocks(self, values, blocks: np.ndarray, what: str) -> np.ndarray:
+        """Blocks (worlds N, 3) with values in the user's order (P, 3) put in."""
+        values = self._points(values, what)
+        out = blocks.astype(float).reshape(self.model.worlds, -1, 3)
+        rows, places = self.net_rows
+        out[:, places] = (values if values.ndim == 3 else values[None])[:, rows]
+        return out.reshape(-1, 3)
+
+    def _points(self, values, what: str) -> np.ndarray:
+        values, count = _numbers(what, values), self.points_count
+        if values.shape not in ((count, 3), (self.model.worlds, count, 3)):
+            raise ValueError(f"{what} have shape {values.shape}; they are ({count}, 3), or one such array a world")
+        if not np.isfinite(values).all():
+            raise ValueError(f"{what}: node {int(np.argwhere(~np.isfinite(values))[0][-2])} is not finite")
+        return values
+
+    def put_edges(self, group: Group, values, out: np.ndarray) -> None:
+        values, start = self.spins(values)
+        own = group.host.own - (0 if group.kind.closed else 1)
+        k, column, index = _user_index(group, own, start)
+        for world in range(self.model.worlds):
+            out[k, column + world * group.rods] = (values if values.ndim == 1 else values[world])[index]
+
+    def spins(self, values) -> tuple[np.ndarray, np.ndarray]:
+        """Spins in the user's order, checked, and where the edges of each rod begin."""
+        counts = self.curves.counts - np.where(self.curves.closed, 0, 1)
+        values = _numbers("spins", values)
+        if values.shape not in ((counts.sum(),), (self.model.worlds, counts.sum())):
+            raise ValueError(f"spins have shape {values.shape}; they are ({counts.sum()},), or one such array a world")
+        if not np.isfinite(values).all():
+            raise ValueError(f"spins: edge {int(np.argwhere(~np.isfinite(values))[0][-1])} is not finite")
+        return values, np.concatenate([[0], np.cumsum(counts)])
+
+    def nodes(self, values: list[np.ndarray], blocks: wp.array | None = None) -> np.ndarray:
+        """From arrays (node, column, dim) of groups and blocks of the net (worlds N, 3) to the user's order, in three dimensions."""
+        start = np.concatenate([[0], np.cumsum(self.curves.counts)])
+        out = np.zeros((self.model.worlds, self.points_count, 3))
+        if blocks is not None:
+            rows, places = self.net_rows
+            out[:, rows] = np.asarray(blocks.numpy() if isinstance(blocks, wp.array) else blocks).reshape(
+                self.model.worlds, -1, 3
+            )[:, places]
+        for group, value in zip(self.model.groups, values, strict=True):
+            axes = [0, 2] if group.kind.dim == 2 else [0, 1, 2]
+            k, column, index = _user_index(group, group.host.own, start)
+            for world in range(self.model.worlds):
+                out[world][index[:, None], axes] = value[k, column + world * group.rods]
+        return out[0] if self.model.worlds == 1 else out
+
+    def edges(self, values: list[np.ndarray], net: np.ndarray | None = None, width: int = 0):
+        """From arrays (node, column) of every group and values of the net's rod edges (worlds, edges) to the user's order."""
+        if not any(group.kind.twist for group in self.model.groups) and net is None:
+            return None
+        counts = self.curves.counts - np.where(self.curves.closed, 0, 1)
+        start = np.concatenate([[0], np.cumsum(counts)])
+        out = np.zeros((self.model.worlds, start[-1], *([width] if width else [])))
+        for group, value in zip(self.model.groups, values, strict=True):
+            if group.kind.twist:
+                own = group.host.own - (0 if group.kind.closed else 1)
+                k, column, index = _user_index(group, own, start)
+                for world in range(self.model.worlds):
+                    out[world][index] = value[k, column + world * group.rods]
+        for rod in self.model.net.host.rods if net is not None else ():
+            rows = start[rod.rod] + np.arange(len(rod.edges))
+            out[:, rows] = net[:, rod.edges - self.model.net.angle_start]
+        return out[0] if self.model.worlds == 1 else out
+
+
+def _numbers(what: str, values) -> np.ndarray:
+    try:
+        return np.asarray(values, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{what} are no array of numbers: {values!r}") from None
+
+
+def _node_radius(batch) -> np.ndarray:
+    radius = np.asarray(batch.section.radius, float)
+    if radius.ndim == 0 or radius.shape[-1] == 1:
+        return radius
+    return 0.5 * (np.concatenate([radius[..., :1], radius], -1) + np.concatenate([radius, radius[..., -1:]], -1))
+
+
+def _alike(parts) -> list[int]:
+    """Number of the first part with the same name and stiffness; of shells of revolution their own."""
+    seen: dict = {}
+    keys = [(part.name, _hashable(part.section)) if hasattr(part, "section") else id(part) for part in parts]
+    return [seen.setdefault(key, len(seen)) for key in keys]
+
+
+def _hashable(section) -> tuple:
+    """The numbers of a section, to be compared."""
+    return tuple(
+        np.asarray(value, dtype=object if value is None else float).tobytes() for value in vars(section).values()
+    )
+
+
+def _user_index(group: Group, own: np.ndarray, start: np.ndarray):
+    """For nodes or edges of a group's rods: place along the rod with ghosts, column, place in the user's order."""
+    column = np.repeat(np.arange(group.rods), own)
+    at = np.arange(own.sum()) - np.repeat(np.concatenate([[0], np.cumsum(own)[:-1]]), own)
+    return at + group.host.first[column], column, at + start[group.host.rods[column]]
