@@ -1,8 +1,8 @@
 """Hard cases of dynamics: stiff, thin, fine, folded, wound, random, unequal, curled, in steps of any length, pulled and pushed.
 
 Every run must end in finite states, by converged steps only (attempts that failed must have been retried), or in an error that
-names the outcome, the rod and the remedy; and what can be known of the motion must hold. Each is run twice: the rod on its own, and as
-part of a net, joined to a stub that is held.
+names the outcome, the rod and the remedy; and what can be known of the motion must hold. Each is run for the rod on its own, and as
+part of a net, joined to a stub that is held: by a hinge, so that elimination is exact, or rigidly, by conjugate gradients.
 """
 
 from dataclasses import dataclass
@@ -22,10 +22,10 @@ STEEL = ddg.Material(young=2e11, poisson=0.3, density=7800.0)
 RUBBER = ddg.Material(young=1e7, poisson=0.5, density=1000.0)
 
 
-@pytest.fixture(autouse=True, params=["alone", "joined"])
+@pytest.fixture(autouse=True, params=["alone", "joined", pytest.param("rigidly joined", marks=slow)])
 def island(request):
     """What the rod shares its Newton loop with: nothing, or a stub."""
-    Run.joined = request.param == "joined"
+    Run.joined, Run.rigid = request.param != "alone", request.param.startswith("rigidly")
 
 
 @dataclass
@@ -39,6 +39,7 @@ class Run:
     statistics: dict
     error: ddg.SolverError | None
     joined: ClassVar[bool] = False
+    rigid: ClassVar[bool] = False
 
     @property
     def tip(self) -> np.ndarray:
@@ -65,9 +66,9 @@ def run(scene, device, dt, steps, start=None, **options) -> Run:
 def with_stub(scene, start):
     """Join a stub along x that is held to the held first node of rod 0; start points with its own."""
     if not scene.joints:
-        stub = scene.add_rod(straight(3) * 0.1 - [0.1, 0.0, 0.0], section=ddg.Stiffness(1e3, 1e-2, GJ=1e-2))
+        stub = scene.add_rod(straight(3) * 0.1 - [0.1, 0.0, 0.0], section=ddg.Stiffness(1e3, 1e-2, GJ=1e-2, mass_per_length=0.01))
         scene.clamp(stub, edges=[0, 1])
-        scene.join([(0, 0), (stub, -1)], rigid=False)
+        scene.join([(0, 0), (stub, -1)], rigid=Run.rigid)
     return None if start is None else np.concatenate([start, scene.batches[1].points[0]])
 
 
