@@ -66,7 +66,9 @@ def run(scene, device, dt, steps, start=None, **options) -> Run:
 def with_stub(scene, start):
     """Join a stub along x that is held to the held first node of rod 0; start points with its own."""
     if not scene.joints:
-        stub = scene.add_rod(straight(3) * 0.1 - [0.1, 0.0, 0.0], section=ddg.Stiffness(1e3, 1e-2, GJ=1e-2, mass_per_length=0.01))
+        stub = scene.add_rod(
+            straight(3) * 0.1 - [0.1, 0.0, 0.0], section=ddg.Stiffness(1e3, 1e-2, GJ=1e-2, mass_per_length=0.01)
+        )
         scene.clamp(stub, edges=[0, 1])
         scene.join([(0, 0), (stub, -1)], rigid=Run.rigid)
     return None if start is None else np.concatenate([start, scene.batches[1].points[0]])

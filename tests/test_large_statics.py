@@ -109,7 +109,7 @@ def test_converged_is_balanced_and_stable(device, build):
     tangent = search.tangent
     outer, gradient = tangent.loads(1.0, tangent.dofs(state)), tangent.gradient(state)
     residual = np.abs(outer - gradient)[tangent.free]
-    limit = 1e-9 * search.allowed(search.load_scale(outer, gradient))
+    limit = 1e-9 * search.residuals.allowed(search.residuals.load_scale(outer, gradient))
     assert (residual <= limit[tangent.free]).all()
 
 

@@ -134,16 +134,18 @@ class Corrector:
         load = here.load + step[-1]
         state = tangent.advance(here.state, step[:-1], load)
         total, reach, polished = step, self.norm(step), False
-        first = solver.first_scale(tangent.loads(here.load, tangent.dofs(here.state)), tangent.gradient(here.state))
+        first = solver.residuals.first_scale(
+            tangent.loads(here.load, tangent.dofs(here.state)), tangent.gradient(here.state)
+        )
         pivot = here.direction
         for iteration in range(options.max_iterations + 1):
             q = tangent.dofs(state)
             residual, stiffness, rate, support, gradient, outer = self.system(state, q, load)
             if not np.isfinite(residual).all() or not np.isfinite(stiffness.data).all():
                 raise Failed("non_finite")
-            scale = np.maximum(first, solver.load_scale(outer, gradient))
+            scale = np.maximum(first, solver.residuals.load_scale(outer, gradient))
             missing = gap(q, load) if gap else 0.0
-            excess = solver.excess(
+            excess, solver.outcome = solver.residuals.excess(
                 residual, gradient, stiffness, q, scale if scale.any() else scale + np.abs(residual).max()
             )
             done = excess <= 0.0 and abs(missing) <= 1e-12 * (1.0 + np.abs(row[:-1]) @ np.abs(q) + abs(row[-1] * load))

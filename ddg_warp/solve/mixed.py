@@ -31,8 +31,8 @@ def newton(solver, state: State, before: float, at: float) -> State | None:
     free = np.flatnonzero(tangent.free)
     jump = tangent.support_step(state, before, at)
     q, gradient, stress = tangent.dofs(state), tangent.gradient(state), None
-    first = solver.first_scale(tangent.loads(at, q), gradient)
-    if (np.abs(tangent.loads(before, q) - gradient) > UNBALANCED * solver.allowed(first))[free].any():
+    first = solver.residuals.first_scale(tangent.loads(at, q), gradient)
+    if (np.abs(tangent.loads(before, q) - gradient) > UNBALANCED * solver.residuals.allowed(first))[free].any():
         # a crumpled start, or a rest shape that has changed: stresses of no equilibrium say nothing about the next one
         stress = [0.0 * part for part in tangent.linear_stress(state, jump)]
     state, factor, polished = tangent.with_prescribed(state, at), None, False
@@ -44,8 +44,8 @@ def newton(solver, state: State, before: float, at: float) -> State | None:
         if not np.isfinite(residual).all() or not np.isfinite(hessian.data).all():
             return None
         if iteration:
-            scale = np.maximum(first, solver.load_scale(outer, gradient))
-            excess = solver.excess(residual, gradient, hessian, q, scale)
+            scale = np.maximum(first, solver.residuals.load_scale(outer, gradient))
+            excess, solver.outcome = solver.residuals.excess(residual, gradient, hessian, q, scale)
             if excess <= 0.0 and (solver.outcome == "converged" or polished):
                 stable = factor.reliable and not factor.negative
                 state.time, solver.stiffness = at, hessian

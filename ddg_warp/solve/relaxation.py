@@ -50,9 +50,9 @@ def relax(
             raise SolverError(
                 "relaxation: forces are not finite; begin nearer to rest", state=state, outcome="non_finite"
             )
-        first = equilibrium.first_scale(outer, gradient) if first is None else first
-        scale = np.maximum(first, equilibrium.load_scale(outer, gradient))
-        if (np.abs(force) <= residual * equilibrium.allowed(scale)).all():
+        first = equilibrium.residuals.first_scale(outer, gradient) if first is None else first
+        scale = np.maximum(first, equilibrium.residuals.load_scale(outer, gradient))
+        if (np.abs(force) <= residual * equilibrium.residuals.allowed(scale)).all():
             return state
         if mass is None:
             mass = _masses(tangent, state)

@@ -25,6 +25,8 @@ from ddg_warp.solve.chains.prescribed import jump_between
 from ddg_warp.solve.choice import static_solver, why_not_pcg
 from ddg_warp.solve.direct import Factorisation, SingularError
 from ddg_warp.solve.net.statics import NetEquilibrium
+from ddg_warp.solve.residuals import Residuals
+from ddg_warp.solve.supports import require_supports
 from ddg_warp.solve.tangent import Tangent
 from ddg_warp.threads import launches
 
@@ -106,7 +108,7 @@ class Equilibrium:
     """A static solver of one model; keeps its tangent between solves.
 
     Attributes:
-        tangent: energy, gradient and Hessian of the model.
+        tangent: energy, gradient and Hessian of the model; residuals: what is small against what, of it.
         net: what solves by conjugate gradients, if that is the solver.
         mixed: whether Newton with stresses of its own is tried first; where it can be, by default.
         iterations: Newton iterations so far.
@@ -118,6 +120,8 @@ class Equilibrium:
     def __init__(self, model, options: StaticsOptions | None = None):
         self.model, self.options = model, options or StaticsOptions()
         self.tangent = Tangent(model)
+        rounding = self.options.floor_factor * model.types.eps
+        self.residuals = Residuals(self.tangent, self.options.rtol, rounding)
         require_supports(model)
         lost_in_rounding(model)
         scene_validate.warn_of_massless(model)
@@ -225,14 +229,14 @@ class Equilibrium:
         energies, q = tangent.element_energies(state), tangent.dofs(state)
         outer = tangent.loads(at, q)
         gradient = tangent.gradient(state)
-        first, polished = self.first_scale(outer, gradient), False
+        first, polished = self.residuals.first_scale(outer, gradient), False
         for _ in range(options.max_iterations):
             residual = outer - gradient
             hessian = tangent.stiffness(state, at)
             if not np.isfinite(residual).all() or not np.isfinite(hessian.data).all():
-                raise SolverError(self.where("non_finite", residual, at), state=state, outcome="non_finite")
-            scale = np.maximum(first, self.load_scale(outer, gradient))
-            excess = self.excess(residual, gradient, hessian, q, scale)
+                raise SolverError(self.residuals.where("non_finite", residual, at), state=state, outcome="non_finite")
+            scale = np.maximum(first, self.residuals.load_scale(outer, gradient))
+            excess, self.outcome = self.residuals.excess(residual, gradient, hessian, q, scale)
             self.stiffness = hessian
             if excess <= 0.0 and (self.outcome == "converged" or polished):
                 return self.found(state, outer, residual, at)
@@ -242,7 +246,7 @@ class Equilibrium:
             shortened = min(1.0, options.rotation_cap / max(1e-300, tangent.rotation(q, direction)))
             direction, decrease = shortened * direction, shortened * decrease
             taken, found = 1.0, False
-            merit = np.linalg.norm(self._scaled(residual)[free])
+            merit = np.linalg.norm(self.residuals.scaled(residual)[free])
             for _ in range(30):
                 trial = tangent.retract(q, taken * direction)
                 candidate = state.copy()
@@ -252,7 +256,7 @@ class Equilibrium:
                 new_outer = tangent.loads(at, trial)
                 change = (new_energies - energies).sum() - 0.5 * (outer + new_outer) @ (trial - q)
                 noise = 64 * self.model.types.eps * (np.abs(energies).sum() + np.abs(gradient) @ np.abs(q))
-                new_merit = np.linalg.norm(self._scaled(new_outer - new_gradient)[free])
+                new_merit = np.linalg.norm(self.residuals.scaled(new_outer - new_gradient)[free])
                 if not np.isfinite(change) or not np.isfinite(new_merit):
                     found = False
                 elif options.mode == "follow":
@@ -268,7 +272,7 @@ class Equilibrium:
                 return self.found(state, outer, residual, at)
             if not found:
                 raise SolverError(
-                    self.where("line_search_failed", residual, at), state=state, outcome="line_search_failed"
+                    self.residuals.where("line_search_failed", residual, at), state=state, outcome="line_search_failed"
                 )
             state, q, energies, gradient, outer = (
                 candidate,
@@ -277,7 +281,9 @@ class Equilibrium:
                 new_gradient,
                 new_outer,
             )
-        raise SolverError(self.where("max_iterations", outer - gradient, at), state=state, outcome="max_iterations")
+        raise SolverError(
+            self.residuals.where("max_iterations", outer - gradient, at), state=state, outcome="max_iterations"
+        )
 
     def _hidden(self, outer: np.ndarray, residual: np.ndarray) -> bool:
         """Whether more than half of the loads is left over, of which rounding does not let the dofs tell."""
@@ -330,40 +336,6 @@ class Equilibrium:
         outer = tangent.loads(at, tangent.dofs(state))
         return self._direction(hessian, outer - tangent.gradient(state) - hessian @ step)[0]
 
-    def load_scale(self, outer: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-        """What residuals of the bodies are compared with [N]: sums of their outer forces, or the largest support force if more.
-
-        A body without either is compared with the mean of all.
-        """
-        tangent = self.tangent
-        loads = np.concatenate(
-            [part.body_loads(tangent.of(part, outer), tangent.of(part, gradient)) for part in tangent.parts]
-        )
-        return np.where(loads > 0.0, loads, loads.mean())
-
-    def first_scale(self, outer: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-        """The load scales of the state that a search starts from, or its residual where there are no loads [N].
-
-        A residual is compared with this or with the present load scale: forces of iterates on the way, however large, excuse nothing.
-        """
-        scale = self.load_scale(outer, gradient)
-        return scale if scale.any() else scale + np.abs((outer - gradient)[self.tangent.free]).max(initial=0.0)
-
-    def allowed(self, scale: np.ndarray) -> np.ndarray:
-        """Residuals of all dofs at rtol = 1 (size,) [N, N m], for such load scales; see `ddg_warp.compile.tolerance`."""
-        return np.concatenate([part.allowed(own) for part, own in self._by_part(scale)])
-
-    def _by_part(self, scale: np.ndarray):
-        """The parts of the tangent, each with the scales of its bodies."""
-        at = 0
-        for part in self.tangent.parts:
-            yield part, scale[at : at + part.body_count]
-            at += part.body_count
-
-    def _scaled(self, residual: np.ndarray) -> np.ndarray:
-        """Moments over an edge length, so that they compare with forces."""
-        return np.where(self.tangent.angle, residual / self.tangent.edge_length(), residual)
-
     def _direction(self, hessian, residual: np.ndarray) -> tuple[np.ndarray, float]:
         """Newton direction on the free dofs and the decrease of energy it promises."""
         free = np.flatnonzero(self.tangent.free)
@@ -384,59 +356,3 @@ class Equilibrium:
             if self.options.mode == "follow" or (factor.reliable and not factor.negative):
                 break
         return factor
-
-    def excess(self, residual, gradient, hessian, q, scale: np.ndarray) -> float:
-        """How far the worst dof, or sum of residuals, is from equilibrium; not positive when all are. `scale`: of the bodies."""
-        tangent, rtol = self.tangent, self.options.rtol
-        free, angle = tangent.free, tangent.angle
-        reach = np.abs(q[free & ~angle]).max(initial=1.0)
-        rounding = self.options.floor_factor * self.model.types.eps
-        floor = rounding * (np.asarray(abs(hessian).sum(axis=1)).ravel() * reach + np.abs(gradient))
-        limit, size = rtol * self.allowed(scale), np.abs(residual)
-        masked = np.where(free, residual, 0.0)
-        sums = [
-            part.sums(own, rtol, tangent.of(part, masked), tangent.of(part, floor))
-            for part, own in self._by_part(scale)
-        ]
-        small = (size <= limit)[free].all() and all(good for good, _ in sums)
-        self.outcome = "converged" if small else "converged_to_rounding"
-        worst = float((size - np.maximum(limit, floor))[free].max())
-        return max(worst, *(excess for _, excess in sums))
-
-    def where(self, outcome: str, residual: np.ndarray, at: float) -> str:
-        """What to tell of a search that failed."""
-        masked = np.where(self.tangent.free, np.abs(self._scaled(residual)), -1.0)
-        worst = int(np.argmax(np.where(np.isfinite(masked), masked, np.inf)))
-        return (
-            f"no equilibrium at load parameter {at:g}: {outcome}, largest residual {residual[worst]:.3g} at "
-            f"{self.tangent.where(worst)}; take more load steps, or hold what can still move freely"
-        )
-
-
-def require_supports(model) -> None:
-    """Refuse a rod that can be shifted as a whole: no node of it holds some component. It may still turn."""
-    for group in model.groups:
-        host, axes = group.host, "xz" if group.kind.dim == 2 else "xyz"
-        held = np.bitwise_or.reduce(host.fixed, axis=0)
-        for d, axis in enumerate(axes):
-            loose = np.flatnonzero((held >> d) & 1 == 0)
-            if loose.size:
-                raise SceneError(
-                    f"rod {host.rods[loose[0]]} is not held along {axis}: a static solve needs supports; "
-                    "add scene.clamp(...) or scene.fix(...)"
-                )
-    if model.net is not None:
-        host = model.net.host
-        for i, shell in enumerate(host.meridians):
-            if not host.fixed[shell.nodes, 2].any():
-                raise SceneError(
-                    f"axisymmetric shell {i} is not held along z: a static solve needs scene.hold_ring(...) or "
-                    "scene.clamp_ring(...)"
-                )
-        spatial = np.setdiff1d(np.arange(host.nodes), [node for shell in host.meridians for node in shell.nodes])
-        loose = np.flatnonzero(~host.holds[spatial].any(0)) if spatial.size else spatial
-        if loose.size:
-            raise SceneError(
-                f"no node of the shells and joined rods is held along {'xyz'[loose[0]]}: a static solve needs supports; "
-                "add scene.hold(...), scene.clamp_boundary(...) or scene.fix(...)"
-            )

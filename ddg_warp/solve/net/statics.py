@@ -157,7 +157,7 @@ class NetEquilibrium:
             residual = outer - self.tangent.gradient(state)
             if status > outcome.CONVERGED_TO_ROUNDING:
                 name = outcome.NAMES[status]
-                raise SolverError(owner.where(name, residual, at), state=state, outcome=name)
+                raise SolverError(owner.residuals.where(name, residual, at), state=state, outcome=name)
         owner.outcome = outcome.NAMES[status]
         state.stable = False if self.newton.islands.clamped.numpy().any() else None
         return owner.found(state, outer, residual, at)
@@ -166,6 +166,6 @@ class NetEquilibrium:
         tangent, part = self.tangent, self.tangent.parts[-1]
         q = tangent.dofs(state)
         outer, gradient = tangent.loads(at, q), tangent.gradient(state)
-        self.newton.begin(tangent.back(q), part.dead_loads(at), at, self.owner.load_scale(outer, gradient))
+        self.newton.begin(tangent.back(q), part.dead_loads(at), at, self.owner.residuals.load_scale(outer, gradient))
         for name, array in self._start.arrays().items():
             wp.copy(array, state.net.arrays()[name])

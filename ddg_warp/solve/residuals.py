@@ -1,0 +1,77 @@
+"""Residuals of equilibria on the host: what they are compared with, and what to tell of one that is too large."""
+
+import numpy as np
+
+
+class Residuals:
+    """Of a model's `Tangent`, by the tolerances of a static solve.
+
+    Args:
+        rtol: see `ddg_warp.compile.tolerance`.
+        rounding: what counts as rounding, over the forces that meet at a dof.
+    """
+
+    def __init__(self, tangent, rtol: float, rounding: float):
+        self.tangent, self.rtol, self.rounding = tangent, rtol, rounding
+
+    def load_scale(self, outer: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """What residuals of the bodies are compared with [N]: sums of their outer forces, or the largest support force if more.
+
+        A body without either is compared with the mean of all.
+        """
+        tangent = self.tangent
+        loads = np.concatenate(
+            [part.body_loads(tangent.of(part, outer), tangent.of(part, gradient)) for part in tangent.parts]
+        )
+        return np.where(loads > 0.0, loads, loads.mean())
+
+    def first_scale(self, outer: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """The load scales of the state that a search starts from, or its residual where there are no loads [N].
+
+        A residual is compared with this or with the present load scale: forces of iterates on the way, however large, excuse nothing.
+        """
+        scale = self.load_scale(outer, gradient)
+        return scale if scale.any() else scale + np.abs((outer - gradient)[self.tangent.free]).max(initial=0.0)
+
+    def allowed(self, scale: np.ndarray) -> np.ndarray:
+        """Residuals of all dofs at rtol = 1 (size,) [N, N m], for such load scales; see `ddg_warp.compile.tolerance`."""
+        return np.concatenate([part.allowed(own) for part, own in self._by_part(scale)])
+
+    def _by_part(self, scale: np.ndarray):
+        """The parts of the tangent, each with the scales of its bodies."""
+        at = 0
+        for part in self.tangent.parts:
+            yield part, scale[at : at + part.body_count]
+            at += part.body_count
+
+    def scaled(self, residual: np.ndarray) -> np.ndarray:
+        """Moments over an edge length, so that they compare with forces."""
+        return np.where(self.tangent.angle, residual / self.tangent.edge_length(), residual)
+
+    def excess(self, residual, gradient, hessian, q, scale: np.ndarray) -> tuple[float, str]:
+        """How far the worst dof, or sum of residuals, is from equilibrium, not positive when all are; and the outcome if it is.
+
+        `scale` is of the bodies.
+        """
+        tangent, rtol = self.tangent, self.rtol
+        free, angle = tangent.free, tangent.angle
+        reach = np.abs(q[free & ~angle]).max(initial=1.0)
+        floor = self.rounding * (np.asarray(abs(hessian).sum(axis=1)).ravel() * reach + np.abs(gradient))
+        limit, size = rtol * self.allowed(scale), np.abs(residual)
+        masked = np.where(free, residual, 0.0)
+        sums = [
+            part.sums(own, rtol, tangent.of(part, masked), tangent.of(part, floor))
+            for part, own in self._by_part(scale)
+        ]
+        small = (size <= limit)[free].all() and all(good for good, _ in sums)
+        worst = float((size - np.maximum(limit, floor))[free].max())
+        return max(worst, *(excess for _, excess in sums)), "converged" if small else "converged_to_rounding"
+
+    def where(self, outcome: str, residual: np.ndarray, at: float) -> str:
+        """What to tell of a search that failed."""
+        masked = np.where(self.tangent.free, np.abs(self.scaled(residual)), -1.0)
+        worst = int(np.argmax(np.where(np.isfinite(masked), masked, np.inf)))
+        return (
+            f"no equilibrium at load parameter {at:g}: {outcome}, largest residual {residual[worst]:.3g} at "
+            f"{self.tangent.where(worst)}; take more load steps, or hold what can still move freely"
+        )

@@ -1,0 +1,34 @@
+"""What static solves ask of the supports of a model."""
+
+import numpy as np
+
+from ddg_warp.errors import SceneError
+
+
+def require_supports(model) -> None:
+    """Refuse a rod that can be shifted as a whole: no node of it holds some component. It may still turn."""
+    for group in model.groups:
+        host, axes = group.host, "xz" if group.kind.dim == 2 else "xyz"
+        held = np.bitwise_or.reduce(host.fixed, axis=0)
+        for d, axis in enumerate(axes):
+            loose = np.flatnonzero((held >> d) & 1 == 0)
+            if loose.size:
+                raise SceneError(
+                    f"rod {host.rods[loose[0]]} is not held along {axis}: a static solve needs supports; "
+                    "add scene.clamp(...) or scene.fix(...)"
+                )
+    if model.net is not None:
+        host = model.net.host
+        for i, shell in enumerate(host.meridians):
+            if not host.fixed[shell.nodes, 2].any():
+                raise SceneError(
+                    f"axisymmetric shell {i} is not held along z: a static solve needs scene.hold_ring(...) or "
+                    "scene.clamp_ring(...)"
+                )
+        spatial = np.setdiff1d(np.arange(host.nodes), [node for shell in host.meridians for node in shell.nodes])
+        loose = np.flatnonzero(~host.holds[spatial].any(0)) if spatial.size else spatial
+        if loose.size:
+            raise SceneError(
+                f"no node of the shells and joined rods is held along {'xyz'[loose[0]]}: a static solve needs supports; "
+                "add scene.hold(...), scene.clamp_boundary(...) or scene.fix(...)"
+            )
