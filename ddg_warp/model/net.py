@@ -149,7 +149,8 @@ class DeviceNet:
         given.lag, given.last, given.rate = state.lag[index], state.last[index], self.still if rate is None else rate
         (given.buffer, given.table), given.slots = part.parameters.arrays, part.slots
         given.data = state.data.get(index, part.data)
-        given.blocks, given.angle_start, given.elements = self.blocks, self.angle_start, part.elements
+        given.blocks, given.angle_start, given.edges = self.blocks, self.angle_start, self.edges
+        given.elements = part.elements
         return given
 
     def strains(self, state: NetState, index: int, strain: wp.array, stress: wp.array | None = None) -> None:
@@ -177,17 +178,17 @@ class DeviceNet:
         Worlds that have not `moved` take over those of `kept` instead. The states may be the same. Launches alone, so that it
         can be captured.
         """
-        real = self.real
+        real, serial = self.real, arrays.serial(self.device)
         if not self.edges:
             return
         kept, moved = kept or before, moved or self.every
 
-        def launch(kernel, dim, inputs, outputs):
-            wp.launch(kernel, dim, inputs, outputs, device=self.device)
+        def launch(kernel, count, inputs, outputs):
+            arrays.sweep(kernel, count, inputs, outputs, self.device, worlds=self.worlds)
 
         launch(
-            frames.edge_kernel(real),
-            self.worlds * self.edges,
+            frames.edge_kernel(real, serial),
+            self.edges,
             [after.q, self.ends, self.blocks, moved, kept.frame, before.frame],
             [after.frame],
         )
@@ -195,7 +196,7 @@ class DeviceNet:
             if part.term.measure.advance:
                 given = self.elements(after, index)
                 given.lag = old
-                launch(frames.lag_kernel(part.term.measure, real), old.shape[1], [given, moved, same], [new])
+                launch(frames.lag_kernel(part.term.measure, real, serial), part.elements, [given, moved, same], [new])
         self.reset_spins(after.q)
 
     def reset_spins(self, blocks: wp.array) -> None:

@@ -70,7 +70,7 @@ class NetNewton:
         self.load = wp.array(np.tile(host.load, (worlds, 1)), dtype=V, device=device)
         self._weights, self._weight = make((3, worlds, blocks), self.real), make((3, worlds), self.real)
         self.change, self.noise, self.square = (self._weights[i] for i in range(3))
-        self.dots = make((worlds, blocks), self.real)
+        self.dots = make((worlds, arrays.takers(blocks, device)), self.real)
         self.mass = (
             make((worlds, blocks), block_inertia(self.real)) if drag else wp.array(host.mass, dtype=V, device=device)
         )
@@ -107,9 +107,10 @@ class NetNewton:
         spins = np.arange(host.nodes, blocks)
         spins = spins[~np.isin(spins, capless)]
         self.spins = wp.array(spins.astype(np.int32), dtype=int, device=device)
-        turning = len(ends) + len(spins)
+        turning = arrays.takers(len(ends) + len(spins), device)
         self.turns = make((worlds, turning), self.real)
-        self._sum, self._sum_linear = (Sums(worlds, blocks, dtype, device) for dtype in (self.real, self.linear))
+        self._sum = Sums(worlds, self.dots.shape[1], self.real, device)
+        self._sum_linear = Sums(worlds, blocks, self.linear, device)
         self._sum_weights = Sums(3 * worlds, blocks, self.real, device)
         self._largest = Sums(worlds, turning, self.real, device, largest=True)
         lengths = host.edge_lengths
@@ -203,11 +204,12 @@ class NetNewton:
         for index, (part, own, kernel) in enumerate(zip(self.net.sets, self.parts, self._evaluate, strict=True)):
             arrays.sweep(
                 kernel,
-                self.worlds * part.elements,
+                part.elements,
                 [self.net.elements(state, index, self.q, self.islands.rate), *self.islands.arrays],
                 [own["factor"], own["tension"], own["second"], own["gradient"], own["energy"], own["stiffness"]],
                 self.device,
                 128,
+                self.worlds,
             )
 
     def balance(self) -> None:
@@ -236,17 +238,24 @@ class NetNewton:
         self._assembly(self.mass, self.islands, self.matrix)
         if self.planes:
             self.planes.matrix(self.matrix, self.islands.wanted)
-        if self.chains:
+        if self.chains and not self._direct:
             self.chains.assemble(self.matrix, self.mass, self.islands)
 
     def direct(self) -> None:
         """Directions: by elimination where that is exact, else by conjugate gradients."""
-        wanted = self.islands.wanted
         if self._direct:
             self.negative.zero_()
             self.forcing.zero_()  # what is left is rounding
-            self.chains.prepare(self.matrix, self.fixed, wanted, self.negative)
-            self.chains.apply(self.matrix, self.right, wanted, self.direction, self.krylov_dots)
+            self.chains.direct(
+                self.matrix,
+                self.mass,
+                self.islands,
+                self.fixed,
+                self.right,
+                self.negative,
+                self.direction,
+                self.krylov_dots,
+            )
         else:
             self.iterate_pcg()
         if self._repeat:  # what was indefinite comes again, without second derivatives and compression
@@ -365,9 +374,8 @@ class NetNewton:
     def take(self) -> None:
         """Lengths of the steps along the directions."""
         blocks = self.net.blocks
-        arrays.sweep(
-            self._measure, self.all, [self.right, self.direction, self.islands.wanted, blocks], [self.dots], self.device
-        )
+        inputs = [self.right, self.direction, self.islands.wanted, blocks]
+        arrays.sweep(self._measure, blocks, inputs, [self.dots], self.device, worlds=self.worlds)
         self._sum(self.dots, self.decrease)
         self.measure_turns()
         wp.launch(
@@ -384,10 +392,11 @@ class NetNewton:
             self.planes.back(self.direction, self.islands.wanted)
         arrays.sweep(
             self._rotate,
-            self.turns.size,
+            len(self.ends) + len(self.spins),
             [self.q, self.direction, self.ends, self.spins, self.islands.wanted, self.net.blocks],
             [self.turns],
             self.device,
+            worlds=self.worlds,
         )
         self._largest(self.turns, self.turn)
 
@@ -395,10 +404,11 @@ class NetNewton:
         """Take the step that is to be taken."""
         arrays.sweep(
             self._move,
-            self.all,
+            self.net.blocks,
             [self.direction, self.islands.step_length, self.islands.todo, self.net.blocks],
             [self.base, self.q],
             self.device,
+            worlds=self.worlds,
         )
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:

@@ -57,13 +57,11 @@ class NetStep(PartStep):
     def attempt(self, before, after) -> None:
         """One solve of every world that has not finished the step, from state `before` to `after`."""
         solver, blocks, islands = self.newton, self.net.blocks, self.islands
-        arrays.sweep(
+        self._sweep(
             self._begin,
-            solver.all,
             [before.q, before.v, solver.held, self.drag.moves if self.drag else solver.mass]
             + [self.integrator._dt, self.damping, solver.outer, *islands.arrays, blocks],
             [solver.q, solver.base, solver.target],
-            self.model.wp_device,
         )
         start = self._start_frames(before)
         if self.motion:
@@ -75,7 +73,7 @@ class NetStep(PartStep):
         if self.energy:
             self.energy.judge(before, start)
         inputs = [solver.q, before.q, before.v, *islands.arrays, blocks]
-        arrays.sweep(self._finish, solver.all, inputs, [after.q, after.v], self.model.wp_device)
+        self._sweep(self._finish, inputs, [after.q, after.v])
         if self.drag:
             self.drag.settle(after, solver, islands)
         self.net.carry(start, after, kept=before, moved=islands.moved)
@@ -83,6 +81,10 @@ class NetStep(PartStep):
             self.motion.turn(islands, before, after)
         self.field.finish(islands.moved, before, after)
         self.net.update_strains(after)
+
+    def _sweep(self, kernel, inputs: list, outputs: list) -> None:
+        """Over the blocks of every world."""
+        arrays.sweep(kernel, self.net.blocks, inputs, outputs, self.model.wp_device, worlds=self.net.worlds)
 
     def _start_frames(self, before):
         """The state whose lagged data serve the solve: for the midpoint rule carried to the predicted midpoint.
@@ -100,12 +102,12 @@ class NetStep(PartStep):
     @property
     def own_kernels(self) -> list:
         """Kernels of an attempt, without those of the solver."""
-        real, net = self.model.types.real, self.net
+        real, net, serial = self.model.types.real, self.net, arrays.serial(self.net.device)
         kernels = [self._begin, self._finish]
-        kernels += [frames.edge_kernel(real)] if net.edges else []
+        kernels += [frames.edge_kernel(real, serial)] if net.edges else []
         kernels += [frames.reset_kernel(real)] if net.host.spins else []
         for part in net.sets:
-            kernels += [frames.lag_kernel(part.term.measure, real)] if part.term.measure.advance else []
+            kernels += [frames.lag_kernel(part.term.measure, real, serial)] if part.term.measure.advance else []
             kernels += [elements.term_kernels(part.term, real)[3]] if part.term.density.lagged else []
         return kernels
 
