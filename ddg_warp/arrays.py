@@ -64,6 +64,6 @@ def takers(count: int, device) -> int:
     return min(1, count) if serial(device) else count
 
 
-def sweep(kernel, count: int, inputs: list, outputs: list, device, threads: int = THREADS) -> None:
-    """Launch a kernel that goes over `count` things."""
-    wp.launch(kernel, takers(count, device), inputs, outputs, device=device, block_dim=threads)
+def sweep(kernel, count: int, inputs: list, outputs: list, device, threads: int = THREADS, worlds: int = 1) -> None:
+    """Launch a kernel that goes over `count` things, or as many of every world; see `kernels.element.share_function`."""
+    wp.launch(kernel, worlds * takers(count, device), inputs, outputs, device=device, block_dim=threads)

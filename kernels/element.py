@@ -157,6 +157,29 @@ def until_function(serial: bool):
 
 
 @cache
+def share_function(serial: bool):
+    """share(tid, count) -> (world, first): the world that a thread is in, and where it starts among `count` things that each has."""
+
+    @wp.func
+    def share(tid: int, count: int):
+        if wp.static(serial):
+            return tid, 0
+        world = tid / count
+        return world, tid - world * count
+
+    return share
+
+
+@wp.func
+def first_of(world: int, count: int):
+    """Index of the first entry of a world where each has `count`.
+
+    What is known not to be negative Warp's indexing need not wrap, which takes the CPU three instructions for every entry.
+    """
+    return wp.max(world * count, 0)
+
+
+@cache
 def gather_functions(kind: ChainKind, real):
     """Device functions that read the window, its lagged data and one parameter."""
     V = wp.types.vector(kind.dim, real)

@@ -153,7 +153,8 @@ class DeviceNet:
         given.lag, given.last, given.rate = state.lag[index], state.last[index], self.still if rate is None else rate
         (given.buffer, given.table), given.slots = part.parameters.arrays, part.slots
         given.data = state.data.get(index, part.data)
-        given.blocks, given.angle_start, given.elements = self.blocks, self.angle_start, part.elements
+        given.blocks, given.angle_start, given.edges = self.blocks, self.angle_start, self.edges
+        given.elements = part.elements
         return given
 
     def strains(self, state: NetState, index: int, strain: wp.array, stress: wp.array | None = None) -> None:
@@ -191,33 +192,32 @@ class DeviceNet:
 
     def _carry(self, before, after, q: wp.array, kept, moved: wp.array, wanted: int, within: int) -> None:
         """See `kernels.net.frames`."""
-        wp.launch(
-            frames.edge_kernel(self.real),
-            self.worlds * self.edges,
+        real, serial = self.real, arrays.serial(self.device)
+
+        def launch(kernel, count, inputs, outputs):
+            arrays.sweep(kernel, count, inputs, outputs, self.device, worlds=self.worlds)
+
+        launch(
+            frames.edge_kernel(real, serial),
+            self.edges,
             [q, self.ends, self.blocks, moved, wanted, kept.frame, before.frame],
             [after.frame],
-            device=self.device,
         )
         for index, (part, same, old, new) in enumerate(zip(self.sets, kept.lag, before.lag, after.lag, strict=True)):
             if part.term.measure.advance:
                 given = self.elements(after, index, q)
                 given.lag = old
-                wp.launch(
-                    frames.lag_kernel(part.term.measure, self.real),
-                    old.shape[1],
-                    [given, moved, wanted, within, same],
-                    [new],
-                    device=self.device,
-                )
+                kernel = frames.lag_kernel(part.term.measure, real, serial)
+                launch(kernel, part.elements, [given, moved, wanted, within, same], [new])
 
     @property
     def carries(self) -> list:
         """Kernels of `carry`, to load before a capture."""
-        real = self.real
-        measures = [part.term.measure for part in self.sets if part.term.measure.advance] if self.edges else []
-        kernels = [frames.lag_kernel(measure, real) for measure in measures]
-        kernels += [frames.edge_kernel(real)] if self.edges else []
-        return kernels + ([frames.reset_kernel(real)] if self.edges and self.host.spins else [])
+        if not self.edges:
+            return []
+        real, serial = self.real, arrays.serial(self.device)
+        kernels = [frames.lag_kernel(s.term.measure, real, serial) for s in self.sets if s.term.measure.advance]
+        return [*kernels, frames.edge_kernel(real, serial), *([frames.reset_kernel(real)] if self.host.spins else [])]
 
     def reset_spins(self, blocks: wp.array) -> None:
         """Zero the rotations of joints, or their rates."""

@@ -154,7 +154,8 @@ class Elements(Sample):
         table = [(row * self.COUNT, 1, 0) for row in range(len(data["buffer"]))]
         given.table, given.slots = put(np.array(table, np.int32), int), put(self.slots.astype(np.int32), int)
         given.data, given.blocks = put(data["constants"], real), self.slots.size
-        given.angle_start, given.elements = self.angle_start, self.COUNT
+        given.angle_start, given.edges = self.angle_start, self.angle_end - self.angle_start
+        given.elements = self.COUNT
         return given
 
     def _launch(self, which: int, real, **changed):

@@ -10,7 +10,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.drag import mass_type
-from ddg_warp.kernels.element import CPU_OPTIONS, until_function
+from ddg_warp.kernels.element import CPU_OPTIONS, first_of, until_function
 from ddg_warp.kernels.islands import CLAMPED, COEFFICIENT, ITERATION, WANTED
 from ddg_warp.kernels.matrix.block_band import block_functions
 from ddg_warp.kernels.matrix.sliced import product_functions, second_function
@@ -126,7 +126,7 @@ def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tupl
         for i in range(wp.static(nodes)):
             e = own.at[i, k, c]
             if e >= 0:
-                e += w * own.elements
+                e += first_of(w, own.elements)
                 for m in range(wp.static(n)):
                     a = row(own, m, i, e)
                     D += wp.outer(a, a)
@@ -165,6 +165,115 @@ def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tupl
 
 
 @cache
+def layout_type():
+    """Where the blocks of chains are: of places, see `ChainPlan`, and the positions of H_ii of blocks."""
+
+    @wp.struct
+    class Layout:
+        places: wp.array3d(dtype=int)
+        chain: wp.array2d(dtype=int)
+        count: wp.array(dtype=int)
+        held: wp.array2d(dtype=wp.uint8)
+        diagonal: wp.array(dtype=int)
+        positions: int
+
+    return Layout
+
+
+@cache
+def blocks_function(
+    terms: tuple[Term, ...], twist: bool, span: int, real, linear, exact_from: tuple[int | None, ...], drag: bool
+):
+    """blocks_at(...) -> D, E, F of a place on free dofs, those of the identity on others.
+
+    `exact_from` says of each term from which iteration on it has second derivatives, one for all, or None where it has none. Without
+    terms all blocks are taken from positions of H.
+    """
+    nb = 4 if twist else 3
+    parts = nb - 2  # blocks of a place: node, and angle of the edge ahead
+    B, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
+    Mass, Layout, Along = mass_type(real, drag), layout_type(), along_type(real, linear)
+    free_of, block_of = place_functions(twist, linear)
+    add = sum_function(terms, twist, real, linear, tuple(first is not None for first in exact_from)) if terms else None
+    begin = next((first for first in exact_from if first is not None), 0)
+
+    @wp.func
+    def blocks_at(
+        matrix: wp.array2d(dtype=linear),
+        mass: Mass,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        layout: Layout,
+        own0: Along,
+        own1: Along,
+        own2: Along,
+        own3: Along,
+        own4: Along,
+        own5: Along,
+        k: int,
+        c: int,
+        w: int,
+    ):
+        """Nodes and angles that have no position of their own have their inertia and drag from here.
+
+        Bits of `held` are dofs of a place that are held, or that it does not have.
+        """
+        D = M()
+        E = M()
+        F = M()
+        first = w * layout.positions
+        if wp.static(add is not None):
+            # what is wanted has been counted as an iteration since it was evaluated
+            late = flags[ITERATION, w] > wp.static(begin) and flags[CLAMPED, w] == 0
+            D, E, F = add(own0, own1, own2, own3, own4, own5, k, c, w, late)
+            for part in range(wp.static(parts)):
+                at = layout.places[part, k, c]
+                if at >= 0:
+                    if layout.diagonal[at] < 0:
+                        for d in range(3):
+                            if part == 0 or d == 0:
+                                if wp.static(drag):
+                                    inertia = mass[w, at].mass[d] * scalars[COEFFICIENT, w]
+                                else:
+                                    inertia = mass[at][d] * scalars[COEFFICIENT, w]
+                                D[3 * part + d, 3 * part + d] = D[3 * part + d, 3 * part + d] + linear(inertia)
+                        if wp.static(drag):
+                            resistance = mass[w, at].resistance
+                            for i in range(3):
+                                for j in range(3):
+                                    if part == 0 or i + j == 0:
+                                        D[3 * part + i, 3 * part + j] = D[3 * part + i, 3 * part + j] + linear(
+                                            resistance[i, j]
+                                        )
+        n = layout.count[c]
+        here = layout.held[k, c]
+        listed = layout.places.shape[0] > wp.static(parts)
+        if listed:
+            D += block_of(matrix, layout.places, wp.static(parts), k, c, first)
+        if here != wp.uint8(0):
+            f = free_of(here)
+            D = wp.cw_mul(D, wp.outer(f, f)) + wp.diag(B(linear(1.0)) - f)
+        if k + 1 < n and layout.chain[k + 1, c] == layout.chain[k, c]:
+            if listed:
+                E += block_of(matrix, layout.places, wp.static(parts + parts**2), k, c, first)
+            if (here | layout.held[k + 1, c]) != wp.uint8(0):
+                E = wp.cw_mul(E, wp.outer(free_of(here), free_of(layout.held[k + 1, c])))
+        else:
+            E = M()
+        if wp.static(span == 2):
+            if k + 2 < n and layout.chain[k + 2, c] == layout.chain[k, c]:
+                if listed:
+                    F += block_of(matrix, layout.places, wp.static(parts + 2 * parts**2), k, c, first)
+                if (here | layout.held[k + 2, c]) != wp.uint8(0):
+                    F = wp.cw_mul(F, wp.outer(free_of(here), free_of(layout.held[k + 2, c])))
+            else:
+                F = M()
+        return D, E, F
+
+    return blocks_at
+
+
+@cache
 def band_kernels(
     terms: tuple[Term, ...],
     twist: bool,
@@ -175,26 +284,15 @@ def band_kernels(
     drag: bool,
     serial: bool,
 ):
-    """assemble(...): blocks on free dofs, those of the identity on others; clear(...): positions of H that they took over;
-    product(...): H p on free dofs, and p . H p block by block.
-
-    `exact_from` says of each term from which iteration on it has second derivatives, one for all, or None where it has none. Without
-    terms all blocks are taken from positions of H.
+    """assemble(...): blocks of places, see `blocks_function`; clear(...): positions of H that they took over; product(...): H p on
+    free dofs, and p . H p block by block.
     """
     nb = 4 if twist else 3
-    parts = nb - 2  # blocks of a place: node, and angle of the edge ahead
-    H, B, M, Mass = (
-        wp.types.vector(3, linear),
-        wp.types.vector(nb, linear),
-        wp.types.matrix((nb, nb), linear),
-        mass_type(real, drag),
-    )
-    Along, until = along_type(real, linear), until_function(serial)
+    H, B = wp.types.vector(3, linear), wp.types.vector(nb, linear)
+    Mass, Layout, Along, until = mass_type(real, drag), layout_type(), along_type(real, linear), until_function(serial)
     _, store, _, _ = block_functions(nb, linear)
     times, free = product_functions(linear)
-    free_of, block_of = place_functions(twist, linear)
-    add = sum_function(terms, twist, real, linear, tuple(first is not None for first in exact_from)) if terms else None
-    begin = next((first for first in exact_from if first is not None), 0)
+    blocks_at = blocks_function(terms, twist, span, real, linear, exact_from, drag)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def assemble(
@@ -202,12 +300,7 @@ def band_kernels(
         mass: Mass,
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
-        places: wp.array3d(dtype=int),
-        chain: wp.array2d(dtype=int),
-        count: wp.array(dtype=int),
-        held: wp.array2d(dtype=wp.uint8),
-        diagonal: wp.array(dtype=int),
-        positions: int,
+        layout: Layout,
         own0: Along,
         own1: Along,
         own2: Along,
@@ -216,65 +309,17 @@ def band_kernels(
         own5: Along,
         blocks_out: wp.array3d(dtype=linear),
     ):
-        """Nodes and angles that have no position of their own have their inertia and drag from here.
-
-        Bits of `held` are dofs of a place that are held, or that it does not have.
-        """
         start, r = wp.tid()
-        w = r / count.shape[0]
-        c = r - w * count.shape[0]
-        if flags[WANTED, w] == 0 or start >= count[c]:
+        w = r / layout.count.shape[0]
+        c = r - w * layout.count.shape[0]
+        n = layout.count[c]
+        if flags[WANTED, w] == 0 or start >= n:
             return
-        for k in range(start, until(start, count[c])):
-            D = M()
-            E = M()
-            F = M()
-            if wp.static(add is not None):
-                # what is wanted has been counted as an iteration since it was evaluated
-                late = flags[ITERATION, w] > wp.static(begin) and flags[CLAMPED, w] == 0
-                D, E, F = add(own0, own1, own2, own3, own4, own5, k, c, w, late)
-                for part in range(wp.static(parts)):
-                    at = places[part, k, c]
-                    if at >= 0:
-                        if diagonal[at] < 0:
-                            for d in range(3):
-                                if part == 0 or d == 0:
-                                    if wp.static(drag):
-                                        inertia = mass[w, at].mass[d] * scalars[COEFFICIENT, w]
-                                    else:
-                                        inertia = mass[at][d] * scalars[COEFFICIENT, w]
-                                    D[3 * part + d, 3 * part + d] = D[3 * part + d, 3 * part + d] + linear(inertia)
-                            if wp.static(drag):
-                                resistance = mass[w, at].resistance
-                                for i in range(3):
-                                    for j in range(3):
-                                        if part == 0 or i + j == 0:
-                                            D[3 * part + i, 3 * part + j] = D[3 * part + i, 3 * part + j] + linear(
-                                                resistance[i, j]
-                                            )
-            here = held[k, c]
-            if places.shape[0] > wp.static(parts):
-                D += block_of(matrix, places, wp.static(parts), k, c, w * positions)
-            if here != wp.uint8(0):
-                f = free_of(here)
-                D = wp.cw_mul(D, wp.outer(f, f)) + wp.diag(B(linear(1.0)) - f)
+        for k in range(start, until(start, n)):
+            D, E, F = blocks_at(matrix, mass, flags, scalars, layout, own0, own1, own2, own3, own4, own5, k, c, w)
             store(blocks_out, 0, k, r, D)
-            if k + 1 < count[c] and chain[k + 1, c] == chain[k, c]:
-                if places.shape[0] > wp.static(parts):
-                    E += block_of(matrix, places, wp.static(parts + parts**2), k, c, w * positions)
-                if (here | held[k + 1, c]) != wp.uint8(0):
-                    E = wp.cw_mul(E, wp.outer(free_of(here), free_of(held[k + 1, c])))
-            else:
-                E = M()
             store(blocks_out, wp.static(nb**2), k, r, E)
             if wp.static(span == 2):
-                if k + 2 < count[c] and chain[k + 2, c] == chain[k, c]:
-                    if places.shape[0] > wp.static(parts):
-                        F += block_of(matrix, places, wp.static(parts + 2 * parts**2), k, c, w * positions)
-                    if (here | held[k + 2, c]) != wp.uint8(0):
-                        F = wp.cw_mul(F, wp.outer(free_of(here), free_of(held[k + 2, c])))
-                else:
-                    F = M()
                 store(blocks_out, wp.static(2 * nb**2), k, r, F)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)

@@ -84,33 +84,75 @@ def found_type(real, linear):
 
 
 @cache
-def residual_functions(real, linear, drag: bool):
-    """outer(...): loads, gravity, inertia and drag of a block; settle(...): its residual, and whether that balances."""
+def largest_function(real, size: int = 3):
+    """largest(v): the largest component by its absolute value, without those that are no numbers.
+
+    `wp.max` looks at both of a pair for what is none, which takes the CPU three times as long.
+    """
+    V = wp.types.vector(size, real)
+
+    @wp.func
+    def largest(v: V):
+        m = wp.abs(v[0])
+        for d in range(1, wp.static(size)):
+            a = wp.abs(v[d])
+            m = wp.where(a > m, a, m)
+        return m
+
+    return largest
+
+
+@cache
+def residual_functions(real, linear, drag: bool, angle: bool = False):
+    """outer(...): loads, gravity, inertia and drag of a block; settle(...): its residual, and whether that balances.
+
+    Of an `angle` of a rod, known as such, vectors have its one dof.
+    """
+    dofs = 1 if angle else 3
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
+    X, M, R = wp.types.vector(dofs, real), wp.types.matrix((3, 3), real), wp.types.matrix((dofs, dofs), real)
     Given, Found = given_type(real, drag), found_type(real, linear)
+    largest = largest_function(real, dofs)
+
+    @wp.func
+    def own(v: V):
+        """The dofs of a block."""
+        x = X()
+        for d in range(wp.static(dofs)):
+            x[d] = v[d]
+        return x
+
+    @wp.func
+    def square(m: M):
+        """What acts between them."""
+        if wp.static(angle):
+            return R(m[0, 0])
+        else:
+            return m
 
     @wp.func
     def outer(given: Given, i: int, k: int, w: int, c: real):
         """Force; its size and stiffness, the work along the step."""
-        x = given.q[i]
-        force = given.load[i]
+        x = own(given.q[i])
+        force = own(given.load[i])
         if wp.static(drag):
-            m = given.mass[w, k].mass
+            m = own(given.mass[w, k].mass)
         else:
-            m = given.mass[k]
-        if k < given.nodes:
-            force += wp.cw_mul(m, given.gravity[0])
-        inertia = wp.cw_mul(m, x - given.target[i]) * c
-        u = x - given.base[i]
+            m = own(given.mass[k])
+        if wp.static(not angle):
+            if k < given.nodes:
+                force += wp.cw_mul(m, given.gravity[0])
+        inertia = wp.cw_mul(m, x - own(given.target[i])) * c
+        u = x - own(given.base[i])
         change = wp.dot(u, inertia - wp.cw_mul(m, u) * (real(0.5) * c) - force)
-        stiff = c * wp.max(m)
+        stiff = c * largest(m)
         if wp.static(drag):
-            resistance = given.mass[w, k].resistance
-            held_back = resistance * (x - given.mass[w, k].carried)
+            resistance = square(given.mass[w, k].resistance)
+            held_back = resistance * (x - own(given.mass[w, k].carried))
             inertia += held_back
             change += wp.dot(u, held_back - resistance * u * real(0.5))
             stiff += wp.max(wp.get_diag(resistance))
-        return force - inertia, wp.max(wp.abs(force)), stiff, change
+        return force - inertia, largest(force), stiff, change
 
     @wp.func
     def settle(
@@ -121,7 +163,7 @@ def residual_functions(real, linear, drag: bool):
         i: int,
         k: int,
         w: int,
-        force: V,
+        force: X,
         size: real,
         stiff: real,
         change: real,
@@ -129,28 +171,35 @@ def residual_functions(real, linear, drag: bool):
     ):
         """See `kernels.balance` for the criterion."""
         mask = int(given.fixed[k])
-        length = wp.where(k < given.nodes, real(1.0), given.arm)
-        reach = wp.max(wp.abs(given.q[i])) + given.longest
-        if k >= given.nodes:
+        reach = largest(own(given.q[i])) + given.longest
+        length = real(1.0)
+        if wp.static(angle):
             reach += real(1.0)
-        limit = given.rtol * load_scale * given.allowed[i]
+            length = given.arm
+        else:
+            if k >= given.nodes:
+                reach += real(1.0)
+                length = given.arm
+        allowed = given.allowed[i]
+        limit = given.rtol * load_scale * allowed
         least = given.floor * (stiff * reach + size)
         found.least[i] = least
         r = H()
-        square = real(0.0)
-        largest = real(0.0)
-        for d in range(3):
+        total = real(0.0)
+        worst = real(0.0)
+        for d in range(wp.static(dofs)):
             if ((mask >> d) & 1) == 0:
-                largest = wp.max(largest, wp.abs(force[d]))
+                a = wp.abs(force[d])
+                worst = wp.where(a > worst, a, worst)
                 r[d] = linear(force[d])
-                square += force[d] * force[d]
-                if not wp.abs(force[d]) <= limit:
+                total += force[d] * force[d]
+                if not a <= limit:
                     flags[DROWNED, w] = 1
-                    if not wp.abs(force[d]) <= least:
+                    if not a <= least:
                         flags[UNBALANCED, w] = 1
         found.right[i] = r
-        found.ratio[w, k] = largest / given.allowed[i]
-        found.square[w, k] = square / (length * length)
+        found.ratio[w, k] = worst / allowed
+        found.square[w, k] = total / (length * length)
         found.change[w, k] = change
         found.noise[w, k] = noise + real(0.5) * size * reach
 
@@ -167,6 +216,7 @@ def balance_kernel(real, linear, drag: bool, serial: bool):
     Given, Found, F = given_type(real, drag), found_type(real, linear), wp.types.matrix((3, 3), real)
     until = until_function(serial)
     outer, settle = residual_functions(real, linear, drag)
+    largest = largest_function(real)
 
     @wp.func
     def force_of(own: Meeting, slot: int, e: int):
@@ -227,7 +277,7 @@ def balance_kernel(real, linear, drag: bool, serial: bool):
                     e = item // wp.static(ITEM) + w * own.elements
                     g = force_of(own, slot, e)
                     f += g
-                    large += wp.max(wp.abs(g))
+                    large += largest(g)
                     stiffness += own.stiffness[e]
                     if slot == 0:
                         new = own.energy[1 - accepted, e]

@@ -13,7 +13,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.element import CPU_OPTIONS, left_out_function, until_function
+from ddg_warp.kernels.element import CPU_OPTIONS, left_out_function, share_function, until_function
 from ddg_warp.kernels.islands import CLAMPED, ITERATION, SLOT, STALE, STATUS
 from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.terms import Term
@@ -39,6 +39,7 @@ def elements_type(real):
         data: R
         blocks: int
         angle_start: int
+        edges: int
         elements: int
 
     return Elements
@@ -57,7 +58,7 @@ def edge_ends(measure: Measure):
 
 @cache
 def place_function(measure: Measure, real):
-    """place(given, q, tid) -> (q, s) of an element."""
+    """place(given, q, w, e) -> (q, s) of element e of world w."""
     Elements = elements_type(real)
     V = wp.types.vector(3, real)
     Q, S, _, _ = measure.types(real)
@@ -66,10 +67,9 @@ def place_function(measure: Measure, real):
     points, (angle_row, spin_row, point_row), (first, second) = measure.points, measure.starts, edge_ends(measure)
 
     @wp.func
-    def place(given: Elements, q: wp.array(dtype=V), tid: int):
-        world = tid / given.elements
-        e = tid - world * given.elements
-        shift = world * given.blocks
+    def place(given: Elements, q: wp.array(dtype=V), w: int, e: int):
+        tid = e + w * given.elements
+        shift = w * given.blocks
         local = Q()
         for i in range(wp.static(edge_count)):
             edge = q[given.slots[second[i], e] + shift] - q[given.slots[first[i], e] + shift]
@@ -88,12 +88,7 @@ def place_function(measure: Measure, real):
                 local[wp.static(point_row) + 3 * i + d] = position[d]
         s = S()
         for i in range(wp.static(frames)):
-            # frames of a world lie behind each other, too
-            f = (
-                given.slots[wp.static(nodes) + i, e]
-                - given.angle_start
-                + world * (given.frame.shape[1] / given.rate.shape[0])
-            )
+            f = given.slots[wp.static(nodes) + i, e] - given.angle_start + w * given.edges
             for c in range(wp.static(FRAME)):
                 s[wp.static(FRAME) * i + c] = given.frame[c, f]
         for c in range(wp.static(own)):
@@ -109,7 +104,7 @@ def place_function(measure: Measure, real):
 
 @cache
 def functions(term: Term, real):
-    """gather(given, q, tid) -> (q, s, w, p) of an element; spread(f, slot) -> derivative with respect to the block of a slot."""
+    """gather(given, q, world, e) -> (q, s, w, p) of an element; spread(f, slot) -> derivative with respect to the block of a slot."""
     Elements = elements_type(real)
     measure, density = term.measure, term.density
     V = wp.types.vector(3, real)
@@ -123,10 +118,9 @@ def functions(term: Term, real):
     place = place_function(measure, real)
 
     @wp.func
-    def gather(given: Elements, q: wp.array(dtype=V), tid: int):
-        local, s = place(given, q, tid)
-        world = tid / given.elements
-        e = tid - world * given.elements
+    def gather(given: Elements, q: wp.array(dtype=V), world: int, e: int):
+        local, s = place(given, q, world, e)
+        tid = e + world * given.elements
         p = P()
         for i in range(wp.static(static_size)):
             row = i + 1
@@ -198,7 +192,8 @@ def term_kernels(term: Term, real, reverse: bool = False):
         energy_out: wp.array(dtype=real),
     ):
         e = wp.tid()
-        x, s, w, p = gather(given, given.q, e)
+        world = e / given.elements
+        x, s, w, p = gather(given, given.q, world, e - world * given.elements)
         energy_out[e] = w * energy_of(strains_of(x, s, w), p)
 
     @wp.kernel(module="unique", enable_backward=reverse)
@@ -207,7 +202,8 @@ def term_kernels(term: Term, real, reverse: bool = False):
         gradient_out: wp.array2d(dtype=V),
     ):
         e = wp.tid()
-        x, s, w, p = gather(given, given.q, e)
+        world = e / given.elements
+        x, s, w, p = gather(given, given.q, world, e - world * given.elements)
         f = gradient_at(x, s, w, p)
         for i in range(wp.static(slots_count)):
             gradient_out[i, e] = spread(f, i)
@@ -223,7 +219,8 @@ def term_kernels(term: Term, real, reverse: bool = False):
         `extra` (strains, elements) is added to the stresses that the second derivatives of the strains are weighted with.
         """
         e, column = wp.tid()
-        x, s, w, p = gather(given, given.q, e)
+        world = e / given.elements
+        x, s, w, p = gather(given, given.q, world, e - world * given.elements)
         v = Q()
         v[column] = real(1.0)
         more = E()
@@ -241,7 +238,8 @@ def term_kernels(term: Term, real, reverse: bool = False):
         stress_out: wp.array2d(dtype=real),
     ):
         e = wp.tid()
-        x, s, w, p = gather(given, given.q, e)
+        world = e / given.elements
+        x, s, w, p = gather(given, given.q, world, e - world * given.elements)
         strain = strains_of(x, s, w)
         for i in range(wp.static(n)):
             strain_out[i, e] = strain[i]
@@ -258,8 +256,9 @@ def term_kernels(term: Term, real, reverse: bool = False):
     ):
         """Stresses of the strains that a step gives to first order, e + J step."""
         tid = wp.tid()
-        x, s, w, p = gather(given, given.q, tid)
-        d, _s, _w, _p = gather(given, step, tid)
+        world = tid / given.elements
+        x, s, w, p = gather(given, given.q, world, tid - world * given.elements)
+        d, _s, _w, _p = gather(given, step, world, tid - world * given.elements)
         e, jacobian = jacobian_of(x, s, w)
         stress = slope_of(e + jacobian * d, p)
         for i in range(wp.static(n)):
@@ -317,7 +316,7 @@ def evaluate_kernel(term: Term, real, linear, exact_from: int | None = None, loc
     Of terms whose measure has second derivatives `second_out` holds, from iteration `exact_from` on, what F and the geometric
     stiffness leave out of the exact Hessian, packed over the local dofs; before, and in `clamped` worlds, it is not written.
     """
-    Elements, until = elements_type(real), until_function(serial)
+    Elements, share, until = elements_type(real), share_function(serial), until_function(serial)
     measure, density = term.measure, term.density
     V, F = wp.types.vector(3, real), wp.types.vector(3, linear)
     Q, S, E, _ = measure.types(real)
@@ -373,12 +372,12 @@ def evaluate_kernel(term: Term, real, linear, exact_from: int | None = None, loc
         energy_out: wp.array2d(dtype=real),
         stiffness_out: wp.array(dtype=linear),
     ):
-        start = wp.tid()
-        for tid in range(start, until(start, stiffness_out.shape[0])):
-            world = tid / given.elements
-            if flags[STATUS, world] != 0:
-                continue
-            x, s, w, p = gather(given, given.q, tid)
+        world, start = share(wp.tid(), given.elements)
+        if flags[STATUS, world] != 0:
+            return
+        for element in range(start, until(start, given.elements)):
+            tid = element + world * given.elements
+            x, s, w, p = gather(given, given.q, world, element)
             if wp.static(stale is not None):
                 if stale(x, s):
                     flags[STALE, world] = 1

@@ -34,9 +34,9 @@ def element_kernel(term: Term, real, linear):
         w = tid / given.elements
         if scalars[PROGRESS, w] >= real(1.0):
             return
-        b, s, weight, p = gather(given, given.q, tid)
-        a, _s, _w, _p = gather(given, q0, tid)
         e = tid - w * given.elements
+        b, s, weight, p = gather(given, given.q, w, e)
+        a, _s, _w, _p = gather(given, q0, w, e)
         reach = wp.max(wp.abs(given.q[given.slots[0, e] + w * given.blocks]))
         rows = balance(a, s, b, s, weight, p, reach, floor)
         least = floor * reach

@@ -6,7 +6,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import outcome
-from ddg_warp.kernels.element import CPU_OPTIONS, until_function
+from ddg_warp.kernels.element import CPU_OPTIONS, share_function, until_function
 from ddg_warp.kernels.islands import (
     ACTIVE,
     CAUTIOUS,
@@ -43,7 +43,7 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool):
     """
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     balanced, decide = judge_functions(renews, real)
-    until = until_function(serial)
+    share, until = share_function(serial), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def judge(
@@ -126,12 +126,15 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool):
         blocks: int,
         dots_out: wp.array2d(dtype=real),
     ):
-        """r . d block by block."""
-        start = wp.tid()
-        for i in range(start, until(start, right.shape[0])):
-            w = i / blocks
-            if wanted[w] != 0:
-                dots_out[w, i - w * blocks] = real(wp.dot(right[i], direction[i]))
+        """r . d of the blocks that a thread takes."""
+        w, start = share(wp.tid(), blocks)
+        if wanted[w] == 0:
+            return
+        total = real(0.0)
+        for k in range(start, until(start, blocks)):
+            i = k + w * blocks
+            total += real(wp.dot(right[i], direction[i]))
+        dots_out[w, start] = total
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def rotate(
@@ -143,23 +146,26 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool):
         blocks: int,
         turn_out: wp.array2d(dtype=real),
     ):
-        """Squared turn of every edge, then of the angles and joints `spins`, by a whole step."""
-        start = wp.tid()
-        for i in range(start, until(start, turn_out.shape[0] * turn_out.shape[1])):
-            count = ends.shape[0] + spins.shape[0]
-            w = i / count
-            if wanted[w] == 0:
-                continue
-            k = i - w * count
+        """Largest squared turn, by a whole step, of what a thread takes: edges, then the angles and joints `spins`."""
+        count = ends.shape[0] + spins.shape[0]
+        w, start = share(wp.tid(), count)
+        if wanted[w] == 0:
+            return
+        shift = w * blocks
+        largest = real(0.0)
+        for k in range(start, until(start, count)):
+            turn = real(0.0)
             if k >= ends.shape[0]:
-                angle = direction[spins[k - ends.shape[0]] + w * blocks]
-                turn_out[w, k] = real(wp.dot(angle, angle))
-                continue
-            a = ends[k, 0] + w * blocks
-            b = ends[k, 1] + w * blocks
-            e = q[b] - q[a]
-            d = direction[b] - direction[a]
-            turn_out[w, k] = real(wp.dot(d, d)) / wp.length_sq(e)
+                angle = direction[spins[k - ends.shape[0]] + shift]
+                turn = real(wp.dot(angle, angle))
+            else:
+                a = ends[k, 0] + shift
+                b = ends[k, 1] + shift
+                e = q[b] - q[a]
+                d = direction[b] - direction[a]
+                turn = real(wp.dot(d, d)) / wp.length_sq(e)
+            largest = wp.where(turn > largest, turn, largest)
+        turn_out[w, start] = largest
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def take(
@@ -201,15 +207,16 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool):
         q: wp.array(dtype=V),
     ):
         """Straight along the direction: a first step from the iterate, which becomes the base, a shortened one from the base."""
-        start = wp.tid()
-        for i in range(start, until(start, q.shape[0])):
-            w = i / blocks
-            if todo[w] != wp.static(PLACE) and todo[w] != wp.static(STRAIGHT):
-                continue
+        w, start = share(wp.tid(), blocks)
+        if todo[w] != wp.static(PLACE) and todo[w] != wp.static(STRAIGHT):
+            return
+        length = step_length[w]
+        for k in range(start, until(start, blocks)):
+            i = k + w * blocks
             if halvings[w] == 0:
                 base[i] = q[i]
             d = direction[i]
-            q[i] = base[i] + V(real(d[0]), real(d[1]), real(d[2])) * step_length[w]
+            q[i] = base[i] + V(real(d[0]), real(d[1]), real(d[2])) * length
 
     return judge, measure, rotate, take, move
 
@@ -233,7 +240,7 @@ def freeze_kernel():
 def step_kernels(real, midpoint: bool, serial: bool):
     """begin(...) and finish(...) of a time step; see `kernels.step` for the schemes."""
     length, restart = attempt_functions(real, midpoint)
-    until = until_function(serial)
+    share, until = share_function(serial), until_function(serial)
     V = wp.types.vector(3, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -253,19 +260,19 @@ def step_kernels(real, midpoint: bool, serial: bool):
         target_out: wp.array(dtype=V),
     ):
         """Starts a solve from the predictor; dofs without mass, whose rates mean nothing, start from where they are."""
-        start = wp.tid()
-        for i in range(start, until(start, q_out.shape[0])):
-            w = i / blocks
-            k = i - w * blocks
-            if k == 0:
-                flags[MOVED, w] = wp.where(scalars[PROGRESS, w] < real(1.0), 1, 0)
-            if scalars[PROGRESS, w] >= real(1.0):
-                continue
-            s = length(scalars, w, dt[w])
-            rate = real(1.0) / s
-            coefficient = rate * (rate + damping[0])
-            if k == 0:
-                restart(flags, scalars, w, rate, coefficient, outer[w])
+        w, start = share(wp.tid(), blocks)
+        ahead = scalars[PROGRESS, w] < real(1.0)
+        if start == 0:
+            flags[MOVED, w] = wp.where(ahead, 1, 0)
+        if not ahead:
+            return
+        s = length(scalars, w, dt[w])
+        rate = real(1.0) / s
+        coefficient = rate * (rate + damping[0])
+        if start == 0:
+            restart(flags, scalars, w, rate, coefficient, outer[w])
+        for k in range(start, until(start, blocks)):
+            i = k + w * blocks
             mask = int(fixed[k])
             here = q0[i]
             v = v0[i]
@@ -289,15 +296,15 @@ def step_kernels(real, midpoint: bool, serial: bool):
         v_out: wp.array(dtype=V),
     ):
         """Blocks and their velocities at the end of the step, of the worlds that converged."""
-        first = wp.tid()
-        for i in range(first, until(first, q_out.shape[0])):
-            w = i / blocks
+        w, first = share(wp.tid(), blocks)
+        ahead = scalars[PROGRESS, w] < real(1.0) and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
+        if first == 0:
+            flags[MOVED, w] = wp.where(ahead, 1, 0)
+        for k in range(first, until(first, blocks)):
+            i = k + w * blocks
             start = q0[i]
             v = v0[i]
             end = start
-            ahead = scalars[PROGRESS, w] < real(1.0) and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
-            if i == w * blocks:
-                flags[MOVED, w] = wp.where(ahead, 1, 0)
             if ahead:
                 end = q[i]
                 change = (end - start) * scalars[RATE, w]

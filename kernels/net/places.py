@@ -7,9 +7,9 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.element import CPU_OPTIONS, until_function
+from ddg_warp.kernels.element import CPU_OPTIONS, first_of, until_function
 from ddg_warp.kernels.islands import COEFFICIENT, LOAD_SCALE, SLOT, STATUS
-from ddg_warp.kernels.net.balance import found_type, given_type, residual_functions
+from ddg_warp.kernels.net.balance import found_type, given_type, largest_function, residual_functions
 from ddg_warp.kernels.net.elements import part_function
 from ddg_warp.kernels.terms import Term
 
@@ -67,7 +67,7 @@ def force_function(terms: tuple[Term, ...], real, linear):
     measure, first, one = terms[-1].measure, len(terms) == 1, one_function(len(terms) - 1, real, linear)
     V, Along = wp.types.vector(3, real), along_type(real, linear)
     nodes, angles = measure.nodes, measure.angles
-    part = part_function(measure, real)
+    part, largest = part_function(measure, real), largest_function(real)
     before = None if first else force_function(terms[:-1], real, linear)
 
     @wp.func
@@ -99,11 +99,11 @@ def force_function(terms: tuple[Term, ...], real, linear):
         for i in range(wp.static(nodes)):
             e = own.at[i, k, c]
             if e >= 0:
-                e += w * own.elements
+                e += first_of(w, own.elements)
                 f = part(own.gradient, 0, i, e)
                 stiffness = real(own.stiffness[e])
                 force += f
-                size += wp.max(wp.abs(f))
+                size += largest(f)
                 stiff += stiffness
                 if i == 0:
                     new = own.energy[1 - accepted, e]
@@ -124,8 +124,9 @@ def force_function(terms: tuple[Term, ...], real, linear):
 def place_kernel(terms: tuple[Term, ...], twist: bool, real, linear, drag: bool, serial: bool):
     """balance(...) of the nodes and angles of places, but for those `elsewhere`; see `kernels.matrix.sliced`."""
     Along, Given, Found = along_type(real, linear), given_type(real, drag), found_type(real, linear)
-    V, until = wp.types.vector(3, real), until_function(serial)
+    M, until = wp.types.vector(1, real), until_function(serial)
     outer, settle = residual_functions(real, linear, drag)
+    outer_of_angle, settle_angle = residual_functions(real, linear, drag, True)
     collect = force_function(terms, real, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -152,6 +153,7 @@ def place_kernel(terms: tuple[Term, ...], twist: bool, real, linear, drag: bool,
         load_scale = scalars[LOAD_SCALE, w]
         coefficient = scalars[COEFFICIENT, w]
         accepted = flags[SLOT, w]
+        shift = first_of(w, given.blocks)
         for k in range(start, until(start, count[c])):
             f, size, stiff, moment, size_too, stiff_too, change, noise = collect(
                 own0, own1, own2, own3, own4, own5, k, c, w, accepted
@@ -159,7 +161,7 @@ def place_kernel(terms: tuple[Term, ...], twist: bool, real, linear, drag: bool,
             node = places[0, k, c]
             if node >= 0:
                 if elsewhere[node] == wp.uint8(0):
-                    i = node + w * given.blocks
+                    i = node + shift
                     force, large, rigid, work = outer(given, i, node, w, coefficient)
                     settle(
                         given,
@@ -179,9 +181,9 @@ def place_kernel(terms: tuple[Term, ...], twist: bool, real, linear, drag: bool,
                 angle = places[1, k, c]
                 if angle >= 0:
                     if elsewhere[angle] == wp.uint8(0):
-                        j = angle + w * given.blocks
-                        turning, large_too, rigid_too, work_too = outer(given, j, angle, w, coefficient)
-                        settle(
+                        j = angle + shift
+                        turning, large_too, rigid_too, work_too = outer_of_angle(given, j, angle, w, coefficient)
+                        settle_angle(
                             given,
                             found,
                             flags,
@@ -189,7 +191,7 @@ def place_kernel(terms: tuple[Term, ...], twist: bool, real, linear, drag: bool,
                             j,
                             angle,
                             w,
-                            turning - V(moment, real(0.0), real(0.0)),
+                            turning - M(moment),
                             large_too + size_too,
                             rigid_too + stiff_too,
                             work_too,

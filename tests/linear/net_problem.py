@@ -132,6 +132,8 @@ class Problem:
         newton.evaluate(self.state.net)
         newton.balance()
         newton.assemble()
+        if newton.chains and newton.chains.exact:  # which assembles as it solves
+            newton.chains.assemble(newton.matrix, newton.mass, newton.islands)
         return self
 
     def iterate(self, forcing: float):
@@ -144,9 +146,11 @@ class Problem:
         """H of a world, from its slices and bands, if these have not been factored in place; of held dofs they hold the identity."""
         table, N = self.newton.system, self.blocks
         rows, columns = table.rows.numpy(), table.columns.numpy()
-        values = self.newton.matrix.numpy().reshape(9, 2, -1)[:, world]
+        values = self.newton.matrix.numpy().reshape(9, 2, -1)[:, world].copy()
         padding = rows < 0
         assert not values[:, padding].any()
+        if self.newton.chains and self.newton.chains.exact:
+            values[:, self.newton.chains.plan.taken] = 0.0  # nobody clears them
         H = np.zeros((N, 3, N, 3))
         for p in np.flatnonzero(~padding):
             H[rows[p], :, columns[p]] += values[:, p].reshape(3, 3)

@@ -7,10 +7,11 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.matrix.bands import band_kernels
+from ddg_warp.kernels.matrix.bands import band_kernels, layout_type
 from ddg_warp.kernels.matrix.sliced import SETS
 from ddg_warp.kernels.net.places import along_type, place_kernel
 from ddg_warp.kernels.solve import elimination, joints
+from ddg_warp.kernels.solve.walk import walk_kernel
 from ddg_warp.solve.choice import long_and_few
 from ddg_warp.solve.net.plan import ChainPlan
 from ddg_warp.solve.reduction import CyclicReduction
@@ -41,8 +42,13 @@ class Chains:
         self.banded = banded and len(self.along) <= SETS
         self.kept = self.plan.where >= 0 if self.banded else None
 
-    def bind(self, table, written: list[dict], real, linear, exact_from: tuple, drag: bool) -> None:
-        """Take the `NetSystem` of the net, without what bands keep, and what the elements of all sets write; see `Assembly`."""
+    def bind(
+        self, table, written: list[dict], real, linear, exact_from: tuple, drag: bool, reuse: bool = False
+    ) -> None:
+        """Take the `NetSystem` of the net, without what bands keep, and what the elements of all sets write; see `Assembly`.
+
+        With `reuse` one matrix serves several directions.
+        """
         self.table, net, plan = table, self.net, self.plan
         plan.bind(net.host, table.rows.numpy(), table.columns.numpy(), self.kept)
         self.exact = self.banded and plan.complete
@@ -76,6 +82,7 @@ class Chains:
         self.joints, self.joint_rows = len(plan.pairs), 2 * len(plan.pairs)
         self.joint_row, self.pairs, self.own = put(plan.joint_row), put(plan.pairs), put(plan.own)
         self.colour, self.taken = put(plan.colour), put(plan.taken)
+        self._clears = self.banded and not self.exact and plan.taken.size > 0  # for products, which are of all of H
         self.starts, self.items = map(put, plan.of_places)
         self.joint_starts, self.joint_items = map(put, plan.of_joints)
         self.moved = wp.zeros(max(1, worlds * self.joint_rows), dtype=H, device=device)
@@ -87,6 +94,10 @@ class Chains:
         self._assemble, self._clear, self._product = band_kernels(
             terms, plan.twist, plan.span, real, linear, late, drag, serial
         )
+        self._layout = layout_type()()
+        for name in ("places", "chain", "count", "held"):
+            setattr(self._layout, name, getattr(self, name))
+        self._layout.diagonal, self._layout.positions = table.diagonal, table.positions
         own = [self._elements(i, written[i], real, linear) for i in sets] or [along_type(real, linear)()]
         self._own = own + own[-1:] * (SETS - len(own))
         if self.banded:
@@ -97,18 +108,23 @@ class Chains:
         made = elimination.chain_kernels(plan.twist, plan.span, linear, plan.size, serial)
         self._factorise, self._load, self._solve, self._solve_all, self._follow, self._finish, *self._columns = made
         self._measure, self._meet = joints.joint_kernels(linear) if self.joints else (None, None)
+        self._walk = None
+        if self.exact and serial and not (self.reduction or reuse):
+            self._walk = walk_kernel(terms, plan.twist, plan.span, real, linear, late, drag, self.joints > 0)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [self._assemble, self._load, self._finish]
+        own = [self._walk] if self._walk else [self._assemble]
+        own += [self._load] if self.coupled or not self._walk else []
+        own += [self._finish] if self.joints or not self._walk else []
         if self.reduction:
             own += [*self._columns, *self.reduction.kernels]
         else:
-            own += [(self._factorise, SERIAL), (self._solve, SERIAL)]
+            own += [] if self._walk else [(self._factorise, SERIAL), (self._solve, SERIAL)]
             own += [(self._solve_all, SERIAL)] if self.coupled else []
         own += [self._balance] if self.banded else []
-        own += [self._clear] if self.banded and self.taken.size else []
+        own += [self._clear] if self._clears else []
         own += [self._product] if self.banded and not self.exact else []
         own += [self._follow] if self.met is not None else []
         return own + ([self._measure, self._meet] if self.joints else [])
@@ -133,17 +149,14 @@ class Chains:
 
     def assemble(self, matrix: wp.array, mass: wp.array, islands) -> None:
         """Blocks of the chains of the worlds that want a direction."""
-        table = self.table
         self._launch(
             self._assemble,
             (arrays.takers(self.longest, self.device), self.columns),
-            [matrix, mass, *islands.arrays, self.places, self.chain, self.count, self.held]
-            + [table.diagonal, table.positions]
-            + self._own,
+            [matrix, mass, *islands.arrays, self._layout, *self._own],
             [self.bands],
         )
-        if self.banded and self.taken.size:
-            inputs = [self.taken, islands.wanted, table.positions]
+        if self._clears:
+            inputs = [self.taken, islands.wanted, self.table.positions]
             self._launch(self._clear, (self.taken.size, self.net.worlds), inputs, [matrix])
 
     def product(self, matrix, p: wp.array, fixed, wanted, product: wp.array, dots: wp.array) -> None:
@@ -157,41 +170,60 @@ class Chains:
             [product, dots],
         )
 
+    def direct(self, matrix, mass, islands, anew, fixed, right, lost: wp.array, z: wp.array, dots: wp.array) -> None:
+        """H^-1 r of the worlds that want a direction, where this is exact; raises `lost` where H is indefinite.
+
+        H is new in the islands `anew`.
+        """
+        if not self._walk:
+            self.assemble(matrix, mass, anew)
+            self.prepare(matrix, fixed, anew.wanted, lost)
+            self.apply(matrix, right, islands.wanted, z, dots)
+            return
+        self._launch(
+            self._walk,
+            self.columns,
+            [matrix, mass, *islands.arrays, self._layout, *self._own, right, self.net.blocks],
+            [self.factors, self.values, lost, z],
+        )
+        if self.joints:
+            self._prepare_joints(matrix, fixed, islands.wanted, lost)
+            self._apply_joints(matrix, right, islands.wanted, z, dots)
+
     def prepare(self, matrix: wp.array, fixed: wp.array, wanted: wp.array, lost: wp.array) -> None:
         """Factors of chains and joints of the worlds that want a direction; raises `lost` where one of them is indefinite."""
-        table, plan, net = self.table, self.plan, self.net
         self._lost, self._reduced = lost, False
         if not self.reduction:
             self._launch(self._factorise, self.columns, [self.bands, self.count, wanted], [self.factors, lost], SERIAL)
-        if not self.joints:
-            return
+        if self.joints:
+            self._prepare_joints(matrix, fixed, wanted, lost)
+
+    def apply(self, matrix, residual, wanted, z: wp.array, dots: wp.array) -> None:
+        """z of the blocks of rods and joints from the residual, where block Jacobi has left its own, and r . z block by block."""
+        self._eliminate(matrix, wanted, self.values, residual, None)
+        self._apply_joints(matrix, residual, wanted, z, dots)
+
+    def _prepare_joints(self, matrix, fixed, wanted, lost: wp.array) -> None:
+        """Factors of joints, once those of chains are there."""
         if self.coupled:
             self._eliminate(matrix, wanted, self.responses, None, self.units)
         self._launch(
             self._measure,
-            net.worlds * self.joints,
-            [matrix, *self._joint_inputs(self.responses), self.own, self.colour, plan.size, fixed, wanted]
-            + [table.positions],
+            self.net.worlds * self.joints,
+            [matrix, *self._joint_inputs(self.responses), self.own, self.colour, self.plan.size, fixed, wanted]
+            + [self.table.positions],
             [self.parts, lost],
         )
 
-    def apply(self, matrix, residual, wanted, z: wp.array, dots: wp.array) -> None:
-        """z of the blocks of rods and joints from the residual, where block Jacobi has left its own, and r . z block by block."""
+    def _apply_joints(self, matrix, residual, wanted, z: wp.array, dots: wp.array) -> None:
+        """z from what chains make of the residual on their own."""
         net = self.net
-        self._eliminate(matrix, wanted, self.values, residual, None)
         if self.joints:
             self._launch(
                 self._meet,
                 net.worlds * self.joints,
-                [
-                    matrix,
-                    *self._joint_inputs(self.values),
-                    self.parts,
-                    residual,
-                    wanted,
-                    net.blocks,
-                    self.table.positions,
-                ],
+                [matrix, *self._joint_inputs(self.values), self.parts, residual, wanted, net.blocks]
+                + [self.table.positions],
                 [self.moved],
             )
         if self.met is not None:

@@ -81,7 +81,7 @@ class NetNewton:
         self.load = wp.array(np.tile(host.load, (worlds, 1)), dtype=V, device=device)
         self._weights, self._weight = make((3, worlds, blocks), self.real), make((3, worlds), self.real)
         self.change, self.noise, self.square = (self._weights[i] for i in range(3))
-        self.dots = make((worlds, blocks), self.real)
+        self.dots = make((worlds, arrays.takers(blocks, device)), self.real)
         self.mass = (
             make((worlds, blocks), block_inertia(self.real)) if drag else wp.array(host.mass, dtype=V, device=device)
         )
@@ -121,9 +121,10 @@ class NetNewton:
         spins = np.arange(host.nodes, blocks)
         spins = spins[~np.isin(spins, capless)]
         self.spins = wp.array(spins.astype(np.int32), dtype=int, device=device)
-        turning = len(ends) + len(spins)
+        turning = arrays.takers(len(ends) + len(spins), device)
         self.squares = make((worlds, turning), self.real)
-        self._sum, self._sum_linear = (Sums(worlds, blocks, dtype, device) for dtype in (self.real, self.linear))
+        self._sum = Sums(worlds, self.dots.shape[1], self.real, device)
+        self._sum_linear = Sums(worlds, blocks, self.linear, device)
         self._sum_weights = Sums(3 * worlds, blocks, self.real, device)
         self._largest = Sums(worlds, turning, self.real, device, largest=True)
         lengths = host.edge_lengths
@@ -133,7 +134,7 @@ class NetNewton:
             for part, *kind in zip(net.sets, self.exact_from, self.local, strict=True)
         ]
         if self.chains:
-            self.chains.bind(self.system, self.parts, self.real, self.linear, self.exact_from, drag)
+            self.chains.bind(self.system, self.parts, self.real, self.linear, self.exact_from, drag, reuse)
         self._direct = self.chains is not None and self.chains.exact
         fails = self.psd == "none"
         repeats = not reuse and (fails or any(exact) or self._direct)
@@ -234,11 +235,12 @@ class NetNewton:
         for index, (part, own, kernel) in enumerate(zip(self.net.sets, self.parts, self._evaluate, strict=True)):
             arrays.sweep(
                 kernel,
-                self.worlds * part.elements,
+                part.elements,
                 [self.net.elements(state, index, self.q, self.islands.rate), *self.islands.arrays],
                 [own["factor"], own["tension"], own["second"], own["gradient"], own["energy"], own["stiffness"]],
                 self.device,
                 128,
+                self.worlds,
             )
 
     def balance(self) -> None:
@@ -268,33 +270,41 @@ class NetNewton:
         self._assembly(self.mass, anew, self.matrix)
         if self.planes:
             self.planes.matrix(self.matrix, anew.wanted)
-        if self.chains:
+        if self.chains and not self._direct:
             self.chains.assemble(self.matrix, self.mass, anew)
 
     def direct(self) -> None:
         """Directions: by elimination where that is exact, else by conjugate gradients."""
-        wanted = self.islands.wanted
         if self._direct:
             self.negative.zero_()
             self.forcing.zero_()  # what is left is rounding
-            self.chains.prepare(self.matrix, self.fixed, self._anew, self.negative)
-            self.chains.apply(self.matrix, self.right, wanted, self.direction, self.krylov_dots)
+            self.chains.direct(
+                self.matrix,
+                self.mass,
+                self.islands,
+                self._anew,
+                self.fixed,
+                self.right,
+                self.negative,
+                self.direction,
+                self.krylov_dots,
+            )
         else:
             self.iterate_pcg()
         if self._repeat:  # what was indefinite comes again, without second derivatives and compression
             wp.launch(self._repeat, self.worlds, [1, *self.islands.arrays, self.negative], device=self.device)
 
     @property
-    def _anew(self) -> wp.array:
-        """Worlds whose matrix is new."""
-        return (self.frozen.islands if self.frozen else self.islands).wanted
+    def _anew(self) -> Islands:
+        """Those whose matrix is new."""
+        return self.frozen.islands if self.frozen else self.islands
 
     def iterate_pcg(self) -> None:
         """Directions by conjugate gradients."""
         table, blocks = self.system, self.net.blocks
         self._launch(
             self._invert,
-            [self.matrix, table.diagonal, self.fixed, self._anew, blocks, table.positions],
+            [self.matrix, table.diagonal, self.fixed, self._anew.wanted, blocks, table.positions],
             [self.inverse],
         )
         self._launch(
@@ -303,9 +313,9 @@ class NetNewton:
             [self.rest, self.direction, self.p, self.krylov_dots],
         )
         if self.chains:
-            self.chains.prepare(self.matrix, self.fixed, self._anew, self._unread[0])
+            self.chains.prepare(self.matrix, self.fixed, self._anew.wanted, self._unread[0])
         if self.levels:
-            self.levels.prepare(self.matrix, self.fixed, self._anew)
+            self.levels.prepare(self.matrix, self.fixed, self._anew.wanted)
         self.precondition(self.p)
         self._sum_linear(self.krylov_dots, self.total)
         self.busy.zero_()
@@ -402,9 +412,8 @@ class NetNewton:
     def take(self) -> None:
         """Lengths of the steps along the directions."""
         blocks = self.net.blocks
-        arrays.sweep(
-            self._measure, self.all, [self.right, self.direction, self.islands.wanted, blocks], [self.dots], self.device
-        )
+        inputs = [self.right, self.direction, self.islands.wanted, blocks]
+        arrays.sweep(self._measure, blocks, inputs, [self.dots], self.device, worlds=self.worlds)
         self._sum(self.dots, self.decrease)
         self.measure_turns()
         wp.launch(
@@ -421,10 +430,11 @@ class NetNewton:
             self.planes.back(self.direction, self.islands.wanted)
         arrays.sweep(
             self._rotate,
-            self.squares.size,
+            len(self.ends) + len(self.spins),
             [self.q, self.direction, self.ends, self.spins, self.islands.wanted, self.net.blocks],
             [self.squares],
             self.device,
+            worlds=self.worlds,
         )
         self._largest(self.squares, self.turn)
 
@@ -433,10 +443,11 @@ class NetNewton:
         islands = self.islands
         arrays.sweep(
             self._move,
-            self.all,
+            self.net.blocks,
             [self.direction, islands.step_length, islands.todo, islands.halvings, self.net.blocks],
             [self.base, self.q],
             self.device,
+            worlds=self.worlds,
         )
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:

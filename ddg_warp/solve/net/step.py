@@ -58,13 +58,11 @@ class NetStep(PartStep):
     def attempt(self, before, after) -> None:
         """One solve of every world that has not finished the step, from state `before` to `after`."""
         solver, blocks, islands = self.newton, self.net.blocks, self.islands
-        arrays.sweep(
+        self._sweep(
             self._begin,
-            solver.all,
             [before.q, before.v, solver.held, self.drag.moves if self.drag else solver.mass]
             + [self.integrator._dt, self.damping, solver.outer, *islands.arrays, blocks],
             [solver.q, solver.base, solver.target],
-            self.model.wp_device,
         )
         if solver.turns:
             solver.turns.predict()
@@ -78,7 +76,7 @@ class NetStep(PartStep):
         if self.energy:
             self.energy.judge(before, start)
         inputs = [solver.q, before.q, before.v, *islands.arrays, blocks]
-        arrays.sweep(self._finish, solver.all, inputs, [after.q, after.v], self.model.wp_device)
+        self._sweep(self._finish, inputs, [after.q, after.v])
         if self.drag:
             self.drag.settle(after, solver, islands)
         self.net.carry(start, after, kept=before, moved=islands.moved)
@@ -86,6 +84,10 @@ class NetStep(PartStep):
             self.motion.turn(islands, before, after)
         self.field.finish(islands.moved, before, after)
         self.net.update_strains(after)
+
+    def _sweep(self, kernel, inputs: list, outputs: list) -> None:
+        """Over the blocks of every world."""
+        arrays.sweep(kernel, self.net.blocks, inputs, outputs, self.model.wp_device, worlds=self.net.worlds)
 
     def _start_frames(self, before):
         """The state whose lagged data serve the solve, which may renew them: for the midpoint rule carried to the predicted midpoint.

@@ -1,0 +1,131 @@
+"""The chains of a net on the CPU: a thread takes one from what its elements write to the solution.
+
+Blocks of places are summed, eliminated and substituted in one walk, as in `sweep`, and H is never stored. A GPU has a thread for each
+place to sum them; see `matrix.bands` and `elimination`.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.drag import mass_type
+from ddg_warp.kernels.element import CPU_OPTIONS, first_of
+from ddg_warp.kernels.islands import WANTED
+from ddg_warp.kernels.matrix.bands import blocks_function, layout_type
+from ddg_warp.kernels.matrix.block_band import block_functions
+from ddg_warp.kernels.net.places import along_type
+from ddg_warp.kernels.solve import pivot
+from ddg_warp.kernels.terms import Term
+
+
+@cache
+def walk_kernel(
+    terms: tuple[Term, ...],
+    twist: bool,
+    span: int,
+    real,
+    linear,
+    exact_from: tuple[int | None, ...],
+    drag: bool,
+    joined: bool,
+):
+    """walk(...): H_II^-1 r_I of every column of chains; notes where a pivot is lost or negative; see `elimination`.
+
+    Where there are joints, chains are `joined`: factors and solution stay at the places, for what joints make of them. Else the
+    solution goes to the blocks z.
+    """
+    nb = 4 if twist else 3
+    H, B, M = wp.types.vector(3, linear), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
+    Mass, Layout, Along = mass_type(real, drag), layout_type(), along_type(real, linear)
+    blocks_at = blocks_function(terms, twist, span, real, linear, exact_from, drag)
+    load, store, vector, put = block_functions(nb, linear)
+    factor, lower, upper, lower_vector, upper_vector, congruence = pivot.functions(nb, linear)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def walk(
+        matrix: wp.array2d(dtype=linear),
+        mass: Mass,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        layout: Layout,
+        own0: Along,
+        own1: Along,
+        own2: Along,
+        own3: Along,
+        own4: Along,
+        own5: Along,
+        right: wp.array(dtype=H),
+        blocks: int,
+        factors: wp.array3d(dtype=linear),
+        values: wp.array3d(dtype=linear),
+        lost: wp.array(dtype=int),
+        z: wp.array(dtype=H),
+    ):
+        r = wp.tid()
+        w = r / layout.count.shape[0]
+        c = r - w * layout.count.shape[0]
+        if flags[WANTED, w] == 0:
+            return
+        n = layout.count[c]
+        shift = first_of(w, blocks)
+        bad = int(0)
+        minus = M()  # what the nodes before take from the block of this node, of its coupling, and of the next node
+        minus_couple = M()
+        minus_next = M()
+        before = B()
+        before2 = B()
+        for k in range(n):
+            D, E, F = blocks_at(matrix, mass, flags, scalars, layout, own0, own1, own2, own3, own4, own5, k, c, w)
+            L, inverse, lost_here = factor(D - minus)
+            bad += lost_here
+            Zb = lower(L, E - minus_couple)
+            U = upper(L, inverse, Zb)
+            minus = minus_next + congruence(Zb, inverse, Zb)
+            u = B()
+            node = layout.places[0, k, c]
+            if node >= 0:
+                v = right[node + shift]
+                for d in range(3):
+                    u[d] = v[d]
+            if wp.static(twist):
+                angle = layout.places[1, k, c]
+                if angle >= 0:
+                    v = right[angle + shift]
+                    u[3] = v[0]
+            u -= before
+            before = before2 + u * U
+            store(factors, 0, k, r, U)
+            if wp.static(span == 2):
+                Zc = lower(L, F)
+                V = upper(L, inverse, Zc)
+                minus_couple = congruence(Zb, inverse, Zc)
+                minus_next = congruence(Zc, inverse, Zc)
+                before2 = u * V
+                store(factors, wp.static(nb**2), k, r, V)
+            if wp.static(joined):
+                store(factors, wp.static(2 * nb**2), k, r, L)
+                put(factors, wp.static(3 * nb**2), k, r, inverse)
+            put(values, 0, k, r, upper_vector(L, inverse, lower_vector(L, u)))
+        if bad > 0:
+            lost[w] = 1
+        e1 = B()
+        e2 = B()
+        for i in range(n):
+            k = n - 1 - i
+            u = vector(values, 0, k, r) - load(factors, 0, k, r) * e1
+            if wp.static(span == 2):
+                u -= load(factors, wp.static(nb**2), k, r) * e2
+            e2 = e1
+            e1 = u
+            if wp.static(joined):
+                put(values, 0, k, r, u)
+            else:
+                node = layout.places[0, k, c]
+                if node >= 0:
+                    z[node + shift] = H(u[0], u[1], u[2])
+                if wp.static(twist):
+                    angle = layout.places[1, k, c]
+                    if angle >= 0:
+                        z[angle + shift] = H(u[3], linear(0.0), linear(0.0))
+
+    return walk
