@@ -5,6 +5,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.element import CPU_OPTIONS, until_function
+from ddg_warp.kernels.islands import ITERATION, LOAD_SCALE, STATUS, STEP_LENGTH
 
 
 @cache
@@ -27,17 +28,25 @@ def part_kernel(real, linear, leaf: bool, serial: bool):
         limit: wp.array2d(dtype=real),
         place: int,
         rtol: real,
-        load_scale: wp.array(dtype=real),
-        status: wp.array(dtype=int),
+        exact: int,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         value_out: wp.array(dtype=V),
         rounding_out: wp.array(dtype=real),
         ratio_out: wp.array2d(dtype=real),
         unbalanced_out: wp.array(dtype=int),
         drowned_out: wp.array(dtype=int),
     ):
-        """`below` is how many the level below has in a world; ratios of sums to their limits go to `place` and after."""
+        """`below` is how many the level below has in a world; ratios of sums to their limits go to `place` and after.
+
+        Where directions are `exact`, a whole step sees to sums, of joined rods as of those on their own; see `kernels.balance`.
+        """
         start, w = wp.tid()
-        if status[w] != 0:
+        if flags[STATUS, w] != 0:
+            return
+        if exact != 0 and flags[ITERATION, w] > 0 and scalars[STEP_LENGTH, w] == real(1.0):
+            for part in range(start, until(start, limit.shape[1])):
+                ratio_out[w, place + part] = real(0.0)
             return
         for part in range(start, until(start, limit.shape[1])):
             total = V()
@@ -55,7 +64,7 @@ def part_kernel(real, linear, leaf: bool, serial: bool):
             rounding_out[i] = square
             largest = wp.max(wp.abs(total))
             ratio_out[w, place + part] = largest / limit[w, part]
-            if not largest <= rtol * load_scale[w] * limit[w, part]:
+            if not largest <= rtol * scalars[LOAD_SCALE, w] * limit[w, part]:
                 drowned_out[w] = 1
                 if not largest <= wp.sqrt(square):
                     unbalanced_out[w] = 1

@@ -247,7 +247,8 @@ class NetNewton:
         """Residuals, the change of the energy, and the worlds that are out of equilibrium."""
         islands = self.islands
         self._balance()
-        self.allowed.sum_up(self.right, self.options.rtol, islands, islands.unbalanced, islands.drowned)
+        flags = islands.unbalanced, islands.drowned
+        self.allowed.sum_up(self.right, self.options.rtol, islands, *flags, self._direct and not self.frozen)
 
     def judge(self) -> None:
         """Stop worlds, reject their iterates, or ask for a direction."""

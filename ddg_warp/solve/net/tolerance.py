@@ -50,15 +50,15 @@ class Allowed:
             limit.assign(loads[:, level.body] * level.weight)
         return wp.array(given.astype(float), dtype=self._real, device=self.net.device)
 
-    def sum_up(self, right, rtol: float, islands, unbalanced, drowned) -> None:
-        """Raise the flags of worlds with a part whose residuals sum up to too much."""
+    def sum_up(self, right, rtol: float, islands, unbalanced, drowned, exact: bool = False) -> None:
+        """Raise the flags of worlds with a part whose residuals sum up to too much; `exact` says that directions are."""
         value, rounding, below, kernel = right, self.least, self.net.blocks, self.kernels[0]
         place = below
         for starts, items, limit, sums, squares in self._levels:
             wp.launch(
                 kernel,
                 (arrays.takers(limit.shape[1], self.net.device), self.net.worlds),
-                [value, rounding, starts, items, below, limit, place, rtol, islands.load_scale, islands.status],
+                [value, rounding, starts, items, below, limit, place, rtol, int(exact), *islands.arrays],
                 [sums, squares, self.ratio, unbalanced, drowned],
                 device=self.net.device,
             )
