@@ -68,11 +68,10 @@ def test_joined_rods_turn_their_edges_as_alone(device, radius, material, points,
     assert other["newton_iterations"]["mean"] < 1.25 * one["newton_iterations"]["mean"]
 
 
-@pytest.mark.parametrize("rtol", [1e-6, 1e-8])
-def test_joined_rods_stop_where_they_do_alone(device, rtol):
+def test_joined_rods_stop_where_they_do_alone(device):
     """Where elimination is exact a tolerance means the same: the same iterates, up to rounding, whoever shares the island."""
     (alone, one), (joined, other) = (
-        advance(cantilever(own, 2e-3, RUBBER), device, 1.0 / 60.0, 20, rtol=rtol) for own in (False, True)
+        advance(cantilever(own, 2e-3, RUBBER), device, 1.0 / 60.0, 20, rtol=1e-8) for own in (False, True)
     )
     assert other["newton_iterations"] == one["newton_iterations"]
     np.testing.assert_allclose(joined[:32], alone, atol=1e-11)
