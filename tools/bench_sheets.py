@@ -147,12 +147,12 @@ def measure(bending: str, cells: int, device, quick: bool, linear: str) -> dict:
         newton.assemble()
 
     newton.forcing.zero_()
-    newton.rho_first.fill_(1.0)
+    newton.krylov.rho_first.fill_(1.0)
     parts = {
         "evaluate": clocked(device, lambda: newton.evaluate(net), repeats),
         "assembly": clocked(device, assembly, repeats),
         "balance": clocked(device, newton.balance, repeats),
-        "iteration": clocked(device, newton.cycle, repeats),
+        "iteration": clocked(device, newton.krylov.cycle, repeats),
     }
     floor = floors(newton)
     solves = sum(statistics["outcomes"].values()) - sum(before["outcomes"].values())

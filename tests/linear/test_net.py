@@ -68,11 +68,11 @@ def test_product_is_that_of_the_matrix(device):
     problem = Problem(frame_and_sheet(), device, 1.02).iterate(1e-13)
     newton, size, free = problem.newton, 3 * problem.blocks, problem.free()
     vector = np.random.default_rng(0).normal(size=(2 * problem.blocks, 3)) * np.tile(~problem.net.host.fixed, (2, 1))
-    newton.p.assign(vector)
+    newton.krylov.p.assign(vector)
     newton.islands.wanted.fill_(1)
-    newton.rho.fill_(1.0)
-    newton.cycle()
-    product = newton.product.numpy().reshape(2, size)
+    newton.krylov.rho.fill_(1.0)
+    newton.krylov.cycle()
+    product = newton.krylov.product.numpy().reshape(2, size)
     for world in range(2):
         expected = np.where(free, problem.matrix(world) @ vector.reshape(2, size)[world], 0.0)
         np.testing.assert_allclose(product[world], expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
@@ -125,15 +125,15 @@ def test_blocks_of_groups_are_those_of_the_matrix(device):
     integrator.step(model.state(), 0.01)
     newton = integrator._net.newton
     newton.islands.wanted.fill_(1)
-    newton.levels.prepare(newton.matrix, newton.fixed, newton.islands.wanted)
+    newton.krylov.levels.prepare(newton.matrix, newton.fixed, newton.islands.wanted)
     table, blocks = newton.system, model.net.blocks
     H = np.zeros((3 * blocks, 3 * blocks))
     rows, columns, values = table.rows.numpy(), table.columns.numpy(), newton.matrix.numpy()
     for p in np.flatnonzero(rows >= 0):
         H[3 * rows[p] : 3 * rows[p] + 3, 3 * columns[p] : 3 * columns[p] + 3] = values[:, p].reshape(3, 3)
     free = ~model.net.host.fixed.ravel()
-    order = newton.levels.order.numpy()
-    for level, groups in enumerate(newton.levels.counts):
+    order = newton.krylov.levels.order.numpy()
+    for level, groups in enumerate(newton.krylov.levels.counts):
         for g in range(groups):
             members = order[g * 8 ** (level + 1) : (g + 1) * 8 ** (level + 1)]
             P = np.zeros((3 * blocks, 3))
@@ -141,5 +141,5 @@ def test_blocks_of_groups_are_those_of_the_matrix(device):
                 P[3 * node : 3 * node + 3] = np.eye(3)
             P[~free] = 0.0
             expected = P.T @ H @ P
-            measured = newton.levels.blocks[level].numpy()[g]
+            measured = newton.krylov.levels.blocks[level].numpy()[g]
             np.testing.assert_allclose(measured, expected, rtol=0.0, atol=1e-10 * np.abs(H).max())

@@ -20,16 +20,18 @@ def applied(problem: Problem, vectors: np.ndarray) -> np.ndarray:
     """The preconditioner on rows of vectors (n, worlds, 3 N), block by block as in a solve."""
     newton = problem.newton
     newton.islands.wanted.fill_(1)
-    inverse = newton.inverse.numpy().astype(float)
+    inverse = newton.krylov.inverse.numpy().astype(float)
     found = []
     for vector in vectors:
         r = vector.reshape(-1, 3)
-        newton.rest.assign(r)
-        newton.z.assign(np.einsum("bij,bj->bi", inverse, r))
-        newton.precondition(newton.z)
-        found.append(newton.z.numpy().astype(float).reshape(vector.shape))
+        newton.krylov.rest.assign(r)
+        newton.krylov.z.assign(np.einsum("bij,bj->bi", inverse, r))
+        newton.krylov.precondition(newton.krylov.z)
+        found.append(newton.krylov.z.numpy().astype(float).reshape(vector.shape))
         dots = newton.krylov_dots.numpy().reshape(-1)
-        np.testing.assert_allclose(dots, (r * newton.z.numpy()).sum(1), rtol=1e-4, atol=1e-6 * np.abs(dots).max())
+        np.testing.assert_allclose(
+            dots, (r * newton.krylov.z.numpy()).sum(1), rtol=1e-4, atol=1e-6 * np.abs(dots).max()
+        )
     return np.array(found)
 
 

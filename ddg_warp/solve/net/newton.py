@@ -1,6 +1,7 @@
 """Newton on a net by preconditioned conjugate gradients; every world has its own loop, all on the device."""
 
 import math
+from functools import cached_property
 
 import numpy as np
 import warp as wp
@@ -16,7 +17,7 @@ from ddg_warp.solve.chains.newton import EARLY, FROZEN, FROZEN_ONLY, NewtonOptio
 from ddg_warp.solve.net.balance import Balance
 from ddg_warp.solve.net.chains import Chains
 from ddg_warp.solve.net.frozen import Frozen
-from ddg_warp.solve.net.multilevel import Multilevel
+from ddg_warp.solve.net.krylov import ConjugateGradients
 from ddg_warp.solve.net.planes import DevicePlanes
 from ddg_warp.solve.net.system import Assembly, NetSystem, Sums
 from ddg_warp.solve.net.tolerance import Allowed
@@ -62,7 +63,6 @@ class NetNewton:
         serial = arrays.serial(device)
         self.worlds, self.all = worlds, worlds * blocks
         V, H = net.vector, wp.types.vector(3, self.linear)
-        M = wp.types.matrix((3, 3), self.linear)
         self.chains = None
         if preconditioner in ("chain", "chain_multilevel"):
             self.chains = Chains(net, self.banded and preconditioner == "chain" and not host.frames)
@@ -94,16 +94,14 @@ class NetNewton:
             self.held = wp.array(bits, dtype=wp.uint8, device=device)
         gravity = np.asarray(model.scene.gravity, float)
         self.gravity = wp.array(gravity[None], dtype=V, device=device)
-        self.right, self.rest, self.z, self.p, self.product, self.direction = (make(self.all, H) for _ in range(6))
-        self.inverse = make(self.all, M)
+        self.right, self.direction = (make(self.all, H) for _ in range(2))
         self.matrix = make((9, worlds * self.system.positions), self.linear)
         self.krylov_dots = make((worlds, blocks), self.linear)
         self.islands = Islands(worlds, self.real, device)
         self.iterations, self.stalled = flags(2)
         self.best, self.decrease, self.turn, self.worst, self.goal = scalars(5)
         self.goal.fill_(math.inf)
-        self.forcing, self.rho, self.rho_first, self.total, self.curvature = scalars(5, self.linear)
-        self.busy = make(1, int)
+        (self.forcing,) = scalars(1, self.linear)
         self.pcg_work = make(1, wp.int64)
         self.frozen = Frozen(self.islands) if reuse else None
         self.psd = self.automatic_psd() if options.psd == "auto" else options.psd
@@ -124,7 +122,6 @@ class NetNewton:
         turning = arrays.takers(len(ends) + len(spins), device)
         self.squares = make((worlds, turning), self.real)
         self._sum = Sums(worlds, self.dots.shape[1], self.real, device)
-        self._sum_linear = Sums(worlds, blocks, self.linear, device)
         self._sum_weights = Sums(3 * worlds, blocks, self.real, device)
         self._largest = Sums(worlds, turning, self.real, device, largest=True)
         lengths = host.edge_lengths
@@ -147,17 +144,12 @@ class NetNewton:
         self._judge, self._measure, self._rotate, self._take, self._move = newton.search_kernels(
             self.real, self.linear, serial, bool(host.rods), bool(net.edges)
         )
-        self._invert, self._start, self._begin, *self._cycle = krylov.solver_kernels(self.linear)
-        self._compare, self._confirm = krylov.confirm_kernels(self.real, self.linear)
         self.allowed = Allowed(net, self.real, self.linear)
-        self._unread = flags(2)
         outer = outer_forces(host, gravity)
         self.outer = self.allowed.assign(self.allowed.bodies.loads(outer)[None])
         self._balance = Balance(self, drag)
         self._worst = Sums(worlds, self.allowed.ratio.shape[1], self.real, device, largest=True)
-        several = preconditioner in ("multilevel", "chain_multilevel")
-        self.levels = Multilevel(net, self.system, self.linear) if several else None
-        self._limit = max(200, 100 * math.isqrt(blocks))
+        self._multilevel = preconditioner in ("multilevel", "chain_multilevel")
 
     def _require_exact(self) -> None:
         """Refuse the exact Hessian where it leaves out what a measure has no second derivatives for."""
@@ -198,14 +190,13 @@ class NetNewton:
         """Kernels to load before a capture."""
         own = [*self._balance.kernels, self._judge, self._measure, self._rotate, self._take]
         own += [*self.allowed.kernels, *([self._repeat] if self._repeat else [])]
-        cycle = [self._move, self._invert, self._start, self._begin, *self._cycle, self._compare, self._confirm]
-        parts = [k for part in (self.chains, self.levels, self.planes, self.turns) if part for k in part.kernels]
-        parts += self.net.carries
+        used = (self.chains, None if self._direct else self.krylov, self.planes, self.turns)
+        parts = [self._move, *self.net.carries, *(k for part in used if part for k in part.kernels)]
         evaluate = [(kernel, 128) for kernel in self._evaluate]
-        sums = (self._sum, self._sum_linear, self._sum_weights, self._largest, self._worst)
+        sums = (self._sum, self._sum_weights, self._largest, self._worst)
         sums = [(k, krylov.THREADS) for part in sums for k in part.kernels]
         own += self.frozen.kernels if self.frozen else []
-        return [*own, *cycle, *evaluate, *self._assembly.kernels, *parts, *sums]
+        return [*own, *evaluate, *self._assembly.kernels, *parts, *sums]
 
     def pcg_iterations(self) -> int:
         """Iterations of all solves so far."""
@@ -283,7 +274,7 @@ class NetNewton:
                 self.matrix,
                 self.mass,
                 self.islands,
-                self._anew,
+                self.anew,
                 self.fixed,
                 self.right,
                 self.negative,
@@ -291,124 +282,27 @@ class NetNewton:
                 self.krylov_dots,
             )
         else:
-            self.iterate_pcg()
+            self.krylov.solve()
         if self._repeat:  # what was indefinite comes again, without second derivatives and compression
             wp.launch(self._repeat, self.worlds, [1, *self.islands.arrays, self.negative], device=self.device)
 
+    @cached_property
+    def krylov(self) -> ConjugateGradients:
+        """What finds directions where elimination is not exact."""
+        return ConjugateGradients(self, self._multilevel)
+
     @property
-    def _anew(self) -> Islands:
+    def anew(self) -> Islands:
         """Those whose matrix is new."""
         return self.frozen.islands if self.frozen else self.islands
 
-    def iterate_pcg(self) -> None:
-        """Directions by conjugate gradients."""
-        table, blocks = self.system, self.net.blocks
-        self._launch(
-            self._invert,
-            [self.matrix, table.diagonal, self.fixed, self._anew.wanted, blocks, table.positions],
-            [self.inverse],
-        )
-        self._launch(
-            self._start,
-            [self.right, self.inverse, self.islands.wanted, blocks],
-            [self.rest, self.direction, self.p, self.krylov_dots],
-        )
-        if self.chains:
-            self.chains.prepare(self.matrix, self.fixed, self._anew.wanted, self._unread[0])
-        if self.levels:
-            self.levels.prepare(self.matrix, self.fixed, self._anew.wanted)
-        self.precondition(self.p)
-        self._sum_linear(self.krylov_dots, self.total)
-        self.busy.zero_()
-        wp.launch(
-            self._begin,
-            self.worlds,
-            [self.total],
-            [self.islands.wanted, self.rho, self.rho_first, self.iterations, self._indefinite, self.busy],
-            device=self.device,
-        )
-        wp.capture_while(self.busy, self.reduce)
-
     @property
-    def _indefinite(self) -> wp.array:
+    def indefinite(self) -> wp.array:
         """Where conjugate gradients note negative curvature: the iterate comes again, or the next one leaves out compression."""
         return self.negative if self._repeat else self.islands.clamped
 
-    def reduce(self) -> None:
-        """Iterate until the residual is small in the norm of the preconditioner, and go on where the tolerance says that it is not."""
-        wp.capture_while(self.busy, self.cycle)
-        self._launch(
-            self._compare, [self.rest, self.allowed.blocks, self.islands.wanted, self.net.blocks], [self.allowed.ratio]
-        )
-        self.allowed.sum_up(self.rest, self.options.rtol, self.islands, *self._unread)
-        self._worst(self.allowed.ratio, self.worst)
-        wp.launch(
-            self._confirm,
-            self.worlds,
-            [self.worst, self.goal, self.options.linear_rtol],
-            [self.forcing, self.islands.wanted, self.busy],
-            device=self.device,
-        )
-
-    def precondition(self, z: wp.array) -> None:
-        """What chains and levels make of z, which holds the residual times the inverses of the diagonal blocks."""
-        if self.chains:
-            self.chains.apply(self.matrix, self.rest, self.islands.wanted, z, self.krylov_dots)
-        if self.levels:
-            self.levels.apply(self.rest, self.fixed, self.islands.wanted, z, self.krylov_dots)
-
-    def cycle(self) -> None:
-        """One iteration of conjugate gradients."""
-        blocks = self.net.blocks
-        _, advance, turn, test = self._cycle
-        self.busy.zero_()
-        if self.chains and self.chains.banded:
-            self.chains.product(self.matrix, self.p, self.fixed, self.islands.wanted, self.product, self.krylov_dots)
-        else:
-            self.multiply(self.p)
-        self._sum_linear(self.krylov_dots, self.curvature)
-        self._launch(
-            advance,
-            [
-                self.p,
-                self.product,
-                self.inverse,
-                self.rho,
-                self.curvature,
-                self.iterations,
-                self.islands.wanted,
-                blocks,
-            ],
-            [self.direction, self.rest, self.z, self.krylov_dots],
-        )
-        self.precondition(self.z)
-        self._sum_linear(self.krylov_dots, self.total)
-        self._launch(turn, [self.z, self.total, self.rho, self.islands.wanted, blocks], [self.p])
-        wp.launch(
-            test,
-            self.worlds,
-            [self.total, self.curvature, self.rho_first, self.forcing, self._limit],
-            [self.rho, self.iterations, self._indefinite, self.islands.wanted, self.busy],
-            device=self.device,
-        )
-
-    def multiply(self, p: wp.array) -> None:
-        """H p on free dofs where none of H lies in bands, and p . H p block by block."""
-        table = self.system
-        self._launch(
-            self._cycle[0],
-            [
-                self.matrix,
-                table.columns,
-                table.slices,
-                self.fixed,
-                p,
-                self.islands.wanted,
-                self.net.blocks,
-                table.positions,
-            ],
-            [self.product, self.krylov_dots],
-        )
+    def watch(self) -> None:
+        """What is looked at after every iteration of conjugate gradients."""
 
     def take(self) -> None:
         """Lengths of the steps along the directions."""
@@ -450,7 +344,3 @@ class NetNewton:
             self.device,
             worlds=self.worlds,
         )
-
-    def _launch(self, kernel, inputs: list, outputs: list) -> None:
-        """One thread for each block of every world."""
-        wp.launch(kernel, self.all, inputs, outputs, device=self.device)

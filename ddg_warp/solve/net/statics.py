@@ -62,18 +62,19 @@ class StaticNewton(NetNewton):
             self.loads.apply(self.base, self._there)
         super().balance()
         if follows:
-            self._launch(
+            wp.launch(
                 self._follow,
+                self.all,
                 [self.q, self.base, self.load, self._there, self.islands.status, self.net.blocks],
                 [self.change],
+                device=self.device,
             )
 
-    def cycle(self) -> None:
-        """One iteration of conjugate gradients, whose directions grow: one that would be cut to a fraction is far enough.
+    def watch(self) -> None:
+        """Directions grow with every iteration: one that would be cut to a fraction is far enough.
 
         (Steihaug, SIAM J. Numer. Anal. 20, 1983.) Else a flat sheet's first direction, which knows bending alone, costs the most.
         """
-        super().cycle()
         if self._whole:
             return
         self.measure_turns()
@@ -92,8 +93,8 @@ class StaticNewton(NetNewton):
         self.evaluate(state)
         self.balance()
         self.assemble()
-        self.multiply(step)
-        self._launch(self._less, [self.product], [self.right])
+        self.krylov.multiply(step)
+        wp.launch(self._less, self.all, [self.krylov.product], [self.right], device=self.device)
         self._whole = True
         self.direct()
         self._whole = False
