@@ -50,7 +50,7 @@ class Group:
         self.gravity_host = gravity[[0, 2]] if kind.dim == 2 else gravity
         self.gravity = wp.array(self.gravity_host[None], dtype=vector, device=device)
         self.outer = put(_outer_forces(host, self.gravity_host), real)
-        self.moving = Moving(host, worlds, self.rods, device, real) if host.moving_nodes or host.moving_edges else None
+        self.moving = Moving(host, worlds, self.rods, device, real) if host.moves else None
         tiled = {name: np.tile(p, (1, worlds)) if p.shape[1] > 1 else p for name, p in host.parameters.items()}
         self.parameters = ParameterTable(tiled, 0, real, device)
 
@@ -104,12 +104,14 @@ class Moving:
         def rest(values):
             return wp.array(np.concatenate([values] * worlds), dtype=real, device=device)
 
-        rows = np.concatenate([np.zeros((0, 5), int), *host.moving_nodes])
+        axes = list(host.axes)
+        rows = np.column_stack([*divmod(host.moving[:, 0], rods), host.moving[:, [1 + d for d in axes]]])
+        rows = np.column_stack([rows, np.full((len(rows), 5 - rows.shape[1]), -1)])
         self.nodes = where(rows)
         points = np.zeros((len(rows), 3))
-        points[:, [0, 2] if host.kind.dim == 2 else [0, 1, 2]] = host.x[rows[:, 0], rows[:, 1]]
+        points[:, axes] = host.x[rows[:, 0], rows[:, 1]]
         self.node_rest = rest(points)
-        rows = np.concatenate([np.zeros((0, 3), int), *host.moving_edges])
+        rows = np.column_stack([*divmod(host.turning[:, 0] - host.nodes, rods), host.turning[:, 1]])
         self.edges = where(rows)
         directors = np.moveaxis(host.frame[0:3], 0, -1)
         self.edge_rest = rest(directors[rows[:, 0], rows[:, 1]] if len(rows) else np.zeros((0, 3)))

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arguments, arrays
-from ddg_warp.compile.chains import pose_starts
+from ddg_warp.compile.conditions import pose_starts
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels import drag, element, motion, step
 from ddg_warp.kernels.islands import Islands

@@ -22,7 +22,7 @@ class ChainTangent:
     """The part of one group of rods; dofs are numbered node by node, rod by rod. See `Tangent` for the methods."""
 
     def __init__(self, model, group, offset: int):
-        self.model, self.group, self.offset = model, group, offset
+        self.model, self.group, self.host, self.offset = model, group, group.host, offset
         kind, real, device = group.kind, model.types.real, model.wp_device
         shape = (group.nodes, group.columns)
         self.size, self.body_count = group.columns * group.nodes * kind.block, group.columns

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
-from ddg_warp.compile.chains import pose_starts
+from ddg_warp.compile.conditions import pose_starts
 from ddg_warp.kernels import drag, motion
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.measures.magnetised_edge import FIELD
@@ -37,7 +37,8 @@ class NetMotion:
             return wp.array(np.ascontiguousarray(values), dtype=net.vector, device=device)
 
         self.nodes, self.rest = put(host.moving), vectors(host.rest)
-        self.edges, self.edge_rest = put(host.turning), vectors(host.frame[:3, host.turning[:, 0]].T)
+        turning = host.turning - [host.nodes, 0]
+        self.edges, self.edge_rest = put(turning), vectors(host.frame[:3, turning[:, 0]].T)
         self.normals = {}
         for i in net.turning_data():
             element, row, index = net.sets[i].turning.T
