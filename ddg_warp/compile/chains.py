@@ -1,12 +1,10 @@
 """From a scene to chains: rods sorted into groups of one kind and similar length, padded, in arrays (node, rod)."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from ddg_warp import arguments
 from ddg_warp.compile import conditions
 from ddg_warp.compile.ghosts import Ghosts
 from ddg_warp.compile.rods import Alike, alike, compress, net_rods, piece_of
@@ -18,26 +16,6 @@ from ddg_warp.scene import drag
 from ddg_warp.scene.scene import Scene
 
 PADDING = 1.25  # longest over shortest rod of a group
-
-
-@dataclass(frozen=True)
-class TimedLoad:
-    """A load that changes: force on nodes k [N], or moment and couple on edges k [N m], of rods in `columns`."""
-
-    k: np.ndarray
-    columns: np.ndarray
-    force: np.ndarray
-    moment: float
-    couple: np.ndarray
-    amplitude: Callable[[float], float] | None
-
-    def at(self, t: float, otherwise: float) -> float:
-        """Its amplitude at t, or `otherwise` if it has none.
-
-        Raises:
-            SolverError: the amplitude is not finite; names the function and the time.
-        """
-        return otherwise if self.amplitude is None else float(arguments.value_at("the amplitude", self.amplitude, t))
 
 
 @dataclass(kw_only=True, eq=False)
@@ -55,9 +33,7 @@ class ChainGroup(Storage):
         fixed: bits of the held components of a node; the bit after the components is the angle (n, R).
         length: of the rod (R,) [m].
         drag: coefficients of the drag on edges (rows, n, R), in the order of `kernels.drag`; None without.
-        load: force on nodes (n, R, dim) [N]; load_angle: twisting moment on edges (n, R) [N m]; None without constant loads.
         parameters: of all terms, "term.parameter", each broadcastable to (n, R).
-        timed_loads: loads with an amplitude, and couples.
     """
 
     kind: ChainKind
@@ -73,10 +49,6 @@ class ChainGroup(Storage):
     length: np.ndarray
     drag: np.ndarray | None
     parameters: dict[str, np.ndarray]
-    load: np.ndarray
-    load_angle: np.ndarray
-    loaded: bool = False
-    timed_loads: list[TimedLoad] = field(default_factory=list)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -99,12 +71,29 @@ class ChainGroup(Storage):
         nodes, angles = Along(first, rods), Along(first + self.nodes, rods)
         return RodPlaces(self.rods, self.own, closed, twist, nodes, angles)
 
+    @property
+    def loaded(self) -> bool:
+        """Whether there is any load."""
+        return bool(self.dead or self.followers)
+
+    def constant_loads(self) -> tuple[np.ndarray, np.ndarray]:
+        """Constant forces on nodes (n, R, dim) [N] and twisting moments on edges (n, R) [N m]."""
+        dim, (places, force) = self.kind.dim, (self.constant.places, self.constant.force)
+        node, forces, moments = places < self.nodes, np.zeros((*self.shape, dim)), np.zeros(self.shape)
+        dofs = dim * places[node, None] + np.arange(dim)
+        np.add.at(forces.reshape(-1), dofs.ravel(), force[node][:, self.axes].ravel())
+        np.add.at(moments.reshape(-1), places[~node] - self.nodes, force[~node, 0])
+        return forces, moments
+
+    def index(self, places: np.ndarray) -> np.ndarray:
+        return places % self.nodes
+
     def fix(self, places: np.ndarray, components: np.ndarray) -> None:
         known = [self.axes.index(d) if d in self.axes else 8 for d in range(3)]
         bits = np.where(places < self.nodes, np.array(known)[components], self.kind.dim)
         flat = self.fixed.reshape(-1)
         for bit in np.unique(bits[bits < 8]):
-            flat[places[bits == bit] % self.nodes] |= np.uint8(1 << bit)
+            flat[self.index(places[bits == bit])] |= np.uint8(1 << bit)
 
     def add_mass(self, places: np.ndarray, mass: float) -> None:
         self.mass.reshape(-1)[places] += mass
@@ -117,7 +106,7 @@ class ChainGroup(Storage):
 
     def dofs(self, places: np.ndarray) -> np.ndarray:
         dim, angle = self.kind.dim, places >= self.nodes
-        k, column = np.divmod(places % self.nodes, len(self.rods))
+        k, column = np.divmod(self.index(places), len(self.rods))
         first = (column * self.shape[0] + k) * self.kind.block
         result = np.full((*places.shape, 3), -1)
         result[..., self.axes] = np.where(angle[..., None], -1, first[..., None] + np.arange(dim))
@@ -125,7 +114,7 @@ class ChainGroup(Storage):
         return result
 
     def name(self, place: int) -> str:
-        k, column = divmod(int(place) % self.nodes, len(self.rods))
+        k, column = divmod(int(self.index(place)), len(self.rods))
         what = "node" if place < self.nodes else "edge"
         return f"{what} {k - self.first[column]} of rod {self.rods[column]}"
 
@@ -151,15 +140,12 @@ def compile_chains(scene: Scene) -> list[ChainGroup]:
         else:
             groups.append([part])
     chains = [_join(group, ghosts, laws) for group in groups]
-    place = np.full((scene.rod_count, 2), -1)  # rods of the net have none
-    for g, chain in enumerate(chains):
-        place[chain.rods] = np.column_stack([np.full(len(chain.rods), g), np.arange(len(chain.rods))])
     for chain in chains:
         claims = conditions.Claims(scene, chain)
         conditions.hold_rods(scene, chain, claims)
         claims.finish()
         conditions.add_masses(scene, chain)
-    _apply_loads(scene, chains, place)
+        conditions.load_rods(scene, chain)
     return chains
 
 
@@ -201,8 +187,6 @@ def _join(parts: list[Alike], ghosts: Ghosts, laws: drag.Laws) -> ChainGroup:
         parameters={
             name: _join_parameter([(rods, values[name]) for rods, values in parameters], n) for name in parameters[0][1]
         },
-        load=np.zeros((n, total, kind.dim)),
-        load_angle=np.zeros((n, total)),
     )
 
 
@@ -215,26 +199,3 @@ def _join_parameter(values: list[tuple[int, np.ndarray]], n: int) -> np.ndarray:
         out[: value.shape[1], columns] = value.T
         out[value.shape[1] :, columns] = value.T[-1:]
     return compress(out.T).T
-
-
-def _apply_loads(scene: Scene, chains: list[ChainGroup], place: np.ndarray) -> None:
-    keep = [0, 2] if scene.dimension == 2 else [0, 1, 2]
-    for load in scene.loads:
-        force, couple = np.asarray(load.force, float)[keep], np.asarray(load.couple, float)
-        what, index = ("node", load.node) if load.edge is None else ("edge", load.edge)
-        for chain, k, columns in _places(chains, place, load.rods, index, what):
-            chain.loaded = True
-            if load.amplitude is None and not couple.any():
-                np.add.at(chain.load, (k, columns), force)
-                np.add.at(chain.load_angle, (k, columns), load.moment)
-            else:
-                chain.timed_loads.append(TimedLoad(k, columns, force, load.moment, couple, load.amplitude))
-
-
-def _places(chains, place, rods, index, what):
-    """Where node or edge `index` of rods lies: (chain, nodes, columns) of each group."""
-    for g in np.unique(place[rods, 0][place[rods, 0] >= 0]):
-        chain = chains[g]
-        columns = place[rods, 1][place[rods, 0] == g]
-        own = chain.own[columns] - (1 if what == "edge" and not chain.kind.closed else 0)
-        yield chain, chain.first[columns] + np.where(index < 0, own + index, index), columns

@@ -1,7 +1,8 @@
-"""What a scene puts on its rods: supports and masses."""
+"""What a scene puts on its rods: supports, masses and loads."""
 
 import numpy as np
 
+from ddg_warp.compile.loads import Couple
 from ddg_warp.compile.storage import FREE, Held, Storage
 from ddg_warp.errors import SceneError
 
@@ -26,6 +27,20 @@ def add_masses(scene, storage: Storage) -> None:
     for rods, node, mass in scene.masses:
         _, rows = storage.places.among(rods)
         storage.add_mass(storage.places.node(rows, node), mass)
+
+
+def load_rods(scene, storage: Storage) -> None:
+    """Add the loads of rods."""
+    places = storage.places
+    for load in scene.loads:
+        _, rows = places.among(load.rods)
+        if load.edge is None:
+            storage.add_load(places.node(rows, load.node), load.force, load.amplitude)
+        elif load.moment:
+            storage.add_load(places.angle(rows, load.edge), (load.moment, 0.0, 0.0), load.amplitude)
+        elif any(load.couple):
+            edges = places.edge(rows, load.edge)
+            storage.followers += [Couple(edge, np.array(load.couple), load.amplitude) for edge in edges if len(edge)]
 
 
 def hold_rods(scene, storage: Storage, claims: "Claims") -> None:

@@ -3,10 +3,13 @@
 Places are numbered nodes first, then angles. The components of a node are those of its position; an angle is component 0 of its own.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+
+from ddg_warp.compile.loads import DeadLoad
 
 FREE = -1  # instead of a pose, of a dof that no motion moves
 
@@ -63,6 +66,14 @@ class RodPlaces:
         rows = rows[self.twist[rows]]
         return self.angles(rows, k % self._edges(rows))
 
+    def edge(self, rows: np.ndarray, k: int) -> Iterator[np.ndarray]:
+        """Places of both nodes of edge k and of its angle (n, 3) of the rods with twist, of both nodes (n, 2) of those without."""
+        for twist in (True, False):
+            some = rows[self.twist[rows] == twist]
+            first = k % self._edges(some)
+            nodes = [self.nodes(some, first), self.nodes(some, (first + 1) % self.own[some])]
+            yield np.column_stack([*nodes, self.angles(some, first)] if twist else nodes)
+
     def _edges(self, rows: np.ndarray) -> np.ndarray:
         return self.own[rows] - np.where(self.closed[rows], 0, 1)
 
@@ -84,6 +95,7 @@ class Storage:
         held: what each support holds here: of the rods, then of the shells and rings of a net.
         moving: nodes that supports move, and the pose of each component, `FREE` of those that none does (n, 4).
         turning: angles that supports turn, and their pose (n, 2).
+        dead: loads that follow nothing; followers: those that do, see `compile.loads`.
         nodes: number of places of nodes; places: where its rods are; axes: components that nodes have.
     """
 
@@ -91,12 +103,36 @@ class Storage:
     moving: np.ndarray = field(default_factory=lambda: np.zeros((0, 4), int))
     turning: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), int))
 
+    dead: list[DeadLoad] = field(default_factory=list)
+    followers: list = field(default_factory=list)
+
     axes = (0, 1, 2)
+
+    def add_load(self, places: np.ndarray, force, amplitude=None) -> None:
+        """Add a dead load of (3,) or (n, 3) on places."""
+        if len(places):
+            self.dead.append(DeadLoad(places, np.broadcast_to(np.asarray(force, float), (len(places), 3)), amplitude))
+
+    @cached_property
+    def constant(self) -> DeadLoad:
+        """All loads that neither change nor follow, as one."""
+        loads = [load for load in self.dead if load.amplitude is None]
+        places = np.concatenate([np.zeros(0, int), *(load.places for load in loads)])
+        return DeadLoad(places, np.concatenate([np.zeros((0, 3)), *(load.force for load in loads)]))
+
+    @property
+    def timed(self) -> list[DeadLoad]:
+        """Loads that change and follow nothing."""
+        return [load for load in self.dead if load.amplitude is not None]
 
     @property
     def moves(self) -> bool:
         """Whether supports move something."""
         return bool(len(self.moving) or len(self.turning))
+
+    def index(self, places: np.ndarray) -> np.ndarray:
+        """Where places are in the array that has them, which of chains is another one for angles."""
+        return places
 
     def fix(self, places: np.ndarray, components: np.ndarray) -> None:
         """Hold dofs."""

@@ -8,6 +8,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.compile import precision
 from ddg_warp.compile.chains import ChainGroup
+from ddg_warp.kernels.gather import Layout
 from ddg_warp.model.parameters import ParameterTable
 from ddg_warp.scene import drag
 
@@ -22,7 +23,8 @@ class Group:
         kind = replace(host.kind, serial=arrays.serial(device))
         vector = wp.types.vector(kind.dim, real)
         self.host, self.kind, self.worlds, self.device = host, kind, worlds, device
-        self.rods = len(host.rods)
+        self.rods = self.stride = len(host.rods)
+        self.layout = Layout(chains=True, dim=kind.dim)
         self.nodes = host.shape[0]
         self.columns = self.rods * worlds
         self.elements = self.nodes if kind.closed else self.nodes - 1
@@ -41,15 +43,13 @@ class Group:
         self.rotary = put(host.rotary, real)
         self.drag = put(host.drag, real) if kind.drag else None
         self.fixed = put(host.fixed, wp.uint8)
-        load = np.concatenate([host.load] * worlds, axis=1) if host.loaded else np.zeros((1, 1, kind.dim))
-        self.load = arrays.upload(load, vector, device)
-        self.load_angle = (
-            put(host.load_angle, real) if host.loaded and kind.twist else wp.zeros((1, 1), dtype=real, device=device)
-        )
+        load, load_angle = host.constant_loads() if host.loaded else (np.zeros((1, 1, kind.dim)), np.zeros((1, 1)))
+        self.load = arrays.upload(np.concatenate([load] * worlds, axis=1), vector, device)
+        self.load_angle = put(load_angle if kind.twist else load_angle[:1, :1], real)
         gravity = np.asarray(scene.gravity, float)
         self.gravity_host = gravity[[0, 2]] if kind.dim == 2 else gravity
         self.gravity = wp.array(self.gravity_host[None], dtype=vector, device=device)
-        self.outer = put(_outer_forces(host, self.gravity_host), real)
+        self.outer = put(_outer_forces(host, self.gravity_host, load, load_angle), real)
         self.moving = Moving(host, worlds, self.rods, device, real) if host.moves else None
         tiled = {name: np.tile(p, (1, worlds)) if p.shape[1] > 1 else p for name, p in host.parameters.items()}
         self.parameters = ParameterTable(tiled, 0, real, device)
@@ -117,18 +117,22 @@ class Moving:
         self.edge_rest = rest(directors[rows[:, 0], rows[:, 1]] if len(rows) else np.zeros((0, 3)))
 
 
-def _outer_forces(host: ChainGroup, gravity: np.ndarray) -> np.ndarray:
+def _outer_forces(host: ChainGroup, gravity: np.ndarray, load: np.ndarray, moment: np.ndarray) -> np.ndarray:
     """Sum of the magnitudes of the outer forces on every rod (R,) [N]: the scale that residuals are compared with."""
-    forces = np.zeros_like(host.mass)
+    forces, rods = np.zeros_like(host.mass), len(host.rods)
     for d, g in enumerate(gravity):
         force = host.mass * g
         if host.loaded:
-            force += host.load[..., d]
+            force += load[..., d]
         forces += np.abs(force, out=force)
     total = forces.sum(0)
     if host.loaded:
-        total += np.abs(host.load_angle).sum(0) / host.length
-    for load in host.timed_loads:
-        size = np.abs(load.force).sum() + (abs(load.moment) + np.abs(load.couple).sum()) / host.length[load.columns]
-        np.add.at(total, load.columns, size)
+        total += np.abs(moment).sum(0) / host.length
+    for timed in host.timed:
+        column = timed.places % rods
+        arm = np.where(timed.places < host.nodes, 1.0, host.length[column])
+        np.add.at(total, column, np.abs(timed.force).sum(1) / arm)
+    for couple in host.followers:
+        column = couple.places[:, 0] % rods
+        np.add.at(total, column, np.abs(couple.couple).sum() / host.length[column])
     return total

@@ -7,6 +7,7 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.compile.net.net import Net
+from ddg_warp.kernels.gather import Layout
 from ddg_warp.kernels.net import elements, frames
 from ddg_warp.model.parameters import ParameterTable
 
@@ -99,6 +100,7 @@ class DeviceNet:
         self.host, self.worlds, self.device, self.real = host, worlds, device, real
         self.vector = wp.types.vector(3, real)
         self.blocks, self.angle_start = host.blocks, host.nodes
+        self.layout, self.stride = Layout(chains=False), host.blocks
         self.edges = host.rod_edges
         self.sets = [DeviceSet(s, worlds, device, real, motions) for s in host.sets]
         self.ends = wp.array(np.ascontiguousarray(host.ends, np.int32).reshape(-1, 2), dtype=int, device=device)

@@ -190,15 +190,11 @@ class Tangent:
 
     def into(self, values: np.ndarray) -> np.ndarray:
         """Vectors in space (size,) as dofs are: components in the frames of oblique planes; see `ddg_warp.solve.net.planes`."""
-        return self._each("into", values)
+        return np.concatenate([part.into(self.of(part, values)) for part in self.parts])
 
     def back(self, values: np.ndarray) -> np.ndarray:
         """Dofs, forces or steps (size,) as vectors in space."""
-        return self._each("back", values)
-
-    def _each(self, how: str, values: np.ndarray) -> np.ndarray:
-        parts = [(part, self.of(part, values)) for part in self.parts]
-        return np.concatenate([getattr(part, how)(own) if hasattr(part, how) else own for part, own in parts])
+        return np.concatenate([part.back(self.of(part, values)) for part in self.parts])
 
     @staticmethod
     def of(part, values: np.ndarray) -> np.ndarray:

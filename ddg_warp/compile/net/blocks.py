@@ -168,7 +168,6 @@ class _Builder:
             stiffness=np.concatenate([np.zeros((3, 0)), *self.stiffness], axis=1),
             mass=np.zeros((blocks, 3)),
             fixed=np.zeros((blocks, 3), bool),
-            load=np.zeros((blocks, 3)),
             meridians=[
                 axisymmetric.meridian(shell, i, scene.ring_supports, merged[numbers])
                 for i, (shell, numbers) in enumerate(zip(scene.axisymmetric_shells, self.meridians, strict=True))

@@ -4,8 +4,8 @@ import numpy as np
 
 from ddg_warp.compile import axisymmetric, conditions
 from ddg_warp.compile.conditions import Claims
-from ddg_warp.compile.net.loads import NetCouple, NetEdgeCouple, NetLoad, NetPressure
-from ddg_warp.compile.net.net import Net, NetRod
+from ddg_warp.compile.loads import EdgeCouple, Pressure
+from ddg_warp.compile.net.net import Net
 from ddg_warp.compile.net.planes import frames_of_planes
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry.shell_forms import FREE as FREE_EDGE
@@ -13,16 +13,18 @@ from ddg_warp.geometry.shell_forms import FREE as FREE_EDGE
 
 def add_masses(scene, net: Net) -> None:
     """Lump masses and rotary inertia at the dofs."""
-    for rod in net.rods:
-        np.add.at(net.mass, rod.all_nodes, rod.piece.mass[rod.row][:, None])
-        if rod.all_edges.size:
-            net.mass[rod.all_edges, 0] += rod.piece.rotary[rod.row]
+    lumps = [(rod.all_nodes, rod.piece.mass[rod.row]) for rod in net.rods]
     for shell, description in zip(net.shells, scene.shells, strict=True):
         weight = shell.plate.area * shell.plate.thickness * description.material.density / 3.0
-        np.add.at(net.mass, shell.nodes[shell.surface.triangles], np.repeat(weight[:, None, None], 3, 1))
+        lumps.append((shell.nodes[shell.surface.triangles].ravel(), np.repeat(weight, 3)))
     for shell in net.meridians:
         axisymmetric.check_gravity(scene.gravity)
-        net.mass[shell.nodes] += shell.mass[:, None]
+        lumps.append((shell.nodes, shell.mass))
+    places, lumped = (np.concatenate(values) for values in zip(*lumps, strict=True))
+    net.mass += np.bincount(places, lumped, net.blocks)[:, None]
+    for rod in net.rods:
+        if rod.all_edges.size:
+            net.mass[rod.all_edges, 0] += rod.piece.rotary[rod.row]
     conditions.add_masses(scene, net)
 
 
@@ -44,49 +46,34 @@ def hold(scene, net: Net) -> None:
 
 
 def load(scene, net: Net) -> None:
-    """Sort loads into dead ones, those that change and those that follow."""
-    members = {rod.rod: rod for rod in net.rods}
-    for given in scene.loads:
-        for index in given.rods:
-            rod = members.get(int(index))
-            if rod is None:
-                continue
-            if given.edge is None:
-                place = rod.nodes[given.node]
-                _put(net, np.array([place]), np.asarray(given.force, float)[None], given.amplitude)
-                continue
-            places = _edge_places(rod, given.edge)
-            if given.moment:
-                _put(net, places[2:], np.array([[given.moment, 0.0, 0.0]]), given.amplitude)
-            if np.any(given.couple):
-                couple, length = np.asarray(given.couple, float), float(rod.piece.length[rod.row])
-                net.couples.append(NetCouple(places[None], couple, given.amplitude, length))
+    """Add the loads of rods, shells and rings."""
+    conditions.load_rods(scene, net)
     for given in scene.shell_loads:
-        _put(net, net.shells[given.shell].nodes[given.vertices], given.force, given.amplitude)
-    for pressure in scene.pressures:
-        shell = net.shells[pressure.shell]
-        triangles = shell.nodes[shell.surface.triangles[pressure.triangles]]
-        if pressure.dead:
-            x = net.rest[triangles]
-            area = np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]) / 6.0 * pressure.pressure[:, None]
-            _put(net, triangles.ravel(), np.repeat(area, 3, axis=0), pressure.amplitude)
-        else:
-            net.pressures.append(NetPressure(triangles, pressure.pressure, pressure.amplitude))
+        net.add_load(net.shells[given.shell].nodes[given.vertices], given.force, given.amplitude)
+    for given in scene.pressures:
+        shell = net.shells[given.shell]
+        triangles = shell.nodes[shell.surface.triangles[given.triangles]]
+        _press(net, Pressure(triangles, given.pressure, given.amplitude), given.dead)
     for given in scene.edge_couples:
-        net.edge_couples.append(_edge_couple(net.shells[given.shell], given))
+        net.followers.append(_edge_couple(net.shells[given.shell], given))
     for given in scene.ring_loads:
         force = np.column_stack([given.force[:, 0], 0.0 * given.force[:, 0], given.force[:, 1]])
-        _put(net, net.meridians[given.shell].nodes[given.nodes], force, given.amplitude)
-    for pressure in scene.ring_pressures:
-        ends = net.meridians[pressure.shell].ends[pressure.edges]
-        band = axisymmetric.NetBand(ends, pressure.pressure, pressure.amplitude)
-        if pressure.dead:
-            _put(net, ends.ravel(), band.forces(net.rest[ends]).reshape(-1, 3), pressure.amplitude)
-        else:
-            net.bands.append(band)
+        net.add_load(net.meridians[given.shell].nodes[given.nodes], force, given.amplitude)
+    for given in scene.ring_pressures:
+        ends = net.meridians[given.shell].ends[given.edges]
+        _press(net, axisymmetric.BandPressure(ends, given.pressure, given.amplitude), given.dead)
 
 
-def _edge_couple(shell, given) -> NetEdgeCouple:
+def _press(net: Net, pressure, dead: bool) -> None:
+    """Add a pressure that follows the surface, or is dead: keeps its forces at rest."""
+    if dead:
+        forces = pressure.forces(net.rest[pressure.places])
+        net.add_load(pressure.places.ravel(), forces.reshape(-1, 3), pressure.amplitude)
+    else:
+        net.followers.append(pressure)
+
+
+def _edge_couple(shell, given) -> EdgeCouple:
     """A couple about boundary edges, which nothing may hold."""
     surface, edges = shell.surface, given.edges
     for edge in edges[shell.kinds.kind[edges] != FREE_EDGE][:1]:
@@ -99,19 +86,4 @@ def _edge_couple(shell, given) -> NetEdgeCouple:
     corners = np.column_stack([ends, surface.edge_opposite[edges, side]])
     length = np.linalg.norm(np.diff(surface.points[ends], axis=1)[:, 0], axis=1)
     places = np.column_stack([shell.nodes[corners], shell.edges[edges]])
-    size = float(np.ptp(surface.points, axis=0).max())
-    return NetEdgeCouple(places, given.couple * length, 1.0 - 2.0 * side, given.amplitude, size)
-
-
-def _edge_places(rod: NetRod, edge: int) -> np.ndarray:
-    """Blocks of an edge's nodes and, with twist, of its angle."""
-    count = len(rod.nodes) - (0 if rod.piece.kind.closed else 1)
-    k = edge % count
-    return np.concatenate([rod.nodes[[k, (k + 1) % len(rod.nodes)]], rod.edges[k : k + 1]])
-
-
-def _put(net: Net, blocks: np.ndarray, force: np.ndarray, amplitude) -> None:
-    if amplitude is None:
-        np.add.at(net.load, blocks, force)
-    else:
-        net.timed.append(NetLoad(blocks, force, amplitude))
+    return EdgeCouple(places, given.couple * length, 1.0 - 2.0 * side, given.amplitude)

@@ -11,7 +11,7 @@ import numpy as np
 
 from ddg_warp.compile import axisymmetric
 from ddg_warp.compile import shells as shell_terms
-from ddg_warp.compile.net.loads import NetCouple, NetEdgeCouple, NetLoad, NetPressure
+from ddg_warp.compile.loads import accumulate
 from ddg_warp.compile.precision import float32_error, float32_errors
 from ddg_warp.compile.rods import Piece
 from ddg_warp.compile.storage import Along, RodPlaces, Storage
@@ -83,7 +83,6 @@ class Net(Storage):
         ends: nodes of every rod edge (rod_edges, 2); frame: director and tangent of it (6, rod_edges).
         stiffness: EI1, EI2 and GJ of its section (3, rod_edges) [N m^2].
         mass: of every dof (N, 3) [kg, kg m^2]; fixed: held dofs (N, 3).
-        load: dead forces (N, 3); timed: those that change; pressures, bands, couples, edge_couples: loads that follow what they act on.
         frames: orthonormal rows (3, 3) that the held components of a node on an oblique plane refer to; see `compile.net.planes`.
     """
 
@@ -99,13 +98,7 @@ class Net(Storage):
     stiffness: np.ndarray
     mass: np.ndarray
     fixed: np.ndarray
-    load: np.ndarray
-    timed: list[NetLoad] = field(default_factory=list)
-    pressures: list[NetPressure] = field(default_factory=list)
     meridians: list[axisymmetric.NetMeridian] = field(default_factory=list)
-    bands: list[axisymmetric.NetBand] = field(default_factory=list)
-    couples: list[NetCouple] = field(default_factory=list)
-    edge_couples: list[NetEdgeCouple] = field(default_factory=list)
     frames: dict[int, np.ndarray] = field(default_factory=dict)
 
     @property
@@ -143,7 +136,7 @@ class Net(Storage):
         self.fixed[places, components] = True
 
     def add_mass(self, places: np.ndarray, mass: float) -> None:
-        np.add.at(self.mass, places, mass)
+        accumulate(self.mass, places, np.full((len(places), 3), mass))
 
     def edge_ends(self, angles: np.ndarray) -> np.ndarray:
         return self.ends[angles - self.nodes]
@@ -157,10 +150,12 @@ class Net(Storage):
                 return f"edge {int(np.argmax(rod.all_edges == place)) - rod.first} of rod {rod.rod}"
         return "the point at ({:g}, {:g}, {:g}) m".format(*self.rest[place])
 
-    @property
-    def followers(self) -> list:
-        """Loads that follow what they act on, each with `places`, `forces` and their `derivative`."""
-        return [*self.pressures, *self.bands, *self.couples, *self.edge_couples]
+    @cached_property
+    def constant_loads(self) -> np.ndarray:
+        """Constant forces on blocks (N, 3) [N, N m]."""
+        result = np.zeros((self.blocks, 3))
+        accumulate(result, self.constant.places, self.constant.force)
+        return result
 
     @cached_property
     def drag(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:

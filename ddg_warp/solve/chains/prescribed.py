@@ -76,49 +76,6 @@ class PrescribedMotion:
             )
 
 
-class TimedLoads:
-    """Loads of a group that change from step to step, and couples, which change with the edge they act on."""
-
-    def __init__(self, model, group, midpoint: bool):
-        real, device, host = model.types.real, model.wp_device, group.host
-        self.group, self.device, self.midpoint = group, device, midpoint
-        self.kernels = step.load_kernels(group.kind, real)
-        timed = host.timed_loads
-        self._load_of = np.concatenate([np.full(len(load.k), i) for i, load in enumerate(timed)])
-        rows = np.concatenate([np.column_stack([load.k, load.columns]) for load in timed])
-        touched = np.unique(np.concatenate([rows, rows + [1, 0]]), axis=0)
-        touched = touched[touched[:, 0] < group.nodes]
-        base = np.zeros((len(touched), 4))
-        base[:, : group.kind.dim] = host.load[touched[:, 0], touched[:, 1]]
-        base[:, 3] = host.load_angle[touched[:, 0], touched[:, 1]]
-
-        def worlds(values, shift=0):
-            return np.concatenate([values + shift * world * group.rods for world in range(model.worlds)])
-
-        self.where = wp.array(worlds(rows, np.array([0, 1])).astype(np.int32), dtype=int, device=device)
-        self.touched = wp.array(worlds(touched, np.array([0, 1])).astype(np.int32), dtype=int, device=device)
-        self.base = wp.array(worlds(base), dtype=real, device=device)
-        self.values = wp.zeros((self.where.shape[0], 7), dtype=real, device=device)
-
-    def upload(self, t0: float, t1: float) -> None:
-        """Values at the time that the scheme balances forces at."""
-        at = 0.5 * (t0 + t1) if self.midpoint else t1
-        table = np.zeros((len(self.group.host.timed_loads), 7))
-        for row, load in zip(table, self.group.host.timed_loads, strict=True):
-            row[: self.group.kind.dim] = load.force
-            row[3] = load.moment
-            row[4:] = load.couple
-            row *= load.at(at, 1.0)
-        self.values.assign(np.tile(table[self._load_of], (self.group.worlds, 1)))
-
-    def apply(self, x: wp.array, load: wp.array, load_angle: wp.array) -> None:
-        """Write constant loads plus these, on edges of nodes x, where such loads were before."""
-        reset, add = self.kernels
-        out = [load, load_angle]
-        wp.launch(reset, self.touched.shape[0], [self.touched, self.base], out, device=self.device)
-        wp.launch(add, self.where.shape[0], [self.where, self.values, x], out, device=self.device)
-
-
 class ChainDrag:
     """Drag on a group of rods, against a fluid that flows."""
 

@@ -10,8 +10,9 @@ from ddg_warp.solve import energy
 from ddg_warp.solve.chains.newton import ChainNewton
 from ddg_warp.solve.chains.partitioned import PartitionedNewton
 from ddg_warp.solve.chains.pcg import PcgNewton, ProjectiveNewton
-from ddg_warp.solve.chains.prescribed import ChainDrag, PrescribedMotion, TimedLoads
+from ddg_warp.solve.chains.prescribed import ChainDrag, PrescribedMotion
 from ddg_warp.solve.choice import automatic
+from ddg_warp.solve.loads import Loads
 from ddg_warp.solve.step import PartStep
 
 DIRECT = {"sweep": ChainNewton, "partitioned": PartitionedNewton}  # solvers of open rods by their name
@@ -31,7 +32,7 @@ class ChainStep(PartStep):
         self._frames = step.finish_frames_kernel(kind, real) if kind.twist else None
         self.energy = energy.ChainEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.motion = PrescribedMotion(model, group, self.midpoint) if group.moving else None
-        self.loads = TimedLoads(model, group, self.midpoint) if group.host.timed_loads else None
+        self.loads = Loads(model, group, self.midpoint) if group.host.timed or group.host.followers else None
         self.drag = ChainDrag(model, group, self.midpoint) if kind.drag else None
 
     def attempt(self, before, after) -> None:

@@ -9,25 +9,26 @@ import warp as wp
 from scipy import sparse
 
 from ddg_warp import arrays
-from ddg_warp.compile.couples import couple_derivatives, couple_forces
 from ddg_warp.compile.tolerance import support_forces
 from ddg_warp.geometry.turning import turned
 from ddg_warp.kernels import element
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.solve.chains.prescribed import PrescribedMotion
+from ddg_warp.solve.part import Part
 from ddg_warp.solve.rigid import Body
 
 
-class ChainTangent:
+class ChainTangent(Part):
     """The part of one group of rods; dofs are numbered node by node, rod by rod. See `Tangent` for the methods."""
 
     def __init__(self, model, group, offset: int):
-        self.model, self.group, self.host, self.offset = model, group, group.host, offset
         kind, real, device = group.kind, model.types.real, model.wp_device
         shape = (group.nodes, group.columns)
-        self.size, self.body_count = group.columns * group.nodes * kind.block, group.columns
+        gravity = np.append(group.gravity_host, 0.0)[None, : kind.block]
+        super().__init__(model, group.host, offset, group.columns * group.nodes * kind.block, _mass(group), gravity)
+        self.group, self.body_count = group, group.columns
         self.incidence = _incidence(group)
-        self.free, self.angle, self.mass = _free(group), _angle(group), _mass(group)
+        self.free, self.angle = _free(group), _angle(group)
         self._windows = arrays.allocate((kind.window, *shape), real, device)
         self._energies = arrays.allocate(shape, real, device)
         self._hessian = arrays.allocate((kind.window**2, *shape), real, device)
@@ -64,63 +65,9 @@ class ChainTangent:
         diagonal = sparse.bsr_matrix((values, np.arange(elements), np.arange(elements + 1)))
         return self.incidence.T @ (diagonal @ self.incidence)
 
-    def loads(self, factor: float, q: np.ndarray) -> np.ndarray:
-        group, kind, host = self.group, self.group.kind, self.group.host
-        force = np.zeros((group.columns, group.nodes, kind.block))
-        dead = host.mass[..., None] * group.gravity_host + host.load
-        force[..., : kind.dim] = np.tile(dead.transpose(1, 0, 2), (group.worlds, 1, 1)) * factor
-        if kind.twist:
-            force[..., kind.dim] = np.tile(host.load_angle.T, (group.worlds, 1)) * factor
-        x = self.blocks(q)
-        for load, columns in self._timed():
-            scale = load.at(factor, factor)
-            np.add.at(force, (columns, load.k, slice(0, kind.dim)), scale * load.force)
-            if kind.twist:
-                np.add.at(force, (columns, load.k, kind.dim), scale * load.moment)
-            if load.couple.any():
-                edges = x[columns, load.k + 1, : kind.dim] - x[columns, load.k, : kind.dim]
-                pair, about = couple_forces(edges, load.couple)
-                np.add.at(force, (columns, load.k + 1, slice(0, kind.dim)), scale * pair)
-                np.add.at(force, (columns, load.k, slice(0, kind.dim)), -scale * pair)
-                if kind.twist:
-                    np.add.at(force, (columns, load.k, kind.dim), scale * about)
-        return force.ravel()
-
-    def load_stiffness(self, factor: float, q: np.ndarray) -> sparse.csc_matrix | None:
-        rows, cols, values = [], [], []
-
-        def put(i, j, block):
-            rows.append(np.repeat(i, len(j)))
-            cols.append(np.tile(j, len(i)))
-            values.append(block.ravel())
-
-        group, kind = self.group, self.group.kind
-        x = self.blocks(q)
-        for load, columns in self._timed():
-            for column, k in zip(columns, load.k, strict=True) if load.couple.any() else ():
-                scale = -load.at(factor, factor)
-                (block,), (about,) = couple_derivatives(np.diff(x[column, k : k + 2, : kind.dim], axis=0), load.couple)
-                first = (column * group.nodes + k) * kind.block + np.arange(kind.dim)
-                second = first + kind.block
-                for i, j, sign in ((first, first, 1), (second, second, 1), (first, second, -1), (second, first, -1)):
-                    put(i, j, sign * scale * block)
-                if kind.twist:
-                    put(first[:1] + kind.dim, second, scale * about)
-                    put(first[:1] + kind.dim, first, -scale * about)
-        if not rows:
-            return None
-        data = (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols)))
-        return sparse.csc_matrix(data, shape=(self.size, self.size))
-
     def blocks(self, q: np.ndarray) -> np.ndarray:
         """Dofs (size,) as (column, node, dofs of a node)."""
         return q.reshape(self.group.columns, self.group.nodes, self.group.kind.block)
-
-    def _timed(self):
-        """Timed loads with their columns in every world."""
-        for load in self.group.host.timed_loads:
-            for world in range(self.group.worlds):
-                yield load, load.columns + world * self.group.rods
 
     def dofs(self, state) -> np.ndarray:
         kind, data = self.group.kind, self.data(state)

@@ -9,7 +9,6 @@ from ddg_warp.compile.conditions import pose_starts
 from ddg_warp.kernels import drag, motion
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.measures.magnetised_edge import FIELD
-from ddg_warp.kernels.net import loads
 from ddg_warp.kernels.net.motion import field_kernel, motion_kernels
 from ddg_warp.model.net import NetState
 from ddg_warp.scene.drag import flow_at
@@ -76,75 +75,6 @@ class NetMotion:
     def _launch(self, kernel, where: wp.array, inputs: list, outputs: list) -> None:
         dim = (len(where), self.model.worlds)
         wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)
-
-
-class NetLoads:
-    """Loads of a net that change or follow what they act on, over the constant ones."""
-
-    def __init__(self, model, midpoint: bool):
-        net, host, device, real = model.net, model.net.host, model.wp_device, model.types.real
-        self.model, self.net, self.midpoint = model, net, midpoint
-        self.constant = wp.array(np.tile(host.load, (model.worlds, 1)), dtype=net.vector, device=device)
-        self._followers = []
-        if not host.followers:
-            return
-
-        def put(values, dtype=int):
-            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
-
-        press, squeeze, twist, bend, self._spread = loads.follower_kernels(real)
-        kinds = [(press, load, load.pressure, real) for load in host.pressures]
-        kinds += [(squeeze, load, load.pressure, real) for load in host.bands]
-        kinds += [(twist, load, np.tile(load.couple, (len(load.places), 1)), net.vector) for load in host.couples]
-        kinds += [(bend, load, load.values, net.vector) for load in host.edge_couples]
-        for kernel, load, values, dtype in kinds:
-            self._followers.append((kernel, load, values, put(load.places.astype(np.int32)), put(values, dtype)))
-        places = np.concatenate([load.places.ravel() for load in host.followers])
-        self.starts, self.items = (put(v.astype(np.int32)) for v in lists(places, net.blocks))
-        self.total = len(places)
-        self.force = wp.zeros(model.worlds * self.total, dtype=net.vector, device=device)
-
-    @property
-    def kernels(self) -> list:
-        """Kernels to load before a capture."""
-        return [*{kernel for kernel, *_ in self._followers}, self._spread] if self._followers else []
-
-    def upload(self, t0: float, t1: float) -> None:
-        """Values at the time that the scheme balances forces at."""
-        at, host = 0.5 * (t0 + t1) if self.midpoint else t1, self.net.host
-        if host.timed:
-            load = host.load.copy()
-            for timed in host.timed:
-                np.add.at(load, timed.blocks, timed.at(at, 1.0) * timed.force)
-            self.constant.assign(np.tile(load, (self.model.worlds, 1)))
-        for _, load, values, _, on_device in self._followers:
-            if load.amplitude is not None:
-                on_device.assign(load.at(at, 1.0) * values)
-
-    def scale(self, dead: np.ndarray, at: float) -> None:
-        """Values of an equilibrium at load parameter `at`, with the loads (blocks, 3) that follow nothing."""
-        self.constant.assign(np.tile(dead, (self.model.worlds, 1)))
-        for _, load, values, _, on_device in self._followers:
-            on_device.assign(load.at(at, at) * values)
-
-    def apply(self, q: wp.array, load: wp.array) -> None:
-        """Write the loads on blocks q."""
-        net, first = self.net, 0
-        if not self._followers:
-            if net.host.timed:
-                wp.copy(load, self.constant)
-            return
-        for kernel, _, _, places, values in self._followers:
-            dim, inputs = (len(places), self.model.worlds), [q, places, values, net.blocks, first, self.total]
-            wp.launch(kernel, dim, inputs, [self.force], device=self.model.wp_device)
-            first += places.size
-        wp.launch(
-            self._spread,
-            self.model.worlds * net.blocks,
-            [self.constant, self.force, self.starts, self.items, net.blocks, self.total],
-            [load],
-            device=self.model.wp_device,
-        )
 
 
 class NetField:
