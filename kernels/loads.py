@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from ddg_warp.kernels.gather import Layout, place_functions
+from ddg_warp.kernels.gather import column_of, point_functions
 
 
 @cache
@@ -54,28 +54,28 @@ def force_functions(real):
 
 
 @cache
-def follower_kernel(name: str, count: int, layout: Layout, real):
+def follower_kernel(name: str, count: int, dim: int, real):
     """Writes the forces of one kind of load on the `count` places of its elements, from `first` on among the `total` of a world."""
-    V, to = wp.types.vector(3, real), place_functions(layout, real)
-    Points, get = to.points, to.get
+    V, P = wp.types.vector(3, real), wp.types.vector(dim, real)
+    get, _ = point_functions(dim, real)
     forces = force_functions(real)[name]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def follow(
-        x: Points,
+        x: wp.array2d(dtype=P),
         places: wp.array2d(dtype=int),
         values: wp.array(dtype=V),
-        stride: int,
+        columns: int,
         first: int,
         total: int,
         force_out: wp.array(dtype=V),
     ):
         k, w = wp.tid()
-        a = get(x, places[k, 0], w, stride)
-        b = get(x, places[k, 1], w, stride)
+        a = get(x, places[k, 0], w, columns)
+        b = get(x, places[k, 1], w, columns)
         c = b
         if wp.static(name in ("press", "bend")):
-            c = get(x, places[k, 2], w, stride)
+            c = get(x, places[k, 2], w, columns)
         f0, f1, f2, f3 = forces(a, b, c, values[k])
         at = first + wp.static(count) * k + w * total
         force_out[at] = f0
@@ -89,10 +89,10 @@ def follower_kernel(name: str, count: int, layout: Layout, real):
 
 
 @cache
-def spread_kernel(layout: Layout, real, angles: bool):
-    """Writes the loads on places, of nodes or of angles: those that follow nothing, and the forces that belong to each."""
-    V, to = wp.types.vector(3, real), place_functions(layout, real)
-    Out, put, set_angle = to.angles if angles else to.points, to.put, to.set_angle
+def spread_kernel(dim: int, real):
+    """Writes the loads on nodes of `dim` components, or on angles, of one: dead ones, and the forces that belong to each."""
+    V, P = wp.types.vector(3, real), wp.types.vector(dim, real) if dim > 1 else real
+    _, put = point_functions(max(2, dim), real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def spread(
@@ -101,17 +101,17 @@ def spread_kernel(layout: Layout, real, angles: bool):
         starts: wp.array(dtype=int),
         items: wp.array(dtype=int),
         force: wp.array(dtype=V),
-        stride: int,
+        columns: int,
         total: int,
-        load_out: Out,
+        load_out: wp.array2d(dtype=P),
     ):
         k, w = wp.tid()
         f = dead[k]
         for at in range(starts[k], starts[k + 1]):
             f += force[items[at] + w * total]
-        if wp.static(angles):
-            set_angle(load_out, places[k], w, stride, f[0])
+        if wp.static(dim > 1):
+            put(load_out, places[k], w, columns, f)
         else:
-            put(load_out, places[k], w, stride, f)
+            load_out[places[k] / columns, column_of(places[k], w, columns)] = f[0]
 
     return spread

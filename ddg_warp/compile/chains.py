@@ -98,6 +98,11 @@ class ChainGroup(Storage):
     def add_mass(self, places: np.ndarray, mass: float) -> None:
         self.mass.reshape(-1)[places] += mass
 
+    def points(self, nodes: np.ndarray) -> np.ndarray:
+        result = np.zeros((len(nodes), 3))
+        result[:, self.axes] = self.x.reshape(-1, self.kind.dim)[nodes]
+        return result
+
     def edge_ends(self, angles: np.ndarray) -> np.ndarray:
         first = angles - self.nodes
         k, column = np.divmod(first, len(self.rods))

@@ -142,6 +142,10 @@ class Storage:
         """Add a mass [kg] to each of some nodes."""
         raise NotImplementedError
 
+    def points(self, nodes: np.ndarray) -> np.ndarray:
+        """Positions of nodes at rest (n, 3) [m]."""
+        raise NotImplementedError
+
     def name(self, place: int) -> str:
         """A place, as a message has it."""
         raise NotImplementedError

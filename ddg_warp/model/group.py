@@ -8,7 +8,6 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.compile import precision
 from ddg_warp.compile.chains import ChainGroup
-from ddg_warp.kernels.gather import Layout
 from ddg_warp.model.parameters import ParameterTable
 from ddg_warp.scene import drag
 
@@ -23,8 +22,8 @@ class Group:
         kind = replace(host.kind, serial=arrays.serial(device))
         vector = wp.types.vector(kind.dim, real)
         self.host, self.kind, self.worlds, self.device = host, kind, worlds, device
-        self.rods = self.stride = len(host.rods)
-        self.layout = Layout(chains=True, dim=kind.dim)
+        self.rods = self.world_columns = len(host.rods)
+        self.dim = kind.dim
         self.nodes = host.shape[0]
         self.columns = self.rods * worlds
         self.elements = self.nodes if kind.closed else self.nodes - 1
@@ -50,7 +49,6 @@ class Group:
         self.gravity_host = gravity[[0, 2]] if kind.dim == 2 else gravity
         self.gravity = wp.array(self.gravity_host[None], dtype=vector, device=device)
         self.outer = put(_outer_forces(host, self.gravity_host, load, load_angle), real)
-        self.moving = Moving(host, worlds, self.rods, device, real) if host.moves else None
         tiled = {name: np.tile(p, (1, worlds)) if p.shape[1] > 1 else p for name, p in host.parameters.items()}
         self.parameters = ParameterTable(tiled, 0, real, device)
 
@@ -85,36 +83,6 @@ class Group:
             mass = mass + s * drag.least(host.drag.T) * host.length / host.count
             length = np.where(host.fixed.any(0), length, np.inf)  # over long steps a free rod has nothing but drag
         return precision.float32_errors(self.kind, mass, length, values, s)
-
-
-class Moving:
-    """Device lists of the dofs of a group that have a prescribed motion.
-
-    Attributes:
-        nodes: (node, column, motion of each component) of held nodes; node_rest: their rest positions (., 3) [m].
-        edges: (edge, column, motion) of held angles; edge_rest: first directors of these edges at rest (., 3).
-    """
-
-    def __init__(self, host: ChainGroup, worlds: int, rods: int, device, real):
-        def where(rows):
-            shift = np.eye(1, rows.shape[1], 1, int)
-            tiled = np.concatenate([rows + world * rods * shift for world in range(worlds)])
-            return wp.array(tiled.astype(np.int32), dtype=int, device=device)
-
-        def rest(values):
-            return wp.array(np.concatenate([values] * worlds), dtype=real, device=device)
-
-        axes = list(host.axes)
-        rows = np.column_stack([*divmod(host.moving[:, 0], rods), host.moving[:, [1 + d for d in axes]]])
-        rows = np.column_stack([rows, np.full((len(rows), 5 - rows.shape[1]), -1)])
-        self.nodes = where(rows)
-        points = np.zeros((len(rows), 3))
-        points[:, axes] = host.x[rows[:, 0], rows[:, 1]]
-        self.node_rest = rest(points)
-        rows = np.column_stack([*divmod(host.turning[:, 0] - host.nodes, rods), host.turning[:, 1]])
-        self.edges = where(rows)
-        directors = np.moveaxis(host.frame[0:3], 0, -1)
-        self.edge_rest = rest(directors[rows[:, 0], rows[:, 1]] if len(rows) else np.zeros((0, 3)))
 
 
 def _outer_forces(host: ChainGroup, gravity: np.ndarray, load: np.ndarray, moment: np.ndarray) -> np.ndarray:

@@ -148,7 +148,7 @@ class NetEnergy(_Energy):
                 device=self.device,
             )
         if net.host.followers:
-            step.loads.apply(solver.q, self._load)
+            step.loads.apply(net.points(solver.q), net.points(self._load), net.angles(self._load))
         wp.launch(
             self._blocks,
             solver.all,

@@ -31,19 +31,17 @@ class Loads:
         first, self._followers = 0, []  # kernel, load, places, values, place of its first force
         for load in host.followers:
             values = wp.array(load.values, dtype=self._vector, device=device)
-            kernel = follower_kernel(load.kernel, load.places.shape[1], part.layout, real)
+            kernel = follower_kernel(load.kernel, load.places.shape[1], part.dim, real)
             self._followers.append((kernel, load, put(host.index(load.places)), values, first))
             first += load.places.size
         target = np.searchsorted(self.places, following)
         items = np.argsort(target, kind="stable")
         starts, items = put(np.searchsorted(target[items], np.arange(len(self.places) + 1))), put(items)
-        places, angles = put(host.index(self.places)), len(self.places)
-        if part.layout.chains:  # which have an array of their own for the moments on angles
-            angles = int(np.searchsorted(self.places, host.nodes))
-        self._spread = [  # kernel, lists, and which array it writes
-            (spread_kernel(part.layout, real, bool(i)), [places[a:b], self._values[a:b], starts[a : b + 1], items], i)
-            for i, (a, b) in enumerate(((0, angles), (angles, len(self.places))))
-            if b > a
+        places, nodes = put(host.index(self.places)), int(np.searchsorted(self.places, host.nodes))
+        self._spread = [  # kernel, which array it writes, and lists
+            (spread_kernel(dim, real), i, [places[some], self._values[some], starts[some.start :], items])
+            for i, (dim, some) in enumerate(((part.dim, slice(0, nodes)), (1, slice(nodes, len(self.places)))))
+            if some.start < some.stop
         ]
 
     def _matrix(self, loads: list) -> sparse.csr_array:
@@ -77,12 +75,12 @@ class Loads:
         for _, load, _, values, _ in self._followers:
             values.assign(load.at(at, at) * load.values)
 
-    def apply(self, x: wp.array, *out: wp.array) -> None:
-        """Write the loads where points are at x: into one array, or into those of forces on nodes and of moments on angles."""
+    def apply(self, x: wp.array, force: wp.array, moment: wp.array) -> None:
+        """Write the loads on nodes, which are at x, and on angles."""
         part = self.part
         for kernel, load, places, values, first in self._followers:
-            inputs = [x, places, values, part.stride, first, self.total]
+            inputs = [x, places, values, part.world_columns, first, self.total]
             wp.launch(kernel, (len(load.places), part.worlds), inputs, [self._force], device=part.device)
-        for kernel, lists, i in self._spread:
-            inputs = [*lists, self._force, part.stride, self.total]
-            wp.launch(kernel, (len(lists[0]), part.worlds), inputs, [out[i]], device=part.device)
+        for kernel, i, lists in self._spread:
+            inputs = [*lists, self._force, part.world_columns, self.total]
+            wp.launch(kernel, (len(lists[0]), part.worlds), inputs, [(force, moment)[i]], device=part.device)

@@ -6,7 +6,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels import outcome, step
-from ddg_warp.solve.chains.prescribed import jump_between
+from ddg_warp.solve.motion import jump_between
 
 
 class PartStep:

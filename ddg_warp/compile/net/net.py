@@ -138,6 +138,9 @@ class Net(Storage):
     def add_mass(self, places: np.ndarray, mass: float) -> None:
         accumulate(self.mass, places, np.full((len(places), 3), mass))
 
+    def points(self, nodes: np.ndarray) -> np.ndarray:
+        return self.rest[nodes]
+
     def edge_ends(self, angles: np.ndarray) -> np.ndarray:
         return self.ends[angles - self.nodes]
 

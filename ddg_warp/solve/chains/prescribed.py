@@ -1,79 +1,14 @@
-"""What is prescribed from outside: motion of supports, and loads that change."""
+"""Drag on rods on their own."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import warp as wp
 
-from ddg_warp import arguments, arrays
-from ddg_warp.compile.conditions import pose_starts
-from ddg_warp.errors import SolverError
-from ddg_warp.kernels import drag, element, motion, step
+from ddg_warp import arrays
+from ddg_warp.kernels import drag, element
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.scene.drag import flow_at
-
-
-def poses(model, t0: float, t1: float) -> np.ndarray:
-    """Poses of all motions of a model between t0 and t1 (rows, 21).
-
-    Raises:
-        SolverError: a motion has no finite value, or leaves the plane of a planar scene; names the function and the time.
-    """
-    rows = np.concatenate([motion.pose(t0, t1) for motion in model.motions])
-    if model.scene.dimension == 2 and rows[:, 19].any():
-        raise SolverError(
-            f"a motion's translation has a part along y at t = {t1:g}: {tuple(rows[np.argmax(np.abs(rows[:, 19])), 18:].tolist())}; "
-            "a scene of dimension 2 stays in the plane of x and z, give 0",
-            outcome=arguments.PRESCRIBED,
-        )
-    return rows
-
-
-def jump_between(model, t0: float, t1: float) -> str:
-    """What to tell of a step or an increment that failed because a motion jumps in it; empty where none does."""
-    for moved in model.motions:
-        at = moved.jump(t0, t1)
-        if at is not None:
-            return (
-                f"a motion of its supports jumps at t = {at:g}, which no step can follow: make it continuous, such as a ramp over a "
-                "few steps"
-            )
-    return ""
-
-
-class PrescribedMotion:
-    """Motion of the held dofs of a group that have one."""
-
-    def __init__(self, model, group, midpoint: bool = False):
-        self.model, self.group = model, group
-        nodes, angles = step.motion_kernels(group.kind, model.types.real, midpoint)
-        self.kernels = [nodes, angles] if group.moving.edges.shape[0] else [nodes]
-        rows = pose_starts(model.motions)[-1]
-        self.pose = wp.zeros((rows, motion.POSE), dtype=model.types.real, device=model.wp_device)
-
-    def upload(self, t0: float, t1: float) -> None:
-        """Poses of all motions between t0 and t1."""
-        self.pose.assign(poses(self.model, t0, t1))
-
-    def apply(self, islands, x: wp.array, frame: wp.array, theta: wp.array) -> None:
-        """Put held nodes and angles where the part of the step that a rod tries ends."""
-        nodes, *angles = self.kernels
-        held, group, device = self.group.moving, self.group, self.model.wp_device
-        wp.launch(
-            nodes,
-            held.nodes.shape[0],
-            [held.nodes, held.node_rest, self.pose, *islands.arrays],
-            [x],
-            device=device,
-        )
-        for kernel in angles:
-            wp.launch(
-                kernel,
-                held.edges.shape[0],
-                [held.edges, held.edge_rest, self.pose, group.count, *islands.arrays, x, frame],
-                [theta],
-                device=device,
-            )
 
 
 class ChainDrag:

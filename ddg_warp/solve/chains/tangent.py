@@ -12,8 +12,7 @@ from ddg_warp import arrays
 from ddg_warp.compile.tolerance import support_forces
 from ddg_warp.geometry.turning import turned
 from ddg_warp.kernels import element
-from ddg_warp.kernels.islands import Islands
-from ddg_warp.solve.chains.prescribed import PrescribedMotion
+from ddg_warp.solve.motion import Motion
 from ddg_warp.solve.part import Part
 from ddg_warp.solve.rigid import Body
 
@@ -86,13 +85,9 @@ class ChainTangent(Part):
 
     def move_supports(self, state, before: float, at: float) -> None:
         """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""
-        group, data = self.group, self.data(state)
-        if group.moving is not None:
-            motion = PrescribedMotion(self.model, group)
-            motion.upload(before, at)
-            islands = Islands(group.columns, self.model.types.real, self.model.wp_device)
-            islands.portion.fill_(1.0)
-            motion.apply(islands, data.x, data.frame, data.theta)
+        if self.host.moves:
+            data = self.data(state)
+            Motion(self.model, self.group).put(before, at, data.x, data.frame, data.theta)
 
     def edges(self, q: np.ndarray) -> np.ndarray:
         """Edge vectors of the windows (E, dim), zero where there is none."""

@@ -6,75 +6,49 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.compile.conditions import pose_starts
-from ddg_warp.kernels import drag, motion
+from ddg_warp.kernels import drag
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.measures.magnetised_edge import FIELD
-from ddg_warp.kernels.net.motion import field_kernel, motion_kernels
+from ddg_warp.kernels.net.motion import field_kernel, normal_kernels
 from ddg_warp.model.net import NetState
 from ddg_warp.scene.drag import flow_at
-from ddg_warp.solve.chains.prescribed import poses
+from ddg_warp.solve.motion import Motion
 from ddg_warp.solve.net.system import lists
 
 
-class NetMotion:
-    """Motion of held nodes, of held angles of rod edges, and of the normals at clamped mesh edges.
+class NetMotion(Motion):
+    """Motion of a net's supports, and of the normals at clamped mesh edges that these turn.
 
-    Poses at both ends of a step come from the host; where supports are in between is found on the device, world by world.
+    Attributes:
+        data: of the sets with such normals, by index, with those that a solve is about.
     """
 
-    def __init__(self, model, midpoint: bool):
-        net, host, device, real = model.net, model.net.host, model.wp_device, model.types.real
-        self.model, self.net = model, net
-        start = pose_starts(model.motions)
-        self.pose = wp.zeros((start[-1], motion.POSE), dtype=real, device=device)
-        self._nodes, self._angles, self._normals, self._turn = motion_kernels(real, midpoint)
-
-        def put(values):
-            return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
-
-        def vectors(values):
-            return wp.array(np.ascontiguousarray(values), dtype=net.vector, device=device)
-
-        self.nodes, self.rest = put(host.moving), vectors(host.rest)
-        turning = host.turning - [host.nodes, 0]
-        self.edges, self.edge_rest = put(turning), vectors(host.frame[:3, turning[:, 0]].T)
-        self.normals = {}
-        for i in net.turning_data():
-            element, row, index = net.sets[i].turning.T
-            where = put(np.column_stack([element, row, start[index]]))
-            self.normals[i] = (where, vectors(net.sets[i].turning_rest))
-        self.data = net.turning_data()  # with the normals that a solve is about
+    def __init__(self, model, midpoint: bool = False):
+        super().__init__(model, model.net, midpoint)
+        self._normals, self._turn = normal_kernels(model.types.real, midpoint)
+        start, self.normals, self.data = pose_starts(model.motions), {}, model.net.turning_data()
+        for i in self.data:
+            (element, row, index), rest = model.net.sets[i].turning.T, model.net.sets[i].turning_rest
+            self.normals[i] = self._list(element, row, start[index]), self._vectors(rest)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        normals = [self._normals, self._turn] if self.normals else []
-        return [self._nodes, *([self._angles] if len(self.edges) else []), *normals]
-
-    def upload(self, t0: float, t1: float) -> None:
-        """Poses of all motions between t0 and t1."""
-        self.pose.assign(poses(self.model, t0, t1))
+        return [*super().kernels, *([self._normals, self._turn] if self.normals else [])]
 
     def apply(self, islands, q: wp.array, frame: wp.array) -> None:
         """Put held blocks and normals where the part of the step that a world tries has them; `frame` are lagged."""
-        net = self.net
-        rows = [self.pose, *islands.arrays]
-        self._launch(self._nodes, self.nodes, [self.nodes, self.rest, *rows, net.blocks], [q])
-        if len(self.edges):
-            inputs = [self.edges, self.edge_rest, self.pose, net.ends, frame, *islands.arrays]
-            self._launch(self._angles, self.edges, [*inputs, net.blocks, net.angle_start], [q])
+        net = self.part
+        super().apply(islands, net.points(q), net.frames(frame), net.angles(q))
         for index, (where, rest) in self.normals.items():
-            self._launch(self._normals, where, [where, rest, *rows, net.sets[index].elements], [self.data[index]])
+            inputs = [where, rest, self.pose, *islands.arrays, net.sets[index].elements]
+            self._launch(self._normals, where, inputs, [self.data[index]])
 
     def turn(self, islands, before: NetState, after: NetState) -> None:
         """Turn the normals of a state that a part of the step ends in, in the worlds that moved."""
         for index, (where, rest) in self.normals.items():
-            inputs = [where, rest, self.pose, *islands.arrays, self.net.sets[index].elements]
+            inputs = [where, rest, self.pose, *islands.arrays, self.part.sets[index].elements]
             self._launch(self._turn, where, [*inputs, before.data[index]], [after.data[index]])
-
-    def _launch(self, kernel, where: wp.array, inputs: list, outputs: list) -> None:
-        dim = (len(where), self.model.worlds)
-        wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)
 
 
 class NetField:

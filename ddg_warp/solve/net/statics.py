@@ -60,8 +60,8 @@ class StaticNewton(NetNewton):
     def balance(self) -> None:
         """Residuals under the loads on the iterate, which do the work of their mean along a step."""
         if self.loads:
-            self.loads.apply(self.q, self.load)
-            self.loads.apply(self.base, self._there)
+            for q, load in ((self.q, self.load), (self.base, self._there)):
+                self.loads.apply(self.net.points(q), self.net.points(load), self.net.angles(load))
         super().balance()
         if self.loads:
             self._launch(

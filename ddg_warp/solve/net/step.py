@@ -58,7 +58,8 @@ class NetStep(PartStep):
 
     def attempt(self, before, after) -> None:
         """One solve of every world that has not finished the step, from state `before` to `after`."""
-        solver, blocks, islands = self.newton, self.net.blocks, self.islands
+        net, solver, islands = self.net, self.newton, self.islands
+        blocks = net.blocks
         arrays.sweep(
             self._begin,
             solver.all,
@@ -71,7 +72,7 @@ class NetStep(PartStep):
         if self.motion:
             self.motion.apply(islands, solver.q, start.frame)
         if self.loads:
-            self.loads.apply(solver.q, solver.load)
+            self.loads.apply(net.points(solver.q), net.points(solver.load), net.angles(solver.load))
         if self.drag:
             self.drag.resist(before, solver, islands)
         solver.solve(start)

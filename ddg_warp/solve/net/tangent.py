@@ -8,7 +8,6 @@ from scipy import sparse
 
 from ddg_warp.compile.tolerance import largest_excess
 from ddg_warp.geometry.turning import turned
-from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.net import elements
 from ddg_warp.solve.net.planes import HostPlanes
 from ddg_warp.solve.net.prescribed import NetMotion
@@ -143,11 +142,7 @@ class NetTangent(Part):
     def move_supports(self, state, before: float, at: float) -> None:
         """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""
         if self.host.moves:
-            motion = NetMotion(self.model, midpoint=False)
-            motion.upload(before, at)
-            islands = Islands(self.net.worlds, self.model.types.real, self.model.wp_device)
-            islands.portion.fill_(1.0)
-            motion.apply(islands, state.net.q, state.net.frame)
+            NetMotion(self.model).put(before, at, state.net.q, state.net.frame)
         self.prescribe(state, at)
 
     def prescribe(self, state, at: float) -> None:
