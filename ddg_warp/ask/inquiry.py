@@ -9,8 +9,7 @@ from ddg_warp import arrays
 from ddg_warp.ask import end_moments
 from ddg_warp.compile.storage import gathered
 from ddg_warp.kernels.terms import AXISYMMETRIC, MAGNETS, SHELLS
-from ddg_warp.solve.chains.prescribed import ChainDrag
-from ddg_warp.solve.net.prescribed import NetDrag
+from ddg_warp.solve.drag import ChainDrag, NetDrag
 from ddg_warp.solve.tangent import Tangent
 from ddg_warp.threads import launches
 

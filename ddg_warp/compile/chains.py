@@ -88,12 +88,10 @@ class ChainGroup(Storage):
     def index(self, places: np.ndarray) -> np.ndarray:
         return places % self.nodes
 
-    def fix(self, places: np.ndarray, components: np.ndarray) -> None:
-        known = [self.axes.index(d) if d in self.axes else 8 for d in range(3)]
-        bits = np.where(places < self.nodes, np.array(known)[components], self.kind.dim)
+    def fix(self, nodes: np.ndarray, along: list[int], angles: np.ndarray) -> None:
         flat = self.fixed.reshape(-1)
-        for bit in np.unique(bits[bits < 8]):
-            flat[self.index(places[bits == bit])] |= np.uint8(1 << bit)
+        flat[nodes] |= np.uint8(sum(1 << bit for bit, d in enumerate(self.axes) if d in along))
+        flat[self.index(angles)] |= np.uint8(1 << self.kind.dim)
 
     def add_mass(self, places: np.ndarray, mass: float) -> None:
         self.mass.reshape(-1)[places] += mass

@@ -37,10 +37,10 @@ def load_rods(scene, storage: Storage) -> None:
         if load.edge is None:
             storage.add_load(places.node(rows, load.node), load.force, load.amplitude)
         elif load.moment:
-            storage.add_load(places.angle(rows, load.edge), (load.moment, 0.0, 0.0), load.amplitude)
+            storage.add_load(places.edge(rows, load.edge)[0][:, 2], (load.moment, 0.0, 0.0), load.amplitude)
         elif any(load.couple):
-            edges = places.edge(rows, load.edge)
-            storage.followers += [Couple(edge, np.array(load.couple), load.amplitude) for edge in edges if len(edge)]
+            edges = filter(len, places.edge(rows, load.edge))
+            storage.followers += [Couple(edge, np.array(load.couple), load.amplitude) for edge in edges]
 
 
 def hold_rods(scene, storage: Storage, claims: "Claims") -> None:
@@ -50,7 +50,7 @@ def hold_rods(scene, storage: Storage, claims: "Claims") -> None:
         found, rows = places.among(support.rods)
         nodes = [places.node(rows, node) for node in support.nodes]
         nth = [found * len(nodes) + n for n in range(len(nodes))]
-        angles = [places.angle(rows, edge) for edge in support.edges]
+        angles = [places.edge(rows, edge)[0][:, 2] for edge in support.edges]
         if support.end:
             last, twisted = support.end == "last", rows[places.twist[rows]]
             nodes += [places.nodes(rows, k) for k in ((places.own[rows] - 1, places.own[rows]) if last else (0, -1))]
@@ -76,7 +76,7 @@ class Claims:
         along = [d for d in range(3) if "xyz"[d] in support.components]
         places = np.concatenate([np.tile(nodes, len(along)), angles])
         components = np.concatenate([np.repeat(np.array(along, int), len(nodes)), 0 * angles])
-        storage.fix(places, components)
+        storage.fix(nodes, along, angles)
         storage.held.append(Held(places, components) if along else Held(nodes, 0 * nodes, support.normal))
         if self.motions:
             poses = np.full(len(places), STILL if motion is None else self._start[id(motion)])

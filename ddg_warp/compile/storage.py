@@ -3,7 +3,6 @@
 Places are numbered nodes first, then angles. The components of a node are those of its position; an angle is component 0 of its own.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -61,21 +60,15 @@ class RodPlaces:
         """Places of node k, from the last if negative."""
         return self.nodes(rows, k % self.own[rows])
 
-    def angle(self, rows: np.ndarray, k: int) -> np.ndarray:
-        """Places of the angle of edge k of the rods that have twist."""
-        rows = rows[self.twist[rows]]
-        return self.angles(rows, k % self._edges(rows))
-
-    def edge(self, rows: np.ndarray, k: int) -> Iterator[np.ndarray]:
-        """Places of both nodes of edge k and of its angle (n, 3) of the rods with twist, of both nodes (n, 2) of those without."""
+    def edge(self, rows: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """Places of both nodes of edge k and of its angle (n, 3) of the rods with twist; of both nodes (n, 2) of those without."""
+        found = []
         for twist in (True, False):
             some = rows[self.twist[rows] == twist]
-            first = k % self._edges(some)
-            nodes = [self.nodes(some, first), self.nodes(some, (first + 1) % self.own[some])]
-            yield np.column_stack([*nodes, self.angles(some, first)] if twist else nodes)
-
-    def _edges(self, rows: np.ndarray) -> np.ndarray:
-        return self.own[rows] - np.where(self.closed[rows], 0, 1)
+            first = k % (self.own[some] - np.where(self.closed[some], 0, 1))
+            ends = [self.nodes(some, first), self.nodes(some, (first + 1) % self.own[some])]
+            found.append(np.column_stack([*ends, self.angles(some, first)] if twist else ends))
+        return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -134,8 +127,8 @@ class Storage:
         """Where places are in the array that has them, which of chains is another one for angles."""
         return places
 
-    def fix(self, places: np.ndarray, components: np.ndarray) -> None:
-        """Hold dofs."""
+    def fix(self, nodes: np.ndarray, along: list[int], angles: np.ndarray) -> None:
+        """Hold nodes along some components, and angles."""
         raise NotImplementedError
 
     def add_mass(self, places: np.ndarray, mass: float) -> None:

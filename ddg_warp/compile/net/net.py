@@ -132,8 +132,9 @@ class Net(Storage):
             angles=along([rod.all_edges for rod in self.rods]),
         )
 
-    def fix(self, places: np.ndarray, components: np.ndarray) -> None:
-        self.fixed[places, components] = True
+    def fix(self, nodes: np.ndarray, along: list[int], angles: np.ndarray) -> None:
+        self.fixed[nodes[:, None], along] = True
+        self.fixed[angles, 0] = True
 
     def add_mass(self, places: np.ndarray, mass: float) -> None:
         accumulate(self.mass, places, np.full((len(places), 3), mass))

@@ -10,8 +10,8 @@ from ddg_warp.solve import energy
 from ddg_warp.solve.chains.newton import ChainNewton
 from ddg_warp.solve.chains.partitioned import PartitionedNewton
 from ddg_warp.solve.chains.pcg import PcgNewton, ProjectiveNewton
-from ddg_warp.solve.chains.prescribed import ChainDrag
 from ddg_warp.solve.choice import automatic
+from ddg_warp.solve.drag import ChainDrag
 from ddg_warp.solve.loads import Loads
 from ddg_warp.solve.motion import Motion
 from ddg_warp.solve.step import PartStep

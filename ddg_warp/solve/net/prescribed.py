@@ -1,19 +1,12 @@
-"""What is prescribed of a net from outside: motion of supports, loads that change or follow, a magnetic field, drag."""
+"""What is prescribed of a net from outside: motion of supports and of the normals that these turn, and a magnetic field."""
 
-from types import SimpleNamespace
-
-import numpy as np
 import warp as wp
 
 from ddg_warp.compile.conditions import pose_starts
-from ddg_warp.kernels import drag
-from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.measures.magnetised_edge import FIELD
 from ddg_warp.kernels.net.motion import field_kernel, normal_kernels
 from ddg_warp.model.net import NetState
-from ddg_warp.scene.drag import flow_at
 from ddg_warp.solve.motion import Motion
-from ddg_warp.solve.net.system import lists
 
 
 class NetMotion(Motion):
@@ -89,76 +82,3 @@ class NetField:
         inputs = [field, first, part.elements, moved, before]
         dim = part.elements * self.model.worlds
         wp.launch(self._kernel, dim, inputs, [after], device=self.model.wp_device)
-
-
-class NetDrag:
-    """Drag on the rods of a net, against a fluid that flows.
-
-    Attributes:
-        moves: what inertia or drag give a rate, as masses of the dofs of blocks that are positive there.
-    """
-
-    def __init__(self, model, midpoint: bool = False):
-        net, host, device, real = model.net, model.net.host, model.wp_device, model.types.real
-        self.model, self.net, self.midpoint = model, net, midpoint
-        self._resist, self._settle = drag.net_kernels(real)
-        ends, angles, coefficients = host.drag
-        places = np.stack([*ends, np.where(angles < 0, host.blocks, angles)], -1).ravel()
-        starts, items = lists(places, host.blocks + 1)
-
-        def put(values, dtype=int):
-            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
-
-        self.ends, self.starts, self.items = (put(v.astype(np.int32)) for v in (ends.T, starts, items // 3))
-        self.coefficients = put(coefficients, real)
-        self.mass = put(host.mass, net.vector)
-        felt = np.zeros((host.blocks, 3))
-        felt[ends] = 1.0
-        felt[angles[angles >= 0], 0] = 1.0
-        self.moves = put(host.mass + felt, net.vector)
-        self.flow = put(flow_at(model.scene, 0.0)[None], net.vector)
-
-    @property
-    def kernels(self) -> list:
-        """Kernels to load before a capture."""
-        return [self._resist, *([self._settle] if self.midpoint else [])]
-
-    def upload(self, t0: float, t1: float) -> None:
-        """The flow at the time that the scheme balances forces at."""
-        if callable(self.model.scene.flow):
-            self.flow.assign(flow_at(self.model.scene, 0.5 * (t0 + t1) if self.midpoint else t1)[None])
-
-    def resist(self, before, solver, islands) -> None:
-        """Write inertia and drag of a solve from the state `before`, once its iterate is predicted."""
-        self._launch(
-            self._resist,
-            [before.q, before.v, solver.q if self.midpoint else before.q, solver.q, self.mass, self.ends]
-            + [self.coefficients, self.starts, self.items, self.flow, solver.outer, *islands.arrays]
-            + [self.net.blocks, self.net.host.nodes],
-            [solver.mass],
-        )
-
-    def at(self, state, t: float) -> tuple[np.ndarray, np.ndarray]:
-        """Inertia and drag (world, block) of a net's state at t, with the resistance over a second, and the flow (blocks, 3)."""
-        net, device = self.net, self.model.wp_device
-        islands = Islands(net.worlds, net.real, device)
-        islands.rate.fill_(1.0)
-        mass = wp.zeros((net.worlds, net.blocks), dtype=drag.block_inertia(net.real), device=device)
-        self.upload(t, t)
-        self.resist(state, SimpleNamespace(q=state.q, outer=net.still, mass=mass), islands)
-        flow = np.zeros((net.blocks, 3))
-        flow[: net.host.nodes] = self.flow.numpy()[0]
-        return mass.numpy(), flow
-
-    def settle(self, after, solver, islands) -> None:
-        """Rates of what has no inertia in the state `after`."""
-        if self.midpoint:
-            self._launch(
-                self._settle,
-                [solver.q, solver.mass, *islands.arrays, self.net.blocks, after.q],
-                [after.v],
-            )
-
-    def _launch(self, kernel, inputs: list, outputs: list) -> None:
-        blocks = self.model.worlds * self.net.blocks
-        wp.launch(kernel, blocks, inputs, outputs, device=self.model.wp_device)

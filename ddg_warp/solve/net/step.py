@@ -10,10 +10,11 @@ from ddg_warp.kernels.net import elements, frames, newton
 from ddg_warp.model.net import NetState
 from ddg_warp.scene import drag
 from ddg_warp.solve.choice import net_preconditioner
+from ddg_warp.solve.drag import NetDrag
 from ddg_warp.solve.energy import NetEnergy
 from ddg_warp.solve.loads import Loads
 from ddg_warp.solve.net.newton import PRECONDITIONERS, NetNewton
-from ddg_warp.solve.net.prescribed import NetDrag, NetField, NetMotion
+from ddg_warp.solve.net.prescribed import NetField, NetMotion
 from ddg_warp.solve.step import PartStep
 from ddg_warp.solve.tangent import Tangent
 
