@@ -63,6 +63,10 @@ class ChainGroup(Storage):
     def nodes(self) -> int:
         return self.mass.size
 
+    @property
+    def size(self) -> int:
+        return self.nodes * (2 if self.kind.twist else 1)
+
     @cached_property
     def places(self) -> RodPlaces:
         rods = len(self.rods)
@@ -70,20 +74,6 @@ class ChainGroup(Storage):
         first = self.first * rods + np.arange(rods)
         nodes, angles = Along(first, rods), Along(first + self.nodes, rods)
         return RodPlaces(self.rods, self.own, closed, twist, nodes, angles)
-
-    @property
-    def loaded(self) -> bool:
-        """Whether there is any load."""
-        return bool(self.dead or self.followers)
-
-    def constant_loads(self) -> tuple[np.ndarray, np.ndarray]:
-        """Constant forces on nodes (n, R, dim) [N] and twisting moments on edges (n, R) [N m]."""
-        dim, (places, force) = self.kind.dim, (self.constant.places, self.constant.force)
-        node, forces, moments = places < self.nodes, np.zeros((*self.shape, dim)), np.zeros(self.shape)
-        dofs = dim * places[node, None] + np.arange(dim)
-        np.add.at(forces.reshape(-1), dofs.ravel(), force[node][:, self.axes].ravel())
-        np.add.at(moments.reshape(-1), places[~node] - self.nodes, force[~node, 0])
-        return forces, moments
 
     def index(self, places: np.ndarray) -> np.ndarray:
         return places % self.nodes

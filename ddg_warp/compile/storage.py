@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ddg_warp.compile.loads import DeadLoad
+from ddg_warp.compile.loads import DeadLoad, accumulate
 
 FREE = -1  # instead of a pose, of a dof that no motion moves
 
@@ -89,7 +89,7 @@ class Storage:
         moving: nodes that supports move, and the pose of each component, `FREE` of those that none does (n, 4).
         turning: angles that supports turn, and their pose (n, 2).
         dead: loads that follow nothing; followers: those that do, see `compile.loads`.
-        nodes: number of places of nodes; places: where its rods are; axes: components that nodes have.
+        size: number of places; nodes: of nodes among them; places: where its rods are; axes: components that nodes have.
     """
 
     held: list[Held] = field(default_factory=list)
@@ -112,6 +112,17 @@ class Storage:
         loads = [load for load in self.dead if load.amplitude is None]
         places = np.concatenate([np.zeros(0, int), *(load.places for load in loads)])
         return DeadLoad(places, np.concatenate([np.zeros((0, 3)), *(load.force for load in loads)]))
+
+    @property
+    def loaded(self) -> bool:
+        """Whether there is any load."""
+        return bool(self.dead or self.followers)
+
+    def constant_loads(self) -> np.ndarray:
+        """Constant forces on all places (size, 3) [N], moments [N m] in component 0 of angles."""
+        result = np.zeros((self.size, 3))
+        accumulate(result, self.constant.places, self.constant.force)
+        return result
 
     @property
     def timed(self) -> list[DeadLoad]:

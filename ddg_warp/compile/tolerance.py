@@ -129,7 +129,7 @@ class Bodies:
 
 def outer_forces(host, gravity) -> np.ndarray:
     """Sizes of the outer forces on every block of a net (N,) [N, N m], those that change at their full amplitude."""
-    dead = host.constant_loads.copy()
+    dead = host.constant_loads()
     dead[: host.nodes] += host.mass[: host.nodes] * np.asarray(gravity, float)
     force = np.abs(dead).sum(1)
     for load in host.timed:

@@ -42,13 +42,13 @@ class Group:
         self.rotary = put(host.rotary, real)
         self.drag = put(host.drag, real) if kind.drag else None
         self.fixed = put(host.fixed, wp.uint8)
-        load, load_angle = host.constant_loads() if host.loaded else (np.zeros((1, 1, kind.dim)), np.zeros((1, 1)))
+        load, moment = _constant_loads(host) if host.loaded else (np.zeros((1, 1, kind.dim)), np.zeros((1, 1)))
         self.load = arrays.upload(np.concatenate([load] * worlds, axis=1), vector, device)
-        self.load_angle = put(load_angle if kind.twist else load_angle[:1, :1], real)
+        self.load_angle = put(moment, real)
         gravity = np.asarray(scene.gravity, float)
         self.gravity_host = gravity[[0, 2]] if kind.dim == 2 else gravity
         self.gravity = wp.array(self.gravity_host[None], dtype=vector, device=device)
-        self.outer = put(_outer_forces(host, self.gravity_host, load, load_angle), real)
+        self.outer = put(_outer_forces(host, self.gravity_host, load, moment), real)
         tiled = {name: np.tile(p, (1, worlds)) if p.shape[1] > 1 else p for name, p in host.parameters.items()}
         self.parameters = ParameterTable(tiled, 0, real, device)
 
@@ -83,6 +83,13 @@ class Group:
             mass = mass + s * drag.least(host.drag.T) * host.length / host.count
             length = np.where(host.fixed.any(0), length, np.inf)  # over long steps a free rod has nothing but drag
         return precision.float32_errors(self.kind, mass, length, values, s)
+
+
+def _constant_loads(host: ChainGroup) -> tuple[np.ndarray, np.ndarray]:
+    """Constant forces on nodes (n, R, dim) [N] and moments on the angles of edges (n, R), or (1, 1) without twist [N m]."""
+    load = host.constant_loads()
+    force = load[: host.nodes].reshape(*host.shape, 3)[..., :: 2 if host.kind.dim == 2 else 1]
+    return force, load[host.nodes :, 0].reshape(host.shape) if host.kind.twist else np.zeros((1, 1))
 
 
 def _outer_forces(host: ChainGroup, gravity: np.ndarray, load: np.ndarray, moment: np.ndarray) -> np.ndarray:

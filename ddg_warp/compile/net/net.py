@@ -107,6 +107,10 @@ class Net(Storage):
         return len(self.rest)
 
     @property
+    def size(self) -> int:
+        return self.blocks
+
+    @property
     def holds(self) -> np.ndarray:
         """Whether something of every dof in space is held (N, 3) bool."""
         result = self.fixed.copy()
@@ -153,13 +157,6 @@ class Net(Storage):
             if place in rod.all_edges:
                 return f"edge {int(np.argmax(rod.all_edges == place)) - rod.first} of rod {rod.rod}"
         return "the point at ({:g}, {:g}, {:g}) m".format(*self.rest[place])
-
-    @cached_property
-    def constant_loads(self) -> np.ndarray:
-        """Constant forces on blocks (N, 3) [N, N m]."""
-        result = np.zeros((self.blocks, 3))
-        accumulate(result, self.constant.places, self.constant.force)
-        return result
 
     @cached_property
     def drag(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:

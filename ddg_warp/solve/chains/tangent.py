@@ -145,8 +145,7 @@ class ChainTangent(Part):
     def where(self, dof: int) -> str:
         """Name of a dof's place."""
         column, k = divmod(dof // self.group.kind.block, self.group.nodes)
-        rod = int(self.group.host.rods[column % self.group.rods])
-        return f"node {k - int(self.group.host.first[column % self.group.rods])} of rod {rod}"
+        return self.host.name(k * self.group.rods + column % self.group.rods)
 
     def retract(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
         """q moved along `step`, with edges turned instead of sheared; see `ddg_warp.geometry.turning`."""
