@@ -32,27 +32,12 @@ class Reaction:
 @launches
 def energies(model, state) -> dict:
     """Energies by term [J]: elastic terms, kinetic, gravity (zero at the origin). Of several worlds arrays (worlds,)."""
-    result = Tangent(model).energy(state)
-    kinetic, potential = np.zeros(model.worlds), np.zeros(model.worlds)
-    for group, data in zip(model.groups, state.groups, strict=True):
-
-        def total(values, group=group):
-            """Sums over nodes (node, column) and rods of a world."""
-            return values.sum(0).reshape(group.worlds, group.rods).sum(1)
-
-        mass = np.tile(group.host.mass, (1, group.worlds))
-        x, v = (arrays.download(array).astype(np.float64) for array in (data.x, data.v))
-        kinetic += 0.5 * total(mass * (v * v).sum(-1))
-        potential -= total(mass * (x @ group.gravity_host))
-        if group.kind.twist:
-            rotary = np.tile(group.host.rotary, (1, group.worlds))
-            kinetic += 0.5 * total(rotary * arrays.download(data.omega).astype(np.float64) ** 2)
-    if model.net is not None:
-        host = model.net.host
-        q, v = (array.numpy().astype(float).reshape(model.worlds, -1, 3) for array in (state.net.q, state.net.v))
-        kinetic += 0.5 * (host.mass * v * v).sum((1, 2))
-        gravity = np.asarray(model.scene.gravity)
-        potential -= (host.mass[: host.nodes] * q[:, : host.nodes] * gravity).sum((1, 2))
+    tangent = Tangent(model)
+    result, kinetic, potential = tangent.energy(state), np.zeros(model.worlds), np.zeros(model.worlds)
+    for part in tangent.parts:
+        q, v = (values.reshape(model.worlds, -1) for values in (part.back(part.dofs(state)), part.rates(state)))
+        kinetic += 0.5 * (part.mass.reshape(v.shape) * v * v).sum(1)
+        potential -= q @ part.weight()
     every = result | {"kinetic": kinetic, "gravity": potential}
     return {name: values if model.worlds > 1 else float(values[0]) for name, values in every.items()}
 

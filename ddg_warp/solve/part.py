@@ -33,10 +33,14 @@ class Part:
         """A matrix of dofs in space as one of dofs as they are."""
         return values
 
+    def weight(self) -> np.ndarray:
+        """Gravity on the dofs of a world, in space [N]."""
+        own = self.mass[: self.size // self.worlds].reshape(-1, self.gravity.shape[1])
+        return (own * self.gravity).ravel()
+
     def dead_loads(self, factor: float) -> np.ndarray:
         """Outer forces on the dofs of a world, in space, that do not follow it."""
-        own = self.mass[: self.size // self.worlds].reshape(-1, self.gravity.shape[1])
-        result = factor * (own * self.gravity).ravel()
+        result = factor * self.weight()
         for load in (self.host.constant, *self.host.timed):
             _add(result, self.host.dofs(load.places), load.at(factor, factor) * load.force)
         return result

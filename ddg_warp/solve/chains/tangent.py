@@ -27,7 +27,8 @@ class ChainTangent(Part):
         super().__init__(model, group.host, offset, group.columns * group.nodes * kind.block, _mass(group), gravity)
         self.group, self.body_count = group, group.columns
         self.incidence = _incidence(group)
-        self.free, self.angle = _free(group), _angle(group)
+        self.free = _free(group)
+        self.angle = np.tile(np.arange(kind.block) >= kind.dim, group.columns * group.nodes)
         self._windows = arrays.allocate((kind.window, *shape), real, device)
         self._energies = arrays.allocate(shape, real, device)
         self._hessian = arrays.allocate((kind.window**2, *shape), real, device)
@@ -69,11 +70,17 @@ class ChainTangent(Part):
         return q.reshape(self.group.columns, self.group.nodes, self.group.kind.block)
 
     def dofs(self, state) -> np.ndarray:
-        kind, data = self.group.kind, self.data(state)
+        return self._flat(self.data(state).x, self.data(state).theta)
+
+    def rates(self, state) -> np.ndarray:
+        return self._flat(self.data(state).v, self.data(state).omega)
+
+    def _flat(self, nodes: wp.array, angles: wp.array) -> np.ndarray:
+        kind = self.group.kind
         q = np.zeros((self.group.columns, self.group.nodes, kind.block))
-        q[..., : kind.dim] = arrays.download(data.x).transpose(1, 0, 2)
+        q[..., : kind.dim] = arrays.download(nodes).transpose(1, 0, 2)
         if kind.twist:
-            q[..., kind.dim] = arrays.download(data.theta).T
+            q[..., kind.dim] = arrays.download(angles).T
         return q.ravel()
 
     def assign(self, state, q: np.ndarray) -> None:
@@ -121,12 +128,10 @@ class ChainTangent(Part):
         """Mean rest length of edges [m]."""
         return float((self.group.host.length / np.maximum(1, self.group.host.own - 1)).mean())
 
-    def point_dofs(self) -> tuple[np.ndarray, list[int], np.ndarray]:
-        """Rows of `State.points`, axes, and the dofs (rows, axes) of the first world."""
-        group, kind = self.group, self.group.kind
-        k, column, rows = self.model.places(group)
-        dofs = ((column * group.nodes + k) * kind.block)[:, None] + np.arange(kind.dim)
-        return rows, [0, 2] if kind.dim == 2 else [0, 1, 2], dofs
+    def point_dofs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of `State.points`, and the dofs (rows, 3) of the first world, -1 for none."""
+        k, column, rows = self.model.places(self.group)
+        return rows, self.host.dofs(k * self.group.rods + column)
 
     def bodies(self) -> list[Body]:
         """Every rod of every world."""
@@ -201,26 +206,18 @@ def _incidence(group) -> sparse.csr_matrix:
     return sparse.csr_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(cols))), shape=shape)
 
 
-def _per_dof(group, nodes: np.ndarray, angles: np.ndarray | None) -> np.ndarray:
-    """(size,) from values of nodes and of angles (n, R), repeated for all worlds."""
-    kind = group.kind
-    full = np.repeat(nodes[..., None], kind.block, axis=-1)
-    if kind.twist:
-        full[..., kind.dim] = angles
-    return np.concatenate([full] * group.worlds, axis=1).transpose(1, 0, 2).ravel()
-
-
 def _free(group) -> np.ndarray:
-    host, kind = group.host, group.kind
-    bits = (host.fixed[..., None] >> np.arange(kind.block)) & 1
+    host = group.host
+    bits = (host.fixed[..., None] >> np.arange(group.kind.block)) & 1
     inside = np.arange(group.nodes)[:, None] < host.count
-    free = (bits == 0) & inside[..., None]
-    return np.concatenate([free] * group.worlds, axis=1).transpose(1, 0, 2).ravel()
-
-
-def _angle(group) -> np.ndarray:
-    return _per_dof(group, np.zeros(group.host.mass.shape), np.ones(group.host.mass.shape)) > 0.0
+    return _every_world(group, (bits == 0) & inside[..., None])
 
 
 def _mass(group) -> np.ndarray:
-    return _per_dof(group, group.host.mass, group.host.rotary)
+    kind = group.kind
+    return _every_world(group, np.stack([group.host.mass] * kind.dim + [group.host.rotary] * kind.twist, axis=-1))
+
+
+def _every_world(group, values: np.ndarray) -> np.ndarray:
+    """Values of dofs (n, R, block) as those of all worlds are numbered (size,)."""
+    return np.concatenate([values] * group.worlds, axis=1).transpose(1, 0, 2).ravel()

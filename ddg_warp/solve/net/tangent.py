@@ -118,6 +118,9 @@ class NetTangent(Part):
     def dofs(self, state) -> np.ndarray:
         return self.into(state.net.q.numpy().astype(np.float64).ravel())
 
+    def rates(self, state) -> np.ndarray:
+        return self.into(state.net.v.numpy().astype(np.float64).ravel())
+
     def assign(self, state, q: np.ndarray) -> None:
         state.net.q.assign(self.back(q).reshape(-1, 3))
 
@@ -198,10 +201,10 @@ class NetTangent(Part):
         """Mean rest length of edges [m]."""
         return float(self.host.edge_lengths.mean())
 
-    def point_dofs(self) -> tuple[np.ndarray, list[int], np.ndarray]:
-        """Rows of `State.points`, axes, and the dofs (rows, axes) of the first world."""
+    def point_dofs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of `State.points`, and the dofs (rows, 3) of the first world."""
         rows, blocks = self.model.net_rows
-        return rows, [0, 1, 2], 3 * blocks[:, None] + np.arange(3)
+        return rows, self.host.dofs(blocks)
 
     def bodies(self) -> list[Body]:
         """Rods with the rotations of their rigid joints, shells, and shells of revolution, of every world."""
