@@ -232,3 +232,21 @@ def test_motions_move_what_their_supports_hold(device, in_net):
     scene.clamp(0, [-1], motion=ddg.Motion(translation=lambda t: (0.0, 0.0, t)))
     with pytest.raises(ddg.SceneError, match="has two motions along x; give it one that does both"):
         scene.build(device)
+
+
+def test_a_joint_may_be_displaced_by_both_its_rods(device):
+    """A displacement for each node that is named: rods that share one name it twice, one rod may not."""
+    scene = one_rod(True)
+    scene.fix(
+        [0, 1],
+        [0, 2],
+        motion=ddg.Motion(translation=lambda t: [(0.0, 0.0, t), (0.0, t, 0.0), (0.0, 0.0, t), (t, 0.0, 0.0)]),
+    )
+    del scene.supports[0]  # the clamp of the shared node
+    model = scene.build(device, "float64")
+    start, end = model.state().points(), steps(model, 4, 0.01).points()
+    np.testing.assert_allclose((end - start)[[0, 2, 9, 11]], 0.04 * np.eye(3)[[2, 1, 2, 0]], atol=1e-12)
+    scene = one_rod(True)
+    scene.fix(1, [1, 1], motion=ddg.Motion(translation=lambda t: [(0.0, 0.0, t), (0.0, t, 0.0)]))
+    with pytest.raises(ddg.SceneError, match="has two motions along x"):
+        scene.build(device)

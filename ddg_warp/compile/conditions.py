@@ -49,16 +49,14 @@ def hold_rods(scene, storage: Storage, claims: "Claims") -> None:
     for support in scene.supports:
         found, rows = places.among(support.rods)
         nodes = [places.node(rows, node) for node in support.nodes]
-        nth = [found * len(nodes) + n for n in range(len(nodes))]
         angles = [places.edge(rows, edge)[0][:, 2] for edge in support.edges]
         if support.end:
             last, twisted = support.end == "last", rows[places.twist[rows]]
             nodes += [places.nodes(rows, k) for k in ((places.own[rows] - 1, places.own[rows]) if last else (0, -1))]
-            nth += [0 * found] * 2
             angles.append(places.angles(twisted, places.own[twisted] - 1 if last else -1))
-        claims.take(
-            support, np.concatenate([_NONE, *nodes]), np.concatenate([_NONE, *nth]), np.concatenate([_NONE, *angles])
-        )
+        owners = np.tile(found, len(nodes))
+        nth = owners * len(support.nodes) + np.repeat(np.arange(len(nodes)), len(found))
+        claims.take(support, np.concatenate([_NONE, *nodes]), nth, owners, np.concatenate([_NONE, *angles]))
 
 
 class Claims:
@@ -68,10 +66,13 @@ class Claims:
         self.storage, self.motions = storage, scene_motions(scene)
         starts = pose_starts(self.motions)
         self._start = {id(motion): int(start) for motion, start in zip(self.motions, starts, strict=False)}
-        self._claims = []  # places, components, poses and number of the support, of each support
+        self._claims = []  # places, components, poses, number of the support and owners, of each support
 
-    def take(self, support, nodes: np.ndarray, nth: np.ndarray, angles: np.ndarray = _NONE) -> None:
-        """Hold nodes, which a support names as its `nth`, along its components, and angles."""
+    def take(self, support, nodes: np.ndarray, nth: np.ndarray, owners: np.ndarray, angles: np.ndarray = _NONE) -> None:
+        """Hold nodes, which a support names as its `nth`, along its components, and angles.
+
+        `owners` tell apart what nodes are named for: joined rods that share one may each displace it, the last counts.
+        """
         storage, motion = self.storage, support.motion
         along = [d for d in range(3) if "xyz"[d] in support.components]
         places = np.concatenate([np.tile(nodes, len(along)), angles])
@@ -83,7 +84,8 @@ class Claims:
             if motion is not None and motion.count is not None:
                 poses += np.tile(nth, len(along))  # such a motion turns no edge
             known = np.isin(components, storage.axes)
-            claims = places, components, poses, np.full(len(places), len(storage.held))
+            owners = np.concatenate([np.tile(owners, len(along)), angles])
+            claims = places, components, poses, np.full(len(places), len(storage.held)), owners
             self._claims.append([values[known] for values in claims])
 
     def finish(self) -> None:
@@ -94,11 +96,12 @@ class Claims:
         """
         if not self._claims:
             return
-        places, components, poses, supports = (np.concatenate(values) for values in zip(*self._claims, strict=True))
-        order = np.argsort(3 * places + components, kind="stable")  # claims of one dof stay in order
-        places, components, poses, supports = (values[order] for values in (places, components, poses, supports))
+        claims = [np.concatenate(values) for values in zip(*self._claims, strict=True)]
+        order = np.argsort(3 * claims[0] + claims[1], kind="stable")  # claims of one dof stay in order
+        places, components, poses, supports, owners = (values[order] for values in claims)
         again = np.diff(3 * places + components) == 0
-        clash = np.flatnonzero(again & (np.diff(poses) != 0) & (np.diff(supports) != 0))
+        shared = (np.diff(supports) == 0) & (np.diff(owners) != 0)
+        clash = np.flatnonzero(again & (np.diff(poses) != 0) & ~shared)
         if clash.size:
             first = clash[np.argmin(order[clash + 1])]
             self._refuse(places[first], components[first], min(poses[first], poses[first + 1]) == STILL)

@@ -35,12 +35,14 @@ def hold(scene, net: Net) -> None:
     normals: dict[int, list] = {}
     for support in scene.shell_supports:
         nodes = net.shells[support.shell].nodes[support.vertices]
-        claims.take(support, nodes, np.arange(len(nodes)))
+        each = np.arange(len(nodes))
+        claims.take(support, nodes, each, each)
         for node in nodes if not support.components else ():
             normals.setdefault(int(node), []).append(support.normal)
     for support in scene.ring_supports:
         nodes = net.meridians[support.shell].nodes[support.nodes]
-        claims.take(support, nodes, np.arange(len(nodes)))
+        each = np.arange(len(nodes))
+        claims.take(support, nodes, each, each)
     claims.finish()
     frames_of_planes(net, normals)
 
