@@ -1,4 +1,4 @@
-"""What surrounds the Newton loop of a time step: predictor, prescribed motion, end update, retry with a smaller step.
+"""What surrounds the Newton loop of a time step: predictor, end update, retry with a smaller step.
 
 Both schemes solve one implicit Euler step of length s (s = h, or h/2 for the implicit midpoint rule):
 
@@ -15,7 +15,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels import frames, motion, outcome
+from ddg_warp.kernels import frames, outcome
 from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, until_function
 from ddg_warp.kernels.islands import (
     BENT,
@@ -332,136 +332,3 @@ def advance_kernel(real):
             remaining[0] = 1
 
     return advance
-
-
-@cache
-def motion_kernels(kind: ChainKind, real, midpoint: bool):
-    """Kernels that put prescribed nodes and edge angles where their motion has them at the end of the (partial) step."""
-    dim = kind.dim
-    V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
-    along, *_ = gather_functions(kind, real)
-    transport, *_ = frames.functions(real)
-    _, placed, branch = motion.functions(real)
-    axis = 2 if dim == 2 else 1  # of space, from one component of a node to the next: x and z, or x, y and z
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def nodes(
-        where: wp.array2d(dtype=int),
-        rest: wp.array2d(dtype=real),
-        pose: wp.array2d(dtype=real),
-        flags: wp.array2d(dtype=int),
-        scalars: wp.array2d(dtype=real),
-        x: wp.array2d(dtype=V),
-    ):
-        """`where` is (node, rod, motion of each component, -1 for none), `rest` the positions in the rest state."""
-        i = wp.tid()
-        k = where[i, 0]
-        r = where[i, 1]
-        if scalars[PROGRESS, r] >= real(1.0):
-            return
-        at = X(rest[i, 0], rest[i, 1], rest[i, 2])
-        here = x[k, r]
-        for d in range(wp.static(dim)):
-            m = where[i, 2 + d]
-            if m >= 0:
-                p = placed(pose, m, scalars[PROGRESS, r] + scalars[PORTION, r], at)
-                if wp.static(midpoint):
-                    p = real(0.5) * (p + placed(pose, m, scalars[PROGRESS, r], at))
-                here[d] = p[d * wp.static(axis)]
-        x[k, r] = here
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def angles(
-        where: wp.array2d(dtype=int),
-        rest: wp.array2d(dtype=real),
-        pose: wp.array2d(dtype=real),
-        count: wp.array(dtype=int),
-        flags: wp.array2d(dtype=int),
-        scalars: wp.array2d(dtype=real),
-        x: wp.array2d(dtype=V),
-        frame: wp.array3d(dtype=real),
-        theta: wp.array2d(dtype=real),
-    ):
-        """`where` is (edge, rod, motion), `rest` the first material director in the rest state."""
-        i = wp.tid()
-        k = where[i, 0]
-        r = where[i, 1]
-        m = where[i, 2]
-        if scalars[PROGRESS, r] >= real(1.0):
-            return
-        t = wp.normalize(x[along(k + 1, count[r]), r] - x[k, r])
-        director = X(rest[i, 0], rest[i, 1], rest[i, 2])
-        start = scalars[PROGRESS, r]
-        end = start + scalars[PORTION, r]
-        if wp.static(midpoint):
-            end = start + real(0.5) * scalars[PORTION, r]
-        u = transport(
-            X(frame[0, k, r], frame[1, k, r], frame[2, k, r]), X(frame[3, k, r], frame[4, k, r], frame[5, k, r]), t
-        )
-        theta[k, r] = branch(pose, m, start, end, director, u, t, theta[k, r])
-
-    return nodes, angles
-
-
-@cache
-def load_kernels(kind: ChainKind, real):
-    """Kernels for loads that change: reset nodes to their constant loads, add forces and moments, add couples."""
-    dim, twist = kind.dim, kind.twist
-    V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
-
-    if dim == 2:
-
-        @wp.func
-        def across(couple: X, e: V):
-            return V(couple[1] * e[1], -couple[1] * e[0])
-
-    else:
-
-        @wp.func
-        def across(couple: X, e: V):
-            return wp.cross(couple, e)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def add(
-        where: wp.array2d(dtype=int),
-        values: wp.array2d(dtype=real),
-        x: wp.array2d(dtype=V),
-        load_out: wp.array2d(dtype=V),
-        load_angle_out: wp.array2d(dtype=real),
-    ):
-        """`where` is (node or edge, rod); `values` are force (3), moment about the edge, couple (3)."""
-        i = wp.tid()
-        k = where[i, 0]
-        r = where[i, 1]
-        force = V()
-        for d in range(wp.static(dim)):
-            force[d] = values[i, d]
-        wp.atomic_add(load_out, k, r, force)
-        if wp.static(twist):
-            wp.atomic_add(load_angle_out, k, r, values[i, 3])
-        couple = X(values[i, 4], values[i, 5], values[i, 6])
-        if wp.length_sq(couple) > real(0.0):
-            e = x[k + 1, r] - x[k, r]
-            pair = across(couple, e) / wp.length_sq(e)
-            wp.atomic_add(load_out, k + 1, r, pair)
-            wp.atomic_add(load_out, k, r, -pair)
-            if wp.static(twist):
-                wp.atomic_add(load_angle_out, k, r, wp.dot(couple, e) / wp.length(e))
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
-    def reset(
-        where: wp.array2d(dtype=int),
-        values: wp.array2d(dtype=real),
-        load_out: wp.array2d(dtype=V),
-        load_angle_out: wp.array2d(dtype=real),
-    ):
-        """`where` is (node, rod), each once; `values` are its constant force (3) and moment."""
-        i = wp.tid()
-        force = V()
-        for d in range(wp.static(dim)):
-            force[d] = values[i, d]
-        load_out[where[i, 0], where[i, 1]] = force
-        if wp.static(twist):
-            load_angle_out[where[i, 0], where[i, 1]] = values[i, 3]
-
-    return reset, add

@@ -93,6 +93,22 @@ def test_rod_in_a_net_spins_as_alone(device, scheme):
     np.testing.assert_allclose(found[1], found[0], atol=1e-9)
 
 
+def test_couple_on_the_edge_that_closes_a_ring(device):
+    """Between its last node and its first; the ring is held at an edge, alone or where another rod is joined to it."""
+    found, turn = [], 2.0 * np.pi * np.arange(8) / 8.0
+    for in_net in (False, True):
+        scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+        ring = scene.add_rod(np.stack([np.cos(turn), np.sin(turn), 0.0 * turn], -1), section=ROD, closed=True)
+        scene.clamp(ring, edges=[3])
+        scene.add_couple(ring, -1, (0.1, 0.2, 0.3))
+        if in_net:
+            other = scene.add_rod(np.outer([1.0, 1.5, 2.0], [np.cos(turn[3]), np.sin(turn[3]), 0.0]), section=ROD)
+            scene.join([(ring, 3), (other, 0)], rigid=False)
+        found.append(steps(scene.build(device, "float64"), 20, 0.01, rtol=1e-11).points()[:8])
+    assert np.abs(found[0][0] - [1.0, 0.0, 0.0]).max() > 1e-3
+    np.testing.assert_allclose(found[1], found[0], atol=1e-9)
+
+
 @pytest.mark.parametrize("case", ["no twist", "planar"])
 @pytest.mark.parametrize("action", [turned_end, coupled])
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -215,4 +231,22 @@ def test_motions_move_what_their_supports_hold(device, in_net):
     np.testing.assert_allclose(steps(model, 4, 0.01).points()[8], bow()[-1] + [-0.04, 0.0, 0.08], atol=1e-14)
     scene.clamp(0, [-1], motion=ddg.Motion(translation=lambda t: (0.0, 0.0, t)))
     with pytest.raises(ddg.SceneError, match="has two motions along x; give it one that does both"):
+        scene.build(device)
+
+
+def test_a_joint_may_be_displaced_by_both_its_rods(device):
+    """A displacement for each node that is named: rods that share one name it twice, one rod may not."""
+    scene = one_rod(True)
+    scene.fix(
+        [0, 1],
+        [0, 2],
+        motion=ddg.Motion(translation=lambda t: [(0.0, 0.0, t), (0.0, t, 0.0), (0.0, 0.0, t), (t, 0.0, 0.0)]),
+    )
+    del scene.supports[0]  # the clamp of the shared node
+    model = scene.build(device, "float64")
+    start, end = model.state().points(), steps(model, 4, 0.01).points()
+    np.testing.assert_allclose((end - start)[[0, 2, 9, 11]], 0.04 * np.eye(3)[[2, 1, 2, 0]], atol=1e-12)
+    scene = one_rod(True)
+    scene.fix(1, [1, 1], motion=ddg.Motion(translation=lambda t: [(0.0, 0.0, t), (0.0, t, 0.0)]))
+    with pytest.raises(ddg.SceneError, match="has two motions along x"):
         scene.build(device)

@@ -7,9 +7,9 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.ask import end_moments
+from ddg_warp.compile.storage import gathered
 from ddg_warp.kernels.terms import AXISYMMETRIC, MAGNETS, SHELLS
-from ddg_warp.solve.chains.prescribed import ChainDrag
-from ddg_warp.solve.net.prescribed import NetDrag
+from ddg_warp.solve.drag import ChainDrag, NetDrag
 from ddg_warp.solve.tangent import Tangent
 from ddg_warp.threads import launches
 
@@ -32,27 +32,12 @@ class Reaction:
 @launches
 def energies(model, state) -> dict:
     """Energies by term [J]: elastic terms, kinetic, gravity (zero at the origin). Of several worlds arrays (worlds,)."""
-    result = Tangent(model).energy(state)
-    kinetic, potential = np.zeros(model.worlds), np.zeros(model.worlds)
-    for group, data in zip(model.groups, state.groups, strict=True):
-
-        def total(values, group=group):
-            """Sums over nodes (node, column) and rods of a world."""
-            return values.sum(0).reshape(group.worlds, group.rods).sum(1)
-
-        mass = np.tile(group.host.mass, (1, group.worlds))
-        x, v = (arrays.download(array).astype(np.float64) for array in (data.x, data.v))
-        kinetic += 0.5 * total(mass * (v * v).sum(-1))
-        potential -= total(mass * (x @ group.gravity_host))
-        if group.kind.twist:
-            rotary = np.tile(group.host.rotary, (1, group.worlds))
-            kinetic += 0.5 * total(rotary * arrays.download(data.omega).astype(np.float64) ** 2)
-    if model.net is not None:
-        host = model.net.host
-        q, v = (array.numpy().astype(float).reshape(model.worlds, -1, 3) for array in (state.net.q, state.net.v))
-        kinetic += 0.5 * (host.mass * v * v).sum((1, 2))
-        gravity = np.asarray(model.scene.gravity)
-        potential -= (host.mass[: host.nodes] * q[:, : host.nodes] * gravity).sum((1, 2))
+    tangent = Tangent(model)
+    result, kinetic, potential = tangent.energy(state), np.zeros(model.worlds), np.zeros(model.worlds)
+    for part in tangent.parts:
+        q, v = (values.reshape(model.worlds, -1) for values in (part.back(part.dofs(state)), part.rates(state)))
+        kinetic += 0.5 * (part.mass.reshape(v.shape) * v * v).sum(1)
+        potential -= q @ part.weight()
     every = result | {"kinetic": kinetic, "gravity": potential}
     return {name: values if model.worlds > 1 else float(values[0]) for name, values in every.items()}
 
@@ -74,25 +59,21 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     q = tangent.dofs(state)
     force = tangent.back(np.where(tangent.free, 0.0, tangent.gradient(state) - tangent.loads(factor, q)))
     q = tangent.back(q)
-    net = model.net.host.held if model.net is not None else []
-    count, shells = max(len(model.held), len(net)), len(model.scene.shell_supports)
-    turns = np.zeros((model.worlds, count, 3))
-    if net:
-        first = len(model.scene.supports)
+    scene = model.scene
+    first, shells = len(scene.supports), len(scene.shell_supports)
+    turns = np.zeros((model.worlds, first + shells + len(scene.ring_supports), 3))
+    if shells:
         turns[:, first : first + shells] = _normal_moments(tangent.parts[-1], state)
     result = []
-    for i in range(count):
+    for i in range(turns.shape[1]):
         worlds = []
         for world in range(model.worlds):
-            places = [*_chain_places(tangent, q, force, model.held[i] if i < len(model.held) else [], world)]
-            if net:
-                places += _net_places(tangent.parts[-1], q, force, net[i], world)
-            about = (
-                places[0][0] if point is None and places else np.zeros(3) if point is None else np.asarray(point, float)
-            )
-            total = sum((push for _, push, _ in places), np.zeros(3))
-            moment = sum((np.cross(here - about, push) + twist for here, push, twist in places), turns[world, i])
-            worlds.append((total, moment, about))
+            parts = [part for part in tangent.parts if i < len(part.host.held)]
+            found = [_taken(part, Tangent.of(part, q), Tangent.of(part, force), i, world) for part in parts]
+            here, push, twist = (np.concatenate(values) for values in zip(*found, strict=True))
+            about = np.concatenate([here, np.zeros((1, 3))])[0] if point is None else np.asarray(point, float)
+            moment = (np.cross(here - about, push) + twist).sum(0) + turns[world, i]
+            worlds.append((push.sum(0), moment, about))
         result.append(Reaction(*(_each_world(np.array(values)) for values in zip(*worlds, strict=True))))
     return result
 
@@ -151,42 +132,25 @@ def _each_world(values: np.ndarray) -> np.ndarray:
     return values[0] if len(values) == 1 else values
 
 
-def _chain_places(tangent, q: np.ndarray, force: np.ndarray, support, world: int):
-    """(place, force, moment) of the nodes and edges of chains that a support holds in a world, taken from `force`."""
-    for held in support:
-        part = tangent.parts[held.group]
-        kind = part.group.kind
-        axes = [0, 2] if kind.dim == 2 else [0, 1, 2]
-        x, f = (part.blocks(tangent.of(part, values))[..., : kind.block] for values in (q, force))
-        for node, column in zip(held.k, held.columns + world * part.group.rods, strict=True):
-            here, push, twist = np.zeros(3), np.zeros(3), np.zeros(3)
-            here[axes] = x[column, node, : kind.dim]
-            if not held.components and kind.twist:
-                along = x[column, (node + 1) % part.group.nodes, : kind.dim] - x[column, node, : kind.dim]
-                twist = f[column, node, kind.dim] * along / np.linalg.norm(along)
-                f[column, node, kind.dim] = 0.0
-            else:
-                bits = [(held.components >> d) & 1 for d in range(kind.dim)]
-                push[axes] = f[column, node, : kind.dim] * bits
-                f[column, node, : kind.dim] -= push[axes]
-            yield here, push, twist
-
-
-def _net_places(part, q: np.ndarray, force: np.ndarray, held, world: int) -> list[tuple]:
-    """(place, force, moment) of the blocks of the net that a support holds in a world, taken from `force`."""
-    host, places = part.host, []
-    x, f = (Tangent.of(part, values).reshape(part.net.worlds, -1, 3)[world] for values in (q, force))
-    for block, component in zip(held.blocks, held.components, strict=True):
-        if held.normal is not None:
-            normal = np.array(held.normal)
-            places.append((x[block], (f[block] @ normal) * normal, np.zeros(3)))
-        elif block < host.nodes:
-            places.append((x[block], f[block] * np.eye(3)[component], np.zeros(3)))
-        else:
-            first, last = x[host.ends[block - host.nodes]]
-            places.append((first, np.zeros(3), f[block, 0] * (last - first) / np.linalg.norm(last - first)))
-        f[block, component] = 0.0
-    return places
+def _taken(part, q: np.ndarray, force: np.ndarray, support: int, world: int) -> tuple:
+    """Where a support holds a part in a world (n, 3), and the forces and moments there (n, 3), which are taken from `force`."""
+    host = part.host
+    held, x, f = host.held[support], *(values.reshape(part.model.worlds, -1)[world] for values in (q, force))
+    dofs, turns = host.dofs(held.places), held.places >= host.nodes
+    if held.normal is not None:
+        push = np.outer(f[dofs] @ held.normal, held.normal)
+        f[dofs] -= push
+        return x[dofs], push, 0.0 * push
+    own = dofs[np.arange(len(dofs)), held.components]
+    size, once = np.zeros(len(own)), np.unique(own, return_index=True)[1]
+    size[once] = gathered(f, own[once])
+    f[own[own >= 0]] = 0.0
+    ends = host.dofs(host.edge_ends(held.places[turns]))
+    dofs[turns] = ends[:, 0]
+    directions, edges = np.eye(3)[held.components], gathered(x, ends[:, 1]) - gathered(x, ends[:, 0])
+    directions[turns] = edges / np.linalg.norm(edges, axis=1, keepdims=True)
+    vectors = size[:, None] * directions
+    return gathered(x, dofs), vectors * ~turns[:, None], vectors * turns[:, None]
 
 
 def _normal_moments(part, state) -> np.ndarray:

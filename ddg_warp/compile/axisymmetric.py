@@ -5,12 +5,13 @@ Shells, 1998, chapter 5): the membrane on edges, where both stretches are known 
 the turning of the tangent is. Every node has half of its edges' surface; at poles and rims it is that of the one edge.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from ddg_warp.compile.chains import TimedLoad
 from ddg_warp.compile.elements import ElementSet
+from ddg_warp.compile.loads import Load
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.terms import AXISYMMETRIC
 
@@ -59,8 +60,8 @@ class NetMeridian:
 
 
 @dataclass
-class NetBand:
-    """Pressure [Pa] on the surface of meridian edges (E, 2) that follows it; amplitude or None.
+class BandPressure(Load):
+    """Pressure [Pa] on the surface of meridian edges (E, 2) that follows it.
 
     Forces are consistent with straight edges: work 2 pi p r (-dz, dr) . dx, with r and dx linear along the edge. They have a
     potential, the enclosed volume, but for the axial force on a moving rim.
@@ -68,17 +69,19 @@ class NetBand:
 
     places: np.ndarray
     pressure: np.ndarray
-    amplitude: object
+    amplitude: Callable[[float], float] | None = None
 
-    at = TimedLoad.at
+    kernel = "squeeze"
+
+    @property
+    def values(self) -> np.ndarray:
+        return np.outer(self.pressure, [1.0, 0.0, 0.0])
 
     def forces(self, x: np.ndarray) -> np.ndarray:
-        """Forces (E, 2, 3) [N] on the ends, at x (E, 2, 3)."""
         across, weight = self._parts(x)
         return weight[..., None] * across[:, None]
 
     def derivative(self, x: np.ndarray) -> np.ndarray:
-        """Derivative of the forces (E, 2, 3, 2, 3) [N/m]."""
         across, weight = self._parts(x)
         scale = np.pi / 3.0 * self.pressure
         result = np.zeros((len(x), 2, 3, 2, 3))

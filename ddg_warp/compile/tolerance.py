@@ -129,11 +129,11 @@ class Bodies:
 
 def outer_forces(host, gravity) -> np.ndarray:
     """Sizes of the outer forces on every block of a net (N,) [N, N m], those that change at their full amplitude."""
-    dead = host.load.copy()
+    dead = host.constant_loads()
     dead[: host.nodes] += host.mass[: host.nodes] * np.asarray(gravity, float)
     force = np.abs(dead).sum(1)
     for load in host.timed:
-        np.add.at(force, load.blocks, np.abs(load.force).sum(-1))
+        np.add.at(force, load.places, np.abs(load.force).sum(-1))
     for load in host.followers:
         np.add.at(force, load.places, np.abs(load.forces(host.rest[load.places])).sum(-1))
     for part in host.sets:

@@ -22,7 +22,8 @@ class Group:
         kind = replace(host.kind, serial=arrays.serial(device))
         vector = wp.types.vector(kind.dim, real)
         self.host, self.kind, self.worlds, self.device = host, kind, worlds, device
-        self.rods = len(host.rods)
+        self.rods = self.world_columns = len(host.rods)
+        self.dim = kind.dim
         self.nodes = host.shape[0]
         self.columns = self.rods * worlds
         self.elements = self.nodes if kind.closed else self.nodes - 1
@@ -41,16 +42,13 @@ class Group:
         self.rotary = put(host.rotary, real)
         self.drag = put(host.drag, real) if kind.drag else None
         self.fixed = put(host.fixed, wp.uint8)
-        load = np.concatenate([host.load] * worlds, axis=1) if host.loaded else np.zeros((1, 1, kind.dim))
-        self.load = arrays.upload(load, vector, device)
-        self.load_angle = (
-            put(host.load_angle, real) if host.loaded and kind.twist else wp.zeros((1, 1), dtype=real, device=device)
-        )
+        load, moment = _constant_loads(host) if host.loaded else (np.zeros((1, 1, kind.dim)), np.zeros((1, 1)))
+        self.load = arrays.upload(np.concatenate([load] * worlds, axis=1), vector, device)
+        self.load_angle = put(moment, real)
         gravity = np.asarray(scene.gravity, float)
         self.gravity_host = gravity[[0, 2]] if kind.dim == 2 else gravity
         self.gravity = wp.array(self.gravity_host[None], dtype=vector, device=device)
-        self.outer = put(_outer_forces(host, self.gravity_host), real)
-        self.moving = Moving(host, worlds, self.rods, device, real) if host.moving_nodes or host.moving_edges else None
+        self.outer = put(_outer_forces(host, self.gravity_host, load, moment), real)
         tiled = {name: np.tile(p, (1, worlds)) if p.shape[1] > 1 else p for name, p in host.parameters.items()}
         self.parameters = ParameterTable(tiled, 0, real, device)
 
@@ -87,46 +85,29 @@ class Group:
         return precision.float32_errors(self.kind, mass, length, values, s)
 
 
-class Moving:
-    """Device lists of the dofs of a group that have a prescribed motion.
-
-    Attributes:
-        nodes: (node, column, motion of each component) of held nodes; node_rest: their rest positions (., 3) [m].
-        edges: (edge, column, motion) of held angles; edge_rest: first directors of these edges at rest (., 3).
-    """
-
-    def __init__(self, host: ChainGroup, worlds: int, rods: int, device, real):
-        def where(rows):
-            shift = np.eye(1, rows.shape[1], 1, int)
-            tiled = np.concatenate([rows + world * rods * shift for world in range(worlds)])
-            return wp.array(tiled.astype(np.int32), dtype=int, device=device)
-
-        def rest(values):
-            return wp.array(np.concatenate([values] * worlds), dtype=real, device=device)
-
-        rows = np.concatenate([np.zeros((0, 5), int), *host.moving_nodes])
-        self.nodes = where(rows)
-        points = np.zeros((len(rows), 3))
-        points[:, [0, 2] if host.kind.dim == 2 else [0, 1, 2]] = host.x[rows[:, 0], rows[:, 1]]
-        self.node_rest = rest(points)
-        rows = np.concatenate([np.zeros((0, 3), int), *host.moving_edges])
-        self.edges = where(rows)
-        directors = np.moveaxis(host.frame[0:3], 0, -1)
-        self.edge_rest = rest(directors[rows[:, 0], rows[:, 1]] if len(rows) else np.zeros((0, 3)))
+def _constant_loads(host: ChainGroup) -> tuple[np.ndarray, np.ndarray]:
+    """Constant forces on nodes (n, R, dim) [N] and moments on the angles of edges (n, R), or (1, 1) without twist [N m]."""
+    load = host.constant_loads()
+    force = load[: host.nodes].reshape(*host.shape, 3)[..., :: 2 if host.kind.dim == 2 else 1]
+    return force, load[host.nodes :, 0].reshape(host.shape) if host.kind.twist else np.zeros((1, 1))
 
 
-def _outer_forces(host: ChainGroup, gravity: np.ndarray) -> np.ndarray:
+def _outer_forces(host: ChainGroup, gravity: np.ndarray, load: np.ndarray, moment: np.ndarray) -> np.ndarray:
     """Sum of the magnitudes of the outer forces on every rod (R,) [N]: the scale that residuals are compared with."""
-    forces = np.zeros_like(host.mass)
+    forces, rods = np.zeros_like(host.mass), len(host.rods)
     for d, g in enumerate(gravity):
         force = host.mass * g
         if host.loaded:
-            force += host.load[..., d]
+            force += load[..., d]
         forces += np.abs(force, out=force)
     total = forces.sum(0)
     if host.loaded:
-        total += np.abs(host.load_angle).sum(0) / host.length
-    for load in host.timed_loads:
-        size = np.abs(load.force).sum() + (abs(load.moment) + np.abs(load.couple).sum()) / host.length[load.columns]
-        np.add.at(total, load.columns, size)
+        total += np.abs(moment).sum(0) / host.length
+    for timed in host.timed:
+        column = timed.places % rods
+        arm = np.where(timed.places < host.nodes, 1.0, host.length[column])
+        np.add.at(total, column, np.abs(timed.force).sum(1) / arm)
+    for couple in host.followers:
+        column = couple.places[:, 0] % rods
+        np.add.at(total, column, np.abs(couple.couple).sum() / host.length[column])
     return total

@@ -4,7 +4,8 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.compile.chains import compile_chains, scene_motions
+from ddg_warp.compile.chains import compile_chains
+from ddg_warp.compile.conditions import scene_motions
 from ddg_warp.compile.precision import choose, warn_of_rounding
 from ddg_warp.errors import SceneError
 from ddg_warp.io import Curves, Surfaces
@@ -25,7 +26,6 @@ class Model:
         curves: rods in the user's order.
         groups: rods of one kind and similar length each; those that are part of the net are not among them.
         net: shells and what is joined, or None.
-        held: what each support of the scene's rods holds in the groups.
         precision: scalar types.
         worlds: number of independent copies.
         allow_rounding: whether what float32 loses in rounding is stepped and solved nevertheless.
@@ -40,7 +40,7 @@ class Model:
         self.types = choose(precision, self.wp_device)
         self.worlds = worlds
         self.version = 0  # rises with every change of a constant array, so that captured steps are captured anew
-        self.chains, self.held = compile_chains(scene)
+        self.chains = compile_chains(scene)
         self.motions = scene_motions(scene)
         self.groups = [Group(chain, scene, worlds, self.wp_device, self.types.real) for chain in self.chains]
         self.net = self._build_net() if needs_net(scene) else None

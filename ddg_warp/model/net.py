@@ -100,6 +100,7 @@ class DeviceNet:
         self.host, self.worlds, self.device, self.real = host, worlds, device, real
         self.vector = wp.types.vector(3, real)
         self.blocks, self.angle_start = host.blocks, host.nodes
+        self.dim, self.world_columns, self.columns = 3, 1, worlds
         self.edges = host.rod_edges
         self.sets = [DeviceSet(s, worlds, device, real, motions) for s in host.sets]
         self.ends = wp.array(np.ascontiguousarray(host.ends, np.int32).reshape(-1, 2), dtype=int, device=device)
@@ -126,6 +127,22 @@ class DeviceNet:
             state.last.append(self._zeros(strains, count if strains else 1))
         state.data = self.turning_data() | self.field_data()
         return state
+
+    def points(self, blocks: wp.array) -> wp.array:
+        """Blocks (W N,) as the points of a storage, [block][world]."""
+        return blocks.reshape((self.worlds, self.blocks)).transpose((1, 0))
+
+    def angles(self, blocks: wp.array) -> wp.array:
+        """Blocks (W N,) as the angles of a storage, [block][world]: their first components."""
+        size = wp.types.type_size_in_bytes(self.real)
+        shape, strides = (self.blocks, self.worlds), (3 * size, 3 * size * self.blocks)
+        view = wp.array(ptr=blocks.ptr, dtype=self.real, shape=shape, strides=strides, device=self.device)
+        view._ref = blocks  # what it looks at lives as long
+        return view
+
+    def frames(self, frame: wp.array) -> wp.array:
+        """Frames (6, W edges) as those of a storage, [component][edge][world]."""
+        return frame.reshape((6, -1, max(1, self.edges))).transpose((0, 2, 1))
 
     def turning_data(self) -> dict[int, wp.array]:
         """Data of the sets with normals that supports turn, as at rest."""

@@ -73,7 +73,7 @@ class ChainEnergy(_Energy):
         self.ranges = 1 if group.kind.serial else max(1, math.isqrt(group.nodes))
         super().__init__(step, group.columns, self.ranges, kept)
         self._loads = [group.load, group.load_angle]
-        self._follows = any(np.any(load.couple) for load in group.host.timed_loads)
+        self._follows = bool(group.host.followers)
         if self._follows:
             self._loads = [wp.clone(load) for load in self._loads]
         self._measure = energy.chain_kernel(group.kind, self.model.types.real, step.newton.linear)
@@ -148,7 +148,7 @@ class NetEnergy(_Energy):
                 device=self.device,
             )
         if net.host.followers:
-            step.loads.apply(solver.q, self._load)
+            step.loads.apply(net.points(solver.q), net.points(self._load), net.angles(self._load))
         wp.launch(
             self._blocks,
             solver.all,

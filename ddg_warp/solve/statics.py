@@ -21,9 +21,9 @@ from ddg_warp.model import validate
 from ddg_warp.model.state import State
 from ddg_warp.scene import validate as scene_validate
 from ddg_warp.solve import mixed, stability
-from ddg_warp.solve.chains.prescribed import jump_between
 from ddg_warp.solve.choice import static_solver, why_not_pcg
 from ddg_warp.solve.direct import Factorisation, SingularError
+from ddg_warp.solve.motion import jump_between
 from ddg_warp.solve.net.statics import NetEquilibrium
 from ddg_warp.solve.residuals import Residuals
 from ddg_warp.solve.supports import require_supports

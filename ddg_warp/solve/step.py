@@ -7,7 +7,7 @@ from ddg_warp import arrays
 from ddg_warp.errors import SolverError
 from ddg_warp.geometry import polyline
 from ddg_warp.kernels import outcome, step
-from ddg_warp.solve.chains.prescribed import jump_between
+from ddg_warp.solve.motion import jump_between
 
 FOLDED = 1e-5  # how close to opposite [rad] edges that meet are called folded, in messages
 

@@ -169,8 +169,8 @@ class Tangent:
         """Dofs of the rows of `State.points` (P, 3), of the first world; -1 for what a planar rod has not."""
         result = np.full((self.model.points_count, 3), -1)
         for part in self.parts:
-            rows, axes, dofs = part.point_dofs()
-            result[rows[:, None], axes] = dofs + part.offset
+            rows, dofs = part.point_dofs()
+            result[rows] = np.where(dofs < 0, -1, dofs + part.offset)
         return result
 
     def at_points(self, values: np.ndarray) -> np.ndarray:
@@ -178,9 +178,9 @@ class Tangent:
         worlds = self.model.worlds
         result = np.zeros((worlds, self.model.points_count, 3), values.dtype)
         for part in self.parts:
-            rows, axes, dofs = part.point_dofs()
+            rows, dofs = part.point_dofs()
             own = self.of(part, values).reshape(worlds, -1)
-            result[:, rows[:, None], axes] = own[:, dofs]
+            result[:, rows] = np.where(dofs < 0, 0.0, own[:, dofs])
         return result if worlds > 1 else result[0]
 
     def where(self, dof: int) -> str:
@@ -190,15 +190,11 @@ class Tangent:
 
     def into(self, values: np.ndarray) -> np.ndarray:
         """Vectors in space (size,) as dofs are: components in the frames of oblique planes; see `ddg_warp.solve.net.planes`."""
-        return self._each("into", values)
+        return np.concatenate([part.into(self.of(part, values)) for part in self.parts])
 
     def back(self, values: np.ndarray) -> np.ndarray:
         """Dofs, forces or steps (size,) as vectors in space."""
-        return self._each("back", values)
-
-    def _each(self, how: str, values: np.ndarray) -> np.ndarray:
-        parts = [(part, self.of(part, values)) for part in self.parts]
-        return np.concatenate([getattr(part, how)(own) if hasattr(part, how) else own for part, own in parts])
+        return np.concatenate([part.back(self.of(part, values)) for part in self.parts])
 
     @staticmethod
     def of(part, values: np.ndarray) -> np.ndarray:

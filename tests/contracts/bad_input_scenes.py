@@ -206,6 +206,9 @@ SUPPORTS = {
     "two motions of a node": (
         lambda s: (s.fix(1, [0], motion=STILL), s.fix(1, [0], "z", SWING)), "node 0 of rod 1", "two motions along z"
     ),
+    "two displacements of a node": (
+        lambda s: s.fix(1, [0, 0], motion=M(lambda t: [[0.0, 0.0, 0.0], [0.0, 0.0, t]])), "node 0 of rod 1", "two motions along x"
+    ),
     "two motions of an edge": (
         lambda s: (s.fix_twist(1, [2], STILL), s.fix_twist(1, [2], SWING)), "edge 2 of rod 1", "two motions"
     ),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.compile.axisymmetric import NetBand
+from ddg_warp.compile.axisymmetric import BandPressure
 from ddg_warp.kernels.terms import AXISYMMETRIC
 from ddg_warp.run.derivatives import relative, samples_of
 from ddg_warp.solve.tangent import Tangent
@@ -76,7 +76,7 @@ def test_pressure_follows_with_its_exact_derivative():
     random = np.random.default_rng(3)
     x = np.column_stack([1.0 + random.random(6), np.zeros(6), np.arange(6.0)]) + 0.1 * random.normal(size=(6, 3))
     ends = np.column_stack([np.arange(5), np.arange(1, 6)])
-    band = NetBand(ends, random.uniform(1.0, 2.0, 5), None)
+    band = BandPressure(ends, random.uniform(1.0, 2.0, 5))
     analytic, step = band.derivative(x[ends]), 1e-6
     for j in range(2):
         for d in range(3):
@@ -84,7 +84,7 @@ def test_pressure_follows_with_its_exact_derivative():
             shift[0, j, d] = step
             column = (band.forces(x[ends] + shift) - band.forces(x[ends] - shift)) / (2.0 * step)
             np.testing.assert_allclose(analytic[..., j, d], column, atol=1e-8)
-    even = NetBand(ends, np.ones(5), None)
+    even = BandPressure(ends, np.ones(5))
     total = np.zeros((6, 3))
     np.add.at(total, ends, even.forces(x[ends]))
 

@@ -112,10 +112,12 @@ class Problem:
         rod, c = column % 2, float(arrays.download(self.newton.islands.coefficient)[column])
         diagonal, force = np.zeros((n, kind.block)), np.zeros((n, kind.block))
         diagonal[:, : kind.dim] = c * host.mass[:n, rod, None]
-        force[:, : kind.dim] = host.mass[:n, rod, None] * self.group.gravity_host + host.load[:n, rod]
+        force[:, : kind.dim] = (
+            host.mass[:n, rod, None] * self.group.gravity_host + arrays.download(self.group.load)[:n, rod]
+        )
         if kind.twist:
             diagonal[:, kind.dim] = c * host.rotary[:n, rod]
-            force[:, kind.dim] = host.load_angle[:n, rod]
+            force[:, kind.dim] = arrays.download(self.group.load_angle)[:n, rod]
         target = self.dofs(self.newton.target, self.newton.target_angle)[column, :n]
         return diagonal.ravel(), target.ravel(), force.ravel()
 

@@ -86,10 +86,15 @@ class Problem:
         c, rod = float(arrays.download(self.newton.islands.coefficient)[column]), column % 2
         diagonal, force = np.zeros((n, kind.block)), np.zeros((n, kind.block))
         diagonal[:, : kind.dim] = c * host.mass[:n, rod, None]
-        force[:, : kind.dim] = host.mass[:n, rod, None] * self.group.gravity_host + host.load[:n, rod]
+        force[:, : kind.dim] = (
+            host.mass[:n, rod, None] * self.group.gravity_host + arrays.download(self.group.load)[:n, rod]
+        )
         target = np.moveaxis(arrays.download(self.newton.target), 0, 1)[column, :n]
         if kind.twist:
-            diagonal[:, kind.dim], force[:, kind.dim] = c * host.rotary[:n, rod], host.load_angle[:n, rod]
+            diagonal[:, kind.dim], force[:, kind.dim] = (
+                c * host.rotary[:n, rod],
+                arrays.download(self.group.load_angle)[:n, rod],
+            )
             target = np.concatenate([target, arrays.download(self.newton.target_angle).T[column, :n, None]], -1)
         H, r = np.diag(diagonal.ravel()), (force - diagonal * (self.before[column, :n] - target)).ravel()
         edge_row, tension_row = kind.vertex_strains * kind.window, kind.factor_rows - kind.tensions

@@ -9,10 +9,11 @@ import numpy as np
 
 from ddg_warp.compile import axisymmetric
 from ddg_warp.compile import shells as shell_terms
-from ddg_warp.compile.chains import FREE, Ghosts, Piece, alike, net_rods, piece_of
+from ddg_warp.compile.ghosts import Ghosts
 from ddg_warp.compile.net import conditions
 from ddg_warp.compile.net import elements as net_elements
 from ddg_warp.compile.net.net import Net, NetRod, NetShell
+from ddg_warp.compile.rods import Piece, alike, net_rods, piece_of
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import shell_forms
 from ddg_warp.geometry.surface import Surface
@@ -167,8 +168,6 @@ class _Builder:
             stiffness=np.concatenate([np.zeros((3, 0)), *self.stiffness], axis=1),
             mass=np.zeros((blocks, 3)),
             fixed=np.zeros((blocks, 3), bool),
-            load=np.zeros((blocks, 3)),
-            poses=np.full((blocks, 3), FREE),
             meridians=[
                 axisymmetric.meridian(shell, i, scene.ring_supports, merged[numbers])
                 for i, (shell, numbers) in enumerate(zip(scene.axisymmetric_shells, self.meridians, strict=True))

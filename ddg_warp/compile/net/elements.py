@@ -6,11 +6,11 @@ import numpy as np
 
 from ddg_warp.compile import axisymmetric
 from ddg_warp.compile import shells as shell_terms
-from ddg_warp.compile.chains import Piece
 from ddg_warp.compile.elements import ElementSet
 from ddg_warp.compile.net.glue import glue_sets
 from ddg_warp.compile.net.magnets import magnet_sets
 from ddg_warp.compile.net.net import Net, NetRod, NetSet
+from ddg_warp.compile.rods import Piece
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import polyline, shell_forms
 from ddg_warp.kernels.terms import JOINTS, term_key

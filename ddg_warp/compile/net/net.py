@@ -11,10 +11,11 @@ import numpy as np
 
 from ddg_warp.compile import axisymmetric
 from ddg_warp.compile import shells as shell_terms
-from ddg_warp.compile.chains import STILL, Piece
-from ddg_warp.compile.net.loads import NetCouple, NetEdgeCouple, NetLoad, NetPressure
+from ddg_warp.compile.loads import accumulate
 from ddg_warp.compile.net.outwards import Outwards, outwards
 from ddg_warp.compile.precision import float32_error, float32_errors
+from ddg_warp.compile.rods import Piece
+from ddg_warp.compile.storage import Along, RodPlaces, Storage
 from ddg_warp.compile.tolerance import Bodies
 from ddg_warp.geometry import shell_forms
 from ddg_warp.geometry.surface import Surface
@@ -71,17 +72,8 @@ class NetSet:
         return self.slots.shape[1]
 
 
-@dataclass(frozen=True)
-class NetHeld:
-    """Dofs that a support holds: (block, component) pairs; or the blocks on an oblique plane with this normal."""
-
-    blocks: np.ndarray
-    components: np.ndarray
-    normal: tuple | None = None
-
-
-@dataclass(eq=False)
-class Net:
+@dataclass(kw_only=True, eq=False)
+class Net(Storage):
     """A scene's net on the host: N blocks of three dofs.
 
     Attributes:
@@ -92,9 +84,6 @@ class Net:
         ends: nodes of every rod edge (rod_edges, 2); frame: director and tangent of it (6, rod_edges).
         stiffness: EI1, EI2 and GJ of its section (3, rod_edges) [N m^2].
         mass: of every dof (N, 3) [kg, kg m^2]; fixed: held dofs (N, 3).
-        load: dead forces (N, 3); timed: those that change; pressures, bands, couples, edge_couples: loads that follow what they act on.
-        held: what each support of `scene.supports`, then of `scene.shell_supports` and `scene.ring_supports`, holds here.
-        poses: of each dof the pose that moves it, `STILL` where it is held still, `FREE` where it is free (N, 3); see `pose_starts`.
         frames: orthonormal rows (3, 3) that the held components of a node on an oblique plane refer to; see `compile.net.planes`.
     """
 
@@ -110,21 +99,17 @@ class Net:
     stiffness: np.ndarray
     mass: np.ndarray
     fixed: np.ndarray
-    load: np.ndarray
-    poses: np.ndarray
-    timed: list[NetLoad] = field(default_factory=list)
-    pressures: list[NetPressure] = field(default_factory=list)
-    held: list[NetHeld] = field(default_factory=list)
     meridians: list[axisymmetric.NetMeridian] = field(default_factory=list)
-    bands: list[axisymmetric.NetBand] = field(default_factory=list)
-    couples: list[NetCouple] = field(default_factory=list)
-    edge_couples: list[NetEdgeCouple] = field(default_factory=list)
     frames: dict[int, np.ndarray] = field(default_factory=dict)
 
     @property
     def blocks(self) -> int:
         """Number of blocks."""
         return len(self.rest)
+
+    @property
+    def size(self) -> int:
+        return self.blocks
 
     @property
     def holds(self) -> np.ndarray:
@@ -134,28 +119,45 @@ class Net:
             result[block] = (np.abs(frame[self.fixed[block]]) > 1e-9).any(0)
         return result
 
-    @property
-    def moves(self) -> bool:
-        """Whether something is moved."""
-        return bool((self.poses > STILL).any())
+    @cached_property
+    def places(self) -> RodPlaces:
+        def each(value):
+            return np.array([value(rod) for rod in self.rods], int)
 
-    @property
-    def moving(self) -> np.ndarray:
-        """Nodes that move, and the pose of each of their components, -1 for none (n, 4)."""
-        blocks = np.flatnonzero((self.poses[: self.nodes] > STILL).any(1))
-        return np.column_stack([blocks, np.maximum(self.poses[blocks], STILL)])
+        def along(lists):
+            starts = np.cumsum([0, *map(len, lists)])[:-1] + each(lambda rod: rod.first)
+            return Along(starts, table=np.concatenate([np.zeros(0, int), *lists]))
 
-    @property
-    def turning(self) -> np.ndarray:
-        """Rod edges whose angle is held by what moves, and its pose (e, 2)."""
-        poses = self.poses[self.nodes : self.nodes + self.rod_edges, 0]
-        edges = np.flatnonzero(poses > STILL)
-        return np.column_stack([edges, poses[edges]])
+        return RodPlaces(
+            rods=each(lambda rod: rod.rod),
+            own=each(lambda rod: len(rod.nodes)),
+            closed=each(lambda rod: rod.piece.kind.closed) > 0,
+            twist=each(lambda rod: rod.piece.kind.twist) > 0,
+            nodes=along([rod.all_nodes for rod in self.rods]),
+            angles=along([rod.all_edges for rod in self.rods]),
+        )
 
-    @property
-    def followers(self) -> list:
-        """Loads that follow what they act on, each with `places`, `forces` and their `derivative`."""
-        return [*self.pressures, *self.bands, *self.couples, *self.edge_couples]
+    def fix(self, nodes: np.ndarray, along: list[int], angles: np.ndarray) -> None:
+        self.fixed[nodes[:, None], along] = True
+        self.fixed[angles, 0] = True
+
+    def add_mass(self, places: np.ndarray, mass: float) -> None:
+        accumulate(self.mass, places, np.full((len(places), 3), mass))
+
+    def points(self, nodes: np.ndarray) -> np.ndarray:
+        return self.rest[nodes]
+
+    def edge_ends(self, angles: np.ndarray) -> np.ndarray:
+        return self.ends[angles - self.nodes]
+
+    def dofs(self, places: np.ndarray) -> np.ndarray:
+        return 3 * places[..., None] + np.arange(3)
+
+    def name(self, place: int) -> str:
+        for rod in self.rods if place >= self.nodes else ():
+            if place in rod.all_edges:
+                return f"edge {int(np.argmax(rod.all_edges == place)) - rod.first} of rod {rod.rod}"
+        return "the point at ({:g}, {:g}, {:g}) m".format(*self.rest[place])
 
     @cached_property
     def drag(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:

@@ -12,14 +12,15 @@ from ddg_warp.errors import SceneError
 ALIGNED = 1e-12  # how far a held direction may be off an axis that it is taken for
 
 
-def frames_of_planes(net, normals: dict[int, list], moves: np.ndarray) -> None:
-    """Hold nodes along the normals of their planes, whatever else holds them; `moves` (blocks,) are those with a motion.
+def frames_of_planes(net, normals: dict[int, list]) -> None:
+    """Hold nodes along the normals of their planes, whatever else holds them.
 
     Raises:
         SceneError: a node on such a plane is also moved.
     """
+    moves = set(net.moving[:, 0].tolist())
     for block, given in normals.items():
-        if moves[block]:
+        if block in moves:
             raise SceneError(
                 "the point at ({:g}, {:g}, {:g}) m is on a symmetry plane across {} and moved by a support; give the support other "
                 "vertices".format(*net.rest[block], tuple(np.round(given[0], 6).tolist()))

@@ -9,8 +9,10 @@ from ddg_warp.solve import energy
 from ddg_warp.solve.chains.newton import ChainNewton
 from ddg_warp.solve.chains.partitioned import PartitionedNewton
 from ddg_warp.solve.chains.pcg import PcgNewton, ProjectiveNewton
-from ddg_warp.solve.chains.prescribed import ChainDrag, PrescribedMotion, TimedLoads
 from ddg_warp.solve.choice import automatic
+from ddg_warp.solve.drag import ChainDrag
+from ddg_warp.solve.loads import Loads
+from ddg_warp.solve.motion import Motion
 from ddg_warp.solve.step import PartStep
 
 DIRECT = {"sweep": ChainNewton, "partitioned": PartitionedNewton}  # solvers of open rods by their name
@@ -28,8 +30,8 @@ class ChainStep(PartStep):
         self._nodes = step.finish_nodes_kernel(kind, real, self.midpoint)
         self._frames = step.finish_frames_kernel(kind, real) if kind.twist else None
         self.energy = energy.ChainEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
-        self.motion = PrescribedMotion(model, group, self.midpoint) if group.moving else None
-        self.loads = TimedLoads(model, group, self.midpoint) if group.host.timed_loads else None
+        self.motion = Motion(model, group, self.midpoint) if group.host.moves else None
+        self.loads = Loads(model, group, self.midpoint) if group.host.timed or group.host.followers else None
         self.drag = ChainDrag(model, group, self.midpoint) if kind.drag else None
 
     def attempt(self, before, after) -> None:

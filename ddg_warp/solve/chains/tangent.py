@@ -9,25 +9,26 @@ import warp as wp
 from scipy import sparse
 
 from ddg_warp import arrays
-from ddg_warp.compile.couples import couple_derivatives, couple_forces
 from ddg_warp.compile.tolerance import support_forces
 from ddg_warp.geometry.turning import turned
 from ddg_warp.kernels import element
-from ddg_warp.kernels.islands import Islands
-from ddg_warp.solve.chains.prescribed import PrescribedMotion
+from ddg_warp.solve.motion import Motion
+from ddg_warp.solve.part import Part
 from ddg_warp.solve.rigid import Body
 
 
-class ChainTangent:
+class ChainTangent(Part):
     """The part of one group of rods; dofs are numbered node by node, rod by rod. See `Tangent` for the methods."""
 
     def __init__(self, model, group, offset: int):
-        self.model, self.group, self.offset = model, group, offset
         kind, real, device = group.kind, model.types.real, model.wp_device
         shape = (group.nodes, group.columns)
-        self.size, self.body_count = group.columns * group.nodes * kind.block, group.columns
+        gravity = np.append(group.gravity_host, 0.0)[None, : kind.block]
+        super().__init__(model, group.host, offset, group.columns * group.nodes * kind.block, _mass(group), gravity)
+        self.group, self.body_count = group, group.columns
         self.incidence = _incidence(group)
-        self.free, self.angle, self.mass = _free(group), _angle(group), _mass(group)
+        self.free = _free(group)
+        self.angle = np.tile(np.arange(kind.block) >= kind.dim, group.columns * group.nodes)
         self._windows = arrays.allocate((kind.window, *shape), real, device)
         self._energies = arrays.allocate(shape, real, device)
         self._hessian = arrays.allocate((kind.window**2, *shape), real, device)
@@ -64,70 +65,22 @@ class ChainTangent:
         diagonal = sparse.bsr_matrix((values, np.arange(elements), np.arange(elements + 1)))
         return self.incidence.T @ (diagonal @ self.incidence)
 
-    def loads(self, factor: float, q: np.ndarray) -> np.ndarray:
-        group, kind, host = self.group, self.group.kind, self.group.host
-        force = np.zeros((group.columns, group.nodes, kind.block))
-        dead = host.mass[..., None] * group.gravity_host + host.load
-        force[..., : kind.dim] = np.tile(dead.transpose(1, 0, 2), (group.worlds, 1, 1)) * factor
-        if kind.twist:
-            force[..., kind.dim] = np.tile(host.load_angle.T, (group.worlds, 1)) * factor
-        x = self.blocks(q)
-        for load, columns in self._timed():
-            scale = load.at(factor, factor)
-            np.add.at(force, (columns, load.k, slice(0, kind.dim)), scale * load.force)
-            if kind.twist:
-                np.add.at(force, (columns, load.k, kind.dim), scale * load.moment)
-            if load.couple.any():
-                edges = x[columns, load.k + 1, : kind.dim] - x[columns, load.k, : kind.dim]
-                pair, about = couple_forces(edges, load.couple)
-                np.add.at(force, (columns, load.k + 1, slice(0, kind.dim)), scale * pair)
-                np.add.at(force, (columns, load.k, slice(0, kind.dim)), -scale * pair)
-                if kind.twist:
-                    np.add.at(force, (columns, load.k, kind.dim), scale * about)
-        return force.ravel()
-
-    def load_stiffness(self, factor: float, q: np.ndarray) -> sparse.csc_matrix | None:
-        rows, cols, values = [], [], []
-
-        def put(i, j, block):
-            rows.append(np.repeat(i, len(j)))
-            cols.append(np.tile(j, len(i)))
-            values.append(block.ravel())
-
-        group, kind = self.group, self.group.kind
-        x = self.blocks(q)
-        for load, columns in self._timed():
-            for column, k in zip(columns, load.k, strict=True) if load.couple.any() else ():
-                scale = -load.at(factor, factor)
-                (block,), (about,) = couple_derivatives(np.diff(x[column, k : k + 2, : kind.dim], axis=0), load.couple)
-                first = (column * group.nodes + k) * kind.block + np.arange(kind.dim)
-                second = first + kind.block
-                for i, j, sign in ((first, first, 1), (second, second, 1), (first, second, -1), (second, first, -1)):
-                    put(i, j, sign * scale * block)
-                if kind.twist:
-                    put(first[:1] + kind.dim, second, scale * about)
-                    put(first[:1] + kind.dim, first, -scale * about)
-        if not rows:
-            return None
-        data = (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols)))
-        return sparse.csc_matrix(data, shape=(self.size, self.size))
-
     def blocks(self, q: np.ndarray) -> np.ndarray:
         """Dofs (size,) as (column, node, dofs of a node)."""
         return q.reshape(self.group.columns, self.group.nodes, self.group.kind.block)
 
-    def _timed(self):
-        """Timed loads with their columns in every world."""
-        for load in self.group.host.timed_loads:
-            for world in range(self.group.worlds):
-                yield load, load.columns + world * self.group.rods
-
     def dofs(self, state) -> np.ndarray:
-        kind, data = self.group.kind, self.data(state)
+        return self._flat(self.data(state).x, self.data(state).theta)
+
+    def rates(self, state) -> np.ndarray:
+        return self._flat(self.data(state).v, self.data(state).omega)
+
+    def _flat(self, nodes: wp.array, angles: wp.array) -> np.ndarray:
+        kind = self.group.kind
         q = np.zeros((self.group.columns, self.group.nodes, kind.block))
-        q[..., : kind.dim] = arrays.download(data.x).transpose(1, 0, 2)
+        q[..., : kind.dim] = arrays.download(nodes).transpose(1, 0, 2)
         if kind.twist:
-            q[..., kind.dim] = arrays.download(data.theta).T
+            q[..., kind.dim] = arrays.download(angles).T
         return q.ravel()
 
     def assign(self, state, q: np.ndarray) -> None:
@@ -139,13 +92,9 @@ class ChainTangent:
 
     def move_supports(self, state, before: float, at: float) -> None:
         """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""
-        group, data = self.group, self.data(state)
-        if group.moving is not None:
-            motion = PrescribedMotion(self.model, group)
-            motion.upload(before, at)
-            islands = Islands(group.columns, self.model.types.real, self.model.wp_device)
-            islands.portion.fill_(1.0)
-            motion.apply(islands, data.x, data.frame, data.theta)
+        if self.host.moves:
+            data = self.data(state)
+            Motion(self.model, self.group).put(before, at, data.x, data.frame, data.theta)
 
     def edges(self, q: np.ndarray) -> np.ndarray:
         """Edge vectors of the windows (E, dim), zero where there is none."""
@@ -179,12 +128,10 @@ class ChainTangent:
         """Mean rest length of edges [m]."""
         return float((self.group.host.length / np.maximum(1, self.group.host.own - 1)).mean())
 
-    def point_dofs(self) -> tuple[np.ndarray, list[int], np.ndarray]:
-        """Rows of `State.points`, axes, and the dofs (rows, axes) of the first world."""
-        group, kind = self.group, self.group.kind
-        k, column, rows = self.model.order.places(group)
-        dofs = ((column * group.nodes + k) * kind.block)[:, None] + np.arange(kind.dim)
-        return rows, [0, 2] if kind.dim == 2 else [0, 1, 2], dofs
+    def point_dofs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of `State.points`, and the dofs (rows, 3) of the first world, -1 for none."""
+        k, column, rows = self.model.order.places(self.group)
+        return rows, self.host.dofs(k * self.group.rods + column)
 
     def bodies(self) -> list[Body]:
         """Every rod of every world."""
@@ -203,8 +150,7 @@ class ChainTangent:
     def where(self, dof: int) -> str:
         """Name of a dof's place."""
         column, k = divmod(dof // self.group.kind.block, self.group.nodes)
-        rod = int(self.group.host.rods[column % self.group.rods])
-        return f"node {k - int(self.group.host.first[column % self.group.rods])} of rod {rod}"
+        return self.host.name(k * self.group.rods + column % self.group.rods)
 
     def retract(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
         """q moved along `step`, with edges turned instead of sheared; see `ddg_warp.geometry.turning`."""
@@ -260,26 +206,18 @@ def _incidence(group) -> sparse.csr_matrix:
     return sparse.csr_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(cols))), shape=shape)
 
 
-def _per_dof(group, nodes: np.ndarray, angles: np.ndarray | None) -> np.ndarray:
-    """(size,) from values of nodes and of angles (n, R), repeated for all worlds."""
-    kind = group.kind
-    full = np.repeat(nodes[..., None], kind.block, axis=-1)
-    if kind.twist:
-        full[..., kind.dim] = angles
-    return np.concatenate([full] * group.worlds, axis=1).transpose(1, 0, 2).ravel()
-
-
 def _free(group) -> np.ndarray:
-    host, kind = group.host, group.kind
-    bits = (host.fixed[..., None] >> np.arange(kind.block)) & 1
+    host = group.host
+    bits = (host.fixed[..., None] >> np.arange(group.kind.block)) & 1
     inside = np.arange(group.nodes)[:, None] < host.count
-    free = (bits == 0) & inside[..., None]
-    return np.concatenate([free] * group.worlds, axis=1).transpose(1, 0, 2).ravel()
-
-
-def _angle(group) -> np.ndarray:
-    return _per_dof(group, np.zeros(group.host.mass.shape), np.ones(group.host.mass.shape)) > 0.0
+    return _every_world(group, (bits == 0) & inside[..., None])
 
 
 def _mass(group) -> np.ndarray:
-    return _per_dof(group, group.host.mass, group.host.rotary)
+    kind = group.kind
+    return _every_world(group, np.stack([group.host.mass] * kind.dim + [group.host.rotary] * kind.twist, axis=-1))
+
+
+def _every_world(group, values: np.ndarray) -> np.ndarray:
+    """Values of dofs (n, R, block) as those of all worlds are numbered (size,)."""
+    return np.concatenate([values] * group.worlds, axis=1).transpose(1, 0, 2).ravel()

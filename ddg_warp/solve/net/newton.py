@@ -78,7 +78,7 @@ class NetNewton:
             return [make(worlds, dtype or self.real) for _ in range(count)]
 
         self.q, self.base, self.target = (make(self.all, V) for _ in range(3))
-        self.load = wp.array(np.tile(host.load, (worlds, 1)), dtype=V, device=device)
+        self.load = wp.array(np.tile(host.constant_loads(), (worlds, 1)), dtype=V, device=device)
         self._weights, self._weight = make((3, worlds, blocks), self.real), make((3, worlds), self.real)
         self.change, self.noise, self.square = (self._weights[i] for i in range(3))
         self.dots = make((worlds, arrays.takers(blocks, device)), self.real)

@@ -1,149 +1,47 @@
-"""What is prescribed of a net from outside: motion of supports, loads that change or follow, a magnetic field, drag."""
+"""What is prescribed of a net from outside: motion of supports and of the normals that these turn, and a magnetic field."""
 
-from types import SimpleNamespace
-
-import numpy as np
 import warp as wp
 
-from ddg_warp.compile.chains import pose_starts
-from ddg_warp.kernels import drag, motion
-from ddg_warp.kernels.islands import Islands
+from ddg_warp.compile.conditions import pose_starts
 from ddg_warp.kernels.measures.magnetised_edge import FIELD
-from ddg_warp.kernels.net import loads
-from ddg_warp.kernels.net.motion import field_kernel, motion_kernels
+from ddg_warp.kernels.net.motion import field_kernel, normal_kernels
 from ddg_warp.model.net import NetState
-from ddg_warp.scene.drag import flow_at
-from ddg_warp.solve.chains.prescribed import poses
-from ddg_warp.solve.net.system import lists
+from ddg_warp.solve.motion import Motion
 
 
-class NetMotion:
-    """Motion of held nodes, of held angles of rod edges, and of the normals at clamped mesh edges.
+class NetMotion(Motion):
+    """Motion of a net's supports, and of the normals at clamped mesh edges that these turn.
 
-    Poses at both ends of a step come from the host; where supports are in between is found on the device, world by world.
+    Attributes:
+        data: of the sets with such normals, by index, with those that a solve is about.
     """
 
-    def __init__(self, model, midpoint: bool):
-        net, host, device, real = model.net, model.net.host, model.wp_device, model.types.real
-        self.model, self.net = model, net
-        start = pose_starts(model.motions)
-        self.pose = wp.zeros((start[-1], motion.POSE), dtype=real, device=device)
-        self._nodes, self._angles, self._normals, self._turn = motion_kernels(real, midpoint)
-
-        def put(values):
-            return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
-
-        def vectors(values):
-            return wp.array(np.ascontiguousarray(values), dtype=net.vector, device=device)
-
-        self.nodes, self.rest = put(host.moving), vectors(host.rest)
-        self.edges, self.edge_rest = put(host.turning), vectors(host.frame[:3, host.turning[:, 0]].T)
-        self.normals = {}
-        for i in net.turning_data():
-            element, row, index = net.sets[i].turning.T
-            where = put(np.column_stack([element, row, start[index]]))
-            self.normals[i] = (where, vectors(net.sets[i].turning_rest))
-        self.data = net.turning_data()  # with the normals that a solve is about
+    def __init__(self, model, midpoint: bool = False):
+        super().__init__(model, model.net, midpoint)
+        self._normals, self._turn = normal_kernels(model.types.real, midpoint)
+        start, self.normals, self.data = pose_starts(model.motions), {}, model.net.turning_data()
+        for i in self.data:
+            (element, row, index), rest = model.net.sets[i].turning.T, model.net.sets[i].turning_rest
+            self.normals[i] = self._list(element, row, start[index]), self._vectors(rest)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        normals = [self._normals, self._turn] if self.normals else []
-        return [self._nodes, *([self._angles] if len(self.edges) else []), *normals]
-
-    def upload(self, t0: float, t1: float) -> None:
-        """Poses of all motions between t0 and t1."""
-        self.pose.assign(poses(self.model, t0, t1))
+        return [*super().kernels, *([self._normals, self._turn] if self.normals else [])]
 
     def apply(self, islands, q: wp.array, frame: wp.array) -> None:
         """Put held blocks and normals where the part of the step that a world tries has them; `frame` are lagged."""
-        net = self.net
-        rows = [self.pose, *islands.arrays]
-        self._launch(self._nodes, self.nodes, [self.nodes, self.rest, *rows, net.blocks], [q])
-        if len(self.edges):
-            inputs = [self.edges, self.edge_rest, self.pose, net.ends, frame, *islands.arrays]
-            self._launch(self._angles, self.edges, [*inputs, net.blocks, net.angle_start], [q])
+        net = self.part
+        super().apply(islands, net.points(q), net.frames(frame), net.angles(q))
         for index, (where, rest) in self.normals.items():
-            self._launch(self._normals, where, [where, rest, *rows, net.sets[index].elements], [self.data[index]])
+            inputs = [where, rest, self.pose, *islands.arrays, net.sets[index].elements]
+            self._launch(self._normals, where, inputs, [self.data[index]])
 
     def turn(self, islands, before: NetState, after: NetState) -> None:
         """Turn the normals of a state that a part of the step ends in, in the worlds that moved."""
         for index, (where, rest) in self.normals.items():
-            inputs = [where, rest, self.pose, *islands.arrays, self.net.sets[index].elements]
+            inputs = [where, rest, self.pose, *islands.arrays, self.part.sets[index].elements]
             self._launch(self._turn, where, [*inputs, before.data[index]], [after.data[index]])
-
-    def _launch(self, kernel, where: wp.array, inputs: list, outputs: list) -> None:
-        dim = (len(where), self.model.worlds)
-        wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)
-
-
-class NetLoads:
-    """Loads of a net that change or follow what they act on, over the constant ones."""
-
-    def __init__(self, model, midpoint: bool):
-        net, host, device, real = model.net, model.net.host, model.wp_device, model.types.real
-        self.model, self.net, self.midpoint = model, net, midpoint
-        self.constant = wp.array(np.tile(host.load, (model.worlds, 1)), dtype=net.vector, device=device)
-        self._followers = []
-        if not host.followers:
-            return
-
-        def put(values, dtype=int):
-            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
-
-        press, squeeze, twist, bend, self._spread = loads.follower_kernels(real)
-        kinds = [(press, load, load.pressure, real) for load in host.pressures]
-        kinds += [(squeeze, load, load.pressure, real) for load in host.bands]
-        kinds += [(twist, load, np.tile(load.couple, (len(load.places), 1)), net.vector) for load in host.couples]
-        kinds += [(bend, load, load.values, net.vector) for load in host.edge_couples]
-        for kernel, load, values, dtype in kinds:
-            self._followers.append((kernel, load, values, put(load.places.astype(np.int32)), put(values, dtype)))
-        places = np.concatenate([load.places.ravel() for load in host.followers])
-        self.starts, self.items = (put(v.astype(np.int32)) for v in lists(places, net.blocks))
-        self.total = len(places)
-        self.force = wp.zeros(model.worlds * self.total, dtype=net.vector, device=device)
-
-    @property
-    def kernels(self) -> list:
-        """Kernels to load before a capture."""
-        return [*{kernel for kernel, *_ in self._followers}, self._spread] if self._followers else []
-
-    def upload(self, t0: float, t1: float) -> None:
-        """Values at the time that the scheme balances forces at."""
-        at, host = 0.5 * (t0 + t1) if self.midpoint else t1, self.net.host
-        if host.timed:
-            load = host.load.copy()
-            for timed in host.timed:
-                np.add.at(load, timed.blocks, timed.at(at, 1.0) * timed.force)
-            self.constant.assign(np.tile(load, (self.model.worlds, 1)))
-        for _, load, values, _, on_device in self._followers:
-            if load.amplitude is not None:
-                on_device.assign(load.at(at, 1.0) * values)
-
-    def scale(self, dead: np.ndarray, at: float) -> None:
-        """Values of an equilibrium at load parameter `at`, with the loads (blocks, 3) that follow nothing."""
-        self.constant.assign(np.tile(dead, (self.model.worlds, 1)))
-        for _, load, values, _, on_device in self._followers:
-            on_device.assign(load.at(at, at) * values)
-
-    def apply(self, q: wp.array, load: wp.array) -> None:
-        """Write the loads on blocks q."""
-        net, first = self.net, 0
-        if not self._followers:
-            if net.host.timed:
-                wp.copy(load, self.constant)
-            return
-        for kernel, _, _, places, values in self._followers:
-            dim, inputs = (len(places), self.model.worlds), [q, places, values, net.blocks, first, self.total]
-            wp.launch(kernel, dim, inputs, [self.force], device=self.model.wp_device)
-            first += places.size
-        wp.launch(
-            self._spread,
-            self.model.worlds * net.blocks,
-            [self.constant, self.force, self.starts, self.items, net.blocks, self.total],
-            [load],
-            device=self.model.wp_device,
-        )
 
 
 class NetField:
@@ -184,76 +82,3 @@ class NetField:
         inputs = [field, first, part.elements, moved, before]
         dim = part.elements * self.model.worlds
         wp.launch(self._kernel, dim, inputs, [after], device=self.model.wp_device)
-
-
-class NetDrag:
-    """Drag on the rods of a net, against a fluid that flows.
-
-    Attributes:
-        moves: what inertia or drag give a rate, as masses of the dofs of blocks that are positive there.
-    """
-
-    def __init__(self, model, midpoint: bool = False):
-        net, host, device, real = model.net, model.net.host, model.wp_device, model.types.real
-        self.model, self.net, self.midpoint = model, net, midpoint
-        self._resist, self._settle = drag.net_kernels(real)
-        ends, angles, coefficients = host.drag
-        places = np.stack([*ends, np.where(angles < 0, host.blocks, angles)], -1).ravel()
-        starts, items = lists(places, host.blocks + 1)
-
-        def put(values, dtype=int):
-            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
-
-        self.ends, self.starts, self.items = (put(v.astype(np.int32)) for v in (ends.T, starts, items // 3))
-        self.coefficients = put(coefficients, real)
-        self.mass = put(host.mass, net.vector)
-        felt = np.zeros((host.blocks, 3))
-        felt[ends] = 1.0
-        felt[angles[angles >= 0], 0] = 1.0
-        self.moves = put(host.mass + felt, net.vector)
-        self.flow = put(flow_at(model.scene, 0.0)[None], net.vector)
-
-    @property
-    def kernels(self) -> list:
-        """Kernels to load before a capture."""
-        return [self._resist, *([self._settle] if self.midpoint else [])]
-
-    def upload(self, t0: float, t1: float) -> None:
-        """The flow at the time that the scheme balances forces at."""
-        if callable(self.model.scene.flow):
-            self.flow.assign(flow_at(self.model.scene, 0.5 * (t0 + t1) if self.midpoint else t1)[None])
-
-    def resist(self, before, solver, islands) -> None:
-        """Write inertia and drag of a solve from the state `before`, once its iterate is predicted."""
-        self._launch(
-            self._resist,
-            [before.q, before.v, solver.q if self.midpoint else before.q, solver.q, self.mass, self.ends]
-            + [self.coefficients, self.starts, self.items, self.flow, solver.outer, *islands.arrays]
-            + [self.net.blocks, self.net.host.nodes],
-            [solver.mass],
-        )
-
-    def at(self, state, t: float) -> tuple[np.ndarray, np.ndarray]:
-        """Inertia and drag (world, block) of a net's state at t, with the resistance over a second, and the flow (blocks, 3)."""
-        net, device = self.net, self.model.wp_device
-        islands = Islands(net.worlds, net.real, device)
-        islands.rate.fill_(1.0)
-        mass = wp.zeros((net.worlds, net.blocks), dtype=drag.block_inertia(net.real), device=device)
-        self.upload(t, t)
-        self.resist(state, SimpleNamespace(q=state.q, outer=net.still, mass=mass), islands)
-        flow = np.zeros((net.blocks, 3))
-        flow[: net.host.nodes] = self.flow.numpy()[0]
-        return mass.numpy(), flow
-
-    def settle(self, after, solver, islands) -> None:
-        """Rates of what has no inertia in the state `after`."""
-        if self.midpoint:
-            self._launch(
-                self._settle,
-                [solver.q, solver.mass, *islands.arrays, self.net.blocks, after.q],
-                [after.v],
-            )
-
-    def _launch(self, kernel, inputs: list, outputs: list) -> None:
-        blocks = self.model.worlds * self.net.blocks
-        wp.launch(kernel, blocks, inputs, outputs, device=self.model.wp_device)

@@ -19,8 +19,8 @@ from ddg_warp.model.state import State
 from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.choice import net_preconditioner
 from ddg_warp.solve.graphs import Graphs
+from ddg_warp.solve.loads import Loads
 from ddg_warp.solve.net.newton import NetNewton
-from ddg_warp.solve.net.prescribed import NetLoads
 
 FORCING = 1e-4  # smallest reduction of the residual that a direction is solved to: Gauss-Newton errs by more
 FAR = 4.0  # turns of a direction, over the cap of a step, at which it is far enough
@@ -35,33 +35,35 @@ class StaticNewton(NetNewton):
         super().__init__(model, options, net_preconditioner(model.net), model.types.real)
         self._whole = False  # whether directions may go as far as they like
         self.gravity.zero_()  # a load like others: `begin` scales them all
-        self.loads, self._there = NetLoads(model, midpoint=False), wp.zeros_like(self.load)
+        self.loads = Loads(model, self.net, midpoint=False) if self.net.host.followers else None
+        self._there = wp.zeros_like(self.load)
         self._follow, self._less, self._far = newton.static_kernels(self.real, self.linear)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [*super().kernels, self._follow, self._less, self._far, *self.loads.kernels]
+        return [*super().kernels, self._follow, self._less, self._far, *(self.loads.kernels if self.loads else [])]
 
     def begin(self, q: np.ndarray, dead: np.ndarray, at: float, scale: np.ndarray) -> None:
-        """Set out from dofs `q` under dead loads (blocks, 3), those that follow at load parameter `at`; load scales of bodies."""
+        """Set out from dofs `q` under dead loads (3 blocks,), those that follow at load parameter `at`; load scales of bodies."""
         for name in ("status", "iteration", "halvings", "unbalanced", "drowned", "clamped", "stale"):
             getattr(self.islands, name).zero_()
         for array in (self.q, self.base):
             array.assign(q.reshape(-1, 3))
-        self.loads.scale(dead, at)
-        wp.copy(self.load, self.loads.constant)
+        for load in (self.load, self._there):
+            load.assign(np.tile(dead.reshape(-1, 3), (self.worlds, 1)))
+        if self.loads:
+            self.loads.scale(dead.reshape(-1, 3), at)
         wp.copy(self.islands.load_scale, self.allowed.assign(scale.reshape(self.worlds, -1)))
         self.islands.active.fill_(1)
 
     def balance(self) -> None:
         """Residuals under the loads on the iterate, which do the work of their mean along a step."""
-        follows = bool(self.net.host.followers)
-        if follows:
-            self.loads.apply(self.q, self.load)
-            self.loads.apply(self.base, self._there)
+        if self.loads:
+            for q, load in ((self.q, self.load), (self.base, self._there)):
+                self.loads.apply(self.net.points(q), self.net.points(load), self.net.angles(load))
         super().balance()
-        if follows:
+        if self.loads:
             wp.launch(
                 self._follow,
                 self.all,

@@ -11,9 +11,11 @@ from ddg_warp.kernels.net import elements, newton
 from ddg_warp.model.net import NetState
 from ddg_warp.scene import drag
 from ddg_warp.solve.choice import net_preconditioner
+from ddg_warp.solve.drag import NetDrag
 from ddg_warp.solve.energy import NetEnergy
+from ddg_warp.solve.loads import Loads
 from ddg_warp.solve.net.newton import PRECONDITIONERS, NetNewton
-from ddg_warp.solve.net.prescribed import NetDrag, NetField, NetLoads, NetMotion
+from ddg_warp.solve.net.prescribed import NetField, NetMotion
 from ddg_warp.solve.step import PartStep
 from ddg_warp.solve.tangent import Tangent
 
@@ -52,12 +54,14 @@ class NetStep(PartStep):
         self.drag = NetDrag(model, self.midpoint) if host.drag else None
         self.energy = NetEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.motion = NetMotion(model, self.midpoint) if host.moves else None
-        self.loads, self.field = NetLoads(model, self.midpoint), NetField(model, self.midpoint)
+        self.loads = Loads(model, self.net, self.midpoint) if host.timed or host.followers else None
+        self.field = NetField(model, self.midpoint)
         self._data = (self.motion.data if self.motion else {}) | self.field.data
 
     def attempt(self, before, after) -> None:
         """One solve of every world that has not finished the step, from state `before` to `after`."""
-        solver, blocks, islands = self.newton, self.net.blocks, self.islands
+        net, solver, islands = self.net, self.newton, self.islands
+        blocks = net.blocks
         self._sweep(
             self._begin,
             [before.q, before.v, solver.held, self.drag.moves if self.drag else solver.mass]
@@ -69,7 +73,8 @@ class NetStep(PartStep):
         start = self._start_frames(before)
         if self.motion:
             self.motion.apply(islands, solver.q, start.frame)
-        self.loads.apply(solver.q, solver.load)
+        if self.loads:
+            self.loads.apply(net.points(solver.q), net.points(solver.load), net.angles(solver.load))
         if self.drag:
             self.drag.resist(before, solver, islands)
         solver.solve(start)

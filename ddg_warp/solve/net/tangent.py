@@ -8,25 +8,23 @@ from scipy import sparse
 
 from ddg_warp.compile.tolerance import largest_excess
 from ddg_warp.geometry.turning import turned
-from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.net import elements
 from ddg_warp.solve.net.planes import HostPlanes
 from ddg_warp.solve.net.prescribed import NetMotion
+from ddg_warp.solve.part import Part
 from ddg_warp.solve.rigid import Body
 
 
-class NetTangent:
+class NetTangent(Part):
     """The part of the net. See `Tangent` for the methods."""
 
     def __init__(self, model, offset: int):
-        self.model, self.net, self.host, self.offset = model, model.net, model.net.host, offset
-        worlds, host = self.net.worlds, self.host
-        self.size, self.body_count = 3 * host.blocks * worlds, host.bodies.count * worlds
-        kind = np.zeros((host.blocks, 3), bool)
-        kind[host.nodes :] = True
-        self.free, self.angle, self.mass = (
-            np.tile(values.ravel(), worlds) for values in (~host.fixed, kind, host.mass)
-        )
+        host, worlds = model.net.host, model.worlds
+        kind, gravity = np.zeros((host.blocks, 3), bool), np.zeros((host.blocks, 3))
+        kind[host.nodes :], gravity[: host.nodes] = True, model.scene.gravity
+        self.free, self.angle, mass = (np.tile(values.ravel(), worlds) for values in (~host.fixed, kind, host.mass))
+        super().__init__(model, host, offset, 3 * host.blocks * worlds, mass, gravity)
+        self.net, self.body_count = model.net, host.bodies.count * worlds
         self.planes = HostPlanes(host, worlds) if host.frames else None
         self._anchored = host.fixed[: host.nodes].copy()
         for shell in host.shells:
@@ -65,12 +63,14 @@ class NetTangent:
         return self.into(result.ravel())
 
     def into(self, values: np.ndarray) -> np.ndarray:
-        """Vectors in space (size,) as the dofs are: in the frames of oblique planes where there are any."""
+        """In the frames of oblique planes where there are any."""
         return self.planes.into(values) if self.planes else values
 
     def back(self, values: np.ndarray) -> np.ndarray:
-        """Dofs, forces or steps (size,) as vectors in space."""
         return self.planes.back(values) if self.planes else values
+
+    def matrix(self, values: sparse.csc_matrix) -> sparse.csc_matrix:
+        return self.planes.matrix(values) if self.planes else values
 
     def forces(self, state, index: int) -> np.ndarray:
         """Derivative of the energy of every element of a set with respect to the blocks of its slots (slots, elements, 3)."""
@@ -95,8 +95,7 @@ class NetTangent:
             to_local, places = scatter[i]
             spread = np.matmul(to_local.T, (values.reshape(-1, size) @ to_local).reshape(count, size, -1))
             total += np.bincount(places, spread.ravel(), len(total))
-        matrix = sparse.csc_matrix((total, rows, starts), shape=(self.size, self.size))
-        return self.planes.matrix(matrix) if self.planes else matrix
+        return self.matrix(sparse.csc_matrix((total, rows, starts), shape=(self.size, self.size)))
 
     def linear_stress(self, state, step: np.ndarray) -> list:
         """Stresses (strains, elements) of every set that the strains e + J step have."""
@@ -116,41 +115,11 @@ class NetTangent:
         self.net.strains(state.net, index, strain, stress)
         return stress.numpy().astype(np.float64)
 
-    def dead_loads(self, factor: float) -> np.ndarray:
-        """Outer forces of a world (blocks, 3) that do not follow it."""
-        host = self.host
-        force = host.load * factor
-        force[: host.nodes] += factor * host.mass[: host.nodes] * np.asarray(self.model.scene.gravity, float)
-        for load in host.timed:
-            np.add.at(force, load.blocks, load.at(factor, factor) * load.force)
-        return force
-
-    def loads(self, factor: float, q: np.ndarray) -> np.ndarray:
-        host, x = self.host, self.back(q).reshape(self.net.worlds, -1, 3)
-        result = np.tile(self.dead_loads(factor), (self.net.worlds, 1, 1))
-        for load in host.followers:
-            for world in range(self.net.worlds):
-                np.add.at(result[world], load.places, load.at(factor, factor) * load.forces(x[world][load.places]))
-        return self.into(result.ravel())
-
-    def load_stiffness(self, factor: float, q: np.ndarray) -> sparse.csc_matrix | None:
-        if not self.host.followers:
-            return None
-        rows, cols, values = [], [], []
-        x, N = self.back(q).reshape(self.net.worlds, -1, 3), self.host.blocks
-        for load in self.host.followers:
-            for world in range(self.net.worlds):
-                place = 3 * (load.places + world * N)[:, :, None] + np.arange(3)
-                row, column = np.broadcast_arrays(place[:, :, :, None, None], place[:, None, None])
-                rows.append(row)
-                cols.append(column)
-                values.append(-load.at(factor, factor) * load.derivative(x[world][load.places]))
-        data, *places = (np.concatenate([part.ravel() for part in parts]) for parts in (values, rows, cols))
-        matrix = sparse.csc_matrix((data, places), shape=(self.size, self.size))
-        return self.planes.matrix(matrix) if self.planes else matrix
-
     def dofs(self, state) -> np.ndarray:
         return self.into(state.net.q.numpy().astype(np.float64).ravel())
+
+    def rates(self, state) -> np.ndarray:
+        return self.into(state.net.v.numpy().astype(np.float64).ravel())
 
     def assign(self, state, q: np.ndarray) -> None:
         state.net.q.assign(self.back(q).reshape(-1, 3))
@@ -176,11 +145,7 @@ class NetTangent:
     def move_supports(self, state, before: float, at: float) -> None:
         """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""
         if self.host.moves:
-            motion = NetMotion(self.model, midpoint=False)
-            motion.upload(before, at)
-            islands = Islands(self.net.worlds, self.model.types.real, self.model.wp_device)
-            islands.portion.fill_(1.0)
-            motion.apply(islands, state.net.q, state.net.frame)
+            NetMotion(self.model).put(before, at, state.net.q, state.net.frame)
         self.prescribe(state, at)
 
     def prescribe(self, state, at: float) -> None:
@@ -236,10 +201,10 @@ class NetTangent:
         """Mean rest length of edges [m]."""
         return float(self.host.edge_lengths.mean())
 
-    def point_dofs(self) -> tuple[np.ndarray, list[int], np.ndarray]:
-        """Rows of `State.points`, axes, and the dofs (rows, axes) of the first world."""
+    def point_dofs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of `State.points`, and the dofs (rows, 3) of the first world."""
         rows, blocks = self.model.order.net_rows
-        return rows, [0, 1, 2], 3 * blocks[:, None] + np.arange(3)
+        return rows, self.host.dofs(blocks)
 
     def bodies(self) -> list[Body]:
         """Rods with the rotations of their rigid joints, shells, and shells of revolution, of every world."""

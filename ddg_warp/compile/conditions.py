@@ -1,0 +1,123 @@
+"""What a scene puts on its rods: supports, masses and loads."""
+
+import numpy as np
+
+from ddg_warp.compile.loads import Couple
+from ddg_warp.compile.storage import FREE, Held, Storage
+from ddg_warp.errors import SceneError
+
+STILL = FREE - 1  # instead of a pose, of a dof that is held still
+
+_NONE = np.zeros(0, int)
+
+
+def scene_motions(scene) -> list:
+    """The different motions of a scene's supports, in order of appearance."""
+    supports = [*scene.supports, *scene.shell_supports, *scene.ring_supports]
+    return list({id(s.motion): s.motion for s in supports if s.motion is not None}.values())
+
+
+def pose_starts(motions: list) -> np.ndarray:
+    """First pose of every motion, among those of all: one a motion, or one for each node that it displaces."""
+    return np.cumsum([0, *(motion.count or 1 for motion in motions)])
+
+
+def add_masses(scene, storage: Storage) -> None:
+    """Add the point masses of rods."""
+    for rods, node, mass in scene.masses:
+        _, rows = storage.places.among(rods)
+        storage.add_mass(storage.places.node(rows, node), mass)
+
+
+def load_rods(scene, storage: Storage) -> None:
+    """Add the loads of rods."""
+    places = storage.places
+    for load in scene.loads:
+        _, rows = places.among(load.rods)
+        if load.edge is None:
+            storage.add_load(places.node(rows, load.node), load.force, load.amplitude)
+        elif load.moment:
+            storage.add_load(places.edge(rows, load.edge)[0][:, 2], (load.moment, 0.0, 0.0), load.amplitude)
+        elif any(load.couple):
+            edges = filter(len, places.edge(rows, load.edge))
+            storage.followers += [Couple(edge, np.array(load.couple), load.amplitude) for edge in edges]
+
+
+def hold_rods(scene, storage: Storage, claims: "Claims") -> None:
+    """Hold what the supports of rods name."""
+    places = storage.places
+    for support in scene.supports:
+        found, rows = places.among(support.rods)
+        nodes = [places.node(rows, node) for node in support.nodes]
+        angles = [places.edge(rows, edge)[0][:, 2] for edge in support.edges]
+        if support.end:
+            last, twisted = support.end == "last", rows[places.twist[rows]]
+            nodes += [places.nodes(rows, k) for k in ((places.own[rows] - 1, places.own[rows]) if last else (0, -1))]
+            angles.append(places.angles(twisted, places.own[twisted] - 1 if last else -1))
+        owners = np.tile(found, len(nodes))
+        nth = owners * len(support.nodes) + np.repeat(np.arange(len(nodes)), len(found))
+        claims.take(support, np.concatenate([_NONE, *nodes]), nth, owners, np.concatenate([_NONE, *angles]))
+
+
+class Claims:
+    """Which pose moves each held dof of a storage; a dof that two poses, or one and a still support, claim is refused."""
+
+    def __init__(self, scene, storage: Storage):
+        self.storage, self.motions = storage, scene_motions(scene)
+        starts = pose_starts(self.motions)
+        self._start = {id(motion): int(start) for motion, start in zip(self.motions, starts, strict=False)}
+        self._claims = []  # places, components, poses, number of the support and owners, of each support
+
+    def take(self, support, nodes: np.ndarray, nth: np.ndarray, owners: np.ndarray, angles: np.ndarray = _NONE) -> None:
+        """Hold nodes, which a support names as its `nth`, along its components, and angles.
+
+        `owners` tell apart what nodes are named for: joined rods that share one may each displace it, the last counts.
+        """
+        storage, motion = self.storage, support.motion
+        along = [d for d in range(3) if "xyz"[d] in support.components]
+        places = np.concatenate([np.tile(nodes, len(along)), angles])
+        components = np.concatenate([np.repeat(np.array(along, int), len(nodes)), 0 * angles])
+        storage.fix(nodes, along, angles)
+        storage.held.append(Held(places, components) if along else Held(nodes, 0 * nodes, support.normal))
+        if self.motions:
+            poses = np.full(len(places), STILL if motion is None else self._start[id(motion)])
+            if motion is not None and motion.count is not None:
+                poses += np.tile(nth, len(along))  # such a motion turns no edge
+            known = np.isin(components, storage.axes)
+            owners = np.concatenate([np.tile(owners, len(along)), angles])
+            claims = places, components, poses, np.full(len(places), len(storage.held)), owners
+            self._claims.append([values[known] for values in claims])
+
+    def finish(self) -> None:
+        """Leave what moves to the storage.
+
+        Raises:
+            SceneError: two supports would have a dof in two places; names it.
+        """
+        if not self._claims:
+            return
+        claims = [np.concatenate(values) for values in zip(*self._claims, strict=True)]
+        order = np.argsort(3 * claims[0] + claims[1], kind="stable")  # claims of one dof stay in order
+        places, components, poses, supports, owners = (values[order] for values in claims)
+        again = np.diff(3 * places + components) == 0
+        shared = (np.diff(supports) == 0) & (np.diff(owners) != 0)
+        clash = np.flatnonzero(again & (np.diff(poses) != 0) & ~shared)
+        if clash.size:
+            first = clash[np.argmin(order[clash + 1])]
+            self._refuse(places[first], components[first], min(poses[first], poses[first + 1]) == STILL)
+        moves = np.append(~again, True) & (poses > FREE)
+        places, components, poses = (values[moves] for values in (places, components, poses))
+        node = places < self.storage.nodes
+        nodes, row = np.unique(places[node], return_inverse=True)
+        moving = np.full((len(nodes), 4), FREE)
+        moving[:, 0], moving[row, 1 + components[node]] = nodes, poses[node]
+        self.storage.moving, self.storage.turning = moving, np.column_stack([places[~node], poses[~node]])
+
+    def _refuse(self, place: int, component: int, still: bool) -> None:
+        where, axis = self.storage.name(place), f" along {'xyz'[component]}" if place < self.storage.nodes else ""
+        if still:
+            raise SceneError(
+                f"{where} is held still by one support and moved by another{axis}; leave one of them out, give the moving one "
+                "other components, or give both the same motion"
+            )
+        raise SceneError(f"{where} has two motions{axis}; give it one that does both")

@@ -1,0 +1,261 @@
+"""From rods of a batch to their arrays: positions, frames, masses and the parameters of their terms, ghosts included."""
+
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from ddg_warp.compile.ghosts import Ghosts, end_director, ghost_node
+from ddg_warp.errors import SceneError
+from ddg_warp.geometry import polyline
+from ddg_warp.kernels.element import ChainKind
+from ddg_warp.kernels.terms import REGISTRY, Term, term_key
+from ddg_warp.scene import drag
+from ddg_warp.scene.descriptions import RodBatch
+from ddg_warp.scene.scene import Scene
+from ddg_warp.scene.validate import check_batch
+
+
+@dataclass(frozen=True)
+class Alike:
+    """Rods of one batch with the same ghosts, all with drag or none."""
+
+    batch: RodBatch
+    rows: np.ndarray  # of the batch
+    ghosts: tuple[int, int]  # at the first and last node, 0 or 1
+    kind: ChainKind
+
+    @property
+    def nodes(self) -> int:
+        """Nodes of a rod, with ghosts."""
+        return self.batch.nodes + sum(self.ghosts)
+
+    @property
+    def rods(self) -> np.ndarray:
+        """The scene's indices."""
+        return self.batch.first + self.rows
+
+    @property
+    def runs(self) -> list["Alike"]:
+        """The same rods, a few at a time, so that what is computed on the way to their arrays stays in the processor's cache."""
+        return [replace(self, rows=rows) for rows in self.batch.runs(self.rows)]
+
+
+@dataclass
+class Piece:
+    """A run of rods of one batch with the same ghosts: arrays (R, ...) including ghosts; see `ChainGroup` for their meaning."""
+
+    batch: RodBatch
+    rods: np.ndarray
+    ghosts: tuple[int, int]
+    kind: ChainKind
+    x: np.ndarray
+    tangent: np.ndarray
+    director: np.ndarray
+    reference_twist: np.ndarray
+    mass: np.ndarray
+    rotary: np.ndarray
+    length: np.ndarray
+    parameters: dict[str, np.ndarray]
+    stiffness: list[np.ndarray]  # EI1, EI2 and GJ of the section, each broadcastable to (R, edges)
+    drag: np.ndarray | None  # coefficients of its law (R, edges, rows), None without
+
+
+def net_rods(scene: Scene) -> np.ndarray:
+    """Which rods belong to the scene's net: those that are joined or attached to something, or magnetised (R,) bool."""
+    members = [rod for joint in scene.joints for rod, _ in joint.members]
+    members += [attachment.rod for attachment in scene.attachments]
+    chosen = np.zeros(scene.rod_count, bool)
+    chosen[np.array(members, int)] = True
+    for magnet in scene.magnets:
+        chosen[magnet.rods] = True
+    return chosen
+
+
+def alike(dimension: int, batch: RodBatch, ghosts: Ghosts, laws: drag.Laws, chosen: np.ndarray) -> list[Alike]:
+    """The chosen rods (R,) of a batch, those with the same ghosts together, and those with drag."""
+    check_batch(batch, dimension)
+    chosen = chosen[batch.first : batch.first + batch.rods]
+    flags = ghosts.count[batch.first : batch.first + batch.rods]
+    if batch.closed and flags.any():
+        raise SceneError(f"rod {batch.first + int(np.argmax(flags.any(1)))} is closed: it has no end to clamp")
+    dragged, result = laws.of_rods[batch.first : batch.first + batch.rods] >= 0, []
+    for *pattern, drags in product((0, 1), (0, 1), (False, True)):
+        rows = np.flatnonzero((flags == pattern).all(1) & (dragged == drags) & chosen)
+        if rows.size:
+            result.append(Alike(batch, rows, tuple(pattern), _kind(dimension, batch, drags)))
+    return result
+
+
+def _kind(dimension: int, batch: RodBatch, dragged: bool) -> ChainKind:
+    prefix = "planar" if dimension == 2 else "rod"
+    names = [f"{prefix}_stretch"]
+    if batch.bend:
+        names.insert(0, f"{prefix}_bend_twist" if batch.twist else f"{prefix}_bend")
+    for term in batch.laws:
+        if term not in names:
+            raise SceneError(
+                f"rod {batch.first} ('{batch.name}'): it has no term {term!r} to give a law; it has {', '.join(names)}"
+            )
+    viscous = bool(np.any(np.asarray(batch.section.viscosity) > 0.0))
+    keys = [*(term_key(name, batch.by_angle) for name in names[:-1]), names[-1]]  # the last is stretch
+    terms = tuple(REGISTRY[key].of(batch.laws).damped(viscous) for key in keys)
+    return ChainKind(dimension, batch.twist, batch.closed, terms, drag=dragged)
+
+
+def piece_of(part: Alike, outside: Ghosts, laws: drag.Laws) -> Piece:
+    """The arrays of some rods.
+
+    Raises:
+        SceneError: a director, a law or a rest shape that they cannot have; names the first rod.
+    """
+    batch, rows, rods, kind, (before, after) = part.batch, part.rows, part.rods, part.kind, part.ghosts
+    points = np.asfortranarray(batch.points[rows])  # as what is made of it: components of vectors lie together
+    if kind.dim == 2:
+        points = points * [1.0, 0.0, 1.0]
+    if before:
+        points = np.concatenate([ghost_node(points, 0, 1, outside.tangent[rods, 0]), points], axis=1)
+    if after:
+        points = np.concatenate([points, ghost_node(points, -1, -2, outside.tangent[rods, 1])], axis=1)
+    edges = polyline.edge_vectors(points, batch.closed)
+    lengths = polyline.length(edges)
+    real = slice(before, lengths.shape[1] - after)
+    tangents = edges / lengths[..., None]
+    section = batch.section
+
+    def on_edges(value):
+        """A stiffness on all edges with ghosts, (1, 1) where it is uniform."""
+        value = np.asarray(value, float)
+        if value.ndim == 0:
+            return value[None, None]
+        full = np.broadcast_to(np.atleast_2d(value), (batch.rods, lengths[:, real].shape[1]))[rows]
+        return np.pad(full, ((0, 0), (before, after)), mode="edge")
+
+    own = np.zeros_like(lengths)
+    own[:, real] = lengths[:, real]
+    line_mass = on_edges(section.mass_per_length) * own
+    mass = np.zeros_like(points[..., 0])
+    if batch.closed:
+        mass += 0.5 * (line_mass + np.roll(line_mass, 1, axis=1))
+    else:
+        mass[:, :-1] += 0.5 * line_mass
+        mass[:, 1:] += 0.5 * line_mass
+    given = batch.director
+    if given is not None and given.ndim > 1:
+        given = np.broadcast_to(given, (batch.rods, *given.shape[1:]))[rows]
+    frames = np.zeros_like(tangents)
+    if kind.twist:
+        frames[:, real] = polyline.directors(tangents[:, real], given)
+        for end, neighbour in ((0, 1),) * before + ((-1, -2),) * after:
+            frames[:, end] = end_director(end, neighbour, lengths, tangents, frames, outside.director[rods, end])
+            bad = np.flatnonzero(~np.isfinite(frames[:, end]).all(1))
+            if bad.size:
+                raise SceneError(
+                    f"rod {rods[bad[0]]} ('{batch.name}'): the director or tangent prescribed at its {'last' if end else 'first'} "
+                    "end lies along the other or points back; give a tangent along the rod and a director across it"
+                )
+    twist = polyline.reference_twist(tangents, frames, batch.closed) if kind.twist else np.zeros((len(rows), 0))
+    voronoi = 0.5 * sum(polyline.ahead(lengths, batch.closed))
+    if before:
+        voronoi[:, 0] = 0.5 * lengths[:, 1]
+    if after:
+        voronoi[:, -1] = 0.5 * lengths[:, -2]
+    natural = _natural(batch, rows, part.ghosts, kind, edges, tangents, frames, twist, voronoi) if batch.bend else []
+    damping = on_edges(section.viscosity)
+
+    def on_vertices(value):
+        value = on_edges(value)
+        return value if value.shape == (1, 1) else 0.5 * sum(polyline.ahead(value, batch.closed))
+
+    parameters = {}
+    for term in kind.terms:
+        stretch = term.measure.span == 1
+        if stretch:
+            stiffness, rest, weight, spread = [on_edges(section.EA)], [np.ones((1, 1))], lengths, damping
+        else:
+            stiffness = [on_vertices(value) for value in _bending(section, kind)]
+            rest, weight, spread = natural, voronoi, on_vertices(section.viscosity)
+        given = {"measure": weight, "stiffness": stiffness, "rest": rest, "viscosity": spread}
+        values = _bound(batch, term, given, on_edges if stretch else on_vertices)
+        parameters |= {f"{term.name}.{name}": compress(np.atleast_2d(v)) for name, v in values.items()}
+    return Piece(
+        batch,
+        rods,
+        part.ghosts,
+        kind,
+        points[..., [0, 2]] if kind.dim == 2 else points,
+        tangents,
+        frames,
+        twist,
+        mass,
+        on_edges(section.rotary_inertia) * own,
+        own.sum(1),
+        parameters,
+        [on_edges(value) for value in (section.EI1, section.EI2, section.GJ)],
+        laws.coefficients(rods, batch.name, on_edges(section.radius), own) if kind.drag else None,
+    )
+
+
+def _bound(batch: RodBatch, term: Term, given: dict, along) -> dict[str, np.ndarray]:
+    """Parameters of a term by name, from what the rod gives and what its law says; `along` puts values where the term has them."""
+    where, families = f"rod {batch.first} ('{batch.name}'), {term.name}", {known.family for known in term.parameters}
+    law = batch.laws.get(term.name)
+    unstrained = 1.0 if term.measure.span == 1 else 0.0
+    bent = (np.abs((value - unstrained) * given["measure"]).max() > 1e-9 for value in given["rest"])
+    if law is not None and "rest" not in families and any(bent):
+        raise SceneError(f"{where}: the law {term.density.name!r} has no strains at rest; give natural='straight'")
+    given = {family: value for family, value in given.items() if family in families}
+    for family, value in law.values.items() if law else ():
+        try:
+            given[family] = [along(v) for v in value] if isinstance(value, list | tuple) else along(value)
+        except (TypeError, ValueError):
+            raise SceneError(
+                f"{where}: {family} = {value!r}; give numbers that broadcast to the {batch.rods} rods and {batch.edges} edges"
+            ) from None
+    try:
+        values = term.bind(**given)
+    except TypeError as error:
+        raise SceneError(f"{where}: law {term.density.name!r}: {error}; give it with Law(density, ...)") from None
+    for known in term.parameters if law else ():
+        rule, holds = known.valid
+        if not np.all(np.isfinite(values[known.name]) & holds(values[known.name])):
+            raise SceneError(f"{where}: {known.name} = {values[known.name]}; it is finite and {rule}")
+    return values
+
+
+def _bending(section, kind: ChainKind) -> list:
+    if kind.twist:
+        return [section.EI1, section.EI2, section.GJ]
+    return [section.EI1] * (3 if kind.dim == 3 else 1)
+
+
+def _natural(batch, rows, ghosts, kind, edges, tangents, frames, twist, voronoi) -> list[np.ndarray]:
+    """Strains at rest of the bending term, (R, vertices) each [1/m]."""
+    if isinstance(batch.natural, str) and batch.natural == "straight":
+        return [np.zeros((1, 1))] * (1 if kind.dim == 2 else 3)
+    if kind.dim == 2:
+        shape = [polyline.planar_curvature(edges[..., [0, 2]], batch.closed, batch.by_angle)]
+    elif kind.twist:
+        shape = [*polyline.curvatures(tangents, frames, batch.closed, batch.by_angle), twist]
+    else:
+        (t0, t1) = polyline.ahead(tangents, batch.closed)
+        if np.any(polyline.length(polyline.cross(t0, t1)) > 1e-9):
+            raise SceneError(
+                f"rod {batch.first} ('{batch.name}') is curved at rest, which needs twist=True; "
+                "or give natural='straight' if it is straight when free"
+            )
+        return [np.zeros((1, 1))] * 3
+    if isinstance(batch.natural, str):
+        return [value / voronoi for value in shape]
+    vertices = voronoi.shape[1] - sum(ghosts)
+    given = [np.broadcast_to(np.asarray(value, float), (batch.rods, vertices))[rows] for value in batch.natural]
+    return [np.pad(value, ((0, 0), ghosts), mode="edge") for value in given]
+
+
+def compress(values: np.ndarray) -> np.ndarray:
+    """(1, 1) for one number, (1, vertices) where all rods are alike, (R, 1) where rods are uniform."""
+    if np.all(values == values[:1, :1]):
+        return values[:1, :1]
+    if np.all(values == values[:1]):
+        return values[:1]
+    return values[:, :1] if np.all(values == values[:, :1]) else values

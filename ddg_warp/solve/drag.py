@@ -1,0 +1,140 @@
+"""Drag on rods on their own and on those of a net, against a fluid that flows; see `kernels.drag`."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.kernels import drag, element
+from ddg_warp.kernels.islands import Islands
+from ddg_warp.scene.drag import flow_at
+from ddg_warp.solve.net.system import lists
+
+
+class Drag:
+    """Drag on a part: `Group` or `DeviceNet`."""
+
+    def __init__(self, model, part, kernels: tuple, midpoint: bool):
+        self.model, self.part, self.midpoint = model, part, midpoint
+        self._resist, self._settle = kernels
+        vector = wp.types.vector(part.dim, model.types.real)
+        self.flow = wp.array(self._flow(0.0), dtype=vector, device=model.wp_device)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [self._resist, *([self._settle] if self.midpoint else [])]
+
+    def upload(self, t0: float, t1: float) -> None:
+        """The flow at the time that the scheme balances forces at."""
+        if callable(self.model.scene.flow):
+            self.flow.assign(self._flow(0.5 * (t0 + t1) if self.midpoint else t1))
+
+    def _flow(self, t: float) -> np.ndarray:
+        return flow_at(self.model.scene, t)[None, list(self.part.host.axes)]
+
+    def _over_a_second(self) -> Islands:
+        """Islands of a solve in which inertia and drag are those of a second."""
+        islands = Islands(self.part.columns, self.model.types.real, self.model.wp_device)
+        islands.coefficient.fill_(1.0)
+        islands.rate.fill_(1.0)
+        return islands
+
+    def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)
+
+
+class ChainDrag(Drag):
+    """Drag on a group of rods, against a fluid that flows."""
+
+    def __init__(self, model, group, midpoint: bool = False):
+        super().__init__(model, group, drag.chain_kernels(group.kind, model.types.real), midpoint)
+
+    def resist(self, before, newton, islands) -> None:
+        """Write inertia and drag of a solve from the state `before`, once its iterate is predicted."""
+        group = self.part
+        self._launch(
+            self._resist,
+            group.node_threads,
+            [before.x, before.v, before.theta, newton.x if self.midpoint else before.x, newton.x, group.drag, self.flow]
+            + [group.mass, group.rotary, group.count, *islands.arrays],
+            [newton.mass, newton.rotary, newton.target_angle],
+        )
+
+    def at(self, data, t: float) -> tuple[np.ndarray, np.ndarray]:
+        """Inertia and drag (node, column) of a group's state at t, with the resistance over a second, and the flow (dim,)."""
+        group, real, device = self.part, self.model.types.real, self.model.wp_device
+        solve = SimpleNamespace(x=data.x)
+        solve.mass = arrays.allocate((group.nodes, group.columns), element.inertia_type(group.kind, real), device)
+        solve.rotary, solve.target_angle = wp.zeros_like(data.theta), wp.clone(data.theta)
+        self.upload(t, t)
+        self.resist(data, solve, self._over_a_second())
+        return arrays.download(solve.mass), self.flow.numpy()[0].astype(float)
+
+    def settle(self, after, newton, islands) -> None:
+        """Rates of what has no inertia in the state `after`."""
+        group = self.part
+        if self.midpoint:
+            self._launch(
+                self._settle,
+                group.node_threads,
+                [newton.x, newton.theta, group.mass, group.rotary, group.count, *islands.arrays]
+                + [after.x, after.theta],
+                [after.v, after.omega],
+            )
+
+
+class NetDrag(Drag):
+    """Drag on the rods of a net, against a fluid that flows.
+
+    Attributes:
+        moves: what inertia or drag give a rate, as masses of the dofs of blocks that are positive there.
+    """
+
+    def __init__(self, model, midpoint: bool = False):
+        net, host, device, real = model.net, model.net.host, model.wp_device, model.types.real
+        super().__init__(model, net, drag.net_kernels(real), midpoint)
+        ends, angles, coefficients = host.drag
+        places = np.stack([*ends, np.where(angles < 0, host.blocks, angles)], -1).ravel()
+        starts, items = lists(places, host.blocks + 1)
+
+        def put(values, dtype=int):
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+        self.ends, self.starts, self.items = (put(v.astype(np.int32)) for v in (ends.T, starts, items // 3))
+        self.coefficients = put(coefficients, real)
+        self.mass = put(host.mass, net.vector)
+        felt = np.zeros((host.blocks, 3))
+        felt[ends] = 1.0
+        felt[angles[angles >= 0], 0] = 1.0
+        self.moves = put(host.mass + felt, net.vector)
+
+    def resist(self, before, solver, islands) -> None:
+        """Write inertia and drag of a solve from the state `before`, once its iterate is predicted."""
+        net = self.part
+        self._launch(
+            self._resist,
+            net.worlds * net.blocks,
+            [before.q, before.v, solver.q if self.midpoint else before.q, solver.q, self.mass, self.ends]
+            + [self.coefficients, self.starts, self.items, self.flow, solver.outer, *islands.arrays]
+            + [net.blocks, net.host.nodes],
+            [solver.mass],
+        )
+
+    def at(self, state, t: float) -> tuple[np.ndarray, np.ndarray]:
+        """Inertia and drag (world, block) of a net's state at t, with the resistance over a second, and the flow (blocks, 3)."""
+        net, device = self.part, self.model.wp_device
+        mass = wp.zeros((net.worlds, net.blocks), dtype=drag.block_inertia(net.real), device=device)
+        self.upload(t, t)
+        self.resist(state, SimpleNamespace(q=state.q, outer=net.still, mass=mass), self._over_a_second())
+        flow = np.zeros((net.blocks, 3))
+        flow[: net.host.nodes] = self.flow.numpy()[0]
+        return mass.numpy(), flow
+
+    def settle(self, after, solver, islands) -> None:
+        """Rates of what has no inertia in the state `after`."""
+        net = self.part
+        if self.midpoint:
+            inputs = [solver.q, solver.mass, *islands.arrays, net.blocks, after.q]
+            self._launch(self._settle, net.worlds * net.blocks, inputs, [after.v])

@@ -1,0 +1,86 @@
+"""Loads on a device that change from step to step, or follow what they act on, over the constant ones."""
+
+import numpy as np
+import warp as wp
+from scipy import sparse
+
+from ddg_warp.kernels.loads import follower_kernel, spread_kernel
+
+
+class Loads:
+    """Loads of a group of rods or of a net, on the places that such loads touch.
+
+    Args:
+        part: `Group` or `DeviceNet`.
+        midpoint: whether the scheme balances forces in the middle of a step.
+    """
+
+    def __init__(self, model, part, midpoint: bool):
+        host, real, device = part.host, model.types.real, model.wp_device
+        self.part, self.midpoint, self._vector = part, midpoint, wp.types.vector(3, real)
+        following = np.concatenate([np.zeros(0, int), *(load.places.ravel() for load in host.followers)])
+        self.places = np.unique(np.concatenate([following, *(load.places for load in host.timed)]))
+        self._dead = self._matrix([host.constant, *host.timed])
+        self._values = wp.zeros(len(self.places), dtype=self._vector, device=device)
+        self.total = len(following)
+        self._force = wp.zeros(max(1, part.worlds * self.total), dtype=self._vector, device=device)
+
+        def put(values):
+            return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
+
+        first, self._followers = 0, []  # kernel, load, places, values, place of its first force
+        for load in host.followers:
+            values = wp.array(load.values, dtype=self._vector, device=device)
+            kernel = follower_kernel(load.kernel, load.places.shape[1], part.dim, real)
+            self._followers.append((kernel, load, put(host.index(load.places)), values, first))
+            first += load.places.size
+        target = np.searchsorted(self.places, following)
+        items = np.argsort(target, kind="stable")
+        starts, items = put(np.searchsorted(target[items], np.arange(len(self.places) + 1))), put(items)
+        places, nodes = put(host.index(self.places)), int(np.searchsorted(self.places, host.nodes))
+        self._spread = [  # kernel, which array it writes, and lists
+            (spread_kernel(dim, real), i, [places[some], self._values[some], starts[some.start :], items])
+            for i, (dim, some) in enumerate(((part.dim, slice(0, nodes)), (1, slice(nodes, len(self.places)))))
+            if some.start < some.stop
+        ]
+
+    def _matrix(self, loads: list) -> sparse.csr_array:
+        """What every load at full amplitude puts on the components of the places (3 P, loads)."""
+        rows, columns, values = [], [], []
+        for i, load in enumerate(loads):
+            known = np.isin(load.places, self.places)
+            rows.append((3 * np.searchsorted(self.places, load.places[known])[:, None] + np.arange(3)).ravel())
+            columns.append(np.full(len(rows[-1]), i))
+            values.append(load.force[known].ravel())
+        data, *where = (np.concatenate(parts) for parts in (values, rows, columns))
+        return sparse.csr_array((data, where), shape=(3 * len(self.places), len(loads)))
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [*{kernel for kernel, *_ in self._followers}, *(kernel for kernel, *_ in self._spread)]
+
+    def upload(self, t0: float, t1: float) -> None:
+        """Values at the time that the scheme balances forces at."""
+        at = 0.5 * (t0 + t1) if self.midpoint else t1
+        amplitudes = [1.0, *(load.at(at, 1.0) for load in self.part.host.timed)]
+        self._values.assign((self._dead @ amplitudes).reshape(-1, 3))
+        for _, load, _, values, _ in self._followers:
+            if load.amplitude is not None:
+                values.assign(load.at(at, 1.0) * load.values)
+
+    def scale(self, dead: np.ndarray, at: float) -> None:
+        """Values of an equilibrium at load parameter `at`, with the loads on all places (P, 3) that follow nothing."""
+        self._values.assign(dead[self.places])
+        for _, load, _, values, _ in self._followers:
+            values.assign(load.at(at, at) * load.values)
+
+    def apply(self, x: wp.array, force: wp.array, moment: wp.array) -> None:
+        """Write the loads on nodes, which are at x, and on angles."""
+        part = self.part
+        for kernel, load, places, values, first in self._followers:
+            inputs = [x, places, values, part.world_columns, first, self.total]
+            wp.launch(kernel, (len(load.places), part.worlds), inputs, [self._force], device=part.device)
+        for kernel, i, lists in self._spread:
+            inputs = [*lists, self._force, part.world_columns, self.total]
+            wp.launch(kernel, (len(lists[0]), part.worlds), inputs, [(force, moment)[i]], device=part.device)

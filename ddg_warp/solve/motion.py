@@ -1,0 +1,94 @@
+"""Motion of supports on a device."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arguments
+from ddg_warp.compile.conditions import pose_starts
+from ddg_warp.errors import SolverError
+from ddg_warp.kernels import motion
+from ddg_warp.kernels.islands import Islands
+
+
+def poses(model, t0: float, t1: float) -> np.ndarray:
+    """Poses of all motions of a model between t0 and t1 (rows, 21).
+
+    Raises:
+        SolverError: a motion has no finite value, or leaves the plane of a planar scene; names the function and the time.
+    """
+    rows = np.concatenate([motion.pose(t0, t1) for motion in model.motions])
+    if model.scene.dimension == 2 and rows[:, 19].any():
+        raise SolverError(
+            f"a motion's translation has a part along y at t = {t1:g}: {tuple(rows[np.argmax(np.abs(rows[:, 19])), 18:].tolist())}; "
+            "a scene of dimension 2 stays in the plane of x and z, give 0",
+            outcome=arguments.PRESCRIBED,
+        )
+    return rows
+
+
+def jump_between(model, t0: float, t1: float) -> str:
+    """What to tell of a step or an increment that failed because a motion jumps in it; empty where none does."""
+    for moved in model.motions:
+        at = moved.jump(t0, t1)
+        if at is not None:
+            return (
+                f"a motion of its supports jumps at t = {at:g}, which no step can follow: make it continuous, such as a ramp over a "
+                "few steps"
+            )
+    return ""
+
+
+class Motion:
+    """Motion of the held nodes and angles of a group of rods or of a net.
+
+    Poses at both ends of a step come from the host; where supports are in between is found on the device, island by island.
+
+    Args:
+        part: `Group` or `DeviceNet`.
+    """
+
+    def __init__(self, model, part, midpoint: bool = False):
+        host, real = part.host, model.types.real
+        self.model, self.part = model, part
+        self.pose = wp.zeros((pose_starts(model.motions)[-1], motion.POSE), dtype=real, device=model.wp_device)
+        self._nodes, self._angles = motion.support_kernels(part.dim, real, midpoint)
+        places, angles = host.moving[:, 0], host.turning[:, 0]
+        self.nodes = self._list(host.index(places), host.moving[:, 1:])
+        self.rest = self._vectors(host.points(places))
+        edges = angles - host.nodes
+        self.angles = self._list(host.index(angles), edges, host.edge_ends(angles), host.turning[:, 1])
+        self.directors = self._vectors(host.frame[:3].reshape(3, -1)[:, edges].T)
+
+    def _list(self, *columns: np.ndarray) -> wp.array:
+        return wp.array(np.column_stack(columns).astype(np.int32), dtype=int, device=self.model.wp_device)
+
+    def _vectors(self, values: np.ndarray) -> wp.array:
+        vector = wp.types.vector(3, self.model.types.real)
+        return wp.array(np.ascontiguousarray(values), dtype=vector, device=self.model.wp_device)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [self._nodes, *([self._angles] if len(self.angles) else [])]
+
+    def upload(self, t0: float, t1: float) -> None:
+        """Poses of all motions between t0 and t1."""
+        self.pose.assign(poses(self.model, t0, t1))
+
+    def apply(self, islands, x: wp.array, frame: wp.array, theta: wp.array) -> None:
+        """Put nodes x and angles theta where the part of the step that an island tries has them; `frame` are lagged."""
+        given = [self.pose, *islands.arrays, self.part.world_columns]
+        self._launch(self._nodes, self.nodes, [self.nodes, self.rest, *given], [x])
+        if len(self.angles):
+            self._launch(self._angles, self.angles, [self.angles, self.directors, *given, x, frame], [theta])
+
+    def put(self, t0: float, t1: float, *arrays: wp.array) -> None:
+        """Put what `apply` puts, which belongs to t0, where it is at t1."""
+        self.upload(t0, t1)
+        islands = Islands(self.part.columns, self.model.types.real, self.model.wp_device)
+        islands.portion.fill_(1.0)
+        self.apply(islands, *arrays)
+
+    def _launch(self, kernel, where: wp.array, inputs: list, outputs: list) -> None:
+        dim = (len(where), self.model.worlds)
+        wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)
