@@ -9,7 +9,6 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.element import CPU_OPTIONS
 from ddg_warp.kernels.matrix.sliced import product_functions
 
 TILE = 4096  # entries that one block of threads sums
@@ -44,35 +43,18 @@ def sum_kernels(real, largest: bool = False):
 
 @cache
 def serial_sum_kernel(real, largest: bool = False):
-    """The same by one thread a row, for the CPU, which has one.
+    """The same by one thread a row, for the CPU, which has one."""
 
-    It adds into as many numbers as a register or two hold: one alone would wait for the sum before.
-    """
-    lanes = 16
-    S = wp.types.vector(lanes, real)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    @wp.kernel(module="unique", enable_backward=False)
     def total(values: wp.array2d(dtype=real), sum_out: wp.array(dtype=real)):
         w = wp.tid()
-        n = values.shape[1]
-        s = S()
-        for i in range(n // wp.static(lanes)):
-            for j in range(wp.static(lanes)):
-                v = values[w, i * wp.static(lanes) + j]
-                if wp.static(largest):
-                    s[j] = wp.where(v > s[j], v, s[j])
-                else:
-                    s[j] = s[j] + v
-        for i in range(n - n % wp.static(lanes), n):
-            v = values[w, i]
+        s = real(0.0)
+        for i in range(values.shape[1]):
             if wp.static(largest):
-                s[0] = wp.where(v > s[0], v, s[0])
+                s = wp.max(s, values[w, i])
             else:
-                s[0] = s[0] + v
-        if wp.static(largest):
-            sum_out[w] = wp.max(s)
-        else:
-            sum_out[w] = wp.dot(s, S(real(1.0)))
+                s += values[w, i]
+        sum_out[w] = s
 
     return total
 
