@@ -11,7 +11,7 @@ import pytest
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp.compile.tolerance import FAN
+from ddg_warp.compile.tolerance import FAN, outer_forces
 from ddg_warp.geometry import meshes
 from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.statics import Equilibrium, StaticsOptions
@@ -142,6 +142,26 @@ def test_a_body_is_judged_by_its_own_load(device):
     force[model.net.host.rods[0].nodes] = 0.0
     mean = sum(bodies.loads(force)[1:3]) / 3
     assert bodies.loads(force)[0] == pytest.approx(mean, rel=0.02)
+
+
+@pytest.mark.parametrize("twist", [True, False])
+@pytest.mark.parametrize("joined", [False, True])
+def test_a_couple_counts_as_a_force_over_the_rod(device, joined, twist):
+    """|M| / L of the rod, alone or joined, in a coarse mesh or a fine one."""
+    for nodes in (11, 81):
+        scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+        section = ddg.Stiffness(EA=1e3, EI1=0.5, GJ=0.4, mass_per_length=0.6, rotary_inertia=0.01)
+        rod = scene.add_rod(np.linspace((0, 0, 0), (2.0, 0, 0), nodes), section=section, twist=twist)
+        scene.add_couple(rod, nodes // 2, (0.1, -0.3, 0.2))
+        if joined:
+            other = scene.add_rod(np.linspace((-1.0, 0, 0), (0, 0, 0), 5), section=section, twist=twist)
+            scene.join([(rod, 0), (other, -1)], rigid=False)
+        model = scene.build(device, "float64")
+        if joined:
+            found = outer_forces(model.net.host, np.zeros(3)).sum()
+        else:
+            found = model.groups[0].outer.numpy()[0]
+        assert found == pytest.approx(0.6 / 2.0)
 
 
 def test_rtol_says_what_it_is_compared_with():

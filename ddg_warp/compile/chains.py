@@ -73,7 +73,7 @@ class ChainGroup(Storage):
         closed, twist = np.full(rods, self.kind.closed), np.full(rods, self.kind.twist)
         first = self.first * rods + np.arange(rods)
         nodes, angles = Along(first, rods), Along(first + self.nodes, rods)
-        return RodPlaces(self.rods, self.own, closed, twist, nodes, angles)
+        return RodPlaces(self.rods, self.own, closed, twist, self.length, nodes, angles)
 
     def index(self, places: np.ndarray) -> np.ndarray:
         return places % self.nodes

@@ -37,10 +37,10 @@ def load_rods(scene, storage: Storage) -> None:
         if load.edge is None:
             storage.add_load(places.node(rows, load.node), load.force, load.amplitude)
         elif load.moment:
-            storage.add_load(places.edge(rows, load.edge)[0][:, 2], (load.moment, 0.0, 0.0), load.amplitude)
+            storage.add_load(places.edge(rows, load.edge)[0][0][:, 2], (load.moment, 0.0, 0.0), load.amplitude)
         elif any(load.couple):
-            edges = filter(len, places.edge(rows, load.edge))
-            storage.followers += [Couple(edge, np.array(load.couple), load.amplitude) for edge in edges]
+            edges = ((edge, length) for edge, length in places.edge(rows, load.edge) if len(edge))
+            storage.followers += [Couple(*edge, np.array(load.couple), load.amplitude) for edge in edges]
 
 
 def hold_rods(scene, storage: Storage, claims: "Claims") -> None:
@@ -49,7 +49,7 @@ def hold_rods(scene, storage: Storage, claims: "Claims") -> None:
     for support in scene.supports:
         found, rows = places.among(support.rods)
         nodes = [places.node(rows, node) for node in support.nodes]
-        angles = [places.edge(rows, edge)[0][:, 2] for edge in support.edges]
+        angles = [places.edge(rows, edge)[0][0][:, 2] for edge in support.edges]
         if support.end:
             last, twisted = support.end == "last", rows[places.twist[rows]]
             nodes += [places.nodes(rows, k) for k in ((places.own[rows] - 1, places.own[rows]) if last else (0, -1))]

@@ -18,6 +18,10 @@ class Load:
 
     amplitude: Callable[[float], float] | None
 
+    def sizes(self, x: np.ndarray) -> np.ndarray:
+        """How much the forces at points x (E, m, 3) count among those that residuals are compared with (E, m) [N]."""
+        return np.abs(self.forces(x)).sum(-1)
+
     def at(self, t: float, otherwise: float) -> float:
         """Its amplitude at t, or `otherwise` if it has none.
 
@@ -65,10 +69,12 @@ class Pressure(Load):
 class Couple(Load):
     """A couple M (3,) [N m], its axis fixed in space, on rod edges: first node, second node and, with twist, angle (C, 3 or 2).
 
-    On an edge e it is the force M x e / |e|^2 on the second node, the opposite one on the first, and the moment M . t about it.
+    On an edge e it is the force M x e / |e|^2 on the second node, the opposite one on the first, and the moment M . t about it. It
+    counts as a force at the end of its rod (`length` (C,) [m]), however short its edge is.
     """
 
     places: np.ndarray
+    length: np.ndarray
     couple: np.ndarray
     amplitude: Callable[[float], float] | None = None
 
@@ -77,6 +83,9 @@ class Couple(Load):
     @property
     def values(self) -> np.ndarray:
         return np.tile(self.couple, (len(self.places), 1))
+
+    def sizes(self, x: np.ndarray) -> np.ndarray:
+        return _first(np.abs(self.couple).sum() / self.length, self.places)
 
     def forces(self, x: np.ndarray) -> np.ndarray:
         e = x[:, 1] - x[:, 0]
@@ -105,12 +114,13 @@ class EdgeCouple(Load):
 
     `moment` (C,) [N m] by the right hand about the edge, `sign` (C,) that of the angle. The normal at the edge spins with its triangle
     and by the angle, hence the forces M / h along the normal on the corner at the height h, in balance with those at the ends, and the
-    moment M on the angle.
+    moment M on the angle. They count as forces over the `length` of the shell [m].
     """
 
     places: np.ndarray
     moment: np.ndarray
     sign: np.ndarray
+    length: float
     amplitude: Callable[[float], float] | None = None
 
     kernel = "bend"
@@ -118,6 +128,9 @@ class EdgeCouple(Load):
     @property
     def values(self) -> np.ndarray:
         return np.column_stack([self.moment, self.sign * self.moment, 0.0 * self.moment])
+
+    def sizes(self, x: np.ndarray) -> np.ndarray:
+        return _first(np.abs(self.moment) / self.length, self.places)
 
     def forces(self, x: np.ndarray) -> np.ndarray:
         e, a = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]
@@ -153,6 +166,13 @@ class EdgeCouple(Load):
 def accumulate(total: np.ndarray, places: np.ndarray, values: np.ndarray) -> None:
     """Add values (n, 3) to the rows `places` of a total (P, 3); a row may come twice. NumPy is fast at this in one dimension."""
     np.add.at(total.reshape(-1), (3 * places[..., None] + np.arange(3)).ravel(), values.ravel())
+
+
+def _first(sizes: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Sizes (E,) of elements at the first of their places (E, m)."""
+    result = np.zeros(places.shape)
+    result[:, 0] = sizes
+    return result
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -32,7 +32,7 @@ class RodPlaces:
 
     Attributes:
         rods: scene's indices (R,).
-        own: nodes without ghosts (R,); closed, twist: (R,) bool.
+        own: nodes without ghosts (R,); closed, twist: (R,) bool; length: at rest (R,) [m].
         nodes, angles: places of nodes and of the angles of edges, counted from the first own one; ghosts are -1 and `own`.
     """
 
@@ -40,6 +40,7 @@ class RodPlaces:
     own: np.ndarray
     closed: np.ndarray
     twist: np.ndarray
+    length: np.ndarray
     nodes: Along
     angles: Along
 
@@ -60,15 +61,19 @@ class RodPlaces:
         """Places of node k, from the last if negative."""
         return self.nodes(rows, k % self.own[rows])
 
-    def edge(self, rows: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
-        """Places of both nodes of edge k and of its angle (n, 3) of the rods with twist; of both nodes (n, 2) of those without."""
+    def edge(self, rows: np.ndarray, k: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Places of both nodes of edge k and of its angle (n, 3) of the rods with twist; of both nodes (n, 2) of those without.
+
+        Each with the lengths of the rods (n,).
+        """
         found = []
         for twist in (True, False):
             some = rows[self.twist[rows] == twist]
             first = k % (self.own[some] - np.where(self.closed[some], 0, 1))
             ends = [self.nodes(some, first), self.nodes(some, (first + 1) % self.own[some])]
-            found.append(np.column_stack([*ends, self.angles(some, first)] if twist else ends))
-        return tuple(found)
+            places = np.column_stack([*ends, self.angles(some, first)] if twist else ends)
+            found.append((places, self.length[some]))
+        return found
 
 
 @dataclass(frozen=True)

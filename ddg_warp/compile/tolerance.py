@@ -135,7 +135,7 @@ def outer_forces(host, gravity) -> np.ndarray:
     for load in host.timed:
         np.add.at(force, load.places, np.abs(load.force).sum(-1))
     for load in host.followers:
-        np.add.at(force, load.places, np.abs(load.forces(host.rest[load.places])).sum(-1))
+        np.add.at(force, load.places, load.sizes(host.rest[load.places]))
     for part in host.sets:
         if part.term.measure.field:
             np.add.at(force, part.slots[0], _magnetic_forces(host, part))

@@ -108,6 +108,5 @@ def _outer_forces(host: ChainGroup, gravity: np.ndarray, load: np.ndarray, momen
         arm = np.where(timed.places < host.nodes, 1.0, host.length[column])
         np.add.at(total, column, np.abs(timed.force).sum(1) / arm)
     for couple in host.followers:
-        column = couple.places[:, 0] % rods
-        np.add.at(total, column, np.abs(couple.couple).sum() / host.length[column])
+        np.add.at(total, couple.places % rods, couple.sizes(None))  # wherever its nodes are
     return total

@@ -88,4 +88,5 @@ def _edge_couple(shell, given) -> EdgeCouple:
     corners = np.column_stack([ends, surface.edge_opposite[edges, side]])
     length = np.linalg.norm(np.diff(surface.points[ends], axis=1)[:, 0], axis=1)
     places = np.column_stack([shell.nodes[corners], shell.edges[edges]])
-    return EdgeCouple(places, given.couple * length, 1.0 - 2.0 * side, given.amplitude)
+    size = float(np.ptp(surface.points, axis=0).max())
+    return EdgeCouple(places, given.couple * length, 1.0 - 2.0 * side, size, given.amplitude)

@@ -133,6 +133,7 @@ class Net(Storage):
             own=each(lambda rod: len(rod.nodes)),
             closed=each(lambda rod: rod.piece.kind.closed) > 0,
             twist=each(lambda rod: rod.piece.kind.twist) > 0,
+            length=np.array([rod.piece.length[rod.row] for rod in self.rods]),
             nodes=along([rod.all_nodes for rod in self.rods]),
             angles=along([rod.all_edges for rod in self.rods]),
         )
