@@ -55,7 +55,7 @@ def load_kernels(kernels, device) -> None:
 
 
 def serial(device) -> bool:
-    """Whether one thread takes all of what kernels go over, rather than one each; see `kernels.element.until_function`."""
+    """Whether one thread takes all of what kernels go over, rather than one each; see `kernels.threads.until_function`."""
     return wp.get_device(device).is_cpu
 
 
@@ -65,5 +65,5 @@ def takers(count: int, device) -> int:
 
 
 def sweep(kernel, count: int, inputs: list, outputs: list, device, threads: int = THREADS, worlds: int = 1) -> None:
-    """Launch a kernel that goes over `count` things, or as many of every world; see `kernels.element.share_function`."""
+    """Launch a kernel that goes over `count` things, or as many of every world; see `kernels.threads.share_function`."""
     wp.launch(kernel, worlds * takers(count, device), inputs, outputs, device=device, block_dim=threads)

@@ -12,7 +12,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, inertia_type, until_function
+from ddg_warp.kernels.chain import ChainKind, gather_functions, inertia_type
 from ddg_warp.kernels.islands import (
     COEFFICIENT,
     DROWNED,
@@ -24,6 +24,7 @@ from ddg_warp.kernels.islands import (
     STEP_LENGTH,
     UNBALANCED,
 )
+from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 
 @cache

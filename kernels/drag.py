@@ -20,8 +20,9 @@ import warp as wp
 
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.balance import node_functions
-from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, inertia_type, until_function
+from ddg_warp.kernels.chain import ChainKind, gather_functions, inertia_type
 from ddg_warp.kernels.islands import COEFFICIENT, LOAD_SCALE, PROGRESS, RATE, STATUS
+from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 # rows of coefficients; SLOPE is tan(gamma), SPEED is zero where nothing is granular
 TANGENTIAL, NORMAL, ROTATIONAL, LATERAL, FRICTION, LEADING, SLOPE, SPEED = range(8)
@@ -171,7 +172,7 @@ def chain_kernels(kind: ChainKind, real):
 
 @cache
 def block_inertia(real):
-    """Inertia and drag of a block of a net over a solve: `ddg_warp.kernels.element.inertia_type` with a mass for each of three dofs."""
+    """Inertia and drag of a block of a net over a solve: `ddg_warp.kernels.chain.inertia_type` with a mass for each of three dofs."""
     V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
 
     @wp.struct

@@ -13,9 +13,11 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import outcome
-from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, inertia_type, term_functions
+from ddg_warp.kernels.chain import ChainKind, gather_functions, inertia_type
+from ddg_warp.kernels.element import term_functions
 from ddg_warp.kernels.islands import PROGRESS, RATE, STATUS
 from ddg_warp.kernels.terms import Term
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 DRIFT, ROUNDING, HELD, DISSIPATED = range(4)  # rows of a balance
 ROWS = 4

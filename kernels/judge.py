@@ -9,7 +9,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import outcome
-from ddg_warp.kernels.element import ChainKind
+from ddg_warp.kernels.chain import ChainKind
 from ddg_warp.kernels.islands import (
     ACTIVE,
     DECREMENT,

@@ -9,7 +9,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import frames
-from ddg_warp.kernels.element import ChainKind
+from ddg_warp.kernels.chain import ChainKind
 from ddg_warp.kernels.islands import ANGLE_CHANGE, BENT, PROGRESS, RATE, STEP_LENGTH, TODO
 from ddg_warp.kernels.search import PLACE, RELAG, move_functions
 

@@ -5,7 +5,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import frames
-from ddg_warp.kernels.element import ChainKind, gather_functions
+from ddg_warp.kernels.chain import ChainKind, gather_functions
 from ddg_warp.kernels.islands import ANGLE_CHANGE, PLACED, STEP_LENGTH, TODO
 from ddg_warp.kernels.turns import excess_function, place_function
 

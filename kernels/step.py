@@ -16,7 +16,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import frames, outcome
-from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, until_function
+from ddg_warp.kernels.chain import ChainKind, gather_functions
 from ddg_warp.kernels.islands import (
     BENT,
     CAUTIOUS,
@@ -32,6 +32,7 @@ from ddg_warp.kernels.islands import (
     attempt_functions,
 )
 from ddg_warp.kernels.search import search_functions
+from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 from ddg_warp.kernels.turns import TURNED
 
 

@@ -46,7 +46,7 @@ def test_places_are_those_of_the_scene(device, kind, in_net):
                 np.testing.assert_allclose(gathered(q, part.host.dofs(np.array([place])))[0], expected, atol=1e-12)
                 np.testing.assert_allclose(part.host.points(np.array([place]))[0], expected, atol=1e-12)
             for k in (*range(batch.edges), -1):
-                edge = np.concatenate([edges[0] for edges in places.edge(np.array([row]), k) if len(edges)])
+                edge = np.concatenate([edges[0] for edges, _ in places.edge(np.array([row]), k) if len(edges)])
                 ends = batch.points[0][[k % batch.edges, (k % batch.edges + 1) % batch.nodes]]
                 np.testing.assert_allclose(part.host.points(edge[:2]), ends, atol=1e-12)
                 if len(edge) > 2:

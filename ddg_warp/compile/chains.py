@@ -10,8 +10,8 @@ from ddg_warp.compile.ghosts import Ghosts
 from ddg_warp.compile.rods import Alike, alike, compress, net_rods, piece_of
 from ddg_warp.compile.storage import Along, RodPlaces, Storage
 from ddg_warp.errors import SceneError
+from ddg_warp.kernels.chain import ChainKind
 from ddg_warp.kernels.drag import ROWS as DRAG_ROWS
-from ddg_warp.kernels.element import ChainKind
 from ddg_warp.scene import drag
 from ddg_warp.scene.scene import Scene
 

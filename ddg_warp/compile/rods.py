@@ -8,7 +8,7 @@ import numpy as np
 from ddg_warp.compile.ghosts import Ghosts, end_director, ghost_node
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import polyline
-from ddg_warp.kernels.element import ChainKind
+from ddg_warp.kernels.chain import ChainKind
 from ddg_warp.kernels.terms import REGISTRY, Term, term_key
 from ddg_warp.scene import drag
 from ddg_warp.scene.descriptions import RodBatch

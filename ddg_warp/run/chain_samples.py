@@ -4,8 +4,8 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.geometry import polyline
-from ddg_warp.kernels import element
-from ddg_warp.kernels.element import ChainKind
+from ddg_warp.kernels import element, evaluate
+from ddg_warp.kernels.chain import ChainKind
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.measures import lagged_frames
 from ddg_warp.kernels.terms import REGISTRY, Term
@@ -110,7 +110,7 @@ class Chain(Sample):
         dim, window = kind.dim, kind.window
         sizes = ((kind.factor_rows,), (kind.geometric_rows,), (window,), (2,), ())
         out = [wp.zeros((*size, *shape), dtype=real, device=self.device) for size in sizes]
-        kernel = element.evaluate_kernel(kind, real, real, 0 if exact else None)
+        kernel = evaluate.evaluate_kernel(kind, real, real, 0 if exact else None)
         inputs, islands = self._inputs(real), Islands(2, real, self.device)
         wp.copy(islands.rate, inputs[4])
         inputs[4:5] = islands.arrays

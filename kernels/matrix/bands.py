@@ -10,13 +10,13 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.drag import mass_type
-from ddg_warp.kernels.element import CPU_OPTIONS, first_of, until_function
 from ddg_warp.kernels.islands import CLAMPED, COEFFICIENT, ITERATION, WANTED
 from ddg_warp.kernels.matrix.block_band import block_functions
 from ddg_warp.kernels.matrix.sliced import product_functions, second_function
 from ddg_warp.kernels.net.elements import part_function
 from ddg_warp.kernels.net.places import along_type, one_function
 from ddg_warp.kernels.terms import Term
+from ddg_warp.kernels.threads import CPU_OPTIONS, first_of, until_function
 
 
 @cache

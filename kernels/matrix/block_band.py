@@ -10,10 +10,11 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.balance import node_functions
-from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, gather_functions, inertia_type
+from ddg_warp.kernels.chain import ChainKind, gather_functions, inertia_type
 from ddg_warp.kernels.islands import CLAMPED, COEFFICIENT, DROWNED, ITERATION, STATUS, UNBALANCED
 from ddg_warp.kernels.matrix import geometric
 from ddg_warp.kernels.solve import pivot
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 
 @cache

@@ -8,7 +8,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.element import ChainKind, gather_functions
+from ddg_warp.kernels.chain import ChainKind, gather_functions
 
 SWEEPS = 12  # of Jacobi's method; 8 x 8 matrices take 5 or 6
 

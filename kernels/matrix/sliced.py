@@ -10,11 +10,11 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.drag import mass_type
-from ddg_warp.kernels.element import CPU_OPTIONS, until_function
 from ddg_warp.kernels.islands import CLAMPED, COEFFICIENT, ITERATION, WANTED
 from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.net.elements import factor_type, part_function
 from ddg_warp.kernels.terms import Term
+from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 SLICE = 32  # rows of a slice of H
 

@@ -8,8 +8,8 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.drag import mass_type
-from ddg_warp.kernels.element import CPU_OPTIONS, until_function
 from ddg_warp.kernels.islands import COEFFICIENT, DROWNED, LOAD_SCALE, SLOT, STATUS, UNBALANCED
+from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 
 @cache

@@ -13,10 +13,11 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.element import CPU_OPTIONS, left_out_function, share_function, until_function
+from ddg_warp.kernels.evaluate import left_out_function
 from ddg_warp.kernels.islands import CLAMPED, ITERATION, SLOT, STALE, STATUS
 from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.terms import Term
+from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
 
 FRAME = 6  # reals of the reference frame of an edge: first director and tangent
 

@@ -4,12 +4,12 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.element import CPU_OPTIONS
 from ddg_warp.kernels.energy import DISSIPATED, DRIFT, HELD, ROUNDING, balance_function
 from ddg_warp.kernels.islands import PROGRESS, RATE
 from ddg_warp.kernels.matrix.sliced import mass_type
 from ddg_warp.kernels.net.elements import elements_type, functions
 from ddg_warp.kernels.terms import Term
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 
 @cache

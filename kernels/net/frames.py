@@ -8,9 +8,9 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import frames
-from ddg_warp.kernels.element import CPU_OPTIONS, share_function, until_function
 from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.net.elements import FRAME, elements_type, place_function
+from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
 
 
 @cache

@@ -6,7 +6,6 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import outcome
-from ddg_warp.kernels.element import CPU_OPTIONS, share_function, until_function
 from ddg_warp.kernels.islands import (
     ACTIVE,
     CAUTIOUS,
@@ -28,6 +27,7 @@ from ddg_warp.kernels.islands import (
 )
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
 from ddg_warp.kernels.search import PLACE, STRAIGHT
+from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
 from ddg_warp.kernels.turns import TURNED
 
 POLISH = 1e-3  # reduction to which a direction must have been solved before rounding excuses what it leaves

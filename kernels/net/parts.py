@@ -4,8 +4,8 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.element import CPU_OPTIONS, until_function
 from ddg_warp.kernels.islands import ITERATION, LOAD_SCALE, STATUS, STEP_LENGTH
+from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 
 @cache

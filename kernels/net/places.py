@@ -7,11 +7,11 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.element import CPU_OPTIONS, first_of, until_function
 from ddg_warp.kernels.islands import COEFFICIENT, LOAD_SCALE, SLOT, STATUS
 from ddg_warp.kernels.net.balance import found_type, given_type, largest_function, residual_functions
 from ddg_warp.kernels.net.elements import part_function
 from ddg_warp.kernels.terms import Term
+from ddg_warp.kernels.threads import CPU_OPTIONS, first_of, until_function
 
 
 @cache

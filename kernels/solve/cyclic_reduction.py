@@ -15,8 +15,8 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.element import CPU_OPTIONS
 from ddg_warp.kernels.solve import pivot
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 
 def level_rows(nb: int) -> tuple[int, int, int]:

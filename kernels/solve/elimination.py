@@ -22,7 +22,6 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.element import CPU_OPTIONS, until_function
 from ddg_warp.kernels.matrix.bands import place_functions
 from ddg_warp.kernels.matrix.block_band import (
     block_functions,
@@ -31,6 +30,7 @@ from ddg_warp.kernels.matrix.block_band import (
     substitute_function,
 )
 from ddg_warp.kernels.solve.joints import coupling_functions
+from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 
 @cache

@@ -10,7 +10,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import outcome
-from ddg_warp.kernels.element import ChainKind
+from ddg_warp.kernels.chain import ChainKind
 from ddg_warp.kernels.islands import CLAMPED, DECREMENT, ITERATION, LOST, SLOT, STATUS, STEP_LENGTH, WANTED
 from ddg_warp.kernels.matrix.block_band import block_functions, product_function, substitute_function
 from ddg_warp.kernels.search import search_functions

@@ -15,7 +15,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import outcome
-from ddg_warp.kernels.element import CPU_OPTIONS, ChainKind, inertia_type
+from ddg_warp.kernels.chain import ChainKind, inertia_type
 from ddg_warp.kernels.islands import (
     ACTIVE,
     ANGLE_CHANGE,
@@ -38,6 +38,7 @@ from ddg_warp.kernels.judge import judge_functions
 from ddg_warp.kernels.matrix import geometric
 from ddg_warp.kernels.search import PLACE, RELAG, search_functions
 from ddg_warp.kernels.solve import pivot
+from ddg_warp.kernels.threads import CPU_OPTIONS
 from ddg_warp.kernels.turns import TURNED
 
 

@@ -9,13 +9,13 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.drag import mass_type
-from ddg_warp.kernels.element import CPU_OPTIONS, first_of
 from ddg_warp.kernels.islands import WANTED
 from ddg_warp.kernels.matrix.bands import blocks_function, layout_type
 from ddg_warp.kernels.matrix.block_band import block_functions
 from ddg_warp.kernels.net.places import along_type
 from ddg_warp.kernels.solve import pivot
 from ddg_warp.kernels.terms import Term
+from ddg_warp.kernels.threads import CPU_OPTIONS, first_of
 
 
 @cache

@@ -6,7 +6,7 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError, check_options
-from ddg_warp.kernels import balance, element, search, step
+from ddg_warp.kernels import balance, chain, evaluate, search, step
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.matrix import geometric
 from ddg_warp.kernels.solve import sweep
@@ -92,7 +92,7 @@ class ChainNewton:
         self.frame = make(7, *twisted)
         self.mass, self.rotary = group.mass, group.rotary
         if kind.drag:
-            self.mass = make(*nodes, dtype=element.inertia_type(kind, self.real))
+            self.mass = make(*nodes, dtype=chain.inertia_type(kind, self.real))
             self.rotary = make(*twisted)
         self.factor = make(kind.factor_rows, *nodes, dtype=self.linear)
         self.gradient = make(kind.window, *nodes)
@@ -113,7 +113,7 @@ class ChainNewton:
             self.without_compression = wp.full(columns, 1, dtype=int, device=device)
             self._project = geometric.project_kernel(kind, self.real, self.linear)
         self.device = device
-        self._evaluate = element.evaluate_kernel(kind, self.real, self.linear, self.exact_from)
+        self._evaluate = evaluate.evaluate_kernel(kind, self.real, self.linear, self.exact_from)
         self._check = balance.check_kernel(kind, self.real, self.linear)
         self._predict = step.predict_kernel(kind, self.real, self.linear, midpoint)
         self._sweep, self._threads = None, 32 if columns < MANY else 128
