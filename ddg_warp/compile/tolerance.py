@@ -6,7 +6,8 @@ axial force by rtol W. In a shell inner forces are per length: over a part with 
 large parts, whose residuals move the whole and add up from step to step, are held to a tenth of W. Both are independent of refinement
 and of what else is in the net: a smooth residual, which displaces most, is caught by its sum over the whole, a rough one, which stiff
 edges carry, node by node. Moments are compared over the length L of the body (of a shell, the root of its area). Parts are the nodes,
-eight of them, eight of these, and so on, along a rod, or along a curve that fills a shell.
+eight of them, eight of these, and so on, along a rod, or along a curve that fills a shell. A whole Newton step along an exact direction
+leaves a remainder of second order, whose sums need no look: of rods on their own, and of joined ones where elimination is exact.
 
 A body with less load than the mean of those it is connected with is given that mean, since it may carry theirs.
 """
