@@ -88,7 +88,7 @@ def search_functions(kind: ChainKind, real, linear):
     dim, twist, angle, every = kind.dim, kind.twist, kind.block - 1, (1 << kind.dim) - 1
     V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
     _, reference_twist, _ = frames.functions(real)
-    step_of, excess, put, carry = move_functions(kind, real, linear)
+    step_of, _, put, carry = move_functions(kind, real, linear)
     along, *_ = gather_functions(kind, real)
     closed = kind.closed
 

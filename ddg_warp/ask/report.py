@@ -47,7 +47,7 @@ def net_lines(model) -> list[str]:
     """What the net holds: dofs, terms, the matrix."""
     host, net = model.net.host, model.net
     name, linear = net_preconditioner(net), model.types.linear
-    chains = Chains(net, name == "chain" and not host.frames) if name.startswith("chain") else None
+    chains = Chains.of(net, name)
     table = NetSystem(net, chains and chains.kept)
     lines = [
         f"net: {len(host.shells)} shells of {sum(len(s.surface.triangles) for s in host.shells)} triangles, "
@@ -63,11 +63,9 @@ def net_lines(model) -> list[str]:
     if chains and chains.banded:
         chains.plan.bind(host, table.rows.numpy(), table.columns.numpy(), chains.kept)
         solver = "elimination along rods, exact" if chains.plan.complete else solver
-        places, block = chains.plan.chain.size, 4 if chains.plan.twist else 3
-        reals, bands = (
-            reals + 3 * block**2 * places,
-            f" and {int(chains.plan.count.sum())} places of rods in bands of {block} x {block}",
-        )
+        places, block = int(chains.plan.count.sum()), chains.plan.block
+        reals += 3 * block**2 * chains.plan.chain.size
+        bands = f" and {places} places of rods in bands of {block} x {block}"
     size = reals * model.worlds * (4 if linear.__name__ == "float32" else 8)
     lines.append(
         f"  solver: {solver}, one Newton loop a world, linear algebra in {linear.__name__}; "

@@ -106,7 +106,8 @@ class PartStep:
             rods=self.rods_of(failed),
         )
 
-    def dead_end(self, x: np.ndarray, first: int, kind, of: str = "") -> str:
+    @staticmethod
+    def dead_end(x: np.ndarray, first: int, kind, of: str = "") -> str:
         """What to do about a rod whose edges no step can start from, at nodes x (n, dim) of the last good state; empty for others.
 
         Args:

@@ -1,8 +1,6 @@
-"""H of a net between the places of its chains: what elements along rods add, in blocks D, E and F as `matrix.block_band` has them.
+"""H of a net between the places of its chains, in bands: blocks D, E and F of `chain_blocks`, laid out as `block_band` has them.
 
-A place of a chain has a node and the angle of the edge ahead of it, a block of -1 where it has none. Blocks of H that belong to two
-places of a chain lie here, not among the positions of `matrix.sliced`, which hold all others; what other elements, such as joints, add
-between two places is taken from there.
+Blocks of H that belong to two places of a chain lie here, not among the positions of `matrix.sliced`, which hold all others.
 """
 
 from functools import cache
@@ -10,267 +8,13 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.drag import mass_type
-from ddg_warp.kernels.islands import CLAMPED, COEFFICIENT, ITERATION, WANTED
+from ddg_warp.kernels.islands import WANTED
 from ddg_warp.kernels.matrix.block_band import block_functions
-from ddg_warp.kernels.matrix.sliced import product_functions, second_function
-from ddg_warp.kernels.net.elements import part_function
-from ddg_warp.kernels.net.places import along_type, one_function
+from ddg_warp.kernels.matrix.chain_blocks import blocks_function, layout_type, value_function
+from ddg_warp.kernels.matrix.sliced import product_functions
+from ddg_warp.kernels.net.places import along_type
 from ddg_warp.kernels.terms import Term
-from ddg_warp.kernels.threads import CPU_OPTIONS, first_of, until_function
-
-
-@cache
-def place_functions(twist: bool, linear):
-    """free_of(held): by bits, 1 at the free dofs of a place, else 0; block_of(...): its block with another one from positions of H."""
-    nb = 4 if twist else 3
-    B, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
-
-    @wp.func
-    def free_of(held: wp.uint8):
-        f = B()
-        for d in range(wp.static(nb)):
-            f[d] = linear(1 - ((int(held) >> d) & 1))
-        return f
-
-    @wp.func
-    def block_of(matrix: wp.array2d(dtype=linear), places: wp.array3d(dtype=int), row: int, k: int, c: int, first: int):
-        m = M()
-        p = places[row, k, c]
-        if p >= 0:
-            for i in range(3):
-                for j in range(3):
-                    m[i, j] = matrix[3 * i + j, p + first]
-        if wp.static(twist):
-            p = places[row + 1, k, c]
-            if p >= 0:
-                for i in range(3):
-                    m[i, 3] = matrix[3 * i, p + first]
-            p = places[row + 2, k, c]
-            if p >= 0:
-                for j in range(3):
-                    m[3, j] = matrix[j, p + first]
-            p = places[row + 3, k, c]
-            if p >= 0:
-                m[3, 3] = matrix[0, p + first]
-        return m
-
-    return free_of, block_of
-
-
-@cache
-def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tuple[bool, ...]):
-    """add(along..., k, c, w, late) -> D, E, F of what the last of the terms, and by calling itself those before, add at a place."""
-    term, curved = terms[-1], exact[-1]
-    measure, nb = term.measure, 4 if twist else 3
-    B, M, Along = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear), along_type(real, linear)
-    n, size, nodes, angles, tensions = (
-        len(measure.strains),
-        measure.size,
-        measure.nodes,
-        measure.angles,
-        measure.tensions,
-    )
-    second_of = second_function(measure, linear) if curved else None
-    before = sum_function(terms[:-1], twist, real, linear, exact[:-1]) if len(terms) > 1 else None
-    first, one = len(terms) == 1, one_function(len(terms) - 1, real, linear)
-    part = part_function(measure, linear)
-
-    @wp.func
-    def row(own: Along, m: int, i: int, e: int):
-        """Factor row of a strain at node i of its element and the angle of the edge ahead."""
-        v = B()
-        u = part(own.factor, m * wp.static(size), i, e)
-        for d in range(3):
-            v[d] = u[d]
-        if wp.static(twist and angles > 0):
-            if i < wp.static(angles):
-                u = part(own.factor, m * wp.static(size), wp.static(nodes) + i, e)
-                v[3] = u[0]
-        return v
-
-    @wp.func
-    def between(own: Along, i: int, j: int, e: int):
-        """Second derivatives between nodes i and j and the angles ahead of them."""
-        m = M()
-        u = second_of(own.second, e, i, j)
-        for a in range(3):
-            for b in range(3):
-                m[a, b] = u[a, b]
-        if wp.static(twist and angles > 0):
-            if j < wp.static(angles):
-                u = second_of(own.second, e, i, wp.static(nodes) + j)
-                for a in range(3):
-                    m[a, 3] = u[a, 0]
-            if i < wp.static(angles):
-                u = second_of(own.second, e, wp.static(nodes) + i, j)
-                for b in range(3):
-                    m[3, b] = u[0, b]
-                if j < wp.static(angles):
-                    u = second_of(own.second, e, wp.static(nodes) + i, wp.static(nodes) + j)
-                    m[3, 3] = u[0, 0]
-        return m
-
-    @wp.func
-    def stretched(own: Along, e: int):
-        """Geometric stiffness of an edge."""
-        m = M()
-        for d in range(3):
-            m[d, d] = own.tension[0, e]
-        return m
-
-    @wp.func
-    def own_sum(own: Along, k: int, c: int, w: int, late: bool):
-        D = M()
-        E = M()
-        F = M()
-        for i in range(wp.static(nodes)):
-            e = own.at[i, k, c]
-            if e >= 0:
-                e += first_of(w, own.elements)
-                for m in range(wp.static(n)):
-                    a = row(own, m, i, e)
-                    D += wp.outer(a, a)
-                    if i + 1 < wp.static(nodes):
-                        E += wp.outer(a, row(own, m, i + 1, e))
-                    if i + 2 < wp.static(nodes):
-                        F += wp.outer(a, row(own, m, i + 2, e))
-                if wp.static(tensions > 0):
-                    T = stretched(own, e)
-                    D += T
-                    if i == 0:
-                        E -= T
-                if wp.static(curved):
-                    if late:
-                        D += between(own, i, i, e)
-                        if i + 1 < wp.static(nodes):
-                            E += between(own, i, i + 1, e)
-                        if i + 2 < wp.static(nodes):
-                            F += between(own, i, i + 2, e)
-        return D, E, F
-
-    @wp.func
-    def add(
-        own0: Along, own1: Along, own2: Along, own3: Along, own4: Along, own5: Along, k: int, c: int, w: int, late: bool
-    ):
-        own = one(own0, own1, own2, own3, own4, own5)
-        D, E, F = own_sum(own, k, c, w, late)
-        if wp.static(not first):
-            D1, E1, F1 = before(own0, own1, own2, own3, own4, own5, k, c, w, late)
-            D += D1
-            E += E1
-            F += F1
-        return D, E, F
-
-    return add
-
-
-@cache
-def layout_type():
-    """Where the blocks of chains are: of places, see `ChainPlan`, and the positions of H_ii of blocks."""
-
-    @wp.struct
-    class Layout:
-        places: wp.array3d(dtype=int)
-        chain: wp.array2d(dtype=int)
-        count: wp.array(dtype=int)
-        held: wp.array2d(dtype=wp.uint8)
-        diagonal: wp.array(dtype=int)
-        positions: int
-
-    return Layout
-
-
-@cache
-def blocks_function(
-    terms: tuple[Term, ...], twist: bool, span: int, real, linear, exact_from: tuple[int | None, ...], drag: bool
-):
-    """blocks_at(...) -> D, E, F of a place on free dofs, those of the identity on others.
-
-    `exact_from` says of each term from which iteration on it has second derivatives, one for all, or None where it has none. Without
-    terms all blocks are taken from positions of H.
-    """
-    nb = 4 if twist else 3
-    parts = nb - 2  # blocks of a place: node, and angle of the edge ahead
-    B, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
-    Mass, Layout, Along = mass_type(real, drag), layout_type(), along_type(real, linear)
-    free_of, block_of = place_functions(twist, linear)
-    add = sum_function(terms, twist, real, linear, tuple(first is not None for first in exact_from)) if terms else None
-    begin = next((first for first in exact_from if first is not None), 0)
-
-    @wp.func
-    def blocks_at(
-        matrix: wp.array2d(dtype=linear),
-        mass: Mass,
-        flags: wp.array2d(dtype=int),
-        scalars: wp.array2d(dtype=real),
-        layout: Layout,
-        own0: Along,
-        own1: Along,
-        own2: Along,
-        own3: Along,
-        own4: Along,
-        own5: Along,
-        k: int,
-        c: int,
-        w: int,
-    ):
-        """Nodes and angles that have no position of their own have their inertia and drag from here.
-
-        Bits of `held` are dofs of a place that are held, or that it does not have.
-        """
-        D = M()
-        E = M()
-        F = M()
-        first = w * layout.positions
-        if wp.static(add is not None):
-            # what is wanted has been counted as an iteration since it was evaluated
-            late = flags[ITERATION, w] > wp.static(begin) and flags[CLAMPED, w] == 0
-            D, E, F = add(own0, own1, own2, own3, own4, own5, k, c, w, late)
-            for part in range(wp.static(parts)):
-                at = layout.places[part, k, c]
-                if at >= 0:
-                    if layout.diagonal[at] < 0:
-                        for d in range(3):
-                            if part == 0 or d == 0:
-                                if wp.static(drag):
-                                    inertia = mass[w, at].mass[d] * scalars[COEFFICIENT, w]
-                                else:
-                                    inertia = mass[at][d] * scalars[COEFFICIENT, w]
-                                D[3 * part + d, 3 * part + d] = D[3 * part + d, 3 * part + d] + linear(inertia)
-                        if wp.static(drag):
-                            resistance = mass[w, at].resistance
-                            for i in range(3):
-                                for j in range(3):
-                                    if part == 0 or i + j == 0:
-                                        D[3 * part + i, 3 * part + j] = D[3 * part + i, 3 * part + j] + linear(
-                                            resistance[i, j]
-                                        )
-        n = layout.count[c]
-        here = layout.held[k, c]
-        listed = layout.places.shape[0] > wp.static(parts)
-        if listed:
-            D += block_of(matrix, layout.places, wp.static(parts), k, c, first)
-        if here != wp.uint8(0):
-            f = free_of(here)
-            D = wp.cw_mul(D, wp.outer(f, f)) + wp.diag(B(linear(1.0)) - f)
-        if k + 1 < n and layout.chain[k + 1, c] == layout.chain[k, c]:
-            if listed:
-                E += block_of(matrix, layout.places, wp.static(parts + parts**2), k, c, first)
-            if (here | layout.held[k + 1, c]) != wp.uint8(0):
-                E = wp.cw_mul(E, wp.outer(free_of(here), free_of(layout.held[k + 1, c])))
-        else:
-            E = M()
-        if wp.static(span == 2):
-            if k + 2 < n and layout.chain[k + 2, c] == layout.chain[k, c]:
-                if listed:
-                    F += block_of(matrix, layout.places, wp.static(parts + 2 * parts**2), k, c, first)
-                if (here | layout.held[k + 2, c]) != wp.uint8(0):
-                    F = wp.cw_mul(F, wp.outer(free_of(here), free_of(layout.held[k + 2, c])))
-            else:
-                F = M()
-        return D, E, F
-
-    return blocks_at
+from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 
 @cache
@@ -293,6 +37,7 @@ def band_kernels(
     _, store, _, _ = block_functions(nb, linear)
     times, free = product_functions(linear)
     blocks_at = blocks_function(terms, twist, span, real, linear, exact_from, drag)
+    value = value_function(twist, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def assemble(
@@ -330,22 +75,6 @@ def band_kernels(
         if wanted[w] != 0:
             for j in range(9):
                 matrix[j, taken[i] + w * positions] = linear(0.0)
-
-    @wp.func
-    def value(v: wp.array(dtype=H), places: wp.array3d(dtype=int), k: int, c: int, shift: int):
-        """Of a vector of blocks, what belongs to a place."""
-        u = B()
-        node = places[0, k, c]
-        if node >= 0:
-            x = v[node + shift]
-            for d in range(3):
-                u[d] = x[d]
-        if wp.static(twist):
-            angle = places[1, k, c]
-            if angle >= 0:
-                x = v[angle + shift]
-                u[3] = x[0]
-        return u
 
     @wp.func
     def along(bands: wp.array3d(dtype=linear), row: int, first: int, count: int, k: int, r: int, u: B):

@@ -22,13 +22,13 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.matrix.bands import place_functions
 from ddg_warp.kernels.matrix.block_band import (
     block_functions,
     factor_function,
     substitute_all_function,
     substitute_function,
 )
+from ddg_warp.kernels.matrix.chain_blocks import place_functions
 from ddg_warp.kernels.solve.joints import coupling_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 

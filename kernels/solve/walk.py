@@ -1,7 +1,7 @@
 """The chains of a net on the CPU: a thread takes one from what its elements write to the solution.
 
 Blocks of places are summed, eliminated and substituted in one walk, as in `sweep`, and H is never stored. A GPU has a thread for each
-place to sum them; see `matrix.bands` and `elimination`.
+place to sum them; see `matrix.bands`, `matrix.chain_blocks` and `elimination`.
 """
 
 from functools import cache
@@ -10,8 +10,8 @@ import warp as wp
 
 from ddg_warp.kernels.drag import mass_type
 from ddg_warp.kernels.islands import WANTED
-from ddg_warp.kernels.matrix.bands import blocks_function, layout_type
 from ddg_warp.kernels.matrix.block_band import block_functions
+from ddg_warp.kernels.matrix.chain_blocks import blocks_function, layout_type, value_function
 from ddg_warp.kernels.net.places import along_type
 from ddg_warp.kernels.solve import pivot
 from ddg_warp.kernels.terms import Term
@@ -38,6 +38,7 @@ def walk_kernel(
     H, B, M = wp.types.vector(3, linear), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     Mass, Layout, Along = mass_type(real, drag), layout_type(), along_type(real, linear)
     blocks_at = blocks_function(terms, twist, span, real, linear, exact_from, drag)
+    value = value_function(twist, linear)
     load, store, vector, put = block_functions(nb, linear)
     factor, lower, upper, lower_vector, upper_vector, congruence = pivot.functions(nb, linear)
 
@@ -81,18 +82,7 @@ def walk_kernel(
             Zb = lower(L, E - minus_couple)
             U = upper(L, inverse, Zb)
             minus = minus_next + congruence(Zb, inverse, Zb)
-            u = B()
-            node = layout.places[0, k, c]
-            if node >= 0:
-                v = right[node + shift]
-                for d in range(3):
-                    u[d] = v[d]
-            if wp.static(twist):
-                angle = layout.places[1, k, c]
-                if angle >= 0:
-                    v = right[angle + shift]
-                    u[3] = v[0]
-            u -= before
+            u = value(right, layout.places, k, c, shift) - before
             before = before2 + u * U
             store(factors, 0, k, r, U)
             if wp.static(span == 2):

@@ -35,6 +35,12 @@ class NetRod:
     all_nodes: np.ndarray  # with ghosts
     all_edges: np.ndarray
 
+    @property
+    def ends(self) -> np.ndarray:
+        """Nodes of all its edges (E, 2), those of ghosts included."""
+        pairs = np.column_stack([self.all_nodes, np.roll(self.all_nodes, -1)])
+        return pairs if self.piece.kind.closed else pairs[:-1]
+
 
 @dataclass
 class NetShell:
@@ -167,7 +173,7 @@ class Net(Storage):
         for rod in self.rods:
             if rod.piece.kind.drag:
                 coefficients = rod.piece.drag[rod.row]
-                ends = np.stack([rod.all_nodes, np.roll(rod.all_nodes, -1)])[:, : len(coefficients)]
+                ends = rod.ends[: len(coefficients)].T
                 angles = rod.all_edges if rod.all_edges.size else np.full(len(coefficients), -1)
                 found.append((ends, angles, coefficients.T))
         return tuple(np.concatenate(parts, -1) for parts in zip(*found, strict=True)) if found else None

@@ -4,6 +4,8 @@ Element windows come from the device; B, a constant sparse matrix of 0, 1 and -1
 g = B^T g_window and H = B^T K_window B, for every term and every kind of chain alike.
 """
 
+from functools import cached_property
+
 import numpy as np
 import warp as wp
 from scipy import sparse
@@ -90,11 +92,15 @@ class ChainTangent(Part):
         if kind.twist:
             arrays.assign(data.theta, np.ascontiguousarray(values[..., kind.dim].T))
 
+    @cached_property
+    def _motion(self) -> Motion:
+        return Motion(self.model, self.group)
+
     def move_supports(self, state, before: float, at: float) -> None:
         """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""
         if self.host.moves:
             data = self.data(state)
-            Motion(self.model, self.group).put(before, at, data.x, data.frame, data.theta)
+            self._motion.put(before, at, data.x, data.frame, data.theta)
 
     def edges(self, q: np.ndarray) -> np.ndarray:
         """Edge vectors of the windows (E, dim), zero where there is none."""

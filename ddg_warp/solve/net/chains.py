@@ -7,7 +7,8 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.matrix.bands import band_kernels, layout_type
+from ddg_warp.kernels.matrix.bands import band_kernels
+from ddg_warp.kernels.matrix.chain_blocks import layout_type
 from ddg_warp.kernels.matrix.sliced import SETS
 from ddg_warp.kernels.net.places import along_type, place_kernel
 from ddg_warp.kernels.solve import elimination, joints
@@ -42,6 +43,13 @@ class Chains:
         self.banded = banded and len(self.along) <= SETS
         self.kept = self.plan.where >= 0 if self.banded else None
 
+    @classmethod
+    def of(cls, net, preconditioner: str, banded: bool = True) -> "Chains | None":
+        """The chains of a preconditioner, in bands where these serve it; None of one without chains."""
+        if preconditioner not in ("chain", "chain_multilevel"):
+            return None
+        return cls(net, banded and preconditioner == "chain" and not net.host.frames)
+
     def bind(
         self, table, written: list[dict], real, linear, exact_from: tuple, drag: bool, reuse: bool = False
     ) -> None:
@@ -63,7 +71,7 @@ class Chains:
         self.held = arrays.upload(plan.held(net.host), wp.uint8, device)
         self.longest, self.width = plan.chain.shape
         self.columns = worlds * self.width
-        block = 4 if plan.twist else 3
+        block = plan.block
         self.factors = arrays.allocate((3 * block**2 + block, self.longest, self.columns), linear, device)
         self.reduction = None
         if long_and_few(self.longest, self.columns, wp.get_device(device)):

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ddg_warp.kernels.islands import Islands
+from ddg_warp.kernels.islands import WANTED, Islands
 from ddg_warp.kernels.net.newton import freeze_kernel
 
 
@@ -12,29 +12,22 @@ class Frozen:
     Compression is left out of it, since it has to be definite wherever the step leads.
 
     Attributes:
-        islands: as those of the solver, but that worlds want a direction only where their matrix is new.
+        arrays, wanted: as of the islands, but that worlds want a direction only where their matrix is new.
     """
 
     def __init__(self, islands: Islands):
-        self._given = islands
-        self.islands = Islands(len(islands), islands.arrays[1].dtype, islands.active.device)
-        self.islands.arrays[1] = islands.arrays[1]
-        self._done = wp.zeros(len(islands), dtype=int, device=islands.active.device)
-        self._freeze = freeze_kernel()
-
-    @property
-    def kernels(self) -> list:
-        """Kernels to load before a capture."""
-        return [self._freeze]
+        self._islands = islands
+        self._flags, scalars = wp.zeros_like(islands.arrays[0]), islands.arrays[1]
+        self.arrays, self.wanted = [self._flags, scalars], self._flags[WANTED]
+        self._done = wp.zeros_like(islands.wanted)
+        self.kernels = [freeze_kernel()]
 
     def begin(self) -> None:
         """Forget the matrix of the last solve."""
         self._done.zero_()
-        self._given.clamped.fill_(1)
+        self._islands.clamped.fill_(1)
 
-    def first(self) -> Islands:
-        """Those that want a direction now and have no matrix yet; they are given one."""
-        flags = self.islands.arrays[0]
-        wp.copy(flags, self._given.arrays[0])
-        wp.launch(self._freeze, len(self._given), [flags, self._done], device=flags.device)
-        return self.islands
+    def update(self) -> None:
+        """Find the worlds that want a direction now and have no matrix yet; they are given one."""
+        wp.copy(self._flags, self._islands.arrays[0])
+        wp.launch(self.kernels[0], len(self._islands), [self._flags, self._done], device=self._flags.device)

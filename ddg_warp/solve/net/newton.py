@@ -63,19 +63,11 @@ class NetNewton:
         serial = arrays.serial(device)
         self.worlds, self.all = worlds, worlds * blocks
         V, H = net.vector, wp.types.vector(3, self.linear)
-        self.chains = None
-        if preconditioner in ("chain", "chain_multilevel"):
-            self.chains = Chains(net, self.banded and preconditioner == "chain" and not host.frames)
+        self.chains = Chains.of(net, preconditioner, self.banded)
         self.system = NetSystem(net, self.chains and self.chains.kept)
 
         def make(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=device)
-
-        def flags(count=1):
-            return [make(worlds, int) for _ in range(count)]
-
-        def scalars(count=1, dtype=None):
-            return [make(worlds, dtype or self.real) for _ in range(count)]
 
         self.q, self.base, self.target = (make(self.all, V) for _ in range(3))
         self.load = wp.array(np.tile(host.constant_loads(), (worlds, 1)), dtype=V, device=device)
@@ -98,10 +90,10 @@ class NetNewton:
         self.matrix = make((9, worlds * self.system.positions), self.linear)
         self.krylov_dots = make((worlds, blocks), self.linear)
         self.islands = Islands(worlds, self.real, device)
-        self.iterations, self.stalled = flags(2)
-        self.best, self.decrease, self.turn, self.worst, self.goal = scalars(5)
+        self.iterations, self.stalled = (make(worlds, int) for _ in range(2))
+        self.best, self.decrease, self.turn, self.worst, self.goal = (make(worlds, self.real) for _ in range(5))
         self.goal.fill_(math.inf)
-        (self.forcing,) = scalars(1, self.linear)
+        self.forcing = make(worlds, self.linear)
         self.pcg_work = make(1, wp.int64)
         self.frozen = Frozen(self.islands) if reuse else None
         self.psd = self.automatic_psd() if options.psd == "auto" else options.psd
@@ -258,7 +250,9 @@ class NetNewton:
 
     def assemble(self) -> None:
         """H of the worlds that want a direction."""
-        anew = self.frozen.first() if self.frozen else self.islands
+        if self.frozen:
+            self.frozen.update()
+        anew = self.anew
         self._assembly(self.mass, anew, self.matrix)
         if self.planes:
             self.planes.matrix(self.matrix, anew.wanted)
@@ -292,9 +286,9 @@ class NetNewton:
         return ConjugateGradients(self, self._multilevel)
 
     @property
-    def anew(self) -> Islands:
+    def anew(self) -> Islands | Frozen:
         """Those whose matrix is new."""
-        return self.frozen.islands if self.frozen else self.islands
+        return self.frozen or self.islands
 
     @property
     def indefinite(self) -> wp.array:

@@ -58,6 +58,11 @@ class ChainPlan:
         self.twist, self.span = bool((angle >= 0).any()), 2 if (reach == 2).any() else 1
         self._arrange(kept, node[kept], angle[kept], np.unique(chain, return_inverse=True)[1])
 
+    @property
+    def block(self) -> int:
+        """Dofs of a place."""
+        return 4 if self.twist else 3
+
     def bind(self, host, rows: np.ndarray, columns: np.ndarray, kept: np.ndarray | None) -> None:
         """Find everything among the rows and columns of positions of H; see `Chains.kept`."""
         if any(part.term.measure.apart for part in host.sets):

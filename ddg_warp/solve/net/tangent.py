@@ -29,7 +29,6 @@ class NetTangent(Part):
         self._anchored = host.fixed[: host.nodes].copy()
         for shell in host.shells:
             self._anchored[shell.nodes] = True
-        self._order = [host.rods[i] for level in host.outwards.levels for i in level]
 
     @cached_property
     def _pattern(self) -> tuple[list, np.ndarray, np.ndarray]:
@@ -132,20 +131,25 @@ class NetTangent(Part):
         q, step = self.back(q), self.back(step)
         moved = q + step
         x, dx, out = (v.reshape(self.net.worlds, -1, 3) for v in (q, step, moved))
+        order = [self.host.rods[i] for level in self.host.outwards.levels for i in level]
         for world in range(self.net.worlds):
             excess = np.zeros((self.host.nodes, 3))
             placed = self._anchored.copy()
-            for rod in self._order:
+            for rod in order:
                 at, closed = rod.all_nodes, rod.piece.kind.closed
                 excess[at] = turned(x[world][at], dx[world][at], placed[at], excess[at], closed)
                 placed[at] = True
             out[world][: self.host.nodes] += excess
         return self.into(moved)
 
+    @cached_property
+    def _motion(self) -> NetMotion:
+        return NetMotion(self.model)
+
     def move_supports(self, state, before: float, at: float) -> None:
         """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""
         if self.host.moves:
-            NetMotion(self.model).put(before, at, state.net.q, state.net.frame)
+            self._motion.put(before, at, state.net.q, state.net.frame)
         self.prescribe(state, at)
 
     def prescribe(self, state, at: float) -> None:

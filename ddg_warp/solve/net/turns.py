@@ -25,7 +25,7 @@ class Turns:
             arrays.upload(plan.anchored.astype(np.uint8), wp.uint8, device),
             put([rod.piece.kind.closed for rod in host.rods]),
         ]
-        self._ends = put(np.concatenate([_ends(rod) for rod in host.rods]))
+        self._ends = put(np.concatenate([rod.ends for rod in host.rods]))
 
     @property
     def kernels(self) -> list:
@@ -61,9 +61,3 @@ class Turns:
             inputs = [level, *self._rods, newton.base, newton.direction, newton.held]
             inputs += [islands.step_length, islands.todo, net.blocks]
             wp.launch(self._place, (len(level), net.worlds), inputs, [newton.q], device=net.device)
-
-
-def _ends(rod) -> np.ndarray:
-    """Nodes of the edges of a rod (E, 2)."""
-    pairs = np.column_stack([rod.all_nodes, np.roll(rod.all_nodes, -1)])
-    return pairs if rod.piece.kind.closed else pairs[:-1]
