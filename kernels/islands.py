@@ -9,6 +9,8 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.turns import TURNED
+
 FLAGS = (
     # the solve: its outcome (see `outcome`), accepted iterates, and how the iterate at hand compares with the tolerance
     "status",
@@ -46,6 +48,7 @@ SCALARS = (
     "decrement",  # expected decrease of the energy by a whole step
     "merit",  # square of the accepted iterate's residual
     "angle_change",  # what angles have yet to move along the direction
+    "turn",  # largest turn of an edge that is still taken straight [rad]; see `turns`
     # the part of the time step that is done, and the part being tried
     "progress",
     "portion",
@@ -53,11 +56,13 @@ SCALARS = (
 (STATUS, ITERATION, UNBALANCED, DROWNED, SLOT, HALVINGS, WANTED, TODO, PLACED, STALE) = range(10)
 (CLAMPED, LOST, BAD, CAUTIOUS, RETRIES, REASON, BENT, MOVED) = range(10, 18)
 ACTIVE, TURNING = range(18, len(FLAGS))
-(COEFFICIENT, RATE, LOAD_SCALE, RESIDUAL, STEP_LENGTH, DECREMENT, MERIT, ANGLE_CHANGE, PROGRESS, PORTION) = range(10)
+(COEFFICIENT, RATE, LOAD_SCALE, RESIDUAL, STEP_LENGTH, DECREMENT, MERIT, ANGLE_CHANGE, TURN, PROGRESS, PORTION) = range(
+    11
+)
 
 
 class Islands:
-    """The entries of `count` islands, all zero at first; each row by its name, too, such as `islands.status`.
+    """The entries of `count` islands, zero at first but for `turn`; each row by its name, too, such as `islands.status`.
 
     Attributes:
         arrays: `flags` and `scalars`, for kernels.
@@ -72,6 +77,7 @@ class Islands:
         for names, array in zip((FLAGS, SCALARS), self.arrays, strict=True):
             for row, name in enumerate(names):
                 setattr(self, name, array[row])
+        self.turn.fill_(TURNED)
         self.signals = self.arrays[0][ACTIVE:]
         self.active, self.turning = (self.signals[row, :1] for row in range(2))
 

@@ -133,6 +133,7 @@ def judge_kernel(kind: ChainKind, real, linear):
         max_halvings: int,
         direction: wp.array3d(dtype=linear),
         fixed: wp.array2d(dtype=wp.uint8),
+        anchor: wp.array(dtype=int),
         base: wp.array2d(dtype=V),
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
@@ -163,7 +164,7 @@ def judge_kernel(kind: ChainKind, real, linear):
         flags[ACTIVE, 0] = 1
         if what == wp.static(PLACE):
             less = scalars[STEP_LENGTH, r]
-            place(x, base, direction, fixed, less, n, r)
+            place(x, base, direction, fixed, anchor, less, 0, n, r)
             turn_angles(theta, direction, less - taken, n, r)
         if wp.static(twist):
             if what == wp.static(RELAG):

@@ -10,8 +10,9 @@ import warp as wp
 
 from ddg_warp.kernels import frames
 from ddg_warp.kernels.chain import ChainKind
-from ddg_warp.kernels.islands import ANGLE_CHANGE, BENT, PROGRESS, RATE, STEP_LENGTH, TODO
+from ddg_warp.kernels.islands import ANGLE_CHANGE, BENT, CAUTIOUS, PROGRESS, RATE, STEP_LENGTH, TODO
 from ddg_warp.kernels.search import PLACE, RELAG, move_functions
+from ddg_warp.kernels.step import predicted_function
 
 
 @cache
@@ -31,6 +32,7 @@ def move_kernels(kind: ChainKind, real, linear):
         todo: wp.array(dtype=int),
         direction: wp.array3d(dtype=linear),
         step_length: wp.array(dtype=real),
+        onward: int,
         base: wp.array2d(dtype=V),
         x: wp.array2d(dtype=V),
         frame: wp.array3d(dtype=real),
@@ -43,7 +45,7 @@ def move_kernels(kind: ChainKind, real, linear):
         if k >= n - 1:
             return
         if todo[r] == wp.static(PLACE):
-            excess_out[k, r] = excess(base, direction, step_length[r], k, n, r)
+            excess_out[k, r] = excess(base, direction, step_length[r], onward, k, n, r)
         if wp.static(twist):
             if todo[r] == wp.static(RELAG):
                 u, t = carry(x, frame, k, n, r)
@@ -111,6 +113,18 @@ def move_kernels(kind: ChainKind, real, linear):
         """Sum over all edges before node k."""
         return prefix[k, r] + sums[0, k // width, r]
 
+    @wp.func
+    def added(
+        x: wp.array2d(dtype=V),
+        base: wp.array2d(dtype=V),
+        direction: wp.array3d(dtype=linear),
+        amount: real,
+        k: int,
+        r: int,
+    ):
+        """What lies between a held node and where the straight step ends."""
+        return x[k, r] - base[k, r] - step_of(direction, k, r) * amount
+
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def move(
         count: wp.array(dtype=int),
@@ -143,19 +157,22 @@ def move_kernels(kind: ChainKind, real, linear):
             return
         shift = V()
         if what == wp.static(PLACE):
-            shift = before(prefix, sums, width, k, r)
             p = held[0, k, r]
             q = held[1, k, r]
+            shift = before(prefix, sums, width, k, r)
+            amount = scalars[STEP_LENGTH, r]
             if p < 0 and q < 0:
                 shift -= mean[r]
             elif p < 0:
-                shift -= before(prefix, sums, width, q, r)
+                shift += added(x, base, direction, amount, q, r) - before(prefix, sums, width, q, r)
             else:
-                start = before(prefix, sums, width, p, r)
-                shift -= start
+                start = added(x, base, direction, amount, p, r) - before(prefix, sums, width, p, r)
+                shift += start
                 if q > p:
-                    shift -= (before(prefix, sums, width, q, r) - start) * (real(k - p) / real(q - p))
-        put(x, base, direction, fixed, scalars[STEP_LENGTH, r], shift, k, r)
+                    end = added(x, base, direction, amount, q, r) - before(prefix, sums, width, q, r)
+                    shift += (end - start) * (real(k - p) / real(q - p))
+        if held[0, k, r] != k:
+            put(x, base, direction, fixed, scalars[STEP_LENGTH, r], shift, k, r)
         if wp.static(twist):
             theta[k, r] = theta[k, r] + scalars[ANGLE_CHANGE, r] * real(direction[wp.static(dim), k, r])
 
@@ -167,6 +184,7 @@ def predict_kernels(kind: ChainKind, real, linear):
     """`aim`: bent rods step along their velocity, with edges turned; `renew`: every rod that moves takes new frames."""
     dim, nb = kind.dim, kind.block
     V = wp.types.vector(dim, real)
+    predicted = predicted_function(dim, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def aim(
@@ -176,6 +194,7 @@ def predict_kernels(kind: ChainKind, real, linear):
         count: wp.array(dtype=int),
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
+        x: wp.array2d(dtype=V),
         base_out: wp.array2d(dtype=V),
         direction_out: wp.array3d(dtype=linear),
     ):
@@ -189,12 +208,11 @@ def predict_kernels(kind: ChainKind, real, linear):
             flags[TODO, r] = wp.where(moving, wp.static(PLACE), 0)
         if moving:
             base_out[k, r] = x0[k, r]
-            v = v0[k, r] / scalars[RATE, r]
+            step = predicted(x[k, r], x0[k, r], v0[k, r], int(fixed[k, r]), flags[CAUTIOUS, r], scalars[RATE, r])
             for d in range(wp.static(nb)):
                 direction_out[d, k, r] = linear(0.0)
             for d in range(wp.static(dim)):
-                if ((int(fixed[k, r]) >> d) & 1) == 0:
-                    direction_out[d, k, r] = linear(v[d])
+                direction_out[d, k, r] = linear(step[d])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def renew(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real)):

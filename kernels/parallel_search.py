@@ -21,11 +21,11 @@ from ddg_warp.kernels.islands import (
     STATUS,
     STEP_LENGTH,
     TODO,
+    TURN,
     WANTED,
 )
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
 from ddg_warp.kernels.search import PLACE, STRAIGHT
-from ddg_warp.kernels.turns import TURNED
 
 
 @cache
@@ -175,6 +175,6 @@ def decide_kernels(kind: ChainKind, real, linear):
         scalars[STEP_LENGTH, r] = whole
         scalars[ANGLE_CHANGE, r] = whole
         scalars[DECREMENT, r] = total
-        flags[TODO, r] = wp.where(rotation > real(wp.static(TURNED**2)), wp.static(PLACE), wp.static(STRAIGHT))
+        flags[TODO, r] = wp.where(rotation > scalars[TURN, r] * scalars[TURN, r], wp.static(PLACE), wp.static(STRAIGHT))
 
     return judge, take

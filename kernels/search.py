@@ -29,11 +29,19 @@ def move_functions(kind: ChainKind, real, linear):
         return v
 
     @wp.func
-    def excess(base: wp.array2d(dtype=V), direction: wp.array3d(dtype=linear), amount: real, j: int, n: int, r: int):
-        """Edge j turned and lengthened by its step, less the same edge with its step added."""
+    def excess(
+        base: wp.array2d(dtype=V),
+        direction: wp.array3d(dtype=linear),
+        amount: real,
+        onward: int,
+        j: int,
+        n: int,
+        r: int,
+    ):
+        """Edge j turned and lengthened by its step, less the same edge with its step added; `onward`: see `kernels.turns`."""
         ahead = along(j + 1, n)
         return excess_of(
-            base[ahead, r] - base[j, r], (step_of(direction, ahead, r) - step_of(direction, j, r)) * amount
+            base[ahead, r] - base[j, r], (step_of(direction, ahead, r) - step_of(direction, j, r)) * amount, onward
         )
 
     @wp.func
@@ -47,11 +55,11 @@ def move_functions(kind: ChainKind, real, linear):
         j: int,
         r: int,
     ):
-        moved = base[j, r] + step_of(direction, j, r) * amount
+        free = shift
         for d in range(wp.static(dim)):
-            if ((int(fixed[j, r]) >> d) & 1) == 0:
-                moved[d] = moved[d] + shift[d]
-        x[j, r] = moved
+            if ((int(fixed[j, r]) >> d) & 1) == 1:
+                free[d] = real(0.0)
+        x[j, r] = base[j, r] + step_of(direction, j, r) * amount + free
 
     @wp.func
     def carry(x: wp.array2d(dtype=V), frame: wp.array3d(dtype=real), j: int, n: int, r: int):
@@ -101,6 +109,8 @@ def search_functions(kind: ChainKind, real, linear):
         amount: real
         count: int
         closed: int
+        anchor: int
+        onward: int
         r: int
 
     @wp.func
@@ -133,11 +143,13 @@ def search_functions(kind: ChainKind, real, linear):
         base: wp.array2d(dtype=V),
         direction: wp.array3d(dtype=linear),
         fixed: wp.array2d(dtype=wp.uint8),
+        anchor: wp.array(dtype=int),
         amount: real,
+        onward: int,
         n: int,
         r: int,
     ):
-        """x = base moved along the direction, with edges turned instead of sheared."""
+        """x = base moved along the direction, with edges turned instead of sheared; `onward`: see `kernels.turns`."""
         rod = Rod()
         rod.x = x
         rod.base = base
@@ -146,6 +158,8 @@ def search_functions(kind: ChainKind, real, linear):
         rod.amount = amount
         rod.count = n
         rod.closed = wp.static(int(closed))
+        rod.anchor = anchor[r]
+        rod.onward = onward
         rod.r = r
         place_rod(rod)
 
@@ -190,6 +204,7 @@ def adjust_kernel(kind: ChainKind, real, linear):
     def adjust(
         count: wp.array(dtype=int),
         fixed: wp.array2d(dtype=wp.uint8),
+        anchor: wp.array(dtype=int),
         direction: wp.array3d(dtype=linear),
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
@@ -209,7 +224,7 @@ def adjust_kernel(kind: ChainKind, real, linear):
                     for d in range(wp.static(dim)):
                         back[d] = straight * real(direction[d, j, r])
                     base[j, r] = x[j, r] - back
-            place(x, base, direction, fixed, scalars[STEP_LENGTH, r], count[r], r)
+            place(x, base, direction, fixed, anchor, scalars[STEP_LENGTH, r], 0, count[r], r)
             turn_angles(theta, direction, scalars[ANGLE_CHANGE, r], count[r], r)
         if wp.static(twist):
             if flags[TODO, r] == wp.static(RELAG):

@@ -29,11 +29,11 @@ from ddg_warp.kernels.islands import (
     REASON,
     RETRIES,
     STATUS,
+    TURN,
     attempt_functions,
 )
 from ddg_warp.kernels.search import search_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
-from ddg_warp.kernels.turns import TURNED
 
 
 @cache
@@ -73,6 +73,8 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
         rate = real(1.0) / s
         coefficient = rate * (rate + damping[0])
         if start == 0:
+            if scalars[TURN, r] == real(0.0):
+                flags[BENT, r] = 1
             restart(flags, scalars, r, rate, coefficient, outer[r])
         ahead = wp.where(flags[CAUTIOUS, r] == 0, s, real(0.0))
         for k in range(start, until(start, n)):
@@ -87,7 +89,8 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
             if flags[CAUTIOUS, r] == 0 and k + 1 < n:
                 turn = (v0[k + 1, r] - v) * s
                 edge = x0[k + 1, r] - x0[k, r]
-                if wp.length_sq(turn) > real(wp.static(TURNED**2)) * wp.length_sq(edge):
+                straight = scalars[TURN, r]
+                if wp.length_sq(turn) > straight * straight * wp.length_sq(edge):
                     flags[BENT, r] = 1
             if wp.static(twist):
                 angle = theta0[k, r]
@@ -103,8 +106,30 @@ def begin_kernel(kind: ChainKind, real, midpoint: bool):
 
 
 @cache
+def predicted_function(dim: int, real):
+    """predicted(x, x0, v, mask, cautious, rate): the step of a node at x0 along its velocity, of what supports hold in part theirs."""
+    V, every = wp.types.vector(dim, real), (1 << dim) - 1
+
+    @wp.func
+    def predicted(x: V, x0: V, v: V, mask: int, cautious: int, rate: real):
+        step = v / rate
+        if cautious != 0:
+            step = V()
+        if (mask & wp.static(every)) != wp.static(every):
+            for d in range(wp.static(dim)):
+                if ((mask >> d) & 1) == 1:
+                    step[d] = x[d] - x0[d]
+        return step
+
+    return predicted
+
+
+@cache
 def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
     """Redo the predictor of a rod whose edges it turns: along its velocity, with edges turned instead of stretched.
+
+    Supports are where they have to be by then, and the rod goes with them; so that no edge is stretched by how far a support has gone
+    from where its velocity leads. By implicit Euler velocities are what the last step did, and edges turn on as they did.
 
     For the midpoint rule the lagged frames are carried to the predicted midpoint. Frames lagged at the start of the step spin
     about their edges by O(h) at the midpoint, which the rotary inertia does not see: it would be of first order there.
@@ -112,12 +137,14 @@ def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
     dim, carried = kind.dim, kind.twist and midpoint
     V = wp.types.vector(dim, real)
     place, _, relag, _ = search_functions(kind, real, linear)
+    predicted = predicted_function(dim, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def predict(
         x0: wp.array2d(dtype=V),
         v0: wp.array2d(dtype=V),
         fixed: wp.array2d(dtype=wp.uint8),
+        anchor: wp.array(dtype=int),
         count: wp.array(dtype=int),
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
@@ -132,11 +159,11 @@ def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
         n = count[r]
         if flags[BENT, r] != 0:
             for k in range(n):
+                step = predicted(x[k, r], x0[k, r], v0[k, r], int(fixed[k, r]), flags[CAUTIOUS, r], scalars[RATE, r])
                 base[k, r] = x0[k, r]
-                v = v0[k, r] / scalars[RATE, r]
                 for d in range(wp.static(dim)):
-                    direction[d, k, r] = linear(wp.where(((int(fixed[k, r]) >> d) & 1) == 0, v[d], real(0.0)))
-            place(x, base, direction, fixed, real(1.0), n, r)
+                    direction[d, k, r] = linear(step[d])
+            place(x, base, direction, fixed, anchor, real(1.0), wp.static(0 if midpoint else 1), n, r)
         if wp.static(carried):
             relag(x, frame, n, r)
 

@@ -1,33 +1,56 @@
 """Steps that turn edges instead of shearing them.
 
-A straight step stretches an edge that it turns, to second order, which in a nearly inextensible rod limits steps to small turns. Here
-an edge becomes its rotation, lengthened by what the step does along it, and positions follow by summation from anchors: nodes that are
-held, or already placed. What misses between two of them is spread over the edges between. Where nodes lie is left to the storage.
+A straight step stretches an edge that it turns, to second order. In a nearly inextensible rod the force of that towers over all else,
+and limits steps to small turns: Newton then takes as many iterations as its path is long. Here an edge becomes its rotation, lengthened
+by what the step does along it, and positions follow by summation from anchors: nodes that are held, or already placed. What misses
+between two of them is spread over the edges between. So Newton works in the directions and lengths of edges, in which stiff and soft
+are apart, and the energy of a trial step says what bending and inertia do. Where nodes lie is left to the storage.
 """
 
 from functools import cache
 
 import warp as wp
 
-TURNED = 0.1  # largest turn of an edge in a step that is still taken straight [rad]; its stretch is TURNED^2 / 2
+# Largest turn of an edge in a step that is still taken straight [rad], and stretches it by half its square; see
+# `ddg_warp.compile.precision.straight_turns` for the rods that turn theirs always.
+TURNED = 0.1
+LEAP = 0.5  # cosine of the largest turn of an edge that a predictor goes on with
 
 
 @cache
 def excess_function(dim: int, real):
-    """excess(e, de): the edge e turned and lengthened by its step, less the same edge with its step added."""
+    """excess(e, de, onward): the edge e turned and lengthened by its step, less the same edge with its step added.
+
+    `onward` is 1 where the step repeats the last one, so that e - de is the edge before: it turns on by the same angle, and its length
+    changes as it did. (Added up, such steps would lengthen an edge that turns by the versine of its turn.)
+    """
     V = wp.types.vector(dim, real)
 
     @wp.func
-    def excess(e: V, de: V):
+    def excess(e: V, de: V, onward: int):
         length = wp.length(e)
         t = e / length
         stretch = wp.dot(t, de)
-        across = (de - t * stretch) / length
-        angle = wp.length(across)
-        sinc = real(1.0)
-        if angle > real(0.0):
-            sinc = wp.sin(angle) / angle
-        return (t * wp.cos(angle) + across * sinc) * wp.max(length + stretch, real(0.1) * length) - e - de
+        across = de - t * stretch
+        aside = wp.length(across)
+        grown = length + stretch
+        cosine = real(1.0)
+        sine = real(0.0)
+        if onward != 0:
+            before = wp.length(e - de)
+            grown = real(2.0) * length - before
+            if before > real(0.0):
+                cosine = (length - stretch) / before
+                sine = aside / before
+            if cosine < real(LEAP):
+                cosine = real(LEAP)
+                sine = real(wp.static((1.0 - LEAP**2) ** 0.5))
+        else:
+            cosine = wp.cos(aside / length)
+            sine = wp.sin(aside / length)
+        if aside > real(0.0):
+            sine /= aside
+        return (t * cosine + across * sine) * wp.max(grown, real(0.1) * length) - e - de
 
     return excess
 
@@ -37,7 +60,8 @@ def place_function(dim: int, real, Rod, edge, step, anchored, added, put):
     """place(rod): puts the nodes of a rod where a step ends, with edges turned. What the storage gives:
 
     Args:
-        Rod: struct of a rod and a step of it; its fields `count` and `closed` say how many nodes it has, and 1 where it is closed.
+        Rod: struct of a rod and a step of it; its fields `count`, `closed`, `anchor` and `onward` say how many nodes it has, 1 where it
+            is closed, its last anchored node or -1, and 1 where the step repeats the last one (see `excess_function`).
         edge, step: (rod, j) -> the edge from node j on before the step, and what the step adds to it.
         anchored: (rod, j) -> whether a node is; added: (rod, j) -> what lies between its place now and where the straight step ends.
         put: (rod, j, shift) puts a node there, and by a shift beyond. Nodes may be counted on past the last one of a closed rod.
@@ -47,35 +71,36 @@ def place_function(dim: int, real, Rod, edge, step, anchored, added, put):
 
     @wp.func
     def excess(rod: Rod, j: int):
-        return excess_of(edge(rod, j), step(rod, j))
+        return excess_of(edge(rod, j), step(rod, j), rod.onward)
 
     @wp.func
     def place(rod: Rod):
         n = rod.count
+        free = rod.anchor < 0
         first = int(0)
-        while first < n and not anchored(rod, first):
-            first += 1
-        free = first == n
         if free:
-            first = 0
             put(rod, first, V())
+        else:
+            while not anchored(rod, first):
+                first += 1
         last = wp.where(rod.closed != 0, first + n, n - 1)
         i = int(first)
         while i < last:
             shift = V()
             if not free:
                 shift = added(rod, i)
-            # the next anchor, or the end
-            stop = i + 1
-            miss = shift + excess(rod, i)
-            while stop < last and not anchored(rod, stop):
-                miss += excess(rod, stop)
-                stop += 1
+            stop = int(last)
             slope = V()
-            if free and rod.closed != 0:
+            if rod.closed != 0 or i < rod.anchor:
+                # to the next anchor, or around, where the rod has to close
+                stop = i + 1
+                miss = shift + excess(rod, i)
+                while stop < last and not anchored(rod, stop):
+                    miss += excess(rod, stop)
+                    stop += 1
+                if not free:
+                    miss -= added(rod, stop)
                 slope = miss / real(stop - i)
-            elif not free and anchored(rod, stop):
-                slope = (miss - added(rod, stop)) / real(stop - i)
             for j in range(i + 1, stop + 1):
                 shift += excess(rod, j - 1) - slope
                 if j < first + n and not anchored(rod, j):

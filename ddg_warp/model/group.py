@@ -42,6 +42,7 @@ class Group:
         self.rotary = put(host.rotary, real)
         self.drag = put(host.drag, real) if kind.drag else None
         self.fixed = put(host.fixed, wp.uint8)
+        self.anchor = put(_last_anchor(host), int)
         load, moment = _constant_loads(host) if host.loaded else (np.zeros((1, 1, kind.dim)), np.zeros((1, 1)))
         self.load = arrays.upload(np.concatenate([load] * worlds, axis=1), vector, device)
         self.load_angle = put(moment, real)
@@ -75,14 +76,21 @@ class Group:
         self.parameters.set(**{name: new})
 
     def float32_errors(self, s: float) -> np.ndarray:
-        """What float32 makes of every rod over a step of s [s]; see `precision.float32_errors`."""
+        """What float32 makes of every rod (columns,) over a step of s [s]; see `precision.float32_errors`."""
         host = self.host
-        values = {name: array[:, : self.rods] for name, array in self.parameters.values.items()}
         mass, length = host.mass.sum(0) / host.count, host.length
         if self.kind.drag:
             mass = mass + s * drag.least(host.drag.T) * host.length / host.count
             length = np.where(host.fixed.any(0), length, np.inf)  # over long steps a free rod has nothing but drag
-        return precision.float32_errors(self.kind, mass, length, values, s)
+        mass, length = (np.tile(values, self.worlds) for values in (mass, length))
+        return precision.float32_errors(self.kind, mass, length, self.parameters.values, s)
+
+
+def _last_anchor(host: ChainGroup) -> np.ndarray:
+    """The last node of every rod (R,) that is held in all directions, -1 where none is."""
+    every = (1 << host.kind.dim) - 1
+    k = np.arange(host.shape[0])[:, None]
+    return np.where(((host.fixed & every) == every) & (k < host.count), k, -1).max(axis=0)
 
 
 def _constant_loads(host: ChainGroup) -> tuple[np.ndarray, np.ndarray]:

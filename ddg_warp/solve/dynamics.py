@@ -112,10 +112,14 @@ class Integrator:
         source = self._own(state)
         self._vacate(1 - source)
         target = self._buffers[1 - source].state
-        if dt != self._dt_host:
+        changed = dt != self._dt_host
+        if changed:
             self._dt.fill_(dt)
             self._dt_host = dt
         self._weigh(dt, state)
+        if changed:
+            for part in self._parts:
+                part.straighten(self._solved(dt))
         start = state.time
         for part in self._parts:
             part.prescribe(start, start + dt)
@@ -175,11 +179,15 @@ class Integrator:
         """Steps of the groups of rods and of the net."""
         return self._chains if self._net is None else [*self._chains, self._net]
 
+    def _solved(self, dt: float) -> float:
+        """Length [s] of the implicit Euler step that a step of dt solves; see `kernels.step`."""
+        return 0.5 * dt if self.scheme == "implicit_midpoint" else dt
+
     def _weigh(self, dt: float, state: State) -> None:
         """What float32 does to steps of dt, where they are longer than those before: solve in float64, or refuse them."""
         if dt <= self._longest or self.model.precision == "float64":
             return
-        s = 0.5 * dt if self.scheme == "implicit_midpoint" else dt
+        s = self._solved(dt)
         if self.model.precision == "float32" and lost_in_rounding(self.model, s, state):
             for part in self._parts:
                 part.rounded = outcome.LOST_IN_ROUNDING
@@ -191,15 +199,11 @@ class Integrator:
     def _promote(self, s: float) -> None:
         """Solve in float64 where float32 factors would not be good enough for a step of s, from now on."""
         for i, chain in enumerate(self._chains):
-            if chain.newton.linear is wp.float32 and chain.group.float32_errors(s).max() > FLOAT32_LIMIT:
+            if chain.newton.linear is wp.float32 and chain.float32_errors(s).max() > FLOAT32_LIMIT:
                 self._chains[i] = ChainStep(self, self.model, chain.group, wp.float64, counts_of=chain)
                 self._graphs.clear()
         net = self._net
-        if (
-            net is not None
-            and net.newton.linear is wp.float32
-            and net.net.host.rod_errors(s).max(initial=0.0) > FLOAT32_LIMIT
-        ):
+        if net is not None and net.newton.linear is wp.float32 and net.float32_errors(s).max() > FLOAT32_LIMIT:
             self._net = NetStep(self, self.model, wp.float64, counts_of=net)
             self._graphs.clear()
 

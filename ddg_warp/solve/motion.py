@@ -75,12 +75,21 @@ class Motion:
         """Poses of all motions between t0 and t1."""
         self.pose.assign(poses(self.model, t0, t1))
 
-    def apply(self, islands, x: wp.array, frame: wp.array, theta: wp.array) -> None:
-        """Put nodes x and angles theta where the part of the step that an island tries has them; `frame` are lagged."""
-        given = [self.pose, *islands.arrays, self.part.world_columns]
-        self._launch(self._nodes, self.nodes, [self.nodes, self.rest, *given], [x])
+    def apply(self, islands, x: wp.array, *directed: wp.array) -> None:
+        """Put what is held where the part of the step that an island tries has it: see `place` and `direct`."""
+        self.place(islands, x)
+        self.direct(islands, x, *directed)
+
+    def place(self, islands, x: wp.array) -> None:
+        """Put nodes x."""
+        inputs = [self.nodes, self.rest, self.pose, *islands.arrays, self.part.world_columns]
+        self._launch(self._nodes, self.nodes, inputs, [x])
+
+    def direct(self, islands, x: wp.array, frame: wp.array, theta: wp.array) -> None:
+        """Put angles theta, from lagged frames to the tangents that edges have in x."""
         if len(self.angles):
-            self._launch(self._angles, self.angles, [self.angles, self.directors, *given, x, frame], [theta])
+            inputs = [self.angles, self.directors, self.pose, *islands.arrays, self.part.world_columns, x, frame]
+            self._launch(self._angles, self.angles, inputs, [theta])
 
     def put(self, t0: float, t1: float, *arrays: wp.array) -> None:
         """Put what `apply` puts, which belongs to t0, where it is at t1."""

@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
+from ddg_warp.compile.precision import straight_turns
 from ddg_warp.errors import SolverError
 from ddg_warp.geometry import polyline
 from ddg_warp.kernels import outcome, step
@@ -16,7 +17,8 @@ class PartStep:
     """Steps all islands of a solver, each with its own retries; see `kernels.step`.
 
     A part says how an attempt is made (`attempt`), which kernels that takes (`own_kernels`), and of an island that was given up
-    who it is (`who`), which rods are concerned (`rods_of`) and where it went wrong (`where`).
+    who it is (`who`), which rods are concerned (`rods_of`) and where it went wrong (`where`); of its islands in a world, what float32
+    makes of their directions over a solve (`float32_errors`).
 
     Args:
         integrator, model: what steps what.
@@ -51,6 +53,11 @@ class PartStep:
     def islands(self):
         """See `kernels.islands`."""
         return self.newton.islands
+
+    def straighten(self, s: float) -> None:
+        """Set which turns are taken straight in solves over s [s]; see `precision.straight_turns`."""
+        islands = self.islands
+        islands.turn.assign(np.resize(straight_turns(self.float32_errors(s)), len(islands)))
 
     def prescribe(self, t0: float, t1: float) -> None:
         """Hand the device what supports, loads, the field and the flow do between t0 and t1."""

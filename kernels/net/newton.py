@@ -20,6 +20,7 @@ from ddg_warp.kernels.islands import (
     STATUS,
     STEP_LENGTH,
     TODO,
+    TURN,
     TURNING,
     UNBALANCED,
     WANTED,
@@ -28,7 +29,6 @@ from ddg_warp.kernels.islands import (
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
 from ddg_warp.kernels.search import PLACE, STRAIGHT
 from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
-from ddg_warp.kernels.turns import TURNED
 
 POLISH = 1e-3  # reduction to which a direction must have been solved before rounding excuses what it leaves
 STALLED = 8  # iterations without progress, where energies drown in rounding, that a world is given
@@ -191,7 +191,7 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool):
         scalars[DECREMENT, w] = decrease[w]
         flags[TODO, w] = wp.static(STRAIGHT)
         if wp.static(turns):
-            if turn[w] > real(wp.static(TURNED**2)):
+            if turn[w] > scalars[TURN, w] * scalars[TURN, w]:
                 flags[TODO, w] = wp.static(PLACE)
                 flags[TURNING, 0] = 1
         wp.atomic_add(work, 0, wp.int64(iterations[w]))
@@ -282,7 +282,7 @@ def step_kernels(real, midpoint: bool, serial: bool):
                     if ((mask >> d) & 1) == 0 and mass[k][d] > real(0.0):
                         here[d] = here[d] + s * v[d]
             q_out[i] = here
-            base_out[i] = here
+            base_out[i] = q0[i]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def finish(

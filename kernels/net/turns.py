@@ -4,9 +4,9 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.islands import STEP_LENGTH, TODO, TURNING
+from ddg_warp.kernels.islands import CAUTIOUS, RATE, STEP_LENGTH, TODO, TURN, TURNING
 from ddg_warp.kernels.search import PLACE
-from ddg_warp.kernels.turns import TURNED, place_function
+from ddg_warp.kernels.turns import place_function
 
 
 @cache
@@ -27,6 +27,8 @@ def turn_kernels(real, linear):
         shift: int  # of blocks of the world
         count: int
         closed: int
+        anchor: int
+        onward: int
 
     @wp.func
     def place_of(rod: Rod, j: int):
@@ -59,11 +61,11 @@ def turn_kernels(real, linear):
     def put(rod: Rod, j: int, shift: V):
         node = rod.nodes[place_of(rod, j)]
         mask = int(rod.fixed[node])
-        moved = rod.base[node + rod.shift] + move_of(rod, node + rod.shift)
+        free = shift
         for d in range(3):
-            if ((mask >> d) & 1) == 0:
-                moved[d] = moved[d] + shift[d]
-        rod.q[node + rod.shift] = moved
+            if ((mask >> d) & 1) == 1:
+                free[d] = real(0.0)
+        rod.q[node + rod.shift] = rod.base[node + rod.shift] + move_of(rod, node + rod.shift) + free
 
     place_rod = place_function(3, real, Rod, edge, step, anchored, added, put)
 
@@ -81,7 +83,8 @@ def turn_kernels(real, linear):
         a = ends[i, 0] + w * blocks
         b = ends[i, 1] + w * blocks
         e = base[b] - base[a]
-        if wp.length_sq(q[b] - q[a] - e) > real(wp.static(TURNED**2)) * wp.length_sq(e):
+        straight = scalars[TURN, w]
+        if straight == real(0.0) or wp.length_sq(q[b] - q[a] - e) > straight * straight * wp.length_sq(e):
             flags[TODO, w] = wp.static(PLACE)
             flags[TURNING, 0] = 1
             scalars[STEP_LENGTH, w] = real(1.0)
@@ -90,13 +93,19 @@ def turn_kernels(real, linear):
     def aim(
         q: wp.array(dtype=V),
         base: wp.array(dtype=V),
-        todo: wp.array(dtype=int),
+        v: wp.array(dtype=V),
+        fixed: wp.array(dtype=wp.uint8),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         blocks: int,
         direction_out: wp.array(dtype=H),
     ):
         i = wp.tid()
-        if todo[i / blocks] == wp.static(PLACE):
+        w = i / blocks
+        if flags[TODO, w] == wp.static(PLACE):
             d = q[i] - base[i]
+            if (int(fixed[i - w * blocks]) & 7) == 7 and flags[CAUTIOUS, w] == 0:
+                d = v[i] / scalars[RATE, w]  # where its rod expects a support; it is where it has to be
             direction_out[i] = H(linear(d[0]), linear(d[1]), linear(d[2]))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -105,12 +114,14 @@ def turn_kernels(real, linear):
         start: wp.array(dtype=int),
         nodes: wp.array(dtype=int),
         held: wp.array(dtype=wp.uint8),
+        anchor: wp.array(dtype=int),
         loops: wp.array(dtype=int),
         base: wp.array(dtype=V),
         direction: wp.array(dtype=H),
         fixed: wp.array(dtype=wp.uint8),
         step_length: wp.array(dtype=real),
         todo: wp.array(dtype=int),
+        onward: int,
         blocks: int,
         q: wp.array(dtype=V),
     ):
@@ -131,6 +142,8 @@ def turn_kernels(real, linear):
         rod.shift = w * blocks
         rod.count = start[r + 1] - start[r]
         rod.closed = loops[r]
+        rod.anchor = anchor[r]
+        rod.onward = onward
         place_rod(rod)
 
     return bend, aim, place

@@ -11,11 +11,10 @@ import warp as wp
 
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.chain import ChainKind
-from ddg_warp.kernels.islands import CLAMPED, DECREMENT, ITERATION, LOST, SLOT, STATUS, STEP_LENGTH, WANTED
+from ddg_warp.kernels.islands import CLAMPED, DECREMENT, ITERATION, LOST, SLOT, STATUS, STEP_LENGTH, TURN, WANTED
 from ddg_warp.kernels.matrix.block_band import block_functions, product_function, substitute_function
 from ddg_warp.kernels.search import search_functions
 from ddg_warp.kernels.solve import pivot
-from ddg_warp.kernels.turns import TURNED
 
 PRECONDITIONERS = ("jacobi", "block_jacobi", "chain")
 
@@ -219,6 +218,7 @@ def take_kernel(kind: ChainKind, real, linear):
         rotation_cap: real,
         direction: wp.array3d(dtype=linear),
         fixed: wp.array2d(dtype=wp.uint8),
+        anchor: wp.array(dtype=int),
         base: wp.array2d(dtype=V),
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
@@ -245,8 +245,8 @@ def take_kernel(kind: ChainKind, real, linear):
         if rotation > rotation_cap * rotation_cap:
             whole = rotation_cap / wp.sqrt(rotation)
         turn_angles(theta, direction, whole, n, r)
-        if rotation > real(wp.static(TURNED**2)):
-            place(x, base, direction, fixed, whole, n, r)
+        if rotation > scalars[TURN, r] * scalars[TURN, r]:
+            place(x, base, direction, fixed, anchor, whole, 0, n, r)
         else:
             for k in range(n):
                 step = V()

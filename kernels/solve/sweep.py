@@ -33,13 +33,13 @@ from ddg_warp.kernels.islands import (
     STATUS,
     STEP_LENGTH,
     TODO,
+    TURN,
 )
 from ddg_warp.kernels.judge import judge_functions
 from ddg_warp.kernels.matrix import geometric
 from ddg_warp.kernels.search import PLACE, RELAG, search_functions
 from ddg_warp.kernels.solve import pivot
 from ddg_warp.kernels.threads import CPU_OPTIONS
-from ddg_warp.kernels.turns import TURNED
 
 
 @cache
@@ -413,7 +413,7 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
         whole = real(1.0)
         if rotation > rotation_cap * rotation_cap:
             whole = rotation_cap / wp.sqrt(rotation)
-        if rotation > real(wp.static(TURNED**2)):
+        if rotation > scalars[TURN, r] * scalars[TURN, r]:
             scalars[ANGLE_CHANGE, r] = whole - real(1.0)
             flags[TODO, r] = wp.static(PLACE)
         scalars[STEP_LENGTH, r] = whole

@@ -147,7 +147,7 @@ def adjusted(newton, todo: int):
     wp.launch(
         search.adjust_kernel(group.kind, newton.real, newton.linear),
         group.columns,
-        [group.count, group.fixed, newton.direction, *newton.islands.arrays, *copies],
+        [group.count, group.fixed, group.anchor, newton.direction, *newton.islands.arrays, *copies],
         device=newton.device,
     )
     newton.islands.todo.fill_(todo)  # which that has done

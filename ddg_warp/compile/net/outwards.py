@@ -20,6 +20,11 @@ class Outwards:
     anchored: np.ndarray
     levels: list[np.ndarray]
 
+    def last_anchors(self) -> np.ndarray:
+        """The last anchored node of every rod (R,), -1 where none is."""
+        place = np.where(self.anchored, np.arange(len(self.nodes)), -1)
+        return np.maximum(np.maximum.reduceat(place, self.start[:-1]) - self.start[:-1], -1)
+
 
 def outwards(rods: list[np.ndarray], held: np.ndarray) -> Outwards:
     """The order for rods with these nodes (blocks), of which some are `held` (N,) bool.

@@ -146,7 +146,7 @@ class ChainNewton:
         wp.launch(
             self._predict,
             self.group.columns,
-            [before.x, before.v, self.group.fixed, self.group.count, *self.islands.arrays],
+            [before.x, before.v, self.group.fixed, self.group.anchor, self.group.count, *self.islands.arrays],
             [self.base, self.direction, self.x, self.frame],
             device=self.device,
         )
@@ -213,7 +213,7 @@ class ChainNewton:
         wp.launch(
             self._adjust,
             group.columns,
-            [group.count, group.fixed, self.direction, *self.islands.arrays],
+            [group.count, group.fixed, group.anchor, self.direction, *self.islands.arrays],
             [self.x, self.theta, self.frame, self.base],
             device=self.device,
         )

@@ -53,10 +53,10 @@ class PartitionedNewton(AssembledNewton):
         self._launch(
             self._aim,
             group.nodes,
-            [before.x, before.v, group.fixed, group.count, *self.islands.arrays],
+            [before.x, before.v, group.fixed, group.count, *self.islands.arrays, self.x],
             [self.base, self.direction],
         )
-        self.move()
+        self.move(onward=not self.midpoint)
         if self.midpoint and group.kind.twist:
             wp.launch(self._renew, group.columns, self.islands.arrays, device=self.device)
             self.move()
@@ -107,13 +107,17 @@ class PartitionedNewton(AssembledNewton):
             device=self.device,
         )
 
-    def move(self) -> None:
-        """Do what is left to do with every rod: a step, straight or with edges turned, or frames of its iterate."""
+    def move(self, onward: bool = False) -> None:
+        """Do what is left to do with every rod: a step, straight or with edges turned, or frames of its iterate.
+
+        `onward`: whether the step repeats the last one; see `kernels.turns`.
+        """
         group, islands, (turn, scan, offset, move) = self.group, self.islands, self._moves
         self._launch(
             turn,
             group.nodes,
-            [group.count, islands.todo, self.direction, islands.step_length, self.base, self.x, self.frame],
+            [group.count, islands.todo, self.direction, islands.step_length, int(onward)]
+            + [self.base, self.x, self.frame],
             [self.prefix, self.new_frame],
         )
         self._launch(scan, self.ranges, [group.count, islands.todo, self.width, self.prefix], [self.sums])

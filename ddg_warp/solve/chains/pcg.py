@@ -68,7 +68,16 @@ class PcgNewton(AssembledNewton):
             self._take,
             group.columns,
             [self.right, self.iterations, group.count, self.options.rotation_cap],
-            [self.direction, group.fixed, self.base, self.x, self.theta, *self.islands.arrays, self.pcg_work],
+            [
+                self.direction,
+                group.fixed,
+                group.anchor,
+                self.base,
+                self.x,
+                self.theta,
+                *self.islands.arrays,
+                self.pcg_work,
+            ],
             device=device,
         )
 
@@ -90,7 +99,7 @@ class PcgNewton(AssembledNewton):
             self._judge,
             group.columns,
             [self.right, self.energy_change, self.energy_noise, group.count, options.floor_factor * self.eps]
-            + [options.max_iterations, options.max_halvings, self.direction, group.fixed, self.base]
+            + [options.max_iterations, options.max_halvings, self.direction, group.fixed, group.anchor, self.base]
             + [self.x, self.theta, self.frame, *self.islands.arrays],
             device=device,
         )

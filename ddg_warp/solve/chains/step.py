@@ -44,10 +44,12 @@ class ChainStep(PartStep):
             + [self.integrator._dt, self.damping, group.outer, *self.islands.arrays],
             [newton.x, newton.theta, newton.frame, newton.target, newton.target_angle],
         )
+        if self.motion:
+            self.motion.place(self.islands, newton.x)
         newton.predict(before)
         self.islands.bent.zero_()
         if self.motion:
-            self.motion.apply(self.islands, newton.x, newton.frame, newton.theta)
+            self.motion.direct(self.islands, newton.x, newton.frame, newton.theta)
         if self.loads:
             self.loads.apply(newton.x, group.load, group.load_angle)
         if self.drag:
@@ -80,6 +82,10 @@ class ChainStep(PartStep):
         if self.group.kind.viscous:
             kernels.append(element.strain_kernel(self.group.kind, self.model.types.real))
         return kernels
+
+    def float32_errors(self, s: float) -> np.ndarray:
+        """Of every rod; see `precision.float32_errors`."""
+        return self.group.float32_errors(s)
 
     def who(self, column: int) -> str:
         """The rod of a column."""

@@ -29,10 +29,14 @@ class NetMotion(Motion):
         """Kernels to load before a capture."""
         return [*super().kernels, *([self._normals, self._turn] if self.normals else [])]
 
-    def apply(self, islands, q: wp.array, frame: wp.array) -> None:
-        """Put held blocks and normals where the part of the step that a world tries has them; `frame` are lagged."""
+    def place(self, islands, q: wp.array) -> None:
+        """Put nodes, among the blocks q."""
+        super().place(islands, self.part.points(q))
+
+    def direct(self, islands, q: wp.array, frame: wp.array) -> None:
+        """Put angles, among the blocks q, and normals."""
         net = self.part
-        super().apply(islands, net.points(q), net.frames(frame), net.angles(q))
+        super().direct(islands, net.points(q), net.frames(frame), net.angles(q))
         for index, (where, rest) in self.normals.items():
             inputs = [where, rest, self.pose, *islands.arrays, net.sets[index].elements]
             self._launch(self._normals, where, inputs, [self.data[index]])

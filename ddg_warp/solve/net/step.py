@@ -68,11 +68,13 @@ class NetStep(PartStep):
             + [self.integrator._dt, self.damping, solver.outer, *islands.arrays, blocks],
             [solver.q, solver.base, solver.target],
         )
+        if self.motion:
+            self.motion.place(islands, solver.q)
         if solver.turns:
-            solver.turns.predict()
+            solver.turns.predict(before.v, not self.midpoint)
         start = self._start_frames(before)
         if self.motion:
-            self.motion.apply(islands, solver.q, start.frame)
+            self.motion.direct(islands, solver.q, start.frame)
         if self.loads:
             self.loads.apply(net.points(solver.q), net.points(solver.load), net.angles(solver.load))
         if self.drag:
@@ -122,6 +124,10 @@ class NetStep(PartStep):
         for part in net.sets:
             kernels += [elements.term_kernels(part.term, real)[3]] if part.term.density.lagged else []
         return kernels
+
+    def float32_errors(self, s: float) -> np.ndarray:
+        """The largest of a rod (1,); see `precision.float32_errors`."""
+        return self.net.host.rod_errors(s).max(initial=0.0, keepdims=True)
 
     def who(self, world: int) -> str:
         """The net of a world."""

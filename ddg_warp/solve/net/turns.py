@@ -23,6 +23,7 @@ class Turns:
         self._rods = [
             *map(put, (plan.start, plan.nodes)),
             arrays.upload(plan.anchored.astype(np.uint8), wp.uint8, device),
+            put(plan.last_anchors()),
             put([rod.piece.kind.closed for rod in host.rods]),
         ]
         self._ends = put(np.concatenate([rod.ends for rod in host.rods]))
@@ -32,20 +33,23 @@ class Turns:
         """Kernels to load before a capture."""
         return [self._bend, self._aim, self._place]
 
-    def predict(self) -> None:
-        """Turn the edges of predictors that turn them far, instead of stretching them."""
+    def predict(self, v: wp.array, onward: bool) -> None:
+        """Turn the edges of predictors by velocities v that turn them far, instead of stretching them.
+
+        `onward`: whether velocities are what the last step did; see `kernels.turns`.
+        """
         newton, net = self.newton, self.net
         islands = newton.islands
         islands.turning.zero_()
         inputs = [newton.q, newton.base, self._ends, net.blocks, *islands.arrays]
         wp.launch(self._bend, (len(self._ends), net.worlds), inputs, [], device=net.device)
-        wp.capture_if(islands.turning, self._redo)
+        wp.capture_if(islands.turning, lambda: self._redo(v, onward))
 
-    def _redo(self) -> None:
+    def _redo(self, v: wp.array, onward: bool) -> None:
         newton, net = self.newton, self.net
-        inputs = [newton.q, newton.base, newton.islands.todo, net.blocks]
+        inputs = [newton.q, newton.base, v, newton.held, *newton.islands.arrays, net.blocks]
         wp.launch(self._aim, newton.all, inputs, [newton.direction], device=net.device)
-        self.place()
+        self.place(onward)
 
     def turn(self, state) -> None:
         """Place the nodes of rods whose edges turn, and renew the frames that `state` lags where that is to be done."""
@@ -53,11 +57,11 @@ class Turns:
         if self.net.edges:
             self.net.renew(state, self.newton.q, self.newton.islands.todo)
 
-    def place(self) -> None:
-        """Nodes of rods, once the straight step has moved everything."""
+    def place(self, onward: bool = False) -> None:
+        """Nodes of rods, once the straight step has moved everything; `onward`: see `predict`."""
         newton, net = self.newton, self.net
         islands = newton.islands
         for level in self._levels:
             inputs = [level, *self._rods, newton.base, newton.direction, newton.held]
-            inputs += [islands.step_length, islands.todo, net.blocks]
+            inputs += [islands.step_length, islands.todo, int(onward), net.blocks]
             wp.launch(self._place, (len(level), net.worlds), inputs, [newton.q], device=net.device)
