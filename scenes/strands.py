@@ -12,16 +12,15 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
+from ddg_warp.scenes import _strands
 
 GROOM = Path(__file__).resolve().parent / "data" / "strands.usdc"
-GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # rad
 PERIOD = 1.0  # s, of the head's motion
 REST = 2.0  # s; the head has come to rest by then
 TURN = 0.9  # rad
-HAIR = np.array([0.36, 0.21, 0.11])  # RGB
 HEAD = 0.97  # radius of the head that is drawn over that of the roots
-PANELS = 3  # of the picture
-SOURCE = "the prescribed motion"
+
+observe = _strands.observe
 
 
 def build(
@@ -72,7 +71,7 @@ def groom(path: str, count: int) -> tuple[np.ndarray, float]:
         return strands[np.linspace(0, len(strands) - 1, count).round().astype(int)], radius
     copies = -(-count // len(strands))
     pivot = strands[:, 0].mean(axis=0)
-    turns = [ddg.Motion(pivot=tuple(pivot)).rotation(k * GOLDEN_ANGLE) for k in range(copies)]
+    turns = [ddg.Motion(pivot=tuple(pivot)).rotation(k * _strands.GOLDEN_ANGLE) for k in range(copies)]
     return np.concatenate([(strands - pivot) @ turn.T + pivot for turn in turns])[:count], radius
 
 
@@ -92,57 +91,9 @@ def head_motion(points: np.ndarray, sway: float) -> ddg.Motion:
     )
 
 
-def placed(motion: ddg.Motion, rest: np.ndarray, t: float) -> np.ndarray:
-    """Where a motion has points of the rest state (..., 3) at time t."""
-    return (rest - motion.pivot) @ motion.rotation(motion.angle(t)).T + motion.pivot + np.asarray(motion.translation(t))
-
-
-def observe(model, state) -> dict[str, float]:
-    """Stretch of edges, distance of the roots from where they belong [m], kinetic energy [J] and speed [m/s]."""
-    batch, support = model.scene.batches[0], model.scene.supports[0]
-    shape = (-1, *batch.points.shape)
-    points, velocities = state.points().reshape(shape), state.velocities().reshape(shape)
-    rest = np.linalg.norm(np.diff(batch.points, axis=-2), axis=-1)
-    stretch = np.linalg.norm(np.diff(points, axis=-2), axis=-1) / rest - 1.0
-    off = points[:, :, :2] - placed(support.motion, batch.points[:, :2], state.time)
-    cell = 0.5 * (np.pad(rest, ((0, 0), (1, 0))) + np.pad(rest, ((0, 0), (0, 1))))
-    square = (velocities**2).sum(axis=-1)
-    return {
-        "stretch": float(np.abs(stretch).max()),
-        "root_error": float(np.abs(off).max()),
-        "kinetic": float(0.5 * batch.section.mass_per_length * (cell * square).sum(axis=(1, 2)).max()),
-        "speed": float(np.sqrt(square.max())),
-    }
-
-
 def check(result) -> list[ddg.Check]:
     """Converged and finite everywhere, roots where the head has them, lengths kept, no more energy than there can be."""
-    outcomes = result.statistics["outcomes"]
-    failed = sum(number for name, number in outcomes.items() if not name.startswith("converged"))
-    series = {name: np.array(values) for name, values in result.series.items()}
-    batch = result.model.scene.batches[0]
-    rest = np.linalg.norm(np.diff(batch.points, axis=1), axis=-1)
-    mass = batch.section.mass_per_length * rest.sum()
-    # What the roots and gravity can give: a strand that rides along at their top speed and falls by its own length.
-    root_speed = fastest_root(result)
-    bound = 0.5 * mass * root_speed**2 + mass * 9.81 * rest.sum(axis=1).max()
-    finite = np.isfinite(result.state.points()).all() and all(np.isfinite(values).all() for values in series.values())
-    return [
-        ddg.Check("solves that did not converge", failed, 0.0, 0.0),
-        ddg.Check("values that are not finite", float(not finite), 0.0, 0.0),
-        ddg.Check("roots from where the head has them [m]", series["root_error"].max(), 0.0, 1e-12, SOURCE),
-        ddg.Check("largest stretch of an edge", series["stretch"].max(), 0.0, 1e-3, "weight and inertia over EA"),
-        ddg.Check(
-            "kinetic energy over its bound", series["kinetic"].max() / bound, 0.0, 1.0, "work of roots and gravity"
-        ),
-    ]
-
-
-def fastest_root(result) -> float:
-    """Top speed [m/s] of any root up to the end of the run."""
-    batch, support = result.model.scene.batches[0], result.model.scene.supports[0]
-    path = np.array([placed(support.motion, batch.points[:, 0], t) for t in result.times])
-    return float(np.linalg.norm(np.diff(path, axis=0), axis=-1).max() / result.dt)
+    return _strands.checks(result, 1e-3, "weight and inertia over EA")
 
 
 def benchmark() -> ddg.bench.Study:
@@ -170,7 +121,7 @@ def picture(result, frames) -> dict:
     found, *_ = np.linalg.lstsq(np.column_stack([2.0 * roots, np.ones(len(roots))]), (roots**2).sum(1), rcond=None)
     radius = np.sqrt(found[3] + found[:3] @ found[:3])
     ball, triangles = meshes.sphere(4)
-    shown = {t: frames[t] for t in list(frames)[:: max(1, (len(frames) - 1) // (PANELS - 1))]}
-    heads = {t: (placed(motion, found[:3] + HEAD * radius * ball, t), triangles) for t in shown}
-    brown = np.random.default_rng(1).uniform(0.6, 1.3, (len(roots), 1)) * HAIR
-    return {"points_by_time": shown, "bodies": heads, "colors": brown, "side_by_side": True}
+    shown = _strands.shown(frames)
+    heads = {t: (_strands.placed(motion, found[:3] + HEAD * radius * ball, t), triangles) for t in shown}
+    colors = _strands.colors(len(roots))
+    return {"points_by_time": shown, "bodies": heads, "colors": colors, "side_by_side": True}

@@ -119,6 +119,25 @@ def test_hair_is_shown_with_its_head_side_by_side(drawn):
     assert len(drawn[0].axes) == 3
 
 
+def test_slim_shapes_fit_their_panels(drawn):
+    """Strands that hang are seen whole, and as slim as they are."""
+    module = load_scene("hair")
+    result = simulate(module.build(strands=4), device="cpu", duration=1.0 / 60.0, progress=False)
+    figure.rods_picture(result.model, path="unused.png", **module.picture(result, {0.0: result.state.points()}))
+    figure.FigureCanvasAgg(drawn[0]).draw()
+    (plot,) = drawn[0].axes
+    limits = np.array([plot.get_xlim(), plot.get_ylim(), plot.get_zlim()])
+    matrix = plot.get_proj()
+    scales = np.linalg.norm(
+        (matrix @ (np.eye(4)[:, :3]))[:3], axis=0
+    )  # of what is seen and its depth, along x, y and z
+    np.testing.assert_allclose(scales, scales[0], rtol=1e-6)
+    assert limits[2, 1] - limits[2, 0] > 3.0 * (limits[0, 1] - limits[0, 0])
+    homogeneous = np.column_stack([result.state.points(), np.ones(len(result.state.points()))]) @ matrix.T
+    seen = plot.transData.transform(homogeneous[:, :2] / homogeneous[:, 3:])
+    assert (seen > plot.bbox.min).all() and (seen < plot.bbox.max).all()
+
+
 def test_titles_fit(drawn):
     """Of every scene, in both kinds of pictures."""
     points = np.eye(3)

@@ -18,6 +18,7 @@ SMALL = {
     "flying_beam": {"n": 20},
     "greenhill": {"n": 100},
     "gridshell_dome": {"rods": 3},
+    "hair": {"strands": 16},
     "hanging_chain": {"n": 25},
     "hanging_sheet": {},
     "helical_flagellum": {"n": 24},

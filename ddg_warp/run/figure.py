@@ -26,7 +26,7 @@ FIELD_COLOR = "#c9bfd6"
 ARROWS = {2: 9, 3: 4}  # of a field along the longest side of a picture, by its dimension
 GREY = "0.35"
 LIGHT_GREY = (0.78, 0.78, 0.78, 1.0)
-CLOSE = 1.5  # how much larger a solid scene is drawn without its axes
+CLOSE = 1.45  # how much larger a solid scene is drawn without its axes
 TITLE = 11  # letters of a title in an inch
 STABILITY = {"stable": (False, "-"), "unstable": (True, "--")}
 SPECIAL = {"limit point": "o", "bifurcation": "D"}
@@ -108,7 +108,8 @@ def rods_picture(
         if side_by_side:
             plot.set_axis_off()
             if not len(flat):
-                plot.set_box_aspect(high - low, zoom=CLOSE)
+                sides = np.ptp([plot.get_xlim(), plot.get_ylim(), plot.get_zlim()], axis=1)
+                plot.set_box_aspect(sides, zoom=CLOSE * _to_fit(sides))
             plot.set_title(
                 f"{label.partition(' [')[0]} {time:.3g} {label.partition('[')[2].rstrip(']')}", fontsize=9, color=GREY
             )
@@ -312,7 +313,7 @@ def _solid_axes(figure: Figure, axes: list[int], low: np.ndarray, high: np.ndarr
     limits = np.stack([low - margin, high + margin], axis=1)
     plot.set(xlim=limits[0], ylim=limits[1], zlim=limits[2])
     sides = limits[:, 1] - limits[:, 0]
-    plot.set_box_aspect(sides, zoom=min(1.0, _seen_height(np.ones(3)) / _seen_height(sides)))
+    plot.set_box_aspect(sides, zoom=_to_fit(sides))
     shares = sides / sides.max()
     for axis, name, share in zip((plot.xaxis, plot.yaxis, plot.zaxis), "xyz", shares, strict=True):
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
@@ -322,6 +323,11 @@ def _solid_axes(figure: Figure, axes: list[int], low: np.ndarray, high: np.ndarr
         axis._axinfo["grid"].update(color="0.9", linewidth=0.5)
     plot.tick_params(labelsize=8, colors=GREY)
     return plot
+
+
+def _to_fit(sides: np.ndarray) -> float:
+    """Zoom of a box that is seen higher than the cube that matplotlib makes room for; 1 of others."""
+    return min(1.0, _seen_height(np.ones(3)) / _seen_height(sides))
 
 
 def _seen_height(sides: np.ndarray) -> float:

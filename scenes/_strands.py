@@ -1,0 +1,85 @@
+"""What scenes of hair share: strands of one kind, held by their first edge on roots that move rigidly; observed and checked."""
+
+import numpy as np
+
+import ddg_warp as ddg
+
+GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # rad
+HAIR = np.array([0.36, 0.21, 0.11])  # RGB
+PANELS = 3  # of the picture
+GRAVITY = 9.81  # m/s^2
+
+
+def placed(motion: ddg.Motion, rest: np.ndarray, t: float) -> np.ndarray:
+    """Where a motion has points of the rest state (..., 3) at time t."""
+    return (rest - motion.pivot) @ motion.rotation(motion.angle(t)).T + motion.pivot + np.asarray(motion.translation(t))
+
+
+def edge_lengths(points: np.ndarray) -> np.ndarray:
+    """Lengths (..., nodes - 1) of the edges between points (..., nodes, 3)."""
+    return np.linalg.norm(np.diff(points, axis=-2), axis=-1)
+
+
+def observe(model, state) -> dict[str, float]:
+    """Stretch of edges, distance of the roots from where they belong [m], kinetic energy [J] and speed [m/s]."""
+    batch, support = model.scene.batches[0], model.scene.supports[0]
+    shape = (-1, *batch.points.shape)
+    points, velocities = state.points().reshape(shape), state.velocities().reshape(shape)
+    rest = edge_lengths(batch.points)
+    stretch = edge_lengths(points) / rest - 1.0
+    off = points[:, :, :2] - placed(support.motion, batch.points[:, :2], state.time)
+    cell = 0.5 * (np.pad(rest, ((0, 0), (1, 0))) + np.pad(rest, ((0, 0), (0, 1))))
+    square = (velocities**2).sum(axis=-1)
+    return {
+        "stretch": float(np.abs(stretch).max()),
+        "root_error": float(np.abs(off).max()),
+        "kinetic": float(0.5 * batch.section.mass_per_length * (cell * square).sum(axis=(1, 2)).max()),
+        "speed": float(np.sqrt(square.max())),
+    }
+
+
+def checks(result, stretch: float, source: str) -> list[ddg.Check]:
+    """Converged and finite everywhere, roots where their motion has them, lengths kept, no more energy than there can be.
+
+    Args:
+        result: a run.
+        stretch: of an edge, the largest there can be.
+        source: where that comes from.
+    """
+    outcomes = result.statistics["outcomes"]
+    failed = sum(number for name, number in outcomes.items() if not name.startswith("converged"))
+    series = {name: np.array(values) for name, values in result.series.items()}
+    batch = result.model.scene.batches[0]
+    rest = edge_lengths(batch.points)
+    mass = batch.section.mass_per_length * rest.sum()
+    # What the roots and gravity can give: a strand that rides along at their top speed and falls by its own length.
+    bound = 0.5 * mass * fastest_root(result) ** 2 + mass * GRAVITY * rest.sum(axis=1).max()
+    finite = np.isfinite(result.state.points()).all() and all(np.isfinite(values).all() for values in series.values())
+    return [
+        ddg.Check("solves that did not converge", failed, 0.0, 0.0),
+        ddg.Check("values that are not finite", float(not finite), 0.0, 0.0),
+        ddg.Check(
+            "roots from where they are to be [m]", series["root_error"].max(), 0.0, 1e-12, "the prescribed motion"
+        ),
+        ddg.Check("largest stretch of an edge", series["stretch"].max(), 0.0, stretch, source),
+        ddg.Check(
+            "kinetic energy over its bound", series["kinetic"].max() / bound, 0.0, 1.0, "work of roots and gravity"
+        ),
+    ]
+
+
+def fastest_root(result) -> float:
+    """Top speed [m/s] of any root up to the end of the run."""
+    batch, support = result.model.scene.batches[0], result.model.scene.supports[0]
+    path = np.array([placed(support.motion, batch.points[:, 0], t) for t in result.times])
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=-1).max() / result.dt)
+
+
+def shown(frames) -> dict:
+    """A few of the frames (time -> points), from the first on."""
+    return {t: frames[t] for t in list(frames)[:: max(1, (len(frames) - 1) // (PANELS - 1))]}
+
+
+def colors(count: int) -> np.ndarray:
+    """RGB (count, 3) of strands, which vary."""
+    return np.random.default_rng(1).uniform(0.6, 1.3, (count, 1)) * HAIR
