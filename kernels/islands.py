@@ -7,8 +7,10 @@ every launch of a graph: two arrays instead of thirty are worth some percent of 
 
 from functools import cache
 
+import numpy as np
 import warp as wp
 
+from ddg_warp.kernels import outcome
 from ddg_warp.kernels.turns import TURNED
 
 FLAGS = (
@@ -28,6 +30,8 @@ FLAGS = (
     "clamped",
     "lost",
     "bad",
+    "detours",  # iterations of a solve with such a matrix in place of the exact Hessian
+    "patience",  # how many there may be
     # the step: whether it starts from the last state instead of the predictor, and what became of it
     "cautious",
     "retries",
@@ -54,15 +58,17 @@ SCALARS = (
     "portion",
 )
 (STATUS, ITERATION, UNBALANCED, DROWNED, SLOT, HALVINGS, WANTED, TODO, PLACED, STALE) = range(10)
-(CLAMPED, LOST, BAD, CAUTIOUS, RETRIES, REASON, BENT, MOVED) = range(10, 18)
-ACTIVE, TURNING = range(18, len(FLAGS))
+(CLAMPED, LOST, BAD, DETOURS, PATIENCE, CAUTIOUS, RETRIES, REASON, BENT, MOVED) = range(10, 20)
+ACTIVE, TURNING = range(20, len(FLAGS))
 (COEFFICIENT, RATE, LOAD_SCALE, RESIDUAL, STEP_LENGTH, DECREMENT, MERIT, ANGLE_CHANGE, TURN, PROGRESS, PORTION) = range(
     11
 )
 
+DETOURS_ALLOWED, LEAST = 30, 0.125  # by parts of a time step that are larger than this
+
 
 class Islands:
-    """The entries of `count` islands, zero at first but for `turn`; each row by its name, too, such as `islands.status`.
+    """The entries of `count` islands, zero at first but for `turn` and `patience`; each row by its name, too, such as `islands.status`.
 
     Attributes:
         arrays: `flags` and `scalars`, for kernels.
@@ -78,11 +84,35 @@ class Islands:
             for row, name in enumerate(names):
                 setattr(self, name, array[row])
         self.turn.fill_(TURNED)
+        self.patience.fill_(np.iinfo(np.int32).max)
         self.signals = self.arrays[0][ACTIVE:]
         self.active, self.turning = (self.signals[row, :1] for row in range(2))
 
     def __len__(self) -> int:
         return self.arrays[0].shape[1]
+
+
+@cache
+def patience_function(real):
+    """out_of_patience(flags, scalars, i): enters an iteration of island i by its kind of matrix; whether the solve should end.
+
+    Where the exact Hessian is indefinite an iteration does without second derivatives, and goes on slowly along a valley that bends,
+    or leaves a saddle. A shorter step, for which inertia makes the Hessian definite, gets there sooner, and to the solution that the
+    motion leads to. `DETOURS_ALLOWED` such iterations are enough, unless the part of the step is the `LEAST` already, or steps may
+    not be tried again.
+    """
+
+    @wp.func
+    def out_of_patience(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), i: int):
+        detours = flags[DETOURS, i] + flags[CLAMPED, i]
+        flags[DETOURS, i] = detours
+        flags[CLAMPED, i] = 0
+        if detours <= flags[PATIENCE, i] or scalars[PORTION, i] <= real(LEAST):
+            return False
+        flags[STATUS, i] = wp.static(outcome.INDEFINITE)
+        return True
+
+    return out_of_patience
 
 
 @cache
@@ -113,6 +143,7 @@ def attempt_functions(real, midpoint: bool):
         flags[HALVINGS, i] = 0
         flags[STALE, i] = 0
         flags[CLAMPED, i] = 0
+        flags[DETOURS, i] = 0
         flags[UNBALANCED, i] = 0
         flags[DROWNED, i] = 0
         flags[ACTIVE, 0] = 1

@@ -23,6 +23,7 @@ from ddg_warp.kernels.islands import (
     TODO,
     TURN,
     WANTED,
+    patience_function,
 )
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
 from ddg_warp.kernels.search import PLACE, STRAIGHT
@@ -101,9 +102,10 @@ def sum_kernels(kind: ChainKind, real, linear):
 
 
 @cache
-def decide_kernels(kind: ChainKind, real, linear):
-    """Decisions of a rod from its partial sums: `judge` of an iterate, `take` of a direction."""
+def decide_kernels(kind: ChainKind, real, linear, exact: bool):
+    """Decisions of a rod from its partial sums: `judge` of an iterate, `take` of a direction; `exact` as of `pcg.repeat_kernel`."""
     balanced, decide = judge_functions(kind.twist, real)
+    out_of_patience = patience_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def judge(
@@ -160,6 +162,9 @@ def decide_kernels(kind: ChainKind, real, linear):
             flags[ITERATION, r] = flags[ITERATION, r] - 1
             scalars[STEP_LENGTH, r] = real(0.0)
             return
+        if wp.static(exact):
+            if out_of_patience(flags, scalars, r):
+                return
         flags[LOST, r] = flags[LOST, r] + flags[BAD, r]
         total = real(0.0)
         rotation = real(0.0)

@@ -96,7 +96,7 @@ def search_functions(kind: ChainKind, real, linear):
     dim, twist, angle, every = kind.dim, kind.twist, kind.block - 1, (1 << kind.dim) - 1
     V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
     _, reference_twist, _ = frames.functions(real)
-    step_of, _, put, carry = move_functions(kind, real, linear)
+    step_of, excess, put, carry = move_functions(kind, real, linear)
     along, *_ = gather_functions(kind, real)
     closed = kind.closed
 
@@ -114,13 +114,9 @@ def search_functions(kind: ChainKind, real, linear):
         r: int
 
     @wp.func
-    def edge(rod: Rod, j: int):
-        return rod.base[along(j + 1, rod.count), rod.r] - rod.base[along(j, rod.count), rod.r]
-
-    @wp.func
-    def step(rod: Rod, j: int):
-        here = step_of(rod.direction, along(j, rod.count), rod.r)
-        return (step_of(rod.direction, along(j + 1, rod.count), rod.r) - here) * rod.amount
+    def excess_at(rod: Rod, j: int):
+        here = along(j, rod.count)
+        return excess(rod.base, rod.direction, rod.amount, rod.onward, here, rod.count, rod.r)
 
     @wp.func
     def anchored(rod: Rod, j: int):
@@ -135,7 +131,7 @@ def search_functions(kind: ChainKind, real, linear):
     def put_node(rod: Rod, j: int, shift: V):
         put(rod.x, rod.base, rod.direction, rod.fixed, rod.amount, shift, along(j, rod.count), rod.r)
 
-    place_rod = place_function(dim, real, Rod, edge, step, anchored, added, put_node)
+    place_rod = place_function(dim, real, Rod, excess_at, anchored, added, put_node)
 
     @wp.func
     def place(

@@ -20,9 +20,11 @@ from ddg_warp.kernels.chain import ChainKind, gather_functions
 from ddg_warp.kernels.islands import (
     BENT,
     CAUTIOUS,
+    DETOURS,
     ITERATION,
     LOST,
     MOVED,
+    PATIENCE,
     PORTION,
     PROGRESS,
     RATE,
@@ -346,8 +348,9 @@ def advance_kernel(real):
         else:
             wp.atomic_add(work, 3, wp.int64(1))
             flags[RETRIES, r] = flags[RETRIES, r] + 1
-            # another start would lead to the same step, and its energy
-            if flags[CAUTIOUS, r] == 0 and result != wp.static(outcome.ENERGY_DRIFT):
+            # another start would lead to the same step, and its energy, or to the same valley
+            again = result != wp.static(outcome.ENERGY_DRIFT) and flags[DETOURS, r] <= flags[PATIENCE, r]
+            if again and flags[CAUTIOUS, r] == 0:
                 flags[CAUTIOUS, r] = 1
             else:
                 flags[CAUTIOUS, r] = 0

@@ -11,9 +11,9 @@ from functools import cache
 
 import warp as wp
 
-# Largest turn of an edge in a step that is still taken straight [rad], and stretches it by half its square; see
-# `ddg_warp.compile.precision.straight_turns` for the rods that turn theirs always.
-TURNED = 0.1
+TURNED = (
+    0.1  # largest turn of an edge that any step takes straight [rad]; see `ddg_warp.compile.precision.straight_turns`
+)
 LEAP = 0.5  # cosine of the largest turn of an edge that a predictor goes on with
 
 
@@ -56,22 +56,17 @@ def excess_function(dim: int, real):
 
 
 @cache
-def place_function(dim: int, real, Rod, edge, step, anchored, added, put):
+def place_function(dim: int, real, Rod, excess, anchored, added, put):
     """place(rod): puts the nodes of a rod where a step ends, with edges turned. What the storage gives:
 
     Args:
-        Rod: struct of a rod and a step of it; its fields `count`, `closed`, `anchor` and `onward` say how many nodes it has, 1 where it
-            is closed, its last anchored node or -1, and 1 where the step repeats the last one (see `excess_function`).
-        edge, step: (rod, j) -> the edge from node j on before the step, and what the step adds to it.
+        Rod: struct of a rod and a step of it; its fields `count`, `closed` and `anchor` say how many nodes it has, 1 where it is
+            closed, and its last anchored node or -1.
+        excess: (rod, j) -> that of the edge from node j on; see `excess_function`.
         anchored: (rod, j) -> whether a node is; added: (rod, j) -> what lies between its place now and where the straight step ends.
         put: (rod, j, shift) puts a node there, and by a shift beyond. Nodes may be counted on past the last one of a closed rod.
     """
     V = wp.types.vector(dim, real)
-    excess_of = excess_function(dim, real)
-
-    @wp.func
-    def excess(rod: Rod, j: int):
-        return excess_of(edge(rod, j), step(rod, j), rod.onward)
 
     @wp.func
     def place(rod: Rod):

@@ -46,7 +46,7 @@ def choose(name: str | None, device) -> Precision:
 FLOAT32_LIMIT = (
     0.02  # relative error of a direction that Newton still corrects quickly; beyond it a state in float32 is doubtful
 )
-STIFF = 1e3  # ratio of stiffnesses from which on edges are turned
+STIFF = 2e3  # ratio of stiffnesses from which on rods take turned steps and second derivatives
 FLOAT32_LOST = 0.1  # and beyond this one its motion is that of its rounding, not of the scene
 
 
@@ -85,10 +85,15 @@ def float32_error(stiffest, softest) -> np.ndarray:
 def straight_turns(errors: np.ndarray) -> np.ndarray:
     """Largest turn of an edge that a step takes straight [rad], of rods with such errors; 0: they always turn their edges.
 
-    A straight step stretches an edge that it turns by an angle a by a^2 / 2. Where stretching is STIFF times as stiff as what resists
-    the turn, or more, that is what the rod answers to first; see `kernels.turns`.
+    A straight step stretches an edge that it turns by an angle a by a^2 / 2. The force of that acts across the edge as a stiffness of
+    a^2 / 2 times that of stretching: at TURNED and STIFF, ten times as much as what resists the turn. See `kernels.turns`.
     """
-    return np.where(errors > float32_error(STIFF, 1.0), 0.0, TURNED)
+    return np.where(stiff(errors), 0.0, TURNED)
+
+
+def stiff(errors: np.ndarray) -> np.ndarray:
+    """Which rods with such errors are STIFF times as stiff along their edges as across, or more."""
+    return errors > float32_error(STIFF, 1.0)
 
 
 def rounding(model, s: float = np.inf) -> tuple[float, str]:

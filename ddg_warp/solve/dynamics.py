@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arguments
-from ddg_warp.compile.precision import FLOAT32_LIMIT, lost_in_rounding
+from ddg_warp.compile.precision import FLOAT32_LIMIT, lost_in_rounding, stiff
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels import outcome
 from ddg_warp.model import validate
@@ -185,27 +185,33 @@ class Integrator:
 
     def _weigh(self, dt: float, state: State) -> None:
         """What float32 does to steps of dt, where they are longer than those before: solve in float64, or refuse them."""
-        if dt <= self._longest or self.model.precision == "float64":
+        if dt <= self._longest:
             return
         s = self._solved(dt)
         if self.model.precision == "float32" and lost_in_rounding(self.model, s, state):
             for part in self._parts:
                 part.rounded = outcome.LOST_IN_ROUNDING
             self._graphs.clear()
-        if self.model.precision == "mixed":
-            self._promote(s)
+        self._adapt(s)
         self._longest = dt
 
-    def _promote(self, s: float) -> None:
-        """Solve in float64 where float32 factors would not be good enough for a step of s, from now on."""
+    def _adapt(self, s: float) -> None:
+        """From now on solve rods by what suits a step of s: float64 where float32 factors are not good enough; see `ChainStep`."""
         for i, chain in enumerate(self._chains):
-            if chain.newton.linear is wp.float32 and chain.float32_errors(s).max() > FLOAT32_LIMIT:
-                self._chains[i] = ChainStep(self, self.model, chain.group, wp.float64, counts_of=chain)
+            if changes := self._suited(chain, s):
+                self._chains[i] = ChainStep(self, self.model, chain.group, *changes, counts_of=chain)
                 self._graphs.clear()
-        net = self._net
-        if net is not None and net.newton.linear is wp.float32 and net.float32_errors(s).max() > FLOAT32_LIMIT:
-            self._net = NetStep(self, self.model, wp.float64, counts_of=net)
+        if self._net is not None and (changes := self._suited(self._net, s)):
+            self._net = NetStep(self, self.model, *changes, counts_of=self._net)
             self._graphs.clear()
+
+    def _suited(self, part, s: float) -> tuple | None:
+        """Scalar type of the linear algebra and whether rods are stiff over a solve of s, where they are not those of the part."""
+        errors, linear = part.float32_errors(s).max(), part.newton.linear
+        if self.model.precision == "mixed" and errors > FLOAT32_LIMIT:
+            linear = wp.float64
+        suited = linear, part.stiff or bool(stiff(errors))
+        return suited if suited != (part.newton.linear, part.stiff) else None
 
     def _own(self, state: State) -> int:
         for i, buffer in enumerate(self._buffers):

@@ -8,6 +8,7 @@ from ddg_warp.compile.precision import straight_turns
 from ddg_warp.errors import SolverError
 from ddg_warp.geometry import polyline
 from ddg_warp.kernels import outcome, step
+from ddg_warp.kernels.islands import DETOURS_ALLOWED, LEAST
 from ddg_warp.solve.motion import jump_between
 
 FOLDED = 1e-5  # how close to opposite [rad] edges that meet are called folded, in messages
@@ -23,7 +24,7 @@ class PartStep:
     Args:
         integrator, model: what steps what.
         newton: the solver, with its islands.
-        counts_of: the step that this one replaces, whose counts and state of the islands it takes over.
+        counts_of: the step that this one replaces, whose counts, name of rounding and state of the islands it takes over.
 
     Attributes:
         energy, motion, loads, field, drag: watch of the energy, motion of the supports, loads that change, the magnetic field, drag;
@@ -44,9 +45,11 @@ class PartStep:
         self.remaining = wp.zeros(1, dtype=int, device=device)
         self.damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
         if counts_of is not None:
-            self.tally, self.work = counts_of.tally, counts_of.work
+            self.tally, self.work, self.rounded = counts_of.tally, counts_of.work, counts_of.rounded
             for own, found in zip(newton.islands.arrays, counts_of.newton.islands.arrays, strict=True):
                 wp.copy(own, found)  # solvers hold rows of their own arrays
+        if 0.5 ** (integrator.retry_limit // 2) < LEAST:
+            newton.islands.patience.fill_(DETOURS_ALLOWED)
         self._start, self._advance = step.start_kernel(real), step.advance_kernel(real)
 
     @property

@@ -88,8 +88,9 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool):
             return
         before = scalars[MERIT, w]
         first = flags[ITERATION, w] == 0
-        expected = scalars[STEP_LENGTH, w] * scalars[DECREMENT, w]  # none of the step that renews frames
-        drowns = not first and expected > real(0.0) and expected <= real(10.0) * noise[w] * floor
+        # by a whole step: a short one says nothing, one that renews frames expects none
+        moved = not first and scalars[STEP_LENGTH, w] > real(0.0)
+        drowns = moved and scalars[DECREMENT, w] <= real(10.0) * noise[w] * floor
         what = decide(change[w], noise[w] * floor, square[w], worst[w], max_iterations, max_halvings, flags, scalars, w)
         if what == wp.static(STOP):
             return

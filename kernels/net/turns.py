@@ -6,47 +6,46 @@ import warp as wp
 
 from ddg_warp.kernels.islands import CAUTIOUS, RATE, STEP_LENGTH, TODO, TURN, TURNING
 from ddg_warp.kernels.search import PLACE
-from ddg_warp.kernels.turns import place_function
+from ddg_warp.kernels.turns import excess_function, place_function
 
 
 @cache
 def turn_kernels(real, linear):
-    """bend(...) finds predictors whose edges turn, aim(...) makes steps of them; place(...) turns the edges of one level's rods."""
+    """What turns edges: bend(...) finds predictors that have to, aim(...) makes steps of them; turn(...) turns edges, a thread each;
+    place(...) sums them along the rods of one level, a thread each, and put(...) takes their nodes there.
+    """
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
+    excess_of = excess_function(3, real)
 
     @wp.struct
     class Rod:
         q: wp.array(dtype=V)
         base: wp.array(dtype=V)
         direction: wp.array(dtype=H)
-        fixed: wp.array(dtype=wp.uint8)
         nodes: wp.array(dtype=int)
         anchored: wp.array(dtype=wp.uint8)
+        excess: wp.array2d(dtype=V)
+        shift: wp.array2d(dtype=V)
         amount: real
         first: int
-        shift: int  # of blocks of the world
+        world: int
+        blocks: int
         count: int
         closed: int
         anchor: int
-        onward: int
 
     @wp.func
     def place_of(rod: Rod, j: int):
         return rod.first + wp.where(j < rod.count, j, j - rod.count)
 
     @wp.func
-    def move_of(rod: Rod, block: int):
-        d = rod.direction[block]
-        return V(real(d[0]), real(d[1]), real(d[2])) * rod.amount
+    def move_of(direction: wp.array(dtype=H), block: int, amount: real):
+        d = direction[block]
+        return V(real(d[0]), real(d[1]), real(d[2])) * amount
 
     @wp.func
-    def edge(rod: Rod, j: int):
-        return rod.base[rod.nodes[place_of(rod, j + 1)] + rod.shift] - rod.base[rod.nodes[place_of(rod, j)] + rod.shift]
-
-    @wp.func
-    def step(rod: Rod, j: int):
-        ahead = move_of(rod, rod.nodes[place_of(rod, j + 1)] + rod.shift)
-        return ahead - move_of(rod, rod.nodes[place_of(rod, j)] + rod.shift)
+    def excess(rod: Rod, j: int):
+        return rod.excess[rod.world, place_of(rod, j)]
 
     @wp.func
     def anchored(rod: Rod, j: int):
@@ -54,20 +53,17 @@ def turn_kernels(real, linear):
 
     @wp.func
     def added(rod: Rod, j: int):
-        block = rod.nodes[place_of(rod, j)] + rod.shift
-        return rod.q[block] - rod.base[block] - move_of(rod, block)
+        p = place_of(rod, j)
+        if rod.anchored[p] == wp.uint8(0):
+            return rod.shift[rod.world, p]
+        block = rod.nodes[p] + rod.world * rod.blocks
+        return rod.q[block] - rod.base[block] - move_of(rod.direction, block, rod.amount)
 
     @wp.func
-    def put(rod: Rod, j: int, shift: V):
-        node = rod.nodes[place_of(rod, j)]
-        mask = int(rod.fixed[node])
-        free = shift
-        for d in range(3):
-            if ((mask >> d) & 1) == 1:
-                free[d] = real(0.0)
-        rod.q[node + rod.shift] = rod.base[node + rod.shift] + move_of(rod, node + rod.shift) + free
+    def shift_by(rod: Rod, j: int, shift: V):
+        rod.shift[rod.world, place_of(rod, j)] = shift
 
-    place_rod = place_function(3, real, Rod, edge, step, anchored, added, put)
+    place_rod = place_function(3, real, Rod, excess, anchored, added, shift_by)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def bend(
@@ -104,28 +100,51 @@ def turn_kernels(real, linear):
         w = i / blocks
         if flags[TODO, w] == wp.static(PLACE):
             d = q[i] - base[i]
-            if (int(fixed[i - w * blocks]) & 7) == 7 and flags[CAUTIOUS, w] == 0:
-                d = v[i] / scalars[RATE, w]  # where its rod expects a support; it is where it has to be
+            if (int(fixed[i - w * blocks]) & 7) == 7:
+                # where its rod expects a support, which is where it has to be
+                d = v[i] * wp.where(flags[CAUTIOUS, w] == 0, real(1.0) / scalars[RATE, w], real(0.0))
             direction_out[i] = H(linear(d[0]), linear(d[1]), linear(d[2]))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def turn(
+        nodes: wp.array(dtype=int),
+        ahead: wp.array(dtype=int),
+        base: wp.array(dtype=V),
+        direction: wp.array(dtype=H),
+        step_length: wp.array(dtype=real),
+        todo: wp.array(dtype=int),
+        onward: int,
+        blocks: int,
+        excess_out: wp.array2d(dtype=V),
+    ):
+        """Excess of the edge from every place to the one `ahead` of it, in worlds that turn their edges."""
+        p, w = wp.tid()
+        if todo[w] != wp.static(PLACE):
+            return
+        a = nodes[p] + w * blocks
+        b = ahead[p] + w * blocks
+        amount = step_length[w]
+        step = move_of(direction, b, amount) - move_of(direction, a, amount)
+        excess_out[w, p] = excess_of(base[b] - base[a], step, onward)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def place(
         rods: wp.array(dtype=int),
         start: wp.array(dtype=int),
         nodes: wp.array(dtype=int),
-        held: wp.array(dtype=wp.uint8),
+        anchored: wp.array(dtype=wp.uint8),
         anchor: wp.array(dtype=int),
         loops: wp.array(dtype=int),
+        q: wp.array(dtype=V),
         base: wp.array(dtype=V),
         direction: wp.array(dtype=H),
-        fixed: wp.array(dtype=wp.uint8),
         step_length: wp.array(dtype=real),
         todo: wp.array(dtype=int),
-        onward: int,
         blocks: int,
-        q: wp.array(dtype=V),
+        excess: wp.array2d(dtype=V),
+        shift_out: wp.array2d(dtype=V),
     ):
-        """Nodes of the `rods` of one level, which a straight step has moved already, in worlds that turn their edges."""
+        """What nodes of the `rods` of one level have to move, once a straight step has been taken, beyond it."""
         i, w = wp.tid()
         if todo[w] != wp.static(PLACE):
             return
@@ -134,16 +153,43 @@ def turn_kernels(real, linear):
         rod.q = q
         rod.base = base
         rod.direction = direction
-        rod.fixed = fixed
         rod.nodes = nodes
-        rod.anchored = held
+        rod.anchored = anchored
+        rod.excess = excess
+        rod.shift = shift_out
         rod.amount = step_length[w]
         rod.first = start[r]
-        rod.shift = w * blocks
+        rod.world = w
+        rod.blocks = blocks
         rod.count = start[r + 1] - start[r]
         rod.closed = loops[r]
         rod.anchor = anchor[r]
-        rod.onward = onward
         place_rod(rod)
 
-    return bend, aim, place
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def put(
+        places: wp.array(dtype=int),
+        nodes: wp.array(dtype=int),
+        fixed: wp.array(dtype=wp.uint8),
+        shift: wp.array2d(dtype=V),
+        base: wp.array(dtype=V),
+        direction: wp.array(dtype=H),
+        step_length: wp.array(dtype=real),
+        todo: wp.array(dtype=int),
+        blocks: int,
+        q: wp.array(dtype=V),
+    ):
+        """The nodes at `places`, of which none is an anchor."""
+        i, w = wp.tid()
+        if todo[w] != wp.static(PLACE):
+            return
+        p = places[i]
+        mask = int(fixed[nodes[p]])
+        free = shift[w, p]
+        for d in range(3):
+            if ((mask >> d) & 1) == 1:
+                free[d] = real(0.0)
+        block = nodes[p] + w * blocks
+        q[block] = base[block] + move_of(direction, block, step_length[w]) + free
+
+    return bend, aim, turn, place, put

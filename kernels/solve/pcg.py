@@ -11,7 +11,18 @@ import warp as wp
 
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.chain import ChainKind
-from ddg_warp.kernels.islands import CLAMPED, DECREMENT, ITERATION, LOST, SLOT, STATUS, STEP_LENGTH, TURN, WANTED
+from ddg_warp.kernels.islands import (
+    CLAMPED,
+    DECREMENT,
+    ITERATION,
+    LOST,
+    SLOT,
+    STATUS,
+    STEP_LENGTH,
+    TURN,
+    WANTED,
+    patience_function,
+)
 from ddg_warp.kernels.matrix.block_band import block_functions, product_function, substitute_function
 from ddg_warp.kernels.search import search_functions
 from ddg_warp.kernels.solve import pivot
@@ -172,13 +183,15 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
 
 
 @cache
-def repeat_kernel(real, fails: bool):
+def repeat_kernel(real, fails: bool, exact: bool = True):
     """Where the exact Hessian is indefinite: end the solve (`fails`), or undo the acceptance and ask for the iterate again.
 
     `negative` counts lost pivots and negative curvatures of this iteration; `clamped` then leaves the geometric stiffness and
     what compression takes away out of the next matrix, and the line search, which has the same numbers, accepts again.
-    `done` says that the direction has been found.
+    `done` says that the direction has been found; `exact` that the matrix is the exact Hessian, unless it is indefinite.
     """
+
+    out_of_patience = patience_function(real)
 
     @wp.kernel(module="unique", enable_backward=False)
     def repeat(done: int, flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), negative: wp.array(dtype=int)):
@@ -197,6 +210,9 @@ def repeat_kernel(real, fails: bool):
         elif done != 0:
             flags[LOST, r] = flags[LOST, r] + negative[r]
             negative[r] = 0
+            if wp.static(exact):
+                if out_of_patience(flags, scalars, r):
+                    flags[WANTED, r] = 0
             flags[CLAMPED, r] = 0
 
     return repeat

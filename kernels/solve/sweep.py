@@ -34,6 +34,7 @@ from ddg_warp.kernels.islands import (
     STEP_LENGTH,
     TODO,
     TURN,
+    patience_function,
 )
 from ddg_warp.kernels.judge import judge_functions
 from ddg_warp.kernels.matrix import geometric
@@ -50,6 +51,7 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
     with `clamped[r]` raised: without what compression takes away, and, for this iteration, without G; or the solve `fails`.
     """
     balanced, _ = judge_functions(kind.twist, real)
+    out_of_patience = patience_function(real)
     dim, nb, twist, span = kind.dim, kind.block, kind.twist, kind.span
     window, nb2, drag, Inertia = kind.window, kind.block**2, kind.drag, inertia_type(kind, real)
     V, H, M = wp.types.vector(dim, real), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
@@ -355,14 +357,15 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
         if flags[ITERATION, r] > max_iterations:
             flags[STATUS, r] = wp.static(outcome.MAX_ITERATIONS)
             return
+        if wp.static(exact):
+            if out_of_patience(flags, scalars, r):
+                return
         flags[ACTIVE, 0] = 1
         flags[SLOT, r] = 1 - accepted_slot
         scalars[DECREMENT, r] = newton
         flags[HALVINGS, r] = 0
         flags[PLACED, r] = 0
         flags[LOST, r] = flags[LOST, r] + lost_here
-        if wp.static(exact):
-            flags[CLAMPED, r] = 0
         if wp.static(twist):
             if flags[STALE, r] != 0:
                 # angles mean something else in new frames: take no step, and ask for a direction there

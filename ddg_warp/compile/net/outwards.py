@@ -20,6 +20,13 @@ class Outwards:
     anchored: np.ndarray
     levels: list[np.ndarray]
 
+    def ahead(self, closed: np.ndarray) -> np.ndarray:
+        """The place of the next node along the rod (P,): past the end that of the first, of an open rod its own; `closed` (R,)."""
+        first, end = self.start[:-1], self.start[1:] - 1
+        places = np.arange(1, len(self.nodes) + 1)
+        places[end] = np.where(closed, first, end)
+        return places
+
     def last_anchors(self) -> np.ndarray:
         """The last anchored node of every rod (R,), -1 where none is."""
         place = np.where(self.anchored, np.arange(len(self.nodes)), -1)

@@ -34,11 +34,13 @@ class NewtonOptions:
         psd: the matrix. "gauss_newton": without second derivatives of bending and twist, never indefinite but for
             compression, which is left out where a pivot is lost. "progressive": from the third iteration on the exact Hessian,
             and in iterations where it is not positive definite Gauss-Newton without compression: for curved, twisted or
-            compressed rods and long steps, where Gauss-Newton takes many iterations. "project": the exact one with every
-            element made positive semi-definite by its eigenvalues, at twenty times the cost of an iteration. "none": the
+            compressed rods and long steps, where Gauss-Newton takes many iterations. Where many iterations are such, a time step is
+            tried again with a shorter one (outcome `indefinite`; see `kernels.islands.patience_function`). "project": the exact one
+            with every element made positive semi-definite by its eigenvalues, at twenty times the cost of an iteration. "none": the
             exact one; where it is indefinite the solve ends with the outcome `indefinite`, and a time step is tried again
-            with a shorter one. "auto": "progressive" for rods that are curved or twisted at rest, on their own or in nets, else
-            "gauss_newton". Nets take all but "project". Their exact Hessian is that of rods and rigid joints; second derivatives of
+            with a shorter one. "auto": "progressive" for rods that are curved or twisted at rest, or stiff over a time step
+            (`compile.precision.stiff`), on their own or in nets, else "gauss_newton". Nets take all but
+            "project". Their exact Hessian is that of rods and rigid joints; second derivatives of
             shells' bending, of glue and of magnets are left out, which "none" refuses. It is indefinite where a pivot is lost, or
             conjugate gradients meet negative curvature; by "gauss_newton" nets go on with the direction found so far, and leave
             compression out of the next matrix.

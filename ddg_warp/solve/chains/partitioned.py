@@ -36,7 +36,7 @@ class PartitionedNewton(AssembledNewton):
         self.new_frame = arrays.allocate(self.frame.shape, real, device)
         self.reduction = CyclicReduction(kind.block, group.nodes, columns, self.linear, device)
         self._weigh, self._gauge = parallel_search.sum_kernels(kind, real, self.linear)
-        self._judge, self._take = parallel_search.decide_kernels(kind, real, self.linear)
+        self._judge, self._take = parallel_search.decide_kernels(kind, real, self.linear, self.exact)
         self._moves = parallel_moves.move_kernels(kind, real, self.linear)
         self._aim, self._renew = parallel_moves.predict_kernels(kind, real, self.linear)
 

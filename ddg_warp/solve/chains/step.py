@@ -1,5 +1,7 @@
 """A time step of a group of rods on their own: predictor, prescribed motion and loads, Newton, end update. See `kernels.step`."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from ddg_warp import arrays
@@ -20,10 +22,17 @@ NET_ONLY = ("multilevel", "chain_multilevel")  # preconditioners of nets
 
 
 class ChainStep(PartStep):
-    """Steps the rods of a group in all worlds, each an island."""
+    """Steps the rods of a group in all worlds, each an island.
 
-    def __init__(self, integrator, model, group, precision=None, counts_of=None):
-        super().__init__(integrator, model, _newton(model, group, integrator, precision), counts_of)
+    Args:
+        precision: scalar type of the linear algebra; that of the model by default.
+        stiff: whether a rod is; see `compile.precision.stiff`. The psd mode "auto" then takes second derivatives.
+        counts_of: the step that this one replaces; see `PartStep`.
+    """
+
+    def __init__(self, integrator, model, group, precision=None, stiff=False, counts_of=None):
+        super().__init__(integrator, model, _newton(model, group, integrator, precision, stiff), counts_of)
+        self.stiff = stiff
         self.group, self.index = group, model.groups.index(group)
         kind, real = group.kind, model.types.real
         self._begin = step.begin_kernel(kind, real, self.midpoint)
@@ -114,10 +123,13 @@ class ChainStep(PartStep):
         return self.dead_end(x, int(host.first[rod]), kind) or self.advice(state)
 
 
-def _newton(model, group, integrator, precision) -> ChainNewton:
+def _newton(model, group, integrator, precision, stiff: bool) -> ChainNewton:
     """The solver of a group that the integrator's `linear` asks for."""
     linear = automatic(group) if integrator.linear in ("auto", *NET_ONLY) else integrator.linear
-    given = (model, group, integrator.options)
+    options = integrator.options
+    if options.psd == "auto" and stiff and integrator.solver == "newton" and linear in (*DIRECT, "chain"):
+        options = replace(options, psd="progressive")
+    given = (model, group, options)
     last = (precision, integrator.scheme == "implicit_midpoint")
     if integrator.solver == "projective":
         return ProjectiveNewton(*given, *last)

@@ -127,7 +127,7 @@ class NetNewton:
         self._direct = self.chains is not None and self.chains.exact
         fails = self.psd == "none"
         repeats = not reuse and (fails or any(exact) or self._direct)
-        self._repeat = pcg.repeat_kernel(self.real, fails) if repeats else None
+        self._repeat = pcg.repeat_kernel(self.real, fails, any(exact)) if repeats else None
         self.negative = make(worlds, int)
         self._assembly = Assembly(
             net, self.system, self.parts, self.real, self.linear, self.exact_from, self.local, drag

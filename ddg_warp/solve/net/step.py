@@ -21,9 +21,9 @@ from ddg_warp.solve.tangent import Tangent
 
 
 class NetStep(PartStep):
-    """Steps a model's net in all worlds, each an island."""
+    """Steps a model's net in all worlds, each an island. Arguments as of `ChainStep`."""
 
-    def __init__(self, integrator, model, linear=None, counts_of=None):
+    def __init__(self, integrator, model, precision=None, stiff=False, counts_of=None):
         self.net = model.net
         host, real = model.net.host, model.types.real
         options = integrator.options
@@ -45,8 +45,11 @@ class NetStep(PartStep):
             )
         preconditioner = net_preconditioner(model.net) if integrator.linear == "auto" else integrator.linear
         reuse = integrator.solver == "projective"
-        solver = NetNewton(model, options, preconditioner, linear, host.drag is not None, reuse)
+        if options.psd == "auto" and stiff and not reuse:
+            options = replace(options, psd="progressive")
+        solver = NetNewton(model, options, preconditioner, precision, host.drag is not None, reuse)
         super().__init__(integrator, model, solver, counts_of)
+        self.stiff = stiff
         if counts_of is not None:
             self.newton.pcg_work = counts_of.newton.pcg_work
         self._begin, self._finish = newton.step_kernels(real, self.midpoint, arrays.serial(model.wp_device))

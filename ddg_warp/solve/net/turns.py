@@ -18,20 +18,24 @@ class Turns:
         def put(values):
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
 
-        self._bend, self._aim, self._place = turn_kernels(newton.real, newton.linear)
-        self._levels = [put(level) for level in plan.levels]
-        self._rods = [
-            *map(put, (plan.start, plan.nodes)),
-            arrays.upload(plan.anchored.astype(np.uint8), wp.uint8, device),
-            put(plan.last_anchors()),
-            put([rod.piece.kind.closed for rod in host.rods]),
-        ]
+        self._bend, self._aim, *self._kernels = turn_kernels(newton.real, newton.linear)
+        loops = np.array([rod.piece.kind.closed for rod in host.rods], int)
+        free = np.flatnonzero(~plan.anchored)
+        rod = np.repeat(np.arange(len(loops)), np.diff(plan.start))
+        self._levels = [(put(level), put(free[np.isin(rod[free], level)])) for level in plan.levels]
+        self._nodes, self._ahead = put(plan.nodes), put(plan.nodes[plan.ahead(loops)])
+        self._anchored = arrays.upload(plan.anchored.astype(np.uint8), wp.uint8, device)
+        self._rods = [put(plan.start), self._nodes, self._anchored, put(plan.last_anchors()), put(loops)]
         self._ends = put(np.concatenate([rod.ends for rod in host.rods]))
+        vector = wp.types.vector(3, newton.real)
+        self._excess, self._shift = (
+            wp.zeros((self.net.worlds, len(plan.nodes)), dtype=vector, device=device) for _ in range(2)
+        )
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [self._bend, self._aim, self._place]
+        return [self._bend, self._aim, *self._kernels]
 
     def predict(self, v: wp.array, onward: bool) -> None:
         """Turn the edges of predictors by velocities v that turn them far, instead of stretching them.
@@ -50,6 +54,7 @@ class Turns:
         inputs = [newton.q, newton.base, v, newton.held, *newton.islands.arrays, net.blocks]
         wp.launch(self._aim, newton.all, inputs, [newton.direction], device=net.device)
         self.place(onward)
+        newton.direction.zero_()  # solvers leave out what is held
 
     def turn(self, state) -> None:
         """Place the nodes of rods whose edges turn, and renew the frames that `state` lags where that is to be done."""
@@ -60,8 +65,12 @@ class Turns:
     def place(self, onward: bool = False) -> None:
         """Nodes of rods, once the straight step has moved everything; `onward`: see `predict`."""
         newton, net = self.newton, self.net
-        islands = newton.islands
-        for level in self._levels:
-            inputs = [level, *self._rods, newton.base, newton.direction, newton.held]
-            inputs += [islands.step_length, islands.todo, int(onward), net.blocks]
-            wp.launch(self._place, (len(level), net.worlds), inputs, [newton.q], device=net.device)
+        turn, place, put = self._kernels
+        moved = [newton.base, newton.direction, newton.islands.step_length, newton.islands.todo]
+        inputs = [self._nodes, self._ahead, *moved, int(onward), net.blocks]
+        wp.launch(turn, (len(self._nodes), net.worlds), inputs, [self._excess], device=net.device)
+        for rods, places in self._levels:
+            inputs = [rods, *self._rods, newton.q, *moved, net.blocks, self._excess]
+            wp.launch(place, (len(rods), net.worlds), inputs, [self._shift], device=net.device)
+            inputs = [places, self._nodes, newton.held, self._shift, *moved, net.blocks]
+            wp.launch(put, (len(places), net.worlds), inputs, [newton.q], device=net.device)
