@@ -40,7 +40,7 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool, 
     """evaluate_at of one term: writes its factor rows; returns its energy, derivative with respect to the window, stiffness.
 
     With `curved`, a term that spans two edges (a rod has one) also writes its geometric stiffness. With `split`, rows of edges have
-    what the matrix carries of their stiffness, and `slack` the rest: see `kernels.solve.tension`.
+    what the matrix carries of their stiffness, and factors end with their slack: see `kernels.solve.tension`.
     """
     term = kind.terms[index]
     W, S13 = wp.types.vector(kind.window, real), wp.types.vector(13, real)
@@ -103,7 +103,6 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool, 
         carried: real,
         factor: wp.array3d(dtype=linear),
         geometric: wp.array3d(dtype=linear),
-        slack: wp.array2d(dtype=linear),
         k: int,
         r: int,
     ):
@@ -120,8 +119,8 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool, 
             if not frozen:
                 factor[wp.static(tension_row), k, r] = linear(c)
         root = root_of(e, p, shift) * wp.sqrt(w)
-        part = real(1.0)
         if wp.static(splits):
+            part = real(1.0)
             whole = real(0.0)
             for i in range(wp.static(dim)):
                 whole += jacobian[0, i] * jacobian[0, i]
@@ -130,11 +129,14 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool, 
             if whole > carried:
                 part = wp.sqrt(carried / whole)
                 rest = carried / (whole - carried)
-            slack[k, r] = linear(rest)
+            factor[wp.static(kind.factor_rows), k, r] = linear(rest)
         if not frozen:
             for m in range(wp.static(n)):
                 for i in range(wp.static(size)):
-                    factor[wp.static(row) + m * wp.static(size) + i, k, r] = linear(part * row_of(root, jacobian, m, i))
+                    entry = row_of(root, jacobian, m, i)
+                    if wp.static(splits):
+                        entry *= part
+                    factor[wp.static(row) + m * wp.static(size) + i, k, r] = linear(entry)
         if wp.static(bends):
             if exact:
                 second = curvature_of(q, short(s), w, slope)
@@ -197,7 +199,6 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
         reuse: int,
         factor_out: wp.array3d(dtype=linear),
         geometric_out: wp.array3d(dtype=linear),
-        slack_out: wp.array2d(dtype=linear),
         gradient_out: wp.array3d(dtype=real),
         energy_out: wp.array3d(dtype=real),
         stiffness_out: wp.array2d(dtype=linear),
@@ -233,7 +234,6 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
                     carried,
                     factor_out,
                     geometric_out,
-                    slack_out,
                     k,
                     r,
                 )
@@ -254,7 +254,6 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
                     carried,
                     factor_out,
                     geometric_out,
-                    slack_out,
                     k,
                     r,
                 )

@@ -108,7 +108,7 @@ class Chain(Sample):
         """F^T F + c, or the `exact` matrix, on the windows (window, window, n, R), window gradient and energies of the fused kernel."""
         kind, shape, real = self.kind, self.shape, self.real
         dim, window = kind.dim, kind.window
-        sizes = ((kind.factor_rows,), (kind.geometric_rows,), (), (window,), (2,), ())
+        sizes = ((kind.factor_rows,), (kind.geometric_rows,), (window,), (2,), ())
         out = [wp.zeros((*size, *shape), dtype=real, device=self.device) for size in sizes]
         kernel = evaluate.evaluate_kernel(kind, real, real, 0 if exact else None)
         inputs, islands = self._inputs(real), Islands(2, real, self.device)
@@ -116,7 +116,7 @@ class Chain(Sample):
         inputs[4:5] = islands.arrays
         clamped = wp.full(2, 0 if exact else 1, dtype=int, device=self.device)
         wp.launch(kernel, shape, [*inputs, clamped, 0], out, device=self.device, block_dim=128)  # it is bound to that
-        rows, geometric, _, force, energy = (array.numpy().astype(float) for array in out[:5])
+        rows, geometric, force, energy = (array.numpy().astype(float) for array in out[:4])
         edge_row, tension_row = kind.vertex_strains * window, kind.factor_rows - kind.tensions
         vertex = rows[:edge_row].reshape(kind.vertex_strains, window, *shape)
         edge = rows[edge_row:tension_row].reshape(kind.edge_strains, dim, *shape)

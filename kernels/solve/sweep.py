@@ -52,7 +52,7 @@ def sweep_kernel(
 
     From iteration `exact_from` on, the matrix has the geometric stiffness G. Where a pivot is lost, the same iterate comes again
     with `clamped[r]` raised: without what compression takes away, and, for this iteration, without G; or the solve `fails`.
-    With `split`, edges have `slack`, and directions end with what edges lengthen by: see `kernels.solve.tension`.
+    With `split`, factors end with the slack of edges, and directions with what edges lengthen by: see `kernels.solve.tension`.
     """
     balanced, _ = judge_functions(kind.twist, real)
     out_of_patience = patience_function(real)
@@ -61,7 +61,7 @@ def sweep_kernel(
     V, H, M = wp.types.vector(dim, real), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     factor_block, lower, upper, lower_vector, upper_vector, congruence = pivot.functions(nb, linear)
     *_, shorter = search_functions(kind, real, linear)
-    angle, rows = nb - 1, kind.factor_rows
+    angle, rows = nb - 1, kind.factor_rows + split
     # in float64 twice as many registers are more than a GPU has: 10 % slower on an H200
     ahead = kind.serial or linear == wp.float32
     beyond = 2 * nb2 + nb  # of what is kept, where that of tensions begins
@@ -70,6 +70,7 @@ def sweep_kernel(
     Pending, eliminate = tension.functions(nb, linear)
     vertex_rows, edge_rows, tensions = kind.vertex_strains, kind.edge_strains, kind.tensions
     exact, begin = exact_from is not None, exact_from or 0
+    slack_row = kind.factor_rows
     aa, ab, ac, bb, bc, cc = geometric.block_functions(kind, linear)
 
     @wp.func
@@ -158,7 +159,6 @@ def sweep_kernel(
     def sweep(
         F: wp.array3d(dtype=linear),
         G: wp.array3d(dtype=linear),
-        slack: wp.array2d(dtype=linear),
         # balance
         right: wp.array3d(dtype=linear),
         energy_change: wp.array2d(dtype=real),
@@ -204,8 +204,9 @@ def sweep_kernel(
         noise = real(0.0)  # rounding of `change`
         newton = real(0.0)  # r^T H^-1 r
         lost_here = int(0)
-        pending = Pending()
-        pending.pivot = linear(1.0)
+        if wp.static(split):
+            pending = Pending()
+            pending.pivot = linear(1.0)
         # What the next node has is read before this one is dealt with: a thread that walks waits for memory most of the time.
         f = rows_of(F, 0, r)
         rj = right_of(right, 0, r)
@@ -282,8 +283,10 @@ def sweep_kernel(
             if not first:
                 change += more
                 noise += real(rounding)
-            free = H(linear(1.0))
+            if wp.static(split):
+                unmasked = H(linear(1.0))
             if mask != wp.uint8(0):
+                free = H()
                 for d in range(wp.static(nb)):
                     free[d] = linear(1 - ((int(mask) >> d) & 1))
                 rows = wp.outer(free, H(linear(1.0)))
@@ -291,6 +294,8 @@ def sweep_kernel(
                 Wab = wp.cw_mul(Wab, rows)
                 Wac = wp.cw_mul(Wac, rows)
                 ra = wp.cw_mul(ra, free)
+                if wp.static(split):
+                    unmasked = free
             # columns of held dofs ahead stay: their solution is zero, and what they gather is masked with their rows
 
             L, inverse, bad = factor_block(Waa)
@@ -298,14 +303,19 @@ def sweep_kernel(
             z = lower_vector(L, rj + ra)
             newton += real(wp.dot(wp.cw_mul(z, inverse), z))
             y = upper_vector(L, inverse, z)
+            if wp.static(not split):
+                for d in range(wp.static(nb)):
+                    Y[wp.static(2 * nb2) + d, j, r] = y[d]
             Zb = lower(L, Wab)
-            Yb = upper(L, inverse, Zb)
+            if wp.static(not split):
+                store(Y, 0, j, r, upper(L, inverse, Zb))
             zd = wp.cw_mul(z, inverse)
             ra = rb - zd * Zb
             Waa = Wbb - congruence(Zb, inverse, Zb)
             if wp.static(span == 2):
                 Zc = lower(L, Wac)
-                Yc = upper(L, inverse, Zc)
+                if wp.static(not split):
+                    store(Y, wp.static(nb2), j, r, upper(L, inverse, Zc))
                 rb = -(zd * Zc)
                 Wab = Wbc - congruence(Zb, inverse, Zc)
                 Wbb = Wcc - congruence(Zc, inverse, Zc)
@@ -314,8 +324,8 @@ def sweep_kernel(
                     loose = linear(0.0)
                     if j < n - 1:
                         edge = part(f, F, wp.static(vertex_rows * window), j, r)
-                        loose = slack[j, r]
-                    out = eliminate(L, inverse, z, Zb, Zc, pending, edge, loose, free)
+                        loose = entry(f, F, wp.static(slack_row), j, r)
+                    out = eliminate(L, inverse, z, Zb, Zc, pending, edge, loose, unmasked)
                     pending = out.pending
                     near = out.b * out.weight
                     far = out.c * out.weight
@@ -327,23 +337,20 @@ def sweep_kernel(
                     Wab += wp.outer(near, out.c)
                     Wbb += wp.outer(far, out.c)
                     y += out.behind * lag
-                    Yb += wp.outer(out.behind, near)
-                    Yc += wp.outer(out.behind, far)
+                    store(Y, 0, j, r, upper(L, inverse, Zb) + wp.outer(out.behind, near))
+                    store(Y, wp.static(nb2), j, r, upper(L, inverse, Zc) + wp.outer(out.behind, far))
                     q = out.coupling * out.weight
                     ahead_too = out.ahead + out.behind * q
                     for d in range(wp.static(nb)):
+                        Y[wp.static(2 * nb2) + d, j, r] = y[d]
                         Y[wp.static(beyond) + d, j, r] = ahead_too[d]
                         Y[wp.static(beyond + nb) + d, j, r] = near[d]
                         Y[wp.static(beyond + 2 * nb) + d, j, r] = far[d]
                     Y[wp.static(beyond + 3 * nb), j, r] = q
                     Y[wp.static(beyond + 3 * nb + 1), j, r] = lag
-                store(Y, wp.static(nb2), j, r, Yc)
             else:
                 Wab = M()
                 Wbb = M()
-            store(Y, 0, j, r, Yb)
-            for d in range(wp.static(nb)):
-                Y[wp.static(2 * nb2) + d, j, r] = y[d]
             Wac = M()
             Wbc = M()
             Wcc = M()
@@ -459,8 +466,9 @@ def sweep_kernel(
                 span_sq = wp.length_sq(x_ahead - here)
                 rotation = wp.max(rotation, wp.length_sq(bent) / span_sq)
                 if wp.static(split):
-                    longer = slack[j, r] * pull * per_root
-                    if slack[j, r] == linear(0.0):
+                    slack = F[wp.static(slack_row), j, r]
+                    longer = slack * pull * per_root
+                    if slack == linear(0.0):
                         longer = linear(wp.dot(bent, x_ahead - here) / wp.sqrt(span_sq))
                     direction[wp.static(nb), j, r] = longer
             x_ahead = here

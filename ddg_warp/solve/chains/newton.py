@@ -97,7 +97,7 @@ class ChainNewton:
         if kind.drag:
             self.mass = make(*nodes, dtype=chain.inertia_type(kind, self.real))
             self.rotary = make(*twisted)
-        self.factor = make(kind.factor_rows, *nodes, dtype=self.linear)
+        self.factor = make(kind.factor_rows + split, *nodes, dtype=self.linear)
         self.gradient = make(kind.window, *nodes)
         self.energy = make(2, *nodes)
         self.stiffness = make(*nodes, dtype=self.linear)
@@ -114,7 +114,6 @@ class ChainNewton:
         rows = kind.geometric_rows if self.exact else 1
         self.exact_from = (EARLY if self.psd == "progressive" else 0) if self.exact else None
         self.geometric = make(rows, *(nodes if self.exact else (1, 1)), dtype=self.linear)
-        self.slack = make(*(nodes if split else (1, 1)), dtype=self.linear)
         self._project = None
         if self.psd == "project" and self.exact:
             self.without_compression = wp.full(columns, 1, dtype=int, device=device)
@@ -182,7 +181,7 @@ class ChainNewton:
             group.element_threads,
             [self.x, self.theta, self.frame, last, *self.islands.arrays, *group.parameters.arrays, group.count]
             + [self.without_compression, int(self.reuse)],
-            [self.factor, self.geometric, self.slack, self.gradient, self.energy, self.stiffness],
+            [self.factor, self.geometric, self.gradient, self.energy, self.stiffness],
             device=self.device,
             block_dim=128,
         )
@@ -215,7 +214,7 @@ class ChainNewton:
         wp.launch(
             self._sweep,
             group.columns,
-            [self.factor, self.geometric, self.slack, self.right, self.energy_change, self.energy_noise, group.count]
+            [self.factor, self.geometric, self.right, self.energy_change, self.energy_noise, group.count]
             + [self.mass, self.rotary, *self.islands.arrays, group.fixed]
             + [options.floor_factor * self.eps, options.rotation_cap]
             + [options.max_iterations, options.max_halvings]
