@@ -147,13 +147,13 @@ def sweep_kernel(
                 v[i] = v[i] + left_at(left, Y, row + i * wp.static(nb) + j, k, r) * e[j]
         return v
 
-    # what exceeds 255 registers goes to shared memory: 8 % on an H200
+    # what exceeds 255 registers goes to shared memory: 8 % on an H200; with tensions it is too much, and costs 12 %
     @wp.kernel(
         module="unique",
         enable_backward=False,
         grid_stride=False,
         launch_bounds=128,
-        enable_cuda_smem_spilling=True,
+        enable_cuda_smem_spilling=not split,
         module_options=CPU_OPTIONS,
     )
     def sweep(
