@@ -6,7 +6,7 @@ import warp as wp
 
 from ddg_warp.kernels.chain import ChainKind, gather_functions
 from ddg_warp.kernels.element import term_functions
-from ddg_warp.kernels.islands import ACTIVE, ITERATION, RATE, SLOT, STALE, STATUS
+from ddg_warp.kernels.islands import ACTIVE, CARRIED, ITERATION, RATE, SLOT, STALE, STATUS
 from ddg_warp.kernels.measures.turning import packed_index
 from ddg_warp.kernels.terms import Term
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
@@ -36,10 +36,11 @@ def left_out_function(term: Term, real):
 
 
 @cache
-def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool):
+def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool, split: bool):
     """evaluate_at of one term: writes its factor rows; returns its energy, derivative with respect to the window, stiffness.
 
-    With `curved`, a term that spans two edges (a rod has one) also writes its geometric stiffness.
+    With `curved`, a term that spans two edges (a rod has one) also writes its geometric stiffness. With `split`, rows of edges have
+    what the matrix carries of their stiffness, and factors end with their slack: see `kernels.solve.tension`.
     """
     term = kind.terms[index]
     W, S13 = wp.types.vector(kind.window, real), wp.types.vector(13, real)
@@ -50,6 +51,7 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool):
     _, row, tension_row, _ = kind.places()[index]
     E = wp.types.vector(n, real)
     has_tension, dim = term.measure.tensions > 0, kind.dim
+    splits = split and has_tension
     bends = curved and term.measure.span == 2
     left_out = left_out_function(term, real)
     dofs = [*range(dim * term.measure.span), *(dim * kind.span + i for i in range(term.measure.angles))]
@@ -98,6 +100,7 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool):
         clamped: int,
         frozen: bool,
         exact: bool,
+        carried: real,
         factor: wp.array3d(dtype=linear),
         geometric: wp.array3d(dtype=linear),
         k: int,
@@ -116,10 +119,24 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool):
             if not frozen:
                 factor[wp.static(tension_row), k, r] = linear(c)
         root = root_of(e, p, shift) * wp.sqrt(w)
+        if wp.static(splits):
+            part = real(1.0)
+            whole = real(0.0)
+            for i in range(wp.static(dim)):
+                whole += jacobian[0, i] * jacobian[0, i]
+            whole *= root[0] * root[0]
+            rest = real(0.0)
+            if whole > carried:
+                part = wp.sqrt(carried / whole)
+                rest = carried / (whole - carried)
+            factor[wp.static(kind.factor_rows), k, r] = linear(rest)
         if not frozen:
             for m in range(wp.static(n)):
                 for i in range(wp.static(size)):
-                    factor[wp.static(row) + m * wp.static(size) + i, k, r] = linear(row_of(root, jacobian, m, i))
+                    entry = row_of(root, jacobian, m, i)
+                    if wp.static(splits):
+                        entry *= part
+                    factor[wp.static(row) + m * wp.static(size) + i, k, r] = linear(entry)
         if wp.static(bends):
             if exact:
                 second = curvature_of(q, short(s), w, slope)
@@ -131,8 +148,8 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool):
         for m in range(wp.static(n)):
             edge = real(0.0)
             for i in range(wp.static(dim)):
-                part = edge_of(root, jacobian, m, i)
-                edge += part * part
+                along = edge_of(root, jacobian, m, i)
+                edge += along * along
             stiffness = wp.max(stiffness, scale_of(root, m) * edge)
         return w * energy_of(e, p), spread((slope * w) * jacobian), stiffness
 
@@ -140,7 +157,7 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool):
 
 
 @cache
-def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None):
+def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, split: bool = False):
     """The fused kernel of a Newton iteration: energy, gradient on the window and Gauss-Newton factor of all terms.
 
     From iteration `exact_from` on also the geometric stiffness of terms that span two edges: the factor, compression included,
@@ -159,7 +176,7 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
     # whenever it is defined, compiled before or not, 0.3 s each. A function that calls itself costs a step on the CPU 5 %.
     terms, everywhere = len(kind.terms), kind.terms[0].measure.span == 1
     W = wp.types.vector(kind.window, real)
-    evaluate_first, evaluate_last = (evaluate_functions(kind, at, real, linear, curved) for at in (0, -1))
+    evaluate_first, evaluate_last = (evaluate_functions(kind, at, real, linear, curved, split) for at in (0, -1))
     options = CPU_OPTIONS | {"max_unroll": kind.geometric_rows} if curved else CPU_OPTIONS
     stale = next((term.measure.stale(real) for term in kind.terms if term.measure.stale), None)
     size, closed = kind.window, kind.closed
@@ -195,6 +212,7 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
         frozen = reuse != 0 and flags[ITERATION, r] > 0
         exact = flags[ITERATION, r] >= wp.static(begin)
         rate = scalars[RATE, r]
+        carried = scalars[CARRIED, r]
         for k in range(start, until(start, n - wp.static(0 if closed else 1))):
             whole = wp.static(closed) or k < n - 2
             q = window(x, theta, k, n, whole, r)
@@ -204,14 +222,40 @@ def evaluate_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
             stiffest = real(0.0)
             if whole or wp.static(everywhere):
                 own, part, stiff = evaluate_first(
-                    q, s, buffer, table, last, rate, clamped[r], frozen, exact, factor_out, geometric_out, k, r
+                    q,
+                    s,
+                    buffer,
+                    table,
+                    last,
+                    rate,
+                    clamped[r],
+                    frozen,
+                    exact,
+                    carried,
+                    factor_out,
+                    geometric_out,
+                    k,
+                    r,
                 )
                 energy += own
                 f += part
                 stiffest = wp.max(stiffest, stiff)
             if wp.static(terms > 1):
                 own_too, part_too, stiff_too = evaluate_last(
-                    q, s, buffer, table, last, rate, clamped[r], frozen, exact, factor_out, geometric_out, k, r
+                    q,
+                    s,
+                    buffer,
+                    table,
+                    last,
+                    rate,
+                    clamped[r],
+                    frozen,
+                    exact,
+                    carried,
+                    factor_out,
+                    geometric_out,
+                    k,
+                    r,
                 )
                 energy += own_too
                 f += part_too

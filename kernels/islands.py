@@ -52,6 +52,7 @@ SCALARS = (
     "decrement",  # expected decrease of the energy by a whole step
     "merit",  # square of the accepted iterate's residual
     "angle_change",  # what angles have yet to move along the direction
+    "carried",  # largest stiffness of an edge that a matrix in float32 has [N/m]; see `solve.tension`
     "turn",  # largest turn of an edge that is still taken straight [rad]; see `turns`
     # the part of the time step that is done, and the part being tried
     "progress",
@@ -60,10 +61,8 @@ SCALARS = (
 (STATUS, ITERATION, UNBALANCED, DROWNED, SLOT, HALVINGS, WANTED, TODO, PLACED, STALE) = range(10)
 (CLAMPED, LOST, BAD, DETOURS, PATIENCE, CAUTIOUS, RETRIES, REASON, BENT, MOVED) = range(10, 20)
 ACTIVE, TURNING = range(20, len(FLAGS))
-(COEFFICIENT, RATE, LOAD_SCALE, RESIDUAL, STEP_LENGTH, DECREMENT, MERIT, ANGLE_CHANGE, TURN, PROGRESS, PORTION) = range(
-    11
-)
-
+(COEFFICIENT, RATE, LOAD_SCALE, RESIDUAL, STEP_LENGTH, DECREMENT, MERIT, ANGLE_CHANGE) = range(8)
+CARRIED, TURN, PROGRESS, PORTION = range(8, len(SCALARS))
 DETOURS_ALLOWED, LEAST = 30, 0.125  # by parts of a time step that are larger than this
 
 

@@ -7,19 +7,22 @@ import warp as wp
 from ddg_warp.kernels import frames
 from ddg_warp.kernels.chain import ChainKind, gather_functions
 from ddg_warp.kernels.islands import ANGLE_CHANGE, PLACED, STEP_LENGTH, TODO
-from ddg_warp.kernels.turns import excess_function, place_function
+from ddg_warp.kernels.turns import edge_functions, place_function
 
 PLACE, RELAG, STRAIGHT = 1, 2, 4  # what is left to be done with an iterate: turn edges, renew frames, move straight
 
 
 @cache
-def move_functions(kind: ChainKind, real, linear):
-    """What happens to one node or edge: excess(...) of a turned edge, put(...) a node, carry(...) a frame to the iterate."""
-    dim = kind.dim
+def move_functions(kind: ChainKind, real, linear, split: bool = False):
+    """What happens to one node or edge: excess(...) of a turned edge, put(...) a node, carry(...) a frame to the iterate.
+
+    With `split`, directions end with what edges lengthen by; see `kernels.solve.sweep`.
+    """
+    dim, block = kind.dim, kind.block
     V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
     transport, *_ = frames.functions(real)
     along, *_ = gather_functions(kind, real)
-    excess_of = excess_function(dim, real)
+    along_edge, excess_of = edge_functions(dim, real)
 
     @wp.func
     def step_of(direction: wp.array3d(dtype=linear), j: int, r: int):
@@ -40,9 +43,12 @@ def move_functions(kind: ChainKind, real, linear):
     ):
         """Edge j turned and lengthened by its step, less the same edge with its step added; `onward`: see `kernels.turns`."""
         ahead = along(j + 1, n)
-        return excess_of(
-            base[ahead, r] - base[j, r], (step_of(direction, ahead, r) - step_of(direction, j, r)) * amount, onward
-        )
+        e = base[ahead, r] - base[j, r]
+        de = (step_of(direction, ahead, r) - step_of(direction, j, r)) * amount
+        if wp.static(split):
+            return excess_of(e, de, real(direction[wp.static(block), j, r]) * amount, onward)
+        else:
+            return excess_of(e, de, along_edge(e, de), onward)
 
     @wp.func
     def put(
@@ -91,12 +97,12 @@ def shorter_function(real):
 
 
 @cache
-def search_functions(kind: ChainKind, real, linear):
+def search_functions(kind: ChainKind, real, linear, split: bool = False):
     """What every solver's line search does to a rod: place(...), turn_angles(...), relag(...), shorter(...)."""
     dim, twist, angle, every = kind.dim, kind.twist, kind.block - 1, (1 << kind.dim) - 1
     V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
     _, reference_twist, _ = frames.functions(real)
-    step_of, excess, put, carry = move_functions(kind, real, linear)
+    step_of, excess, put, carry = move_functions(kind, real, linear, split)
     along, *_ = gather_functions(kind, real)
     closed = kind.closed
 
@@ -190,11 +196,11 @@ def search_functions(kind: ChainKind, real, linear):
 
 
 @cache
-def adjust_kernel(kind: ChainKind, real, linear):
+def adjust_kernel(kind: ChainKind, real, linear, split: bool = False):
     """What a sweep leaves to do for few rods: put a shortened or far turning step, or take the frames of its iterate."""
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
-    place, turn_angles, relag, _ = search_functions(kind, real, linear)
+    place, turn_angles, relag, _ = search_functions(kind, real, linear, split)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def adjust(

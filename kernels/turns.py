@@ -18,8 +18,9 @@ LEAP = 0.5  # cosine of the largest turn of an edge that a predictor goes on wit
 
 
 @cache
-def excess_function(dim: int, real):
-    """excess(e, de, onward): the edge e turned and lengthened by its step, less the same edge with its step added.
+def edge_functions(dim: int, real):
+    """along(e, de): what the step de of an edge e does along it; excess(e, de, stretch, onward): the edge turned by its step and
+    lengthened by `stretch`, less the same edge with its step added.
 
     `onward` is 1 where the step repeats the last one, so that e - de is the edge before: it turns on by the same angle, and its length
     changes as it did. (Added up, such steps would lengthen an edge that turns by the versine of its turn.)
@@ -27,11 +28,15 @@ def excess_function(dim: int, real):
     V = wp.types.vector(dim, real)
 
     @wp.func
-    def excess(e: V, de: V, onward: int):
+    def along_edge(e: V, de: V):
+        return wp.dot(e, de) / wp.length(e)
+
+    @wp.func
+    def excess(e: V, de: V, stretch: real, onward: int):
         length = wp.length(e)
         t = e / length
-        stretch = wp.dot(t, de)
-        across = de - t * stretch
+        along = wp.dot(t, de)
+        across = de - t * along
         aside = wp.length(across)
         grown = length + stretch
         cosine = real(1.0)
@@ -40,7 +45,7 @@ def excess_function(dim: int, real):
             before = wp.length(e - de)
             grown = real(2.0) * length - before
             if before > real(0.0):
-                cosine = (length - stretch) / before
+                cosine = (length - along) / before
                 sine = aside / before
             if cosine < real(LEAP):
                 cosine = real(LEAP)
@@ -54,7 +59,7 @@ def excess_function(dim: int, real):
             cosine = real(1.0)  # it kept its direction, or turned over, for which there is no plane
         return (t * cosine + across * sine) * wp.max(grown, real(0.1) * length) - e - de
 
-    return excess
+    return along_edge, excess
 
 
 @cache
@@ -64,7 +69,7 @@ def place_function(dim: int, real, Rod, excess, anchored, added, put):
     Args:
         Rod: struct of a rod and a step of it; its fields `count`, `closed` and `anchor` say how many nodes it has, 1 where it is
             closed, and its last anchored node or -1.
-        excess: (rod, j) -> that of the edge from node j on; see `excess_function`.
+        excess: (rod, j) -> that of the edge from node j on; see `edge_functions`.
         anchored: (rod, j) -> whether a node is; added: (rod, j) -> what lies between its place now and where the straight step ends.
         put: (rod, j, shift) puts a node there, and by a shift beyond. Nodes may be counted on past the last one of a closed rod.
     """

@@ -40,7 +40,7 @@ def build(
     points, radius = groom(path, count)
     scene = ddg.Scene(
         mass_damping=0.4,  # 1/s, drag of the air
-        analysis=ddg.Dynamics(dt=1.0 / 120.0, duration=REST, scheme="implicit_euler"),
+        analysis=ddg.Dynamics(dt=1.0 / 60.0, duration=REST, scheme="implicit_euler"),
     )
     strands = scene.add_rods(
         points,

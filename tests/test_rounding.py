@@ -159,7 +159,7 @@ def test_the_bound(device):
 
 
 def test_solver_that_takes_over_leaves_out_compression_where_it_must(device):
-    """Buckling in one long step, after a short one that float32 carried: float64 takes over and goes as it would on its own."""
+    """Buckling in one long step, after a short one that float32 carried: another solver takes over and goes as it would on its own."""
     found = {}
     for precision in ("mixed", "float64"):
         scene = ddg.Scene(gravity=(0.0, 0.0, -1e-3))
@@ -174,7 +174,7 @@ def test_solver_that_takes_over_leaves_out_compression_where_it_must(device):
         assert integrator.statistics()["linear"] == ["float32" if precision == "mixed" else "float64"]
         state = integrator.step(state, 1.0)
         statistics = integrator.statistics()
-        assert statistics["linear"] == ["float64"]
+        assert statistics["linear"] == ["float32 with tensions" if precision == "mixed" else "float64"]
         assert set(statistics["outcomes"]) <= {"converged", "converged_to_rounding"}
         assert integrator._chains[0].newton.islands.clamped.numpy().tolist() == [1]
         found[precision] = statistics["newton_iterations"]["max"], np.abs(state.points()[-1])

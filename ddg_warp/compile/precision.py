@@ -47,39 +47,53 @@ FLOAT32_LIMIT = (
     0.02  # relative error of a direction that Newton still corrects quickly; beyond it a state in float32 is doubtful
 )
 STIFF = 2e3  # ratio of stiffnesses from which on rods take turned steps and second derivatives
+CARRIED = 1e-3  # error up to which a float32 matrix takes a stiffness; see `kernels.solve.tension`
 FLOAT32_LOST = 0.1  # and beyond this one its motion is that of its rounding, not of the scene
 
 
-def float32_errors(kind, mass: np.ndarray, length: np.ndarray, parameters: dict, s: float) -> np.ndarray:
-    """Estimate of the relative error that a float32 solution makes in the direction of rods of one kind (R,).
+def stiffnesses(kind, mass: np.ndarray, length: np.ndarray, parameters: dict, s: float) -> tuple[np.ndarray, ...]:
+    """Of rods of one kind: of stretching an edge, of bending at a node, and of the softest mode, each (R,) [N/m].
 
-    The rounding unit times the ratio of the stiffest to the softest mode: stretching of an edge against inertia over the step
-    of s [s] and the lowest bending mode; at rest, s = inf, against bending alone. For a curved steel rod of r/L = 2e-3 (64 nodes,
-    1/240 s) it gives 0.1, where 9 % were measured.
-
-    A law that names no stiffness is taken for the worst: of stretching without a bound, of bending without any.
+    The last is inertia over the step of s [s] and the lowest bending mode; at rest, s = inf, that alone. A law that names no stiffness
+    is taken for the worst: of stretching without a bound, of bending without any.
 
     Args:
         kind: `ChainKind` of the rods.
         mass: mean of their nodes (R,) [kg]; length: (R,) [m].
         parameters: of all terms, "term.parameter", each broadcastable to (n, R).
     """
-    softest = mass / s**2
+    softest, bending = mass / s**2, np.zeros_like(length)
     for term in kind.terms:
         measure = parameters[f"{term.name}.measure"]
         stretches = term.measure.span == 1
         stiffness = parameters[f"{term.name}.{term.stiffness[0]}"] if term.stiffness else np.inf if stretches else 0.0
         if stretches:
-            stiffest = (stiffness / measure).max(0)
+            stretching = (stiffness / measure).max(0)
         else:
             softest = softest + (stiffness * measure).min(0) * (np.pi / length) ** 4
-    return float32_error(np.broadcast_to(stiffest, length.shape), softest)
+            bending = (16.0 * stiffness / measure**3).max(0)  # a node to and fro between its neighbours
+    return np.broadcast_to(stretching, length.shape), np.broadcast_to(bending, length.shape), softest
+
+
+def float32_errors(kind, mass: np.ndarray, length: np.ndarray, parameters: dict, s: float) -> np.ndarray:
+    """Estimate of the relative error that a float32 solution makes in the direction of rods of one kind (R,).
+
+    The rounding unit times the ratio of the stiffest to the softest mode. For a curved steel rod of r/L = 2e-3 (64 nodes, 1/240 s) it
+    gives 0.1, where 9 % were measured. Arguments as of `stiffnesses`.
+    """
+    stretching, _, softest = stiffnesses(kind, mass, length, parameters, s)
+    return float32_error(stretching, softest)
 
 
 def float32_error(stiffest, softest) -> np.ndarray:
     """The rounding unit of float32 times the ratio of stiffnesses [N/m]."""
     with np.errstate(divide="ignore"):
         return 0.5 * float(np.finfo(np.float32).eps) * np.asarray(stiffest) / softest
+
+
+def largest_carried(softest: np.ndarray) -> np.ndarray:
+    """The stiffness that a float32 matrix carries beside the softest mode, within an error of CARRIED [N/m]."""
+    return CARRIED / float32_error(1.0, 1.0) * softest
 
 
 def straight_turns(errors: np.ndarray) -> np.ndarray:

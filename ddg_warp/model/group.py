@@ -75,15 +75,20 @@ class Group:
             new = np.repeat(np.broadcast_to(along, (self.worlds, elements)), self.rods, axis=0).T
         self.parameters.set(**{name: new})
 
-    def float32_errors(self, s: float) -> np.ndarray:
-        """What float32 makes of every rod (columns,) over a step of s [s]; see `precision.float32_errors`."""
+    def stiffnesses(self, s: float) -> tuple[np.ndarray, ...]:
+        """Stiffnesses of every rod (columns,) over a step of s [s]; see `precision.stiffnesses`."""
         host = self.host
         mass, length = host.mass.sum(0) / host.count, host.length
         if self.kind.drag:
             mass = mass + s * drag.least(host.drag.T) * host.length / host.count
             length = np.where(host.fixed.any(0), length, np.inf)  # over long steps a free rod has nothing but drag
         mass, length = (np.tile(values, self.worlds) for values in (mass, length))
-        return precision.float32_errors(self.kind, mass, length, self.parameters.values, s)
+        return precision.stiffnesses(self.kind, mass, length, self.parameters.values, s)
+
+    def float32_errors(self, s: float) -> np.ndarray:
+        """What float32 makes of every rod (columns,) over a step of s [s]; see `precision.float32_errors`."""
+        stretching, _, softest = self.stiffnesses(s)
+        return precision.float32_error(stretching, softest)
 
 
 def _last_anchor(host: ChainGroup) -> np.ndarray:

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arguments
-from ddg_warp.compile.precision import FLOAT32_LIMIT, lost_in_rounding, stiff
+from ddg_warp.compile.precision import lost_in_rounding
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels import outcome
 from ddg_warp.model import validate
@@ -32,7 +32,8 @@ class Integrator:
         for _ in range(100):
             state = integrator.step(state, dt=0.01)
 
-    In mixed precision, groups whose float32 factors would be poor at the step taken (stiff, finely divided rods and long steps)
+    In mixed precision, groups whose float32 factors would be poor at the step taken (stiff, finely divided rods and long steps) take
+    tensions of edges for unknowns of their own, or, where that does not do or is not to be had (closed rods, nets, few and long rods),
     are solved in float64; `statistics()["linear"]` says which.
 
     A step is one captured graph: nothing in it allocates or waits for the host. On CUDA, outcomes are read every
@@ -156,7 +157,7 @@ class Integrator:
             "pcg_iterations": sum(part.newton.pcg_iterations() for part in self._parts),
             "retries": int(work[:, 3].sum()),
             "lost_pivots": int(work[:, 4].sum()),
-            "linear": [part.newton.linear.__name__ for part in self._parts],
+            "linear": [str(part.means) for part in self._parts],
             "outcomes": {name: int(tally[code]) for code, name in outcome.NAMES.items() if tally[code]},
         } | ({} if self.energy_bound is None else {"energy": energy.summary([part.energy for part in self._parts])})
 
@@ -198,22 +199,14 @@ class Integrator:
         self._longest = dt
 
     def _adapt(self, s: float) -> None:
-        """From now on solve rods by what suits a step of s: float64 where float32 factors are not good enough; see `ChainStep`."""
+        """From now on solve by what suits a step of s; see `Means`."""
         for i, chain in enumerate(self._chains):
-            if changes := self._suited(chain, s):
-                self._chains[i] = ChainStep(self, self.model, chain.group, *changes, counts_of=chain)
+            if (means := chain.suited(s)) != chain.means:
+                self._chains[i] = ChainStep(self, self.model, chain.group, means, counts_of=chain)
                 self._graphs.clear()
-        if self._net is not None and (changes := self._suited(self._net, s)):
-            self._net = NetStep(self, self.model, *changes, counts_of=self._net)
+        if self._net is not None and (means := self._net.suited(s)) != self._net.means:
+            self._net = NetStep(self, self.model, means, counts_of=self._net)
             self._graphs.clear()
-
-    def _suited(self, part, s: float) -> tuple | None:
-        """Scalar type of the linear algebra and whether rods are stiff over a solve of s, where they are not those of the part."""
-        errors, linear = part.float32_errors(s).max(), part.newton.linear
-        if self.model.precision == "mixed" and errors > FLOAT32_LIMIT:
-            linear = wp.float64
-        suited = linear, part.stiff or bool(stiff(errors))
-        return suited if suited != (part.newton.linear, part.stiff) else None
 
     def _own(self, state: State) -> int:
         for i, buffer in enumerate(self._buffers):

@@ -1,10 +1,12 @@
 """A time step of what one solver advances, a group of rods or the net: attempts, retries, and what became of them."""
 
+from typing import NamedTuple
+
 import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.compile.precision import straight_turns
+from ddg_warp.compile.precision import FLOAT32_LIMIT, stiff, straight_turns
 from ddg_warp.errors import SolverError
 from ddg_warp.geometry import polyline
 from ddg_warp.kernels import outcome, step
@@ -12,6 +14,26 @@ from ddg_warp.kernels.islands import DETOURS_ALLOWED, LEAST
 from ddg_warp.solve.motion import jump_between
 
 FOLDED = 1e-5  # how close to opposite [rad] edges that meet are called folded, in messages
+
+
+class Means(NamedTuple):
+    """What the solves of a part take.
+
+    Attributes:
+        linear: scalar type of the linear algebra; None for that of the model.
+        stiff: whether a rod is over the step; see `compile.precision.stiff`.
+        split: whether tensions of edges are unknowns of their own; see `kernels.solve.tension`.
+    """
+
+    linear: type | None = None
+    stiff: bool = False
+    split: bool = False
+
+    def __str__(self) -> str:
+        return self.linear.__name__ + self.split * " with tensions"
+
+
+USUAL = Means()
 
 
 class PartStep:
@@ -24,6 +46,7 @@ class PartStep:
     Args:
         integrator, model: what steps what.
         newton: the solver, with its islands.
+        means: what it takes.
         counts_of: the step that this one replaces, whose counts, name of rounding and state of the islands it takes over.
 
     Attributes:
@@ -35,7 +58,8 @@ class PartStep:
 
     energy = motion = loads = field = drag = None
 
-    def __init__(self, integrator, model, newton, counts_of: "PartStep | None" = None):
+    def __init__(self, integrator, model, newton, means: Means, counts_of: "PartStep | None" = None):
+        self.means = means._replace(linear=newton.linear)
         self.integrator, self.model, self.newton = integrator, model, newton
         real, device = model.types.real, model.wp_device
         self.midpoint = integrator.scheme == "implicit_midpoint"
@@ -56,6 +80,18 @@ class PartStep:
     def islands(self):
         """See `kernels.islands`."""
         return self.newton.islands
+
+    def suited(self, s: float) -> Means:
+        """What suits solves over s [s], and all shorter ones before."""
+        errors, (linear, was_stiff, split) = self.float32_errors(s).max(), self.means
+        if self.model.precision == "mixed" and errors > FLOAT32_LIMIT:
+            split = linear is wp.float32 and bool(self.split_errors(s).max() <= FLOAT32_LIMIT)
+            linear = wp.float32 if split else wp.float64
+        return Means(linear, was_stiff or bool(stiff(errors)), split)
+
+    def split_errors(self, s: float) -> np.ndarray:
+        """The same with tensions as unknowns; infinite where they cannot be."""
+        return np.array([np.inf])
 
     def straighten(self, s: float) -> None:
         """Set which turns are taken straight in solves over s [s]; see `precision.straight_turns`."""

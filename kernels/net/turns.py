@@ -6,7 +6,7 @@ import warp as wp
 
 from ddg_warp.kernels.islands import CAUTIOUS, RATE, STEP_LENGTH, TODO, TURN, TURNING
 from ddg_warp.kernels.search import PLACE
-from ddg_warp.kernels.turns import excess_function, place_function
+from ddg_warp.kernels.turns import edge_functions, place_function
 
 
 @cache
@@ -15,7 +15,7 @@ def turn_kernels(real, linear):
     place(...) sums them along the rods of one level, a thread each, and put(...) takes their nodes there.
     """
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
-    excess_of = excess_function(3, real)
+    along_edge, excess_of = edge_functions(3, real)
 
     @wp.struct
     class Rod:
@@ -125,7 +125,8 @@ def turn_kernels(real, linear):
         b = ahead[p] + w * blocks
         amount = step_length[w]
         step = move_of(direction, b, amount) - move_of(direction, a, amount)
-        excess_out[w, p] = excess_of(base[b] - base[a], step, onward)
+        edge = base[b] - base[a]
+        excess_out[w, p] = excess_of(edge, step, along_edge(edge, step), onward)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def place(

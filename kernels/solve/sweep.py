@@ -19,6 +19,7 @@ from ddg_warp.kernels.chain import ChainKind, inertia_type
 from ddg_warp.kernels.islands import (
     ACTIVE,
     ANGLE_CHANGE,
+    CARRIED,
     CLAMPED,
     COEFFICIENT,
     DECREMENT,
@@ -39,16 +40,19 @@ from ddg_warp.kernels.islands import (
 from ddg_warp.kernels.judge import judge_functions
 from ddg_warp.kernels.matrix import geometric
 from ddg_warp.kernels.search import PLACE, RELAG, search_functions
-from ddg_warp.kernels.solve import pivot
+from ddg_warp.kernels.solve import pivot, tension
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
 
 @cache
-def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, fails: bool = False):
+def sweep_kernel(
+    kind: ChainKind, real, linear, exact_from: int | None = None, fails: bool = False, split: bool = False
+):
     """The sweep for one kind of chain; see the module's text.
 
     From iteration `exact_from` on, the matrix has the geometric stiffness G. Where a pivot is lost, the same iterate comes again
     with `clamped[r]` raised: without what compression takes away, and, for this iteration, without G; or the solve `fails`.
+    With `split`, factors end with the slack of edges, and directions with what edges lengthen by: see `kernels.solve.tension`.
     """
     balanced, _ = judge_functions(kind.twist, real)
     out_of_patience = patience_function(real)
@@ -57,12 +61,16 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
     V, H, M = wp.types.vector(dim, real), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     factor_block, lower, upper, lower_vector, upper_vector, congruence = pivot.functions(nb, linear)
     *_, shorter = search_functions(kind, real, linear)
-    angle, rows = nb - 1, kind.factor_rows
+    angle, rows = nb - 1, kind.factor_rows + split
     # in float64 twice as many registers are more than a GPU has: 10 % slower on an H200
     ahead = kind.serial or linear == wp.float32
-    Rows, Kept = wp.types.vector(rows, linear), wp.types.vector(2 * nb2 + nb, linear)
+    beyond = 2 * nb2 + nb  # of what is kept, where that of tensions begins
+    kept_size = beyond + (tension.kept_rows(nb) if split else 0)
+    Rows, Kept = wp.types.vector(rows, linear), wp.types.vector(kept_size, linear)
+    Pending, eliminate = tension.functions(nb, linear)
     vertex_rows, edge_rows, tensions = kind.vertex_strains, kind.edge_strains, kind.tensions
     exact, begin = exact_from is not None, exact_from or 0
+    slack_row = kind.factor_rows
     aa, ab, ac, bb, bc, cc = geometric.block_functions(kind, linear)
 
     @wp.func
@@ -120,7 +128,7 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
         """What the elimination of a node has left, if that is read ahead."""
         v = Kept()
         if wp.static(ahead):
-            for i in range(wp.static(2 * nb2 + nb)):
+            for i in range(wp.static(kept_size)):
                 v[i] = Y[i, k, r]
         return v
 
@@ -139,13 +147,13 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
                 v[i] = v[i] + left_at(left, Y, row + i * wp.static(nb) + j, k, r) * e[j]
         return v
 
-    # what exceeds 255 registers goes to shared memory: 8 % on an H200
+    # what exceeds 255 registers goes to shared memory: 8 % on an H200; with tensions it is too much, and costs 12 %
     @wp.kernel(
         module="unique",
         enable_backward=False,
         grid_stride=False,
         launch_bounds=128,
-        enable_cuda_smem_spilling=True,
+        enable_cuda_smem_spilling=not split,
         module_options=CPU_OPTIONS,
     )
     def sweep(
@@ -196,6 +204,9 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
         noise = real(0.0)  # rounding of `change`
         newton = real(0.0)  # r^T H^-1 r
         lost_here = int(0)
+        if wp.static(split):
+            pending = Pending()
+            pending.pivot = linear(1.0)
         # What the next node has is read before this one is dealt with: a thread that walks waits for memory most of the time.
         f = rows_of(F, 0, r)
         rj = right_of(right, 0, r)
@@ -272,6 +283,8 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
             if not first:
                 change += more
                 noise += real(rounding)
+            if wp.static(split):
+                unmasked = H(linear(1.0))
             if mask != wp.uint8(0):
                 free = H()
                 for d in range(wp.static(nb)):
@@ -281,6 +294,8 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
                 Wab = wp.cw_mul(Wab, rows)
                 Wac = wp.cw_mul(Wac, rows)
                 ra = wp.cw_mul(ra, free)
+                if wp.static(split):
+                    unmasked = free
             # columns of held dofs ahead stay: their solution is zero, and what they gather is masked with their rows
 
             L, inverse, bad = factor_block(Waa)
@@ -288,19 +303,51 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
             z = lower_vector(L, rj + ra)
             newton += real(wp.dot(wp.cw_mul(z, inverse), z))
             y = upper_vector(L, inverse, z)
-            for d in range(wp.static(nb)):
-                Y[wp.static(2 * nb2) + d, j, r] = y[d]
+            if wp.static(not split):
+                for d in range(wp.static(nb)):
+                    Y[wp.static(2 * nb2) + d, j, r] = y[d]
             Zb = lower(L, Wab)
-            store(Y, 0, j, r, upper(L, inverse, Zb))
+            if wp.static(not split):
+                store(Y, 0, j, r, upper(L, inverse, Zb))
             zd = wp.cw_mul(z, inverse)
             ra = rb - zd * Zb
             Waa = Wbb - congruence(Zb, inverse, Zb)
             if wp.static(span == 2):
                 Zc = lower(L, Wac)
-                store(Y, wp.static(nb2), j, r, upper(L, inverse, Zc))
+                if wp.static(not split):
+                    store(Y, wp.static(nb2), j, r, upper(L, inverse, Zc))
                 rb = -(zd * Zc)
                 Wab = Wbc - congruence(Zb, inverse, Zc)
                 Wbb = Wcc - congruence(Zc, inverse, Zc)
+                if wp.static(split):
+                    edge = H()
+                    loose = linear(0.0)
+                    if j < n - 1:
+                        edge = part(f, F, wp.static(vertex_rows * window), j, r)
+                        loose = entry(f, F, wp.static(slack_row), j, r)
+                    out = eliminate(L, inverse, z, Zb, Zc, pending, edge, loose, unmasked)
+                    pending = out.pending
+                    near = out.b * out.weight
+                    far = out.c * out.weight
+                    lag = out.right * out.weight
+                    newton -= real(out.right * lag)
+                    ra += near * out.right
+                    rb += far * out.right
+                    Waa += wp.outer(near, out.b)
+                    Wab += wp.outer(near, out.c)
+                    Wbb += wp.outer(far, out.c)
+                    y += out.behind * lag
+                    store(Y, 0, j, r, upper(L, inverse, Zb) + wp.outer(out.behind, near))
+                    store(Y, wp.static(nb2), j, r, upper(L, inverse, Zc) + wp.outer(out.behind, far))
+                    q = out.coupling * out.weight
+                    ahead_too = out.ahead + out.behind * q
+                    for d in range(wp.static(nb)):
+                        Y[wp.static(2 * nb2) + d, j, r] = y[d]
+                        Y[wp.static(beyond) + d, j, r] = ahead_too[d]
+                        Y[wp.static(beyond + nb) + d, j, r] = near[d]
+                        Y[wp.static(beyond + 2 * nb) + d, j, r] = far[d]
+                    Y[wp.static(beyond + 3 * nb), j, r] = q
+                    Y[wp.static(beyond + 3 * nb + 1), j, r] = lag
             else:
                 Wab = M()
                 Wbb = M()
@@ -376,6 +423,9 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
                 return
         e1 = H()
         e2 = H()
+        pulled = linear(0.0)
+        pull = linear(0.0)
+        per_root = linear(real(1.0) / wp.sqrt(scalars[CARRIED, r]))
         rotation = real(0.0)
         x_ahead = V()
         left = kept(Y, n - 1, r)
@@ -394,6 +444,16 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
             step = -times(left, Y, 0, j, r, e1)
             if wp.static(span == 2):
                 step -= times(left, Y, wp.static(nb2), j, r, e2)
+            if wp.static(split):
+                # the tension ahead is known from the node there; that of the edge behind is for the node before
+                behind = left_at(left, Y, wp.static(beyond + 3 * nb), j, r) * pulled
+                behind -= left_at(left, Y, wp.static(beyond + 3 * nb + 1), j, r)
+                for d in range(wp.static(nb)):
+                    step[d] = step[d] - left_at(left, Y, wp.static(beyond) + d, j, r) * pulled
+                    behind += left_at(left, Y, wp.static(beyond + nb) + d, j, r) * e1[d]
+                    behind += left_at(left, Y, wp.static(beyond + 2 * nb) + d, j, r) * e2[d]
+                pull = pulled
+                pulled = behind
             for d in range(wp.static(nb)):
                 step[d] = step[d] + left_at(left, Y, wp.static(2 * nb2) + d, j, r)
                 direction[d, j, r] = step[d]
@@ -403,7 +463,14 @@ def sweep_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, f
                 dx[d] = real(step[d])
                 bent[d] = real(e1[d] - step[d])
             if i > 0:
-                rotation = wp.max(rotation, wp.length_sq(bent) / wp.length_sq(x_ahead - here))
+                span_sq = wp.length_sq(x_ahead - here)
+                rotation = wp.max(rotation, wp.length_sq(bent) / span_sq)
+                if wp.static(split):
+                    slack = F[wp.static(slack_row), j, r]
+                    longer = slack * pull * per_root
+                    if slack == linear(0.0):
+                        longer = linear(wp.dot(bent, x_ahead - here) / wp.sqrt(span_sq))
+                    direction[wp.static(nb), j, r] = longer
             x_ahead = here
             x[j, r] = here + dx
             if wp.static(twist):

@@ -9,7 +9,7 @@ from ddg_warp.errors import SceneError, check_options
 from ddg_warp.kernels import balance, chain, evaluate, search, step
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.matrix import geometric
-from ddg_warp.kernels.solve import sweep
+from ddg_warp.kernels.solve import sweep, tension
 
 EARLY = 2  # iterations that "progressive" makes by Gauss-Newton: far from a solution the exact matrix is no better
 PSD_MODES = ("auto", "gauss_newton", "project", "progressive", "none")
@@ -67,6 +67,7 @@ class ChainNewton:
         model, group, options: what to solve, and how.
         linear: scalar type of the linear algebra; that of the model by default.
         midpoint: whether predicted iterates are midpoints, to which the lagged frames are carried.
+        split: whether edges may be stiffer than the matrix carries, by tensions that are unknowns; see `kernels.solve.tension`.
 
     Attributes:
         x, theta, frame: the iterate and its lagged frames; base: the accepted positions it was reached from.
@@ -77,7 +78,7 @@ class ChainNewton:
 
     reuse = False  # whether the matrix of a step's first iterate serves the whole step
 
-    def __init__(self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False):
+    def __init__(self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False, split: bool = False):
         self.group, self.options = group, options
         self.real, self.linear = model.types.real, linear or model.types.linear
         self.eps = model.types.eps
@@ -96,12 +97,15 @@ class ChainNewton:
         if kind.drag:
             self.mass = make(*nodes, dtype=chain.inertia_type(kind, self.real))
             self.rotary = make(*twisted)
-        self.factor = make(kind.factor_rows, *nodes, dtype=self.linear)
+        self.factor = make(kind.factor_rows + split, *nodes, dtype=self.linear)
         self.gradient = make(kind.window, *nodes)
         self.energy = make(2, *nodes)
         self.stiffness = make(*nodes, dtype=self.linear)
-        self.elimination = make(2 * kind.block**2 + kind.block, *nodes, dtype=self.linear) if not kind.closed else None
-        self.right, self.direction = (make(kind.block, *nodes, dtype=self.linear) for _ in range(2))
+        kept = 2 * kind.block**2 + kind.block + (tension.kept_rows(kind.block) if split else 0)
+        self.elimination = make(kept, *nodes, dtype=self.linear) if not kind.closed else None
+        self.right, self.direction = (
+            make(rows, *nodes, dtype=self.linear) for rows in (kind.block, kind.block + split)
+        )
         self.energy_change, self.energy_noise = make(*nodes), make(*nodes, dtype=self.linear)
         self.islands = Islands(columns, self.real, device)
         self.without_compression = self.islands.clamped  # rods whose matrix leaves out what compression takes away
@@ -115,19 +119,25 @@ class ChainNewton:
             self.without_compression = wp.full(columns, 1, dtype=int, device=device)
             self._project = geometric.project_kernel(kind, self.real, self.linear)
         self.device = device
-        self._evaluate = evaluate.evaluate_kernel(kind, self.real, self.linear, self.exact_from)
+        self._evaluate = evaluate.evaluate_kernel(kind, self.real, self.linear, self.exact_from, split)
         self._check = balance.check_kernel(kind, self.real, self.linear)
         self._predict = step.predict_kernel(kind, self.real, self.linear, midpoint)
         self._sweep, self._threads = None, 32 if columns < MANY else 128
         if not kind.closed:
-            self._sweep = sweep.sweep_kernel(kind, self.real, self.linear, self.exact_from, self.psd == "none")
-        self._adjust = None if kind.closed else search.adjust_kernel(kind, self.real, self.linear)
+            self._sweep = sweep.sweep_kernel(kind, self.real, self.linear, self.exact_from, self.psd == "none", split)
+        self._adjust = None if kind.closed else search.adjust_kernel(kind, self.real, self.linear, split)
 
     def automatic_psd(self) -> str:
         """The mode of `NewtonOptions.psd` that suits the rods: Gauss-Newton lacks what a natural curvature does to their roll."""
         group = self.group
         rest = [f"{term.name}.{name}" for term in group.kind.terms if term.measure.span == 2 for name in term.rest]
         return "progressive" if any(group.parameters[name].any() for name in rest) else "gauss_newton"
+
+    @property
+    def splits(self) -> bool:
+        """Whether tensions can be unknowns of their own: those of a stretch that bending goes with."""
+        kind = self.group.kind
+        return kind.span == 2 and kind.edge_strains == kind.tensions == 1
 
     @property
     def kernels(self) -> list:

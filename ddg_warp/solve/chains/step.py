@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from ddg_warp import arrays
+from ddg_warp.compile.precision import float32_error, largest_carried
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels import element, step
 from ddg_warp.solve import energy
@@ -15,7 +16,7 @@ from ddg_warp.solve.choice import automatic
 from ddg_warp.solve.drag import ChainDrag
 from ddg_warp.solve.loads import Loads
 from ddg_warp.solve.motion import Motion
-from ddg_warp.solve.step import PartStep
+from ddg_warp.solve.step import USUAL, PartStep
 
 DIRECT = {"sweep": ChainNewton, "partitioned": PartitionedNewton}  # solvers of open rods by their name
 NET_ONLY = ("multilevel", "chain_multilevel")  # preconditioners of nets
@@ -25,14 +26,12 @@ class ChainStep(PartStep):
     """Steps the rods of a group in all worlds, each an island.
 
     Args:
-        precision: scalar type of the linear algebra; that of the model by default.
-        stiff: whether a rod is; see `compile.precision.stiff`. The psd mode "auto" then takes second derivatives.
+        means: what solves take; see `Means`. The psd mode "auto" takes second derivatives of stiff rods.
         counts_of: the step that this one replaces; see `PartStep`.
     """
 
-    def __init__(self, integrator, model, group, precision=None, stiff=False, counts_of=None):
-        super().__init__(integrator, model, _newton(model, group, integrator, precision, stiff), counts_of)
-        self.stiff = stiff
+    def __init__(self, integrator, model, group, means=USUAL, counts_of=None):
+        super().__init__(integrator, model, _newton(model, group, integrator, means), means, counts_of)
         self.group, self.index = group, model.groups.index(group)
         kind, real = group.kind, model.types.real
         self._begin = step.begin_kernel(kind, real, self.midpoint)
@@ -96,6 +95,17 @@ class ChainStep(PartStep):
         """Of every rod; see `precision.float32_errors`."""
         return self.group.float32_errors(s)
 
+    def split_errors(self, s: float) -> np.ndarray:
+        """Of every rod; infinite where the solver cannot take tensions for unknowns."""
+        _, bending, softest = self.group.stiffnesses(s)
+        errors = float32_error(np.maximum(bending, largest_carried(softest)), softest)
+        return errors if type(self.newton) is ChainNewton and self.newton.splits else np.full_like(errors, np.inf)
+
+    def straighten(self, s: float) -> None:
+        """As of `PartStep`; and what float32 matrices carry."""
+        super().straighten(s)
+        self.islands.carried.assign(largest_carried(self.group.stiffnesses(s)[2]))
+
     def who(self, column: int) -> str:
         """The rod of a column."""
         rod = self._rod(column)
@@ -123,20 +133,22 @@ class ChainStep(PartStep):
         return self.dead_end(x, int(host.first[rod]), kind) or self.advice(state)
 
 
-def _newton(model, group, integrator, precision, stiff: bool) -> ChainNewton:
+def _newton(model, group, integrator, means) -> ChainNewton:
     """The solver of a group that the integrator's `linear` asks for."""
     linear = automatic(group) if integrator.linear in ("auto", *NET_ONLY) else integrator.linear
     options = integrator.options
-    if options.psd == "auto" and stiff and integrator.solver == "newton" and linear in (*DIRECT, "chain"):
+    if options.psd == "auto" and means.stiff and integrator.solver == "newton" and linear in (*DIRECT, "chain"):
         options = replace(options, psd="progressive")
     given = (model, group, options)
-    last = (precision, integrator.scheme == "implicit_midpoint")
+    last = (means.linear, integrator.scheme == "implicit_midpoint")
     if integrator.solver == "projective":
         return ProjectiveNewton(*given, *last)
     if linear in DIRECT and group.kind.closed:
         raise SceneError(
             f"linear {linear!r}: rod {group.host.rods[0]} is closed; use 'auto' or a preconditioner of PCG"
         )
+    if linear == "sweep":
+        return ChainNewton(*given, *last, split=means.split)
     if linear in DIRECT:
         return DIRECT[linear](*given, *last)
     return PcgNewton(*given, linear, *last)

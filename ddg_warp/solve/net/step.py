@@ -16,14 +16,14 @@ from ddg_warp.solve.energy import NetEnergy
 from ddg_warp.solve.loads import Loads
 from ddg_warp.solve.net.newton import PRECONDITIONERS, NetNewton
 from ddg_warp.solve.net.prescribed import NetField, NetMotion
-from ddg_warp.solve.step import PartStep
+from ddg_warp.solve.step import USUAL, PartStep
 from ddg_warp.solve.tangent import Tangent
 
 
 class NetStep(PartStep):
     """Steps a model's net in all worlds, each an island. Arguments as of `ChainStep`."""
 
-    def __init__(self, integrator, model, precision=None, stiff=False, counts_of=None):
+    def __init__(self, integrator, model, means=USUAL, counts_of=None):
         self.net = model.net
         host, real = model.net.host, model.types.real
         options = integrator.options
@@ -45,11 +45,10 @@ class NetStep(PartStep):
             )
         preconditioner = net_preconditioner(model.net) if integrator.linear == "auto" else integrator.linear
         reuse = integrator.solver == "projective"
-        if options.psd == "auto" and stiff and not reuse:
+        if options.psd == "auto" and means.stiff and not reuse:
             options = replace(options, psd="progressive")
-        solver = NetNewton(model, options, preconditioner, precision, host.drag is not None, reuse)
-        super().__init__(integrator, model, solver, counts_of)
-        self.stiff = stiff
+        solver = NetNewton(model, options, preconditioner, means.linear, host.drag is not None, reuse)
+        super().__init__(integrator, model, solver, means, counts_of)
         if counts_of is not None:
             self.newton.pcg_work = counts_of.newton.pcg_work
         self._begin, self._finish = newton.step_kernels(real, self.midpoint, arrays.serial(model.wp_device))
