@@ -17,7 +17,7 @@ from ddg_warp.kernels.densities import NOT_NEGATIVE, Density, Parameter
 from ddg_warp.kernels.islands import DETOURS_ALLOWED, Islands
 from ddg_warp.kernels.net.newton import STALLED, search_kernels
 from ddg_warp.kernels.step import advance_kernel
-from ddg_warp.kernels.turns import LEAP, TURNED, excess_function
+from ddg_warp.kernels.turns import LEAP, TURNED, edge_functions
 
 slow = pytest.mark.slow
 DONE = {"converged", "converged_to_rounding"}
@@ -37,19 +37,19 @@ def linear_of(solver: str) -> str:
 # The turned edge.
 
 
-def excess_of(device, e, de, onward: int) -> np.ndarray:
-    """`excess_function` of edges e and their steps de (n, dim)."""
+def excess_of(device, e, de, onward: int, more: float = 0.0) -> np.ndarray:
+    """`edge_functions` of edges e and their steps de (n, dim), lengthened by what these do along them and `more`."""
     dim = e.shape[1]
-    V, excess = wp.types.vector(dim, wp.float64), excess_function(dim, wp.float64)
+    V, (along, excess) = wp.types.vector(dim, wp.float64), edge_functions(dim, wp.float64)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def call(e: wp.array(dtype=V), de: wp.array(dtype=V), onward: int, out: wp.array(dtype=V)):
+    def call(e: wp.array(dtype=V), de: wp.array(dtype=V), more: wp.float64, onward: int, out: wp.array(dtype=V)):
         i = wp.tid()
-        out[i] = excess(e[i], de[i], onward)
+        out[i] = excess(e[i], de[i], along(e[i], de[i]) + more, onward)
 
     given = [wp.array(np.ascontiguousarray(values), dtype=V, device=device) for values in (e, de)]
     out = wp.zeros(len(e), dtype=V, device=device)
-    wp.launch(call, len(e), [*given, onward], [out], device=device)
+    wp.launch(call, len(e), [*given, more, onward], [out], device=device)
     return out.numpy()
 
 
@@ -73,7 +73,7 @@ def test_a_step_turns_an_edge_by_what_it_does_across(device, dim):
     """Turned by |across| / |e| towards it, and lengthened by what the step does along the edge; never to less than a tenth."""
     e, de, length, stretch = edges_and_steps(dim)
     end = e + de + excess_of(device, e, de, 0)
-    np.testing.assert_allclose(np.linalg.norm(end, axis=1), np.maximum(length + stretch, 0.1 * length), rtol=1e-12)
+    np.testing.assert_allclose(lengths(end), np.maximum(length + stretch, 0.1 * length), rtol=1e-12)
     across = de - e * (stretch / length)[:, None]
     turn = np.linalg.norm(across, axis=1) / length
     # past half a turn it comes around on the other side
@@ -89,11 +89,22 @@ def test_a_step_turns_an_edge_by_what_it_does_across(device, dim):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
+def test_an_edge_grows_by_what_it_is_told(device, dim):
+    """Where a solve knows that better than the step says, in the same direction; a predictor goes by the edge before alone."""
+    e, de, length, stretch = edges_and_steps(dim)
+    usual, end = (e + de + excess_of(device, e, de, 0, more) for more in (0.0, 0.25))
+    np.testing.assert_allclose(lengths(end), np.maximum(length + stretch + 0.25, 0.1 * length), rtol=1e-12)
+    np.testing.assert_allclose(angle_between(usual, end), 0.0, rtol=0.0, atol=1e-12)
+    usual, end = (excess_of(device, e, de, 1, more) for more in (0.0, 0.25))
+    np.testing.assert_array_equal(end, usual)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
 def test_a_predictor_turns_an_edge_on_as_it_turned(device, dim):
     """With e0 = e - de before: |end| = 2 |e| - |e0|, the turn from e is that from e0 to e, up to 60 degrees, in the same plane."""
     e, de, length, _ = edges_and_steps(dim)
     end, before = e + de + excess_of(device, e, de, 1), np.linalg.norm(e - de, axis=1)
-    np.testing.assert_allclose(np.linalg.norm(end, axis=1), np.maximum(2.0 * length - before, 0.1 * length), rtol=1e-12)
+    np.testing.assert_allclose(lengths(end), np.maximum(2.0 * length - before, 0.1 * length), rtol=1e-12)
     ran = before > 0.0  # an edge that had no length has not turned
     assert not ran.all()
     np.testing.assert_allclose(angle_between(e, end)[~ran], 0.0, rtol=0.0, atol=1e-12)
@@ -459,7 +470,7 @@ def test_iterations_do_not_grow_with_the_stiffness_of_stretching(device, joined)
 
 
 def parts(integrator) -> list:
-    return [(part.newton.psd, part.stiff) for part in integrator._parts]
+    return [(part.newton.psd, part.means.stiff) for part in integrator._parts]
 
 
 @pytest.mark.parametrize("joined", [False, True])
@@ -495,7 +506,7 @@ def test_the_midpoint_rule_is_about_half_the_step(device):
     """At 1/120 s, whose ratio is 2,800, and 700 over half of it."""
     for scheme, expected in zip(SCHEMES, (True, False), strict=True):
         _, integrator = advance(cantilever(64, ddg.Circle(2e-3), RUBBER), device, 1.0 / 120.0, 1, scheme=scheme)
-        assert integrator._parts[0].stiff == expected
+        assert integrator._parts[0].means.stiff == expected
 
 
 @pytest.mark.parametrize(
@@ -565,7 +576,7 @@ def test_worlds_are_stiff_each_by_itself(device):
     np.testing.assert_array_equal(integrator._parts[0].islands.turn.numpy(), [TURNED, 0.0])
     for points, factor in zip(together, (1.0, 100.0), strict=True):
         alone, own = run(factor)
-        assert own._parts[0].stiff == (factor > 1.0)
+        assert own._parts[0].means.stiff == (factor > 1.0)
         np.testing.assert_allclose(points, alone, rtol=0.0, atol=1e-12)
     assert np.abs(together[0] - together[1]).max() > 1e-6
 
@@ -578,7 +589,7 @@ def test_parameters_that_make_a_rod_stiff_are_noticed(device):
     for factor, stiff, straight_turn in ((1.0, False, TURNED), (1e3, True, 0.0), (1.0, True, TURNED)):
         model.set_parameter("rod_stretch", "stiffness", factor * axial)
         state = integrator.step(state, 0.01)
-        assert integrator._parts[0].stiff == stiff
+        assert integrator._parts[0].means.stiff == stiff
         assert integrator._parts[0].islands.turn.numpy() == straight_turn
     assert integrator.statistics()["outcomes"] == {"converged": 3}
 
@@ -612,7 +623,7 @@ def test_laws_that_name_no_stiffness_move_in_mixed_precision(device, name):
     scene = lawful(UNNAMED[name])
     (mixed, integrator), (exact, _) = (advance(scene, device, 0.02, 20, p, rtol=1e-10) for p in ("mixed", "float64"))
     assert parts(integrator) == [("progressive", True)]
-    assert integrator.statistics()["linear"] == ["float32" if name == "bending" else "float64"]
+    assert integrator.statistics()["linear"] == ["float32" if name == "bending" else "float32 with tensions"]
     assert np.abs(exact - scene.batches[0].points[0]).max() > 0.1
     np.testing.assert_allclose(mixed, exact, rtol=0.0, atol=1e-6)
     if name == "stretching":
