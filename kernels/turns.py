@@ -55,6 +55,8 @@ def edge_functions(dim: int, real):
             sine = wp.sin(aside / length)
         if aside > real(0.0):
             sine /= aside
+        else:
+            cosine = real(1.0)  # it kept its direction, or turned over, for which there is no plane
         return (t * cosine + across * sine) * wp.max(grown, real(0.1) * length) - e - de
 
     return along_edge, excess

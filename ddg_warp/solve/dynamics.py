@@ -99,7 +99,7 @@ class Integrator:
         self._steps_since_check = 0
         self._dt = wp.zeros(model.worlds, dtype=model.types.real, device=model.wp_device)
         self._dt_host = None
-        self._longest = 0.0
+        self._longest, self._version = 0.0, model.version
 
     def step(self, state: State, dt: float) -> State:
         """The state after a step of dt [s]. No state changes that is held: see `State`.
@@ -113,7 +113,7 @@ class Integrator:
         source = self._own(state)
         self._vacate(1 - source)
         target = self._buffers[1 - source].state
-        changed = dt != self._dt_host
+        changed = dt != self._dt_host or self.model.version != self._version
         if changed:
             self._dt.fill_(dt)
             self._dt_host = dt
@@ -185,7 +185,9 @@ class Integrator:
         return 0.5 * dt if self.scheme == "implicit_midpoint" else dt
 
     def _weigh(self, dt: float, state: State) -> None:
-        """What float32 does to steps of dt, where they are longer than those before: solve in float64, or refuse them."""
+        """What suits steps of dt, where they are longer than those before or parameters have changed: solve by it, or refuse them."""
+        if self.model.version != self._version:
+            self._version, self._longest = self.model.version, 0.0
         if dt <= self._longest:
             return
         s = self._solved(dt)
