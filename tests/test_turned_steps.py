@@ -17,7 +17,7 @@ from ddg_warp.kernels.densities import NOT_NEGATIVE, Density, Parameter
 from ddg_warp.kernels.islands import DETOURS_ALLOWED, Islands
 from ddg_warp.kernels.net.newton import STALLED, search_kernels
 from ddg_warp.kernels.step import advance_kernel
-from ddg_warp.kernels.turns import LEAP, TURNED, excess_function
+from ddg_warp.kernels.turns import LEAP, TURNED, edge_functions
 
 slow = pytest.mark.slow
 DONE = {"converged", "converged_to_rounding"}
@@ -38,14 +38,14 @@ def linear_of(solver: str) -> str:
 
 
 def excess_of(device, e, de, onward: int) -> np.ndarray:
-    """`excess_function` of edges e and their steps de (n, dim)."""
+    """Excess of edges e and their steps de (n, dim), which lengthen them by what they do along them; see `edge_functions`."""
     dim = e.shape[1]
-    V, excess = wp.types.vector(dim, wp.float64), excess_function(dim, wp.float64)
+    V, (along, excess) = wp.types.vector(dim, wp.float64), edge_functions(dim, wp.float64)
 
     @wp.kernel(module="unique", enable_backward=False)
     def call(e: wp.array(dtype=V), de: wp.array(dtype=V), onward: int, out: wp.array(dtype=V)):
         i = wp.tid()
-        out[i] = excess(e[i], de[i], onward)
+        out[i] = excess(e[i], de[i], along(e[i], de[i]), onward)
 
     given = [wp.array(np.ascontiguousarray(values), dtype=V, device=device) for values in (e, de)]
     out = wp.zeros(len(e), dtype=V, device=device)
@@ -459,7 +459,7 @@ def test_iterations_do_not_grow_with_the_stiffness_of_stretching(device, joined)
 
 
 def parts(integrator) -> list:
-    return [(part.newton.psd, part.stiff) for part in integrator._parts]
+    return [(part.newton.psd, part.means.stiff) for part in integrator._parts]
 
 
 @pytest.mark.parametrize("joined", [False, True])
@@ -495,7 +495,7 @@ def test_the_midpoint_rule_is_about_half_the_step(device):
     """At 1/120 s, whose ratio is 2,800, and 700 over half of it."""
     for scheme, expected in zip(SCHEMES, (True, False), strict=True):
         _, integrator = advance(cantilever(64, ddg.Circle(2e-3), RUBBER), device, 1.0 / 120.0, 1, scheme=scheme)
-        assert integrator._parts[0].stiff == expected
+        assert integrator._parts[0].means.stiff == expected
 
 
 @pytest.mark.parametrize(
@@ -565,7 +565,7 @@ def test_worlds_are_stiff_each_by_itself(device):
     np.testing.assert_array_equal(integrator._parts[0].islands.turn.numpy(), [TURNED, 0.0])
     for points, factor in zip(together, (1.0, 100.0), strict=True):
         alone, own = run(factor)
-        assert own._parts[0].stiff == (factor > 1.0)
+        assert own._parts[0].means.stiff == (factor > 1.0)
         np.testing.assert_allclose(points, alone, rtol=0.0, atol=1e-12)
     assert np.abs(together[0] - together[1]).max() > 1e-6
 
@@ -578,7 +578,7 @@ def test_parameters_that_make_a_rod_stiff_are_noticed(device):
     for factor, stiff, straight_turn in ((1.0, False, TURNED), (1e3, True, 0.0), (1.0, True, TURNED)):
         model.set_parameter("rod_stretch", "stiffness", factor * axial)
         state = integrator.step(state, 0.01)
-        assert integrator._parts[0].stiff == stiff
+        assert integrator._parts[0].means.stiff == stiff
         assert integrator._parts[0].islands.turn.numpy() == straight_turn
     assert integrator.statistics()["outcomes"] == {"converged": 3}
 
