@@ -1,0 +1,182 @@
+"""Tensions as unknowns of the sweep: the same directions as without, and in float32 as good ones however stiff edges are."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import ddg_warp as ddg
+from ddg_warp import arrays
+from ddg_warp.solve.chains.newton import ChainNewton, NewtonOptions
+
+KINDS = {"twist": {}, "untwisted": {"twist": False}, "planar": {"dimension": 2}}
+EVERY_KIND = pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name == "twist" else pytest.mark.slow) for name in KINDS]
+)
+HAIR = ddg.Material(young=4e9, poisson=0.4, density=1300.0, viscosity=1e-3)
+
+
+def rods(name: str, axial: float, supports: str = "many", natural: str = "straight") -> ddg.Scene:
+    """Rough rods with many supports, at their ends, in their middle and along single axes, with one at the "root", or "none"."""
+    given = {"dimension": 3} | KINDS[name]
+    dimension = given.pop("dimension")
+    across = 1.0 if dimension == 3 else 0.0
+    random, scene = np.random.default_rng(5), ddg.Scene(gravity=(0.3, -0.5 * across, -2.0), dimension=dimension)
+    section = ddg.Stiffness(EA=axial, EI1=0.6, GJ=0.5, mass_per_length=0.7, **({"EI2": 0.9} if name == "twist" else {}))
+    for nodes in (3, 4, 17, 40):
+        points = np.cumsum(np.array([1.0, 0.0, 0.2]) + 0.2 * random.normal(size=(nodes, 3)), axis=0)
+        points[:, 1] *= across
+        rod = scene.add_rod(points, section=section, natural=natural, **given)
+        if supports != "none":
+            scene.clamp(rod, edges=[0])
+        if supports == "many" and nodes > 3:
+            scene.fix(rod, [nodes - 2], components="z")
+            if nodes > 16:
+                scene.fix(rod, [11])
+    return scene
+
+
+def directions(
+    scene: ddg.Scene, device, linear, carried: float | None, psd: str = "gauss_newton", kept: bool = False
+) -> list:
+    """First Newton direction of every group from a rough iterate, (dofs, nodes, rods), its edges, and the nodes of rods.
+
+    `kept`: whether edges have kept their lengths, from the first node on.
+    """
+    random, found = np.random.default_rng(11), []
+    model = scene.build(device, "float64")
+    for group, state in zip(model.groups, model.state().groups, strict=True):
+        newton = ChainNewton(model, group, NewtonOptions(psd=psd), linear, split=carried is not None)
+        x = arrays.download(state.x)
+        noise = 1e-3 * random.normal(size=x.shape)
+        mask = (arrays.download(group.fixed)[..., None] >> np.arange(group.kind.dim)) & 1
+        iterate = x + noise * (mask == 0)
+        if kept:
+            edges = np.diff(iterate, axis=0)
+            size = np.linalg.norm(np.diff(x, axis=0), axis=-1, keepdims=True)
+            edges *= size / np.maximum(np.linalg.norm(edges, axis=-1, keepdims=True), 1e-300)
+            iterate[1:] = iterate[0] + np.cumsum(edges, axis=0)
+        arrays.assign(newton.x, iterate)
+        arrays.assign(newton.target, x)
+        if group.kind.twist:
+            wp.copy(newton.frame, state.frame)
+        newton.islands.coefficient.fill_(2.0 if psd == "gauss_newton" else 100.0)
+        newton.islands.rate.fill_(1.0)
+        if carried is not None:
+            newton.islands.carried.fill_(carried)
+        edges = np.diff(arrays.download(newton.x), axis=0)
+        for _ in range(2):  # the second for rods whose matrix compression has made indefinite
+            newton.iterate(state.last)
+            if newton.islands.iteration.numpy().all():
+                break
+        inside = np.arange(group.nodes)[:, None] < group.host.count
+        found.append((arrays.download(newton.direction).astype(float) * inside, edges, group.host.count))
+    return found
+
+
+def error(found: np.ndarray, exact: np.ndarray) -> float:
+    """The largest of a rod, relative to its largest displacement."""
+    return float((np.abs(found - exact).max((0, 1)) / np.abs(exact).max((0, 1))).max())
+
+
+@EVERY_KIND
+@pytest.mark.parametrize("supports", ["many", "none"])
+@pytest.mark.parametrize("psd", ["gauss_newton", pytest.param("none", marks=pytest.mark.slow)])
+def test_directions_are_those_of_the_whole_matrix(device, name, supports, psd):
+    """H + r^T r / s is the Schur complement of [H r^T; r -s], whatever the share of the stiffness that H carries."""
+    scene = rods(
+        name, 9.0, supports, "shape" if psd == "none" and name != "untwisted" else "straight"
+    )  # the exact Hessian is definite near it
+    exact = directions(scene, device, wp.float64, None, psd)
+    for carried in (1e-3, 1.0, 5.0, 1e3):  # edges have some 9; the last leaves no tension
+        for (found, edges, count), (expected, *_) in zip(
+            directions(scene, device, wp.float64, carried, psd), exact, strict=True
+        ):
+            assert error(found[:-1], expected) < 1e-9
+            dim = edges.shape[2]
+            steps = np.diff(np.moveaxis(found[:dim], 0, -1), axis=0)
+            along = np.sum(edges * steps, -1) / np.linalg.norm(edges, axis=-1)
+            inside = np.arange(len(along))[:, None] < count - 1
+            # what edges lengthen by, the last row
+            np.testing.assert_allclose(found[-1, :-1][inside], along[inside], rtol=0, atol=1e-9 * np.abs(steps).max())
+
+
+def test_float32_is_as_good_however_stiff_edges_are(device):
+    """Errors of directions: those of tensions do not grow with EA; without tensions they do, by a hundred for a hundred."""
+    errors = {True: [], False: []}
+    for axial in (1e2, 1e4, 1e6, 1e8):
+        scene = rods("twist", axial, "root")
+        exact = directions(scene, device, wp.float64, None, kept=True)
+        for split, found in errors.items():
+            got = directions(scene, device, wp.float32, 1e2 if split else None, kept=True)
+            found.append(max(error(a[: b.shape[0]], b) for (a, *_), (b, *_) in zip(got, exact, strict=True)))
+    assert max(errors[True]) < 1e-3
+    assert errors[False][-1] > 1e2 * errors[True][-1]
+
+
+def hair(nodes: int, strands: int = 4) -> ddg.Scene:
+    """Curled hair of 40 um on roots that are shaken."""
+    s = np.linspace(0.0, 0.28, nodes)
+    curl = 0.01 * np.minimum(1.0, s / 0.14)
+    points = np.stack([curl * np.cos(80.0 * s), curl * np.sin(80.0 * s), -s], -1)
+    turn = np.arange(strands)[:, None]
+    x, y = (
+        points[:, 0] * np.cos(turn) - points[:, 1] * np.sin(turn),
+        points[:, 0] * np.sin(turn) + points[:, 1] * np.cos(turn),
+    )
+    scene = ddg.Scene(mass_damping=0.5)
+    rods = scene.add_rods(
+        np.stack([x, y, np.broadcast_to(points[:, 2], x.shape)], -1),
+        section=ddg.Circle(4e-5),
+        material=HAIR,
+        natural="shape",
+    )
+    shake = ddg.Motion(translation=lambda t: (0.05 * np.sin(4.0 * np.pi * t), 0.0, 0.0))
+    scene.clamp(rods, edges=[0], motion=shake)
+    return scene
+
+
+def advance(scene: ddg.Scene, device, precision: str, dt: float, steps: int, **options):
+    """Points after some steps, and the statistics."""
+    model = scene.build(device, precision)
+    integrator, state = ddg.Integrator(model, **options), model.state()
+    for _ in range(steps):
+        state = integrator.step(state, dt)
+    integrator.check(state)
+    return state.points(), integrator.statistics()
+
+
+@pytest.mark.parametrize(
+    ("nodes", "dt", "scheme"),
+    [
+        (32, 1.0 / 240.0, "implicit_euler"),
+        (32, 1.0 / 60.0, "implicit_euler"),
+        pytest.param(64, 1.0 / 60.0, "implicit_euler", marks=pytest.mark.slow),
+        pytest.param(128, 1.0 / 60.0, "implicit_euler", marks=pytest.mark.slow),
+        pytest.param(32, 1.0 / 120.0, "implicit_midpoint", marks=pytest.mark.slow),
+    ],
+)
+def test_hair_moves_as_in_float64(device, nodes, dt, scheme):
+    """Within 1e-6 m of float64 at rtol 1e-10, in as many iterations, and without retries."""
+    steps = round(0.25 / dt)
+    options = {"scheme": scheme} | ({"energy_bound": None} if scheme == "implicit_midpoint" else {})
+    exact, one = advance(hair(nodes), device, "float64", dt, steps, rtol=1e-10, **options)
+    usual, two = advance(hair(nodes), device, "float64", dt, steps, **options)
+    found, other = advance(hair(nodes), device, "mixed", dt, steps, **options)
+    assert one["linear"] == ["float64"]
+    assert other["linear"] == ["float32 with tensions"]
+    assert np.abs(found - exact).max() < max(1e-6, 2.0 * np.abs(usual - exact).max())
+    assert other["newton_iterations"]["mean"] < 1.1 * two["newton_iterations"]["mean"]
+    assert other["newton_iterations"]["max"] <= 10
+    assert other["retries"] == 0
+
+
+def test_bending_beyond_float32_is_solved_in_float64(device):
+    """Steel of 256 edges over 0.1 s: a node to and fro between its neighbours is stiffer than float32 has digits, too."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
+    points = np.linspace([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], 257)
+    rod = scene.add_rod(
+        points, section=ddg.Circle(2e-3), material=ddg.Material(young=2e11, poisson=0.3, density=7800.0)
+    )
+    scene.clamp(rod)
+    _, statistics = advance(scene, device, "mixed", 0.1, 2)
+    assert statistics["linear"] == ["float64"]
