@@ -17,7 +17,7 @@ from ddg_warp.kernels.densities import NOT_NEGATIVE, Density, Parameter
 from ddg_warp.kernels.islands import DETOURS_ALLOWED, Islands
 from ddg_warp.kernels.net.newton import STALLED, search_kernels
 from ddg_warp.kernels.step import advance_kernel
-from ddg_warp.kernels.turns import LEAP, TURNED, edge_functions
+from ddg_warp.kernels.turns import LEAP, edge_functions
 
 slow = pytest.mark.slow
 DONE = {"converged", "converged_to_rounding"}
@@ -475,20 +475,20 @@ def parts(integrator) -> list:
 
 @pytest.mark.parametrize("joined", [False, True])
 def test_second_derivatives_come_with_long_steps(device, joined):
-    """A soft straight rod is Gauss-Newton's at 1/240 s; from a step of 1/30 s on it is stiff; what was counted stays.
+    """A soft straight rod is Gauss-Newton's at 1/240 s; from a step of 1/15 s on it is stiff; what was counted stays.
 
-    EA / l over m / h^2 (with l = 1/63, m = rho A / 64) is E h^2 63 64 / rho: 700 at 1/240 s, 45,000 at 1/30 s.
+    EA / l over m / h^2 (with l = 1/63, m = rho A / 64) is E h^2 63 64 / rho: 700 at 1/240 s, 180,000 at 1/15 s.
     """
     model = cantilever(64, ddg.Circle(2e-3), RUBBER, joined).build(device, "float64")
     integrator, state = ddg.Integrator(model), model.state()
     for _ in range(10):
         state = integrator.step(state, 1.0 / 240.0)
     assert parts(integrator) == [("gauss_newton", False)]
-    np.testing.assert_array_equal(integrator._parts[0].islands.turn.numpy(), TURNED)
+    np.testing.assert_allclose(integrator._parts[0].islands.turn.numpy(), np.sqrt(2.0 / 700.0), rtol=0.02)
     early = integrator.statistics()
     assert early["outcomes"] == {"converged": 10}
     for _ in range(5):
-        state = integrator.step(state, 1.0 / 30.0)
+        state = integrator.step(state, 1.0 / 15.0)
     assert parts(integrator) == [("progressive", True)]
     np.testing.assert_array_equal(integrator._parts[0].islands.turn.numpy(), 0.0)
     late = integrator.statistics()
@@ -498,14 +498,14 @@ def test_second_derivatives_come_with_long_steps(device, joined):
     # a shorter step takes its edges straight again; its matrix stays
     integrator.step(state, 1.0 / 240.0)
     assert parts(integrator) == [("progressive", True)]
-    np.testing.assert_array_equal(integrator._parts[0].islands.turn.numpy(), TURNED)
+    np.testing.assert_allclose(integrator._parts[0].islands.turn.numpy(), np.sqrt(2.0 / 700.0), rtol=0.02)
     assert integrator.statistics()["outcomes"] == {"converged": 16}
 
 
 def test_the_midpoint_rule_is_about_half_the_step(device):
-    """At 1/120 s, whose ratio is 2,800, and 700 over half of it."""
+    """At 1/20 s, whose ratio is 101,000, and 25,000 over half of it."""
     for scheme, expected in zip(SCHEMES, (True, False), strict=True):
-        _, integrator = advance(cantilever(64, ddg.Circle(2e-3), RUBBER), device, 1.0 / 120.0, 1, scheme=scheme)
+        _, integrator = advance(cantilever(64, ddg.Circle(2e-3), RUBBER), device, 1.0 / 20.0, 1, scheme=scheme)
         assert integrator._parts[0].means.stiff == expected
 
 
@@ -522,7 +522,7 @@ def test_the_midpoint_rule_is_about_half_the_step(device):
 )
 def test_what_stiff_rods_take(device, options, psd):
     """What cannot tell an indefinite matrix, freezes it, or was told otherwise does without; all go to the same place."""
-    scene = cantilever(32, ddg.Circle(2e-3), RUBBER)
+    scene = cantilever(32, ddg.Circle(2e-3), ddg.Material(young=5e8, poisson=0.5, density=1000.0))
     expected, usual = advance(scene, device, T60, 5, rtol=1e-9)
     assert parts(usual) == [("progressive", True)]
     points, integrator = advance(scene, device, T60, 5, rtol=1e-9, **options)
@@ -537,8 +537,9 @@ def test_a_step_of_another_matrix_goes_on_from_the_last(device):
     ends = []
     for psd in ("auto", "progressive"):
         integrator, state = ddg.Integrator(model, rtol=1e-11, psd=psd), model.state()
-        for dt in [1.0 / 240.0] * 5 + [1.0 / 30.0] * 5:
+        for dt in [1.0 / 240.0] * 5 + [1.0 / 8.0] * 5:
             state = integrator.step(state, dt)
+        assert parts(integrator)[0][0] == "progressive"
         ends.append(state.points())
     np.testing.assert_allclose(ends[0], ends[1], rtol=0.0, atol=1e-9)
 
@@ -559,7 +560,7 @@ def test_wound_up_by_20_turns(device):
 
 
 def test_worlds_are_stiff_each_by_itself(device):
-    """One with a hundred times the stretching stiffness turns its edges always, the other takes small turns straight: as alone."""
+    """One with a thousand times the stretching stiffness turns its edges always, the other takes small turns straight: as alone."""
     scene, names = cantilever(20, ddg.Circle(0.02), RUBBER), ("rod_stretch", "stiffness")
     scene.clamp(0, edges=[0])
 
@@ -572,9 +573,9 @@ def test_worlds_are_stiff_each_by_itself(device):
             state = integrator.step(state, 0.01)
         return state.points(), integrator
 
-    together, integrator = run(1.0, 100.0)
-    np.testing.assert_array_equal(integrator._parts[0].islands.turn.numpy(), [TURNED, 0.0])
-    for points, factor in zip(together, (1.0, 100.0), strict=True):
+    together, integrator = run(1.0, 1e3)
+    assert (integrator._parts[0].islands.turn.numpy() > 0.0).tolist() == [True, False]
+    for points, factor in zip(together, (1.0, 1e3), strict=True):
         alone, own = run(factor)
         assert own._parts[0].means.stiff == (factor > 1.0)
         np.testing.assert_allclose(points, alone, rtol=0.0, atol=1e-12)
@@ -586,11 +587,11 @@ def test_parameters_that_make_a_rod_stiff_are_noticed(device):
     model = cantilever(20, ddg.Circle(0.02), RUBBER).build(device, "float64")
     integrator, state = ddg.Integrator(model), model.state()
     axial = float(model.parameters()["0/rod_stretch/stiffness"].flat[0])
-    for factor, stiff, straight_turn in ((1.0, False, TURNED), (1e3, True, 0.0), (1.0, True, TURNED)):
+    for factor, stiff, straight_turns in ((1.0, False, True), (1e3, True, False), (1.0, True, True)):
         model.set_parameter("rod_stretch", "stiffness", factor * axial)
         state = integrator.step(state, 0.01)
         assert integrator._parts[0].means.stiff == stiff
-        assert integrator._parts[0].islands.turn.numpy() == straight_turn
+        assert (integrator._parts[0].islands.turn.numpy()[0] > 0.0) == straight_turns
     assert integrator.statistics()["outcomes"] == {"converged": 3}
 
 
@@ -622,7 +623,7 @@ def test_laws_that_name_no_stiffness_move_in_mixed_precision(device, name):
     """They are taken for the worst: of bending for none, of stretching for unlimited, which makes a rod stiff over any step."""
     scene = lawful(UNNAMED[name])
     (mixed, integrator), (exact, _) = (advance(scene, device, 0.02, 20, p, rtol=1e-10) for p in ("mixed", "float64"))
-    assert parts(integrator) == [("progressive", True)]
+    assert parts(integrator) == [("gauss_newton", False) if name == "bending" else ("progressive", True)]
     assert integrator.statistics()["linear"] == ["float32" if name == "bending" else "float32 with tensions"]
     assert np.abs(exact - scene.batches[0].points[0]).max() > 0.1
     np.testing.assert_allclose(mixed, exact, rtol=0.0, atol=1e-6)

@@ -46,7 +46,7 @@ def choose(name: str | None, device) -> Precision:
 FLOAT32_LIMIT = (
     0.02  # relative error of a direction that Newton still corrects quickly; beyond it a state in float32 is doubtful
 )
-STIFF = 2e3  # ratio of stiffnesses from which on rods take turned steps and second derivatives
+STIFF = 5e4  # ratio of stiffnesses from which on rods always turn their edges, and take second derivatives
 CARRIED = 1e-3  # error up to which a float32 matrix takes a stiffness; see `kernels.solve.tension`
 FLOAT32_LOST = 0.1  # and beyond this one its motion is that of its rounding, not of the scene
 
@@ -100,9 +100,12 @@ def straight_turns(errors: np.ndarray) -> np.ndarray:
     """Largest turn of an edge that a step takes straight [rad], of rods with such errors; 0: they always turn their edges.
 
     A straight step stretches an edge that it turns by an angle a by a^2 / 2. The force of that acts across the edge as a stiffness of
-    a^2 / 2 times that of stretching: at TURNED and STIFF, ten times as much as what resists the turn. See `kernels.turns`.
+    a^2 / 2 times that of stretching, which may be as much as what resists the turn, but no more. Stiff rods turn even the least, for
+    what a straight step leaves takes an iteration more. See `kernels.turns`.
     """
-    return np.where(stiff(errors), 0.0, TURNED)
+    with np.errstate(divide="ignore"):
+        turns = np.minimum(TURNED, np.sqrt(2.0 * float32_error(1.0, 1.0) / errors))
+    return np.where(stiff(errors), 0.0, turns)
 
 
 def stiff(errors: np.ndarray) -> np.ndarray:
