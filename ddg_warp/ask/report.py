@@ -1,10 +1,16 @@
 """The report of a model: terms, elements, dofs, solver, kernels, memory, and what the scene does without."""
 
+from collections.abc import Callable
+
+import numpy as np
+
 from ddg_warp.kernels.solve import cyclic_reduction
 from ddg_warp.kernels.terms import ALL
+from ddg_warp.scene.scene import Dynamics
 from ddg_warp.solve.choice import automatic, net_preconditioner
 from ddg_warp.solve.net.chains import Chains
 from ddg_warp.solve.net.system import NetSystem
+from ddg_warp.solve.step import Means, suited
 
 SOLVERS = {
     "chain": "PCG (closed chains)",
@@ -32,6 +38,7 @@ def report(model) -> str:
         if kind.drag:
             lines.append("  drag, implicit")
         lines.append(f"  solver: {SOLVERS[automatic(group)]}, linear algebra in {model.types.linear.__name__}")
+        lines += step_lines(model, lambda s, group=group: (group.float32_errors(s), _split_errors(group, s)))
         lines.append(f"  memory: {bytes_per_node(model, group)} bytes a node")
     if model.net is not None:
         lines += net_lines(model)
@@ -41,6 +48,22 @@ def report(model) -> str:
     if not any(group.kind.twist for group in model.groups) and (model.net is None or not model.net.edges):
         lines.append("no angles, no frames, no rotary inertia")
     return "\n".join(lines)
+
+
+def _split_errors(group, s: float) -> np.ndarray:
+    return group.split_errors(s) if automatic(group) == "sweep" else np.array([np.inf])
+
+
+def step_lines(model, errors_of: Callable) -> list[str]:
+    """What the steps of the scene's analysis, if it has any, take beyond the model's precision; `errors_of`: s -> see `suited`."""
+    analysis = model.scene.analysis
+    if not isinstance(analysis, Dynamics):
+        return []
+    errors = errors_of(analysis.dt * (0.5 if analysis.scheme == "implicit_midpoint" else 1.0))
+    means = suited(model.precision, Means(model.types.linear), *(each.max(initial=0.0) for each in errors))
+    taken = ["edges turned, second derivatives"] * means.stiff
+    taken += [f"linear algebra in {means}"] * (means.linear is not model.types.linear or means.split)
+    return [f"  over steps of {analysis.dt:g} s: {', '.join(taken)}"] if taken else []
 
 
 def net_lines(model) -> list[str]:
@@ -71,7 +94,7 @@ def net_lines(model) -> list[str]:
         f"  solver: {solver}, one Newton loop a world, linear algebra in {linear.__name__}; "
         f"H: {table.entries} blocks of 3 x 3{bands}, {size / 1e6:.3g} MB"
     )
-    return lines
+    return lines + step_lines(model, lambda s: (host.rod_errors(s), np.array([np.inf])))
 
 
 def bytes_per_node(model, group) -> int:

@@ -90,6 +90,12 @@ class Group:
         stretching, _, softest = self.stiffnesses(s)
         return precision.float32_error(stretching, softest)
 
+    def split_errors(self, s: float) -> np.ndarray:
+        """The same with tensions as unknowns; infinite where they cannot be: beside bending, of one stretch."""
+        _, bending, softest = self.stiffnesses(s)
+        errors = precision.float32_error(np.maximum(bending, precision.largest_carried(softest)), softest)
+        return errors if self.kind.span == 2 and self.kind.edge_strains == self.kind.tensions == 1 else errors + np.inf
+
 
 def _last_anchor(host: ChainGroup) -> np.ndarray:
     """The last node of every rod (R,) that is held in all directions, -1 where none is."""

@@ -36,6 +36,15 @@ class Means(NamedTuple):
 USUAL = Means()
 
 
+def suited(precision: str, before: Means, errors: float, split_errors: float) -> Means:
+    """What suits a solve in which float32 makes such errors, without and with tensions as unknowns, and those `before`, too."""
+    linear, was_stiff, split = before
+    if precision == "mixed" and errors > FLOAT32_LIMIT:
+        split = linear is wp.float32 and bool(split_errors <= FLOAT32_LIMIT)
+        linear = wp.float32 if split else wp.float64
+    return Means(linear, was_stiff or bool(stiff(errors)), split)
+
+
 class PartStep:
     """Steps all islands of a solver, each with its own retries; see `kernels.step`.
 
@@ -83,11 +92,7 @@ class PartStep:
 
     def suited(self, s: float) -> Means:
         """What suits solves over s [s], and all shorter ones before."""
-        errors, (linear, was_stiff, split) = self.float32_errors(s).max(), self.means
-        if self.model.precision == "mixed" and errors > FLOAT32_LIMIT:
-            split = linear is wp.float32 and bool(self.split_errors(s).max() <= FLOAT32_LIMIT)
-            linear = wp.float32 if split else wp.float64
-        return Means(linear, was_stiff or bool(stiff(errors)), split)
+        return suited(self.model.precision, self.means, self.float32_errors(s).max(), self.split_errors(s).max())
 
     def split_errors(self, s: float) -> np.ndarray:
         """The same with tensions as unknowns; infinite where they cannot be."""

@@ -134,12 +134,6 @@ class ChainNewton:
         return "progressive" if any(group.parameters[name].any() for name in rest) else "gauss_newton"
 
     @property
-    def splits(self) -> bool:
-        """Whether tensions can be unknowns of their own: those of a stretch that bending goes with."""
-        kind = self.group.kind
-        return kind.span == 2 and kind.edge_strains == kind.tensions == 1
-
-    @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         return [*self.kernels_around, (self._sweep, self._threads), self._adjust]

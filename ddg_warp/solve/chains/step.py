@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from ddg_warp import arrays
-from ddg_warp.compile.precision import float32_error, largest_carried
+from ddg_warp.compile.precision import largest_carried
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels import element, step
 from ddg_warp.solve import energy
@@ -97,9 +97,7 @@ class ChainStep(PartStep):
 
     def split_errors(self, s: float) -> np.ndarray:
         """Of every rod; infinite where the solver cannot take tensions for unknowns."""
-        _, bending, softest = self.group.stiffnesses(s)
-        errors = float32_error(np.maximum(bending, largest_carried(softest)), softest)
-        return errors if type(self.newton) is ChainNewton and self.newton.splits else np.full_like(errors, np.inf)
+        return self.group.split_errors(s) if type(self.newton) is ChainNewton else super().split_errors(s)
 
     def straighten(self, s: float) -> None:
         """As of `PartStep`; and what float32 matrices carry."""
