@@ -13,6 +13,7 @@ from ddg_warp.kernels.chain import ChainKind
 from ddg_warp.kernels.islands import ANGLE_CHANGE, BENT, CAUTIOUS, PROGRESS, RATE, STEP_LENGTH, TODO
 from ddg_warp.kernels.search import PLACE, RELAG, move_functions
 from ddg_warp.kernels.step import predicted_function
+from ddg_warp.kernels.turns import onward_function
 
 
 @cache
@@ -24,6 +25,7 @@ def move_kernels(kind: ChainKind, real, linear):
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
     step_of, excess, put, carry = move_functions(kind, real, linear)
+    onward_of = onward_function(real)
     _, reference_twist, _ = frames.functions(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -32,6 +34,7 @@ def move_kernels(kind: ChainKind, real, linear):
         todo: wp.array(dtype=int),
         direction: wp.array3d(dtype=linear),
         step_length: wp.array(dtype=real),
+        straight: wp.array(dtype=real),
         onward: int,
         base: wp.array2d(dtype=V),
         x: wp.array2d(dtype=V),
@@ -45,7 +48,7 @@ def move_kernels(kind: ChainKind, real, linear):
         if k >= n - 1:
             return
         if todo[r] == wp.static(PLACE):
-            excess_out[k, r] = excess(base, direction, step_length[r], onward, k, n, r)
+            excess_out[k, r] = excess(base, direction, step_length[r], onward_of(straight[r], onward), k, n, r)
         if wp.static(twist):
             if todo[r] == wp.static(RELAG):
                 u, t = carry(x, frame, k, n, r)

@@ -36,6 +36,7 @@ from ddg_warp.kernels.islands import (
 )
 from ddg_warp.kernels.search import search_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
+from ddg_warp.kernels.turns import onward_function
 
 
 @cache
@@ -139,7 +140,7 @@ def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
     dim, carried = kind.dim, kind.twist and midpoint
     V = wp.types.vector(dim, real)
     place, _, relag, _ = search_functions(kind, real, linear)
-    predicted = predicted_function(dim, real)
+    predicted, onward_of = predicted_function(dim, real), onward_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def predict(
@@ -165,7 +166,8 @@ def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
                 base[k, r] = x0[k, r]
                 for d in range(wp.static(dim)):
                     direction[d, k, r] = linear(step[d])
-            place(x, base, direction, fixed, anchor, real(1.0), wp.static(0 if midpoint else 1), n, r)
+            onward = onward_of(scalars[TURN, r], wp.static(0 if midpoint else 1))
+            place(x, base, direction, fixed, anchor, real(1.0), onward, n, r)
         if wp.static(carried):
             relag(x, frame, n, r)
 

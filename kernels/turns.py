@@ -66,6 +66,17 @@ def edge_functions(dim: int, real):
 
 
 @cache
+def onward_function(real):
+    """onward(straight, wanted): `wanted` for rods that always turn their edges; a soft one lengthens as its velocity says."""
+
+    @wp.func
+    def onward(straight: real, wanted: int):
+        return wp.where(straight == real(0.0), wanted, 0)
+
+    return onward
+
+
+@cache
 def place_function(dim: int, real, Rod, excess, anchored, added, put):
     """place(rod): puts the nodes of a rod where a step ends, with edges turned. What the storage gives:
 

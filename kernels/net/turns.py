@@ -6,7 +6,7 @@ import warp as wp
 
 from ddg_warp.kernels.islands import CAUTIOUS, RATE, STEP_LENGTH, TODO, TURN, TURNING
 from ddg_warp.kernels.search import PLACE
-from ddg_warp.kernels.turns import edge_functions, place_function
+from ddg_warp.kernels.turns import edge_functions, onward_function, place_function
 
 
 @cache
@@ -16,6 +16,7 @@ def turn_kernels(real, linear):
     """
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     along_edge, excess_of = edge_functions(3, real)
+    onward_of = onward_function(real)
 
     @wp.struct
     class Rod:
@@ -113,6 +114,7 @@ def turn_kernels(real, linear):
         direction: wp.array(dtype=H),
         step_length: wp.array(dtype=real),
         todo: wp.array(dtype=int),
+        straight: wp.array(dtype=real),
         onward: int,
         blocks: int,
         excess_out: wp.array2d(dtype=V),
@@ -126,7 +128,7 @@ def turn_kernels(real, linear):
         amount = step_length[w]
         step = move_of(direction, b, amount) - move_of(direction, a, amount)
         edge = base[b] - base[a]
-        excess_out[w, p] = excess_of(edge, step, along_edge(edge, step), onward)
+        excess_out[w, p] = excess_of(edge, step, along_edge(edge, step), onward_of(straight[w], onward))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def place(

@@ -116,7 +116,7 @@ class PartitionedNewton(AssembledNewton):
         self._launch(
             turn,
             group.nodes,
-            [group.count, islands.todo, self.direction, islands.step_length, int(onward)]
+            [group.count, islands.todo, self.direction, islands.step_length, islands.turn, int(onward)]
             + [self.base, self.x, self.frame],
             [self.prefix, self.new_frame],
         )

@@ -67,7 +67,7 @@ class Turns:
         newton, net = self.newton, self.net
         turn, place, put = self._kernels
         moved = [newton.base, newton.direction, newton.islands.step_length, newton.islands.todo]
-        inputs = [self._nodes, self._ahead, *moved, int(onward), net.blocks]
+        inputs = [self._nodes, self._ahead, *moved, newton.islands.turn, int(onward), net.blocks]
         wp.launch(turn, (len(self._nodes), net.worlds), inputs, [self._excess], device=net.device)
         for rods, places in self._levels:
             inputs = [rods, *self._rods, newton.q, *moved, net.blocks, self._excess]
