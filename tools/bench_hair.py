@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import warp as wp
-from bench_hard import read_rows
+from bench_hard import read_rows, side_by_side
 
 import ddg_warp as ddg
 from ddg_warp.run.summary import machine, table, write_table
@@ -87,13 +87,7 @@ def main() -> int:
         print(table(rows[-1:]).splitlines()[1], file=sys.stderr, flush=True)
         write_table(chosen.out / f"hair_steps_{chosen.label}", rows, origin)  # what is cut short leaves what it has
     if chosen.against:
-        other = {row["case"]: row for row in read_rows(chosen.against)}
-        rows = [
-            {"case": row["case"]}
-            | {f"{name} {each['label']}": each[name] for name in COMPARED for each in (other[row["case"]], row)}
-            for row in rows
-            if row["case"] in other
-        ]
+        rows = side_by_side(read_rows(chosen.against), rows, COMPARED)
         write_table(chosen.out / f"hair_steps_{chosen.against.stem.split('_')[-1]}_{chosen.label}", rows, origin)
     print(table(rows))
     return 0

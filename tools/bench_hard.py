@@ -331,15 +331,15 @@ def measure(case: Case, label: str, device: str, precision: str) -> dict:
     }
 
 
-def side_by_side(before: list[dict], after: list[dict]) -> list[dict]:
-    """What two runs found, by case; empty where one of them lacks it."""
+def side_by_side(before: list[dict], after: list[dict], compared: tuple = COMPARED) -> list[dict]:
+    """What two runs found in the columns `compared`, by case; empty where one of them lacks it."""
     first, second = ({row["case"]: row for row in rows} for rows in (before, after))
     labels = before[0]["label"], after[0]["label"]
     return [
         {"case": case}
         | {
             f"{name} {label}": rows.get(case, {}).get(name, "")
-            for name in COMPARED
+            for name in compared
             for label, rows in zip(labels, (first, second), strict=True)
         }
         for case in dict.fromkeys([*second, *first])

@@ -78,6 +78,12 @@ class ChainGroup(Storage):
     def index(self, places: np.ndarray) -> np.ndarray:
         return places % self.nodes
 
+    @property
+    def anchored(self) -> np.ndarray:
+        """Which nodes are held in all directions (n, R) bool."""
+        every = (1 << self.kind.dim) - 1
+        return ((self.fixed & every) == every) & (np.arange(self.shape[0])[:, None] < self.count)
+
     def fix(self, nodes: np.ndarray, along: list[int], angles: np.ndarray) -> None:
         flat = self.fixed.reshape(-1)
         flat[nodes] |= np.uint8(sum(1 << bit for bit, d in enumerate(self.axes) if d in along))

@@ -99,9 +99,7 @@ class Group:
 
 def _last_anchor(host: ChainGroup) -> np.ndarray:
     """The last node of every rod (R,) that is held in all directions, -1 where none is."""
-    every = (1 << host.kind.dim) - 1
-    k = np.arange(host.shape[0])[:, None]
-    return np.where(((host.fixed & every) == every) & (k < host.count), k, -1).max(axis=0)
+    return np.where(host.anchored, np.arange(host.shape[0])[:, None], -1).max(axis=0)
 
 
 def _constant_loads(host: ChainGroup) -> tuple[np.ndarray, np.ndarray]:

@@ -213,7 +213,8 @@ def repeat_kernel(real, fails: bool, exact: bool = True):
             if wp.static(exact):
                 if out_of_patience(flags, scalars, r):
                     flags[WANTED, r] = 0
-            flags[CLAMPED, r] = 0
+            else:
+                flags[CLAMPED, r] = 0
 
     return repeat
 

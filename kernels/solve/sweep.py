@@ -423,9 +423,10 @@ def sweep_kernel(
                 return
         e1 = H()
         e2 = H()
-        pulled = linear(0.0)
-        pull = linear(0.0)
-        per_root = linear(real(1.0) / wp.sqrt(scalars[CARRIED, r]))
+        if wp.static(split):
+            pulled = linear(0.0)
+            pull = linear(0.0)
+            per_root = linear(real(1.0) / wp.sqrt(scalars[CARRIED, r]))
         rotation = real(0.0)
         x_ahead = V()
         left = kept(Y, n - 1, r)

@@ -6,13 +6,13 @@ import warp as wp
 
 import ddg_warp as ddg
 from ddg_warp import arrays
+from ddg_warp.scenes import hair as curled
 from ddg_warp.solve.chains.newton import ChainNewton, NewtonOptions
 
 KINDS = {"twist": {}, "untwisted": {"twist": False}, "planar": {"dimension": 2}}
 EVERY_KIND = pytest.mark.parametrize(
     "name", [pytest.param(name, marks=() if name == "twist" else pytest.mark.slow) for name in KINDS]
 )
-HAIR = ddg.Material(young=4e9, poisson=0.4, density=1300.0, viscosity=1e-3)
 
 
 def rods(name: str, axial: float, supports: str = "many", natural: str = "straight") -> ddg.Scene:
@@ -113,26 +113,9 @@ def test_float32_is_as_good_however_stiff_edges_are(device):
     assert errors[False][-1] > 1e2 * errors[True][-1]
 
 
-def hair(nodes: int, strands: int = 4) -> ddg.Scene:
-    """Curled hair of 40 um on roots that are shaken."""
-    s = np.linspace(0.0, 0.28, nodes)
-    curl = 0.01 * np.minimum(1.0, s / 0.14)
-    points = np.stack([curl * np.cos(80.0 * s), curl * np.sin(80.0 * s), -s], -1)
-    turn = np.arange(strands)[:, None]
-    x, y = (
-        points[:, 0] * np.cos(turn) - points[:, 1] * np.sin(turn),
-        points[:, 0] * np.sin(turn) + points[:, 1] * np.cos(turn),
-    )
-    scene = ddg.Scene(mass_damping=0.5)
-    rods = scene.add_rods(
-        np.stack([x, y, np.broadcast_to(points[:, 2], x.shape)], -1),
-        section=ddg.Circle(4e-5),
-        material=HAIR,
-        natural="shape",
-    )
-    shake = ddg.Motion(translation=lambda t: (0.05 * np.sin(4.0 * np.pi * t), 0.0, 0.0))
-    scene.clamp(rods, edges=[0], motion=shake)
-    return scene
+def hair(nodes: int) -> ddg.Scene:
+    """Four curled hairs of 40 um on roots that are shaken."""
+    return curled.build(strands=4, nodes=nodes)
 
 
 def advance(scene: ddg.Scene, device, precision: str, dt: float, steps: int, **options):
@@ -186,9 +169,7 @@ def test_the_report_says_what_steps_take(device):
     """Of the scene's analysis: what float32 alone carries, with tensions, and in float64; a soft rod needs nothing of it."""
     said = "over steps of 0.0166667 s: edges turned, second derivatives"
     for precision, linear in (("mixed", ", linear algebra in float32 with tensions"), ("float64", "")):
-        scene = hair(32)
-        scene.analysis = ddg.Dynamics(dt=1.0 / 60.0, duration=1.0)
-        assert said + linear + "\n" in scene.build(device, precision).report()
+        assert said + linear + "\n" in hair(32).build(device, precision).report()
     soft = ddg.Scene(analysis=ddg.Dynamics(dt=1.0 / 240.0, duration=1.0))
     rod = soft.add_rod(
         np.linspace([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], 32), section=ddg.Circle(2e-3), material=ddg.Material(1e7)

@@ -143,9 +143,7 @@ class PartitionedNewton(AssembledNewton):
 
 def _held_neighbours(group) -> np.ndarray:
     """The held nodes next to every node, itself included: (before or after, node, column), -1 where there is none."""
-    host, every = group.host, (1 << group.kind.dim) - 1
-    k = np.arange(group.nodes)[:, None]
-    held = ((host.fixed & every) == every) & (k < host.count)
+    k, held = np.arange(group.nodes)[:, None], group.host.anchored
     before = np.maximum.accumulate(np.where(held, k, -1), axis=0)
     after = np.minimum.accumulate(np.where(held, k, group.nodes)[::-1], axis=0)[::-1]
     neighbours = np.stack([before, np.where(after < group.nodes, after, -1)]).astype(np.int32)
