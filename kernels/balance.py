@@ -29,7 +29,7 @@ from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 @cache
 def node_functions(kind: ChainKind, real):
-    """Gathers for one node: force(g, row, k, r), and balance(...) -> residual and what it is judged by.
+    """Gathers for one node: force, behind, balance(...) -> residual and what it is judged by, and edge_force.
 
     balance returns the residual force and moment, the size of the element forces that meet, and the elastic part of the moment.
     """
@@ -110,7 +110,7 @@ def node_functions(kind: ChainKind, real):
             moment -= elastic + c * rotary[k, r] * (theta[k, r] - target_angle[k, r])
         return f, moment, size, elastic
 
-    return force, behind, balance
+    return force, behind, balance, edge_force
 
 
 @cache
@@ -122,7 +122,7 @@ def check_kernel(kind: ChainKind, real, linear):
     """
     dim, nb, twist, closed, drag = kind.dim, kind.block, kind.twist, kind.closed, kind.drag
     V, Inertia = wp.types.vector(dim, real), inertia_type(kind, real)
-    _, behind, balance = node_functions(kind, real)
+    _, behind, balance, _ = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
     until = until_function(kind.serial)
 

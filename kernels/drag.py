@@ -63,7 +63,7 @@ def chain_kernels(kind: ChainKind, real):
     V, M, P = wp.types.vector(dim, real), wp.types.matrix((dim, dim), real), wp.types.vector(ROWS, real)
     Inertia = inertia_type(kind, real)
     half = edge_function(dim, real)
-    _, behind, _ = node_functions(kind, real)
+    _, behind, *_ = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
     until = until_function(kind.serial)
 

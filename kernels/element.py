@@ -13,6 +13,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.chain import ChainKind, gather_functions
+from ddg_warp.kernels.variation import variation_functions
 
 
 @cache
@@ -95,8 +96,10 @@ def term_kernels(kind: ChainKind, index: int, real, reverse: bool = False):
     V, W = wp.types.vector(kind.dim, real), wp.types.vector(kind.window, real)
     S13 = wp.types.vector(13, real)
     P = wp.types.vector(term.density.parameter_size(len(term.measure.strains)), real)
+    E = wp.types.vector(len(term.measure.strains), real)
     strains_of, jacobian_of, *_ = term.measure.functions(real)
     energy_of, slope_of, _ = term.density.functions(real, len(term.measure.strains))
+    along, _ = variation_functions(term, real)
     _, window, lagged, _ = gather_functions(kind, real)
     load, local, short, spread = term_functions(kind, index, real)
     size = kind.window
@@ -106,10 +109,6 @@ def term_kernels(kind: ChainKind, index: int, real, reverse: bool = False):
     def gradient_at(q: W, s: S13, w: real, p: P):
         e, jacobian = jacobian_of(local(q), short(s), w)
         return spread((slope_of(e, p) * w) * jacobian)
-
-    @wp.func
-    def along(q: W, s: S13, w: real, p: P, v: W):
-        return wp.dot(gradient_at(q, s, w, p), v)
 
     @wp.kernel(module="unique", enable_backward=reverse)
     def energy(
@@ -172,13 +171,11 @@ def term_kernels(kind: ChainKind, index: int, real, reverse: bool = False):
             w, p = load(buffer, table, last, rate[r], k, r)
             v = W()
             v[column] = real(1.0)
-            dq, _ds, _dw, _dp, _dv = wp.grad(along)(
-                window(x, theta, k, n, whole, r), lagged(frame, k, n, whole, r), w, p, v
-            )
+            q = local(window(x, theta, k, n, whole, r))
+            dq, _ds, _dw, _dp, _dv, _de = wp.grad(along)(q, short(lagged(frame, k, n, whole, r)), w, p, local(v), E())
+            f = spread(dq)
             for i in range(wp.static(size)):
-                hessian_out[i * wp.static(size) + column, k, r] = (
-                    hessian_out[i * wp.static(size) + column, k, r] + dq[i]
-                )
+                hessian_out[i * wp.static(size) + column, k, r] = hessian_out[i * wp.static(size) + column, k, r] + f[i]
 
     return energy, gradient, hessian
 

@@ -63,7 +63,7 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
     drag, Inertia = kind.drag, inertia_type(kind, real)
     edge_row, tension_row = vertex_rows * window, vertex_rows * window + edge_rows * dim
     _, store, _, _ = block_functions(nb, linear)
-    _, behind, _ = node_functions(kind, real)
+    _, behind, *_ = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
     curved, begin = exact_from is not None, exact_from or 0
     first_first, first_mid, first_last, mid_mid, mid_last, last_last = geometric.block_functions(kind, linear)
@@ -200,7 +200,7 @@ def product_function(kind: ChainKind, linear):
     """times(blocks, v, k, n, r): row k of H v."""
     nb2, span, closed = kind.block**2, kind.span, kind.closed
     load, _, vector, _ = block_functions(kind.block, linear)
-    _, behind, _ = node_functions(kind, wp.float64)
+    _, behind, *_ = node_functions(kind, wp.float64)
     along, *_ = gather_functions(kind, wp.float64)
 
     @wp.func

@@ -18,6 +18,7 @@ from ddg_warp.kernels.islands import CLAMPED, ITERATION, SLOT, STALE, STATUS
 from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.terms import Term
 from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
+from ddg_warp.kernels.variation import variation_functions
 
 FRAME = 6  # reals of the reference frame of an edge: first director and tangent
 
@@ -175,17 +176,13 @@ def term_kernels(term: Term, real, reverse: bool = False):
     strains_of, jacobian_of, *_ = measure.functions(real)
     energy_of, slope_of, _ = density.functions(real, n)
     gather, spread = functions(term, real)
+    along, _ = variation_functions(term, real)
     slots_count, size = measure.slots, measure.size
 
     @wp.func
     def gradient_at(q: Q, s: S, w: real, p: P):
         e, jacobian = jacobian_of(q, s, w)
         return (slope_of(e, p) * w) * jacobian
-
-    @wp.func
-    def along(q: Q, s: S, w: real, p: P, v: Q, extra: E):
-        e, jacobian = jacobian_of(q, s, w)
-        return wp.dot(((slope_of(e, p) + extra) * w) * jacobian, v)
 
     @wp.kernel(module="unique", enable_backward=reverse)
     def energy(

@@ -28,6 +28,7 @@ class ChainTangent(Part):
         gravity = np.append(group.gravity_host, 0.0)[None, : kind.block]
         super().__init__(model, group.host, offset, group.columns * group.nodes * kind.block, _mass(group), gravity)
         self.group, self.body_count = group, group.columns
+        self.rate = group.still  # over what strain-rate damping counts: at rest not
         self.incidence = _incidence(group)
         self.free = _free(group)
         self.angle = np.tile(np.arange(kind.block) >= kind.dim, group.columns * group.nodes)
@@ -178,7 +179,7 @@ class ChainTangent(Part):
         wp.launch(
             kernel,
             grid,
-            [data.x, data.theta, data.frame, data.last, group.still, *group.parameters.arrays, group.count],
+            [data.x, data.theta, data.frame, data.last, self.rate, *group.parameters.arrays, group.count],
             [out],
             device=self.model.wp_device,
         )

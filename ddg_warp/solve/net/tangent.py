@@ -25,6 +25,7 @@ class NetTangent(Part):
         self.free, self.angle, mass = (np.tile(values.ravel(), worlds) for values in (~host.fixed, kind, host.mass))
         super().__init__(model, host, offset, 3 * host.blocks * worlds, mass, gravity)
         self.net, self.body_count = model.net, host.bodies.count * worlds
+        self.rate = model.net.still  # over what strain-rate damping counts: at rest not
         self.planes = HostPlanes(host, worlds) if host.frames else None
         self._anchored = host.fixed[: host.nodes].copy()
         for shell in host.shells:
@@ -251,7 +252,7 @@ class NetTangent(Part):
         wp.launch(
             elements.term_kernels(part.term, self.net.real)[which],
             (part.elements * self.net.worlds, *columns),
-            [self.net.elements(state.net, index), *more],
+            [self.net.elements(state.net, index, rate=self.rate), *more],
             [out],
             device=self.net.device,
         )

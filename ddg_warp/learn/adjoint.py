@@ -1,0 +1,142 @@
+"""Gradients of time steps and equilibria by the implicit function theorem.
+
+A step solves a balance of forces f(q; state, parameters, ...) = 0 for its dofs q. Of a loss with the derivative g by q, its reverse
+solves H^T w = g with the exact Hessian of the solution, once, whatever the number of Newton iterations was; the derivative by
+everything else that f reads is that of w . f, which Warp's reverse mode gives element by element. What surrounds the solve (inertia,
+velocities, frames carried along, joints' ghosts, strains that damping keeps) has a reverse of its own. See Tortorelli and Michaleris,
+Inverse Problems in Engineering 1, 1994, 71, for such adjoints, and `ddg_warp.kernels.variation` for the elements.
+
+Derivatives by a state are a `State`, whose arrays hold them: `points()` are those by positions, in the user's order.
+"""
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+
+from ddg_warp.errors import SolverError
+from ddg_warp.learn.chains import ChainAdjoint, Kept
+from ddg_warp.learn.net import NetAdjoint, NetKept
+from ddg_warp.model import validate
+from ddg_warp.model.state import State
+from ddg_warp.threads import launches
+
+
+@dataclass
+class Tape:
+    """What the reverse of a step reads: the states that it led from and to, its length [s], and what the solves of its parts left."""
+
+    before: State
+    after: State
+    dt: float
+    parts: list
+
+
+@launches
+class Adjoint:
+    """Reverse of the steps of an integrator.
+
+        adjoint = Adjoint(integrator)
+        after, tape = adjoint.step(state, dt=0.01)
+        gradient, inputs = adjoint.pull(tape, loss_by_after)
+
+    Args:
+        integrator: an `Integrator`. Its steps are made as ever; to be differentiable each has to be made by one solve.
+
+    Raises:
+        SceneError: the model has something that no gradient goes through; names it.
+    """
+
+    def __init__(self, integrator):
+        self.integrator, self.model = integrator, integrator.model
+        self.chains = [ChainAdjoint(self.model, group, integrator.scheme) for group in self.model.groups]
+        self.net = NetAdjoint(self.model, integrator.scheme) if self.model.net is not None else None
+
+    def step(self, state: State, dt: float) -> tuple[State, Tape]:
+        """The state after a step, and what its reverse needs, which stays valid for as long as it is held."""
+        after = self.integrator.step(state, dt)
+        return after, Tape(state, after, dt, self.keep(state))
+
+    def keep(self, state: State) -> list:
+        """What the step just made from `state` leaves for its reverse, part by part."""
+        integrator = self.integrator
+        kept = [
+            own.keep(part, state.groups[part.index]) for own, part in zip(self.chains, integrator._chains, strict=True)
+        ]
+        return kept + ([self.net.keep(integrator._net, state.net)] if self.net else [])
+
+    def pull(self, tape: Tape, given: State) -> tuple[State, list]:
+        """Derivatives by the state that a step started from, and by what else it read: `ChainInputs` of every group, `NetInputs`.
+
+        Args:
+            tape: of the step.
+            given: derivatives by the state that it led to.
+
+        Raises:
+            SolverError: the step was made in parts, as a solve failed.
+        """
+        validate.check_state("pull", self.model, given)
+        for kept, part in zip(tape.parts, self.integrator._parts, strict=True):
+            _require_whole(kept.whole.numpy(), part)
+        return self.pull_parts(tape.before, tape.after, tape.parts, given, self.integrator._solved(tape.dt))
+
+    def pull_parts(self, before: State, after: State, parts: list, given: State, s: float) -> tuple[State, list]:
+        """The same without a check, for solves over s [s]."""
+        groups, inputs = [], []
+        for own, kept, end, by in zip(self.chains, parts, after.groups, given.groups, strict=False):
+            start, read = own.pull(kept, end, by, s)
+            groups.append(start)
+            inputs.append(read)
+        net = None
+        if self.net:
+            net, read = self.net.pull(parts[-1], after.net, given.net, s)
+            inputs.append(read)
+        return State(self.model, groups, net, before.time), inputs
+
+
+@launches
+class EquilibriumAdjoint:
+    """Gradients of equilibria, stable or not, by what their balance reads; points of a path at their load parameter.
+
+    Args:
+        model: whose equilibria they are.
+
+    Raises:
+        SceneError: the model has something that no gradient goes through; names it.
+    """
+
+    def __init__(self, model):
+        self.model = model
+        self.chains = [ChainAdjoint(model, group, None) for group in model.groups]
+        self.net = NetAdjoint(model, None) if model.net is not None else None
+
+    def pull(self, state: State, given: State) -> list:
+        """Derivatives by what the balance of the parts read: `ChainInputs` of every group, `NetInputs`.
+
+        Args:
+            state: the equilibrium; its time is the load parameter.
+            given: derivatives by it; those by velocities have no effect.
+
+        Raises:
+            SolverError: the tangent of the equilibrium is singular (a limit point, a bifurcation).
+        """
+        validate.check_state("pull", self.model, state)
+        validate.check_state("pull", self.model, given)
+        inputs = []
+        for own, at, by in zip(self.chains, state.groups, given.groups, strict=True):
+            kept = Kept(at, at.x, at.theta, at.frame, None, state.time)
+            inputs.append(own.pull(kept, at, by, np.inf)[1])
+        if self.net:
+            kept = NetKept(state.net, state.net, None, state.time)
+            inputs.append(self.net.pull(kept, state.net, given.net, np.inf)[1])
+        return inputs
+
+
+def _require_whole(portion: np.ndarray, part: SimpleNamespace) -> None:
+    """Refuse the reverse of a step that was made in parts."""
+    bad = np.flatnonzero(portion < 1.0)
+    if bad.size:
+        raise SolverError(
+            f"{part.who(int(bad[0]))} took the step in parts, as a solve failed: no gradient goes through it; take a smaller dt",
+            outcome="in_parts",
+        )

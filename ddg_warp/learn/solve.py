@@ -1,0 +1,167 @@
+"""The linear systems of adjoints: the exact Hessian of a solve, transposed, without anything that makes it definite."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from ddg_warp import arrays
+from ddg_warp.errors import SolverError
+from ddg_warp.solve.chains.assembled import AssembledNewton
+from ddg_warp.solve.chains.newton import NewtonOptions
+from ddg_warp.solve.chains.tangent import ChainTangent
+from ddg_warp.solve.direct import SingularError, regular
+from ddg_warp.solve.reduction import CyclicReduction
+
+SINGULAR = 1e-6  # part of a right-hand side that a solution may miss; a singular matrix, which has been made regular, misses more
+
+
+class HostSolve:
+    """(H + c M - dL/dq)^T w = g of a part of a model, by sparse factors on the host."""
+
+    def __init__(self, tangent):
+        self.tangent = tangent
+
+    def __call__(self, state, rate: float, coefficient: float, factor: float | None, given: np.ndarray) -> np.ndarray:
+        """w (size,), zero at held dofs.
+
+        Args:
+            state: the solution with its lagged frames, as a state has its parts.
+            rate: of the implicit Euler step [1/s], zero for an equilibrium, over which strain-rate damping counts.
+            coefficient: c, zero for an equilibrium [1/s^2].
+            factor: load parameter of an equilibrium, whose loads L follow the dofs q; None in a step, where they do not.
+            given: g (size,).
+
+        A singular matrix, of what can move without stiffness, serves a loss that does not depend on that motion.
+
+        Raises:
+            SolverError: the loss does.
+        """
+        tangent, following = self.tangent, None
+        tangent.rate = wp.full(len(tangent.rate), rate, dtype=tangent.rate.dtype, device=tangent.rate.device)
+        matrix = tangent.hessian(state) + sparse.diags(coefficient * tangent.mass)
+        if factor is not None:
+            following = _total(tangent.load_stiffness(factor, tangent.dofs(state)), self._spun(state, factor))
+        free = np.flatnonzero(tangent.free)
+        own, given = sparse.csc_matrix(matrix if following is None else matrix + following)[free][:, free], given[free]
+        try:
+            solve = regular(own, tangent.mass[free])[0].solve if following is None else _transposed(own)
+            found = solve(given)
+        except (SingularError, RuntimeError) as error:
+            raise self._singular(free) from error
+        missed = np.abs(own.T @ found - given)
+        if not missed.max(initial=0.0) <= SINGULAR * np.abs(given).max(initial=0.0):
+            raise self._singular(free[int(np.argmax(missed))])
+        w = np.zeros(tangent.size)
+        w[free] = found
+        return w
+
+    def _spun(self, state, factor: float) -> sparse.csc_matrix | None:
+        """What frames that an equilibrium carries along do, where the tangent holds them still; None where nothing twists an edge.
+
+        A moment M on the angle of an edge e turns with its frame, which spins about t by t . (t x de) / 2 |e| less than one that is
+        held still: it adds the force M [t] de / 2 |e|^2 across the edge, [t] the matrix of t x. M is what loads and supports put there.
+        """
+        tangent, rows, columns, values = self.tangent, [], [], []
+        q = tangent.dofs(state)
+        moments = np.where(tangent.free, tangent.loads(factor, q), tangent.gradient(state))
+        for body in tangent.bodies():
+            if len(body.angles) and (body.nodes >= 0).all():
+                ends = body.nodes[body.ends]  # (edges, 2, 3)
+                felt = moments[body.angles] * tangent.free[ends].any((1, 2)) != 0.0
+                ends, moment = ends[felt], moments[body.angles][felt]
+                e = q[ends[:, 1]] - q[ends[:, 0]]
+                size = moment / (2.0 * np.linalg.norm(e, axis=1) ** 3)
+                across = size[:, None, None] * np.swapaxes(np.cross(e[:, None], np.eye(3)), 1, 2)
+                sign = np.array([[1.0, -1.0], [-1.0, 1.0]])
+                row, column = np.broadcast_arrays(ends[:, :, None, :, None], ends[:, None, :, None, :])
+                rows.append(row.ravel())
+                columns.append(column.ravel())
+                values.append((sign[None, :, :, None, None] * across[:, None, None]).ravel())
+        if not sum(map(len, values)):
+            return None
+        data, *places = (np.concatenate(parts) for parts in (values, rows, columns))
+        return sparse.csc_matrix((data, places), shape=(tangent.size, tangent.size))
+
+    def _singular(self, dof: np.ndarray | int) -> SolverError:
+        place = self.tangent.where(int(np.ravel(dof)[0]))
+        return SolverError(
+            f"no gradient goes through the solution: {place} can move without any stiffness, along what the loss depends on; hold it, "
+            "or stay off limit points and bifurcations",
+            outcome="singular",
+        )
+
+
+def _total(*matrices: sparse.csc_matrix | None) -> sparse.csc_matrix | None:
+    """Sum of the matrices that there are."""
+    return sum(m for m in matrices if m is not None) if any(m is not None for m in matrices) else None
+
+
+def _transposed(matrix: sparse.csc_matrix):
+    """The solution of the transposed system, for a matrix that is not symmetric."""
+    factors = splu(matrix)
+    return lambda given: factors.solve(given, trans="T")
+
+
+class ChainSolve:
+    """H w = g of a group of rods, in the precision of its state: by cyclic reduction; on the host of closed rods and of equilibria."""
+
+    def __init__(self, model, group):
+        self.model, self.group = model, group
+        real, device, kind = model.types.real, model.wp_device, group.kind
+        self.host = HostSolve(ChainTangent(model, group, 0))
+        self.reduction = None
+        if not kind.closed:
+            self.system = AssembledNewton(model, group, NewtonOptions(psd="none"), real)
+            self.system.islands.unbalanced.fill_(1)  # every rod wants its matrix
+            self.reduction = CyclicReduction(kind.block, group.nodes, group.columns, real, device)
+            self._wanted = wp.full(group.columns, 1, dtype=int, device=device)
+        self._mask = arrays.upload(_free(group), real, device)
+
+    def __call__(self, solved, last: wp.array, s: float, given: wp.array) -> wp.array:
+        """w (block, n, R), zero at held dofs, for the right-hand side `given`.
+
+        Args:
+            solved: the solution `x`, `theta` and its lagged `frame`.
+            last: strains of the last step.
+            s: length of the implicit Euler step [s]; infinite for an equilibrium, of which `solved.time` is the load parameter.
+
+        Raises:
+            SolverError: H is singular.
+        """
+        rate = 1.0 / s
+        coefficient = rate * (rate + self.model.scene.mass_damping)
+        right = wp.map(wp.mul, given, self._mask)
+        if self.reduction is None or not rate:
+            return self._on_host(solved, last, rate, coefficient, right)
+        system = self.system
+        system.x, system.theta, system.frame = solved.x, solved.theta, solved.frame
+        islands = system.islands
+        islands.coefficient.fill_(coefficient)
+        islands.rate.fill_(rate)
+        islands.bad.zero_()
+        system.evaluate(last)
+        system.assemble_blocks()
+        w = arrays.allocate(right.shape, system.linear, system.device)
+        self.reduction.solve(system.blocks, right, self.group.count, self._wanted, w, islands.bad)
+        return w
+
+    def _on_host(self, solved, last, rate: float, coefficient: float, right: wp.array) -> wp.array:
+        data = SimpleNamespace(x=solved.x, theta=solved.theta, frame=solved.frame, last=last)
+        groups = [data if each is self.group else None for each in self.model.groups]
+        factor = None if rate else solved.time
+        b = arrays.download(right).astype(float).transpose(2, 1, 0).ravel()
+        w = self.host(SimpleNamespace(groups=groups), rate, coefficient, factor, b)
+        out = arrays.allocate(right.shape, right.dtype, right.device)
+        arrays.assign(out, self.host.tangent.blocks(w).transpose(2, 1, 0))
+        return out
+
+
+def _free(group) -> np.ndarray:
+    """One for dofs that are free (block, n, columns), zero for held ones and behind the end of a rod."""
+    host = group.host
+    bits = (host.fixed[None] >> np.arange(group.kind.block)[:, None, None]) & 1
+    inside = np.arange(group.nodes)[:, None] < host.count
+    return np.tile((bits == 0) & inside, (1, 1, group.worlds)).astype(float)

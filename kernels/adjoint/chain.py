@@ -1,0 +1,233 @@
+"""Reverse of a step on chains; see `kernels.variation`.
+
+Every element writes its own shares, which nodes then gather, so that sums come in one order, without atomics. Cotangents of dofs lie
+as right-hand sides do, [component of a node][node][rod].
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.balance import node_functions
+from ddg_warp.kernels.chain import ChainKind, gather_functions
+from ddg_warp.kernels.element import term_functions
+from ddg_warp.kernels.variation import carried_function, variation_functions
+
+
+@cache
+def pull_kernel(kind: ChainKind, index: int, real):
+    """pull(...): what the elements of a term bring, -w . dE/dq, by their inputs.
+
+    Adds those by the window, by the lagged data of its two edges and by the rate, and those by the rest measure and the parameters, in
+    the rows that the term has in the table.
+    Writes those by the strains of the last step.
+    """
+    term = kind.terms[index]
+    measure, density = term.measure, term.density
+    n, size = len(measure.strains), density.parameter_size(len(measure.strains))
+    V, W = wp.types.vector(kind.dim, real), wp.types.vector(kind.window, real)
+    E = wp.types.vector(n, real)
+    along_node, window, lagged, _ = gather_functions(kind, real)
+    load, local, short, spread = term_functions(kind, index, real)
+    along, _ = variation_functions(term, real)
+    row, _, _, strain_row = kind.places()[index]
+    static_size, missing = len(term.parameter_names) - 1, 0 if kind.closed else measure.span
+    dim, span, twist = kind.dim, kind.span, kind.twist
+    frames, lagged_density = measure.lag_size > 0, density.lagged
+
+    @wp.func
+    def displaced(v: wp.array3d(dtype=real), k: int, count: int, whole: bool, r: int):
+        """The window of a displacement."""
+        q = W()
+        b = along_node(k + 1, count)
+        for d in range(wp.static(dim)):
+            q[d] = v[d, b, r] - v[d, k, r]
+        if wp.static(twist):
+            q[wp.static(dim * span)] = v[wp.static(dim), k, r]
+        if wp.static(span == 2):
+            if whole:
+                c = along_node(k + 2, count)
+                for d in range(wp.static(dim)):
+                    q[wp.static(dim) + d] = v[d, c, r] - v[d, b, r]
+                if wp.static(twist):
+                    q[wp.static(dim * span + 1)] = v[wp.static(dim), b, r]
+        return q
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def pull(
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        frame: wp.array3d(dtype=real),
+        last: wp.array3d(dtype=real),
+        rate: wp.array(dtype=real),
+        buffer: wp.array(dtype=real),
+        table: wp.array2d(dtype=int),
+        count: wp.array(dtype=int),
+        w: wp.array3d(dtype=real),
+        window_out: wp.array3d(dtype=real),
+        lag_out: wp.array3d(dtype=real),
+        parameter_out: wp.array3d(dtype=real),
+        last_out: wp.array3d(dtype=real),
+        rate_out: wp.array2d(dtype=real),
+    ):
+        k, r = wp.tid()
+        nodes = count[r]
+        if k >= nodes - wp.static(missing):
+            return
+        whole = wp.static(measure.span) == 2
+        measured, p = load(buffer, table, last, rate[r], k, r)
+        q = local(window(x, theta, k, nodes, whole, r))
+        s = short(lagged(frame, k, nodes, whole, r))
+        v = -local(displaced(w, k, nodes, whole, r))
+        dq, ds, dmeasure, dp, _dv, _de = wp.grad(along)(q, s, measured, p, v, E())
+        f = spread(dq)
+        for i in range(wp.static(kind.window)):
+            window_out[i, k, r] = window_out[i, k, r] + f[i]
+        if wp.static(frames):
+            for i in range(13):
+                lag_out[i, k, r] = lag_out[i, k, r] + ds[i]
+        parameter_out[wp.static(row), k, r] = parameter_out[wp.static(row), k, r] + dmeasure
+        for i in range(wp.static(static_size)):
+            parameter_out[wp.static(row + 1) + i, k, r] = dp[i]
+        if wp.static(lagged_density):
+            for i in range(wp.static(n)):
+                last_out[wp.static(strain_row) + i, k, r] = dp[wp.static(static_size) + i]
+            rate_out[k, r] = rate_out[k, r] + dp[wp.static(size - 1)]
+
+    return pull
+
+
+@cache
+def strain_kernel(kind: ChainKind, index: int, real):
+    """pull(...): from the derivative by a term's strains at a state to those by window, lagged data and rest measure. Adds."""
+    term = kind.terms[index]
+    measure = term.measure
+    n = len(measure.strains)
+    V, E = wp.types.vector(kind.dim, real), wp.types.vector(n, real)
+    _, window, lagged, _ = gather_functions(kind, real)
+    load, local, short, spread = term_functions(kind, index, real)
+    _, strained = variation_functions(term, real)
+    row, _, _, strain_row = kind.places()[index]
+    missing, frames = 0 if kind.closed else measure.span, measure.lag_size > 0
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def pull(
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        frame: wp.array3d(dtype=real),
+        last: wp.array3d(dtype=real),
+        rate: wp.array(dtype=real),
+        buffer: wp.array(dtype=real),
+        table: wp.array2d(dtype=int),
+        count: wp.array(dtype=int),
+        given: wp.array3d(dtype=real),
+        window_out: wp.array3d(dtype=real),
+        lag_out: wp.array3d(dtype=real),
+        parameter_out: wp.array3d(dtype=real),
+    ):
+        k, r = wp.tid()
+        nodes = count[r]
+        if k >= nodes - wp.static(missing):
+            return
+        whole = wp.static(measure.span) == 2
+        measured, _p = load(buffer, table, last, rate[r], k, r)
+        q = local(window(x, theta, k, nodes, whole, r))
+        s = short(lagged(frame, k, nodes, whole, r))
+        f = E()
+        for i in range(wp.static(n)):
+            f[i] = given[wp.static(strain_row) + i, k, r]
+        dq, ds, dmeasure, _df = wp.grad(strained)(q, s, measured, f)
+        g = spread(dq)
+        for i in range(wp.static(kind.window)):
+            window_out[i, k, r] = window_out[i, k, r] + g[i]
+        if wp.static(frames):
+            for i in range(13):
+                lag_out[i, k, r] = lag_out[i, k, r] + ds[i]
+        parameter_out[wp.static(row), k, r] = parameter_out[wp.static(row), k, r] + dmeasure
+
+    return pull
+
+
+@cache
+def frame_kernel(kind: ChainKind, real):
+    """pull(...): the reverse of `step.finish_frames_kernel`. Adds to the window, of which only its first edge counts.
+
+    The reference twist is found anew at every state; the lagged one only says which turn it is of.
+    """
+    V, X = wp.types.vector(kind.dim, real), wp.types.vector(3, real)
+    along_node, *_ = gather_functions(kind, real)
+    carried = carried_function(real)
+    closed = kind.closed
+
+    @wp.func
+    def three(a: wp.array3d(dtype=real), row: int, k: int, r: int):
+        return X(a[row, k, r], a[row + 1, k, r], a[row + 2, k, r])
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def pull(
+        x: wp.array2d(dtype=V),
+        frame: wp.array3d(dtype=real),
+        count: wp.array(dtype=int),
+        given: wp.array3d(dtype=real),
+        window_out: wp.array3d(dtype=real),
+        frame_out: wp.array3d(dtype=real),
+    ):
+        k, r = wp.tid()
+        n = count[r]
+        if k >= n - wp.static(0 if closed else 1):
+            return
+        e = x[along_node(k + 1, n), r] - x[k, r]
+        de, du, dt, _u, _t = wp.grad(carried)(
+            e, three(frame, 0, k, r), three(frame, 3, k, r), three(given, 0, k, r), three(given, 3, k, r)
+        )
+        for d in range(3):
+            window_out[d, k, r] = window_out[d, k, r] + de[d]
+            frame_out[d, k, r] = frame_out[d, k, r] + du[d]
+            frame_out[3 + d, k, r] = frame_out[3 + d, k, r] + dt[d]
+
+    return pull
+
+
+@cache
+def gather_kernels(kind: ChainKind, real):
+    """nodes(...) adds what windows bring to the dofs of a node; edges(...) what lagged data of vertices bring to frames of edges."""
+    dim, twist, closed, window = kind.dim, kind.twist, kind.closed, kind.window
+    _, behind, _, edge_force = node_functions(kind, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def nodes(window_in: wp.array3d(dtype=real), count: wp.array(dtype=int), dof_out: wp.array3d(dtype=real)):
+        k, r = wp.tid()
+        n = count[r]
+        if k >= n:
+            return
+        b = behind(k, n)
+        if wp.static(closed) or k < n - 1:
+            f = edge_force(window_in, k, n, r)
+            for d in range(wp.static(dim)):
+                dof_out[d, k, r] = dof_out[d, k, r] - f[d]
+            if wp.static(twist):
+                dof_out[wp.static(dim), k, r] = dof_out[wp.static(dim), k, r] + window_in[wp.static(window - 2), k, r]
+        if b >= 0:
+            f = edge_force(window_in, b, n, r)
+            for d in range(wp.static(dim)):
+                dof_out[d, k, r] = dof_out[d, k, r] + f[d]
+            if wp.static(twist):
+                if wp.static(closed) or k < n - 1:
+                    dof_out[wp.static(dim), k, r] = (
+                        dof_out[wp.static(dim), k, r] + window_in[wp.static(window - 1), b, r]
+                    )
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def edges(lag_in: wp.array3d(dtype=real), count: wp.array(dtype=int), frame_out: wp.array3d(dtype=real)):
+        k, r = wp.tid()
+        n = count[r]
+        if k >= n - wp.static(0 if closed else 1):
+            return
+        b = behind(k, n)
+        for c in range(6):
+            total = lag_in[c, k, r]
+            if b >= 0:
+                total += lag_in[6 + c, b, r]
+            frame_out[c, k, r] = frame_out[c, k, r] + total
+
+    return nodes, edges

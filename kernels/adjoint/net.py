@@ -1,0 +1,287 @@
+"""Reverse of a step on nets; see `kernels.variation`, and `kernels.net.elements` for how elements and worlds lie.
+
+Every slot of an element writes its own shares; blocks and edges gather what is theirs by lists, so that sums come in one order, without
+atomics.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.net import elements
+from ddg_warp.kernels.net.elements import FRAME, elements_type, place_function
+from ddg_warp.kernels.terms import Term
+from ddg_warp.kernels.variation import carried_function, variation_functions
+
+
+@cache
+def pull_kernel(term: Term, real):
+    """pull(...): what elements bring, -w . dE/dq, by their slots, lagged and constant data, rest measure, parameters, strains of the
+    last step and rate. Adds but to the last two.
+    """
+    Elements, measure, density = elements_type(real), term.measure, term.density
+    V = wp.types.vector(3, real)
+    Q, S, E, _ = measure.types(real)
+    n, size = len(measure.strains), density.parameter_size(len(measure.strains))
+    gather, spread = elements.functions(term, real)
+    along, _ = variation_functions(term, real)
+    slots, rows, data = measure.slots, len(term.parameter_names) - 1, measure.lag_size + measure.data_size
+    lagged = density.lagged
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def pull(
+        given: Elements,
+        w: wp.array(dtype=V),
+        slot_out: wp.array2d(dtype=V),
+        lag_out: wp.array2d(dtype=real),
+        parameter_out: wp.array2d(dtype=real),
+        last_out: wp.array2d(dtype=real),
+        rate_out: wp.array(dtype=real),
+    ):
+        tid = wp.tid()
+        world = tid / given.elements
+        e = tid - world * given.elements
+        q, s, measured, p = gather(given, given.q, world, e)
+        v, _s, _w, _p = gather(given, w, world, e)
+        dq, ds, dmeasure, dp, _dv, _de = wp.grad(along)(q, s, measured, p, -v, E())
+        for i in range(wp.static(slots)):
+            slot_out[i, tid] = slot_out[i, tid] + spread(dq, i)
+        for i in range(wp.static(data)):
+            lag_out[i, tid] = lag_out[i, tid] + ds[i]
+        parameter_out[0, tid] = parameter_out[0, tid] + dmeasure
+        for i in range(wp.static(rows)):
+            parameter_out[1 + i, tid] = dp[i]
+        if wp.static(lagged):
+            for i in range(wp.static(n)):
+                last_out[i, tid] = dp[wp.static(rows) + i]
+            rate_out[tid] = dp[wp.static(size - 1)]
+
+    return pull
+
+
+@cache
+def strain_kernel(term: Term, real):
+    """pull(...): from the derivative by strains at a state to those by slots, lagged data and rest measure. Adds."""
+    Elements, measure = elements_type(real), term.measure
+    V = wp.types.vector(3, real)
+    _, _, E, _ = measure.types(real)
+    n = len(measure.strains)
+    gather, spread = elements.functions(term, real)
+    _, strained = variation_functions(term, real)
+    slots, data = measure.slots, measure.lag_size + measure.data_size
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def pull(
+        given: Elements,
+        by: wp.array2d(dtype=real),
+        slot_out: wp.array2d(dtype=V),
+        lag_out: wp.array2d(dtype=real),
+        parameter_out: wp.array2d(dtype=real),
+    ):
+        tid = wp.tid()
+        world = tid / given.elements
+        q, s, measured, _p = gather(given, given.q, world, tid - world * given.elements)
+        f = E()
+        for i in range(wp.static(n)):
+            f[i] = by[i, tid]
+        dq, ds, dmeasure, _df = wp.grad(strained)(q, s, measured, f)
+        for i in range(wp.static(slots)):
+            slot_out[i, tid] = slot_out[i, tid] + spread(dq, i)
+        for i in range(wp.static(data)):
+            lag_out[i, tid] = lag_out[i, tid] + ds[i]
+        parameter_out[0, tid] = parameter_out[0, tid] + dmeasure
+
+    return pull
+
+
+@cache
+def lag_kernel(term: Term, real):
+    """pull(...): the reverse of `net.frames.lag_kernel`, from the derivatives by an element's own lagged rows. Adds."""
+    Elements, measure = elements_type(real), term.measure
+    V = wp.types.vector(3, real)
+    Q, S, _, _ = measure.types(real)
+    own = measure.lag_size - FRAME * measure.frames
+    L = wp.types.vector(own, real)
+    place, advance = place_function(measure, real), measure.advance(real)
+    _, spread = elements.functions(term, real)
+    slots, data = measure.slots, measure.lag_size + measure.data_size
+
+    @wp.func
+    def advanced(q: Q, s: S, f: L):
+        return wp.dot(advance(q, s), f)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def pull(
+        given: Elements,
+        by: wp.array2d(dtype=real),
+        slot_out: wp.array2d(dtype=V),
+        lag_out: wp.array2d(dtype=real),
+    ):
+        tid = wp.tid()
+        world = tid / given.elements
+        q, s = place(given, given.q, world, tid - world * given.elements)
+        f = L()
+        for i in range(wp.static(own)):
+            f[i] = by[i, tid]
+        dq, ds, _df = wp.grad(advanced)(q, s, f)
+        for i in range(wp.static(slots)):
+            slot_out[i, tid] = slot_out[i, tid] + spread(dq, i)
+        for i in range(wp.static(data)):
+            lag_out[i, tid] = lag_out[i, tid] + ds[i]
+
+    return pull
+
+
+@cache
+def frame_kernel(real):
+    """pull(...): the reverse of `net.frames.edge_kernel`: by the edge vector, and, added, by the frame of before."""
+    V = wp.types.vector(3, real)
+    carried = carried_function(real)
+
+    @wp.func
+    def three(a: wp.array2d(dtype=real), row: int, f: int):
+        return V(a[row, f], a[row + 1, f], a[row + 2, f])
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def pull(
+        q: wp.array(dtype=V),
+        ends: wp.array2d(dtype=int),
+        blocks: int,
+        frame: wp.array2d(dtype=real),
+        by: wp.array2d(dtype=real),
+        edge_out: wp.array2d(dtype=V),
+        frame_out: wp.array2d(dtype=real),
+    ):
+        f = wp.tid()
+        world = f / ends.shape[0]
+        i = f - world * ends.shape[0]
+        e = q[ends[i, 1] + world * blocks] - q[ends[i, 0] + world * blocks]
+        de, du, dt, _u, _t = wp.grad(carried)(
+            e, three(frame, 0, f), three(frame, 3, f), three(by, 0, f), three(by, 3, f)
+        )
+        edge_out[0, f] = -de
+        edge_out[1, f] = de
+        for d in range(3):
+            frame_out[d, f] = frame_out[d, f] + du[d]
+            frame_out[3 + d, f] = frame_out[3 + d, f] + dt[d]
+
+    return pull
+
+
+@cache
+def gather_kernels(real):
+    """slots(...) adds what slots of elements bring to blocks; frames(...) what their lagged data bring to the frames of edges.
+
+    Item i of a list is slot i / `count` of element i % `count`, of which there are `count` in each world.
+    """
+    V = wp.types.vector(3, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def slots(
+        starts: wp.array(dtype=int),
+        items: wp.array(dtype=int),
+        count: int,
+        blocks: int,
+        slot_in: wp.array2d(dtype=V),
+        out: wp.array(dtype=V),
+    ):
+        tid = wp.tid()
+        world = tid / blocks
+        k = tid - world * blocks
+        total = out[tid]
+        for at in range(starts[k], starts[k + 1]):
+            total += slot_in[items[at] / count, items[at] % count + world * count]
+        out[tid] = total
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def frames(
+        starts: wp.array(dtype=int),
+        items: wp.array(dtype=int),
+        count: int,
+        edges: int,
+        lag_in: wp.array2d(dtype=real),
+        out: wp.array2d(dtype=real),
+    ):
+        tid = wp.tid()
+        world = tid / edges
+        k = tid - world * edges
+        for at in range(starts[k], starts[k + 1]):
+            row = items[at] / count * wp.static(FRAME)
+            e = items[at] % count + world * count
+            for c in range(wp.static(FRAME)):
+                out[c, tid] = out[c, tid] + lag_in[row + c, e]
+
+    return slots, frames
+
+
+@cache
+def step_kernels(real, midpoint: bool):
+    """solution(...) and start(...) as of `kernels.adjoint.step`, of the blocks of a net. Joints' rotations begin every step at zero."""
+    V = wp.types.vector(3, real)
+    share = real(2.0 if midpoint else 1.0)
+    kept = real(1.0 if midpoint else 0.0)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def solution(
+        q: wp.array(dtype=V),
+        v: wp.array(dtype=V),
+        more: wp.array(dtype=V),
+        rate: real,
+        last: int,
+        blocks: int,
+        out: wp.array(dtype=V),
+    ):
+        """`last` is the number of blocks that are no rotations."""
+        i = wp.tid()
+        total = more[i]
+        if i % blocks < last:
+            total += q[i] + v[i] * rate
+        out[i] = total * share
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def start(
+        q: wp.array(dtype=V),
+        v: wp.array(dtype=V),
+        more: wp.array(dtype=V),
+        solved: wp.array(dtype=V),
+        q0: wp.array(dtype=V),
+        v0: wp.array(dtype=V),
+        w: wp.array(dtype=V),
+        held: wp.array(dtype=V),
+        mass: wp.array(dtype=V),
+        gravity: wp.array(dtype=V),
+        nodes: int,
+        last: int,
+        blocks: int,
+        rate: real,
+        damping: wp.array(dtype=real),
+        q_out: wp.array(dtype=V),
+        v_out: wp.array(dtype=V),
+        mass_out: wp.array(dtype=V),
+        rate_out: wp.array(dtype=real),
+        damping_out: wp.array(dtype=real),
+        gravity_out: wp.array(dtype=V),
+    ):
+        """`held` is what is left at held dofs that no motion moves."""
+        i = wp.tid()
+        k = i % blocks
+        if k >= last:
+            return
+        c = rate * (rate + damping[0])
+        m = mass[k]
+        own = w[i]
+        step = solved[i] - q0[i]
+        before = v0[i]
+        q_out[i] = wp.cw_mul(m, own) * c + held[i] - (q[i] + more[i]) * kept - v[i] * (rate * share)
+        v_out[i] = wp.cw_mul(m, own) * rate - v[i] * kept
+        outer = before * rate - step * c
+        if k < nodes:
+            outer += gravity[0]
+            gravity_out[i] = wp.cw_mul(m, own)
+        mass_out[i] = wp.cw_mul(own, outer)
+        rate_out[i] = share * wp.dot(v[i], step) - wp.dot(
+            wp.cw_mul(m, own), step * (real(2.0) * rate + damping[0]) - before
+        )
+        damping_out[i] = -rate * wp.dot(wp.cw_mul(m, own), step)
+
+    return solution, start

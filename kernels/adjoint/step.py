@@ -1,0 +1,131 @@
+"""Reverse of what surrounds the solve of a step on chains: end update, inertia and predictor. See `kernels.step` for the schemes.
+
+Both solve m (c (x - x_n) - r v_n) + ... = 0 with r = 1 / s and c = r (r + alpha). Implicit Euler ends at x, with r (x - x_n); the
+midpoint rule at 2 x - x_n, with 2 r (x - x_n) - v_n.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.chain import ChainKind
+
+
+@cache
+def step_kernels(kind: ChainKind, real, midpoint: bool):
+    """solution(...): derivatives by the dofs that a solve has found, from those by the end of the step; start(...): by the start of the
+    step, masses and what all nodes share, from those and from w.
+
+    `more` is what came to the dofs of the end through its frames and strains.
+    """
+    dim, twist = kind.dim, kind.twist
+    V = wp.types.vector(dim, real)
+    share = real(2.0 if midpoint else 1.0)  # of the solution in the end
+    kept = real(1.0 if midpoint else 0.0)  # of minus the start in the end
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def solution(
+        x: wp.array2d(dtype=V),
+        v: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        omega: wp.array2d(dtype=real),
+        more: wp.array3d(dtype=real),
+        count: wp.array(dtype=int),
+        rate: wp.array(dtype=real),
+        dof_out: wp.array3d(dtype=real),
+    ):
+        k, r = wp.tid()
+        if k >= count[r]:
+            return
+        total = x[k, r] + v[k, r] * rate[r]
+        for d in range(wp.static(dim)):
+            dof_out[d, k, r] = share * (total[d] + more[d, k, r])
+        if wp.static(twist):
+            dof_out[wp.static(dim), k, r] = share * (theta[k, r] + omega[k, r] * rate[r] + more[wp.static(dim), k, r])
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def start(
+        # the end: derivatives by it
+        x: wp.array2d(dtype=V),
+        v: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        omega: wp.array2d(dtype=real),
+        more: wp.array3d(dtype=real),
+        # the solve: its solution, where it started, w, and what is left at held dofs
+        q: wp.array2d(dtype=V),
+        angle: wp.array2d(dtype=real),
+        x0: wp.array2d(dtype=V),
+        v0: wp.array2d(dtype=V),
+        theta0: wp.array2d(dtype=real),
+        omega0: wp.array2d(dtype=real),
+        w: wp.array3d(dtype=real),
+        held: wp.array3d(dtype=real),
+        mass: wp.array2d(dtype=real),
+        rotary: wp.array2d(dtype=real),
+        fixed: wp.array2d(dtype=wp.uint8),
+        moved: wp.array2d(dtype=wp.uint8),
+        count: wp.array(dtype=int),
+        rate: wp.array(dtype=real),
+        damping: wp.array(dtype=real),
+        gravity: wp.array(dtype=V),
+        # derivatives by the start; by masses; by the rate, the damping and gravity, of every node
+        x_out: wp.array2d(dtype=V),
+        v_out: wp.array2d(dtype=V),
+        theta_out: wp.array2d(dtype=real),
+        omega_out: wp.array2d(dtype=real),
+        mass_out: wp.array2d(dtype=real),
+        rotary_out: wp.array2d(dtype=real),
+        rate_out: wp.array2d(dtype=real),
+        damping_out: wp.array2d(dtype=real),
+        gravity_out: wp.array2d(dtype=V),
+    ):
+        """`moved` are dofs that a motion puts in place; other held ones stay where the step starts. Adds to the rate's."""
+        k, r = wp.tid()
+        if k >= count[r]:
+            return
+        rho = rate[r]
+        alpha = damping[0]
+        c = rho * (rho + alpha)
+        mask = int(fixed[k, r])
+        put = int(moved[k, r])
+        m = mass[k, r]
+        own = V()
+        stays = V()
+        by_end = x[k, r]
+        for d in range(wp.static(dim)):
+            by_end[d] = by_end[d] + more[d, k, r]
+            if ((mask >> d) & 1) == 0:
+                own[d] = w[d, k, r]
+            elif ((put >> d) & 1) == 0:
+                stays[d] = held[d, k, r]
+        step = q[k, r] - x0[k, r]
+        before = v0[k, r]
+        ended = v[k, r]
+        x_out[k, r] = own * (c * m) + stays - by_end * kept - ended * (rho * share)
+        v_out[k, r] = own * (rho * m) - ended * kept
+        mass_out[k, r] = wp.dot(own, gravity[0] - step * c + before * rho)
+        gravity_out[k, r] = own * m
+        by_rate = share * wp.dot(ended, step) - m * wp.dot(own, step * (real(2.0) * rho + alpha) - before)
+        by_damping = -m * rho * wp.dot(own, step)
+        if wp.static(twist):
+            free = real(0.0)
+            rests = real(0.0)
+            if ((mask >> wp.static(dim)) & 1) == 0:
+                free = w[wp.static(dim), k, r]
+            elif ((put >> wp.static(dim)) & 1) == 0:
+                rests = held[wp.static(dim), k, r]
+            j = rotary[k, r]
+            turn = angle[k, r] - theta0[k, r]
+            spin = omega0[k, r]
+            spun = omega[k, r]
+            theta_out[k, r] = (
+                free * c * j + rests - (theta[k, r] + more[wp.static(dim), k, r]) * kept - spun * (rho * share)
+            )
+            omega_out[k, r] = free * rho * j - spun * kept
+            rotary_out[k, r] = free * (spin * rho - turn * c)
+            by_rate += share * spun * turn - j * free * (turn * (real(2.0) * rho + alpha) - spin)
+            by_damping -= j * rho * free * turn
+        rate_out[k, r] = rate_out[k, r] + by_rate
+        damping_out[k, r] = by_damping
+
+    return solution, start

@@ -1,0 +1,102 @@
+"""Gradients of equilibria against central differences, by parameters and loads."""
+
+import numpy as np
+import pytest
+
+from ddg_warp import arrays, statics
+from ddg_warp.errors import SolverError
+from ddg_warp.learn.adjoint import EquilibriumAdjoint
+from tests.learn.differences import Difference, along, cotangent, directions, product
+from tests.learn.test_adjoint import SCENES, by_parameters, close, shared, tables
+
+RTOL = 1e-13
+
+
+def followed():
+    """A couple that follows the edge it bends: its stiffness is not symmetric."""
+    scene = SCENES["twisted"]()
+    scene.fix(1, [-1])
+    scene.add_couple(0, -1, (1e-4, 2e-4, -1e-4))
+    return scene
+
+
+CASES = {
+    "followed": followed,
+    "clamped_end": SCENES["clamped_end"],
+    "joined": SCENES["joined"],
+    "sheet": SCENES["sheet"],
+    "stiffened": SCENES["stiffened"],
+}
+
+
+def position_weights(model, state) -> dict:
+    """Weights of positions, angles and frames alone, as velocities and kept strains are no part of an equilibrium."""
+    weights = directions(model, state, 5)
+    weights = {
+        name: values * (name.rpartition("/")[2] in ("x", "q", "theta", "frame")) for name, values in weights.items()
+    }
+    return weights
+
+
+def solved(name: str):
+    model = CASES[name]().build(device="cpu", precision="float64")
+    state = statics.solve(model, rtol=RTOL)
+    weights = position_weights(model, state)
+    inputs = EquilibriumAdjoint(model).pull(state, cotangent(model, weights))
+    difference = Difference(model, state, weights, lambda start: statics.solve(model, start, start=1.0, rtol=RTOL))
+    return model, state, inputs, difference
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_an_equilibrium_by_its_parameters(name):
+    model, _, inputs, difference = solved(name)
+    random = np.random.default_rng(11)
+    for number, (table, found) in enumerate(zip(tables(model), by_parameters(model, inputs), strict=True)):
+        for row, (parameter, values) in enumerate(table.values.items()):
+            if parameter.endswith("viscosity"):
+                assert not found[row].any()  # at rest nothing is damped
+                continue
+            own = found[row] if number < len(model.groups) else found[row].reshape(model.worlds, -1)
+            gradient, size = shared(own, values.shape), np.abs(values).max()
+            direction = along(gradient, random.uniform(0.5, 1.0, values.shape) * (size or 1.0))
+            reference = difference.by_parameter(table, parameter, direction, 1e-4)
+            scale = 1e-3 * abs(difference.loss())
+            assert close(float((gradient * direction).sum()), reference, scale), parameter
+
+
+@pytest.mark.parametrize("name", ["followed", "joined", "sheet"])
+def test_an_equilibrium_by_its_loads(name):
+    """A dead force on a node; by `load`, where it is w."""
+    model, _, inputs, difference = solved(name)
+    if model.groups:
+        host, (k, column) = model.groups[0].host, (3, 0)
+        found, place = arrays.download(inputs[0].load)[:3, k, column], k * len(host.rods) + column
+    else:
+        host, place = model.net.host, model.net.host.nodes - 1
+        found = inputs[-1].load.numpy()[place]
+    force = np.where(found < 0.0, -1.0, 1.0)
+    host.add_load(np.array([place]), 0.0 * force, None)
+    del host.constant  # made anew, with it
+    added = host.constant
+
+    def pull(x):
+        added.force[-1] = x * force
+
+    assert close(float(found @ force), difference.by(pull, 1e-6))
+
+
+def test_a_mechanism_has_no_gradient():
+    """A joined rod that is not held can spin about its hinge: angles of its edges have no gradient, positions do."""
+    model = SCENES["hinged"]().build(device="cpu", precision="float64")
+    state = statics.solve(model)
+    weights = directions(model, state, 5)
+    with pytest.raises(SolverError, match=r"no gradient goes through the solution: edge \d of rod \d can move without"):
+        EquilibriumAdjoint(model).pull(state, cotangent(model, weights))
+
+
+def test_velocities_of_an_equilibrium_have_no_effect():
+    model, state, inputs, difference = solved("joined")
+    weights = {name: values + 1.0 * name.endswith("/v") for name, values in difference.weights.items()}
+    again = EquilibriumAdjoint(model).pull(state, cotangent(model, weights))
+    np.testing.assert_array_equal(inputs[-1].load.numpy(), again[-1].load.numpy())
+    assert product(state, weights) == pytest.approx(difference.loss())
