@@ -14,6 +14,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -23,7 +24,7 @@ from ddg_warp.ask.fields import check_fields
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.learn.episodes import DONE, DataError, Episodes, EpisodeWriter
 from ddg_warp.learn.ranges import GROWING, LogUniform, Range, Uniform, draw, seed_of
-from ddg_warp.learn.work import in_processes, in_turn, on_ray, require_ray
+from ddg_warp.learn.work import KEPT, SweepError, in_processes, in_turn, on_ray, require_ray
 from ddg_warp.run.catalog import SHARED, load_scene, parameters, scene_name
 from ddg_warp.run.progress import progress_bar
 from ddg_warp.run.run_directory import TRAJECTORY
@@ -32,10 +33,6 @@ from ddg_warp.run.summary import plain, write_json
 ABOUT = "sweep.json"
 REFUSED = "refused"  # outcome of parameters of which no scene can be built
 OPTIONS = ("device", "precision", "dt", "duration", "fields", "options")  # of `simulate`
-
-
-class SweepError(RuntimeError):
-    """A sample met an error that is no outcome of a solver, such as a mistake in the function that is swept; it names the sample."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +94,9 @@ class Run:
 
     def __call__(self, sample: Sample) -> dict:
         began = time.perf_counter()
+        # Ray may run a sample again whose worker was lost.
+        shutil.rmtree(sample.directory, ignore_errors=True)
+        sample.directory.mkdir(parents=True)
         try:
             result = self.run(sample)
             outcome, failure = getattr(result, "outcome", DONE), getattr(result, "failure", "")
@@ -106,7 +106,7 @@ class Run:
             outcome, failure = REFUSED, str(error)
         except Exception as error:
             told = f"sample {sample.name} of {sample.parameters}: {type(error).__name__}: {error}"
-            raise SweepError(f"{told}; what is finished is kept, and the same call goes on from there") from error
+            raise SweepError(f"{told}; {KEPT}") from error
         return {"outcome": outcome, "failure": failure, "seconds": time.perf_counter() - began}
 
 
@@ -151,7 +151,7 @@ def sweep(
         SceneError: A range is none, or the scene has no such parameter.
         DataError: `out` holds the episodes of another sweep.
         InputError: There is no such scene.
-        SweepError: A sample met an error that is no outcome of a solver.
+        SweepError: A sample met an error that is no outcome of a solver, or workers were lost.
         ModuleNotFoundError: `ray` is wanted, but not installed.
     """
     out, options = Path(out), dict(options or {})
@@ -176,8 +176,11 @@ def sweep(
             Sample(names[index], values[index], seed_of(seed, index), writer.scratch(names[index]).resolve())
             for index in todo
         )
-        with progress_bar(len(values), len(values) - len(todo), progress, "sample", "") as bar:
-            for sample, ended in _finished(run, samples_to_run, workers, ray, gpus):
+        with (
+            progress_bar(len(values), len(values) - len(todo), progress, "sample", "") as bar,
+            closing(_finished(run, samples_to_run, workers, ray, gpus)) as finished,
+        ):
+            for sample, ended in finished:
                 kept = {"parameters": plain(sample.parameters), "seed": sample.seed}
                 writer.add(sample.name, sample.directory / TRAJECTORY, **kept, **ended)
                 shutil.rmtree(sample.directory)
