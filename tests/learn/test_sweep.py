@@ -9,6 +9,7 @@ import time
 
 import numpy as np
 import pytest
+from test_episodes import record
 
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.io.hdf5 import TrajectoryReader
@@ -50,8 +51,6 @@ def scene(tmp_path, monkeypatch) -> str:
 
 
 def noted(directory, load: float, seed: int) -> None:
-    from test_episodes import record
-
     record(directory)
     if load > 0.9:
         raise SolverError("rod 0 folds; take a smaller load", outcome="line_search_failed")
