@@ -26,9 +26,9 @@ except ModuleNotFoundError as error:
     raise ModuleNotFoundError("data sets need torch: `pip install 'ddg-warp[torch]'`", name="torch") from error
 
 from ddg_warp import arguments
-from ddg_warp.errors import SceneError
+from ddg_warp.errors import DataError, SceneError
 from ddg_warp.io.hdf5_read import TrajectoryReader
-from ddg_warp.learn.episodes import INDEX, DataError, Episodes
+from ddg_warp.learn.episodes import INDEX, Episodes
 from ddg_warp.run.run_directory import TRAJECTORY
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64}

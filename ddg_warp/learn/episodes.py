@@ -11,7 +11,6 @@ lacks at most the last of them.
 from __future__ import annotations
 
 import errno
-import hashlib
 import json
 import os
 import re
@@ -23,20 +22,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ddg_warp import arguments
-from ddg_warp.errors import SolverError
+from ddg_warp.errors import DataError, SolverError
+from ddg_warp.learn.splits import FRACTIONS, SPLITS, checked_fractions, split_of
 from ddg_warp.run.run_directory import LOCK, TRAJECTORY, lock_directory
 from ddg_warp.run.summary import write_json
 
 INDEX, SCRATCH = "index.json", ".partial"
-SPLITS = ("train", "validation", "test")
-FRACTIONS = (0.8, 0.1, 0.1)
 DONE = "converged"  # outcome of an episode that ran to its end
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 SHARE = 0.05  # of the time of a writer that saving the index may take
-
-
-class DataError(ValueError):
-    """Data cannot be written or read as asked; the message names the file or folder, what is wrong and the remedy."""
 
 
 @dataclass(frozen=True)
@@ -71,17 +65,6 @@ class Episode:
     def failed(self) -> bool:
         """Whether it ended early."""
         return self.outcome != DONE
-
-
-def split_of(name: str, fractions: tuple[float, float, float] = FRACTIONS, seed: int = 0) -> str:
-    """The split of an episode: of its name and the seed alone, so that it does not depend on the other episodes."""
-    digest = hashlib.sha256(f"{seed}:{name}".encode()).digest()
-    place = int.from_bytes(digest[:8], "big") / 2.0**64
-    for split, share in zip(SPLITS, fractions, strict=True):
-        place -= share
-        if place < 0.0:
-            return split
-    return next(split for split, share in reversed([*zip(SPLITS, fractions, strict=True)]) if share > 0.0)
 
 
 class Episodes:
@@ -159,14 +142,14 @@ class EpisodeWriter:
         self._lock = lock_directory(self.directory)
         try:
             old = Episodes(self.directory) if (self.directory / INDEX).exists() else None
-            for name, value in given.items() if old else ():
+            for name, value in given.items() if old is not None else ():
                 if getattr(old, name) != value:
                     kept = getattr(old, name)
                     raise DataError(
                         f"{self.directory} has {name} = {kept}, not {value}; leave {name} out, or take another folder"
                     )
-            self.fractions = old.fractions if old else given.get("fractions", FRACTIONS)
-            self.seed = old.seed if old else given.get("seed", 0)
+            self.fractions = old.fractions if old is not None else given.get("fractions", FRACTIONS)
+            self.seed = old.seed if old is not None else given.get("seed", 0)
             self._episodes = {episode.name: episode for episode in old or ()}
             shutil.rmtree(self.directory / SCRATCH, ignore_errors=True)  # of a writer that was killed
             self._cost, self._saved = 0.0, 0.0
@@ -180,6 +163,9 @@ class EpisodeWriter:
 
     def __exit__(self, *_) -> None:
         self.close()
+
+    def __len__(self) -> int:
+        return len(self._episodes)
 
     def __contains__(self, name: str) -> bool:
         return name in self._episodes
@@ -284,16 +270,6 @@ class EpisodeWriter:
         (self.directory / LOCK).unlink(missing_ok=True)
         os.close(self._lock)
         self._lock = None
-
-
-def checked_fractions(fractions) -> tuple[float, float, float]:
-    """Shares of train, validation and test that are none of them negative and are one together."""
-    values = arguments.floats(fractions)
-    if values.shape != (3,) or not (values >= 0.0).all() or abs(values.sum() - 1.0) > 1e-9:
-        raise DataError(
-            f"fractions = {fractions!r}; give the shares of train, validation and test, which are 1 together"
-        )
-    return tuple(values.tolist())
 
 
 def _size(trajectory) -> tuple[int, int]:

@@ -22,10 +22,9 @@ from pathlib import Path
 import numpy as np
 
 from ddg_warp import arguments
-from ddg_warp.errors import SceneError
+from ddg_warp.errors import DataError, SceneError
 from ddg_warp.geometry.polyline import cross, directors, length, unit
 from ddg_warp.learn import plain_pickle
-from ddg_warp.learn.episodes import DataError
 
 VARIABLE = "DDG_WARP_RECORDINGS"
 RATE = 100.0  # frames per second

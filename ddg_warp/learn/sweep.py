@@ -1,6 +1,6 @@
 """Runs over ranges of parameters, each an episode of one folder: here, in several processes, or on a Ray cluster.
 
-    sweep("cantilever", {"young": LogUniform(1e6, 1e8), "n": 40}, samples=100, out="out/soft")
+    sweep("tip_load", {"load": LogUniform(0.1, 10.0), "n": 40}, samples=100, out="out/loads")
 
 Samples and their seeds follow from the seed of the sweep and their index (`ddg_warp.learn.ranges`). What is finished is kept: the
 same call goes on where one that was killed has stopped, and ends with the same episodes. One that fails keeps the outcome of its
@@ -21,8 +21,8 @@ from pathlib import Path
 
 from ddg_warp import arguments
 from ddg_warp.ask.fields import check_fields
-from ddg_warp.errors import SceneError, SolverError
-from ddg_warp.learn.episodes import DONE, DataError, Episodes, EpisodeWriter
+from ddg_warp.errors import DataError, SceneError, SolverError
+from ddg_warp.learn.episodes import DONE, Episodes, EpisodeWriter
 from ddg_warp.learn.ranges import GROWING, LogUniform, Range, Uniform, draw, seed_of
 from ddg_warp.learn.work import KEPT, SweepError, in_processes, in_turn, on_ray, require_ray
 from ddg_warp.run.catalog import SHARED, load_scene, parameters, scene_name
@@ -167,7 +167,7 @@ def sweep(
     about = {"what": _name_of(what), "ranges": _written(ranges), "samples": samples, "design": design, "seed": seed}
     about["options"] = {name: value for name, value in options.items() if name != "device"}
     with EpisodeWriter(out, fractions=fractions, seed=seed) as writer:
-        about["samples"] = max(samples, _refuse_other(out / ABOUT, plain(about)))
+        about["samples"] = max(samples, _refuse_other(out / ABOUT, plain(about), len(writer)))
         write_json(out / ABOUT, about)
         names = [f"{index:06d}" for index in range(len(values))]
         todo = [index for index, name in enumerate(names) if name not in writer]
@@ -242,13 +242,15 @@ def _written(ranges: Mapping) -> dict:
     }
 
 
-def _refuse_other(path: Path, about: dict) -> int:
+def _refuse_other(path: Path, about: dict, episodes: int) -> int:
     """How many samples a folder was made for, 0 for a new one; more or fewer of some designs belong to the same sweep.
 
     Raises:
-        DataError: It holds the episodes of another sweep.
+        DataError: It holds the episodes of another sweep, or of none.
     """
     if not path.exists():
+        if episodes:
+            raise DataError(f"{path.parent} holds {episodes} episodes of no sweep; take another folder")
         return 0
     old = json.loads(path.read_text())
     for name, value in about.items():

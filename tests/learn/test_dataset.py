@@ -8,9 +8,9 @@ import pytest
 from test_episodes import filled, record
 
 import ddg_warp as ddg
-from ddg_warp.errors import SceneError
+from ddg_warp.errors import DataError, SceneError
 from ddg_warp.io.hdf5 import TrajectoryReader
-from ddg_warp.learn.episodes import DataError, EpisodeWriter
+from ddg_warp.learn.episodes import EpisodeWriter
 from ddg_warp.run.simulate import simulate
 
 torch = pytest.importorskip("torch", reason="torch, an extra, is not installed")

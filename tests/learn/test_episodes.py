@@ -12,9 +12,10 @@ import h5py
 import numpy as np
 import pytest
 
-from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.errors import DataError, SceneError, SolverError
 from ddg_warp.io.hdf5 import TrajectoryReader
-from ddg_warp.learn.episodes import SPLITS, DataError, Episodes, EpisodeWriter, split_of
+from ddg_warp.learn.episodes import Episodes, EpisodeWriter
+from ddg_warp.learn.splits import SPLITS, split_of
 
 
 def record(directory, frames: int = 3, points: int = 2) -> None:
@@ -136,6 +137,11 @@ def test_a_folder_of_others_is_refused(tmp_path):
         EpisodeWriter(tmp_path / "new", fractions=(0.8, 0.1, 0.2))
     with pytest.raises(DataError, match="no episode 'run_7'"):
         Episodes(tmp_path / "own")["run_7"]
+    EpisodeWriter(tmp_path / "none", fractions=(0.0, 0.5, 0.5)).close()
+    with pytest.raises(DataError, match="fractions"):  # though there is none yet
+        EpisodeWriter(tmp_path / "none", fractions=(0.8, 0.1, 0.1))
+    EpisodeWriter(tmp_path / "none").close()
+    assert Episodes(tmp_path / "none").fractions == (0.0, 0.5, 0.5)
     (tmp_path / "own" / "index.json").write_text("{")
     with pytest.raises(DataError, match="damaged"):
         Episodes(tmp_path / "own")

@@ -5,8 +5,7 @@ import pickle
 import numpy as np
 import pytest
 
-from ddg_warp.errors import SceneError
-from ddg_warp.learn.episodes import DataError
+from ddg_warp.errors import DataError, SceneError
 from ddg_warp.learn.mocap import VARIABLE, Recording, read, recordings
 from ddg_warp.learn.plain_pickle import UnsafePickleError
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from test_episodes import record
 
-from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.errors import DataError, SceneError, SolverError
 from ddg_warp.io.hdf5 import TrajectoryReader
-from ddg_warp.learn.episodes import DataError, Episodes
+from ddg_warp.learn.episodes import Episodes
 from ddg_warp.learn.ranges import Choice, LogUniform, Uniform
 from ddg_warp.learn.sweep import SweepError, sweep
 from ddg_warp.learn.work import in_processes
@@ -230,6 +230,9 @@ def test_a_folder_of_another_sweep_is_refused(scene, device):
     with pytest.raises(DataError, match="seed"):
         sweep(scene, RANGES, 2, out="out", seed=1, options=options, progress=False)
     assert len(sweep(scene, RANGES, 1, out="out", options=options, progress=False)) == 2
+    os.remove("out/sweep.json")
+    with pytest.raises(DataError, match="2 episodes of no sweep"):
+        sweep(scene, RANGES, 2, out="out", options=options, progress=False)
 
 
 def test_the_command(scene, device, capsys):
