@@ -11,7 +11,7 @@ import ddg_warp
 PACKAGE = Path(ddg_warp.__file__).parent
 LAYERS = ("geometry", "scene", "compile", "io", "model", "solve", "ask", "run", "learn")
 # What a user calls on an object of a lower layer, which imports its answer when it is asked.
-FACADES = {"scene/scene.py": "model", "model/model.py": "ask"}
+FACADES = {"scene/scene.py": "model", "model/model.py": "ask", "run/cli.py": "learn"}
 
 
 def layer(module: str) -> int:

@@ -111,8 +111,8 @@ def scene_name(name: str) -> str:
     return Path(name).stem
 
 
-def add_parameters(parser: argparse.ArgumentParser, module: ModuleType) -> None:
-    """Add a flag for every parameter of the scene's `build`; flags that are not given leave no trace in the result.
+def add_parameters(parser: argparse.ArgumentParser, module: ModuleType, leave: tuple[str, ...] = ()) -> None:
+    """Add a flag for every parameter of the scene's `build` but those to `leave`; flags that are not given leave no trace.
 
     Raises:
         InputError: A parameter has no default, an unknown type, or the name of an option of `run`.
@@ -123,7 +123,7 @@ def add_parameters(parser: argparse.ArgumentParser, module: ModuleType) -> None:
         where = f"build({name}) of {module.__name__}"
         if kind not in (bool, int, float, str) or default is parameter.empty:
             raise InputError(f"{where} needs a default, and a type of int, float, str or bool")
-        if name in SHARED:
+        if name in SHARED or name in leave:
             continue
         if name in RESERVED:
             raise InputError(f"{where} has the name of an option of `run`; rename it")

@@ -1,4 +1,4 @@
-"""The command line: `ddg-warp run | list | check | bench | export | info`.
+"""The command line: `ddg-warp run | sweep | list | check | bench | export | info`.
 
 Exit codes: 0 done; 1 a check or the solver failed; 2 a mistake in what was asked for; 130 interrupted.
 """
@@ -60,7 +60,9 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def parser(arguments: list[str]) -> Parser:
-    """The parser of these arguments; `run SCENE` and `bench SCENE` add the flags of the scene."""
+    """The parser of these arguments; `run SCENE`, `sweep SCENE` and `bench SCENE` add the flags of the scene."""
+    from ddg_warp.learn import command
+
     top = Parser(prog="ddg-warp", description="Simulate flexible slender structures on NVIDIA Warp.")
     commands = top.add_subparsers(metavar="COMMAND", required=True)
 
@@ -82,6 +84,14 @@ def parser(arguments: list[str]) -> Parser:
     run.add_argument("--json", type=Path, metavar="FILE", help="write the summary to FILE too")
     if arguments[:1] == ["run"] and len(arguments) > 1 and not arguments[1].startswith("-"):
         add_parameters(run.add_argument_group(f"parameters of {arguments[1]}"), load_scene(arguments[1]))
+
+    sweep = commands.add_parser("sweep", help="run a scene over ranges of its parameters, into a data set")
+    sweep.set_defaults(command=command.sweep_scene)
+    add_settings(sweep)
+    command.add_flags(sweep)
+    if arguments[:1] == ["sweep"] and len(arguments) > 1 and not arguments[1].startswith("-"):
+        group = sweep.add_argument_group(f"parameters of {arguments[1]}, for all samples")
+        add_parameters(group, load_scene(arguments[1]), leave=command.FLAGS)
 
     show = commands.add_parser("list", help="list scenes and terms")
     show.set_defaults(command=list_all)

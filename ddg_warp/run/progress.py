@@ -20,13 +20,13 @@ class Lines:
         self._stream.flush()
 
 
-def progress_bar(steps: int, done: int, shown: bool):
-    """Steps done, time elapsed and time remaining, on stderr: redrawn on a terminal, a line at a time in a file or pipe."""
+def progress_bar(steps: int, done: int, shown: bool, unit: str = "step", what: str = "compiling, once"):
+    """Units done, time elapsed and time remaining, on stderr: redrawn on a terminal, a line at a time in a file or pipe."""
     from tqdm import tqdm
 
-    style = {"total": steps, "initial": done, "desc": "compiling, once", "unit": "step", "disable": not shown}
+    style = {"total": steps, "initial": done, "desc": what, "unit": unit, "disable": not shown}
     if not sys.stderr.isatty():
-        form = "{desc}{n_fmt} of {total_fmt} steps, {elapsed} elapsed, {remaining} remaining"
+        form = f"{{desc}}{{n_fmt}} of {{total_fmt}} {unit}s, {{elapsed}} elapsed, {{remaining}} remaining"
         seldom = {"mininterval": LINE_EVERY, "maxinterval": 2.0 * LINE_EVERY, "delay": LINE_EVERY, "miniters": 1}
         style |= {"file": Lines(sys.stderr), "bar_format": form, **seldom}
     return tqdm(**style)

@@ -34,6 +34,7 @@ class Result:
         wall_time: Time from the scene to the end [s].
         compile_time: Time from the scene to the end of the first step, less a steady step [s].
         failure: Why the run ended early; empty where it did not.
+        outcome: "converged", or the name of the outcome that ended the run early.
         path: The path of equilibria that was followed, if that was the analysis (`ddg_warp.scene.path.Path`).
     """
 
@@ -49,6 +50,7 @@ class Result:
     wall_time: float = 0.0
     compile_time: float = 0.0
     failure: str = ""
+    outcome: str = "converged"
     path: Any = None
 
     def __repr__(self) -> str:
@@ -56,6 +58,10 @@ class Result:
         names = ", ".join(self.series) or "nothing"
         ended = f"; failed: {self.failure}" if self.failure else ""
         return f"<Result: {len(self.times)} states, times {reached}, observed {names}, {self.wall_time:.3g} s of wall time{ended}>"
+
+    def fail(self, error: SolverError, said: str = "") -> None:
+        """Notes that, and by which outcome, the run ended early."""
+        self.failure, self.outcome = f"{said}{error}", error.outcome or "failed"
 
     @property
     def seconds_per_step(self) -> float:
@@ -97,6 +103,7 @@ def simulate(
     resume: str | Path | None = None,
     force: bool = False,
     fields: Sequence[str] = (),
+    usd: bool = True,
     observe: Callable[[Any, Any], Mapping[str, float]] | None = None,
     provenance: Mapping | None = None,
     options: Mapping | None = None,
@@ -116,6 +123,7 @@ def simulate(
         resume: Directory of an earlier run, which this one continues.
         force: Whether to replace a run that `out` holds already.
         fields: What to record beside positions: "velocities", "directors" and the names of `ddg_warp.ask.fields`.
+        usd: Whether to record scene.usdc, too.
         observe: (model, state) -> values by name, taken at the start and after every step.
         provenance: Attributes of the trajectory: scene, parameters, command.
         options: Keyword arguments of the `Integrator`, or of `StaticsOptions`: rtol and others.
@@ -149,7 +157,9 @@ def simulate(
     try:
         result = Result(scene, model, scene.initial(model) if scene.initial else model.state(), dt=dt)
     except SolverError as error:
-        return Result(scene, model, model.state(), dt=dt, failure=f"the first state could not be found: {error}")
+        result = Result(scene, model, model.state(), dt=dt)
+        result.fail(error, "the first state could not be found: ")
+        return result
     if resume is not None:
         continue_from(result, Path(resume))
     result.energies["start"] = energies(model, result.state)
@@ -159,7 +169,7 @@ def simulate(
         if out is not None or resume is not None:
             attributes = {**(provenance or {}), "dt": dt or 0.0, "precision": model.precision, "worlds": worlds}
             attributes |= {"duration": duration} if dynamic else {}
-            recorder = stack.enter_context(open_recorder(model, out, resume, dt, attributes, force, fields))
+            recorder = stack.enter_context(open_recorder(model, out, resume, dt, attributes, force, fields, usd))
         if recorder is not None and dynamic:
             options.setdefault("check_every", 1)  # recording waits for every step as it is
         done = max(0, len(result.times) - 1)
@@ -182,7 +192,7 @@ def simulate(
                 keep(result.state)
             run(result, steps, keep, options=options, clock=clock or wall_clock(model.device), bar=bar)
         except SolverError as error:
-            result.failure = str(error)
+            result.fail(error)
             result.state = error.state if error.state is not None else result.state
     result.compile_time = max(0.0, result.compile_time - result.seconds_per_step)
     result.energies["end"] = energies(model, result.state)
@@ -297,7 +307,7 @@ def continue_from(result: Result, directory: Path) -> None:
         result.series = {name: values[:frames].tolist() for name, values in reader.series.items()}
 
 
-def open_recorder(model, out, resume, dt, provenance, force, fields):
+def open_recorder(model, out, resume, dt, provenance, force, fields, usd):
     """The recorder of a run in `out`, or of the run that it resumes."""
     from ddg_warp.run.record import Recorder
 
@@ -307,9 +317,8 @@ def open_recorder(model, out, resume, dt, provenance, force, fields):
         provenance = {name: provenance[name] for name in provenance.keys() & {"duration"}}
     vectors = {name: name in fields for name in ("velocities", "directors")}
     fields = [name for name in fields if name not in vectors]
-    return Recorder(
-        model, directory, fps=fps, resume=again, force=force, fields=fields, provenance=provenance, **vectors
-    )
+    options = {"fps": fps, "resume": again, "force": force, "fields": fields, "usd": usd, "provenance": provenance}
+    return Recorder(model, directory, **options, **vectors)
 
 
 def wall_clock(device: str) -> Callable[[], float]:

@@ -1,0 +1,87 @@
+"""`ddg-warp sweep SCENE`: a scene over ranges of its parameters, from the command line."""
+
+import argparse
+import sys
+from collections import Counter
+from pathlib import Path
+
+from ddg_warp.run.catalog import SHARED, InputError, load_scene, parameters, refused, scene_name
+
+FLAGS = (
+    "range",
+    "samples",
+    "design",
+    "seed",
+    "workers",
+    "ray",
+    "gpus",
+)  # a scene's parameter of such a name has a range only
+
+
+def add_flags(command: argparse.ArgumentParser) -> None:
+    """Add the flags of `sweep`; those of the scene give values that all samples share."""
+    command.add_argument("scene", metavar="SCENE", help="a scene of `ddg-warp list`, or a Python file; comes first")
+    command.add_argument(
+        "--range",
+        action="append",
+        default=[],
+        metavar="NAME=RANGE",
+        help="of a parameter: LOW:HIGH, LOW:HIGH:log, or values A,B,C; for several parameters, several times",
+    )
+    command.add_argument("--samples", type=int, default=1, metavar="N", help="how many; on a grid along each range")
+    command.add_argument("--design", default="random", help="random, latin_hypercube, sobol or grid (default: random)")
+    command.add_argument("--seed", type=int, default=0, metavar="N", help="what samples are drawn with (default: 0)")
+    command.add_argument("--dt", type=float, metavar="S", help="time step [s] (default: the scene's)")
+    command.add_argument("--duration", type=float, metavar="S", help="end of each run [s] (default: the scene's)")
+    command.add_argument("--fields", metavar="NAME,...", help="record these too, such as velocities,directors")
+    command.add_argument("--out", type=Path, metavar="DIR", help="folder of the episodes (default: out/sweep/SCENE)")
+    command.add_argument("--workers", type=int, metavar="N", help="processes at work at once (default: this one)")
+    command.add_argument("--ray", action="store_true", help="work on Ray")
+    command.add_argument("--gpus", type=float, default=0.0, metavar="N", help="share of a GPU for each sample on Ray")
+
+
+def sweep_scene(chosen: argparse.Namespace) -> int:
+    """`sweep`: run the samples, or those that are left of them; fails where every sample failed."""
+    from ddg_warp.learn.sweep import OPTIONS, SweepError, sweep
+    from ddg_warp.run.cli import DONE, FAILED, require_device
+
+    module, name = load_scene(chosen.scene), scene_name(chosen.scene)
+    require_device(chosen.device)
+    asked = {key: value for key, value in vars(chosen).items() if value is not None}
+    options = {key: asked[key] for key in OPTIONS if key in asked}
+    if "fields" in options:
+        options["fields"] = [field for field in chosen.fields.split(",") if field]
+    ranges = {key: asked[key] for key in parameters(module, {}) if key in asked and key not in (*FLAGS, *SHARED)}
+    directory = chosen.out or Path("out/sweep") / name
+    with refused():
+        ranges |= dict(_named(text) for text in chosen.range)
+        try:
+            episodes = sweep(
+                chosen.scene,
+                ranges,
+                chosen.samples,
+                out=directory,
+                options=options,
+                **{key: asked[key] for key in ("design", "seed", "workers", "ray", "gpus") if key in asked},
+            )
+        except ModuleNotFoundError as error:
+            if error.name != "ray":
+                raise
+            raise InputError(str(error)) from error
+        except SweepError as error:
+            print(f"ddg-warp: {error}", file=sys.stderr)
+            return FAILED
+    outcomes = Counter(episode.outcome for episode in episodes)
+    print(f"{name}: {len(episodes)} episodes: {', '.join(f'{n} {outcome}' for outcome, n in outcomes.most_common())}")
+    print(f"they are in {directory}")
+    return FAILED if all(episode.failed for episode in episodes) else DONE
+
+
+def _named(text: str):
+    """Name and range of a `--range`."""
+    from ddg_warp.learn.ranges import parsed
+
+    name, sign, range_ = text.partition("=")
+    if not sign:
+        raise InputError(f"--range {text}: it is NAME=LOW:HIGH, NAME=LOW:HIGH:log, or NAME=A,B,C")
+    return name.replace("-", "_"), parsed(range_)

@@ -1,0 +1,226 @@
+"""Windows of recorded runs as a torch data set.
+
+    data = Recordings("data/pulls", window=16, stride=8, split="train")
+    loader = torch.utils.data.DataLoader(data, batch_size=32, shuffle=True, num_workers=4)
+
+Files are opened where and when they are first read, by each worker for itself, forked or spawned: what is sent to a worker holds
+paths and numbers only.
+"""
+
+from __future__ import annotations
+
+import os
+from bisect import bisect_right
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from numbers import Number
+from pathlib import Path
+
+import numpy as np
+
+try:
+    import torch
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError("data sets need torch: `pip install 'ddg-warp[torch]'`", name="torch") from error
+
+from ddg_warp import arguments
+from ddg_warp.errors import DataError, SceneError
+from ddg_warp.io.hdf5_read import TrajectoryReader
+from ddg_warp.learn.episodes import INDEX, Episodes
+from ddg_warp.run.run_directory import TRAJECTORY
+
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
+OPEN_FILES = 64  # of each worker, the last used
+VECTORS = ("points", "velocities", "directors")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A file of windows.
+
+    Attributes:
+        path: The file.
+        frames: Frames in it.
+        worlds: Independent copies in every frame, each of which gives windows of its own.
+        parameters: What the run was made of, by name.
+    """
+
+    path: Path
+    frames: int
+    worlds: int
+    parameters: dict
+
+
+class Recordings(torch.utils.data.Dataset):
+    """Windows of frames of recorded runs, in the order of files, worlds and times.
+
+    An item is a dict of tensors: `time` (W,) [s], each field as recorded, such as `points` (W, P, 3) [m], `velocities` (W, P, 3)
+    [m/s], `directors` (W, E, 3), fields of points (W, P) or triangles (W, T), observed values (W,); `parameters`, the numbers among the
+    parameters that all files have, each (); `file`, the place of its file in `sources`, and `world`. Files of rods with different
+    numbers of points give items that do not stack: collate them yourself, or make a data set of each.
+
+    Args:
+        paths: A folder of episodes (`ddg_warp.learn.episodes`), a directory of a run, a trajectory.h5, or several of them.
+        window: Frames in an item, W.
+        stride: Recorded frames from the start of a window to that of the next.
+        every: Recorded frames from one frame of a window to the next.
+        fields: What to read beside times: "points", "velocities", "directors", names of fields or of observed values.
+        split: "train", "validation" or "test" of folders of episodes; None for all.
+        failed: Whether to read also episodes that ended early.
+        short: What becomes of a file with fewer frames than a window spans: "refuse" it, or "skip" it; `skipped` has their paths.
+        dtype: "float32" or "float64", in which everything is recorded.
+
+    Attributes:
+        sources: The files that are read, a list of `Source`.
+        skipped: Paths of files that are too short.
+
+    Raises:
+        SceneError: An option is no such option.
+        DataError: There is nothing to read, a file is too short, or a field was not recorded.
+        TrajectoryError: A file is damaged.
+    """
+
+    def __init__(
+        self,
+        paths,
+        *,
+        window: int,
+        stride: int = 1,
+        every: int = 1,
+        fields: Sequence[str] = ("points",),
+        split: str | None = None,
+        failed: bool = False,
+        short: str = "refuse",
+        dtype: str = "float64",
+    ):
+        self.window, self.stride, self.every = (
+            arguments.count(f"Recordings: {name}", value)
+            for name, value in (("window", window), ("stride", stride), ("every", every))
+        )
+        if isinstance(fields, str):
+            raise SceneError(f"Recordings: fields = {fields!r}; give a list of names")
+        self.fields = tuple(dict.fromkeys(fields))
+        self._dtype = arguments.choice("Recordings: dtype", dtype, DTYPES)
+        arguments.choice("Recordings: short", short, ("refuse", "skip"))
+        several = not isinstance(paths, str | os.PathLike)
+        found = [source for path in (paths if several else [paths]) for source in _sources(Path(path), split, failed)]
+        span = (self.window - 1) * self.every + 1
+        self.skipped = [source.path for source in found if source.frames < span]
+        if self.skipped and short == "refuse":
+            first = next(source for source in found if source.frames < span)
+            raise DataError(
+                f"{first.path} has {first.frames} frames, a window spans {span}: shorten the window, or leave out such files "
+                f"({len(self.skipped)} of {len(found)}) by short='skip'"
+            )
+        self.sources = [source for source in found if source.frames >= span]
+        if not self.sources:
+            told = f"of the split {split!r} " if split else ""
+            raise DataError(
+                f"{paths}: there is no episode {told}with {span} frames to read; record some, or choose others"
+            )
+        self._per_world = [(source.frames - span) // self.stride + 1 for source in self.sources]
+        counts = (n * source.worlds for n, source in zip(self._per_world, self.sources, strict=True))
+        self._ends = list(accumulate(counts))
+        shared = set.intersection(*({*source.parameters} for source in self.sources))
+        self._parameters = sorted(
+            name for name in shared if all(isinstance(source.parameters[name], Number) for source in self.sources)
+        )
+        self._readers: OrderedDict[int, TrajectoryReader] = OrderedDict()
+        self._owner = os.getpid()
+        self._reader(0)
+        self.close()  # for workers to fork from
+
+    def __len__(self) -> int:
+        return self._ends[-1]
+
+    def __getitem__(self, index: int) -> dict:
+        place, world, start = self.place(index)
+        source, reader = self.sources[place], self._reader(place)
+        frames = slice(start, start + (self.window - 1) * self.every + 1, self.every)
+        item = {"time": self._tensor(reader.time[frames])}
+        for name in self.fields:
+            item[name] = self._tensor(self._read(reader, source, name, frames, world))
+        item["parameters"] = {name: self._tensor(source.parameters[name]) for name in self._parameters}
+        return item | {"file": place, "world": world}
+
+    def place(self, index: int) -> tuple[int, int, int]:
+        """Of an item the place of its file in `sources`, its world and its first frame.
+
+        Raises:
+            IndexError: There is no such item.
+        """
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"item {index}: there are {len(self)} windows")
+        index %= len(self)
+        place = bisect_right(self._ends, index)
+        index -= self._ends[place - 1] if place else 0
+        world, window = divmod(index, self._per_world[place])
+        return place, world, window * self.stride
+
+    def __getstate__(self) -> dict:
+        return vars(self) | {"_readers": OrderedDict()}
+
+    def close(self) -> None:
+        """Closes the files that this process has open; they are opened again when they are read."""
+        if self._owner == os.getpid():
+            for reader in self._readers.values():
+                reader.close()
+        self._readers = OrderedDict()
+
+    def _reader(self, place: int) -> TrajectoryReader:
+        """The open file of a source, one of this process."""
+        if self._owner != os.getpid():  # forked: the files of the parent are left to it
+            self._readers, self._owner = OrderedDict(), os.getpid()
+        if place not in self._readers:
+            path = self.sources[place].path
+            reader = self._readers[place] = TrajectoryReader(path)
+            self._check_fields(reader, path)
+        self._readers.move_to_end(place)
+        if len(self._readers) > OPEN_FILES:
+            self._readers.popitem(last=False)[1].close()
+        return self._readers[place]
+
+    def _check_fields(self, reader: TrajectoryReader, path: Path) -> None:
+        recorded = {name for name in VECTORS if getattr(reader, name) is not None}
+        recorded |= reader.fields.keys() | reader.series.keys()
+        for name in self.fields:
+            if name not in recorded:
+                raise DataError(f"{path}: {name!r} was not recorded; there is {', '.join(sorted(recorded))}")
+
+    def _read(self, reader: TrajectoryReader, source: Source, name: str, frames: slice, world: int) -> np.ndarray:
+        """Frames of a field in one world."""
+        if name in VECTORS:
+            values = getattr(reader, name)[frames]
+            return values[:, world] if values.ndim == 4 else values
+        if name in reader.series:
+            return reader.series[name][frames]
+        values = reader.fields[name][frames]
+        if f"at_cells/{name}" in reader.recorded:  # behind the rods of all worlds, which have none
+            values = values[:, source.worlds * len(reader.counts) :]
+        return values.reshape(len(values), source.worlds, -1)[:, world]
+
+    def _tensor(self, values) -> torch.Tensor:
+        return torch.tensor(values, dtype=DTYPES[self._dtype])
+
+
+def _sources(path: Path, split: str | None, failed: bool) -> list[Source]:
+    """The files of a path: of the episodes in a folder, or that of one run."""
+    if (path / INDEX).is_file():
+        episodes = Episodes(path)
+        return [
+            Source(episodes.path(episode), episode.frames, episode.worlds, episode.parameters)
+            for episode in episodes.select(split, failed)
+        ]
+    if split is not None:
+        raise DataError(
+            f"{path} is no folder of episodes and has no split {split!r}; leave split out, or write it by EpisodeWriter"
+        )
+    path = path / TRAJECTORY if path.is_dir() else path
+    if not path.is_file():
+        raise DataError(f"{path} does not exist; give a folder of episodes, a directory of a run, or a trajectory.h5")
+    with TrajectoryReader(path) as reader:
+        worlds = reader.points.shape[1] if reader.points.ndim == 4 else 1
+        parameters = reader.provenance.get("parameters", {})
+        return [Source(path, len(reader), worlds, parameters if isinstance(parameters, dict) else {})]

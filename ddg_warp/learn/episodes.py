@@ -1,0 +1,295 @@
+"""Episodes: recorded runs in one folder, each with its parameters, seed and outcome, and in a split of its own.
+
+    DIR/NAME.h5       what was recorded of an episode, see `ddg_warp.io.hdf5`; one that failed early may have none
+    DIR/index.json    the fractions of the splits, and an entry for each episode
+
+A split follows from the name of an episode and the seed of the folder by a hash, so that an episode stays where it is when
+others are added. Files are written aside and renamed: a writer killed at any time leaves complete episodes, and an index that
+lacks at most the last of them.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+import shutil
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ddg_warp import arguments
+from ddg_warp.errors import DataError, SolverError
+from ddg_warp.learn.splits import FRACTIONS, SPLITS, checked_fractions, split_of
+from ddg_warp.run.run_directory import LOCK, TRAJECTORY, lock_directory
+from ddg_warp.run.summary import write_json
+
+INDEX, SCRATCH = "index.json", ".partial"
+DONE = "converged"  # outcome of an episode that ran to its end
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+SHARE = 0.05  # of the time of a writer that saving the index may take
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One recorded run.
+
+    Attributes:
+        name: Its name, also of its file.
+        split: "train", "validation" or "test".
+        outcome: "converged", or the name of the outcome that ended it early.
+        failure: Why it ended early; empty where it did not.
+        seed: What random numbers it was made with; None where there were none.
+        parameters: What it was made of, by name.
+        seconds: Wall time that it took [s].
+        frames: Recorded frames.
+        worlds: Independent copies in every frame.
+        file: Name of its file in the folder; empty where nothing was recorded.
+    """
+
+    name: str
+    split: str
+    outcome: str = DONE
+    failure: str = ""
+    seed: int | None = None
+    parameters: dict = field(default_factory=dict)
+    seconds: float = 0.0
+    frames: int = 0
+    worlds: int = 1
+    file: str = ""
+
+    @property
+    def failed(self) -> bool:
+        """Whether it ended early."""
+        return self.outcome != DONE
+
+
+class Episodes:
+    """The episodes of a folder, as its index has them, in the order of their names.
+
+    Raises:
+        DataError: The folder has no index, or it is damaged.
+    """
+
+    def __init__(self, directory):
+        self.directory = Path(directory)
+        path = self.directory / INDEX
+        if not path.is_file():
+            raise DataError(f"{self.directory} holds no episodes: {path} is missing; `EpisodeWriter` writes it")
+        try:
+            content = json.loads(path.read_text())
+            self.fractions, self.seed = tuple(content["fractions"]), content["seed"]
+            self._episodes = {entry["name"]: Episode(**entry) for entry in content["episodes"]}
+        except (ValueError, KeyError, TypeError) as error:
+            raise DataError(f"{path} is damaged ({error}); take a copy of it, or write the episodes anew") from error
+
+    def __len__(self) -> int:
+        return len(self._episodes)
+
+    def __iter__(self) -> Iterator[Episode]:
+        return iter(self._episodes.values())
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._episodes
+
+    def __getitem__(self, name: str) -> Episode:
+        if name not in self._episodes:
+            raise DataError(f"{self.directory} has no episode {name!r}; iterate over it to see what it has")
+        return self._episodes[name]
+
+    def select(self, split: str | None = None, failed: bool = False) -> list[Episode]:
+        """Episodes with frames to read.
+
+        Args:
+            split: "train", "validation" or "test"; None for all.
+            failed: Whether to take also what was recorded of episodes that ended early.
+        """
+        if split is not None:
+            arguments.choice("split", split, SPLITS)
+        chosen = (episode for episode in self if split in (None, episode.split))
+        return [episode for episode in chosen if episode.frames and (failed or not episode.failed)]
+
+    def path(self, episode: Episode) -> Path:
+        """The file of an episode."""
+        return self.directory / episode.file
+
+
+class EpisodeWriter:
+    """Adds episodes to a folder, one process at a time.
+
+        with EpisodeWriter("data/pulls") as writer:
+            with writer.episode("pull_000", parameters={"force": 0.5}) as directory:
+                with ddg.Recorder(model, directory, usd=False) as recorder: ...
+
+    Args:
+        directory: The folder; made if there is none.
+        fractions: Shares of train, validation and test; by default those of the folder, or 0.8, 0.1 and 0.1.
+        seed: What splits are drawn with; by default that of the folder, or 0.
+
+    Raises:
+        DataError: The fractions are no shares of one, or the folder has others.
+        FileExistsError: Another process writes to the folder.
+    """
+
+    def __init__(self, directory, *, fractions: tuple[float, float, float] | None = None, seed: int | None = None):
+        self.directory = Path(directory)
+        given = {} if fractions is None else {"fractions": checked_fractions(fractions)}
+        given |= {} if seed is None else {"seed": arguments.count("EpisodeWriter: seed", seed, 0)}
+        self.directory.mkdir(parents=True, exist_ok=True)
+        self._lock = lock_directory(self.directory)
+        try:
+            old = Episodes(self.directory) if (self.directory / INDEX).exists() else None
+            for name, value in given.items() if old is not None else ():
+                if getattr(old, name) != value:
+                    kept = getattr(old, name)
+                    raise DataError(
+                        f"{self.directory} has {name} = {kept}, not {value}; leave {name} out, or take another folder"
+                    )
+            self.fractions = old.fractions if old is not None else given.get("fractions", FRACTIONS)
+            self.seed = old.seed if old is not None else given.get("seed", 0)
+            self._episodes = {episode.name: episode for episode in old or ()}
+            shutil.rmtree(self.directory / SCRATCH, ignore_errors=True)  # of a writer that was killed
+            self._cost, self._saved = 0.0, 0.0
+            self._save()
+        except BaseException:
+            self._let_go()
+            raise
+
+    def __enter__(self) -> EpisodeWriter:
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()
+
+    def __len__(self) -> int:
+        return len(self._episodes)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._episodes
+
+    @contextmanager
+    def episode(self, name: str, *, parameters: Mapping | None = None, seed: int | None = None) -> Iterator[Path]:
+        """Gives a directory to record a run in, such as that of a `Recorder`, and adds the run when the block ends.
+
+        A SolverError ends the episode with its outcome, and goes on to the caller. After any other error nothing is added.
+
+        Args:
+            name: The episode's name.
+            parameters: What it is made of, by name: numbers, texts, lists of them.
+            seed: What its random numbers are made with.
+        """
+        entry = {"parameters": parameters, "seed": seed}
+        directory, began = self.scratch(name), time.perf_counter()
+        trajectory = directory / TRAJECTORY
+        try:
+            yield directory
+        except SolverError as error:
+            entry |= {"outcome": error.outcome or "failed", "failure": str(error)}
+            self.add(name, trajectory, seconds=time.perf_counter() - began, **entry)
+            raise
+        else:
+            self.add(name, trajectory, seconds=time.perf_counter() - began, **entry)
+        finally:
+            shutil.rmtree(directory, ignore_errors=True)
+
+    def scratch(self, name: str) -> Path:
+        """An empty directory beside the episodes to record one in; what is left in it is lost with the next writer."""
+        self._check_new(name)
+        directory = self.directory / SCRATCH / name
+        shutil.rmtree(directory, ignore_errors=True)
+        directory.mkdir(parents=True)
+        return directory
+
+    def add(
+        self,
+        name: str,
+        trajectory=None,
+        *,
+        parameters: Mapping | None = None,
+        seed: int | None = None,
+        outcome: str = DONE,
+        failure: str = "",
+        seconds: float = 0.0,
+    ) -> Episode:
+        """Adds an episode.
+
+        Args:
+            name: Its name.
+            trajectory: The file that was recorded; it is moved into the folder. One that failed may have none.
+            parameters, seed, outcome, failure, seconds: See `Episode`.
+
+        Raises:
+            DataError: There is an episode of that name, or one that converged has no frames.
+        """
+        self._check_new(name)
+        frames, worlds = _size(trajectory)
+        if not (frames or outcome != DONE):
+            raise DataError(
+                f"episode {name!r}: no frame was recorded in {trajectory}; record one, or say how it failed"
+            )
+        file = f"{name}.h5" if frames else ""
+        if file:
+            _move(Path(trajectory), self.directory / file)
+        split = split_of(name, self.fractions, self.seed)
+        made = {"seed": seed, "parameters": dict(parameters or {}), "seconds": seconds}
+        episode = Episode(name, split, outcome, failure, **made, frames=frames, worlds=worlds, file=file)
+        self._episodes[name] = episode
+        # An index of very many episodes is not written anew for each of them; what a kill then costs is run again.
+        if time.perf_counter() - self._saved > self._cost / SHARE:
+            self._save()
+        return episode
+
+    def close(self) -> None:
+        """Writes the index; a second call does nothing."""
+        if self._lock is not None:
+            try:
+                self._save()
+            finally:
+                self._let_go()
+
+    def _check_new(self, name: str) -> None:
+        if self._lock is None:
+            raise DataError(f"the writer of {self.directory} is closed: open another, which goes on with the folder")
+        if not (isinstance(name, str) and NAME.fullmatch(name)):
+            raise DataError(f"episode {name!r}: a name is made of letters, digits, and . _ - after the first")
+        if name in self._episodes:
+            raise DataError(f"{self.directory} has an episode {name!r} already; choose another name")
+
+    def _save(self) -> None:
+        began = time.perf_counter()
+        entries = [vars(self._episodes[name]) for name in sorted(self._episodes)]  # in whatever order they were made
+        write_json(self.directory / INDEX, {"fractions": self.fractions, "seed": self.seed, "episodes": entries})
+        self._saved = time.perf_counter()
+        self._cost = self._saved - began
+
+    def _let_go(self) -> None:
+        shutil.rmtree(self.directory / SCRATCH, ignore_errors=True)
+        (self.directory / LOCK).unlink(missing_ok=True)
+        os.close(self._lock)
+        self._lock = None
+
+
+def _size(trajectory) -> tuple[int, int]:
+    """Frames and worlds of a recorded file; none where there is no file."""
+    from ddg_warp.io.hdf5_read import TrajectoryReader
+
+    if trajectory is None or not Path(trajectory).exists():
+        return 0, 1
+    with TrajectoryReader(trajectory) as reader:
+        return len(reader), reader.points.shape[1] if reader.points.ndim == 4 else 1
+
+
+def _move(source: Path, target: Path) -> None:
+    """Renames a file, or across disks copies it aside first."""
+    try:
+        os.replace(source, target)
+    except OSError as error:
+        if error.errno != errno.EXDEV:
+            raise
+        aside = target.with_name(f"{target.name}.partial")
+        shutil.copyfile(source, aside)
+        os.replace(aside, target)
+        source.unlink()

@@ -1,0 +1,237 @@
+"""Recordings of real cables by motion capture, read from the user's own clone of a public repository.
+
+Markers along a cable that two robots hold and move, every hundredth of a second. In the recordings of Chen, Zhang, Brei, Zhang,
+Chen, Wu, Vasudevan, *Differentiable Discrete Elastic Rods for Real-Time Modeling of Deformable Linear Objects*, 2024
+(arXiv 2406.05931), a file data_set/DLO1/train/101.pkl holds frames, each of (3, M) coordinates with z up, of 13 markers (12 on other
+cables), of which the first two and the last two are held. Those of the branched cables of Chen et al., *DEFT*, 2025
+(arXiv 2502.15037), hold coordinates first, with y up: `read(path, axes="cfm", markers=20, up="y")`.
+
+    for path in recordings("data_set/DLO1/train"):  # below the folder that DDG_WARP_RECORDINGS names
+        recording = read(path)
+
+Files are pickles, and are read as arrays of numbers only (`ddg_warp.learn.plain_pickle`).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ddg_warp import arguments
+from ddg_warp.errors import DataError, SceneError
+from ddg_warp.geometry.polyline import cross, directors, length, unit
+from ddg_warp.learn import plain_pickle
+
+VARIABLE = "DDG_WARP_RECORDINGS"
+RATE = 100.0  # frames per second
+HELD = (0, 1, -2, -1)  # markers that the two grips hold
+# Axes of the file, in the order that makes the one that points up the last, and keeps the frame right-handed.
+UP = {"x": (1, 2, 0), "y": (2, 0, 1), "z": (0, 1, 2)}
+
+
+@dataclass(frozen=True)
+class Grip:
+    """One grip over time.
+
+    Attributes:
+        position: Of the outermost marker that it holds [m], shape (F, 3).
+        frame: Rotations, shape (F, 3, 3), whose columns are the tangent, from the first marker of the cable to the last, and two
+            directors. Markers say nothing of the turn about the tangent: it is carried along in time without twist.
+    """
+
+    position: np.ndarray
+    frame: np.ndarray
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Markers of a cable over time, with z up.
+
+    Attributes:
+        name: Its file, as seen from the folder of recordings.
+        times: Times of the frames [s], shape (F,), from 0.
+        markers: Positions [m], shape (F, M, 3), NaN where the cameras lost one.
+        held: The markers of both grips, two each, the outermost outside; empty where nothing is held.
+    """
+
+    name: str
+    times: np.ndarray
+    markers: np.ndarray
+    held: tuple[int, ...] = HELD
+
+    @property
+    def complete(self) -> bool:
+        """Whether every marker is seen in every frame."""
+        return bool(np.isfinite(self.markers).all())
+
+    def grips(self) -> tuple[Grip, Grip]:
+        """The first grip and the last.
+
+        Raises:
+            DataError: Nothing is held, or a marker of a grip is lost, or two are in one place.
+        """
+        if not self.held:
+            raise DataError(f"{self.name}: no markers are held; read it with held=(first, second, last but one, last)")
+        first, second, third, last = self.held
+        return self._grip(first, first, second), self._grip(last, third, last)
+
+    def _grip(self, outermost: int, behind: int, ahead: int) -> Grip:
+        edges = self.markers[:, ahead] - self.markers[:, behind]
+        bad = ~(length(edges) > 0.0)
+        if bad.any():
+            raise DataError(
+                f"{self.name}: frame {np.argmax(bad)}: markers {behind} and {ahead} of a grip are lost, or in one place; "
+                "take other frames, or other markers as held"
+            )
+        tangents = unit(edges)
+        first = directors(tangents[None], None)[0]  # a curve of tangents over time
+        frame = np.stack([tangents, first, cross(tangents, first)], axis=-1)
+        return Grip(self.markers[:, outermost].copy(), frame)
+
+    def resampled(self, times, degree: int = 3) -> Recording:
+        """The recording at other times, between frames by a spline through them.
+
+        Args:
+            times: Times [s], shape (n,), increasing, within those of the recording.
+            degree: 1 for straight lines between frames, 3 for a cubic spline.
+
+        Raises:
+            SceneError: There is no such degree.
+            DataError: Times are outside of the recording, there are too few frames, or markers are lost.
+        """
+        from scipy.interpolate import make_interp_spline
+
+        if degree not in (1, 3):
+            raise SceneError(f"resampled: degree = {degree!r}; it is 1 or 3")
+        times = np.atleast_1d(arguments.floats(times))
+        inside = times.ndim == 1 and times.size and times[0] >= self.times[0] and times[-1] <= self.times[-1]
+        if not (inside and (np.diff(times) > 0.0).all()):
+            reach = f"{self.times[0]:g} to {self.times[-1]:g} s"
+            raise DataError(f"{self.name} has frames from {reach}; give increasing times within")
+        if len(self.times) <= degree:
+            raise DataError(f"{self.name} has {len(self.times)} frames, fewer than a spline of degree {degree} needs")
+        if not self.complete:
+            frame, marker = np.argwhere(~np.isfinite(self.markers).all(axis=2))[0]
+            raise DataError(
+                f"{self.name}: frame {frame}: marker {marker} is lost; resample frames where all are seen (`between`)"
+            )
+        return replace(self, times=times, markers=make_interp_spline(self.times, self.markers, k=degree)(times))
+
+    def between(self, first: int, last: int) -> Recording:
+        """The frames from `first` up to, but without, `last`; times go on from 0."""
+        times = self.times[first:last]
+        if not len(times):
+            raise DataError(f"{self.name}: there are no frames from {first} to {last}; there are {len(self.times)}")
+        return replace(self, times=times - times[0], markers=self.markers[first:last])
+
+
+def recordings(folder: str = "", *, root=None) -> list[Path]:
+    """The pickles below a folder of recordings, in the order of the numbers in their names.
+
+    Args:
+        folder: Where below the root to look, such as "data_set/DLO1/train".
+        root: The clone; by default the folder that the environment variable DDG_WARP_RECORDINGS names.
+
+    Raises:
+        DataError: There is no such folder, or no recording in it.
+    """
+    path = _root(root) / folder
+    found = [each for each in path.rglob("*") if each.suffix in (".pkl", ".pickle")]
+    if not found:
+        raise DataError(f"{path} holds no recordings (*.pkl); name a folder of them, of a clone that is complete")
+    return sorted(
+        found, key=lambda each: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", str(each))]
+    )
+
+
+def read(
+    path,
+    *,
+    root=None,
+    axes: str = "fcm",
+    markers: int | None = None,
+    rate: float = RATE,
+    up: str = "z",
+    held: tuple[int, ...] = HELD,
+) -> Recording:
+    """A recording.
+
+    Args:
+        path: The file, as `recordings` gives it, or as seen from the root.
+        root: See `recordings`.
+        axes: What the axes of its array are: frames, coordinates and markers, by their first letters.
+        markers: How many there are, of a file that has frames and markers on one axis, frame after frame (axes "cfm" as (3, F M)).
+        rate: Frames per second.
+        up: The axis of the file that points up, "x", "y" or "z"; the recording has z up.
+        held: The markers of both grips, from the first of the cable to the last; empty where nothing is held.
+
+    Raises:
+        SceneError: An option is no such option.
+        DataError: The file does not exist, or holds no markers over time.
+        UnsafePickleError: The file asks for more than arrays of numbers.
+    """
+    path = Path(path)
+    path = path if path.is_absolute() else _root(root) / path
+    if not path.is_file():
+        raise DataError(f"the recording {path} does not exist; `recordings()` lists what there is")
+    if sorted(str(axes)) != ["c", "f", "m"]:
+        raise SceneError(
+            f"read: axes = {axes!r}; they are the letters f, c, m of frames, coordinates, markers, in their order"
+        )
+    arguments.choice("read: up", up, UP)
+    arguments.positive("read: rate", rate, "1/s")
+    values = _array(plain_pickle.load(path), path)
+    if markers is not None and values.ndim == 2 and axes == "cfm":
+        arguments.count("read: markers", markers)
+        if values.shape[1] % markers:
+            raise DataError(f"{path} has an array {values.shape}, not of {markers} markers a frame; correct markers")
+        values = values.reshape(len(values), -1, markers)
+    if values.ndim != 3 or values.shape[axes.index("c")] != 3 or not values.size:
+        raise DataError(
+            f"{path} has an array {values.shape}, with three coordinates nowhere in axes = {axes!r}; give its axes"
+        )
+    values = values.transpose([axes.index(letter) for letter in "fmc"])[..., UP[up]]
+    if np.isinf(values).any():
+        frame, marker = np.argwhere(np.isinf(values).any(axis=2))[0]
+        raise DataError(f"{path}: frame {frame}: marker {marker} is at infinity; correct the file, or leave it out")
+    held = _checked_held(held, values.shape[1], path)
+    name = "/".join(path.parts[-3:])
+    return Recording(name, np.arange(len(values)) / rate, np.ascontiguousarray(values), held)
+
+
+def _root(root) -> Path:
+    """The folder of recordings."""
+    given = root if root is not None else os.environ.get(VARIABLE)
+    if not given:
+        raise DataError(
+            f"where are the recordings? Give root, or set {VARIABLE} to your clone of them; none come with ddg_warp"
+        )
+    if not Path(given).is_dir():
+        raise DataError(f"the folder of recordings {given} does not exist; clone them, and give root or set {VARIABLE}")
+    return Path(given)
+
+
+def _array(content, path: Path) -> np.ndarray:
+    """What a file holds as one array of real numbers."""
+    try:
+        values = np.asarray(content)
+    except ValueError:  # frames of different shapes
+        values = np.zeros(0, object)
+    if values.dtype.kind not in "iuf":
+        raise DataError(
+            f"{path} holds {type(content).__name__}, no array of markers over time; frames are of one shape"
+        )
+    return values.astype(np.float64)
+
+
+def _checked_held(held, count: int, path: Path) -> tuple[int, ...]:
+    """Four markers of those that there are, or none."""
+    held = tuple(held)
+    fits = all(isinstance(marker, int) and -count <= marker < count for marker in held)
+    if held and not (fits and len({marker % count for marker in held}) == len(held) == 4):
+        raise DataError(f"{path} has {count} markers; held = {held} must be four of them, two of each grip, or none")
+    return tuple(marker % count for marker in held)

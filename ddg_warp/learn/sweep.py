@@ -1,0 +1,260 @@
+"""Runs over ranges of parameters, each an episode of one folder: here, in several processes, or on a Ray cluster.
+
+    sweep("tip_load", {"load": LogUniform(0.1, 10.0), "n": 40}, samples=100, out="out/loads")
+
+Samples and their seeds follow from the seed of the sweep and their index (`ddg_warp.learn.ranges`). What is finished is kept: the
+same call goes on where one that was killed has stopped, and ends with the same episodes. One that fails keeps the outcome of its
+SolverError, and what was recorded until then.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+
+from ddg_warp import arguments
+from ddg_warp.ask.fields import check_fields
+from ddg_warp.errors import DataError, SceneError, SolverError
+from ddg_warp.learn.episodes import DONE, Episodes, EpisodeWriter
+from ddg_warp.learn.ranges import GROWING, LogUniform, Range, Uniform, draw, seed_of
+from ddg_warp.learn.work import KEPT, SweepError, in_processes, in_turn, on_ray, require_ray
+from ddg_warp.run.catalog import SHARED, load_scene, parameters, scene_name
+from ddg_warp.run.progress import progress_bar
+from ddg_warp.run.run_directory import TRAJECTORY
+from ddg_warp.run.summary import plain, write_json
+
+ABOUT = "sweep.json"
+REFUSED = "refused"  # outcome of parameters of which no scene can be built
+OPTIONS = ("device", "precision", "dt", "duration", "fields", "options")  # of `simulate`
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What one episode is made of, and where it is recorded."""
+
+    name: str
+    parameters: dict
+    seed: int
+    directory: Path
+
+
+@dataclass(frozen=True)
+class SceneRun:
+    """Simulates a scene whose `build` takes the parameters, and the seed if it has one; `options` are those of `simulate`."""
+
+    scene: str
+    options: dict
+
+    def __call__(self, sample: Sample):
+        from ddg_warp.run.simulate import simulate
+
+        module = _loaded(self.scene)
+        known = inspect.signature(module.build).parameters
+        times = {name: value for name, value in (self.options | sample.parameters).items() if name in SHARED}
+        given = {"seed": sample.seed} | times | sample.parameters
+        given = {name: value for name, value in given.items() if name in known}
+        return simulate(
+            module.build(**given),
+            out=sample.directory,
+            usd=False,
+            progress=False,
+            observe=getattr(module, "observe", None),
+            provenance={"scene": scene_name(self.scene), "parameters": parameters(module, given)},
+            **(self.options | times),
+        )
+
+
+@dataclass(frozen=True)
+class FunctionRun:
+    """Calls a function of the user's with a directory, the parameters, and the seed if it takes one."""
+
+    function: Callable
+
+    def __call__(self, sample: Sample):
+        seed = {"seed": sample.seed} if "seed" in inspect.signature(self.function).parameters else {}
+        return self.function(sample.directory, **(seed | sample.parameters))
+
+
+@dataclass(frozen=True)
+class Run:
+    """Runs a sample and says how it ended, as `EpisodeWriter.add` takes it.
+
+    Raises:
+        SweepError: Whatever is no outcome of a solver.
+    """
+
+    run: SceneRun | FunctionRun
+
+    def __call__(self, sample: Sample) -> dict:
+        began = time.perf_counter()
+        # Ray may run a sample again whose worker was lost.
+        shutil.rmtree(sample.directory, ignore_errors=True)
+        sample.directory.mkdir(parents=True)
+        try:
+            result = self.run(sample)
+            outcome, failure = getattr(result, "outcome", DONE), getattr(result, "failure", "")
+        except SolverError as error:
+            outcome, failure = error.outcome or "failed", str(error)
+        except SceneError as error:
+            outcome, failure = REFUSED, str(error)
+        except Exception as error:
+            told = f"sample {sample.name} of {sample.parameters}: {type(error).__name__}: {error}"
+            raise SweepError(f"{told}; {KEPT}") from error
+        return {"outcome": outcome, "failure": failure, "seconds": time.perf_counter() - began}
+
+
+def sweep(
+    what: str | Callable,
+    ranges: Mapping[str, object],
+    samples: int,
+    *,
+    out,
+    design: str = "random",
+    seed: int = 0,
+    fractions: tuple[float, float, float] | None = None,
+    options: Mapping | None = None,
+    workers: int | None = None,
+    ray: bool = False,
+    gpus: float = 0.0,
+    progress: bool = True,
+) -> Episodes:
+    """Runs samples over ranges of parameters, as far as `out` does not hold them yet.
+
+    Args:
+        what: A scene of `ddg-warp list`, or the path of a scene file; or a function `run(directory, **parameters)` that records
+            directory/trajectory.h5, and may return the `Result` of `simulate`. A parameter `seed` of the function, or of the scene's
+            `build`, takes the seed of the sample, unless it has a range.
+        ranges: Range of each parameter by name, `Uniform`, `LogUniform` or `Choice`; anything else is a value for all samples.
+        samples: How many; with design "grid" how many along each range.
+        out: Folder of the episodes, see `ddg_warp.learn.episodes`. On a cluster all machines must see it.
+        design: "random", "latin_hypercube", "sobol" or "grid".
+        seed: What samples, their seeds and the splits are drawn with.
+        fractions: Shares of train, validation and test; by default 0.8, 0.1 and 0.1.
+        options: Of `simulate`, for scenes: device, precision, dt, duration, fields, options.
+        workers: How many processes work at once, by default this one alone; on Ray how many samples are under way at once, by default
+            as many as its cluster has room for.
+        ray: Whether to work on Ray, in the cluster that this process has joined (`ray.init`) or in one of this machine.
+        gpus: Share of a GPU that a sample takes on Ray, which shows it no other.
+        progress: Whether to say how far the sweep is.
+
+    Returns:
+        The episodes.
+
+    Raises:
+        SceneError: A range is none, or the scene has no such parameter.
+        DataError: `out` holds the episodes of another sweep.
+        InputError: There is no such scene.
+        SweepError: A sample met an error that is no outcome of a solver, or workers were lost.
+        ModuleNotFoundError: `ray` is wanted, but not installed.
+    """
+    out, options = Path(out), dict(options or {})
+    run = Run(_runner(what, ranges, options))
+    if workers is not None:
+        arguments.count("workers", workers)
+    arguments.number("gpus", gpus, "a number that is not negative", lambda v: v >= 0.0)
+    if ray:
+        require_ray()
+    elif gpus:
+        raise SceneError(f"gpus = {gpus}: Ray hands out GPUs; give ray=True, or options={{'device': 'cuda:0'}}")
+    values = draw(ranges, samples, design, seed)
+    about = {"what": _name_of(what), "ranges": _written(ranges), "samples": samples, "design": design, "seed": seed}
+    about["options"] = {name: value for name, value in options.items() if name != "device"}
+    with EpisodeWriter(out, fractions=fractions, seed=seed) as writer:
+        about["samples"] = max(samples, _refuse_other(out / ABOUT, plain(about), len(writer)))
+        write_json(out / ABOUT, about)
+        names = [f"{index:06d}" for index in range(len(values))]
+        todo = [index for index, name in enumerate(names) if name not in writer]
+        # A scratch directory is made when its sample is handed out, by a path that other processes understand.
+        samples_to_run = (
+            Sample(names[index], values[index], seed_of(seed, index), writer.scratch(names[index]).resolve())
+            for index in todo
+        )
+        with (
+            progress_bar(len(values), len(values) - len(todo), progress, "sample", "") as bar,
+            closing(_finished(run, samples_to_run, workers, ray, gpus)) as finished,
+        ):
+            for sample, ended in finished:
+                kept = {"parameters": plain(sample.parameters), "seed": sample.seed}
+                writer.add(sample.name, sample.directory / TRAJECTORY, **kept, **ended)
+                shutil.rmtree(sample.directory)
+                bar.update()
+    return Episodes(out)
+
+
+def _finished(run: Run, samples: Iterator[Sample], workers: int | None, ray: bool, gpus: float) -> Iterator[tuple]:
+    """(sample, how it ended) of all samples, as they are finished."""
+    if ray:
+        return on_ray(run, samples, workers, gpus)
+    return in_processes(run, samples, workers) if workers and workers > 1 else in_turn(run, samples)
+
+
+def _runner(what: str | Callable, ranges: Mapping, options: Mapping) -> SceneRun | FunctionRun:
+    """What runs a sample; refuses ranges and options that it does not know."""
+    if callable(what):
+        if options:
+            raise SceneError(f"options = {options!r} are of `simulate`, for scenes; a function gives them itself")
+        known = inspect.signature(what).parameters.values()
+        if any(parameter.kind is parameter.VAR_KEYWORD for parameter in known):
+            return FunctionRun(what)
+        names, kinds = {parameter.name for parameter in [*known][1:]}, {}
+    else:
+        what = str(Path(what).resolve()) if what.endswith(".py") else what
+        found = inspect.signature(_loaded(what).build, eval_str=True).parameters
+        names, kinds = {*found, *SHARED}, {name: parameter.annotation for name, parameter in found.items()}
+    for name, range_ in ranges.items():
+        if name not in names:
+            raise SceneError(f"ranges: there is no parameter {name!r}; there are {', '.join(sorted(names))}")
+        if kinds.get(name) is int and isinstance(range_, Uniform | LogUniform):
+            raise SceneError(
+                f"ranges: {name} is a whole number; give Choice(range(LOW, HIGH + 1)), or a list of values"
+            )
+    if unknown := options.keys() - set(OPTIONS):
+        raise SceneError(f"options: {', '.join(sorted(unknown))}: there are {', '.join(OPTIONS)}")
+    check_fields([name for name in options.get("fields", ()) if name not in ("velocities", "directors")])
+    return FunctionRun(what) if callable(what) else SceneRun(what, dict(options))
+
+
+@cache
+def _loaded(scene: str):
+    """The module of a scene, loaded once a process."""
+    return load_scene(scene)
+
+
+def _name_of(what: str | Callable) -> str:
+    """What is swept, as the folder remembers it."""
+    if isinstance(what, str):
+        return scene_name(what)
+    return f"{what.__module__}.{getattr(what, '__qualname__', type(what).__name__)}"
+
+
+def _written(ranges: Mapping) -> dict:
+    """Ranges as JSON has them."""
+    return {
+        name: {type(range_).__name__: asdict(range_)} if isinstance(range_, Range) else range_
+        for name, range_ in ranges.items()
+    }
+
+
+def _refuse_other(path: Path, about: dict, episodes: int) -> int:
+    """How many samples a folder was made for, 0 for a new one; more or fewer of some designs belong to the same sweep.
+
+    Raises:
+        DataError: It holds the episodes of another sweep, or of none.
+    """
+    if not path.exists():
+        if episodes:
+            raise DataError(f"{path.parent} holds {episodes} episodes of no sweep; take another folder")
+        return 0
+    old = json.loads(path.read_text())
+    for name, value in about.items():
+        if old.get(name) != value and not (name == "samples" and about["design"] in GROWING):
+            found = f"{path.parent} holds a sweep with {name} = {old.get(name)}, not {value}"
+            raise DataError(f"{found}; go on with that, or take another folder")
+    return old["samples"]
