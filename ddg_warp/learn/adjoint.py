@@ -9,10 +9,11 @@ Inverse Problems in Engineering 1, 1994, 71, for such adjoints, and `ddg_warp.ke
 Derivatives by a state are a `State`, whose arrays hold them: `points()` are those by positions, in the user's order.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
+import warp as wp
 
 from ddg_warp.errors import SolverError
 from ddg_warp.learn.chains import ChainAdjoint, Kept
@@ -78,10 +79,10 @@ class Adjoint:
         validate.check_state("pull", self.model, given)
         for kept, part in zip(tape.parts, self.integrator._parts, strict=True):
             _require_whole(kept.whole.numpy(), part)
-        return self.pull_parts(tape.before, tape.after, tape.parts, given, self.integrator._solved(tape.dt))
+        return _copied(*self.pull_parts(tape.before, tape.after, tape.parts, given, self.integrator._solved(tape.dt)))
 
     def pull_parts(self, before: State, after: State, parts: list, given: State, s: float) -> tuple[State, list]:
-        """The same without a check, for solves over s [s]."""
+        """The same without a check, for solves over s [s]; what it returns is written anew by the next call."""
         groups, inputs = [], []
         for own, kept, end, by in zip(self.chains, parts, after.groups, given.groups, strict=False):
             start, read = own.pull(kept, end, by, s)
@@ -125,11 +126,20 @@ class EquilibriumAdjoint:
         inputs = []
         for own, at, by in zip(self.chains, state.groups, given.groups, strict=True):
             kept = Kept(at, at.x, at.theta, at.frame, None, state.time)
-            inputs.append(own.pull(kept, at, by, np.inf)[1])
+            inputs += _copied(self.model.empty_state(), [own.pull(kept, at, by, np.inf)[1]])[1]
         if self.net:
             kept = NetKept(state.net, state.net, None, state.time)
             inputs.append(self.net.pull(kept, state.net, given.net, np.inf)[1])
         return inputs
+
+
+def _copied(state: State, inputs: list) -> tuple[State, list]:
+    """Derivatives of their own."""
+    return state.copy(), [replace(own, **{k: _cloned(v) for k, v in vars(own).items()}) for own in inputs]
+
+
+def _cloned(value):
+    return [wp.clone(array) for array in value] if isinstance(value, list) else wp.clone(value)
 
 
 def _require_whole(portion: np.ndarray, part: SimpleNamespace) -> None:

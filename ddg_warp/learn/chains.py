@@ -76,10 +76,31 @@ class ChainAdjoint:
         self._frame = chain.frame_kernel(kind, real) if kind.twist else None
         self._nodes, self._edges = chain.gather_kernels(kind, real)
         self._solution, self._start = step.step_kernels(kind, real, scheme == "implicit_midpoint")
-        self._rows = sum(len(term.parameter_names) for term in kind.terms)
         self._moved = arrays.upload(np.tile(_moved(group), (1, group.worlds)), wp.uint8, device)
         self._rate = wp.zeros(group.columns, dtype=real, device=device)
         self._damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
+        twisted, viscous = kind.twist, kind.viscous
+        self._window, self._lag = self._rows(kind.window), self._rows(13)
+        self._end, self._dof, self._right = (self._rows(kind.block) for _ in range(3))
+        self._by_frame = self._rows(7, twisted and viscous)
+        self._start_state = GroupState(
+            x=self._make(self.vector),
+            v=self._make(self.vector),
+            theta=self._make(needed=twisted),
+            omega=self._make(needed=twisted),
+            frame=self._rows(7, twisted),
+            last=self._rows(kind.strain_rows, viscous),
+        )
+        self._inputs = ChainInputs(
+            parameters=self._rows(sum(len(term.parameter_names) for term in kind.terms)),
+            mass=self._make(),
+            rotary=self._make(),
+            load=self._rows(kind.block),
+            held=self._dof,
+            rate=self._make(),
+            damping=self._make(),
+            gravity=self._make(self.vector),
+        )
 
     def keep(self, step, before: GroupState) -> Kept:
         """What the step that a `ChainStep` has just made leaves for its reverse; `before` has to stay as it is."""
@@ -88,71 +109,78 @@ class ChainAdjoint:
         return Kept(before, wp.clone(newton.x), theta, frame, wp.clone(step.islands.portion))
 
     def pull(self, kept: Kept, after: GroupState, given: GroupState, s: float) -> tuple[GroupState, ChainInputs]:
-        """Derivatives by the start of a step, and by what else it read.
+        """Derivatives by the start of a step, and by what else it read; both are written anew by the next call. Launches alone, but for
+        closed rods and equilibria.
 
         Args:
             after: the state that it led to.
             given: derivatives by that state.
             s: length of the implicit Euler step that it solved [s].
         """
-        group, kind = self.group, self.group.kind
-        before = kept.before
-        window, lag, parameters = self._zeros(kind.window), self._zeros(13), self._zeros(self._rows)
-        dof = self._zeros(kind.block)
-        frame, by_frame = self._zeros(7, kind.twist), given.frame
-        last = self._zeros(kind.strain_rows, kind.viscous)
+        group, kind, before = self.group, self.group.kind, kept.before
+        start, inputs, window, lag = self._start_state, self._inputs, self._window, self._lag
+        for array in (window, lag, self._end, inputs.parameters, inputs.rate, start.frame, start.last):
+            array.zero_()
         self._rate.fill_(1.0 / s)
+        by_frame = given.frame
         if kind.viscous:
             # strains of the end, which the next step is damped from
             for kernel in self._strain:
                 read = [after.x, after.theta, after.frame, after.last, group.still]
-                self._launch(kernel, [*read, *self._parameters, given.last], [window, lag, parameters])
+                self._launch(kernel, [*read, *self._parameters, given.last], [window, lag, inputs.parameters])
             if kind.twist:
-                by_frame = wp.clone(given.frame)
+                by_frame = self._by_frame
+                wp.copy(by_frame, given.frame)
                 self._launch(self._edges, [lag, group.count], [by_frame])
                 lag.zero_()
         if kind.twist:
-            self._launch(self._frame, [after.x, kept.frame, group.count, by_frame], [window, frame])
-        more = self._zeros(kind.block)
-        self._launch(self._nodes, [window, group.count], [more])
-        end = [given.x, given.v, given.theta, given.omega, more]
-        self._launch(self._solution, [*end, group.count, self._rate], [dof])
-        w = self.solve(kept, before.last, s, dof)
+            self._launch(self._frame, [after.x, kept.frame, group.count, by_frame], [window, start.frame])
+        self._launch(self._nodes, [window, group.count], [self._end])
+        end = [given.x, given.v, given.theta, given.omega, self._end]
+        self._launch(self._solution, [*end, group.fixed, group.count, self._rate], [self._dof, self._right])
+        self.solve(kept, before.last, s, self._right, inputs.load)
         window.zero_()
-        by_rate = wp.zeros((group.nodes, group.columns), dtype=self.real, device=self.device)
+        read = [kept.x, kept.theta, kept.frame, before.last, self._rate, *self._parameters, inputs.load]
         for kernel in self._pull:
-            read = [kept.x, kept.theta, kept.frame, before.last, self._rate]
-            self._launch(kernel, [*read, *self._parameters, w], [window, lag, parameters, last, by_rate])
-        self._launch(self._nodes, [window, group.count], [dof])
+            self._launch(kernel, read, [window, lag, inputs.parameters, start.last, inputs.rate])
+        self._launch(self._nodes, [window, group.count], [self._dof])
         if kind.twist:
-            self._launch(self._edges, [lag, group.count], [frame])
-        return self._start_of(kept, end, w, dof, by_rate, frame, last, parameters)
-
-    def _start_of(self, kept, end, w, held, by_rate, frame, last, parameters) -> tuple[GroupState, ChainInputs]:
-        group, kind, before = self.group, self.group.kind, kept.before
-
-        def make(dtype=self.real, needed=True):
-            shape = (group.nodes, group.columns) if needed else (1, 1)
-            return arrays.allocate(shape, dtype, self.device)
-
-        x, v, theta, omega = make(self.vector), make(self.vector), make(needed=kind.twist), make(needed=kind.twist)
-        mass, rotary, damping, gravity = make(), make(), make(), make(self.vector)
+            self._launch(self._edges, [lag, group.count], [start.frame])
         self._launch(
             self._start,
-            [*end, kept.x, kept.theta, before.x, before.v, before.theta, before.omega, w, held, group.mass]
-            + [group.rotary, group.fixed, self._moved, group.count, self._rate, self._damping, group.gravity],
-            [x, v, theta, omega, mass, rotary, by_rate, damping, gravity],
+            [*end, kept.x, kept.theta, before.x, before.v, before.theta, before.omega, inputs.load, self._dof]
+            + [
+                group.mass,
+                group.rotary,
+                group.fixed,
+                self._moved,
+                group.count,
+                self._rate,
+                self._damping,
+                group.gravity,
+            ],
+            [start.x, start.v, start.theta, start.omega, inputs.mass, inputs.rotary, inputs.rate, inputs.damping]
+            + [inputs.gravity],
         )
-        start = GroupState(x, v, theta, omega, frame, last)
-        return start, ChainInputs(parameters, mass, rotary, w, held, by_rate, damping, gravity)
+        return start, inputs
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        own = [*self._pull, *self._strain, self._nodes, self._edges, self._solution, self._start]
+        return [*own, *([self._frame] if self._frame else []), *self.solve.kernels]
 
     @property
     def _parameters(self) -> list:
         return [*self.group.parameters.arrays, self.group.count]
 
-    def _zeros(self, rows: int, needed: bool = True) -> wp.array:
+    def _rows(self, rows: int, needed: bool = True) -> wp.array:
         shape = (rows, self.group.nodes, self.group.columns) if needed else (1, 1, 1)
         return arrays.allocate(shape, self.real, self.device)
+
+    def _make(self, dtype=None, needed: bool = True) -> wp.array:
+        shape = (self.group.nodes, self.group.columns) if needed else (1, 1)
+        return arrays.allocate(shape, dtype or self.real, self.device)
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
         wp.launch(kernel, (self.group.nodes, self.group.columns), inputs, outputs, device=self.device)

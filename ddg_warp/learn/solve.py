@@ -118,10 +118,16 @@ class ChainSolve:
             self.system.islands.unbalanced.fill_(1)  # every rod wants its matrix
             self.reduction = CyclicReduction(kind.block, group.nodes, group.columns, real, device)
             self._wanted = wp.full(group.columns, 1, dtype=int, device=device)
-        self._mask = arrays.upload(_free(group), real, device)
 
-    def __call__(self, solved, last: wp.array, s: float, given: wp.array) -> wp.array:
-        """w (block, n, R), zero at held dofs, for the right-hand side `given`.
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        if self.reduction is None:
+            return []
+        return [(self.system._evaluate, 128), self.system._assemble, *self.reduction.kernels]
+
+    def __call__(self, solved, last: wp.array, s: float, right: wp.array, w: wp.array) -> None:
+        """Write w (block, n, R), zero at held dofs, for a right-hand side that is zero there.
 
         Args:
             solved: the solution `x`, `theta` and its lagged `frame`.
@@ -133,9 +139,9 @@ class ChainSolve:
         """
         rate = 1.0 / s
         coefficient = rate * (rate + self.model.scene.mass_damping)
-        right = wp.map(wp.mul, given, self._mask)
         if self.reduction is None or not rate:
-            return self._on_host(solved, last, rate, coefficient, right)
+            self._on_host(solved, last, rate, coefficient, right, w)
+            return
         system = self.system
         system.x, system.theta, system.frame = solved.x, solved.theta, solved.frame
         islands = system.islands
@@ -144,24 +150,12 @@ class ChainSolve:
         islands.bad.zero_()
         system.evaluate(last)
         system.assemble_blocks()
-        w = arrays.allocate(right.shape, system.linear, system.device)
         self.reduction.solve(system.blocks, right, self.group.count, self._wanted, w, islands.bad)
-        return w
 
-    def _on_host(self, solved, last, rate: float, coefficient: float, right: wp.array) -> wp.array:
+    def _on_host(self, solved, last, rate: float, coefficient: float, right: wp.array, w: wp.array) -> None:
         data = SimpleNamespace(x=solved.x, theta=solved.theta, frame=solved.frame, last=last)
         groups = [data if each is self.group else None for each in self.model.groups]
         factor = None if rate else solved.time
         b = arrays.download(right).astype(float).transpose(2, 1, 0).ravel()
-        w = self.host(SimpleNamespace(groups=groups), rate, coefficient, factor, b)
-        out = arrays.allocate(right.shape, right.dtype, right.device)
-        arrays.assign(out, self.host.tangent.blocks(w).transpose(2, 1, 0))
-        return out
-
-
-def _free(group) -> np.ndarray:
-    """One for dofs that are free (block, n, columns), zero for held ones and behind the end of a rod."""
-    host = group.host
-    bits = (host.fixed[None] >> np.arange(group.kind.block)[:, None, None]) & 1
-    inside = np.arange(group.nodes)[:, None] < host.count
-    return np.tile((bits == 0) & inside, (1, 1, group.worlds)).astype(float)
+        found = self.host(SimpleNamespace(groups=groups), rate, coefficient, factor, b)
+        arrays.assign(w, self.host.tangent.blocks(found).transpose(2, 1, 0))

@@ -30,18 +30,26 @@ def step_kernels(kind: ChainKind, real, midpoint: bool):
         theta: wp.array2d(dtype=real),
         omega: wp.array2d(dtype=real),
         more: wp.array3d(dtype=real),
+        fixed: wp.array2d(dtype=wp.uint8),
         count: wp.array(dtype=int),
         rate: wp.array(dtype=real),
         dof_out: wp.array3d(dtype=real),
+        right_out: wp.array3d(dtype=real),
     ):
+        """`right_out` are those by free dofs, zero at held ones."""
         k, r = wp.tid()
         if k >= count[r]:
             return
+        mask = int(fixed[k, r])
         total = x[k, r] + v[k, r] * rate[r]
         for d in range(wp.static(dim)):
-            dof_out[d, k, r] = share * (total[d] + more[d, k, r])
+            own = share * (total[d] + more[d, k, r])
+            dof_out[d, k, r] = own
+            right_out[d, k, r] = wp.where(((mask >> d) & 1) == 0, own, real(0.0))
         if wp.static(twist):
-            dof_out[wp.static(dim), k, r] = share * (theta[k, r] + omega[k, r] * rate[r] + more[wp.static(dim), k, r])
+            turn = share * (theta[k, r] + omega[k, r] * rate[r] + more[wp.static(dim), k, r])
+            dof_out[wp.static(dim), k, r] = turn
+            right_out[wp.static(dim), k, r] = wp.where(((mask >> wp.static(dim)) & 1) == 0, turn, real(0.0))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def start(
