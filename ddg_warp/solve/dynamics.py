@@ -8,12 +8,14 @@ from ddg_warp.compile.precision import lost_in_rounding
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels import outcome
 from ddg_warp.model import validate
+from ddg_warp.model.controls import Controls
 from ddg_warp.model.state import State
 from ddg_warp.scene import drag
 from ddg_warp.solve import energy
 from ddg_warp.solve.buffers import Buffer
 from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.chains.step import NET_ONLY, ChainStep
+from ddg_warp.solve.controls import LOADS, Given
 from ddg_warp.solve.graphs import Graphs
 from ddg_warp.solve.net.step import NetStep
 from ddg_warp.threads import launches
@@ -92,6 +94,7 @@ class Integrator:
         self.check_every = check_every or (32 if model.wp_device.is_cuda else 1)
         _require_mass(model)
         _refuse_curved_membranes(model)
+        self.given: Given | None = None  # loads that steps are given, once one is
         self._chains = [ChainStep(self, model, group) for group in model.groups]
         self._net = NetStep(self, model) if model.net is not None else None
         self._buffers = [Buffer(model), Buffer(model)]
@@ -101,15 +104,21 @@ class Integrator:
         self._dt_host = None
         self._longest, self._version = 0.0, model.version
 
-    def step(self, state: State, dt: float) -> State:
+    def step(self, state: State, dt: float, controls: Controls | None = None) -> State:
         """The state after a step of dt [s]. No state changes that is held: see `State`.
+
+        Args:
+            state: where the step starts; dt: its length [s].
+            controls: poses of grips, loads and gravity of this step, world by world; see `Controls`.
 
         Raises:
             SolverError: a rod could not be stepped within the retries, or float32 would lose its motion in rounding; the message
                 names rod and outcome.
+            SceneError: controls do not fit the model.
         """
         dt = arguments.number("dt", dt, "a time step that is positive and finite [s]", lambda v: v > 0.0)
         validate.check_state("step", self.model, state)
+        found = self._checked(controls)
         source = self._own(state)
         self._vacate(1 - source)
         target = self._buffers[1 - source].state
@@ -121,6 +130,7 @@ class Integrator:
         if changed:
             for part in self._parts:
                 part.straighten(self._solved(dt))
+        self._control(found, source)
         start = state.time
         for part in self._parts:
             part.prescribe(start, start + dt)
@@ -175,6 +185,36 @@ class Integrator:
             )
         return None
 
+    def _checked(self, controls: Controls | None) -> dict[str, np.ndarray]:
+        """What controls give, as arrays by name."""
+        if controls is None:
+            return {}
+        if not isinstance(controls, Controls):
+            raise SceneError(f"step: controls are {controls!r}; give Controls(poses=..., forces=..., gravity=...)")
+        return controls.checked(self.model)
+
+    def _control(self, found: dict[str, np.ndarray], source: int) -> None:
+        """Hand the device what a step from a buffer is given; parts that carry no such loads yet are made anew, to do so."""
+        if self.given is None and any(name in found for name in LOADS):
+            self.given = Given(self.model)
+            self._remake()
+        if self.given is not None:
+            self.given.upload(found)
+        if self.model.grips:
+            now, then = (self._buffers[i].own.grips.pose for i in (source, 1 - source))
+            if "poses" in found:
+                poses = np.broadcast_to(found["poses"], (self.model.worlds, *found["poses"].shape[1:]))
+                then.assign(np.ascontiguousarray(poses.reshape(-1, 6).T))
+            else:
+                wp.copy(then, now)
+
+    def _remake(self) -> None:
+        """Make all parts anew, with what they count."""
+        self._chains = [ChainStep(self, self.model, part.group, part.means, counts_of=part) for part in self._chains]
+        if self._net is not None:
+            self._net = NetStep(self, self.model, self._net.means, counts_of=self._net)
+        self._graphs.clear()
+
     @property
     def _parts(self) -> list:
         """Steps of the groups of rods and of the net."""
@@ -227,6 +267,9 @@ class Integrator:
     def _launch(self, source: int) -> None:
         """Launches of a step of all parts from one buffer to the other."""
         before, after = self._buffers[source].own, self._buffers[1 - source].own
+        for part in self._parts:
+            if part.motion:
+                part.motion.follow(before, after)
         for chain in self._chains:
             chain.step(before.groups[chain.index], after.groups[chain.index])
         if self._net is not None:

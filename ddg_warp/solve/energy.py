@@ -72,7 +72,7 @@ class ChainEnergy(_Energy):
         group = step.group
         self.ranges = 1 if group.kind.serial else max(1, math.isqrt(group.nodes))
         super().__init__(step, group.columns, self.ranges, kept)
-        self._loads = [group.load, group.load_angle]
+        self._loads = [step.newton.load, step.newton.load_angle]
         self._follows = bool(group.host.followers)
         if self._follows:
             self._loads = [wp.clone(load) for load in self._loads]
@@ -95,8 +95,8 @@ class ChainEnergy(_Energy):
             + [before.last, *step.islands.arrays, *group.parameters.arrays, group.count, newton.mass, group.rotary]
             + [
                 *self._loads,
-                group.load,
-                group.load_angle,
+                newton.load,
+                newton.load_angle,
                 int(self._follows),
                 newton.stiffness,
                 step.damping,
