@@ -18,8 +18,10 @@ from ddg_warp.solve.chains.step import NET_ONLY, ChainStep
 from ddg_warp.solve.controls import LOADS, Given
 from ddg_warp.solve.graphs import Graphs
 from ddg_warp.solve.net.step import NetStep
+from ddg_warp.solve.worlds import Worlds, outcomes
 from ddg_warp.threads import launches
 
+FAILURES = ("raise", "flag")
 SOLVERS = ("newton", "projective")
 SCHEMES = ("implicit_euler", "implicit_midpoint")
 ENERGY_BOUND = 0.1
@@ -62,6 +64,9 @@ class Integrator:
             and where it is unstable the energy grows to a multiple within some steps: a tenth lies between. Implicit Euler takes
             energy out of what steps do not resolve and is not watched. See `kernels.energy`.
         check_every: steps between readings of the outcomes; by default 1 on the CPU and 32 on CUDA.
+        failures: what becomes of a step that is given up: "raise" stops the run, as described; by "flag" nothing is read or raised.
+            The world it is in then rests as it was before that step, all of it, until `reset` starts it anew; the others go on, and
+            `outcomes` tells which are which.
 
     Raises:
         SceneError: a free node has neither mass nor drag along and across its rod, the scheme does not exist, or implicit Euler is
@@ -78,6 +83,7 @@ class Integrator:
         retry_limit: int = 20,
         energy_bound: float | None = ENERGY_BOUND,
         check_every: int | None = None,
+        failures: str = "raise",
         **options,
     ):
         validate.check_model("Integrator", model)
@@ -85,6 +91,7 @@ class Integrator:
         arguments.choice("solver", solver, SOLVERS)
         if model.net is None and linear in NET_ONLY:
             raise SceneError(f"linear = {linear!r} is of nets; rods on their own take 'auto', or see `Integrator`")
+        self.failures = arguments.choice("failures", failures, FAILURES)
         if check_every is not None:
             arguments.count("check_every", check_every)
         self.model, self.scheme, self.solver, self.linear = model, scheme, solver, linear
@@ -97,6 +104,7 @@ class Integrator:
         self.given: Given | None = None  # loads that steps are given, once one is
         self._chains = [ChainStep(self, model, group) for group in model.groups]
         self._net = NetStep(self, model) if model.net is not None else None
+        self._worlds, self._first = Worlds(model), None
         self._buffers = [Buffer(model), Buffer(model)]
         self._graphs = Graphs(model, self._load_modules)
         self._steps_since_check = 0
@@ -137,7 +145,7 @@ class Integrator:
         self._graphs.replay(source, lambda: self._launch(source))
         target.time = start + dt
         self._steps_since_check += 1
-        if self._steps_since_check >= self.check_every:
+        if self.failures == "raise" and self._steps_since_check >= self.check_every:
             self.check(target)
         for callback in self.model.scene.callbacks:
             callback(target)
@@ -147,11 +155,57 @@ class Integrator:
         """Read the outcomes of all steps since the last reading.
 
         Raises:
-            SolverError: a rod has been given up.
+            SolverError: a rod has been given up, and failures are not flagged.
         """
         self._steps_since_check = 0
-        for part in self._parts:
+        for part in self._parts if self.failures == "raise" else ():
             part.raise_failures(state)
+
+    def outcomes(self) -> np.ndarray:
+        """What became of every world (worlds,): "converged", or the name of the outcome for which something in it was given up."""
+        return outcomes(self.model, self._parts)
+
+    def failure(self, state: State, world: int) -> str:
+        """What was given up in a world, where it went wrong, and what to do; empty where nothing was.
+
+        Args:
+            state: the last one, in which the world rests.
+            world: index.
+        """
+        validate.check_state("failure", self.model, state)
+        if not 0 <= arguments.index("world", world) < self.model.worlds:
+            raise SceneError(f"world {world} does not exist; the model has {self.model.worlds}")
+        return next(filter(None, (part.failure_in(state, world) for part in self._parts)), "")
+
+    def reset(self, state: State, mask, to: State | None = None) -> State:
+        """A state whose worlds of a mask are as in another state, while the others are as they were, bit for bit.
+
+        What the integrator keeps of these worlds is forgotten: outcomes, retries, the account of their energy. They then step as they
+        would in a new integrator. Time is one for all worlds and goes on: loads, fields and flows that the scene has as functions of
+        time do not start anew (see `Controls` for what each world has of its own).
+
+        Args:
+            state: of this model; it is not changed.
+            mask: bools (worlds,), True for those that start anew.
+            to: where they start: a state of this model, each from its own world of it, or of the same scene built with worlds=1, all
+                from that one. By default the model's first state.
+
+        Raises:
+            SceneError: the mask or the state does not fit, or supports that a `Motion` moves are elsewhere at the time of the state.
+        """
+        validate.check_state("reset", self.model, state)
+        mask = self._worlds.mask(mask)
+        if to is None:
+            if self._first is None or self._first[0] != self.model.version:
+                self._first = self.model.version, self.model.state()
+            to = self._first[1]
+        self._worlds.check_source(to, state)
+        source = self._own(state)
+        self._vacate(1 - source)
+        target = self._buffers[1 - source].state
+        target.assign(state)
+        self._worlds.reset(self._parts, mask, to, target)
+        return target
 
     def statistics(self) -> dict:
         """Counts since the integrator was made: Newton iterations of a solve, retries, lost pivots, outcomes.
@@ -274,10 +328,14 @@ class Integrator:
             chain.step(before.groups[chain.index], after.groups[chain.index])
         if self._net is not None:
             self._net.step(before.net, after.net)
+        if self.failures == "flag":
+            self._worlds.settle(self._parts, before, after)
 
     def _load_modules(self) -> None:
         for part in self._parts:
             part.load_modules()
+        if self.failures == "flag":
+            self._worlds.load_modules()
 
 
 def _refuse_curved_membranes(model) -> None:

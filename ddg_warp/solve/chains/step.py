@@ -112,9 +112,10 @@ class ChainStep(PartStep):
         self.islands.carried.assign(largest_carried(self.group.stiffnesses(s)[2]))
 
     def who(self, column: int) -> str:
-        """The rod of a column."""
+        """The rod of a column, and its world where there are several."""
         rod = self._rod(column)
-        return f"rod {rod} ('{self.model.curves.names[rod]}')"
+        world = f" of world {column // self.group.rods}" if self.model.worlds > 1 else ""
+        return f"rod {rod} ('{self.model.curves.names[rod]}'){world}"
 
     def rods_of(self, columns: np.ndarray) -> list[int]:
         """Rods of columns, as the user counts them."""
