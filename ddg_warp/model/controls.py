@@ -52,6 +52,17 @@ class Controls:
         return found
 
 
+def checked(controls: Controls | None, model) -> dict[str, np.ndarray]:
+    """What controls give, see `Controls.checked`; nothing without."""
+    if controls is None:
+        return {}
+    if not isinstance(controls, Controls):
+        raise SceneError(
+            f"step: controls are {controls!r}; give Controls(poses=..., forces=..., moments=..., gravity=...)"
+        )
+    return controls.checked(model)
+
+
 def _numbers(name: str, values, shape: tuple, worlds: int) -> np.ndarray:
     """The one place where arrays of others become ours."""
     try:

@@ -8,9 +8,8 @@ from ddg_warp.compile.precision import lost_in_rounding
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels import outcome
 from ddg_warp.model import validate
-from ddg_warp.model.controls import Controls
+from ddg_warp.model.controls import Controls, checked
 from ddg_warp.model.state import State
-from ddg_warp.scene import drag
 from ddg_warp.solve import energy
 from ddg_warp.solve.buffers import Buffer
 from ddg_warp.solve.chains.newton import NewtonOptions
@@ -24,7 +23,6 @@ from ddg_warp.threads import launches
 FAILURES = ("raise", "flag")
 SOLVERS = ("newton", "projective")
 SCHEMES = ("implicit_euler", "implicit_midpoint")
-ENERGY_BOUND = 0.1
 
 
 @launches
@@ -81,7 +79,7 @@ class Integrator:
         solver: str = "newton",
         linear: str = "auto",
         retry_limit: int = 20,
-        energy_bound: float | None = ENERGY_BOUND,
+        energy_bound: float | None = energy.BOUND,
         check_every: int | None = None,
         failures: str = "raise",
         **options,
@@ -97,10 +95,10 @@ class Integrator:
         self.model, self.scheme, self.solver, self.linear = model, scheme, solver, linear
         self.options = NewtonOptions(**options)
         self.retry_limit = arguments.count("retry_limit (0 for no retry)", retry_limit, 0)
-        self.energy_bound = self._bound(energy_bound)
+        self.energy_bound = energy.bound(energy_bound, scheme)
         self.check_every = check_every or (32 if model.wp_device.is_cuda else 1)
-        _require_mass(model)
-        _refuse_curved_membranes(model)
+        validate.require_mass(model)
+        validate.refuse_curved_membranes(model)
         self.given: Given | None = None  # loads that steps are given, once one is
         self._chains = [ChainStep(self, model, group) for group in model.groups]
         self._net = NetStep(self, model) if model.net is not None else None
@@ -126,7 +124,7 @@ class Integrator:
         """
         dt = arguments.number("dt", dt, "a time step that is positive and finite [s]", lambda v: v > 0.0)
         validate.check_state("step", self.model, state)
-        found = self._checked(controls)
+        found = checked(controls, self.model)
         source = self._own(state)
         self._vacate(1 - source)
         target = self._buffers[1 - source].state
@@ -225,28 +223,6 @@ class Integrator:
             "outcomes": {name: int(tally[code]) for code, name in outcome.NAMES.items() if tally[code]},
         } | ({} if self.energy_bound is None else {"energy": energy.summary([part.energy for part in self._parts])})
 
-    def _bound(self, given: float | None) -> float | None:
-        """The bound of the energy, None where it is not watched."""
-        if given is not None:
-            given = arguments.number(
-                "energy_bound", given, "a fraction between 0 and 1, or None", lambda v: 0.0 < v < 1.0
-            )
-        if self.scheme == "implicit_midpoint":
-            return given
-        if given not in (None, ENERGY_BOUND):
-            raise SceneError(
-                f"energy_bound = {given:g} is of the implicit midpoint rule; {self.scheme} takes energy out"
-            )
-        return None
-
-    def _checked(self, controls: Controls | None) -> dict[str, np.ndarray]:
-        """What controls give, as arrays by name."""
-        if controls is None:
-            return {}
-        if not isinstance(controls, Controls):
-            raise SceneError(f"step: controls are {controls!r}; give Controls(poses=..., forces=..., gravity=...)")
-        return controls.checked(self.model)
-
     def _control(self, found: dict[str, np.ndarray], source: int) -> None:
         """Hand the device what a step from a buffer is given; parts that carry no such loads yet are made anew, to do so."""
         if self.given is None and any(name in found for name in LOADS):
@@ -336,30 +312,3 @@ class Integrator:
             part.load_modules()
         if self.failures == "flag":
             self._worlds.load_modules()
-
-
-def _refuse_curved_membranes(model) -> None:
-    """Its strains turn with the normals, so that the matrix of a time step, which is made positive, is far from the tangent."""
-    for i, shell in enumerate(model.scene.shells):
-        if shell.membrane == "curved":
-            raise SceneError(
-                f"shell {i} ('{shell.name}'): membrane 'curved' serves statics and spectra; for dynamics add it with membrane='flat'"
-            )
-
-
-def _require_mass(model) -> None:
-    for group in model.groups:
-        host, kind = group.host, group.kind
-        positions = (1 << kind.dim) - 1
-        k = np.arange(group.nodes)[:, None]
-        own = (k >= host.first) & (k < host.first + host.own)
-        bad = (host.mass <= 0.0) & ((host.fixed & positions) != positions) & own
-        if kind.drag:
-            held_back = drag.holds(host.drag)  # edges; the last node of an open rod starts none
-            bad &= ~(held_back | np.roll(held_back, 1, axis=0))
-        if bad.any():
-            k, column = np.argwhere(bad)[0]
-            raise SceneError(
-                f"node {k - host.first[column]} of rod {host.rods[column]} is free and has no mass; "
-                "give the material a density, the section a mass_per_length, or the rod drag along and across"
-            )

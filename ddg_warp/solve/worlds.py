@@ -54,6 +54,8 @@ class Worlds:
             inputs = [part.islands.arrays[0], part.islands_each, self.resting, self._failed]
             self._launch(self._note, len(part.islands), inputs, [self._any])
         wp.capture_if(self._any, lambda: self._rest(parts, before, after))
+        if after.grips is not None:  # which go where they are told, but for worlds that rest
+            self._take_part(self.resting, before.grips, after.grips, before.model.worlds)
 
     def _rest(self, parts: list, before: State, after: State) -> None:
         self.take_over(self._failed, before, after)
@@ -64,16 +66,19 @@ class Worlds:
 
     def take_over(self, mask: wp.array, source: State, target: State) -> None:
         """Put everything of a state into another one, in worlds of a mask; a state of one world goes into each of them."""
-        several = self.model.worlds
         for name, part in target.parts().items():
-            given = source.parts()[name].arrays()
-            for label, array in part.arrays().items():
-                if array.shape[-1] % several:
-                    continue  # not there, but for one number
-                share = array.shape[-1] // several
-                stride = share if source.model.worlds == several else 0
-                kernel, cubes = select_kernel(array.dtype), [_cube(a) for a in (given[label], array)]
-                self._launch(kernel, cubes[1].shape, [mask, share, stride, cubes[0]], [cubes[1]])
+            self._take_part(mask, source.parts()[name], part, source.model.worlds)
+
+    def _take_part(self, mask: wp.array, source, target, worlds: int) -> None:
+        """The same of a part of a state, from one of so many worlds."""
+        several, given = self.model.worlds, source.arrays()
+        for name, array in target.arrays().items():
+            if array.shape[-1] % several:
+                continue  # not there, but for one number
+            share = array.shape[-1] // several
+            stride = share if worlds == several else 0
+            kernel, cubes = select_kernel(array.dtype), [_cube(a) for a in (given[name], array)]
+            self._launch(kernel, cubes[1].shape, [mask, share, stride, cubes[0]], [cubes[1]])
 
     def mask(self, mask) -> wp.array:
         """A mask that a user gives, on the device.
