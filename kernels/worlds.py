@@ -12,8 +12,11 @@ from ddg_warp.kernels.islands import REASON, STATUS
 
 
 @cache
-def select_kernel(dtype):
-    """Takes over the entries of another array in worlds of a mask; `stride` is the share, or 0 where that array has one world."""
+def select_kernel(dtype, serial: bool):
+    """Takes over the entries of another array in worlds of a mask; `stride` is the share, or 0 where that array has one world.
+
+    A thread takes one entry (row, row, world, entry of it), or all of a world if `serial`.
+    """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def select(
@@ -23,10 +26,16 @@ def select_kernel(dtype):
         source: wp.array3d(dtype=dtype),
         out: wp.array3d(dtype=dtype),
     ):
-        i, j, k = wp.tid()
-        w = k / share
-        if mask[w] != 0:
-            out[i, j, k] = source[i, j, k - w * (share - stride)]
+        i, j, w, k = wp.tid()
+        if mask[w] == 0:
+            return
+        if wp.static(serial):
+            for r in range(share):
+                for a in range(out.shape[0]):
+                    for b in range(out.shape[1]):
+                        out[a, b, w * share + r] = source[a, b, w * stride + r]
+        else:
+            out[i, j, w * share + k] = source[i, j, w * stride + k]
 
     return select
 

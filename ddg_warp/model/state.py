@@ -134,7 +134,7 @@ class State:
         """Take over everything of another state of the same model."""
         for mine, theirs in zip(self.parts().values(), other.parts().values(), strict=True):
             for array, source in zip(mine.arrays().values(), theirs.arrays().values(), strict=True):
-                wp.copy(array, source)
+                arrays.copy(array, source)
         self.time, self.stable = other.time, None
 
     def snapshot(self) -> dict[str, np.ndarray]:

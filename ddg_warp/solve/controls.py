@@ -86,6 +86,9 @@ class ControlledLoads(Loads):
     def _upload_dead(self, amplitudes: list[float]) -> None:
         if len(amplitudes) > 1:
             self._shared.assign((self._dead @ amplitudes).reshape(-1, 3))
+
+    def give(self) -> None:
+        """Add what the step at hand is given, and find what residuals are compared with; launches alone, so that it can be captured."""
         values = self._values.reshape(self._sizes.shape)
         device = self.model.wp_device
         wp.launch(self._load, self._sizes.shape, self._inputs, [values, self._sizes], device=device)

@@ -102,7 +102,7 @@ class Integrator:
         self.given: Given | None = None  # loads that steps are given, once one is
         self._chains = [ChainStep(self, model, group) for group in model.groups]
         self._net = NetStep(self, model) if model.net is not None else None
-        self._worlds, self._first = Worlds(model), None
+        self._worlds, self._first = Worlds(model), (None, None)
         self._buffers = [Buffer(model), Buffer(model)]
         self._graphs = Graphs(model, self._load_modules)
         self._steps_since_check = 0
@@ -140,7 +140,7 @@ class Integrator:
         start = state.time
         for part in self._parts:
             part.prescribe(start, start + dt)
-        self._graphs.replay(source, lambda: self._launch(source))
+        self._graphs.replay((source, self.given is not None and self.given.any), lambda: self._launch(source))
         target.time = start + dt
         self._steps_since_check += 1
         if self.failures == "raise" and self._steps_since_check >= self.check_every:
@@ -193,17 +193,25 @@ class Integrator:
         """
         validate.check_state("reset", self.model, state)
         mask = self._worlds.mask(mask)
-        if to is None:
-            if self._first is None or self._first[0] != self.model.version:
-                self._first = self.model.version, self.model.state()
-            to = self._first[1]
+        if self._first[0] != self.model.version:
+            self._first = self.model.version, self.model.state()
+        to = self._first[1] if to is None else to
         self._worlds.check_source(to, state)
+        self._worlds.load_modules()
         source = self._own(state)
         self._vacate(1 - source)
-        target = self._buffers[1 - source].state
-        target.assign(state)
-        self._worlds.reset(self._parts, mask, to, target)
-        return target
+        now, then = (self._buffers[i] for i in (source, 1 - source))
+
+        def launch():
+            then.own.assign(now.own)
+            self._worlds.reset(self._parts, mask, to, then.own)
+
+        if to is self._first[1]:
+            self._graphs.replay(("reset", source), launch)
+        else:  # whose arrays may be gone by the next time
+            launch()
+        then.state.time, then.state.stable = state.time, None
+        return then.state
 
     def statistics(self) -> dict:
         """Counts since the integrator was made: Newton iterations of a solve, retries, lost pivots, outcomes.
@@ -300,6 +308,8 @@ class Integrator:
         for part in self._parts:
             if part.motion:
                 part.motion.follow(before, after)
+            if self.given is not None:
+                part.loads.give()
         for chain in self._chains:
             chain.step(before.groups[chain.index], after.groups[chain.index])
         if self._net is not None:

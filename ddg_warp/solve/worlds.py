@@ -35,16 +35,10 @@ class Worlds:
         self.resting, self._failed, self._mask = (self._zeros(model.worlds) for _ in range(3))
         self._any = self._zeros(1)
         self._note, self._seal, self._enter, self._clear = island_kernels()
-        self._loaded = False
+        self._serial, self._loaded = arrays.serial(model.wp_device), False
 
     def _zeros(self, count: int) -> wp.array:
         return wp.zeros(count, dtype=int, device=self.model.wp_device)
-
-    @property
-    def kernels(self) -> list:
-        """Kernels of `settle`, to load before a capture."""
-        types = {array.dtype for part in self.model.empty_state().parts().values() for array in part.arrays().values()}
-        return [self._note, self._seal, self._enter, *(select_kernel(dtype) for dtype in types)]
 
     def settle(self, parts: list, before: State, after: State) -> None:
         """After a step: have worlds rest in which something was given up; launches alone, so that it can be captured."""
@@ -77,8 +71,9 @@ class Worlds:
                 continue  # not there, but for one number
             share = array.shape[-1] // several
             stride = share if worlds == several else 0
-            kernel, cubes = select_kernel(array.dtype), [_cube(a) for a in (given[name], array)]
-            self._launch(kernel, cubes[1].shape, [mask, share, stride, cubes[0]], [cubes[1]])
+            kernel, cubes = select_kernel(array.dtype, self._serial), [_cube(a) for a in (given[name], array)]
+            dim = (1, 1, several, 1) if self._serial else (*cubes[1].shape[:2], several, share)
+            self._launch(kernel, dim, [mask, share, stride, cubes[0]], [cubes[1]])
 
     def mask(self, mask) -> wp.array:
         """A mask that a user gives, on the device.
@@ -119,9 +114,6 @@ class Worlds:
 
     def reset(self, parts: list, mask: wp.array, to: State, target: State) -> None:
         """Put worlds of the mask into the state `to`, and forget what became of them."""
-        if not self._loaded:
-            with capturing():
-                self.load_modules()
         self.take_over(mask, to, target)
         self._launch(forget_kernel(int), (1, self.model.worlds), [mask, 1], [self.resting.reshape((1, -1))])
         for part in parts:
@@ -131,10 +123,23 @@ class Worlds:
                 self._launch(kernel, account.shape, [mask, part.islands_each], [account])
 
     def load_modules(self) -> None:
-        """Compile and load what `reset` launches."""
+        """Compile and load what it launches, once."""
+        if self._loaded:
+            return
+        with capturing():
+            types = {
+                array.dtype for part in self.model.empty_state().parts().values() for array in part.arrays().values()
+            }
+            kernels = [
+                self._note,
+                self._seal,
+                self._enter,
+                self._clear,
+                *(select_kernel(dtype, self._serial) for dtype in types),
+            ]
+            kernels += [forget_kernel(dtype) for dtype in (int, self.model.types.real)]
+            arrays.load_kernels(kernels, self.model.wp_device)
         self._loaded = True
-        accounts = forget_kernel(int), forget_kernel(self.model.types.real)
-        arrays.load_kernels([*self.kernels, self._clear, *accounts], self.model.wp_device)
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)
