@@ -193,9 +193,10 @@ class Integrator:
         """
         validate.check_state("reset", self.model, state)
         mask = self._worlds.mask(mask)
-        if self._first[0] != self.model.version:
+        anew = to is None
+        if anew and self._first[0] != self.model.version:
             self._first = self.model.version, self.model.state()
-        to = self._first[1] if to is None else to
+        to = self._first[1] if anew else to
         self._worlds.check_source(to, state)
         self._worlds.load_modules()
         source = self._own(state)
@@ -206,7 +207,7 @@ class Integrator:
             then.own.assign(now.own)
             self._worlds.reset(self._parts, mask, to, then.own)
 
-        if to is self._first[1]:
+        if anew:
             self._graphs.replay(("reset", source), launch)
         else:  # whose arrays may be gone by the next time
             launch()

@@ -200,4 +200,5 @@ class PartStep:
     def advice(self, state) -> str:
         """What to do about a step that failed and has no other reason."""
         jump = jump_between(self.model, state.time - self.integrator._dt_host, state.time)
-        return jump or "take a smaller dt, a looser rtol, or check its loads and supports"
+        grips = "move grips less in a step, " if self.model.grips else ""
+        return jump or f"{grips}take a smaller dt, a looser rtol, or check its loads and supports"
