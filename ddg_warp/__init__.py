@@ -17,6 +17,7 @@ if TYPE_CHECKING:  # what editors and type checkers read; at run time see `_HOME
     from ddg_warp.errors import SceneError, SceneWarning, SolverError
     from ddg_warp.geometry import meshes
     from ddg_warp.model import rest_shapes
+    from ddg_warp.model.controls import Controls
     from ddg_warp.model.model import Model
     from ddg_warp.model.state import State
     from ddg_warp.run import bench
@@ -24,6 +25,7 @@ if TYPE_CHECKING:  # what editors and type checkers read; at run time see `_HOME
     from ddg_warp.run.record import Recorder
     from ddg_warp.scene.descriptions import Dynamics, Law, Statics, Trace
     from ddg_warp.scene.drag import Granular, Viscous
+    from ddg_warp.scene.grip import Grip
     from ddg_warp.scene.material import Circle, Ellipse, Material, Rectangle, Ribbon, Stiffness
     from ddg_warp.scene.motion import Motion
     from ddg_warp.scene.path import Displacement, Stop
@@ -35,10 +37,12 @@ __version__ = "0.1.0"
 __all__ = [
     "Check",
     "Circle",
+    "Controls",
     "Displacement",
     "Dynamics",
     "Ellipse",
     "Granular",
+    "Grip",
     "Integrator",
     "Law",
     "Material",
@@ -70,10 +74,12 @@ __all__ = [
 _HOME = {
     "Check": "run.check",
     "Circle": "scene.material",
+    "Controls": "model.controls",
     "Displacement": "scene.path",
     "Dynamics": "scene.descriptions",
     "Ellipse": "scene.material",
     "Granular": "scene.drag",
+    "Grip": "scene.grip",
     "Integrator": "solve.dynamics",
     "Law": "scene.descriptions",
     "Material": "scene.material",

@@ -31,11 +31,15 @@ def upload(values: np.ndarray, dtype, device) -> wp.array:
 
 def assign(array: wp.array, values: np.ndarray) -> None:
     """Copy host values of the same logical shape into a device array."""
-    new = upload(np.asarray(values), array.dtype, array.device)
+    copy(array, upload(np.asarray(values), array.dtype, array.device))
+
+
+def copy(array: wp.array, source: wp.array) -> None:
+    """Copy a device array into another one that is laid out alike; can be captured."""
     if not array.is_contiguous:  # copied as they lie in memory, which takes a fraction of the time
         order = tuple(reversed(range(array.ndim)))
-        array, new = array.transpose(order), new.transpose(order)
-    wp.copy(array, new)
+        array, source = array.transpose(order), source.transpose(order)
+    wp.copy(array, source)
 
 
 def download(array: wp.array) -> np.ndarray:

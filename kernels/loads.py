@@ -90,7 +90,10 @@ def follower_kernel(name: str, count: int, dim: int, real):
 
 @cache
 def spread_kernel(dim: int, real):
-    """Writes the loads on nodes of `dim` components, or on angles, of one: dead ones, and the forces that belong to each."""
+    """Writes the loads on nodes of `dim` components, or on angles, of one: dead ones, and the forces that belong to each.
+
+    Dead ones are shared by all worlds, with `stride` 0, or lie as many apart.
+    """
     V, P = wp.types.vector(3, real), wp.types.vector(dim, real) if dim > 1 else real
     _, put = point_functions(max(2, dim), real)
 
@@ -98,6 +101,7 @@ def spread_kernel(dim: int, real):
     def spread(
         places: wp.array(dtype=int),
         dead: wp.array(dtype=V),
+        stride: int,
         starts: wp.array(dtype=int),
         items: wp.array(dtype=int),
         force: wp.array(dtype=V),
@@ -106,7 +110,7 @@ def spread_kernel(dim: int, real):
         load_out: wp.array2d(dtype=P),
     ):
         k, w = wp.tid()
-        f = dead[k]
+        f = dead[k + w * stride]
         for at in range(starts[k], starts[k + 1]):
             f += force[items[at] + w * total]
         if wp.static(dim > 1):

@@ -2,6 +2,7 @@
 
 A pose is a row of an array: the rotation vector of the step (3), the rotation at its start (9), the pivot (3), the translations
 at its start and end (3 each). s is the fraction of the step; the turn runs at a constant rate, so that no part of it is a chord.
+Where worlds are moved each for itself, by `Grip`, the rows of one world follow those of another, `stride` apart, which else is zero.
 
 Supports are at the end of the part of the step that is taken; for the midpoint rule positions are the mean of those at both of its
 ends, so that the extrapolated ones are exact, and angles and normals those in the middle.
@@ -88,6 +89,7 @@ def support_kernels(dim: int, real, midpoint: bool):
         where: wp.array2d(dtype=int),
         rest: wp.array(dtype=X),
         pose: wp.array2d(dtype=real),
+        stride: int,
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         columns: int,
@@ -104,6 +106,7 @@ def support_kernels(dim: int, real, midpoint: bool):
         for d in range(3):
             m = where[i, 1 + d]
             if m >= 0:
+                m += w * stride
                 p = placed(pose, m, start + scalars[PORTION, r], rest[i])
                 if wp.static(midpoint):
                     p = real(0.5) * (p + placed(pose, m, start, rest[i]))
@@ -115,6 +118,7 @@ def support_kernels(dim: int, real, midpoint: bool):
         where: wp.array2d(dtype=int),
         rest: wp.array(dtype=X),
         pose: wp.array2d(dtype=real),
+        stride: int,
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         columns: int,
@@ -134,6 +138,66 @@ def support_kernels(dim: int, real, midpoint: bool):
             X(frame[0, e, r], frame[1, e, r], frame[2, e, r]), X(frame[3, e, r], frame[4, e, r], frame[5, e, r]), t
         )
         k = where[i, 0] / columns
-        theta[k, r] = branch(pose, where[i, 4], start, reached(scalars, r), rest[i], u, t, theta[k, r])
+        theta[k, r] = branch(pose, where[i, 4] + w * stride, start, reached(scalars, r), rest[i], u, t, theta[k, r])
 
     return nodes, angles
+
+
+@cache
+def grip_kernel(real):
+    """Poses of all motions over a step, world by world: those of grips between two states, of functions of time as they are given."""
+    X, Q = wp.types.vector(3, real), wp.types.quaternion(real)
+
+    @wp.func
+    def row(values: wp.array2d(dtype=real), first: int, i: int):
+        return X(values[first, i], values[first + 1, i], values[first + 2, i])
+
+    @wp.func
+    def quaternion(rotation: X):
+        angle = wp.length(rotation)
+        q = Q(real(0.0), real(0.0), real(0.0), real(1.0))
+        if angle > real(0.0):
+            v = rotation * (wp.sin(real(0.5) * angle) / angle)
+            q = Q(v[0], v[1], v[2], wp.cos(real(0.5) * angle))
+        return q
+
+    @wp.func
+    def turn_between(r0: X, r1: X):
+        """The rotation vector of the shortest turn from one orientation to another, exactly none where they are the same."""
+        q = quaternion(r1) * wp.quat_inverse(quaternion(r0))
+        v = X(q[0], q[1], q[2])
+        if q[3] < real(0.0):
+            v = -v
+        size = wp.length(v)
+        if size == real(0.0) or r0 == r1:
+            return X()
+        return v * (real(2.0) * wp.atan2(size, wp.abs(q[3])) / size)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def grip(
+        grips: wp.array(dtype=int),
+        count: int,
+        shared: wp.array2d(dtype=real),
+        before: wp.array2d(dtype=real),
+        after: wp.array2d(dtype=real),
+        pose_out: wp.array2d(dtype=real),
+    ):
+        """`grips` is the number of the grip of each row, among `count`, -1 where it is a function of time."""
+        m, w = wp.tid()
+        at = m + w * grips.shape[0]
+        for c in range(wp.static(POSE)):
+            pose_out[at, c] = shared[m, c]
+        if grips[m] < 0:
+            return
+        i = grips[m] + w * count
+        r0 = row(before, 3, i)
+        turn = turn_between(r0, row(after, 3, i))
+        rotation = wp.quat_to_matrix(quaternion(r0))
+        for d in range(3):
+            pose_out[at, d] = turn[d]
+            for e in range(3):
+                pose_out[at, 3 + 3 * d + e] = rotation[d, e]
+            pose_out[at, 15 + d] = before[d, i]
+            pose_out[at, 18 + d] = after[d, i]
+
+    return grip

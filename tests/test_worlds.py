@@ -1,5 +1,7 @@
 """Worlds: copies of one topology with parameters, supports and outcomes of their own."""
 
+import time
+
 import numpy as np
 import pytest
 import warp as wp
@@ -97,6 +99,28 @@ def test_one_bad_world_does_not_stop_the_others(device):
     np.testing.assert_array_equal(state.points()[0], points[0])
     with pytest.raises(ddg.SolverError, match="non_finite"):
         integrator.check(state)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [8, 64])
+def test_many_worlds_cost_what_many_rods_do(device, count):
+    """Worlds of one rod step as fast as that many rods of one world, to what a busy machine makes of a time."""
+    points = np.zeros((count, 32, 3))
+    points[:, :, 0] = np.linspace(0.0, 1.0, 32)
+    integrators = []
+    for rods, worlds in ((points, 1), (points[:1], count)):
+        scene = ddg.Scene()
+        scene.clamp(scene.add_rods(rods, section=ddg.Circle(0.02), material=ddg.Material(1e7, 0.5, 1000.0)))
+        integrators.append(ddg.Integrator(scene.build(device, "float64", worlds=worlds)))
+    best = [np.inf, np.inf]
+    for _ in range(6):  # in turns, so that both meet the same neighbours
+        for i, integrator in enumerate(integrators):
+            state, started = integrator.model.state(), time.perf_counter()
+            for _ in range(20):
+                state = integrator.step(state, 1.0 / 240.0)
+            state.points()
+            best[i] = min(best[i], time.perf_counter() - started)
+    assert best[1] < 1.25 * best[0]
 
 
 def test_a_step_reads_nothing_back(device, monkeypatch):

@@ -114,6 +114,15 @@ class Bodies:
         total = np.bincount(self._component, own) / np.maximum(1, np.bincount(self._component))
         return np.maximum(own, np.where(total > 0.0, total, own.mean())[self._component])
 
+    @property
+    def components(self) -> np.ndarray:
+        """Number of what every body is connected with (count,)."""
+        return self._component
+
+    def limit_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Blocks, bodies and weights of which `limits` takes the largest product of weight and load."""
+        return self._blocks, self._body, self._weight
+
     def support(self, force: np.ndarray) -> np.ndarray:
         """The largest support force of every body (count,) [N], from the forces on held nodes (N, 3), zero elsewhere."""
         result = support_forces(force[self._line], self._line_body, self.count)
@@ -132,7 +141,12 @@ def outer_forces(host, gravity) -> np.ndarray:
     """Sizes of the outer forces on every block of a net (N,) [N, N m], those that change at their full amplitude."""
     dead = host.constant_loads()
     dead[: host.nodes] += host.mass[: host.nodes] * np.asarray(gravity, float)
-    force = np.abs(dead).sum(1)
+    return np.abs(dead).sum(1) + changing_forces(host)
+
+
+def changing_forces(host) -> np.ndarray:
+    """Of these, the sizes of loads that change, at their full amplitude, or follow, and of a magnetic field."""
+    force = np.zeros(host.blocks)
     for load in host.timed:
         np.add.at(force, load.places, np.abs(load.force).sum(-1))
     for load in host.followers:

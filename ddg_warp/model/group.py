@@ -120,10 +120,15 @@ def _outer_forces(host: ChainGroup, gravity: np.ndarray, load: np.ndarray, momen
     total = forces.sum(0)
     if host.loaded:
         total += np.abs(moment).sum(0) / host.length
+    return total + changing_forces(host).reshape(-1, rods).sum(0)
+
+
+def changing_forces(host: ChainGroup) -> np.ndarray:
+    """Sizes of loads that change, at their full amplitude, or follow, by place [N]; moments over the length of the rod."""
+    force = np.zeros(host.size)
     for timed in host.timed:
-        column = timed.places % rods
-        arm = np.where(timed.places < host.nodes, 1.0, host.length[column])
-        np.add.at(total, column, np.abs(timed.force).sum(1) / arm)
+        arm = np.where(timed.places < host.nodes, 1.0, host.length[timed.places % len(host.rods)])
+        np.add.at(force, timed.places, np.abs(timed.force).sum(1) / arm)
     for couple in host.followers:
-        np.add.at(total, couple.places % rods, couple.sizes(None))  # wherever its nodes are
-    return total
+        np.add.at(force, couple.places, couple.sizes(None))  # wherever its nodes are
+    return force

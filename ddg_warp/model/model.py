@@ -13,7 +13,8 @@ from ddg_warp.kernels import element, step
 from ddg_warp.model import glue, validate
 from ddg_warp.model.group import Group
 from ddg_warp.model.order import Order
-from ddg_warp.model.state import GroupState, State
+from ddg_warp.model.state import GripState, GroupState, State
+from ddg_warp.scene.grip import Grip
 from ddg_warp.threads import launches
 
 
@@ -26,6 +27,8 @@ class Model:
         curves: rods in the user's order.
         groups: rods of one kind and similar length each; those that are part of the net are not among them.
         net: shells and what is joined, or None.
+        motions: the different motions of its supports; grips: those that every step is told, in the order in which `Controls` give
+            their poses: as supports were added, of rods, then of shells, then of shells of revolution.
         precision: scalar types.
         worlds: number of independent copies.
         allow_rounding: whether what float32 loses in rounding is stepped and solved nevertheless.
@@ -42,6 +45,7 @@ class Model:
         self.version = 0  # rises with every change of a constant array, so that captured steps are captured anew
         self.chains = compile_chains(scene)
         self.motions = scene_motions(scene)
+        self.grips = [motion for motion in self.motions if isinstance(motion, Grip)]
         self.groups = [Group(chain, scene, worlds, self.wp_device, self.types.real) for chain in self.chains]
         self.net = self._build_net() if needs_net(scene) else None
         self.allow_rounding = allow_rounding
@@ -256,8 +260,11 @@ class Model:
 
     def empty_state(self) -> State:
         """Arrays of a state, not yet filled."""
-        net = self.net.empty() if self.net is not None else None
-        return State(self, [self._group_state(group) for group in self.groups], net)
+        net, grips = self.net.empty() if self.net is not None else None, None
+        if self.grips:
+            shape = (6, self.worlds * len(self.grips))
+            grips = GripState(wp.zeros(shape, dtype=self.types.real, device=self.wp_device))
+        return State(self, [self._group_state(group) for group in self.groups], net, grips=grips)
 
     def restore(self, snapshot: dict[str, np.ndarray]) -> State:
         """The state that `State.snapshot` saved, bit by bit.

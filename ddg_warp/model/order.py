@@ -75,6 +75,44 @@ class Order:
         vertices = 0 if self.model.net is None else sum(len(shell.nodes) for shell in self.model.net.host.shells)
         return int(self.curves.counts.sum()) + vertices
 
+    @cached_property
+    def edge_starts(self) -> np.ndarray:
+        """Where the edges of every curve begin among all (curves + 1,)."""
+        return np.cumsum([0, *(self.curves.counts - np.where(self.curves.closed, 0, 1))])
+
+    @property
+    def edges_count(self) -> int:
+        """Rows of `State.angles` in one world."""
+        return int(self.edge_starts[-1])
+
+    @cached_property
+    def twisted(self) -> np.ndarray:
+        """Which edges have an angle (edges,) bool."""
+        result = np.zeros(self.edges_count, bool)
+        for group in self.model.groups:
+            if group.kind.twist:
+                result[self.edge_places(group)[2]] = True
+        for rod in self.model.net.host.rods if self.model.net is not None else ():
+            result[self.edge_starts[rod.rod] + np.arange(len(rod.edges))] = True
+        return result
+
+    @property
+    def meridian_rows(self) -> slice:
+        """Rows of `State.points` that are nodes of meridians."""
+        counts, meridians = self.curves.counts, len(self.model.scene.axisymmetric_shells)
+        rods = len(counts) - meridians
+        return slice(int(counts[:rods].sum()), int(counts.sum()))
+
+    def edge(self, row: int) -> tuple[int, int]:
+        """Edge and curve of a row of `State.angles`."""
+        curve = int(np.searchsorted(self.edge_starts, row, side="right")) - 1
+        return int(row - self.edge_starts[curve]), curve
+
+    def edge_places(self, group: Group) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of a group's edges: place along the rod with ghosts, column, row of `State.angles`."""
+        own = group.host.own - (0 if group.kind.closed else 1)
+        return _user_index(group, own, self.edge_starts)
+
     def put_nodes(self, group: Group, values, out: np.ndarray, what: str) -> None:
         """Put values in the user's order (P, 3) into (node, column, dim) of a group."""
         values = self._points(values, what)
@@ -101,21 +139,19 @@ class Order:
         return values
 
     def put_edges(self, group: Group, values, out: np.ndarray) -> None:
-        values, start = self.spins(values)
-        own = group.host.own - (0 if group.kind.closed else 1)
-        k, column, index = _user_index(group, own, start)
+        values, _ = self.spins(values)
+        k, column, index = self.edge_places(group)
         for world in range(self.model.worlds):
             out[k, column + world * group.rods] = (values if values.ndim == 1 else values[world])[index]
 
     def spins(self, values) -> tuple[np.ndarray, np.ndarray]:
         """Spins in the user's order, checked, and where the edges of each rod begin."""
-        counts = self.curves.counts - np.where(self.curves.closed, 0, 1)
-        values = _numbers("spins", values)
-        if values.shape not in ((counts.sum(),), (self.model.worlds, counts.sum())):
-            raise ValueError(f"spins have shape {values.shape}; they are ({counts.sum()},), or one such array a world")
+        values, count = _numbers("spins", values), self.edges_count
+        if values.shape not in ((count,), (self.model.worlds, count)):
+            raise ValueError(f"spins have shape {values.shape}; they are ({count},), or one such array a world")
         if not np.isfinite(values).all():
             raise ValueError(f"spins: edge {int(np.argwhere(~np.isfinite(values))[0][-1])} is not finite")
-        return values, np.concatenate([[0], np.cumsum(counts)])
+        return values, self.edge_starts
 
     def nodes(self, values: list[np.ndarray], blocks: wp.array | None = None) -> np.ndarray:
         """From arrays (node, column, dim) of groups and blocks of the net (worlds N, 3) to the user's order, in three dimensions."""
@@ -137,17 +173,14 @@ class Order:
         """From arrays (node, column) of every group and values of the net's rod edges (worlds, edges) to the user's order."""
         if not any(group.kind.twist for group in self.model.groups) and net is None:
             return None
-        counts = self.curves.counts - np.where(self.curves.closed, 0, 1)
-        start = np.concatenate([[0], np.cumsum(counts)])
-        out = np.zeros((self.model.worlds, start[-1], *([width] if width else [])))
+        out = np.zeros((self.model.worlds, self.edges_count, *([width] if width else [])))
         for group, value in zip(self.model.groups, values, strict=True):
             if group.kind.twist:
-                own = group.host.own - (0 if group.kind.closed else 1)
-                k, column, index = _user_index(group, own, start)
+                k, column, index = self.edge_places(group)
                 for world in range(self.model.worlds):
                     out[world][index] = value[k, column + world * group.rods]
         for rod in self.model.net.host.rods if net is not None else ():
-            rows = start[rod.rod] + np.arange(len(rod.edges))
+            rows = self.edge_starts[rod.rod] + np.arange(len(rod.edges))
             out[:, rows] = net[:, rod.edges - self.model.net.angle_start]
         return out[0] if self.model.worlds == 1 else out
 

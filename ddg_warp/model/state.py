@@ -33,6 +33,21 @@ class GroupState:
         return dict(self.__dict__)
 
 
+@dataclass
+class GripState:
+    """Where the grips of a model are.
+
+    Attributes:
+        pose: translation (3) [m] and rotation vector (3) [rad] of each, relative to rest (6, worlds grips).
+    """
+
+    pose: wp.array
+
+    def arrays(self) -> dict[str, wp.array]:
+        """All arrays by name."""
+        return dict(self.__dict__)
+
+
 @launches
 class State:
     """Positions, velocities, frames and time of a model's rods and shells. A step returns another state and does not change this one.
@@ -43,15 +58,18 @@ class State:
     anew: rather keep the state.
 
     Attributes:
+        time: [s], which all worlds share.
+        grips: poses of the grips of all worlds; None without, see `Grip`.
         stable: of an equilibrium that a static solver found, whether it is stable, in all worlds; None where that was not asked, as
             in dynamics. See `Equilibrium.solve`.
     """
 
-    def __init__(self, model, groups: list[GroupState], net=None, time: float = 0.0):
+    def __init__(self, model, groups: list[GroupState], net=None, time: float = 0.0, grips: GripState | None = None):
         self.stable: bool | None = None
         self.model = model
         self.groups = groups
         self.net = net
+        self.grips = grips
         self.time = time
 
     def __repr__(self) -> str:
@@ -59,8 +77,10 @@ class State:
         return f"<State at t = {self.time:g} s: {model.worlds} worlds of {model.points_count} points on {model.device}>"
 
     def parts(self) -> dict:
-        """State of every group of rods, and of the net if there is one, by name."""
-        return {str(i): group for i, group in enumerate(self.groups)} | ({"net": self.net} if self.net else {})
+        """State of every group of rods, and of the net and of the grips if there are any, by name."""
+        others = {"net": self.net, "grips": self.grips}
+        groups = {str(i): group for i, group in enumerate(self.groups)}
+        return groups | {name: part for name, part in others.items() if part is not None}
 
     def points(self) -> np.ndarray:
         """Positions (P, 3) [m], or (worlds, P, 3): nodes in the order of `model.curves` (rods, meridians), then vertices."""
@@ -96,6 +116,13 @@ class State:
             values.append(polyline.material_directors(u, t, theta))
         return model.order.edges(values, net, 3)
 
+    def poses(self) -> np.ndarray | None:
+        """Poses of the grips, in the order of `model.grips` (grips, 6) or (worlds, grips, 6): see `Grip`; None without."""
+        if self.grips is None:
+            return None
+        values = self.grips.pose.numpy().T.reshape(self.model.worlds, -1, 6)
+        return values[0] if self.model.worlds == 1 else values
+
     def copy(self) -> "State":
         """An independent copy."""
         other = self.model.empty_state()
@@ -107,7 +134,7 @@ class State:
         """Take over everything of another state of the same model."""
         for mine, theirs in zip(self.parts().values(), other.parts().values(), strict=True):
             for array, source in zip(mine.arrays().values(), theirs.arrays().values(), strict=True):
-                wp.copy(array, source)
+                arrays.copy(array, source)
         self.time, self.stable = other.time, None
 
     def snapshot(self) -> dict[str, np.ndarray]:

@@ -1,6 +1,9 @@
-"""Refusals of what is no model, or no state of one."""
+"""Refusals of what is no model, or no state of one, and of models that cannot be stepped in time."""
+
+import numpy as np
 
 from ddg_warp.errors import SceneError
+from ddg_warp.scene import drag
 
 
 def check_model(call: str, model) -> None:
@@ -19,3 +22,31 @@ def check_state(call: str, model, state) -> None:
         raise SceneError(f"{call}: the state is {state!r}; give one of this model, such as model.state()")
     if state.model is not model:
         raise SceneError(f"{call}: the state is of another model; give one that this model made, such as model.state()")
+
+
+def refuse_curved_membranes(model) -> None:
+    """Its strains turn with the normals, so that the matrix of a time step, which is made positive, is far from the tangent."""
+    for i, shell in enumerate(model.scene.shells):
+        if shell.membrane == "curved":
+            raise SceneError(
+                f"shell {i} ('{shell.name}'): membrane 'curved' serves statics and spectra; for dynamics add it with membrane='flat'"
+            )
+
+
+def require_mass(model) -> None:
+    """Refuse free nodes of rods on their own that nothing gives an equation of motion."""
+    for group in model.groups:
+        host, kind = group.host, group.kind
+        positions = (1 << kind.dim) - 1
+        k = np.arange(group.nodes)[:, None]
+        own = (k >= host.first) & (k < host.first + host.own)
+        bad = (host.mass <= 0.0) & ((host.fixed & positions) != positions) & own
+        if kind.drag:
+            held_back = drag.holds(host.drag)  # edges; the last node of an open rod starts none
+            bad &= ~(held_back | np.roll(held_back, 1, axis=0))
+        if bad.any():
+            k, column = np.argwhere(bad)[0]
+            raise SceneError(
+                f"node {k - host.first[column]} of rod {host.rods[column]} is free and has no mass; "
+                "give the material a density, the section a mass_per_length, or the rod drag along and across"
+            )

@@ -9,6 +9,7 @@ import numpy as np
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry.surface import Surface
+from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.material import Material, Stiffness
 from ddg_warp.scene.motion import Motion
 from ddg_warp.scene.path import Displacement, Stop
@@ -151,7 +152,7 @@ class Support:
     components: str = "xyz"
     edges: tuple[int, ...] = ()
     end: str = ""
-    motion: Motion | None = None
+    motion: Motion | Grip | None = None
     tangent: np.ndarray | None = None
     director: np.ndarray | None = None
     call: str = "fix"  # what users know it by
@@ -205,7 +206,7 @@ class ShellSupport:
     components: str
     edges: str = ""
     normal: tuple = (0.0, 0.0, 0.0)
-    motion: Motion | None = None
+    motion: Motion | Grip | None = None
     call: str = "hold"  # what users know it by
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 from ddg_warp.scene import validate
+from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.material import Material
 from ddg_warp.scene.motion import Motion
 
@@ -35,7 +36,7 @@ class RingSupport:
     components: str
     tangent: tuple | None = None
     clamped: bool = False
-    motion: Motion | None = None
+    motion: Motion | Grip | None = None
     call: str = "hold_ring"  # what users know it by
 
 
@@ -110,7 +111,7 @@ class Meridians:
         self.axisymmetric_shells.append(AxisymmetricShell(points, thickness, deepcopy(material), deepcopy(rest), name))
         return len(self.axisymmetric_shells) - 1
 
-    def hold_ring(self, shell: int, nodes, components: str = "xz", motion: Motion | None = None) -> None:
+    def hold_ring(self, shell: int, nodes, components: str = "xz", motion: Motion | Grip | None = None) -> None:
         """Hold radius ("x") or height ("z") of nodes of a meridian; the surface may turn there (simply supported).
 
         `motion` moves them in the plane of x and z, by a translation, which may be another one for each node, and a rotation about the
@@ -119,7 +120,7 @@ class Meridians:
         self._hold_ring(RingSupport(shell, self._nodes(shell, nodes), components, motion=motion))
 
     def clamp_ring(
-        self, shell: int, end: str, components: str = "xz", tangent=None, motion: Motion | None = None
+        self, shell: int, end: str, components: str = "xz", tangent=None, motion: Motion | Grip | None = None
     ) -> None:
         """Hold components and the direction of the meridian at a rim, its "first" or "last" node; a motion turns it, too.
 

@@ -26,7 +26,8 @@ class Motion:
     A point X of the rest state is at pivot + R(angle(t)) (X - pivot) + translation(t). The angle is cumulative: it counts turns
     past 2 pi, however far it goes in a step, so that an end can be wound up. In statics t is the load parameter.
 
-    Both are zero at t = 0: supports start where they are at rest.
+    Both are zero at t = 0: supports start where they are at rest. Functions of time are the same in all worlds of a model; what is to
+    move in each for itself, or is decided from step to step, is held by a `Grip`.
 
     Attributes:
         translation: t -> displacement (3,) [m]; or (n, 3), one for each node that `fix` names (of one rod after the other), or each

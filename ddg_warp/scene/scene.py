@@ -11,6 +11,7 @@ from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 from ddg_warp.scene import drag, validate
 from ddg_warp.scene.descriptions import Dynamics, Law, Load, RodBatch, Statics, Support, Trace, laws_of
+from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.material import Material, Stiffness
 from ddg_warp.scene.motion import Motion
 from ddg_warp.scene.structures import Structures
@@ -178,7 +179,7 @@ class Scene(Structures):
         self.batches.append(batch)
         return range(batch.first, batch.first + batch.rods)
 
-    def clamp(self, rods, edges=(0,), motion: Motion | None = None) -> None:
+    def clamp(self, rods, edges=(0,), motion: Motion | Grip | None = None) -> None:
         """Hold edges: both nodes and the angle. The continuum clamp then lies at the middle of the edge.
 
         Negative indices count from the last edge; a mask of bools, or a slice, chooses among the edges, too. `motion` moves them;
@@ -192,7 +193,7 @@ class Scene(Structures):
         self,
         rods,
         end: str = "first",
-        motion: Motion | None = None,
+        motion: Motion | Grip | None = None,
         components: str = "xyz",
         tangent=None,
         director=None,
@@ -232,12 +233,12 @@ class Scene(Structures):
         held = {"components": components, "end": end, "tangent": tangent, "director": director}
         self._support("clamp_end", rods, motion=motion, **held)
 
-    def fix(self, rods, nodes, components: str = "xyz", motion: Motion | None = None) -> None:
+    def fix(self, rods, nodes, components: str = "xyz", motion: Motion | Grip | None = None) -> None:
         """Hold components of nodes (a hinge). A motion may give every node a displacement of its own."""
         rods, nodes = self._on_rods("fix", rods, "node", nodes)
         self._support("fix", rods, nodes=nodes, components=components, motion=motion)
 
-    def fix_twist(self, rods, edges, motion: Motion | None = None) -> None:
+    def fix_twist(self, rods, edges, motion: Motion | Grip | None = None) -> None:
         """Hold the angle of edges."""
         rods, edges = self._on_rods("fix_twist", rods, "edge", edges)
         self._need_twist("fix_twist", rods)
@@ -308,7 +309,7 @@ class Scene(Structures):
         Args:
             device: Warp device, such as "cpu" or "cuda:0"; by default CUDA if there is one.
             precision: "float64" (default on the CPU), "mixed" (default on CUDA) or "float32".
-            worlds: independent copies.
+            worlds: independent copies that share their time; parameters, states, `Controls` and outcomes are each world's own.
             allow_rounding: step and solve in "float32" also where its rounding decides what comes out; counted as `lost_in_rounding`.
 
         Raises:

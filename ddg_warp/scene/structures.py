@@ -21,6 +21,7 @@ from ddg_warp.scene.descriptions import (
     ShellLoad,
     ShellSupport,
 )
+from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.magnets import Magnets
 from ddg_warp.scene.material import Material
 from ddg_warp.scene.meridians import Meridians
@@ -95,14 +96,16 @@ class Structures(Meridians, Magnets):
         self.shells.append(Shell(surface, thickness, deepcopy(material), bending, membrane, rest, name))
         return len(self.shells) - 1
 
-    def hold(self, shell: int, vertices, components: str = "xyz", motion: Motion | None = None) -> None:
+    def hold(self, shell: int, vertices, components: str = "xyz", motion: Motion | Grip | None = None) -> None:
         """Hold components of vertices of a shell, which `motion` moves; the surface may turn there (simply supported).
 
         The motion may give every vertex a displacement of its own.
         """
         self._hold("hold", shell, vertices, components, motion=motion)
 
-    def clamp_boundary(self, shell: int, vertices, components: str = "xyz", motion: Motion | None = None) -> None:
+    def clamp_boundary(
+        self, shell: int, vertices, components: str = "xyz", motion: Motion | Grip | None = None
+    ) -> None:
         """Hold components of vertices, and the surface's normal at the mesh edges between them, inside the surface, too.
 
         `motion` moves the components and turns the normals as one body, however many times; it moves no other components, so
@@ -113,7 +116,7 @@ class Structures(Meridians, Magnets):
         self._need_edges("clamp_boundary", shell, vertices, np.arange(len(surface.edges)), "mesh edge", "hold")
         self._hold("clamp_boundary", shell, vertices, components, edges="clamp", motion=motion)
 
-    def symmetry(self, shell: int, vertices, axis, motion: Motion | None = None) -> None:
+    def symmetry(self, shell: int, vertices, axis, motion: Motion | Grip | None = None) -> None:
         """Put vertices on a symmetry plane, which the surface meets at a right angle.
 
         Args:
@@ -147,7 +150,8 @@ class Structures(Meridians, Magnets):
         self._need_edges("symmetry", shell, vertices, surface.boundary_edges, "boundary edge", "hold")
         if motion is not None and (not axis or getattr(motion, "turns", False)):
             raise SceneError(
-                "symmetry: a plane that moves is across an axis of space and does not turn; give 'x', 'y' or 'z' and a translation"
+                "symmetry: a plane that moves is across an axis of space and does not turn; give 'x', 'y' or 'z' and "
+                "Motion(translation=...)"
             )
         self._hold("symmetry", shell, vertices, axis, edges="symmetry", normal=tuple(normal.tolist()), motion=motion)
 

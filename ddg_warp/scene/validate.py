@@ -9,6 +9,7 @@ from ddg_warp.errors import SceneError, SceneWarning
 from ddg_warp.geometry import polyline
 from ddg_warp.scene import drag
 from ddg_warp.scene.descriptions import Dynamics, Statics, Trace
+from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.motion import Motion
 
 DOUBLED = 1e-10  # length of an edge, over the longest of its rod, at which its two nodes are one
@@ -53,7 +54,8 @@ def check_scene(scene) -> None:
         )
     drag.check_flow(scene)
     _check_magnets(scene)
-    supports = [s for s in (*scene.supports, *scene.shell_supports, *scene.ring_supports) if s.motion is not None]
+    every = (*scene.supports, *scene.shell_supports, *scene.ring_supports)
+    supports = [s for s in every if isinstance(s.motion, Motion)]  # a grip starts at rest
     if not supports or scene.initial is not None or not isinstance(scene.analysis, Dynamics):
         return  # a state may start elsewhere, and equilibria have no time before the first
     objects = [*scene.batches, *scene.shells, *scene.axisymmetric_shells]
@@ -97,8 +99,8 @@ def _check_magnets(scene) -> None:
 
 def check_motion(call: str, motion, planar: bool) -> None:
     """Refuse what is no motion, or turns out of the plane of x and z where that is all there is."""
-    if motion is not None and not isinstance(motion, Motion):
-        raise SceneError(f"{call}: motion is {motion!r}; give Motion(translation=..., angle=...)")
+    if motion is not None and not isinstance(motion, Motion | Grip):
+        raise SceneError(f"{call}: motion is {motion!r}; give Motion(translation=..., angle=...) or Grip(pivot=...)")
     if motion is not None and planar and not motion.planar:
         raise SceneError(
             f"{call}: the motion turns about {tuple(motion.axis)}, out of the plane of x and z; give axis=(0, 1, 0)"

@@ -25,8 +25,10 @@ class Buffer:
 
     def _allocate(self) -> None:
         self.own = self._model.empty_state()
-        groups = [_mapped(group, lambda array: array[:]) for group in self.own.groups]
-        self.state = State(self._model, groups, self.own.net and _mapped(self.own.net, lambda array: array[:]))
+        *groups, net, grips = (
+            part and _mapped(part, lambda array: array[:]) for part in (*self.own.groups, self.own.net, self.own.grips)
+        )
+        self.state = State(self._model, groups, net, grips=grips)
         self._watch()
 
     def _watch(self) -> None:

@@ -8,19 +8,21 @@ from ddg_warp.compile.precision import lost_in_rounding
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels import outcome
 from ddg_warp.model import validate
+from ddg_warp.model.controls import Controls, checked
 from ddg_warp.model.state import State
-from ddg_warp.scene import drag
 from ddg_warp.solve import energy
 from ddg_warp.solve.buffers import Buffer
 from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.chains.step import NET_ONLY, ChainStep
+from ddg_warp.solve.controls import LOADS, Given
 from ddg_warp.solve.graphs import Graphs
 from ddg_warp.solve.net.step import NetStep
+from ddg_warp.solve.worlds import Worlds, outcomes
 from ddg_warp.threads import launches
 
+FAILURES = ("raise", "flag")
 SOLVERS = ("newton", "projective")
 SCHEMES = ("implicit_euler", "implicit_midpoint")
-ENERGY_BOUND = 0.1
 
 
 @launches
@@ -60,6 +62,9 @@ class Integrator:
             and where it is unstable the energy grows to a multiple within some steps: a tenth lies between. Implicit Euler takes
             energy out of what steps do not resolve and is not watched. See `kernels.energy`.
         check_every: steps between readings of the outcomes; by default 1 on the CPU and 32 on CUDA.
+        failures: what becomes of a step that is given up: "raise" stops the run, as described; by "flag" nothing is read or raised.
+            The world it is in then rests as it was before that step, all of it, until `reset` starts it anew; the others go on, and
+            `outcomes` tells which are which.
 
     Raises:
         SceneError: a free node has neither mass nor drag along and across its rod, the scheme does not exist, or implicit Euler is
@@ -74,8 +79,9 @@ class Integrator:
         solver: str = "newton",
         linear: str = "auto",
         retry_limit: int = 20,
-        energy_bound: float | None = ENERGY_BOUND,
+        energy_bound: float | None = energy.BOUND,
         check_every: int | None = None,
+        failures: str = "raise",
         **options,
     ):
         validate.check_model("Integrator", model)
@@ -83,17 +89,20 @@ class Integrator:
         arguments.choice("solver", solver, SOLVERS)
         if model.net is None and linear in NET_ONLY:
             raise SceneError(f"linear = {linear!r} is of nets; rods on their own take 'auto', or see `Integrator`")
+        self.failures = arguments.choice("failures", failures, FAILURES)
         if check_every is not None:
             arguments.count("check_every", check_every)
         self.model, self.scheme, self.solver, self.linear = model, scheme, solver, linear
         self.options = NewtonOptions(**options)
         self.retry_limit = arguments.count("retry_limit (0 for no retry)", retry_limit, 0)
-        self.energy_bound = self._bound(energy_bound)
+        self.energy_bound = energy.bound(energy_bound, scheme)
         self.check_every = check_every or (32 if model.wp_device.is_cuda else 1)
-        _require_mass(model)
-        _refuse_curved_membranes(model)
+        validate.require_mass(model)
+        validate.refuse_curved_membranes(model)
+        self.given: Given | None = None  # loads that steps are given, once one is
         self._chains = [ChainStep(self, model, group) for group in model.groups]
         self._net = NetStep(self, model) if model.net is not None else None
+        self._worlds, self._first = Worlds(model), (None, None)
         self._buffers = [Buffer(model), Buffer(model)]
         self._graphs = Graphs(model, self._load_modules)
         self._steps_since_check = 0
@@ -101,15 +110,21 @@ class Integrator:
         self._dt_host = None
         self._longest, self._version = 0.0, model.version
 
-    def step(self, state: State, dt: float) -> State:
+    def step(self, state: State, dt: float, controls: Controls | None = None) -> State:
         """The state after a step of dt [s]. No state changes that is held: see `State`.
+
+        Args:
+            state: where the step starts; dt: its length [s].
+            controls: poses of grips, loads and gravity of this step, world by world; see `Controls`.
 
         Raises:
             SolverError: a rod could not be stepped within the retries, or float32 would lose its motion in rounding; the message
                 names rod and outcome.
+            SceneError: controls do not fit the model.
         """
         dt = arguments.number("dt", dt, "a time step that is positive and finite [s]", lambda v: v > 0.0)
         validate.check_state("step", self.model, state)
+        found = checked(controls, self.model)
         source = self._own(state)
         self._vacate(1 - source)
         target = self._buffers[1 - source].state
@@ -121,13 +136,14 @@ class Integrator:
         if changed:
             for part in self._parts:
                 part.straighten(self._solved(dt))
+        self._control(found, source)
         start = state.time
         for part in self._parts:
             part.prescribe(start, start + dt)
-        self._graphs.replay(source, lambda: self._launch(source))
+        self._graphs.replay((source, self.given is not None and self.given.any), lambda: self._launch(source))
         target.time = start + dt
         self._steps_since_check += 1
-        if self._steps_since_check >= self.check_every:
+        if self.failures == "raise" and self._steps_since_check >= self.check_every:
             self.check(target)
         for callback in self.model.scene.callbacks:
             callback(target)
@@ -137,11 +153,66 @@ class Integrator:
         """Read the outcomes of all steps since the last reading.
 
         Raises:
-            SolverError: a rod has been given up.
+            SolverError: a rod has been given up, and failures are not flagged.
         """
         self._steps_since_check = 0
-        for part in self._parts:
+        for part in self._parts if self.failures == "raise" else ():
             part.raise_failures(state)
+
+    def outcomes(self) -> np.ndarray:
+        """What became of every world (worlds,): "converged", or the name of the outcome for which something in it was given up."""
+        return outcomes(self.model, self._parts)
+
+    def failure(self, state: State, world: int) -> str:
+        """What was given up in a world, where it went wrong, and what to do; empty where nothing was.
+
+        Args:
+            state: the last one, in which the world rests.
+            world: index.
+        """
+        validate.check_state("failure", self.model, state)
+        if not 0 <= arguments.index("world", world) < self.model.worlds:
+            raise SceneError(f"world {world} does not exist; the model has {self.model.worlds}")
+        return next(filter(None, (part.failure_in(state, world) for part in self._parts)), "")
+
+    def reset(self, state: State, mask, to: State | None = None) -> State:
+        """A state whose worlds of a mask are as in another state, while the others are as they were, bit for bit.
+
+        What the integrator keeps of these worlds is forgotten: outcomes, retries, the account of their energy. They then step as they
+        would in a new integrator. Time is one for all worlds and goes on: loads, fields and flows that the scene has as functions of
+        time do not start anew (see `Controls` for what each world has of its own).
+
+        Args:
+            state: of this model; it is not changed.
+            mask: bools (worlds,), True for those that start anew.
+            to: where they start: a state of this model, each from its own world of it, or of the same scene built with worlds=1, all
+                from that one. By default the model's first state.
+
+        Raises:
+            SceneError: the mask or the state does not fit, or supports that a `Motion` moves are elsewhere at the time of the state.
+        """
+        validate.check_state("reset", self.model, state)
+        mask = self._worlds.mask(mask)
+        anew = to is None
+        if anew and self._first[0] != self.model.version:
+            self._first = self.model.version, self.model.state()
+        to = self._first[1] if anew else to
+        self._worlds.check_source(to, state)
+        self._worlds.load_modules()
+        source = self._own(state)
+        self._vacate(1 - source)
+        now, then = (self._buffers[i] for i in (source, 1 - source))
+
+        def launch():
+            then.own.assign(now.own)
+            self._worlds.reset(self._parts, mask, to, then.own)
+
+        if anew:
+            self._graphs.replay(("reset", source), launch)
+        else:  # whose arrays may be gone by the next time
+            launch()
+        then.state.time, then.state.stable = state.time, None
+        return then.state
 
     def statistics(self) -> dict:
         """Counts since the integrator was made: Newton iterations of a solve, retries, lost pivots, outcomes.
@@ -161,19 +232,27 @@ class Integrator:
             "outcomes": {name: int(tally[code]) for code, name in outcome.NAMES.items() if tally[code]},
         } | ({} if self.energy_bound is None else {"energy": energy.summary([part.energy for part in self._parts])})
 
-    def _bound(self, given: float | None) -> float | None:
-        """The bound of the energy, None where it is not watched."""
-        if given is not None:
-            given = arguments.number(
-                "energy_bound", given, "a fraction between 0 and 1, or None", lambda v: 0.0 < v < 1.0
-            )
-        if self.scheme == "implicit_midpoint":
-            return given
-        if given not in (None, ENERGY_BOUND):
-            raise SceneError(
-                f"energy_bound = {given:g} is of the implicit midpoint rule; {self.scheme} takes energy out"
-            )
-        return None
+    def _control(self, found: dict[str, np.ndarray], source: int) -> None:
+        """Hand the device what a step from a buffer is given; parts that carry no such loads yet are made anew, to do so."""
+        if self.given is None and any(name in found for name in LOADS):
+            self.given = Given(self.model)
+            self._remake()
+        if self.given is not None:
+            self.given.upload(found)
+        if self.model.grips:
+            now, then = (self._buffers[i].own.grips.pose for i in (source, 1 - source))
+            if "poses" in found:
+                poses = np.broadcast_to(found["poses"], (self.model.worlds, *found["poses"].shape[1:]))
+                then.assign(np.ascontiguousarray(poses.reshape(-1, 6).T))
+            else:
+                wp.copy(then, now)
+
+    def _remake(self) -> None:
+        """Make all parts anew, with what they count."""
+        self._chains = [ChainStep(self, self.model, part.group, part.means, counts_of=part) for part in self._chains]
+        if self._net is not None:
+            self._net = NetStep(self, self.model, self._net.means, counts_of=self._net)
+        self._graphs.clear()
 
     @property
     def _parts(self) -> list:
@@ -227,38 +306,20 @@ class Integrator:
     def _launch(self, source: int) -> None:
         """Launches of a step of all parts from one buffer to the other."""
         before, after = self._buffers[source].own, self._buffers[1 - source].own
+        for part in self._parts:
+            if part.motion:
+                part.motion.follow(before, after)
+            if self.given is not None:
+                part.loads.give()
         for chain in self._chains:
             chain.step(before.groups[chain.index], after.groups[chain.index])
         if self._net is not None:
             self._net.step(before.net, after.net)
+        if self.failures == "flag":
+            self._worlds.settle(self._parts, before, after)
 
     def _load_modules(self) -> None:
         for part in self._parts:
             part.load_modules()
-
-
-def _refuse_curved_membranes(model) -> None:
-    """Its strains turn with the normals, so that the matrix of a time step, which is made positive, is far from the tangent."""
-    for i, shell in enumerate(model.scene.shells):
-        if shell.membrane == "curved":
-            raise SceneError(
-                f"shell {i} ('{shell.name}'): membrane 'curved' serves statics and spectra; for dynamics add it with membrane='flat'"
-            )
-
-
-def _require_mass(model) -> None:
-    for group in model.groups:
-        host, kind = group.host, group.kind
-        positions = (1 << kind.dim) - 1
-        k = np.arange(group.nodes)[:, None]
-        own = (k >= host.first) & (k < host.first + host.own)
-        bad = (host.mass <= 0.0) & ((host.fixed & positions) != positions) & own
-        if kind.drag:
-            held_back = drag.holds(host.drag)  # edges; the last node of an open rod starts none
-            bad &= ~(held_back | np.roll(held_back, 1, axis=0))
-        if bad.any():
-            k, column = np.argwhere(bad)[0]
-            raise SceneError(
-                f"node {k - host.first[column]} of rod {host.rods[column]} is free and has no mass; "
-                "give the material a density, the section a mass_per_length, or the rod drag along and across"
-            )
+        if self.failures == "flag":
+            self._worlds.load_modules()

@@ -5,10 +5,29 @@ import math
 import numpy as np
 import warp as wp
 
+from ddg_warp import arguments
+from ddg_warp.errors import SceneError
 from ddg_warp.kernels import energy
 from ddg_warp.kernels.net import energy as net_energy
 from ddg_warp.kernels.solve import krylov
 from ddg_warp.solve.net.system import Sums
+
+BOUND = 0.1  # see `Integrator`
+
+
+def bound(given: float | None, scheme: str) -> float | None:
+    """The bound of the energy that an integrator is given, None where the energy is not watched.
+
+    Raises:
+        SceneError: it is no fraction, or not of the midpoint rule.
+    """
+    if given is not None:
+        given = arguments.number("energy_bound", given, "a fraction between 0 and 1, or None", lambda v: 0.0 < v < 1.0)
+    if scheme == "implicit_midpoint":
+        return given
+    if given not in (None, BOUND):
+        raise SceneError(f"energy_bound = {given:g} is of the implicit midpoint rule; {scheme} takes energy out")
+    return None
 
 
 def summary(parts: list["_Energy"]) -> dict[str, float]:
@@ -72,7 +91,7 @@ class ChainEnergy(_Energy):
         group = step.group
         self.ranges = 1 if group.kind.serial else max(1, math.isqrt(group.nodes))
         super().__init__(step, group.columns, self.ranges, kept)
-        self._loads = [group.load, group.load_angle]
+        self._loads = [step.newton.load, step.newton.load_angle]
         self._follows = bool(group.host.followers)
         if self._follows:
             self._loads = [wp.clone(load) for load in self._loads]
@@ -95,8 +114,8 @@ class ChainEnergy(_Energy):
             + [before.last, *step.islands.arrays, *group.parameters.arrays, group.count, newton.mass, group.rotary]
             + [
                 *self._loads,
-                group.load,
-                group.load_angle,
+                newton.load,
+                newton.load_angle,
                 int(self._follows),
                 newton.stiffness,
                 step.damping,

@@ -17,11 +17,11 @@ class Loads:
 
     def __init__(self, model, part, midpoint: bool):
         host, real, device = part.host, model.types.real, model.wp_device
-        self.part, self.midpoint, self._vector = part, midpoint, wp.types.vector(3, real)
+        self.model, self.part, self.midpoint, self._vector = model, part, midpoint, wp.types.vector(3, real)
         following = np.concatenate([np.zeros(0, int), *(load.places.ravel() for load in host.followers)])
-        self.places = np.unique(np.concatenate([following, *(load.places for load in host.timed)]))
+        self.places = self._touched(following)
         self._dead = self._matrix([host.constant, *host.timed])
-        self._values = wp.zeros(len(self.places), dtype=self._vector, device=device)
+        self._values = wp.zeros(self._copies * len(self.places), dtype=self._vector, device=device)
         self.total = len(following)
         self._force = wp.zeros(max(1, part.worlds * self.total), dtype=self._vector, device=device)
 
@@ -38,11 +38,25 @@ class Loads:
         items = np.argsort(target, kind="stable")
         starts, items = put(np.searchsorted(target[items], np.arange(len(self.places) + 1))), put(items)
         places, nodes = put(host.index(self.places)), int(np.searchsorted(self.places, host.nodes))
+        stride = len(self.places) if self._copies > 1 else 0
         self._spread = [  # kernel, which array it writes, and lists
-            (spread_kernel(dim, real), i, [places[some], self._values[some], starts[some.start :], items])
+            (
+                spread_kernel(dim, real),
+                i,
+                [places[some], self._values[some.start :], stride, starts[some.start :], items],
+            )
             for i, (dim, some) in enumerate(((part.dim, slice(0, nodes)), (1, slice(nodes, len(self.places)))))
             if some.start < some.stop
         ]
+
+    @property
+    def _copies(self) -> int:
+        """How many there are of what follows nothing: one for all worlds."""
+        return 1
+
+    def _touched(self, following: np.ndarray) -> np.ndarray:
+        """Places on which loads act that change or follow."""
+        return np.unique(np.concatenate([following, *(load.places for load in self.part.host.timed)]))
 
     def _matrix(self, loads: list) -> sparse.csr_array:
         """What every load at full amplitude puts on the components of the places (3 P, loads)."""
@@ -63,11 +77,14 @@ class Loads:
     def upload(self, t0: float, t1: float) -> None:
         """Values at the time that the scheme balances forces at."""
         at = 0.5 * (t0 + t1) if self.midpoint else t1
-        amplitudes = [1.0, *(load.at(at, 1.0) for load in self.part.host.timed)]
-        self._values.assign((self._dead @ amplitudes).reshape(-1, 3))
+        self._upload_dead([1.0, *(load.at(at, 1.0) for load in self.part.host.timed)])
         for _, load, _, values, _ in self._followers:
             if load.amplitude is not None:
                 values.assign(load.at(at, 1.0) * load.values)
+
+    def _upload_dead(self, amplitudes: list[float]) -> None:
+        """What follows nothing: constant loads, then each that changes."""
+        self._values.assign((self._dead @ amplitudes).reshape(-1, 3))
 
     def scale(self, dead: np.ndarray, at: float) -> None:
         """Values of an equilibrium at load parameter `at`, with the loads on all places (P, 3) that follow nothing."""

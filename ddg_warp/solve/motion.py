@@ -8,6 +8,7 @@ from ddg_warp.compile.conditions import pose_starts
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels import motion
 from ddg_warp.kernels.islands import Islands
+from ddg_warp.model.state import State
 
 
 def poses(model, t0: float, t1: float) -> np.ndarray:
@@ -41,16 +42,31 @@ def jump_between(model, t0: float, t1: float) -> str:
 class Motion:
     """Motion of the held nodes and angles of a group of rods or of a net.
 
-    Poses at both ends of a step come from the host; where supports are in between is found on the device, island by island.
+    Poses at both ends of a step come from the host, those of grips from the states there; where supports are in between is found on the
+    device, island by island.
 
     Args:
         part: `Group` or `DeviceNet`.
+
+    Attributes:
+        pose: see `kernels.motion`; with grips, of every world, `stride` rows apart.
     """
 
     def __init__(self, model, part, midpoint: bool = False):
         host, real = part.host, model.types.real
         self.model, self.part = model, part
-        self.pose = wp.zeros((pose_starts(model.motions)[-1], motion.POSE), dtype=real, device=model.wp_device)
+        starts = pose_starts(model.motions)
+        self._shared = wp.zeros((starts[-1], motion.POSE), dtype=real, device=model.wp_device)
+        self.pose, self.stride, self._grip = self._shared, 0, None
+        if model.grips:
+            grips = np.full(starts[-1], -1)
+            places = [i for i, moved in enumerate(model.motions) if moved in model.grips]
+            grips[starts[places]] = np.arange(len(places))
+            self.stride, self._grips = len(grips), self._list(grips).flatten()
+            self.pose = wp.zeros((model.worlds * len(grips), motion.POSE), dtype=real, device=model.wp_device)
+            self._grip = motion.grip_kernel(real)
+            self._shared.assign(poses(model, 0.0, 0.0))
+        self._timed = len(model.grips) < len(model.motions)
         self._nodes, self._angles = motion.support_kernels(part.dim, real, midpoint)
         places, angles = host.moving[:, 0], host.turning[:, 0]
         self.nodes = self._list(host.index(places), host.moving[:, 1:])
@@ -69,11 +85,18 @@ class Motion:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [self._nodes, *([self._angles] if len(self.angles) else [])]
+        return [self._nodes, *([self._angles] if len(self.angles) else []), *([self._grip] if self._grip else [])]
 
     def upload(self, t0: float, t1: float) -> None:
-        """Poses of all motions between t0 and t1."""
-        self.pose.assign(poses(self.model, t0, t1))
+        """Poses between t0 and t1 of motions that are functions of time."""
+        if self._timed:
+            self._shared.assign(poses(self.model, t0, t1))
+
+    def follow(self, before: State, after: State) -> None:
+        """Poses of every world over the step from one state to another, where there are grips; launches alone."""
+        if self._grip:
+            inputs = [self._grips, len(self.model.grips), self._shared, before.grips.pose, after.grips.pose]
+            self._launch(self._grip, self._grips, inputs, [self.pose])
 
     def apply(self, islands, x: wp.array, *directed: wp.array) -> None:
         """Put what is held where the part of the step that an island tries has it: see `place` and `direct`."""
@@ -82,18 +105,20 @@ class Motion:
 
     def place(self, islands, x: wp.array) -> None:
         """Put nodes x."""
-        inputs = [self.nodes, self.rest, self.pose, *islands.arrays, self.part.world_columns]
+        inputs = [self.nodes, self.rest, self.pose, self.stride, *islands.arrays, self.part.world_columns]
         self._launch(self._nodes, self.nodes, inputs, [x])
 
     def direct(self, islands, x: wp.array, frame: wp.array, theta: wp.array) -> None:
         """Put angles theta, from lagged frames to the tangents that edges have in x."""
         if len(self.angles):
-            inputs = [self.angles, self.directors, self.pose, *islands.arrays, self.part.world_columns, x, frame]
+            inputs = [self.angles, self.directors, self.pose, self.stride]
+            inputs += [*islands.arrays, self.part.world_columns, x, frame]
             self._launch(self._angles, self.angles, inputs, [theta])
 
-    def put(self, t0: float, t1: float, *arrays: wp.array) -> None:
-        """Put what `apply` puts, which belongs to t0, where it is at t1."""
+    def put(self, state: State, t0: float, t1: float, *arrays: wp.array) -> None:
+        """Put what `apply` puts, arrays of a state that belong to t0, where it is at t1."""
         self.upload(t0, t1)
+        self.follow(state, state)
         islands = Islands(self.part.columns, self.model.types.real, self.model.wp_device)
         islands.portion.fill_(1.0)
         self.apply(islands, *arrays)

@@ -80,7 +80,7 @@ def solve(
 
     Args:
         model: what to equilibrate.
-        state: where to begin; the rest state by default. It is not changed.
+        state: where to begin; the rest state by default. It is not changed. What a `Grip` holds stays where it is.
         load_steps: increments; one that fails is halved.
         start, end: load parameter, which scales gravity and loads and is the time of motions and amplitudes.
         options: see `StaticsOptions`.
@@ -100,6 +100,10 @@ def solve(
     for name, value in (("start", start), ("end", end)):
         arguments.number(f"statics: {name}", value)
     load_steps = arguments.count("load_steps", load_steps)
+    if "controls" in options:
+        raise SceneError(
+            "statics: equilibria take no controls, which are of a time step: grips are where the state has them, add loads to the scene"
+        )
     return Equilibrium(model, StaticsOptions(**options)).load(state or model.state(), load_steps, start, end)
 
 

@@ -90,6 +90,11 @@ class PartStep:
         """See `kernels.islands`."""
         return self.newton.islands
 
+    @property
+    def islands_each(self) -> int:
+        """How many of them a world has."""
+        return len(self.islands) // self.model.worlds
+
     def suited(self, s: float) -> Means:
         """What suits solves over s [s], and all shorter ones before."""
         return suited(self.model.precision, self.means, self.float32_errors(s).max(), self.split_errors(s).max())
@@ -144,18 +149,29 @@ class PartStep:
         if not failed.size:
             return
         first = int(failed[0])
-        name = outcome.NAMES[int(self.islands.reason.numpy()[first])]
-        if self.energy and name == "energy_drift":
-            what = self.energy.failure(first)
-        else:
-            what = self.where(state, first)
+        name, text = self.failure(state, first)
         raise SolverError(
-            f"{self.who(first)} could not be stepped to t = {state.time:g} s: {name} within "
-            f"{self.integrator.retry_limit} retries, {what}",
+            f"{self.who(first)} could not be stepped to t = {state.time:g} s: {text}",
             state=state,
             outcome=name,
             rods=self.rods_of(failed),
         )
+
+    def failure(self, state, island: int) -> tuple[str, str]:
+        """Outcome of an island that was given up and rests in a state, and what to tell of it."""
+        name = outcome.NAMES[int(self.islands.reason.numpy()[island])]
+        if self.energy and name == "energy_drift":
+            what = self.energy.failure(island)
+        else:
+            what = self.where(state, island)
+        return name, f"{name} within {self.integrator.retry_limit} retries, {what}"
+
+    def failure_in(self, state, world: int) -> str:
+        """What to tell of the first island that was given up in a world, empty where none was."""
+        flags = self.islands.status.numpy() == outcome.GIVEN_UP, self.islands.reason.numpy() != 0
+        failed = np.flatnonzero(flags[0] & flags[1])
+        failed = failed[failed // self.islands_each == world]
+        return f"{self.who(int(failed[0]))}: {self.failure(state, int(failed[0]))[1]}" if failed.size else ""
 
     @staticmethod
     def dead_end(x: np.ndarray, first: int, kind, of: str = "") -> str:
@@ -184,4 +200,5 @@ class PartStep:
     def advice(self, state) -> str:
         """What to do about a step that failed and has no other reason."""
         jump = jump_between(self.model, state.time - self.integrator._dt_host, state.time)
-        return jump or "take a smaller dt, a looser rtol, or check its loads and supports"
+        grips = "move grips less in a step, " if self.model.grips else ""
+        return jump or f"{grips}take a smaller dt, a looser rtol, or check its loads and supports"

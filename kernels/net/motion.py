@@ -25,6 +25,7 @@ def normal_kernels(real, midpoint: bool):
         where: wp.array2d(dtype=int),
         rest: wp.array(dtype=V),
         pose: wp.array2d(dtype=real),
+        stride: int,
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         elements: int,
@@ -33,7 +34,7 @@ def normal_kernels(real, midpoint: bool):
         """`where` is (element, first row of its data, motion), `rest` the normal at rest."""
         i, w = wp.tid()
         if scalars[PROGRESS, w] < real(1.0):
-            n = turned(pose, where[i, 2], reached(scalars, w), rest[i])
+            n = turned(pose, where[i, 2] + w * stride, reached(scalars, w), rest[i])
             write(where, i, w * elements, n, data_out)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -41,6 +42,7 @@ def normal_kernels(real, midpoint: bool):
         where: wp.array2d(dtype=int),
         rest: wp.array(dtype=V),
         pose: wp.array2d(dtype=real),
+        stride: int,
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         elements: int,
@@ -54,7 +56,7 @@ def normal_kernels(real, midpoint: bool):
         for d in range(3):
             n[d] = before[where[i, 1] + d, column]
         if flags[MOVED, w] != 0:
-            n = turned(pose, where[i, 2], scalars[PROGRESS, w] + scalars[PORTION, w], rest[i])
+            n = turned(pose, where[i, 2] + w * stride, scalars[PROGRESS, w] + scalars[PORTION, w], rest[i])
         write(where, i, w * elements, n, data_out)
 
     return normals, turn

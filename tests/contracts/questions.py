@@ -440,6 +440,71 @@ def failure(kind, variant):
         raise AssertionError("one iteration a step was enough")
 
 
+# Worlds that are told apart.
+
+
+def _told(kind, variant):
+    """A model held by a grip, an integrator, and the controls of step k: every world goes up at a rate of its own."""
+    scene, _ = kind.scene(gravity=(0.0, 0.0, -1.0), motion=ddg.Grip())
+    model = variant.build(scene)
+
+    def controls(k):
+        poses = np.zeros((variant.worlds, 1, 6))
+        poses[:, 0, 2] = k * DT * (1.0 + np.arange(variant.worlds))
+        return ddg.Controls(poses)
+
+    return model, ddg.Integrator(model, failures="flag"), controls
+
+
+def grip(kind, variant):
+    """A grip moves its supports in every world as a motion of that rate does; what is in equilibrium there hangs as before."""
+    model, integrator, controls = _told(kind, variant)
+    state = model.state()
+    for k in range(1, 4):
+        state = integrator.step(state, DT, controls(k))
+    for world, points in enumerate(variant.each(state.points())):
+        motion = ddg.Motion(lambda t, w=world: (0.0, 0.0, (1.0 + w) * t))
+        alone, _, _ = still(kind, Variant(variant.device, variant.precision), gravity=(0.0, 0.0, -1.0), motion=motion)
+        close(points, _steps(alone, 3).points(), atol=1e-9)
+    assert set(integrator.outcomes()) == {"converged"}
+    hung, hangs = variant.each(statics.solve(model).points()), variant.each(statics.solve(model, state).points())
+    lift = np.zeros_like(hung)
+    lift[..., 2] = 3 * DT * (1.0 + np.arange(variant.worlds))[:, None]
+    close(hangs, hung + lift, atol=1e-5)
+
+
+def controls(kind, variant):
+    """Gravity that a step is given, or its forces on all points, are the scene's: each world falls as under its own."""
+    factors = 0.5 + np.arange(variant.worlds)
+    model, _, _ = still(kind, variant)
+    down = np.outer(factors, (0.0, 0.0, -1.0))
+    weight = _mass(model)[:, None] * down[:, None]
+    for given in (ddg.Controls(gravity=down), ddg.Controls(forces=weight)):
+        integrator, state = ddg.Integrator(model), model.state()
+        for _ in range(3):
+            state = integrator.step(state, DT, given)
+        for world, points in enumerate(variant.each(state.points())):
+            alone, _, _ = still(kind, Variant(variant.device, variant.precision), gravity=tuple(down[world]))
+            close(points, _steps(alone, 3).points(), atol=1e-8)
+
+
+def reset(kind, variant):
+    """The last world starts anew and is as a fresh one of that time, bit for bit on the CPU; the others go on."""
+    model, integrator, controls = _told(kind, variant)
+    state, last = model.state(), np.arange(variant.worlds) == variant.worlds - 1
+    for k in range(1, 3):
+        state = integrator.step(state, DT, controls(k))
+    fresh, others = model.state(), ddg.Integrator(model).step(state, DT, controls(3))
+    fresh.time = state.time
+    state = integrator.step(integrator.reset(state, last), DT, controls(3))
+    fresh = ddg.Integrator(model).step(fresh, DT, controls(3))
+    compare = np.testing.assert_array_equal if variant.device == "cpu" else close
+    for world in range(variant.worlds):
+        expected = fresh if last[world] else others
+        for found, wanted in ((state.points(), expected.points()), (state.velocities(), expected.velocities())):
+            compare(variant.each(found)[world], variant.each(wanted)[world])
+
+
 QUESTIONS = {
     function.__name__.replace("_", " "): function
     for function in (
@@ -448,5 +513,6 @@ QUESTIONS = {
         *(motion, turned_clamp, load, couple, pressure, mass_damping, strain_rate_damping, drag),
         *(implicit_euler, implicit_midpoint, equilibrium, spectrum, continuation),
         *(record, export, failure),
+        *(grip, controls, reset),
     )
 }

@@ -57,7 +57,7 @@ REFUSED = {
 }
 for _question in (
     *("turned clamp", "load", "pressure", "mass damping", "strain rate damping"),
-    *("implicit euler", "implicit midpoint", "record", "export", "failure"),
+    *("implicit euler", "implicit midpoint", "record", "export", "failure", "grip", "controls", "reset"),
 ):
     REFUSED.setdefault(_question, {})["shell, curved membrane"] = ("shell 0", "'curved'", "statics", "membrane='flat'")
 MANY = {"continuation": ("one world",)}  # what several worlds are refused

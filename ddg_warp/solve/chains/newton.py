@@ -73,6 +73,7 @@ class ChainNewton:
         x, theta, frame: the iterate and its lagged frames; base: the accepted positions it was reached from.
         target, target_angle, coefficient: the quadratic of inertia, coefficient * m |x - target|^2 / 2.
         mass, rotary: m; with drag, of which `kernels.drag` makes them at the start of a solve, its own.
+        load, load_angle: forces on nodes and moments about edges, where there are any (`loaded`).
         islands: state of every rod's search; see `kernels.islands`.
     """
 
@@ -93,6 +94,7 @@ class ChainNewton:
         self.x, self.base, self.target = (make(*nodes, dtype=vector) for _ in range(3))
         self.theta, self.target_angle = make(*twisted), make(*twisted)
         self.frame = make(7, *twisted)
+        self.load, self.load_angle, self.loaded = group.load, group.load_angle, group.host.loaded
         self.mass, self.rotary = group.mass, group.rotary
         if kind.drag:
             self.mass = make(*nodes, dtype=chain.inertia_type(kind, self.real))
@@ -147,6 +149,11 @@ class ChainNewton:
         """None: the sweep is direct."""
         return 0
 
+    def take_loads(self) -> None:
+        """Have loads of its own, on all nodes and angles, instead of the constant ones of the group."""
+        self.load, self.loaded = arrays.allocate(self.x.shape, self.x.dtype, self.device), True
+        self.load_angle = arrays.allocate(self.theta.shape, self.real, self.device)
+
     def predict(self, before) -> None:
         """Redo the predictor of bent rods from the state `before`, with edges turned; carry frames to midpoints."""
         wp.launch(
@@ -196,7 +203,7 @@ class ChainNewton:
             group.node_threads,
             [self.gradient, self.energy, self.stiffness, group.count, self.mass, self.rotary, *self.islands.arrays]
             + [self.x, self.theta, self.base, self.direction, self.target, self.target_angle]
-            + [group.gravity, group.load, group.load_angle, int(group.host.loaded), group.fixed, group.length]
+            + [group.gravity, self.load, self.load_angle, int(self.loaded), group.fixed, group.length]
             + [options.rtol, options.floor_factor * self.eps],
             [self.right, self.energy_change, self.energy_noise],
             device=self.device,

@@ -13,6 +13,7 @@ from ddg_warp.solve.chains.newton import ChainNewton
 from ddg_warp.solve.chains.partitioned import PartitionedNewton
 from ddg_warp.solve.chains.pcg import PcgNewton, ProjectiveNewton
 from ddg_warp.solve.choice import automatic
+from ddg_warp.solve.controls import ChainScale, ControlledLoads
 from ddg_warp.solve.drag import ChainDrag
 from ddg_warp.solve.loads import Loads
 from ddg_warp.solve.motion import Motion
@@ -37,9 +38,15 @@ class ChainStep(PartStep):
         self._begin = step.begin_kernel(kind, real, self.midpoint)
         self._nodes = step.finish_nodes_kernel(kind, real, self.midpoint)
         self._frames = step.finish_frames_kernel(kind, real) if kind.twist else None
+        self.outer = group.outer
+        if (given := integrator.given) is not None:
+            self.newton.take_loads()
+            scale = ChainScale(model, group)
+            self.outer, self.loads = scale.load, ControlledLoads(model, group, self.midpoint, given, scale)
+        elif group.host.timed or group.host.followers:
+            self.loads = Loads(model, group, self.midpoint)
         self.energy = energy.ChainEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.motion = Motion(model, group, self.midpoint) if group.host.moves else None
-        self.loads = Loads(model, group, self.midpoint) if group.host.timed or group.host.followers else None
         self.drag = ChainDrag(model, group, self.midpoint) if kind.drag else None
 
     def attempt(self, before, after) -> None:
@@ -49,7 +56,7 @@ class ChainStep(PartStep):
             self._begin,
             group.node_threads,
             [before.x, before.v, before.theta, before.omega, before.frame, group.fixed, group.count, group.world]
-            + [self.integrator._dt, self.damping, group.outer, *self.islands.arrays],
+            + [self.integrator._dt, self.damping, self.outer, *self.islands.arrays],
             [newton.x, newton.theta, newton.frame, newton.target, newton.target_angle],
         )
         if self.motion:
@@ -59,7 +66,7 @@ class ChainStep(PartStep):
         if self.motion:
             self.motion.direct(self.islands, newton.x, newton.frame, newton.theta)
         if self.loads:
-            self.loads.apply(newton.x, group.load, group.load_angle)
+            self.loads.apply(newton.x, newton.load, newton.load_angle)
         if self.drag:
             self.drag.resist(before, newton, self.islands)
         newton.solve(before.last)
@@ -105,9 +112,10 @@ class ChainStep(PartStep):
         self.islands.carried.assign(largest_carried(self.group.stiffnesses(s)[2]))
 
     def who(self, column: int) -> str:
-        """The rod of a column."""
+        """The rod of a column, and its world where there are several."""
         rod = self._rod(column)
-        return f"rod {rod} ('{self.model.curves.names[rod]}')"
+        world = f" of world {column // self.group.rods}" if self.model.worlds > 1 else ""
+        return f"rod {rod} ('{self.model.curves.names[rod]}'){world}"
 
     def rods_of(self, columns: np.ndarray) -> list[int]:
         """Rods of columns, as the user counts them."""

@@ -101,7 +101,7 @@ class ChainTangent(Part):
         """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""
         if self.host.moves:
             data = self.data(state)
-            self._motion.put(before, at, data.x, data.frame, data.theta)
+            self._motion.put(state, before, at, data.x, data.frame, data.theta)
 
     def edges(self, q: np.ndarray) -> np.ndarray:
         """Edge vectors of the windows (E, dim), zero where there is none."""

@@ -11,6 +11,7 @@ from ddg_warp.kernels.net import elements, newton
 from ddg_warp.model.net import NetState
 from ddg_warp.scene import drag
 from ddg_warp.solve.choice import net_preconditioner
+from ddg_warp.solve.controls import ControlledLoads, NetScale
 from ddg_warp.solve.drag import NetDrag
 from ddg_warp.solve.energy import NetEnergy
 from ddg_warp.solve.loads import Loads
@@ -56,7 +57,11 @@ class NetStep(PartStep):
         self.drag = NetDrag(model, self.midpoint) if host.drag else None
         self.energy = NetEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.motion = NetMotion(model, self.midpoint) if host.moves else None
-        self.loads = Loads(model, self.net, self.midpoint) if host.timed or host.followers else None
+        if (given := integrator.given) is not None:
+            scale = NetScale(model, self.net, solver)
+            self.loads = ControlledLoads(model, self.net, self.midpoint, given, scale)
+        elif host.timed or host.followers:
+            self.loads = Loads(model, self.net, self.midpoint)
         self.field = NetField(model, self.midpoint)
         self._data = (self.motion.data if self.motion else {}) | self.field.data
 

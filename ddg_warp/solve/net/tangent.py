@@ -9,6 +9,7 @@ from scipy import sparse
 from ddg_warp.compile.tolerance import largest_excess
 from ddg_warp.geometry.turning import turned
 from ddg_warp.kernels.net import elements
+from ddg_warp.scene.grip import Grip
 from ddg_warp.solve.net.planes import HostPlanes
 from ddg_warp.solve.net.prescribed import NetMotion
 from ddg_warp.solve.part import Part
@@ -150,7 +151,7 @@ class NetTangent(Part):
     def move_supports(self, state, before: float, at: float) -> None:
         """Put held dofs where their motions have them at load parameter `at`; the state belongs to `before`."""
         if self.host.moves:
-            self._motion.put(before, at, state.net.q, state.net.frame)
+            self._motion.put(state, before, at, state.net.q, state.net.frame)
         self.prescribe(state, at)
 
     def prescribe(self, state, at: float) -> None:
@@ -162,9 +163,14 @@ class NetTangent(Part):
             for motion in np.unique(part.turning[:, 2]):
                 chosen = part.turning[:, 2] == motion
                 element, row, _ = part.turning[chosen].T
-                turned = self.model.motions[motion].turn(at, part.turning_rest[chosen])
+                moved = self.model.motions[motion]
+                if isinstance(moved, Grip):  # which every world has elsewhere
+                    where = state.poses().reshape(self.net.worlds, -1, 6)[:, self.model.grips.index(moved)]
+                else:
+                    where = at
+                turned = moved.turn(where, part.turning_rest[chosen])
                 for d in range(3):
-                    values[row + d, element + columns] = turned[:, d]
+                    values[row + d, element + columns] = turned[..., d]
             if part.term.measure.field:
                 values[-part.term.measure.field :] = self.model.scene.applied_field.at(at, at)[:, None]
             data.assign(values)

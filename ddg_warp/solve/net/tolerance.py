@@ -12,6 +12,7 @@ class Allowed:
 
     Attributes:
         blocks: of every block of all worlds [N, N m]; least: what rounding leaves there, which `settle` writes.
+        limits: of the parts of every level (worlds, parts) [N].
         ratio: of residuals of blocks, then of sums over parts, to what they may be.
     """
 
@@ -39,6 +40,7 @@ class Allowed:
                 make(worlds * n),
             )
             self._levels.append(own)
+        self.limits = [limit for _, _, limit, _, _ in self._levels]
 
     def assign(self, loads: np.ndarray) -> wp.array:
         """Take the loads of bodies (worlds or 1, bodies) [N]; load scales of the worlds: 1, or 0 where there are none."""
@@ -46,7 +48,7 @@ class Allowed:
         given = (loads > 0.0).any(1)
         loads = np.where(given[:, None], loads, 1.0)
         self.blocks.assign(np.concatenate([self.bodies.limits(own) for own in loads]))
-        for level, (*_, limit, _, _) in zip(self.bodies.levels, self._levels, strict=True):
+        for level, limit in zip(self.bodies.levels, self.limits, strict=True):
             limit.assign(loads[:, level.body] * level.weight)
         return wp.array(given.astype(float), dtype=self._real, device=self.net.device)
 

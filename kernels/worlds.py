@@ -1,0 +1,97 @@
+"""Worlds apart: those in which something was given up come to rest, and those of a mask start anew; see `ddg_warp.solve.worlds`.
+
+Arrays of all worlds have one world after the other along their last axis, islands likewise: each world has a `share` of it.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels import outcome
+from ddg_warp.kernels.islands import REASON, STATUS
+
+
+@cache
+def select_kernel(dtype, serial: bool):
+    """Takes over the entries of another array in worlds of a mask; `stride` is the share, or 0 where that array has one world.
+
+    A thread takes one entry (row, row, world, entry of it), or all of a world if `serial`.
+    """
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def select(
+        mask: wp.array(dtype=int),
+        share: int,
+        stride: int,
+        source: wp.array3d(dtype=dtype),
+        out: wp.array3d(dtype=dtype),
+    ):
+        i, j, w, k = wp.tid()
+        if mask[w] == 0:
+            return
+        if wp.static(serial):
+            for r in range(share):
+                for a in range(out.shape[0]):
+                    for b in range(out.shape[1]):
+                        out[a, b, w * share + r] = source[a, b, w * stride + r]
+        else:
+            out[i, j, w * share + k] = source[i, j, w * stride + k]
+
+    return select
+
+
+@cache
+def island_kernels():
+    """note(...), seal(...), enter(...) of worlds in which an island was given up in this step; clear(...) of worlds that start anew."""
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def note(
+        flags: wp.array2d(dtype=int),
+        share: int,
+        resting: wp.array(dtype=int),
+        failed: wp.array(dtype=int),
+        any_failed: wp.array(dtype=int),
+    ):
+        """Enter the largest outcome of islands that were given up in worlds which did not rest before."""
+        i = wp.tid()
+        w = i / share
+        if flags[STATUS, i] == wp.static(outcome.GIVEN_UP) and resting[w] == 0:
+            wp.atomic_max(failed, w, flags[REASON, i])
+            any_failed[0] = 1
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def seal(failed: wp.array(dtype=int), share: int, flags: wp.array2d(dtype=int)):
+        """Have the others in their worlds rest, too, for no reason of their own."""
+        i = wp.tid()
+        if failed[i / share] != 0 and flags[STATUS, i] != wp.static(outcome.GIVEN_UP):
+            flags[STATUS, i] = wp.static(outcome.GIVEN_UP)
+            flags[REASON, i] = 0
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def enter(failed: wp.array(dtype=int), resting: wp.array(dtype=int)):
+        w = wp.tid()
+        if failed[w] != 0:
+            resting[w] = failed[w]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def clear(mask: wp.array(dtype=int), share: int, flags: wp.array2d(dtype=int)):
+        i = wp.tid()
+        if mask[i / share] != 0:
+            flags[STATUS, i] = wp.static(outcome.CONVERGED)
+            flags[REASON, i] = 0
+
+    return note, seal, enter, clear
+
+
+@cache
+def forget_kernel(dtype):
+    """Zeroes columns of worlds of a mask."""
+    zero = wp.constant(dtype(0))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def forget(mask: wp.array(dtype=int), share: int, out: wp.array2d(dtype=dtype)):
+        row, i = wp.tid()
+        if mask[i / share] != 0:
+            out[row, i] = zero
+
+    return forget
