@@ -51,3 +51,18 @@ def carried_function(real):
         return wp.dot(wp.normalize(v - new * wp.dot(v, new)), du) + wp.dot(new, dt)
 
     return carried
+
+
+@cache
+def angle_function(real):
+    """angle(e, u, t, d): angle about the edge e from its reference director, the frame (u, t) carried along to it, to the director d."""
+    V = wp.types.vector(3, real)
+    transport, *_ = frames.functions(real)
+
+    @wp.func
+    def angle(e: V, u: V, t: V, d: V):
+        new = wp.normalize(e)
+        v = transport(u, t, new)
+        return wp.atan2(wp.dot(wp.cross(v, d), new), wp.dot(v, d))
+
+    return angle

@@ -103,6 +103,11 @@ class ChainGroup(Storage):
         seam = self.kind.closed & (k + 1 == self.count[column])
         return np.stack([first, np.where(seam, column, first + len(self.rods))], -1)
 
+    def holding(self, nodes: np.ndarray) -> np.ndarray:
+        held = np.ones((*nodes.shape, 3), bool)
+        held[..., self.axes] = (self.fixed.ravel()[nodes][..., None] >> np.arange(self.kind.dim)) & 1 == 1
+        return held
+
     def dofs(self, places: np.ndarray) -> np.ndarray:
         dim, angle = self.kind.dim, places >= self.nodes
         k, column = np.divmod(self.index(places), len(self.rods))

@@ -163,6 +163,10 @@ class Storage:
         """Nodes of the rod edges whose angles these are (n, 2)."""
         raise NotImplementedError
 
+    def holding(self, nodes: np.ndarray) -> np.ndarray:
+        """Which components of nodes (..., 3) are held, or not there."""
+        raise NotImplementedError
+
     def dofs(self, places: np.ndarray) -> np.ndarray:
         """Dofs of the components of places (..., 3) as a `Tangent` counts them in one world; -1 where there is none."""
         raise NotImplementedError

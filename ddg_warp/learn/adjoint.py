@@ -78,21 +78,28 @@ class Adjoint:
         """
         validate.check_state("pull", self.model, given)
         for kept, part in zip(tape.parts, self.integrator._parts, strict=True):
-            _require_whole(kept.whole.numpy(), part)
+            _require_one_solve(kept, part)
+        self.upload(tape.before.time, tape.dt)
         return _copied(*self.pull_parts(tape.before, tape.after, tape.parts, given, self.integrator._solved(tape.dt)))
+
+    def upload(self, start: float, dt: float) -> None:
+        """What supports do in the step whose reverse follows."""
+        for own in (*self.chains, *([self.net] if self.net else [])):
+            if own.supports:
+                own.supports.upload(start, start + dt)
 
     def pull_parts(self, before: State, after: State, parts: list, given: State, s: float) -> tuple[State, list]:
         """The same without a check, for solves over s [s]; what it returns is written anew by the next call."""
         groups, inputs = [], []
         for own, kept, end, by in zip(self.chains, parts, after.groups, given.groups, strict=False):
-            start, read = own.pull(kept, end, by, s)
+            start, read = own.pull(kept, end, by, s, (before, after))
             groups.append(start)
             inputs.append(read)
         net = None
         if self.net:
-            net, read = self.net.pull(parts[-1], after.net, given.net, s)
+            net, read = self.net.pull(parts[-1], after.net, given.net, s, (before, after))
             inputs.append(read)
-        return State(self.model, groups, net, before.time), inputs
+        return State(self.model, groups, net, before.time, self.model.empty_state().grips), inputs
 
 
 @launches
@@ -142,11 +149,17 @@ def _cloned(value):
     return [wp.clone(array) for array in value] if isinstance(value, list) else wp.clone(value)
 
 
-def _require_whole(portion: np.ndarray, part: SimpleNamespace) -> None:
-    """Refuse the reverse of a step that was made in parts."""
-    bad = np.flatnonzero(portion < 1.0)
-    if bad.size:
-        raise SolverError(
-            f"{part.who(int(bad[0]))} took the step in parts, as a solve failed: no gradient goes through it; take a smaller dt",
-            outcome="in_parts",
-        )
+def _require_one_solve(kept: Kept | NetKept, part) -> None:
+    """Refuse the reverse of a step that was made in parts, or in which frames were renewed."""
+    lagged, now = kept.frames
+    changed = (lagged.numpy() != now.numpy()).any(0).reshape(-1, len(part.islands))
+    for bad, what in (
+        (kept.whole.numpy() < 1.0, "took the step in parts, as a solve failed"),
+        (
+            changed.any(0),
+            "turned an edge by more than 90 degrees in the step, so that its frames were renewed on the way",
+        ),
+    ):
+        if bad.any():
+            who = part.who(int(np.argmax(bad)))
+            raise SolverError(f"{who} {what}: no gradient goes through it; take a smaller dt", outcome="no_gradient")

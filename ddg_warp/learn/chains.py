@@ -10,6 +10,7 @@ from ddg_warp.compile.storage import FREE
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.adjoint import chain, step
 from ddg_warp.learn.solve import ChainSolve
+from ddg_warp.learn.supports import Supports
 from ddg_warp.model.state import GroupState
 
 
@@ -30,6 +31,11 @@ class Kept:
     frame: wp.array
     whole: wp.array | None
     time: float = 0.0
+
+    @property
+    def frames(self) -> tuple[wp.array, wp.array]:
+        """Lagged frames before the step and at its solution; another pair says that they were renewed."""
+        return self.before.frame, self.frame
 
 
 @dataclass
@@ -70,6 +76,7 @@ class ChainAdjoint:
         self.device, self.real = device, real
         self.vector = wp.types.vector(kind.dim, real)
         self.solve = ChainSolve(model, group)
+        self.supports = Supports(model, group) if scheme and group.host.moves else None
         terms = range(len(kind.terms))
         self._pull = [chain.pull_kernel(kind, i, real) for i in terms]
         self._strain = [chain.strain_kernel(kind, i, real) for i in terms] if kind.viscous else []
@@ -108,7 +115,7 @@ class ChainAdjoint:
         theta, frame = (wp.clone(newton.theta), wp.clone(newton.frame)) if twist else (newton.theta, newton.frame)
         return Kept(before, wp.clone(newton.x), theta, frame, wp.clone(step.islands.portion))
 
-    def pull(self, kept: Kept, after: GroupState, given: GroupState, s: float) -> tuple[GroupState, ChainInputs]:
+    def pull(self, kept: Kept, after: GroupState, given: GroupState, s: float, states=None) -> tuple:
         """Derivatives by the start of a step, and by what else it read; both are written anew by the next call. Launches alone, but for
         closed rods and equilibria.
 
@@ -116,6 +123,10 @@ class ChainAdjoint:
             after: the state that it led to.
             given: derivatives by that state.
             s: length of the implicit Euler step that it solved [s].
+            states: those of the model at both ends, where supports move.
+
+        Returns:
+            Derivatives by the start, a `GroupState`, and `ChainInputs`.
         """
         group, kind, before = self.group, self.group.kind, kept.before
         start, inputs, window, lag = self._start_state, self._inputs, self._window, self._lag
@@ -146,6 +157,9 @@ class ChainAdjoint:
         self._launch(self._nodes, [window, group.count], [self._dof])
         if kind.twist:
             self._launch(self._edges, [lag, group.count], [start.frame])
+        if self.supports and kind.twist:
+            held = self._dof[: kind.dim], self._dof[kind.dim]
+            self.supports.pull(*states, kept.x, kept.frame, *held, start.frame)
         self._launch(
             self._start,
             [*end, kept.x, kept.theta, before.x, before.v, before.theta, before.omega, inputs.load, self._dof]
@@ -168,7 +182,8 @@ class ChainAdjoint:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         own = [*self._pull, *self._strain, self._nodes, self._edges, self._solution, self._start]
-        return [*own, *([self._frame] if self._frame else []), *self.solve.kernels]
+        own += [*([self._frame] if self._frame else []), *self.solve.kernels]
+        return own + (self.supports.kernels if self.supports else [])
 
     @property
     def _parameters(self) -> list:

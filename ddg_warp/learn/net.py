@@ -11,6 +11,7 @@ from ddg_warp.errors import SceneError
 from ddg_warp.kernels.adjoint import net as reverse
 from ddg_warp.kernels.net.elements import FRAME
 from ddg_warp.learn.solve import HostSolve
+from ddg_warp.learn.supports import Supports
 from ddg_warp.model.net import NetState
 from ddg_warp.solve.net.system import lists
 from ddg_warp.solve.net.tangent import NetTangent
@@ -24,6 +25,11 @@ class NetKept:
     solved: NetState
     whole: wp.array | None
     time: float = 0.0
+
+    @property
+    def frames(self) -> tuple[wp.array, wp.array]:
+        """As of `Kept`."""
+        return self.before.frame, self.solved.frame
 
 
 @dataclass
@@ -64,6 +70,7 @@ class NetAdjoint:
         _refuse(model, scheme)
         self.solve = HostSolve(NetTangent(model, 0))
         host = net.host
+        self.supports = Supports(model, net) if scheme and host.moves else None
         self._mass = wp.array(host.mass, dtype=net.vector, device=self.device)
         self._gravity = wp.array(np.array(model.scene.gravity, float)[None], dtype=net.vector, device=self.device)
         self._damping = wp.array([model.scene.mass_damping], dtype=real, device=self.device)
@@ -98,7 +105,9 @@ class NetAdjoint:
             solved = replace(solved, frame=wp.clone(frame), lag=[wp.clone(values) for values in lag])
         return NetKept(before, solved, wp.clone(step.islands.portion))
 
-    def pull(self, kept: NetKept, after: NetState, given: NetState, s: float) -> tuple[NetState, NetInputs]:
+    def pull(
+        self, kept: NetKept, after: NetState, given: NetState, s: float, states=None
+    ) -> tuple[NetState, NetInputs]:
         """As `ChainAdjoint.pull`."""
         net, solved, before = self.net, kept.solved, kept.before
         rate = 1.0 / s
@@ -145,6 +154,10 @@ class NetAdjoint:
         self._collect(slots, lags, by_q, carried, inputs)
         start.lag = [self._own(i, lag, more) for i, (lag, more) in enumerate(zip(lags, own, strict=True))]
         start.frame = carried
+        if self.supports:
+            frame, by_frame = (net.frames(array) for array in (solved.frame, carried))
+            held, angle = net.components(by_q), net.angles(by_q)
+            self.supports.pull(*states, net.points(solved.q), frame, held, angle, by_frame)
         count = len(by_q)
         inputs.mass, inputs.load, inputs.held, inputs.gravity = wp.zeros_like(by_q), w, by_q, wp.zeros_like(by_q)
         inputs.rate, inputs.damping = (wp.zeros(count, dtype=self.real, device=self.device) for _ in range(2))

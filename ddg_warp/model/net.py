@@ -140,6 +140,14 @@ class DeviceNet:
         view._ref = blocks  # what it looks at lives as long
         return view
 
+    def components(self, blocks: wp.array) -> wp.array:
+        """Blocks (W N,) as [component][block][world]."""
+        size = wp.types.type_size_in_bytes(self.real)
+        shape, strides = (3, self.blocks, self.worlds), (size, 3 * size, 3 * size * self.blocks)
+        view = wp.array(ptr=blocks.ptr, dtype=self.real, shape=shape, strides=strides, device=self.device)
+        view._ref = blocks
+        return view
+
     def frames(self, frame: wp.array) -> wp.array:
         """Frames (6, W edges) as those of a storage, [component][edge][world]."""
         return frame.reshape((6, -1, max(1, self.edges))).transpose((0, 2, 1))

@@ -128,6 +128,19 @@ class Integrator:
         source = self._own(state)
         self._vacate(1 - source)
         target = self._buffers[1 - source].state
+        self._prepare(dt, state)
+        self._control(found, source)
+        self.advance(source, state.time, dt)
+        target.time = state.time + dt
+        self._steps_since_check += 1
+        if self.failures == "raise" and self._steps_since_check >= self.check_every:
+            self.check(target)
+        for callback in self.model.scene.callbacks:
+            callback(target)
+        return target
+
+    def _prepare(self, dt: float, state: State) -> None:
+        """Solve by what suits steps of dt from now on."""
         changed = dt != self._dt_host or self.model.version != self._version
         if changed:
             self._dt.fill_(dt)
@@ -136,18 +149,12 @@ class Integrator:
         if changed:
             for part in self._parts:
                 part.straighten(self._solved(dt))
-        self._control(found, source)
-        start = state.time
+
+    def advance(self, source: int, start: float, dt: float) -> None:
+        """A step from what one buffer holds, at the time `start`, to the other."""
         for part in self._parts:
             part.prescribe(start, start + dt)
         self._graphs.replay((source, self.given is not None and self.given.any), lambda: self._launch(source))
-        target.time = start + dt
-        self._steps_since_check += 1
-        if self.failures == "raise" and self._steps_since_check >= self.check_every:
-            self.check(target)
-        for callback in self.model.scene.callbacks:
-            callback(target)
-        return target
 
     def check(self, state: State) -> None:
         """Read the outcomes of all steps since the last reading.

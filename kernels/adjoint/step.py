@@ -9,6 +9,10 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.chain import ChainKind
+from ddg_warp.kernels.gather import column_of, point_functions
+from ddg_warp.kernels.motion import functions as motion_functions
+from ddg_warp.kernels.motion import reached_function
+from ddg_warp.kernels.variation import angle_function
 
 
 @cache
@@ -137,3 +141,54 @@ def step_kernels(kind: ChainKind, real, midpoint: bool):
         damping_out[k, r] = by_damping
 
     return solution, start
+
+
+@cache
+def angle_kernel(dim: int, real, midpoint: bool):
+    """pull(...): of the angles that motions turn, the reverse of `kernels.motion.support_kernels`.
+
+    Adds to the derivatives by the nodes of their edges (component, node, column) and by the frames that these had; writes those by the
+    directors that the motions put there.
+    """
+    X, V = wp.types.vector(3, real), wp.types.vector(dim, real)
+    get, _ = point_functions(dim, real)
+    turned, *_ = motion_functions(real)
+    reached = reached_function(real, midpoint)
+    angle = angle_function(real)
+    planar = dim == 2
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def pull(
+        where: wp.array2d(dtype=int),
+        rest: wp.array(dtype=X),
+        pose: wp.array2d(dtype=real),
+        stride: int,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        columns: int,
+        x: wp.array2d(dtype=V),
+        frame: wp.array3d(dtype=real),
+        by_angle: wp.array2d(dtype=real),
+        node_out: wp.array3d(dtype=real),
+        frame_out: wp.array3d(dtype=real),
+        director_out: wp.array2d(dtype=X),
+    ):
+        i, w = wp.tid()
+        r = column_of(where[i, 0], w, columns)
+        k = where[i, 1] / columns
+        d = turned(pose, where[i, 4] + w * stride, reached(scalars, r), rest[i])
+        e = get(x, where[i, 3], w, columns) - get(x, where[i, 2], w, columns)
+        u = X(frame[0, k, r], frame[1, k, r], frame[2, k, r])
+        t = X(frame[3, k, r], frame[4, k, r], frame[5, k, r])
+        de, du, dt, dd = wp.grad(angle)(e, u, t, d)
+        by = by_angle[where[i, 0] / columns, r]
+        director_out[i, w] = dd * by
+        for c in range(3):
+            frame_out[c, k, r] = frame_out[c, k, r] + by * du[c]
+            frame_out[3 + c, k, r] = frame_out[3 + c, k, r] + by * dt[c]
+        for c in range(wp.static(dim)):
+            share = by * de[wp.static(2 if planar else 1) * c]
+            wp.atomic_add(node_out, c, where[i, 3] / columns, r, share)
+            wp.atomic_sub(node_out, c, where[i, 2] / columns, r, share)
+
+    return pull

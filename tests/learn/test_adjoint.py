@@ -255,3 +255,23 @@ def test_what_has_no_gradient_says_so(scheme):
     model = twisted().build(device="cpu")
     with pytest.raises(SceneError, match=r"rod \d: no gradient goes through the midpoint rule with twist"):
         Adjoint(ddg.Integrator(model, scheme=scheme))
+
+
+def turned_clamp(joint=False):
+    """A clamp that a motion shifts and turns, out of its plane: its edge's angle is found in the lagged frame."""
+    scene = joined() if joint else twisted()
+    scene.supports.clear()
+    motion = ddg.Motion(
+        translation=lambda t: (0.05 * np.sin(9.0 * t), 0.3 * t, 0.0), angle=lambda t: 4.0 * t, axis=(0.3, 1.0, 0.2)
+    )
+    scene.clamp(0, motion=motion)
+    return scene
+
+
+SCENES |= {"turned_clamp": turned_clamp, "turned_joined": lambda: turned_clamp(joint=True)}
+
+
+@pytest.mark.parametrize("name", ["turned_clamp", "turned_joined"])
+def test_steps_under_a_motion_that_turns(name):
+    model, gradient, _, difference = differentiated(name, "implicit_euler", 2)
+    check_state(model, gradient, difference)

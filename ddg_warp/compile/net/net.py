@@ -125,6 +125,9 @@ class Net(Storage):
             result[block] = (np.abs(frame[self.fixed[block]]) > 1e-9).any(0)
         return result
 
+    def holding(self, nodes: np.ndarray) -> np.ndarray:
+        return self.fixed[nodes]
+
     @cached_property
     def places(self) -> RodPlaces:
         def each(value):

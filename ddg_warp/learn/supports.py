@@ -1,0 +1,70 @@
+"""Reverse of what puts supports in place during a step."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels.adjoint.step import angle_kernel
+from ddg_warp.kernels.islands import Islands
+from ddg_warp.solve.motion import Motion
+
+
+class Supports:
+    """Of a group of rods or of a net, whose motions are functions of time or grips.
+
+    Args:
+        part: `Group` or `DeviceNet`.
+
+    Raises:
+        SceneError: a motion turns an edge that it does not hold at both ends.
+    """
+
+    def __init__(self, model, part):
+        self.model, self.part, real = model, part, model.types.real
+        host = part.host
+        self.motion = Motion(model, part)
+        self._islands = Islands(part.columns, real, model.wp_device)
+        self._islands.portion.fill_(1.0)
+        self._angles = angle_kernel(part.dim, real, False)
+        turning, ends = host.turning[:, 0], host.edge_ends(host.turning[:, 0])
+        loose = np.flatnonzero(~host.holding(ends).all((1, 2)))
+        if loose.size:
+            raise SceneError(
+                f"no gradient goes through a motion that turns {host.name(int(turning[loose[0]]))} and does not hold both of its nodes; "
+                "clamp the edge"
+            )
+        self.by_director = wp.zeros(
+            (len(turning), model.worlds), dtype=wp.types.vector(3, real), device=model.wp_device
+        )
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [self._angles, *self.motion.kernels]
+
+    def upload(self, t0: float, t1: float) -> None:
+        """Poses of the motions that are functions of time."""
+        self.motion.upload(t0, t1)
+
+    def pull(
+        self, before, after, x: wp.array, frame: wp.array, held: wp.array, angle: wp.array, by_frame: wp.array
+    ) -> None:
+        """Take derivatives by turned angles to those by directors (`by_director`), by the nodes of their edges and by lagged frames.
+
+        Args:
+            before, after: states of the model at both ends of the step.
+            x, frame: nodes at the solution [node][column], and the lagged frames [component][edge][column].
+            held, angle: derivatives by nodes [component][node][column], which are added to, and by angles [edge][column].
+            by_frame: derivatives by the lagged frames, which are added to.
+        """
+        motion = self.motion
+        motion.follow(before, after)
+        if len(motion.angles):
+            read = [motion.angles, motion.directors, motion.pose, motion.stride, *self._islands.arrays]
+            wp.launch(
+                self._angles,
+                (len(motion.angles), self.model.worlds),
+                [*read, self.part.world_columns, x, frame, angle],
+                [held, by_frame, self.by_director],
+                device=self.model.wp_device,
+            )
