@@ -55,7 +55,7 @@ def carried_function(real):
 
 @cache
 def angle_function(real):
-    """angle(e, u, t, d): angle about the edge e from its reference director, the frame (u, t) carried along to it, to the director d."""
+    """angle(e, u, t, d): angle about the edge e from its reference director, of the frame (u, t) carried along, to the director d."""
     V = wp.types.vector(3, real)
     transport, *_ = frames.functions(real)
 

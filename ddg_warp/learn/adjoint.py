@@ -10,7 +10,6 @@ Derivatives by a state are a `State`, whose arrays hold them: `points()` are tho
 """
 
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
 
 import numpy as np
 import warp as wp
@@ -152,11 +151,12 @@ def _cloned(value):
 def _require_one_solve(kept: Kept | NetKept, part) -> None:
     """Refuse the reverse of a step that was made in parts, or in which frames were renewed."""
     lagged, now = kept.frames
-    changed = (lagged.numpy() != now.numpy()).any(0).reshape(-1, len(part.islands))
+    changed = (lagged.numpy() != now.numpy()).any(0)
+    changed = changed.any(0) if changed.ndim == 2 else changed.reshape(len(part.islands), -1).any(1)
     for bad, what in (
         (kept.whole.numpy() < 1.0, "took the step in parts, as a solve failed"),
         (
-            changed.any(0),
+            changed,
             "turned an edge by more than 90 degrees in the step, so that its frames were renewed on the way",
         ),
     ):

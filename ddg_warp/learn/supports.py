@@ -30,8 +30,8 @@ class Supports:
         loose = np.flatnonzero(~host.holding(ends).all((1, 2)))
         if loose.size:
             raise SceneError(
-                f"no gradient goes through a motion that turns {host.name(int(turning[loose[0]]))} and does not hold both of its nodes; "
-                "clamp the edge"
+                f"no gradient goes through a motion that turns {host.name(int(turning[loose[0]]))} and does not hold both of its "
+                "nodes; clamp the edge"
             )
         self.by_director = wp.zeros(
             (len(turning), model.worlds), dtype=wp.types.vector(3, real), device=model.wp_device

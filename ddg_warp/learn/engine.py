@@ -1,0 +1,317 @@
+"""Steps of many worlds and their reverse, between tensors: what `ddg_warp.torch` stands on.
+
+Memory of integrator and adjoint stays where it is, so that each is one captured graph: tensors are copied in and out.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.errors import SceneError
+from ddg_warp.learn.adjoint import Adjoint
+from ddg_warp.learn.chains import Kept
+from ddg_warp.learn.net import NetKept
+from ddg_warp.learn.poses import Poses
+from ddg_warp.solve.controls import LOADS
+from ddg_warp.solve.dynamics import Integrator
+from ddg_warp.solve.graphs import Graphs
+
+FOREVER = 2**62  # steps between readings of outcomes, which worlds flag
+GRADIENTS = (
+    "x",
+    "v",
+    "theta",
+    "omega",
+    "frame",
+    "last",
+    "q",
+    "lag",
+)  # arrays of a state that have some, by how their names begin
+
+
+@dataclass(frozen=True)
+class Field:
+    """An array of a state as a tensor: its name, the axis along which worlds lie, and whether it has gradients."""
+
+    name: str
+    axis: int
+    smooth: bool
+
+
+def fields(model) -> list[Field]:
+    """Arrays of a model's states that hold something, in their order."""
+    result, nothing = [], {"net/frame"} if model.net is not None and not model.net.edges else set()
+    for part, values in model.empty_state().parts().items():
+        for name, array in values.arrays().items():
+            if array.size > 1 and f"{part}/{name}" not in nothing:
+                axis = array.ndim - 1
+                result.append(Field(f"{part}/{name}", axis, name.rstrip("_0123456789") in GRADIENTS))
+    return result
+
+
+def tensors(state, names: list[Field]) -> list[torch.Tensor]:
+    """Tensors that look at the arrays of a state."""
+    found = {f"{part}/{name}": array for part, data in state.parts().items() for name, array in data.arrays().items()}
+    return [wp.to_torch(found[field.name], requires_grad=False) for field in names]
+
+
+class Engine:
+    """Steps and gradients of a model with its worlds.
+
+    Args:
+        model, scheme, options: as of `Integrator`.
+
+    Attributes:
+        fields: what the tensors of a state are.
+        whole: of every part, the part of the last step that its islands' last solve was about (islands,).
+    """
+
+    def __init__(self, model, scheme: str, options: dict):
+        self.model = model
+        self._midpoint = scheme == "implicit_midpoint"
+        self.integrator = Integrator(model, scheme, failures="flag", check_every=FOREVER, **options)
+        self.adjoint = None
+        self.fields = fields(model)
+        self.before, self.after = (buffer.own for buffer in self.integrator._buffers)
+        self.source, self.target = (tensors(state, self.fields) for state in (self.before, self.after))
+        self._tables = {}
+        self._written = {}
+        self._graphs = None
+
+    # parameters
+
+    def tables(self, name: str) -> list:
+        """Parts whose table has a parameter "term.parameter": (table, its full shape, rows of its elements among all).
+
+        Elements are counted through all parts: groups of rods, each rod by rod, then element sets of the net.
+
+        Raises:
+            SceneError: nothing has it.
+        """
+        if name not in self._tables:
+            found, start, model = [], 0, self.model
+            for group in model.groups:
+                if name in group.parameters.values:
+                    term = next(t for t in group.kind.terms if name.startswith(f"{t.name}."))
+                    missing = 0 if group.kind.closed else term.measure.span
+                    inside = np.arange(group.nodes)[:, None] < group.host.count - missing
+                    rows = np.zeros(inside.shape, np.int64)
+                    rows.T[inside.T] = start + np.arange(inside.sum())
+                    start += int(inside.sum())
+                    found.append((group.parameters, rows, True))
+            for part in model.net.sets if model.net is not None else ():
+                own = name.rpartition(".")
+                if part.term.name == own[0] and own[2] in part.parameters.values:
+                    found.append((part.parameters, start + np.arange(part.elements), False))
+                    start += part.elements
+            if not found:
+                known = sorted({*self.names()})
+                raise SceneError(f"parameters: nothing has {name!r}; this model has {', '.join(known)}")
+            device = str(wp.device_to_torch(model.wp_device))
+            self._tables[name] = (
+                start,
+                [(table, torch.as_tensor(rows, device=device), chain) for table, rows, chain in found],
+            )
+        return self._tables[name]
+
+    def names(self) -> list[str]:
+        """Names of all parameters."""
+        model = self.model
+        result = [name for group in model.groups for name in group.parameters.values]
+        for part in model.net.sets if model.net is not None else ():
+            result += [f"{part.term.name}.{name}" for name in part.parameters.values]
+        return result
+
+    def full(self, name: str, values: torch.Tensor) -> list[torch.Tensor]:
+        """A parameter of shape (), (B,), (E,) or (B, E) as each table has it with one number an element and world."""
+        count, found = self.tables(name)
+        worlds, real = self.model.worlds, wp.dtype_to_torch(self.model.types.real)
+        shape = tuple(values.shape)
+        if shape == ():
+            wide = values.expand(worlds, count)
+        elif shape in ((worlds, 1), (1, count), (worlds, count), (1, 1)):
+            wide = values.expand(worlds, count)
+        elif shape == (worlds,) and worlds != count and worlds > 1:
+            wide = values[:, None].expand(worlds, count)
+        elif shape == (count,) and (worlds != count or worlds == 1):
+            wide = values.expand(worlds, count)
+        else:
+            raise SceneError(
+                f"parameters: {name} has shape {shape}; give (), ({worlds}, 1) for each world, (1, {count}) for each element, or "
+                f"({worlds}, {count})"
+            )
+        wide = wide.to(real)
+        result = []
+        for _, rows, chain in found:
+            own = wide[:, rows.reshape(-1)]
+            if chain:
+                own = own.reshape(worlds, *rows.shape).permute(1, 0, 2).reshape(rows.shape[0], -1)
+            result.append(own)
+        return result
+
+    def value(self, name: str) -> torch.Tensor:
+        """The values that the model has of a parameter (worlds, elements)."""
+        count, found = self.tables(name)
+        worlds, own = self.model.worlds, name.rpartition(".")[2]
+        result = torch.zeros((worlds, count), dtype=wp.dtype_to_torch(self.model.types.real), device=found[0][1].device)
+        for table, rows, chain in found:
+            values = np.broadcast_to(table[name if chain else own], self._shape(rows, chain))
+            wide = torch.as_tensor(np.ascontiguousarray(values), device=result.device).to(result.dtype)
+            if chain:
+                group = next(g for g in self.model.groups if g.parameters is table)
+                term = next(t for t in group.kind.terms if name.startswith(f"{t.name}."))
+                missing = 0 if group.kind.closed else term.measure.span
+                inside = torch.as_tensor(np.arange(group.nodes)[:, None] < group.host.count - missing)
+                wide = wide.reshape(rows.shape[0], worlds, -1).permute(1, 0, 2)
+                result[:, rows[inside]] = wide[:, inside]
+            else:
+                result[:, rows] = wide
+        return result
+
+    def _shape(self, rows: torch.Tensor, chain: bool) -> tuple[int, int]:
+        worlds = self.model.worlds
+        return (rows.shape[0], worlds * rows.shape[1]) if chain else (worlds, len(rows))
+
+    def write(self, names: tuple, values: list[torch.Tensor]) -> None:
+        """Put full parameters in place; what is there already stays."""
+        values = iter(values)
+        for name in names:
+            own = name.rpartition(".")[2]
+            for table, rows, chain in self.tables(name)[1]:
+                given, key, shape = next(values), name if chain else own, self._shape(rows, chain)
+                if table[key].shape != shape:
+                    table.set(**{key: np.broadcast_to(table[key], shape)})
+                    self.model.version += 1
+                    self._written.clear()
+                last = self._written.get((id(table), key))
+                if last is None or last[0] is not given or last[1] != given._version:
+                    self._view(table, key, shape).copy_(given)
+                    self._written[id(table), key] = given, given._version
+
+    def _view(self, table, key: str, shape: tuple) -> torch.Tensor:
+        row = list(table.values).index(key)
+        offset = sum(values.size for values in list(table.values.values())[:row])
+        return wp.to_torch(table.buffer, requires_grad=False)[offset : offset + shape[0] * shape[1]].view(shape)
+
+    # steps
+
+    def forward(self, start: float, dt: float, state, controls: dict) -> list[torch.Tensor]:
+        """The state after a step, its tensors, and of every part what tells whether it has a gradient (islands,)."""
+        integrator = self.integrator
+        self.fill(self.source, state)
+        integrator._prepare(dt, self.before)
+        self._give(controls)
+        integrator.advance(0, start, dt)
+        return [tensor.clone() for tensor in self.target] + [self._smooth(part) for part in integrator._parts]
+
+    @staticmethod
+    def fill(places: list[torch.Tensor], values) -> None:
+        """Copy tensors to where they are read."""
+        for place, value in zip(places, values, strict=True):
+            place.copy_(value)
+
+    def _smooth(self, part) -> torch.Tensor:
+        """One for islands whose step was one solve in the frames that it began with, else not a number."""
+        portion = wp.to_torch(part.islands.portion, requires_grad=False)
+        smooth = portion == 1.0
+        if part is not self.integrator._net:
+            if part.group.kind.twist:
+                before = wp.to_torch(self.before.groups[part.index].frame, requires_grad=False)
+                smooth = smooth & (wp.to_torch(part.newton.frame, requires_grad=False) == before).all(0).all(0)
+        elif part.net.edges:
+            before = wp.to_torch(self.before.net.frame, requires_grad=False)
+            same = wp.to_torch(part._lagged[0], requires_grad=False) == before
+            smooth = smooth & same.all(0).reshape(len(portion), -1).all(1)
+        smooth = smooth & (wp.to_torch(part.islands.status, requires_grad=False) <= 2)
+        return torch.where(smooth, 1.0, float("nan")).to(portion.dtype)
+
+    def _give(self, controls: dict) -> None:
+        """Hand the integrator loads and poses."""
+        integrator, model = self.integrator, self.model
+        if integrator.given is None and any(name in controls for name in LOADS):
+            integrator._control({"gravity": np.array(model.scene.gravity, float)[None]}, 0)
+        if integrator.given is not None:
+            given = integrator.given
+            given.any = any(name in controls for name in LOADS)
+            for name in LOADS:
+                place = wp.to_torch(getattr(given, name), requires_grad=False)
+                if name in controls:
+                    value = controls[name]
+                    if name == "gravity":
+                        value = value - torch.as_tensor(given._usual, dtype=value.dtype, device=value.device)
+                    place.copy_(value)
+                else:
+                    place.zero_()
+        if model.grips:
+            place = wp.to_torch(self.after.grips.pose, requires_grad=False)
+            if "poses" in controls:
+                place.copy_(controls["poses"].reshape(-1, 6).T)
+            else:
+                place.copy_(wp.to_torch(self.before.grips.pose, requires_grad=False))
+
+    # gradients
+
+    def _adjoint(self) -> Adjoint:
+        if self.adjoint is None:
+            self.adjoint = Adjoint(self.integrator)
+            self._given = self.model.empty_state()
+            self._by_state = tensors(self._given, self.fields)
+            self._graphs = Graphs(self.model, self._load)
+            groups = zip(self.before.groups, self.after.groups, strict=True)
+            solved = [wp.clone(after.x) if self._midpoint else after.x for after in self.after.groups]
+            self._parts = [
+                Kept(before, x, after.theta, before.frame, None)
+                for x, (before, after) in zip(solved, groups, strict=True)
+            ]
+            self.poses = Poses(self) if self.model.grips else None
+        return self.adjoint
+
+    def _load(self) -> None:
+        kernels = [kernel for own in self.adjoint.chains for kernel in own.kernels]
+        arrays.load_kernels(kernels, self.model.wp_device)
+
+    def backward(self, start: float, dt: float, before, after, given) -> tuple[list[torch.Tensor], list]:
+        """Derivatives by the state before a step, and by what else it read, part by part.
+
+        Args:
+            start, dt: time and length of the step.
+            before, after, given: tensors of the states at its ends, and of the derivatives by the latter.
+        """
+        adjoint = self._adjoint()
+        self.fill(self.source, before)
+        self.fill(self.target, after)
+        self.fill(self._by_state, given)
+        adjoint.upload(start, dt)
+        s, parts = self.integrator._solved(dt), list(self._parts)
+        for kept, end in zip(parts if self._midpoint else (), self.after.groups, strict=False):
+            x, ends = wp.to_torch(kept.x, requires_grad=False), (end.x, kept.before.x)
+            torch.mul(sum(wp.to_torch(array, requires_grad=False) for array in ends), 0.5, out=x)
+        if adjoint.net:
+            parts.append(self._net_kept(dt))
+
+        def launch():
+            self._found = adjoint.pull_parts(self.before, self.after, parts, self._given, s)
+
+        if all(own.solve.reduction for own in adjoint.chains) and not adjoint.net:
+            self._graphs.replay(dt, launch)
+        else:
+            launch()
+        found, inputs = self._found
+        found.grips = self.model.empty_state().grips
+        return [tensor.clone() for tensor in tensors(found, self.fields)], inputs
+
+    def _net_kept(self, dt: float) -> NetKept:
+        """Of the net: joints' rotations are those at the rates of the step, as their dofs begin it at zero."""
+        net, before, after = self.model.net, self.before.net, self.after.net
+        solved = wp.clone(after.q)
+        q = wp.to_torch(solved, requires_grad=False)
+        if self._midpoint:
+            q.add_(wp.to_torch(before.q, requires_grad=False)).mul_(0.5)
+        spins = net.host.spins
+        if spins:
+            rates = wp.to_torch(after.v, requires_grad=False).reshape(net.worlds, -1, 3)[:, -spins:]
+            q.view(net.worlds, -1, 3)[:, -spins:] = rates * dt
+        return NetKept(before, replace(before, q=solved, data=after.data), None)
