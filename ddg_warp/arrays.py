@@ -36,10 +36,17 @@ def assign(array: wp.array, values: np.ndarray) -> None:
 
 def copy(array: wp.array, source: wp.array) -> None:
     """Copy a device array into another one that is laid out alike; can be captured."""
-    if not array.is_contiguous:  # copied as they lie in memory, which takes a fraction of the time
-        order = tuple(reversed(range(array.ndim)))
-        array, source = array.transpose(order), source.transpose(order)
-    wp.copy(array, source)
+    wp.copy(_lying(array), _lying(source))  # which takes a fraction of the time
+
+
+def clear(array: wp.array) -> None:
+    """Zero a device array; can be captured."""
+    _lying(array).zero_()
+
+
+def _lying(array: wp.array) -> wp.array:
+    """An array of this kind as it lies in memory, contiguous."""
+    return array if array.is_contiguous else array.transpose(tuple(reversed(range(array.ndim))))
 
 
 def download(array: wp.array) -> np.ndarray:

@@ -131,7 +131,7 @@ class ChainAdjoint:
         group, kind, before = self.group, self.group.kind, kept.before
         start, inputs, window, lag = self._start_state, self._inputs, self._window, self._lag
         for array in (window, lag, self._end, inputs.parameters, inputs.rate, start.frame, start.last):
-            array.zero_()
+            arrays.clear(array)
         self._rate.fill_(1.0 / s)
         by_frame = given.frame
         if kind.viscous:
@@ -141,16 +141,16 @@ class ChainAdjoint:
                 self._launch(kernel, [*read, *self._parameters, given.last], [window, lag, inputs.parameters])
             if kind.twist:
                 by_frame = self._by_frame
-                wp.copy(by_frame, given.frame)
+                arrays.copy(by_frame, given.frame)
                 self._launch(self._edges, [lag, group.count], [by_frame])
-                lag.zero_()
+                arrays.clear(lag)
         if kind.twist:
             self._launch(self._frame, [after.x, kept.frame, group.count, by_frame], [window, start.frame])
         self._launch(self._nodes, [window, group.count], [self._end])
         end = [given.x, given.v, given.theta, given.omega, self._end]
         self._launch(self._solution, [*end, group.fixed, group.count, self._rate], [self._dof, self._right])
         self.solve(kept, before.last, s, self._right, inputs.load)
-        window.zero_()
+        arrays.clear(window)
         read = [kept.x, kept.theta, kept.frame, before.last, self._rate, *self._parameters, inputs.load]
         for kernel in self._pull:
             self._launch(kernel, read, [window, lag, inputs.parameters, start.last, inputs.rate])

@@ -3,6 +3,7 @@
 Memory of integrator and adjoint stays where it is, so that each is one captured graph: tensors are copied in and out.
 """
 
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -77,7 +78,7 @@ class Engine:
         self.fields = fields(model)
         self.before, self.after = (buffer.own for buffer in self.integrator._buffers)
         self.source, self.target = (tensors(state, self.fields) for state in (self.before, self.after))
-        self._tables = {}
+        self._tables, self._places_found = {}, {}
         self._written = {}
         self._graphs = None
 
@@ -86,24 +87,23 @@ class Engine:
     def tables(self, name: str) -> list:
         """Parts whose table has a parameter "term.parameter": (table, its full shape, rows of its elements among all).
 
-        Elements are counted through all parts: groups of rods, each rod by rod, then element sets of the net.
+        Elements are counted rod by rod, those of clamped ends included, then through the element sets of the net.
 
         Raises:
             SceneError: nothing has it.
         """
         if name not in self._tables:
-            found, start, model = [], 0, self.model
-            for group in model.groups:
-                if name in group.parameters.values:
-                    term = next(t for t in group.kind.terms if name.startswith(f"{t.name}."))
-                    missing = 0 if group.kind.closed else term.measure.span
-                    inside = np.arange(group.nodes)[:, None] < group.host.count - missing
-                    rows = np.zeros(inside.shape, np.int64)
-                    rows.T[inside.T] = start + np.arange(inside.sum())
-                    start += int(inside.sum())
-                    found.append((group.parameters, rows, True))
+            found, model, own = [], self.model, name.rpartition(".")
+            counts = np.zeros(model.scene.rod_count, np.int64)  # elements of every rod on its own
+            groups = [(group, self._inside(group, name)) for group in model.groups if name in group.parameters.values]
+            for group, inside in groups:
+                counts[group.host.rods] = inside.sum(0)
+            first = np.cumsum(counts) - counts
+            for group, inside in groups:
+                rows = first[group.host.rods] + np.arange(group.nodes)[:, None]
+                found.append((group.parameters, np.where(inside, rows, 0), True))
+            start = int(counts.sum())
             for part in model.net.sets if model.net is not None else ():
-                own = name.rpartition(".")
                 if part.term.name == own[0] and own[2] in part.parameters.values:
                     found.append((part.parameters, start + np.arange(part.elements), False))
                     start += part.elements
@@ -116,6 +116,13 @@ class Engine:
                 [(table, torch.as_tensor(rows, device=device), chain) for table, rows, chain in found],
             )
         return self._tables[name]
+
+    @staticmethod
+    def _inside(group, name: str) -> np.ndarray:
+        """Where rods of a group have elements of the term that a parameter belongs to (n, R)."""
+        term = next(term for term in group.kind.terms if name.startswith(f"{term.name}."))
+        missing = 0 if group.kind.closed else term.measure.span
+        return np.arange(group.nodes)[:, None] < group.host.count - missing
 
     def names(self) -> list[str]:
         """Names of all parameters."""
@@ -159,12 +166,10 @@ class Engine:
         result = torch.zeros((worlds, count), dtype=wp.dtype_to_torch(self.model.types.real), device=found[0][1].device)
         for table, rows, chain in found:
             values = np.broadcast_to(table[name if chain else own], self._shape(rows, chain))
-            wide = torch.as_tensor(np.ascontiguousarray(values), device=result.device).to(result.dtype)
+            wide = torch.tensor(values, dtype=result.dtype, device=result.device)
             if chain:
-                group = next(g for g in self.model.groups if g.parameters is table)
-                term = next(t for t in group.kind.terms if name.startswith(f"{t.name}."))
-                missing = 0 if group.kind.closed else term.measure.span
-                inside = torch.as_tensor(np.arange(group.nodes)[:, None] < group.host.count - missing)
+                group = next(group for group in self.model.groups if group.parameters is table)
+                inside = torch.as_tensor(self._inside(group, name))
                 wide = wide.reshape(rows.shape[0], worlds, -1).permute(1, 0, 2)
                 result[:, rows[inside]] = wide[:, inside]
             else:
@@ -315,3 +320,171 @@ class Engine:
             rates = wp.to_torch(after.v, requires_grad=False).reshape(net.worlds, -1, 3)[:, -spins:]
             q.view(net.worlds, -1, 3)[:, -spins:] = rates * dt
         return NetKept(before, replace(before, q=solved, data=after.data), None)
+
+    # what `ddg_warp.learn.step` asks
+
+    def stream(self):
+        """Launches on torch's stream; on the CPU there is one order for all."""
+        if not self.model.wp_device.is_cuda:
+            return nullcontext()
+        stream = wp.stream_from_torch(torch.cuda.current_stream(wp.device_to_torch(self.model.wp_device)))
+        return wp.ScopedStream(stream)
+
+    @property
+    def parts(self) -> int:
+        """How many parts step on their own: groups of rods, and the net."""
+        return len(self.integrator._parts)
+
+    def parameter_axes(self, names: tuple) -> list[int]:
+        """Axes along which the worlds of full parameters lie."""
+        return [int(chain) for name in names for _, _, chain in self.tables(name)[1]]
+
+    def flagged(self, values: torch.Tensor, field: Field, flags) -> torch.Tensor:
+        """Derivatives by an array of a state, not numbers where the step has none."""
+        flag = flags[self._part(field.name.partition("/")[0])]
+        if values.shape[field.axis] != len(flag):  # entries of a net, world by world
+            flag = flag.repeat_interleave(values.shape[field.axis] // len(flag))
+        shape = [1] * values.ndim
+        shape[field.axis] = -1
+        return values * flag.reshape(shape)
+
+    def _part(self, name: str) -> int:
+        return len(self.model.groups) if name == "net" else int(name)
+
+    def by_parameters(self, names: tuple, inputs: list, flags) -> list[torch.Tensor]:
+        """Derivatives by full parameters, in the order of `write`."""
+        result, model = [], self.model
+        for name in names:
+            own = name.rpartition(".")[2]
+            for table, rows, chain in self.tables(name)[1]:
+                if chain:
+                    index = next(i for i, group in enumerate(model.groups) if group.parameters is table)
+                    row = list(table.values).index(name)
+                    values = wp.to_torch(inputs[index].parameters, requires_grad=False)[row]
+                    result.append(values * flags[index])
+                else:
+                    index = next(i for i, part in enumerate(model.net.sets) if part.parameters is table)
+                    row = list(table.values).index(own)
+                    values = wp.to_torch(inputs[-1].parameters[index], requires_grad=False)[row]
+                    result.append(values.reshape(model.worlds, len(rows)) * flags[-1][:, None])
+        return result
+
+    def by_control(self, name: str, value: torch.Tensor, inputs: list, flags) -> torch.Tensor:
+        """Derivatives by what a step is given (worlds, ...)."""
+        if name == "poses":
+            return self.poses.pull(inputs, value) * self._by_world(flags)[:, None, None]
+        result = torch.zeros_like(value)
+        model, worlds = self.model, self.model.worlds
+        for i, group in enumerate(model.groups):
+            found = inputs[i]
+            if name == "gravity":
+                own = wp.to_torch(found.gravity, requires_grad=False) * flags[i][:, None]
+                own = own.reshape(group.nodes, worlds, group.rods, -1).sum((0, 2))
+                result[:, list(group.host.axes)] += own
+                continue
+            w = (wp.to_torch(found.load, requires_grad=False) * flags[i]).reshape(-1, group.nodes, worlds, group.rods)
+            if name == "forces":
+                k, column, rows = self._places(("points", i), lambda group=group: model.order.places(group))
+                result[:, rows[:, None], torch.tensor(group.host.axes)] = w[: group.kind.dim, k, :, column].permute(2, 0, 1)
+            elif group.kind.twist:
+                k, column, rows = self._places(("edges", i), lambda group=group: model.order.edge_places(group))
+                result[:, rows] = w[group.kind.dim, k, :, column].T
+        if model.net is not None:
+            found = inputs[-1]
+            if name == "gravity":
+                own = wp.to_torch(found.gravity, requires_grad=False).reshape(worlds, -1, 3).sum(1)
+                return result + own * flags[-1][:, None]
+            w = wp.to_torch(found.load, requires_grad=False).reshape(worlds, -1, 3) * flags[-1][:, None, None]
+            if name == "forces":
+                rows, blocks = self._places(("points", "net"), lambda: model.order.net_rows)
+                result[:, rows] = w[:, blocks]
+            else:
+                for rod in model.net.host.rods:
+                    first = int(model.order.edge_starts[rod.rod])
+                    result[:, first : first + len(rod.edges)] = w[:, torch.as_tensor(rod.edges), 0]
+        return result
+
+    def _places(self, key, find) -> list[torch.Tensor]:
+        if key not in self._places_found:
+            device = str(wp.device_to_torch(self.model.wp_device))
+            self._places_found[key] = [torch.as_tensor(np.asarray(v), device=device) for v in find()]
+        return self._places_found[key]
+
+    def _by_world(self, flags) -> torch.Tensor:
+        """One for worlds in which all has gradients."""
+        return torch.stack([flag.reshape(self.model.worlds, -1).sum(1) * 0.0 + 1.0 for flag in flags]).prod(0)
+
+    # the user's order
+
+    def _of(self, name: str) -> int | None:
+        return next((i for i, field in enumerate(self.fields) if field.name == name), None)
+
+    def points(self, values, own: str, blocks: str) -> torch.Tensor:
+        """Points (worlds, P, 3) from the tensors of a state."""
+        model, worlds = self.model, self.model.worlds
+        real = wp.dtype_to_torch(model.types.real)
+        result = torch.zeros((worlds, model.points_count, 3), dtype=real, device=values[0].device)
+        for i, group in enumerate(model.groups):
+            k, column, rows = self._places(("points", i), lambda group=group: model.order.places(group))
+            found = values[self._of(f"{i}/{own}")].reshape(group.nodes, worlds, group.rods, -1)[k, :, column]
+            axes = torch.as_tensor(list(group.host.axes), device=found.device)
+            result = result.index_put((torch.arange(worlds, device=found.device)[:, None, None], rows[:, None], axes), found.movedim(1, 0))
+        if model.net is not None:
+            rows, blocks_of = self._places(("points", "net"), lambda: model.order.net_rows)
+            found = values[self._of(f"net/{blocks}")].reshape(worlds, -1, 3)[:, blocks_of]
+            result = result.index_put((torch.arange(worlds, device=found.device)[:, None], rows), found)
+        return result
+
+    def edges(self, values) -> torch.Tensor:
+        """Angles (worlds, edges) from the tensors of a state."""
+        model, worlds = self.model, self.model.worlds
+        real = wp.dtype_to_torch(model.types.real)
+        result = torch.zeros((worlds, model.order.edges_count), dtype=real, device=values[0].device)
+        for i, group in enumerate(model.groups):
+            if group.kind.twist:
+                k, column, rows = self._places(("edges", i), lambda group=group: model.order.edge_places(group))
+                found = values[self._of(f"{i}/theta")].reshape(group.nodes, worlds, group.rods)[k, :, column]
+                result = result.index_put((torch.arange(worlds, device=found.device)[:, None], rows), found.T)
+        if model.net is not None:
+            q = values[self._of("net/q")].reshape(worlds, -1, 3)
+            for rod in model.net.host.rods:
+                first = int(model.order.edge_starts[rod.rod])
+                rows = torch.arange(first, first + len(rod.edges), device=q.device)
+                found = q[:, torch.as_tensor(rod.edges, device=q.device), 0]
+                result = result.index_put((torch.arange(worlds, device=q.device)[:, None], rows), found)
+        return result
+
+    def put_points(self, values: list, own: str, blocks: str, points: torch.Tensor) -> list:
+        """Tensors of a state with points (P, 3) or (worlds, P, 3) in place of its own.
+
+        Raises:
+            SceneError: their shape does not fit.
+        """
+        model, worlds = self.model, self.model.worlds
+        if tuple(points.shape) not in ((model.points_count, 3), (worlds, model.points_count, 3)):
+            raise SceneError(
+                f"points have shape {tuple(points.shape)}; they are ({model.points_count}, 3) or ({worlds}, {model.points_count}, 3)"
+            )
+        points = points.to(device=values[0].device, dtype=wp.dtype_to_torch(model.types.real))
+        points, values = points.expand(worlds, *points.shape[-2:]), list(values)
+        for i, group in enumerate(model.groups):
+            k, column, rows = self._places(("points", i), lambda group=group: model.order.places(group))
+            at, shape = self._of(f"{i}/{own}"), (group.nodes, worlds, group.rods, -1)
+            found = points[:, rows][..., list(group.host.axes)]
+            whole = values[at].reshape(shape)
+            place = k[None], torch.arange(worlds, device=k.device)[:, None], column[None]
+            values[at] = whole.index_put(place, found).reshape(values[at].shape)
+        if model.net is not None:
+            rows, blocks_of = self._places(("given", "net"), lambda: _last(*model.order.net_rows))
+            at = self._of(f"net/{blocks}")
+            whole = values[at].reshape(worlds, -1, 3)
+            place = torch.arange(worlds, device=rows.device)[:, None], blocks_of[None]
+            values[at] = whole.index_put(place, points[:, rows]).reshape(values[at].shape)
+        return values
+
+
+def _last(rows: np.ndarray, blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of points and their blocks, of points that are one (joined) the last alone."""
+    _, from_end = np.unique(blocks[::-1], return_index=True)
+    kept = len(blocks) - 1 - from_end
+    return rows[kept], blocks[kept]

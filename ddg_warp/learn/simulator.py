@@ -1,0 +1,262 @@
+"""Simulator: a model as a torch module. States go in and come out; nothing is kept between calls."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import warp as wp
+from torch.utils import checkpoint
+
+from ddg_warp import arguments
+from ddg_warp.errors import SceneError
+from ddg_warp.learn.engine import Engine, tensors
+from ddg_warp.learn.step import Call, Step
+from ddg_warp.model import validate
+
+CONTROLS = {"forces": "points", "moments": "edges", "gravity": None, "poses": "grips"}
+
+
+@dataclass(frozen=True)
+class WorldState:
+    """A state of B worlds as tensors, which lie as the device likes it; `positions` and the like are in the user's order.
+
+    Attributes:
+        values: the arrays of a `State` by the order of `Engine.fields`.
+        time: [s], of all worlds.
+        engine: what knows their meaning.
+    """
+
+    values: tuple
+    time: float
+    engine: Engine
+
+    @property
+    def positions(self) -> torch.Tensor:
+        """Points (B, P, 3) [m], in the order of `State.points`."""
+        return self.engine.points(self.values, "x", "q")
+
+    @property
+    def velocities(self) -> torch.Tensor:
+        """Their velocities (B, P, 3) [m/s]."""
+        return self.engine.points(self.values, "v", "v")
+
+    @property
+    def angles(self) -> torch.Tensor:
+        """Angles of edges (B, edges) [rad], zero where there is no twist."""
+        return self.engine.edges(self.values)
+
+    def detach(self) -> "WorldState":
+        """The same without history."""
+        return WorldState(tuple(value.detach() for value in self.values), self.time, self.engine)
+
+
+torch.utils._pytree.register_pytree_node(
+    WorldState,
+    lambda state: (list(state.values), (state.time, state.engine)),
+    lambda values, context: WorldState(tuple(values), *context),
+)
+
+
+class Simulator(torch.nn.Module):
+    """Steps of a model as a differentiable module.
+
+        simulator = Simulator(model, dt=0.01)
+        state = simulator.initial_state(batch=8)
+        state = simulator.step(state, {"rod_bend_twist.stiffness_1": stiffness})
+        loss = ((state.positions - goal) ** 2).sum()
+        loss.backward()
+
+    Args:
+        model: what to step. Worlds of a batch are copies of it: it is built anew with as many as a state has.
+        dt: length of the steps [s].
+        scheme, options: as of `Integrator`. Worlds in which a step fails rest, see `outcomes`; gradients that go through a step that
+            failed, was made in parts or renewed its frames are not numbers, in these worlds alone.
+
+    Parameters are dictionaries from "term.parameter" (see `Model.set_parameter`) to tensors (), (B, 1), (1, E) or (B, E), E the elements
+    that have it. Controls are dictionaries of "forces" (B, P, 3) or (P, 3), "moments" (B, edges), "gravity" (B, 3) or (3,) and
+    "poses" (B, grips, 6), see `Controls`.
+
+    Raises:
+        SceneError: the model has something that no gradient goes through, once one is asked for.
+    """
+
+    def __init__(self, model, dt: float, *, scheme: str = "implicit_euler", **options):
+        super().__init__()
+        validate.check_model("Simulator", model)
+        self.dt = arguments.number("dt", dt, "a time step that is positive and finite [s]", lambda v: v > 0.0)
+        self.model, self.scheme, self.options = model, scheme, options
+        self._engines: dict[int, Engine] = {}
+
+    def engine(self, worlds: int) -> Engine:
+        """What steps so many worlds; made when it is first asked for."""
+        if worlds not in self._engines:
+            model = self.model
+            if worlds != model.worlds:
+                options = {"device": model.device, "precision": model.precision, "allow_rounding": model.allow_rounding}
+                model = self.model.scene.build(worlds=worlds, **options)
+                _copy_parameters(self.model, model)
+            self._engines[worlds] = Engine(model, self.scheme, self.options)
+        return self._engines[worlds]
+
+    def __getstate__(self):
+        return self.__dict__ | {"_engines": {}, "model": _Recipe.of(self.model)}
+
+    def __setstate__(self, state):
+        self.__dict__.update(state)
+        self.model = state["model"].build()
+
+    def __deepcopy__(self, memo):
+        return type(self)(self.model, self.dt, scheme=self.scheme, **self.options)
+
+    def initial_state(self, batch: int | None = None, positions=None, velocities=None) -> WorldState:
+        """The first state of so many worlds: at rest, or elsewhere.
+
+        Args:
+            batch: worlds; by default those of positions or velocities, else of the model.
+            positions, velocities: (P, 3) or (B, P, 3); gradients go through both. Frames stay those of the rest state and are carried
+                along by the first step: no edge may be further than 90 degrees from there.
+
+        Raises:
+            SceneError: shapes do not fit.
+        """
+        given = [v for v in (positions, velocities) if v is not None and v.ndim == 3]
+        worlds = batch or (given[0].shape[0] if given else self.model.worlds)
+        engine = self.engine(worlds)
+        values = [tensor.clone() for tensor in tensors(engine.model.state(), engine.fields)]
+        for what, names in ((positions, ("x", "q")), (velocities, ("v", "v"))):
+            if what is not None:
+                values = engine.put_points(values, *names, what)
+        return WorldState(tuple(values), 0.0, engine)
+
+    def step(self, state: WorldState, parameters: dict | None = None, controls: dict | None = None) -> WorldState:
+        """The state after a step of dt.
+
+        Raises:
+            SceneError: a name or shape does not fit.
+        """
+        return self._step(state, self._full(state.engine, parameters), self._controls(state.engine, controls))
+
+    forward = step
+
+    def rollout(
+        self,
+        state: WorldState,
+        parameters: dict | None = None,
+        controls=None,
+        *,
+        steps: int,
+        save: int = 1,
+        checkpoint_every: int | None = None,
+    ) -> list[WorldState]:
+        """States after every `save` steps of so many.
+
+        Args:
+            controls: of all steps, or a function of the number of the step that gives them.
+            steps: how many.
+            save: of which every so many are returned.
+            checkpoint_every: keep only every so many states for gradients, and step again from there when they are asked for.
+
+        Returns:
+            Trajectory, without the state that it began with.
+        """
+        arguments.count("steps", steps)
+        arguments.count("save", save)
+        engine, result, block = state.engine, [], checkpoint_every or 1
+        full = self._full(engine, parameters)
+
+        def some(first: int, count: int, state: WorldState, full: list) -> list[WorldState]:
+            saved = []
+            for number in range(first, first + count):
+                own = controls(number) if callable(controls) else controls
+                state = self._step(state, full, self._controls(engine, own))
+                if (number + 1) % save == 0:
+                    saved.append(state)
+            return [*saved, state]
+
+        for first in range(0, steps, block):
+            count = min(block, steps - first)
+            if checkpoint_every:
+                found = checkpoint.checkpoint(some, first, count, state, full, use_reentrant=False)
+            else:
+                found = some(first, count, state, full)
+            *saved, state = found
+            result += saved
+        return result
+
+    def outcomes(self, worlds: int | None = None) -> np.ndarray:
+        """What became of the last step of every world of so many; see `Integrator.outcomes`."""
+        return self.engine(worlds or self.model.worlds).integrator.outcomes()
+
+    def parameter(self, name: str, batch: int | None = None) -> torch.Tensor:
+        """The values that the model has of a parameter "term.parameter" (B, E)."""
+        return self.engine(batch or self.model.worlds).value(name)
+
+    def _full(self, engine: Engine, parameters: dict | None) -> list:
+        return [(name, engine.full(name, torch.as_tensor(values))) for name, values in (parameters or {}).items()]
+
+    def _controls(self, engine: Engine, controls: dict | None) -> dict:
+        model, worlds = engine.model, engine.model.worlds
+        real = wp.dtype_to_torch(model.types.real)
+        shapes = {
+            "forces": (model.points_count, 3),
+            "moments": (model.order.edges_count,),
+            "gravity": (3,),
+            "poses": (len(model.grips), 6),
+        }
+        result = {}
+        for name, values in (controls or {}).items():
+            if name not in shapes:
+                raise SceneError(f"controls: there is no {name!r}; there are {', '.join(shapes)}")
+            own, shape = torch.as_tensor(values), shapes[name]
+            if tuple(own.shape) not in (shape, (worlds, *shape)):
+                raise SceneError(f"controls: {name} have shape {tuple(own.shape)}; they are {shape} or {(worlds, *shape)}")
+            if name == "poses" and not model.grips:
+                raise SceneError("controls: poses of no grip; hold something by Grip(...), as in scene.clamp(rod, motion=Grip())")
+            result[name] = own.to(device=str(wp.device_to_torch(model.wp_device)), dtype=real).expand(worlds, *shape)
+        return result
+
+    def _step(self, state: WorldState, full: list, controls: dict) -> WorldState:
+        engine = state.engine
+        call = Call(
+            engines=self.engine,
+            worlds=engine.model.worlds,
+            start=state.time,
+            dt=self.dt,
+            fields=tuple(engine.fields),
+            parameters=tuple(name for name, _ in full),
+            controls=tuple(controls),
+        )
+        values = [value for _, own in full for value in own]
+        found = Step.apply(call, *state.values, *values, *controls.values())
+        return WorldState(tuple(found[: len(engine.fields)]), state.time + self.dt, engine)
+
+
+class _Recipe:
+    """A model that can be built again elsewhere."""
+
+    def __init__(self, model):
+        self.scene = model.scene
+        self.options = {
+            "device": model.device,
+            "precision": model.precision,
+            "worlds": model.worlds,
+            "allow_rounding": model.allow_rounding,
+        }
+
+    of = classmethod(lambda cls, model: cls(model))
+
+    def build(self):
+        """The model."""
+        return self.scene.build(**self.options)
+
+
+def _copy_parameters(source, target) -> None:
+    """Give a model of other worlds the parameters of another one, which has one world or the same in all."""
+    pairs = [(a.parameters, b.parameters) for a, b in zip(source.groups, target.groups, strict=True)]
+    nets = (source.net, target.net) if source.net is not None else ()
+    if nets:
+        pairs += [(a.parameters, b.parameters) for a, b in zip(nets[0].sets, nets[1].sets, strict=True)]
+    for own, other in pairs:
+        for name, values in own.values.items():
+            if values.shape == other[name].shape:
+                other.set(**{name: values.copy()})

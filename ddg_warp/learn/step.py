@@ -1,0 +1,139 @@
+"""A time step as a function that torch differentiates and batches; see `ddg_warp.learn.engine`."""
+
+from dataclasses import dataclass, replace
+
+import torch
+
+
+@dataclass(frozen=True)
+class Call:
+    """What of a step is no tensor: who makes it, when, and what the tensors are.
+
+    Attributes:
+        engines: worlds -> `Engine`; worlds: how many there are.
+        start, dt: time at its start and length [s].
+        fields: tensors of the state.
+        parameters, controls: names of those that follow; of a parameter as many as parts have it.
+    """
+
+    engines: object
+    worlds: int
+    start: float
+    dt: float
+    fields: tuple
+    parameters: tuple
+    controls: tuple
+
+    @property
+    def engine(self):
+        """Of so many worlds."""
+        return self.engines(self.worlds)
+
+    def split(self, tensors):
+        """Tensors of the state, of the parameters, and those of the controls by name."""
+        states, controls = len(self.fields), len(tensors) - len(self.controls)
+        return tensors[:states], tensors[states:controls], dict(zip(self.controls, tensors[controls:], strict=True))
+
+    @property
+    def state_axes(self) -> list[int]:
+        """Axes along which the worlds of the tensors of a state lie."""
+        return [field.axis for field in self.fields]
+
+    @property
+    def axes(self) -> list[int]:
+        """The same of all tensors."""
+        return self.state_axes + self.engine.parameter_axes(self.parameters) + [0] * len(self.controls)
+
+
+class Step(torch.autograd.Function):
+    """step(call, *tensors) -> the tensors of the state after it, and one of each part that tells where there are gradients."""
+
+    @staticmethod
+    def forward(call: Call, *tensors):
+        engine = call.engine
+        with engine.stream():
+            state, parameters, controls = call.split(tensors)
+            engine.write(call.parameters, parameters)
+            return tuple(engine.forward(call.start, call.dt, state, controls))
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        call, *tensors = inputs
+        ctx.call, ctx.results = call, len(output)
+        ctx.save_for_backward(*tensors, *output)
+        rough = [tensor for tensor, field in zip(output, call.fields, strict=False) if not field.smooth]
+        ctx.mark_non_differentiable(*rough, *output[len(call.fields) :])
+
+    @staticmethod
+    def backward(ctx, *given):
+        call, saved = ctx.call, ctx.saved_tensors
+        found = iter(Pull.apply(call, *saved, *given[: len(call.fields)]))
+        count = len(saved) - ctx.results - len(call.fields)
+        by_state = [next(found) if field.smooth else None for field in call.fields]
+        return None, *by_state, *(next(found) for _ in range(count))
+
+    @staticmethod
+    def jvp(ctx, *tangents):
+        raise NotImplementedError("steps have no forward-mode derivatives; take torch.func.grad or backward()")
+
+    @staticmethod
+    def vmap(info, in_dims, call: Call, *tensors):
+        axes = call.axes
+        return _folded(Step, info.batch_size, in_dims, call, tensors, axes, call.state_axes + [0] * call.engine.parts)
+
+
+class Pull(torch.autograd.Function):
+    """pull(call, *tensors, *results, *given) -> derivatives by those tensors of a step that have some.
+
+    Of what went into the step, of what `Step` gave, and of the derivatives by its state; one level only.
+    """
+
+    @staticmethod
+    def forward(call: Call, *tensors):
+        engine, count = call.engine, len(call.fields)
+        parts = engine.parts
+        given, tensors = tensors[-count:], tensors[:-count]
+        output, tensors = tensors[-count - parts :], tensors[: -count - parts]
+        state, parameters, controls = call.split(tensors)
+        flags = output[count:]
+        with engine.stream():
+            engine.write(call.parameters, parameters)
+            found, inputs = engine.backward(call.start, call.dt, state, output[:count], given)
+            by_state = [
+                engine.flagged(values, field, flags)
+                for values, field in zip(found, call.fields, strict=True)
+                if field.smooth
+            ]
+            by_parameters = engine.by_parameters(call.parameters, inputs, flags)
+            by_controls = [engine.by_control(name, controls[name], inputs, flags) for name in call.controls]
+        return *by_state, *by_parameters, *by_controls
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        pass
+
+    @staticmethod
+    def backward(ctx, *given):
+        raise NotImplementedError("steps have first derivatives alone; take differences of gradients for second ones")
+
+    @staticmethod
+    def vmap(info, in_dims, call: Call, *tensors):
+        axes = call.axes
+        smooth = [field.axis for field in call.fields if field.smooth]
+        given = [*axes, *call.state_axes, *[0] * call.engine.parts, *call.state_axes]
+        return _folded(Pull, info.batch_size, in_dims, call, tensors, given, smooth + axes[len(call.fields) :])
+
+
+def _folded(function, batch: int, in_dims, call: Call, tensors, axes: list[int], axes_found: list[int]):
+    """A function of a batch as that of batch x worlds, whose worlds lie along these axes of what it takes and gives."""
+    wide = []
+    for tensor, dim, axis in zip(tensors, in_dims[1:], axes, strict=True):
+        own = tensor.unsqueeze(0).expand(batch, *tensor.shape) if dim is None else tensor.movedim(dim, 0)
+        own = own.movedim(0, axis)
+        wide.append(own.reshape(*own.shape[:axis], -1, *own.shape[axis + 2 :]))
+    found = function.apply(replace(call, worlds=batch * call.worlds), *wide)
+    result = []
+    for tensor, axis in zip(found, axes_found, strict=False):
+        split = tensor.reshape(*tensor.shape[:axis], batch, -1, *tensor.shape[axis + 1 :])
+        result.append(split.movedim(axis, 0))
+    return tuple(result), (0,) * len(result)

@@ -1,0 +1,6 @@
+"""The simulator as a torch module: steps, roll-outs and equilibria as pure functions of tensors, with gradients of all of them."""
+
+from ddg_warp.learn.modules import PositiveParameters, RodParameters
+from ddg_warp.learn.simulator import Simulator, WorldState
+
+__all__ = ["PositiveParameters", "RodParameters", "Simulator", "WorldState"]

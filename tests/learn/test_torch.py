@@ -1,0 +1,243 @@
+"""The simulator as a torch module: gradients of everything that goes in, transforms, batches."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp.errors import SceneError
+from tests.learn.differences import TIGHT
+from tests.learn.test_adjoint import CLOSE, CURVE, DT, SCENES, SOFT, a_scene
+
+torch = pytest.importorskip("torch")
+from ddg_warp.torch import RodParameters, Simulator  # noqa: E402
+
+STIFFNESS = {
+    "twisted": "rod_bend_twist.stiffness_1",
+    "planar": "planar_bend.stiffness",
+    "joined": "rod_bend_twist.stiffness_1",
+    "sheet": "shell_stretch.stiffness",
+}
+
+
+def simulator(name: str, **options) -> Simulator:
+    return Simulator(SCENES[name]().build(device="cpu", precision="float64"), DT, **TIGHT, **options)
+
+
+def gripped() -> Simulator:
+    """A rod held at both ends, of which one is moved and turned."""
+    scene = a_scene()
+    rod = scene.add_rod(CURVE, section=ddg.Ellipse(0.004, 0.003), material=SOFT)
+    scene.clamp(rod, motion=ddg.Grip(pivot=(0.1, 0.0, 0.0)))
+    scene.clamp(rod, edges=[-1])
+    return Simulator(scene.build(device="cpu", precision="float64"), DT, **TIGHT)
+
+
+def check(loss, values: dict, sizes: dict) -> None:
+    """The gradient of loss(**values) along random directions against central differences of fourth order."""
+    values = {name: value.clone().requires_grad_() for name, value in values.items()}
+    gradients = torch.autograd.grad(loss(**values), values.values())
+    generator = torch.Generator().manual_seed(3)
+    for (name, value), gradient in zip(values.items(), gradients, strict=True):
+        direction = torch.rand(value.shape, generator=generator, dtype=value.dtype)
+        direction = direction * torch.where(gradient < 0.0, -1.0, 1.0) * (gradient != 0.0)
+        found, step = float((gradient * direction).sum()), sizes[name]
+        with torch.no_grad():
+            at = {x: float(loss(**(values | {name: value + x * step * direction}))) for x in (2.0, 1.0, -1.0, -2.0)}
+        near, far = ((at[x] - at[-x]) / (2.0 * x * step) for x in (1.0, 2.0))
+        assert found == pytest.approx((4.0 * near - far) / 3.0, rel=CLOSE), name
+
+
+@pytest.mark.parametrize("name", STIFFNESS)
+def test_everything_that_goes_in_has_a_gradient(name):
+    own, term = simulator(name), STIFFNESS[name]
+    first = torch.as_tensor(own.model.state().points())
+    flat = torch.tensor([1.0, 0.0, 1.0] if name == "planar" else [1.0, 1.0, 1.0])
+    generator = torch.Generator().manual_seed(1)
+    force = 1e-3 * torch.randn((2, len(first), 3), generator=generator, dtype=torch.float64) * flat
+    weight = torch.randn((len(first), 3), generator=generator, dtype=torch.float64)
+
+    def loss(positions, velocities, stiffness, forces, gravity):
+        state = own.initial_state(positions=positions, velocities=velocities)
+        for state in own.rollout(state, {term: stiffness}, {"forces": forces, "gravity": gravity}, steps=3):
+            pass
+        return (weight * state.positions).sum() + 0.1 * (state.velocities**2).sum()
+
+    values = {
+        "positions": first.expand(2, -1, -1),
+        "velocities": torch.zeros((2, len(first), 3), dtype=torch.float64),
+        "stiffness": own.parameter(term, 2),
+        "forces": force,
+        "gravity": torch.tensor([[0.0, 0.0, -9.81], [1.0, 0.0, -5.0]], dtype=torch.float64),
+    }
+    sizes = {"positions": 1e-7, "velocities": 1e-5, "forces": 1e-5, "gravity": 1e-2}
+    check(loss, values, sizes | {"stiffness": 1e-3 * float(values["stiffness"].max())})
+
+
+def test_poses_and_moments_have_gradients():
+    own = gripped()
+
+    def loss(poses, moments):
+        state = own.initial_state(2)
+        for number in range(3):
+            state = own.step(state, None, {"poses": poses * (number + 1), "moments": moments})
+        return (state.positions**2).sum() + 0.1 * (state.angles[:, 1:-1]).sum() + 0.01 * (state.velocities**2).sum()
+
+    poses = torch.tensor([[[0.001, 0.002, -0.001, 0.02, 0.01, 0.03]], [[0.0, 0.001, 0.0, 0.05, -0.04, 0.01]]])
+    moments = 1e-6 * torch.ones((2, len(CURVE) - 1))
+    check(loss, {"poses": poses.double(), "moments": moments.double()}, {"poses": 1e-6, "moments": 1e-8})
+
+
+@pytest.mark.parametrize("shape", [(), (2, 1), (1, 9), (2, 9)])
+def test_gradients_have_the_shape_of_what_was_given(shape):
+    own = simulator("twisted")
+    values = own.parameter("rod_stretch.stiffness", 2).mean() * torch.ones(shape, dtype=torch.float64)
+    values.requires_grad_()
+    state = own.step(own.initial_state(2), {"rod_stretch.stiffness": values})
+    (gradient,) = torch.autograd.grad((state.positions**2).sum(), values)
+    whole = own.parameter("rod_stretch.stiffness", 2).mean().expand(2, 9).clone().requires_grad_()
+    again = own.step(own.initial_state(2), {"rod_stretch.stiffness": whole})
+    (wide,) = torch.autograd.grad((again.positions**2).sum(), whole)
+    assert gradient.shape == shape
+    torch.testing.assert_close(gradient, wide.sum_to_size(shape), rtol=1e-10, atol=0.0)
+
+
+def test_elements_are_counted_rod_by_rod():
+    """The stretch of one edge of the second rod moves that rod alone."""
+    own = simulator("twisted")
+    rest = torch.zeros((1, 9), dtype=torch.float64, requires_grad=True)
+    state = own.step(own.initial_state(), {"rod_stretch.rest": rest})
+    (gradient,) = torch.autograd.grad((state.positions[0, len(CURVE) :] ** 2).sum(), rest)
+    assert (gradient[0, :5] == 0.0).all()
+    assert (gradient[0, 5:] != 0.0).all()
+
+
+@pytest.mark.parametrize("name", ["twisted", "joined"])
+def test_transforms(name):
+    """vmap makes worlds of a batch; grad and vmap of grad give what a loop of backward gives."""
+    own, term = simulator(name), STIFFNESS[name]
+
+    def loss(stiffness, velocities):
+        state = own.initial_state(1, velocities=velocities)
+        for state in own.rollout(state, {term: stiffness}, steps=2):
+            pass
+        return (state.positions**2).sum() + (state.velocities**2).sum()
+
+    stiffness = own.parameter(term)[0, 0] * torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64)
+    points = own.model.points_count
+    velocities = torch.zeros((3, points, 3), dtype=torch.float64)
+    one = [torch.func.grad(loss)(k, v) for k, v in zip(stiffness, velocities, strict=True)]
+    many = torch.func.vmap(torch.func.grad(loss))(stiffness, velocities)
+    torch.testing.assert_close(many, torch.stack(one), rtol=1e-9, atol=0.0)
+    values = torch.func.vmap(loss)(stiffness, velocities)
+    torch.testing.assert_close(values, torch.stack([loss(k, v) for k, v in zip(stiffness, velocities, strict=True)]))
+
+
+def test_checkpoints_change_nothing():
+    own = simulator("twisted")
+    found = []
+    for every in (None, 1, 3):
+        stiffness = torch.tensor(1.5e-4, dtype=torch.float64, requires_grad=True)
+        states = own.rollout(
+            own.initial_state(), {STIFFNESS["twisted"]: stiffness}, steps=7, save=2, checkpoint_every=every
+        )
+        assert len(states) == 3
+        (gradient,) = torch.autograd.grad(sum((state.positions**2).sum() for state in states), stiffness)
+        found.append(float(gradient))
+    assert found[0] == found[1] == found[2]
+
+
+def test_steps_are_those_of_the_integrator():
+    own, model = simulator("joined"), SCENES["joined"]().build(device="cpu", precision="float64")
+    integrator, state = ddg.Integrator(model, **TIGHT), model.state()
+    tensors = own.initial_state()
+    for _ in range(4):
+        state, tensors = integrator.step(state, DT), own.step(tensors)
+    np.testing.assert_array_equal(tensors.positions[0].numpy(), state.points())
+    np.testing.assert_array_equal(tensors.velocities[0].numpy(), state.velocities())
+    np.testing.assert_array_equal(tensors.angles[0].numpy(), state.angles())
+
+
+def test_a_world_without_a_gradient_says_so_alone():
+    """One of two worlds is thrown so fast that its step is made in parts."""
+    own = Simulator(SCENES["twisted"]().build(device="cpu", precision="float64"), 0.02, max_iterations=4)
+    points = own.model.points_count
+    speed = torch.zeros((2, points, 3), dtype=torch.float64)
+    speed[1, 2:] = torch.randn((points - 2, 3), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    speed.requires_grad_()
+    state = own.step(own.initial_state(velocities=speed))
+    (gradient,) = torch.autograd.grad((state.positions**2).sum(), speed)
+    assert torch.isfinite(gradient[0]).all()
+    assert torch.isnan(gradient[1]).any()
+    assert torch.isfinite(state.positions).all()
+
+
+def test_twice_and_forward_mode_are_refused():
+    own = simulator("planar")
+    k = torch.tensor(1e-3, dtype=torch.float64, requires_grad=True)
+    state = own.step(own.initial_state(), {STIFFNESS["planar"]: k})
+    (gradient,) = torch.autograd.grad((state.positions**2).sum(), k, create_graph=True)
+    with pytest.raises(NotImplementedError, match="first derivatives alone"):
+        gradient.backward()
+    with pytest.raises(NotImplementedError, match="no forward-mode derivatives"):
+        torch.func.jvp(
+            lambda k: own.step(own.initial_state(), {STIFFNESS["planar"]: k}).positions, (k.detach(),), (k.detach(),)
+        )
+
+
+def test_copies_and_pickles():
+    own = simulator("twisted")
+    factors = RodParameters(own)
+    other = pickle.loads(pickle.dumps(own))
+    for each in (copy.deepcopy(own), other):
+        state = each.step(each.initial_state(), copy.deepcopy(factors)())
+        torch.testing.assert_close(state.positions, own.step(own.initial_state(), factors()).positions, rtol=0.0, atol=0.0)
+    again = RodParameters(own)
+    with torch.no_grad():
+        factors.logarithms["bending"] += 0.3
+    again.load_state_dict(factors.state_dict())
+    torch.testing.assert_close(again()["rod_bend_twist.stiffness_1"], factors()["rod_bend_twist.stiffness_1"])
+
+
+def test_a_stiffness_is_found_again():
+    """Three stiffnesses of a rod from its motion, by gradients of their logarithms."""
+    own = simulator("twisted")
+    truth = {"bending": 0.7, "twisting": 1.4}
+    factors = RodParameters(own, names=tuple(truth))
+    with torch.no_grad():
+        for name, value in truth.items():
+            factors.logarithms[name].fill_(np.log(value))
+    recorded = [s.positions.detach() for s in own.rollout(own.initial_state(), factors(), steps=10)]
+    with torch.no_grad():
+        for name in truth:
+            factors.logarithms[name].zero_()
+    optimiser = torch.optim.LBFGS(factors.parameters(), lr=1.0, max_iter=60, tolerance_grad=1e-14, tolerance_change=1e-16, line_search_fn="strong_wolfe")
+
+    def closure():
+        optimiser.zero_grad()
+        states = own.rollout(own.initial_state(), factors(), steps=10)
+        loss = 1e10 * sum(((s.positions - r) ** 2).sum() for s, r in zip(states, recorded, strict=True))
+        loss.backward()
+        return loss
+
+    optimiser.step(closure)
+    for name, value in truth.items():
+        assert float(factors.logarithms[name].exp()) == pytest.approx(value, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "controls", "message"),
+    [
+        ({"rod_bend.stiffness": 1.0}, None, "nothing has 'rod_bend.stiffness'; this model has rod_bend_twist"),
+        ({"rod_stretch.stiffness": torch.ones(4)}, None, r"rod_stretch.stiffness has shape \(4,\); give \(\), \(2, 1\)"),
+        (None, {"force": torch.zeros(3)}, "there is no 'force'; there are forces"),
+        (None, {"gravity": torch.zeros(4)}, r"gravity have shape \(4,\); they are \(3,\) or \(2, 3\)"),
+        (None, {"poses": torch.zeros((0, 6))}, "poses of no grip"),
+    ],
+)
+def test_what_does_not_fit_is_refused(parameters, controls, message):
+    own = simulator("twisted")
+    with pytest.raises(SceneError, match=message):
+        own.step(own.initial_state(2), parameters, controls)
