@@ -77,6 +77,20 @@ def test_a_world_that_fails_rests_and_starts_anew(device, build, scheme):
     assert integrator.outcomes().tolist() == ["converged"] * 3
 
 
+@pytest.mark.parametrize("build", [some_rods, joined], ids=lambda build: build.__name__)
+def test_a_state_of_one_s_own_starts_all_worlds(device, build):
+    """What failed before does not stick to a state that the integrator has not made: the step is a function of what it is given."""
+    model = model_of(build, ddg.Grip(PIVOT), device, worlds=3)
+    state, integrator = run(model, 2, controls=controls, failures="flag")
+    kept = state.copy()
+    state = integrator.step(state, DT, controls(3, whip=1))
+    assert integrator.outcomes()[1] == "non_finite"
+    again = integrator.step(kept, DT, controls(3)).snapshot()
+    assert integrator.outcomes().tolist() == ["converged"] * 3
+    for name, values in ddg.Integrator(model).step(kept, DT, controls(3)).snapshot().items():
+        np.testing.assert_array_equal(again[name], values, err_msg=name)
+
+
 @SCHEMES
 def test_energy_accounts_start_anew_with_their_worlds(device, scheme):
     """The account of a world that is reset is that of a fresh one; those of others go on."""

@@ -19,7 +19,8 @@ class Controls:
     Attributes:
         poses: of every `Grip` at the end of the step (grips, 6) or (worlds, grips, 6): translation [m] and rotation vector [rad],
             relative to rest, in the order of `model.grips`. Grips rest where they are without.
-        forces: on points (P, 3) or (worlds, P, 3) [N], in the order of `State.points`; of a shell of revolution on the whole ring.
+        forces: on points (P, 3) or (worlds, P, 3) [N], in the order of `State.points`; on rows of one node, which joined
+            rods have, their sum; of a shell of revolution on the whole ring.
         moments: about the tangents of edges (edges,) or (worlds, edges) [N m], in the order of `State.angles`.
         gravity: (3,) or (worlds, 3) [m/s^2], instead of the scene's.
     """

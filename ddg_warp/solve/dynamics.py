@@ -63,8 +63,8 @@ class Integrator:
             energy out of what steps do not resolve and is not watched. See `kernels.energy`.
         check_every: steps between readings of the outcomes; by default 1 on the CPU and 32 on CUDA.
         failures: what becomes of a step that is given up: "raise" stops the run, as described; by "flag" nothing is read or raised.
-            The world it is in then rests as it was before that step, all of it, until `reset` starts it anew; the others go on, and
-            `outcomes` tells which are which.
+            The world it is in then rests as it was before that step, all of it, until `reset` starts it anew, or the integrator is
+            given a state that it has not made itself; the others go on, and `outcomes` tells which are which.
 
     Raises:
         SceneError: a free node has neither mass nor drag along and across its rod, the scheme does not exist, or implicit Euler is
@@ -303,6 +303,8 @@ class Integrator:
         for part in self._parts:
             if part.energy:
                 part.energy.account.zero_()
+        if self.failures == "flag":  # raised, a failure must stay until it is read
+            self._worlds.forget(self._parts)
         return 0
 
     def _vacate(self, index: int) -> None:

@@ -122,6 +122,13 @@ class Worlds:
                 kernel = forget_kernel(account.dtype)
                 self._launch(kernel, account.shape, [mask, part.islands_each], [account])
 
+    def forget(self, parts: list) -> None:
+        """Have all worlds go on, whatever became of them."""
+        self.resting.zero_()
+        for part in parts:
+            part.islands.status.fill_(outcome.CONVERGED)
+            part.islands.reason.zero_()
+
     def load_modules(self) -> None:
         """Compile and load what it launches, once."""
         if self._loaded:
