@@ -35,18 +35,20 @@ def assign(array: wp.array, values: np.ndarray) -> None:
 
 
 def copy(array: wp.array, source: wp.array) -> None:
-    """Copy a device array into another one that is laid out alike; can be captured."""
-    wp.copy(_lying(array), _lying(source))  # which takes a fraction of the time
+    """Copy a device array into another one; where both are laid out alike, that can be captured."""
+    if not array.is_contiguous:  # copied as they lie in memory, which takes a fraction of the time
+        array, source = _turned(array), _turned(source)
+    wp.copy(array, source)
 
 
 def clear(array: wp.array) -> None:
     """Zero a device array; can be captured."""
-    _lying(array).zero_()
+    (array if array.is_contiguous else _turned(array)).zero_()
 
 
-def _lying(array: wp.array) -> wp.array:
-    """An array of this kind as it lies in memory, contiguous."""
-    return array if array.is_contiguous else array.transpose(tuple(reversed(range(array.ndim))))
+def _turned(array: wp.array) -> wp.array:
+    """An array of this kind with its dimensions in reverse, as it lies in the CPU's memory."""
+    return array.transpose(tuple(reversed(range(array.ndim))))
 
 
 def download(array: wp.array) -> np.ndarray:

@@ -12,10 +12,11 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.learn.adjoint import Adjoint
+from ddg_warp.learn.adjoint import Adjoint, EquilibriumAdjoint
 from ddg_warp.learn.chains import Kept
 from ddg_warp.learn.net import NetKept
 from ddg_warp.learn.poses import Poses
+from ddg_warp.solve import statics
 from ddg_warp.solve.controls import LOADS
 from ddg_warp.solve.dynamics import Integrator
 from ddg_warp.solve.graphs import Graphs
@@ -73,13 +74,13 @@ class Engine:
     def __init__(self, model, scheme: str, options: dict):
         self.model = model
         self._midpoint = scheme == "implicit_midpoint"
-        self.integrator = Integrator(model, scheme, failures="flag", check_every=FOREVER, **options)
-        self.adjoint = None
+        self.integrator = Integrator(model, scheme, failures="flag", check_every=FOREVER, energy_bound=None, **options)
+        self.adjoint = self._equilibria = None
         self.fields = fields(model)
         self.before, self.after = (buffer.own for buffer in self.integrator._buffers)
         self.source, self.target = (tensors(state, self.fields) for state in (self.before, self.after))
         self._tables, self._places_found = {}, {}
-        self._written = {}
+        self._written, self._held = {}, {}
         self._graphs = None
 
     # parameters
@@ -150,7 +151,7 @@ class Engine:
                 f"parameters: {name} has shape {shape}; give (), ({worlds}, 1) for each world, (1, {count}) for each element, or "
                 f"({worlds}, {count})"
             )
-        wide = wide.to(real)
+        wide = wide.to(device=str(wp.device_to_torch(self.model.wp_device)), dtype=real)
         result = []
         for _, rows, chain in found:
             own = wide[:, rows.reshape(-1)]
@@ -181,20 +182,26 @@ class Engine:
         return (rows.shape[0], worlds * rows.shape[1]) if chain else (worlds, len(rows))
 
     def write(self, names: tuple, values: list[torch.Tensor]) -> None:
-        """Put full parameters in place; what is there already stays."""
-        values = iter(values)
-        for name in names:
-            own = name.rpartition(".")[2]
-            for table, rows, chain in self.tables(name)[1]:
-                given, key, shape = next(values), name if chain else own, self._shape(rows, chain)
-                if table[key].shape != shape:
-                    table.set(**{key: np.broadcast_to(table[key], shape)})
-                    self.model.version += 1
-                    self._written.clear()
-                last = self._written.get((id(table), key))
-                if last is None or last[0] is not given or last[1] != given._version:
-                    self._view(table, key, shape).copy_(given)
-                    self._written[id(table), key] = given, given._version
+        """Put full parameters in place; what is there already stays, and others are as the model has them."""
+        places = [
+            (table, name if chain else name.rpartition(".")[2], self._shape(rows, chain))
+            for name in names
+            for table, rows, chain in self.tables(name)[1]
+        ]
+        for table, key, shape in places:  # first, as this makes their memory anew
+            if table[key].shape != shape:
+                table.set(**{key: np.broadcast_to(table[key], shape)})
+                self.model.version += 1
+                self._written.clear()
+        now = {(id(table), key) for table, key, _ in places}
+        for place in [place for place in self._written if place not in now]:  # back to what the model has
+            table, (_, key) = self._written.pop(place)[0], place
+            self._view(table, key, table[key].shape).copy_(torch.tensor(table[key]))
+        for (table, key, shape), given in zip(places, values, strict=True):
+            if self._written.get((id(table), key)) != (table, id(given), given._version):
+                self._view(table, key, shape).copy_(given)
+                self._written[id(table), key] = table, id(given), given._version
+                self._held[id(table), key] = given  # so that nothing else gets its id
 
     def _view(self, table, key: str, shape: tuple) -> torch.Tensor:
         row = list(table.values).index(key)
@@ -207,6 +214,7 @@ class Engine:
         """The state after a step, its tensors, and of every part what tells whether it has a gradient (islands,)."""
         integrator = self.integrator
         self.fill(self.source, state)
+        integrator.forget()
         integrator._prepare(dt, self.before)
         self._give(controls)
         integrator.advance(0, start, dt)
@@ -321,6 +329,29 @@ class Engine:
             q.view(net.worlds, -1, 3)[:, -spins:] = rates * dt
         return NetKept(before, replace(before, q=solved, data=after.data), None)
 
+    # equilibria
+
+    def balance(self, state, options: dict) -> list[torch.Tensor]:
+        """The equilibrium from the tensors of a state, and one of each part, as of `forward`."""
+        start = self.model.empty_state()
+        self.fill(tensors(start, self.fields), state)
+        found = statics.solve(self.model, start, **options)
+        ones = [
+            torch.ones(len(part.islands), dtype=state[0].dtype, device=state[0].device)
+            for part in self.integrator._parts
+        ]
+        return [tensor.clone() for tensor in tensors(found, self.fields)] + ones
+
+    def balance_backward(self, end: float, state, given) -> list:
+        """Derivatives by what an equilibrium at the load parameter `end` reads, part by part."""
+        if self._equilibria is None:
+            self._equilibria = EquilibriumAdjoint(self.model)
+        at, by = self.model.empty_state(), self.model.empty_state()
+        self.fill(tensors(at, self.fields), state)
+        self.fill(tensors(by, self.fields), given)
+        at.time = end
+        return self._equilibria.pull(at, by)
+
     # what `ddg_warp.learn.step` asks
 
     def stream(self):
@@ -385,7 +416,9 @@ class Engine:
             w = (wp.to_torch(found.load, requires_grad=False) * flags[i]).reshape(-1, group.nodes, worlds, group.rods)
             if name == "forces":
                 k, column, rows = self._places(("points", i), lambda group=group: model.order.places(group))
-                result[:, rows[:, None], torch.tensor(group.host.axes)] = w[: group.kind.dim, k, :, column].permute(2, 0, 1)
+                result[:, rows[:, None], torch.tensor(group.host.axes)] = w[: group.kind.dim, k, :, column].permute(
+                    2, 0, 1
+                )
             elif group.kind.twist:
                 k, column, rows = self._places(("edges", i), lambda group=group: model.order.edge_places(group))
                 result[:, rows] = w[group.kind.dim, k, :, column].T
@@ -428,7 +461,9 @@ class Engine:
             k, column, rows = self._places(("points", i), lambda group=group: model.order.places(group))
             found = values[self._of(f"{i}/{own}")].reshape(group.nodes, worlds, group.rods, -1)[k, :, column]
             axes = torch.as_tensor(list(group.host.axes), device=found.device)
-            result = result.index_put((torch.arange(worlds, device=found.device)[:, None, None], rows[:, None], axes), found.movedim(1, 0))
+            result = result.index_put(
+                (torch.arange(worlds, device=found.device)[:, None, None], rows[:, None], axes), found.movedim(1, 0)
+            )
         if model.net is not None:
             rows, blocks_of = self._places(("points", "net"), lambda: model.order.net_rows)
             found = values[self._of(f"net/{blocks}")].reshape(worlds, -1, 3)[:, blocks_of]

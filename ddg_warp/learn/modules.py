@@ -36,7 +36,9 @@ class RodParameters(torch.nn.Module):
         SceneError: the model has no rods, or none with such a stiffness.
     """
 
-    def __init__(self, simulator, batch: int | None = None, names: tuple[str, ...] = ("stretching", "bending", "twisting")):
+    def __init__(
+        self, simulator, batch: int | None = None, names: tuple[str, ...] = ("stretching", "bending", "twisting")
+    ):
         super().__init__()
         found = _stiffnesses(simulator.model)
         for name in names:
@@ -61,7 +63,9 @@ class RodParameters(torch.nn.Module):
 def _stiffnesses(model) -> dict[str, list[str]]:
     """Parameters of a model's rods by what they resist."""
     terms = [term for group in model.groups for term in group.kind.terms]
-    terms += [part.term for part in (model.net.sets if model.net is not None else ()) if part.term.name.startswith("rod")]
+    terms += [
+        part.term for part in (model.net.sets if model.net is not None else ()) if part.term.name.startswith("rod")
+    ]
     found: dict[str, list[str]] = {}
     for term in dict.fromkeys(terms):
         for own, strain in zip(term.stiffness, term.measure.strains, strict=False):

@@ -10,7 +10,7 @@ from torch.utils import checkpoint
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 from ddg_warp.learn.engine import Engine, tensors
-from ddg_warp.learn.step import Call, Step
+from ddg_warp.learn.step import Balance, Call, Step
 from ddg_warp.model import validate
 
 CONTROLS = {"forces": "points", "moments": "edges", "gravity": None, "poses": "grips"}
@@ -72,8 +72,8 @@ class Simulator(torch.nn.Module):
         scheme, options: as of `Integrator`. Worlds in which a step fails rest, see `outcomes`; gradients that go through a step that
             failed, was made in parts or renewed its frames are not numbers, in these worlds alone.
 
-    Parameters are dictionaries from "term.parameter" (see `Model.set_parameter`) to tensors (), (B, 1), (1, E) or (B, E), E the elements
-    that have it. Controls are dictionaries of "forces" (B, P, 3) or (P, 3), "moments" (B, edges), "gravity" (B, 3) or (3,) and
+    Parameters are dictionaries from "term.parameter" (see `Model.set_parameter`) to tensors (), (B, 1), (1, E) or (B, E), E the
+    elements that have it. Controls are dictionaries of "forces" (B, P, 3) or (P, 3), "moments" (B, edges), "gravity" (B, 3) or (3,) and
     "poses" (B, grips, 6), see `Controls`.
 
     Raises:
@@ -183,6 +183,27 @@ class Simulator(torch.nn.Module):
             result += saved
         return result
 
+    def equilibrium(
+        self, parameters: dict | None = None, *, state: WorldState | None = None, batch: int | None = None, **options
+    ) -> WorldState:
+        """The equilibrium of every world, with gradients by parameters (by state and controls there are none).
+
+        Args:
+            parameters: as of `step`.
+            state: where the search begins; by default the first state of so many worlds (`batch`).
+            options: as of `ddg_warp.statics.solve`.
+
+        Raises:
+            SolverError: there is none, in one of the worlds.
+        """
+        state = state or self.initial_state(batch)
+        engine, end = state.engine, float(options.get("end", 1.0))
+        full = self._full(engine, parameters)
+        call = self._call(engine, end, full, {})
+        values = [value for _, own in full for value in own]
+        found = Balance.apply(call, tuple(options.items()), *(value.detach() for value in state.values), *values)
+        return WorldState(tuple(found[: len(engine.fields)]), end, engine)
+
     def outcomes(self, worlds: int | None = None) -> np.ndarray:
         """What became of the last step of every world of so many; see `Integrator.outcomes`."""
         return self.engine(worlds or self.model.worlds).integrator.outcomes()
@@ -192,7 +213,13 @@ class Simulator(torch.nn.Module):
         return self.engine(batch or self.model.worlds).value(name)
 
     def _full(self, engine: Engine, parameters: dict | None) -> list:
-        return [(name, engine.full(name, torch.as_tensor(values))) for name, values in (parameters or {}).items()]
+        return [(name, engine.full(name, self._tensor(values))) for name, values in (parameters or {}).items()]
+
+    def _tensor(self, values) -> torch.Tensor:
+        """Numbers as a tensor, in the precision of states where they have none of their own."""
+        if isinstance(values, torch.Tensor):
+            return values
+        return torch.as_tensor(values, dtype=wp.dtype_to_torch(self.model.types.real))
 
     def _controls(self, engine: Engine, controls: dict | None) -> dict:
         model, worlds = engine.model, engine.model.worlds
@@ -207,28 +234,35 @@ class Simulator(torch.nn.Module):
         for name, values in (controls or {}).items():
             if name not in shapes:
                 raise SceneError(f"controls: there is no {name!r}; there are {', '.join(shapes)}")
-            own, shape = torch.as_tensor(values), shapes[name]
+            own, shape = self._tensor(values), shapes[name]
             if tuple(own.shape) not in (shape, (worlds, *shape)):
-                raise SceneError(f"controls: {name} have shape {tuple(own.shape)}; they are {shape} or {(worlds, *shape)}")
+                raise SceneError(
+                    f"controls: {name} have shape {tuple(own.shape)}; they are {shape} or {(worlds, *shape)}"
+                )
             if name == "poses" and not model.grips:
-                raise SceneError("controls: poses of no grip; hold something by Grip(...), as in scene.clamp(rod, motion=Grip())")
+                raise SceneError(
+                    "controls: poses of no grip; hold something by Grip(...), as in scene.clamp(rod, motion=Grip())"
+                )
             result[name] = own.to(device=str(wp.device_to_torch(model.wp_device)), dtype=real).expand(worlds, *shape)
         return result
 
     def _step(self, state: WorldState, full: list, controls: dict) -> WorldState:
         engine = state.engine
-        call = Call(
+        call = self._call(engine, state.time, full, controls)
+        values = [value for _, own in full for value in own]
+        found = Step.apply(call, *state.values, *values, *controls.values())
+        return WorldState(tuple(found[: len(engine.fields)]), state.time + self.dt, engine)
+
+    def _call(self, engine: Engine, start: float, full: list, controls: dict) -> Call:
+        return Call(
             engines=self.engine,
             worlds=engine.model.worlds,
-            start=state.time,
+            start=start,
             dt=self.dt,
             fields=tuple(engine.fields),
             parameters=tuple(name for name, _ in full),
             controls=tuple(controls),
         )
-        values = [value for _, own in full for value in own]
-        found = Step.apply(call, *state.values, *values, *controls.values())
-        return WorldState(tuple(found[: len(engine.fields)]), state.time + self.dt, engine)
 
 
 class _Recipe:

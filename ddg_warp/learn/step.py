@@ -82,6 +82,42 @@ class Step(torch.autograd.Function):
         return _folded(Step, info.batch_size, in_dims, call, tensors, axes, call.state_axes + [0] * call.engine.parts)
 
 
+class Balance(torch.autograd.Function):
+    """balance(call, options, *tensors) -> the tensors of the equilibrium from a state, with gradients by parameters; see `Step`.
+
+    Where it starts from has no gradient: an equilibrium does not depend on that.
+    """
+
+    @staticmethod
+    def forward(call: Call, options: tuple, *tensors):
+        engine = call.engine
+        state, parameters, _ = call.split(tensors)
+        with engine.stream():
+            engine.write(call.parameters, parameters)
+            return tuple(engine.balance(state, dict(options)))
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        call, _, *tensors = inputs
+        ctx.call, ctx.results = call, len(output)
+        ctx.save_for_backward(*tensors, *output)
+        rough = [tensor for tensor, field in zip(output, call.fields, strict=False) if not field.smooth]
+        ctx.mark_non_differentiable(*rough, *output[len(call.fields) :])
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, *given):
+        call, saved = ctx.call, ctx.saved_tensors
+        engine, count = call.engine, len(call.fields)
+        tensors, output = saved[: -ctx.results], saved[-ctx.results :]
+        _, parameters, _ = call.split(tensors)
+        with engine.stream():
+            engine.write(call.parameters, parameters)
+            inputs = engine.balance_backward(call.start, output[:count], given[:count])
+            found = engine.by_parameters(call.parameters, inputs, output[count:])
+        return None, None, *([None] * count), *found
+
+
 class Pull(torch.autograd.Function):
     """pull(call, *tensors, *results, *given) -> derivatives by those tensors of a step that have some.
 

@@ -300,12 +300,16 @@ class Integrator:
                 return i
         self._vacate(0)
         self._buffers[0].state.assign(state)
+        self.forget()
+        return 0
+
+    def forget(self) -> None:
+        """Of a state that comes from elsewhere nothing is known: accounts of energy start anew, and worlds that rest."""
         for part in self._parts:
             if part.energy:
                 part.energy.account.zero_()
         if self.failures == "flag":  # raised, a failure must stay until it is read
             self._worlds.forget(self._parts)
-        return 0
 
     def _vacate(self, index: int) -> None:
         """Make sure that nobody holds the state in a buffer."""

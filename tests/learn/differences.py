@@ -5,8 +5,14 @@ import numpy as np
 import ddg_warp as ddg
 from ddg_warp import arrays
 
+DEVICE = "cpu"  # what models of these tests are built for; see `conftest`
 CHANGE = 1e-5  # of the loss, by a step of differences
 TIGHT = {"rtol": 1e-13}
+
+
+def built(scene):
+    """A model in float64."""
+    return scene.build(device=DEVICE, precision="float64")
 
 
 def entries(state) -> dict[str, object]:

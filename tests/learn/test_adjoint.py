@@ -8,7 +8,7 @@ from ddg_warp import arrays
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.geometry import meshes
 from ddg_warp.learn.adjoint import Adjoint
-from tests.learn.differences import TIGHT, Difference, along, cotangent, directions, entries, lively
+from tests.learn.differences import TIGHT, Difference, along, built, cotangent, directions, entries, lively
 
 DT = 0.01
 CLOSE = 1e-6  # relative error of a gradient, as asked
@@ -147,7 +147,7 @@ def close(found: float, wanted: float, scale: float = 0.0) -> bool:
 
 
 def differentiated(name: str, scheme: str, steps: int):
-    model = SCENES[name]().build(device="cpu", precision="float64")
+    model = built(SCENES[name]())
     state = lively(model, scheme=scheme)
     weights = directions(model, state, 5)
 
@@ -241,7 +241,7 @@ def test_gradients_repeat_bit_by_bit():
 
 
 def test_a_step_in_parts_is_refused():
-    model = twisted().build(device="cpu", precision="float64")
+    model = built(twisted())
     integrator = ddg.Integrator(model, max_iterations=3)
     adjoint, state = Adjoint(integrator), lively(model, speed=1.0)
     after, tape = adjoint.step(state, 0.02)
@@ -252,7 +252,7 @@ def test_a_step_in_parts_is_refused():
 
 @pytest.mark.parametrize("scheme", ["implicit_midpoint"])
 def test_what_has_no_gradient_says_so(scheme):
-    model = twisted().build(device="cpu")
+    model = built(twisted())
     with pytest.raises(SceneError, match=r"rod \d: no gradient goes through the midpoint rule with twist"):
         Adjoint(ddg.Integrator(model, scheme=scheme))
 

@@ -6,7 +6,7 @@ import pytest
 from ddg_warp import arrays, statics
 from ddg_warp.errors import SolverError
 from ddg_warp.learn.adjoint import EquilibriumAdjoint
-from tests.learn.differences import Difference, along, cotangent, directions, product
+from tests.learn.differences import Difference, along, built, cotangent, directions, product
 from tests.learn.test_adjoint import SCENES, by_parameters, close, shared, tables
 
 RTOL = 1e-13
@@ -39,7 +39,7 @@ def position_weights(model, state) -> dict:
 
 
 def solved(name: str):
-    model = CASES[name]().build(device="cpu", precision="float64")
+    model = built(CASES[name]())
     state = statics.solve(model, rtol=RTOL)
     weights = position_weights(model, state)
     inputs = EquilibriumAdjoint(model).pull(state, cotangent(model, weights))
@@ -87,7 +87,7 @@ def test_an_equilibrium_by_its_loads(name):
 
 def test_a_mechanism_has_no_gradient():
     """A joined rod that is not held can spin about its hinge: angles of its edges have no gradient, positions do."""
-    model = SCENES["hinged"]().build(device="cpu", precision="float64")
+    model = built(SCENES["hinged"]())
     state = statics.solve(model)
     weights = directions(model, state, 5)
     with pytest.raises(SolverError, match=r"no gradient goes through the solution: edge \d of rod \d can move without"):

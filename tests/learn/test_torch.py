@@ -8,7 +8,7 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.errors import SceneError
-from tests.learn.differences import TIGHT
+from tests.learn.differences import TIGHT, built
 from tests.learn.test_adjoint import CLOSE, CURVE, DT, SCENES, SOFT, a_scene
 
 torch = pytest.importorskip("torch")
@@ -23,7 +23,7 @@ STIFFNESS = {
 
 
 def simulator(name: str, **options) -> Simulator:
-    return Simulator(SCENES[name]().build(device="cpu", precision="float64"), DT, **TIGHT, **options)
+    return Simulator(built(SCENES[name]()), DT, **TIGHT, **options)
 
 
 def gripped() -> Simulator:
@@ -32,16 +32,16 @@ def gripped() -> Simulator:
     rod = scene.add_rod(CURVE, section=ddg.Ellipse(0.004, 0.003), material=SOFT)
     scene.clamp(rod, motion=ddg.Grip(pivot=(0.1, 0.0, 0.0)))
     scene.clamp(rod, edges=[-1])
-    return Simulator(scene.build(device="cpu", precision="float64"), DT, **TIGHT)
+    return Simulator(built(scene), DT, **TIGHT)
 
 
 def check(loss, values: dict, sizes: dict) -> None:
     """The gradient of loss(**values) along random directions against central differences of fourth order."""
     values = {name: value.clone().requires_grad_() for name, value in values.items()}
     gradients = torch.autograd.grad(loss(**values), values.values())
-    generator = torch.Generator().manual_seed(3)
+    torch.manual_seed(3)
     for (name, value), gradient in zip(values.items(), gradients, strict=True):
-        direction = torch.rand(value.shape, generator=generator, dtype=value.dtype)
+        direction = torch.rand(value.shape, dtype=value.dtype)
         direction = direction * torch.where(gradient < 0.0, -1.0, 1.0) * (gradient != 0.0)
         found, step = float((gradient * direction).sum()), sizes[name]
         with torch.no_grad():
@@ -53,16 +53,15 @@ def check(loss, values: dict, sizes: dict) -> None:
 @pytest.mark.parametrize("name", STIFFNESS)
 def test_everything_that_goes_in_has_a_gradient(name):
     own, term = simulator(name), STIFFNESS[name]
-    first = torch.as_tensor(own.model.state().points())
+    first = torch.tensor(own.model.state().points())
     flat = torch.tensor([1.0, 0.0, 1.0] if name == "planar" else [1.0, 1.0, 1.0])
-    generator = torch.Generator().manual_seed(1)
-    force = 1e-3 * torch.randn((2, len(first), 3), generator=generator, dtype=torch.float64) * flat
-    weight = torch.randn((len(first), 3), generator=generator, dtype=torch.float64)
+    torch.manual_seed(1)
+    force = 1e-3 * torch.randn((2, len(first), 3), dtype=torch.float64) * flat
+    weight = torch.randn((len(first), 3), dtype=torch.float64)
 
     def loss(positions, velocities, stiffness, forces, gravity):
         state = own.initial_state(positions=positions, velocities=velocities)
-        for state in own.rollout(state, {term: stiffness}, {"forces": forces, "gravity": gravity}, steps=3):
-            pass
+        *_, state = own.rollout(state, {term: stiffness}, {"forces": forces, "gravity": gravity}, steps=3)
         return (weight * state.positions).sum() + 0.1 * (state.velocities**2).sum()
 
     values = {
@@ -120,9 +119,7 @@ def test_transforms(name):
     own, term = simulator(name), STIFFNESS[name]
 
     def loss(stiffness, velocities):
-        state = own.initial_state(1, velocities=velocities)
-        for state in own.rollout(state, {term: stiffness}, steps=2):
-            pass
+        *_, state = own.rollout(own.initial_state(1, velocities=velocities), {term: stiffness}, steps=2)
         return (state.positions**2).sum() + (state.velocities**2).sum()
 
     stiffness = own.parameter(term)[0, 0] * torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64)
@@ -150,22 +147,23 @@ def test_checkpoints_change_nothing():
 
 
 def test_steps_are_those_of_the_integrator():
-    own, model = simulator("joined"), SCENES["joined"]().build(device="cpu", precision="float64")
+    own, model = simulator("joined"), built(SCENES["joined"]())
     integrator, state = ddg.Integrator(model, **TIGHT), model.state()
     tensors = own.initial_state()
     for _ in range(4):
         state, tensors = integrator.step(state, DT), own.step(tensors)
-    np.testing.assert_array_equal(tensors.positions[0].numpy(), state.points())
-    np.testing.assert_array_equal(tensors.velocities[0].numpy(), state.velocities())
-    np.testing.assert_array_equal(tensors.angles[0].numpy(), state.angles())
+    np.testing.assert_array_equal(tensors.positions[0].cpu().numpy(), state.points())
+    np.testing.assert_array_equal(tensors.velocities[0].cpu().numpy(), state.velocities())
+    np.testing.assert_array_equal(tensors.angles[0].cpu().numpy(), state.angles())
 
 
 def test_a_world_without_a_gradient_says_so_alone():
     """One of two worlds is thrown so fast that its step is made in parts."""
-    own = Simulator(SCENES["twisted"]().build(device="cpu", precision="float64"), 0.02, max_iterations=4)
+    own = Simulator(built(SCENES["twisted"]()), 0.02, max_iterations=4)
     points = own.model.points_count
     speed = torch.zeros((2, points, 3), dtype=torch.float64)
-    speed[1, 2:] = torch.randn((points - 2, 3), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    torch.manual_seed(0)
+    speed[1, 2:] = torch.randn((points - 2, 3), dtype=torch.float64)
     speed.requires_grad_()
     state = own.step(own.initial_state(velocities=speed))
     (gradient,) = torch.autograd.grad((state.positions**2).sum(), speed)
@@ -187,13 +185,38 @@ def test_twice_and_forward_mode_are_refused():
         )
 
 
+def test_what_is_not_given_is_as_the_model_has_it():
+    own = simulator("twisted")
+    usual = own.step(own.initial_state()).positions
+    soft = own.step(own.initial_state(), {STIFFNESS["twisted"]: 1e-6}).positions
+    again = own.step(own.initial_state(), {"rod_stretch.viscosity": 0.01}).positions
+    assert (soft != usual).any()
+    torch.testing.assert_close(again, usual, rtol=0.0, atol=0.0)
+
+
+@pytest.mark.parametrize("name", ["twisted", "sheet"])
+def test_equilibria(name):
+    scene = SCENES[name]()
+    if name == "twisted":
+        scene.fix(1, [-1])
+    own, term = Simulator(built(scene), DT), STIFFNESS[name]
+
+    def loss(stiffness):
+        return (own.equilibrium({term: stiffness}, batch=2, rtol=1e-12).positions ** 2).sum()
+
+    values = own.parameter(term, 2) * torch.tensor([[1.0], [2.0]])
+    check(loss, {"stiffness": values}, {"stiffness": 1e-2 * float(values.max())})
+
+
 def test_copies_and_pickles():
     own = simulator("twisted")
     factors = RodParameters(own)
     other = pickle.loads(pickle.dumps(own))
     for each in (copy.deepcopy(own), other):
         state = each.step(each.initial_state(), copy.deepcopy(factors)())
-        torch.testing.assert_close(state.positions, own.step(own.initial_state(), factors()).positions, rtol=0.0, atol=0.0)
+        torch.testing.assert_close(
+            state.positions, own.step(own.initial_state(), factors()).positions, rtol=0.0, atol=0.0
+        )
     again = RodParameters(own)
     with torch.no_grad():
         factors.logarithms["bending"] += 0.3
@@ -213,7 +236,14 @@ def test_a_stiffness_is_found_again():
     with torch.no_grad():
         for name in truth:
             factors.logarithms[name].zero_()
-    optimiser = torch.optim.LBFGS(factors.parameters(), lr=1.0, max_iter=60, tolerance_grad=1e-14, tolerance_change=1e-16, line_search_fn="strong_wolfe")
+    optimiser = torch.optim.LBFGS(
+        factors.parameters(),
+        lr=1.0,
+        max_iter=60,
+        tolerance_grad=1e-14,
+        tolerance_change=1e-16,
+        line_search_fn="strong_wolfe",
+    )
 
     def closure():
         optimiser.zero_grad()
@@ -231,7 +261,11 @@ def test_a_stiffness_is_found_again():
     ("parameters", "controls", "message"),
     [
         ({"rod_bend.stiffness": 1.0}, None, "nothing has 'rod_bend.stiffness'; this model has rod_bend_twist"),
-        ({"rod_stretch.stiffness": torch.ones(4)}, None, r"rod_stretch.stiffness has shape \(4,\); give \(\), \(2, 1\)"),
+        (
+            {"rod_stretch.stiffness": torch.ones(4)},
+            None,
+            r"rod_stretch.stiffness has shape \(4,\); give \(\), \(2, 1\)",
+        ),
         (None, {"force": torch.zeros(3)}, "there is no 'force'; there are forces"),
         (None, {"gravity": torch.zeros(4)}, r"gravity have shape \(4,\); they are \(3,\) or \(2, 3\)"),
         (None, {"poses": torch.zeros((0, 6))}, "poses of no grip"),

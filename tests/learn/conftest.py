@@ -1,0 +1,17 @@
+"""Models and tensors of these tests are on the device under test."""
+
+import pytest
+
+from tests.learn import differences
+
+
+@pytest.fixture(autouse=True)
+def _everything_on(device, monkeypatch):
+    monkeypatch.setattr(differences, "DEVICE", device)
+    if device.startswith("cuda"):
+        torch = pytest.importorskip("torch")
+        torch.set_default_device(device)
+        yield
+        torch.set_default_device("cpu")
+    else:
+        yield
