@@ -73,13 +73,17 @@ class Adjoint:
             given: derivatives by the state that it led to.
 
         Raises:
-            SolverError: the step was made in parts, as a solve failed.
+            SolverError: the step was made in parts, as a solve failed; frames were renewed in it; or it ended at no minimum.
         """
         validate.check_state("pull", self.model, given)
         for kept, part in zip(tape.parts, self.integrator._parts, strict=True):
             _require_one_solve(kept, part)
         self.upload(tape.before.time, tape.dt)
-        return _copied(*self.pull_parts(tape.before, tape.after, tape.parts, given, self.integrator._solved(tape.dt)))
+        s = self.integrator._solved(tape.dt)
+        found = _copied(*self.pull_parts(tape.before, tape.after, tape.parts, given, s))
+        for own, part in zip(self.chains, self.integrator._chains, strict=True):
+            _require_minimum(own, part)
+        return found
 
     def upload(self, start: float, dt: float) -> None:
         """What supports do in the step whose reverse follows."""
@@ -146,6 +150,16 @@ def _copied(state: State, inputs: list) -> tuple[State, list]:
 
 def _cloned(value):
     return [wp.clone(array) for array in value] if isinstance(value, list) else wp.clone(value)
+
+
+def _require_minimum(own: ChainAdjoint, part) -> None:
+    """Refuse the reverse of a step to a saddle, which a solve may end at: the Hessian has negative pivots there."""
+    bad = np.flatnonzero(own.solve.failed.numpy()) if own.solve.failed is not None else []
+    if len(bad):
+        raise SolverError(
+            f"{part.who(int(bad[0]))} ended the step at no minimum of its energy: no gradient goes through it; take a smaller dt",
+            outcome="no_gradient",
+        )
 
 
 def _require_one_solve(kept: Kept | NetKept, part) -> None:

@@ -308,11 +308,15 @@ class Engine:
         def launch():
             self._found = adjoint.pull_parts(self.before, self.after, parts, self._given, s)
 
-        if all(own.solve.reduction for own in adjoint.chains) and not adjoint.net:
+        if all(own.solve.system for own in adjoint.chains) and not adjoint.net:
             self._graphs.replay(dt, launch)
         else:
             launch()
         found, inputs = self._found
+        self._solved_by = [
+            None if own.solve.failed is None else wp.to_torch(own.solve.failed, requires_grad=False) == 0
+            for own in adjoint.chains
+        ]
         found.grips = self.model.empty_state().grips
         return [tensor.clone() for tensor in tensors(found, self.fields)], inputs
 
@@ -360,6 +364,11 @@ class Engine:
             return nullcontext()
         stream = wp.stream_from_torch(torch.cuda.current_stream(wp.device_to_torch(self.model.wp_device)))
         return wp.ScopedStream(stream)
+
+    def solved(self, flags) -> list[torch.Tensor]:
+        """Flags of a step, not numbers where its reverse has failed, too: of rods that are at no minimum."""
+        ones = zip(flags, [*self._solved_by, None], strict=False)
+        return [flag if ok is None else torch.where(ok, flag, float("nan")) for flag, ok in ones]
 
     @property
     def parts(self) -> int:

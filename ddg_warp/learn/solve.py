@@ -10,8 +10,9 @@ from scipy.sparse.linalg import splu
 from ddg_warp import arrays
 from ddg_warp.errors import SolverError
 from ddg_warp.solve.chains.assembled import AssembledNewton
-from ddg_warp.solve.chains.newton import NewtonOptions
+from ddg_warp.solve.chains.newton import ChainNewton, NewtonOptions
 from ddg_warp.solve.chains.tangent import ChainTangent
+from ddg_warp.solve.choice import automatic
 from ddg_warp.solve.direct import SingularError, regular
 from ddg_warp.solve.reduction import CyclicReduction
 
@@ -106,24 +107,38 @@ def _transposed(matrix: sparse.csc_matrix):
 
 
 class ChainSolve:
-    """H w = g of a group of rods, in the precision of its state: by cyclic reduction; on the host of closed rods and of equilibria."""
+    """H w = g of a group of rods, in the precision of its state: by the sweep or cyclic reduction, as steps are made; on the host of
+    closed rods and of equilibria.
+
+    Attributes:
+        failed: not zero of rods whose H is not positive definite (columns,), so that w means nothing; None on the host.
+    """
 
     def __init__(self, model, group):
         self.model, self.group = model, group
         real, device, kind = model.types.real, model.wp_device, group.kind
         self.host = HostSolve(ChainTangent(model, group, 0))
-        self.reduction = None
-        if not kind.closed:
-            self.system = AssembledNewton(model, group, NewtonOptions(psd="none"), real)
-            self.system.islands.unbalanced.fill_(1)  # every rod wants its matrix
+        self.system = self.reduction = self.failed = None
+        if kind.closed:
+            return
+        given = model, group, NewtonOptions(psd="none"), real
+        if automatic(group) == "sweep":
+            self.system = ChainNewton(*given)
+            self._moved = self.system.x, self.system.theta  # what the sweep moves along w
+            self.failed = self.system.islands.status
+        else:
+            self.system = AssembledNewton(*given)
             self.reduction = CyclicReduction(kind.block, group.nodes, group.columns, real, device)
             self._wanted = wp.full(group.columns, 1, dtype=int, device=device)
+            self.failed = self.system.islands.bad
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        if self.reduction is None:
+        if self.system is None:
             return []
+        if self.reduction is None:
+            return [(self.system._evaluate, 128), (self.system._sweep, self.system._threads)]
         return [(self.system._evaluate, 128), self.system._assemble, *self.reduction.kernels]
 
     def __call__(self, solved, last: wp.array, s: float, right: wp.array, w: wp.array) -> None:
@@ -135,22 +150,30 @@ class ChainSolve:
             s: length of the implicit Euler step [s]; infinite for an equilibrium, of which `solved.time` is the load parameter.
 
         Raises:
-            SolverError: H is singular.
+            SolverError: H is singular; on the host alone, see `failed`.
         """
         rate = 1.0 / s
         coefficient = rate * (rate + self.model.scene.mass_damping)
-        if self.reduction is None or not rate:
+        if self.system is None or not rate:
             self._on_host(solved, last, rate, coefficient, right, w)
             return
         system = self.system
         system.x, system.theta, system.frame = solved.x, solved.theta, solved.frame
         islands = system.islands
+        islands.arrays[0].zero_()
         islands.coefficient.fill_(coefficient)
         islands.rate.fill_(rate)
-        islands.bad.zero_()
+        islands.unbalanced.fill_(1)  # every rod wants its matrix
         system.evaluate(last)
-        system.assemble_blocks()
-        self.reduction.solve(system.blocks, right, self.group.count, self._wanted, w, islands.bad)
+        if self.reduction is None:
+            islands.stale.zero_()  # frames are as they were in the step
+            (system.x, system.theta), system.right, system.direction = self._moved, right, w
+            arrays.copy(system.x, solved.x)
+            arrays.copy(system.theta, solved.theta)
+            system.eliminate()
+        else:
+            system.assemble_blocks()
+            self.reduction.solve(system.blocks, right, self.group.count, self._wanted, w, islands.bad)
 
     def _on_host(self, solved, last, rate: float, coefficient: float, right: wp.array, w: wp.array) -> None:
         data = SimpleNamespace(x=solved.x, theta=solved.theta, frame=solved.frame, last=last)

@@ -135,6 +135,7 @@ class Pull(torch.autograd.Function):
         with engine.stream():
             engine.write(call.parameters, parameters)
             found, inputs = engine.backward(call.start, call.dt, state, output[:count], given)
+            flags = engine.solved(flags)
             by_state = [
                 engine.flagged(values, field, flags)
                 for values, field in zip(found, call.fields, strict=True)

@@ -211,6 +211,18 @@ class ChainNewton:
 
     def sweep(self) -> None:
         """Factor, decide, and take the next step."""
+        self.eliminate()
+        group = self.group
+        wp.launch(
+            self._adjust,
+            group.columns,
+            [group.count, group.fixed, group.anchor, self.direction, *self.islands.arrays],
+            [self.x, self.theta, self.frame, self.base],
+            device=self.device,
+        )
+
+    def eliminate(self) -> None:
+        """Factor, decide, find a direction and move straight along it."""
         group, options = self.group, self.options
         wp.launch(
             self._sweep,
@@ -222,11 +234,4 @@ class ChainNewton:
             + [self.x, self.theta, self.base, self.elimination, self.direction],
             device=self.device,
             block_dim=self._threads,
-        )
-        wp.launch(
-            self._adjust,
-            group.columns,
-            [group.count, group.fixed, group.anchor, self.direction, *self.islands.arrays],
-            [self.x, self.theta, self.frame, self.base],
-            device=self.device,
         )

@@ -1,0 +1,126 @@
+"""What gradients cost: a step of many cantilevers from torch, forward and backward, against the integrator's step alone.
+
+    python tools/bench_gradients.py [--cuda] [--out DIR]
+
+Rods of 24 nodes, clamped at their first edge and released straight, 0.01 s a step, implicit Euler, as rods of one world or a world each.
+`step`: `Integrator.step`; `torch`: `Simulator.step` without gradients; `forward`, `backward`: with them, by state and the bending
+stiffness of every element. `error` is that of the gradient along a direction against central differences in float64 (of the smallest
+model). Time is the least of some runs of a step. Prints a table; writes gradients_DEVICE.csv and .json.
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+import warp as wp
+
+import ddg_warp as ddg
+from ddg_warp.run.summary import machine, table, write_table
+from ddg_warp.torch import Simulator
+
+DT, NODES = 0.01, 24  # [s]
+RUBBER = ddg.Material(young=1e7, poisson=0.5, density=1000.0)
+NAME = "rod_bend_twist.stiffness_1"
+WARM = 20  # steps after which rods are on their way
+
+
+def model_of(count: int, worlds: bool, device: str, precision: str):
+    """Cantilevers, each a world or all in one."""
+    scene = ddg.Scene(gravity=(0.0, -2.943, -9.81))
+    points = np.zeros((1 if worlds else count, NODES, 3))
+    points[:, :, 0] = np.linspace(0.0, 1.0, NODES)
+    scene.clamp(scene.add_rods(points, section=ddg.Circle(0.02), material=RUBBER))
+    return scene.build(device, precision, worlds=count if worlds else 1)
+
+
+class Clock:
+    """Least seconds of what runs, by name."""
+
+    def __init__(self, device):
+        self.device, self.best = device, {}
+
+    def __call__(self, name: str, call):
+        """What a call returns, timed."""
+        wp.synchronize_device(self.device)
+        started = time.perf_counter()
+        result = call()
+        wp.synchronize_device(self.device)
+        self.best[name] = min(self.best.get(name, np.inf), time.perf_counter() - started)
+        return result
+
+
+def measure(count: int, worlds: bool, device: str, precision: str, runs: int) -> dict:
+    """Milliseconds of every way of making a step."""
+    model = model_of(count, worlds, device, precision)
+    simulator, clock = Simulator(model, DT), Clock(model.wp_device)
+    integrator, plain = ddg.Integrator(model), model.state()
+    state, batch = simulator.initial_state(), model.worlds
+    stiffness = simulator.parameter(NAME).clone().requires_grad_()
+    for _ in range(WARM):
+        plain = integrator.step(plain, DT)
+        with torch.no_grad():
+            state = simulator.step(state)
+    before = torch.cuda.max_memory_allocated() if device.startswith("cuda") else 0
+    for _ in range(runs):
+        clock("step", lambda: integrator.step(plain, DT))
+        with torch.no_grad():
+            clock("torch", lambda: simulator.step(state))
+        after = clock("forward", lambda: simulator.step(state, {NAME: stiffness}))
+        loss = (after.positions[..., 2] ** 2).sum()
+        clock("backward", lambda loss=loss: torch.autograd.grad(loss, stiffness))
+    found = {"rods": count, "worlds": batch, "precision": precision}
+    found |= {f"{name} [ms]": 1e3 * seconds for name, seconds in clock.best.items()}
+    found["backward over step"] = clock.best["backward"] / clock.best["step"]
+    if device.startswith("cuda"):
+        found["torch memory a rod [kB]"] = (torch.cuda.max_memory_allocated() - before) / count / 1e3
+    return found
+
+
+def error(device: str, precision: str) -> float:
+    """Relative error of the gradient of ten steps by a factor of all stiffnesses, against differences in float64."""
+
+    def loss(factor: torch.Tensor, precision: str) -> torch.Tensor:
+        simulator = Simulator(model_of(4, True, device, precision), DT, rtol=1e-10)
+        *_, state = simulator.rollout(simulator.initial_state(), {NAME: simulator.parameter(NAME) * factor}, steps=10)
+        return (state.positions[:, -1, 2] ** 2).sum()
+
+    one = torch.ones((), dtype=torch.float64, requires_grad=True)
+    (found,) = torch.autograd.grad(loss(one, precision), one)
+    with torch.no_grad():
+        values = {x: float(loss(one + x, "float64")) for x in (-2e-3, -1e-3, 1e-3, 2e-3)}
+    near, far = ((values[x] - values[-x]) / (2.0 * x) for x in (1e-3, 2e-3))
+    reference = (4.0 * near - far) / 3.0
+    return abs(float(found) - reference) / abs(reference)
+
+
+def main() -> int:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cuda", action="store_true")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    parser.add_argument("--runs", type=int, default=30)
+    options = parser.parse_args()
+    device = "cuda:0" if options.cuda else "cpu"
+    wp.config.quiet = True
+    cases = [(2560, False), (2560, True), (100_000, False)] if options.cuda else [(16, False), (16, True), (256, False)]
+    rows = []
+    for precision in ("mixed", "float64") if options.cuda else ("float64",):
+        wrong = error(device, precision)
+        for count, worlds in cases:
+            rows.append(measure(count, worlds, device, precision, options.runs) | {"error": wrong})
+            print(rows[-1], flush=True)
+    print(table(rows))
+    origin = {
+        "command": "python tools/bench_gradients.py" + options.cuda * " --cuda",
+        "device": device,
+        "machine": machine(),
+    }
+    write_table(options.out / f"gradients_{device.partition(':')[0]}", rows, origin)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
