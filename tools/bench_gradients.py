@@ -2,7 +2,8 @@
 
     python tools/bench_gradients.py [--cuda] [--out DIR]
 
-Rods of 24 nodes, clamped at their first edge and released straight, 0.01 s a step, implicit Euler, as rods of one world or a world each.
+Rods of 24 nodes, clamped at their first edge and released straight, 0.01 s a step, implicit Euler, as rods of one world or a world
+each.
 `step`: `Integrator.step`; `torch`: `Simulator.step` without gradients; `forward`, `backward`: with them, by state and the bending
 stiffness of every element. `error` is that of the gradient along a direction against central differences in float64 (of the smallest
 model). Time is the least of some runs of a step. Prints a table; writes gradients_DEVICE.csv and .json.

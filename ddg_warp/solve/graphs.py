@@ -2,6 +2,7 @@
 
 import gc
 from collections.abc import Callable, Hashable
+from contextlib import nullcontext
 
 import warp as wp
 
@@ -37,8 +38,11 @@ class Graphs:
         if not self._graphs:
             self._load()
         gc.disable()  # a collection while capturing would free arrays into the graph
+        device = self._model.wp_device
+        # a stream of its own, as CUDA captures nothing on the one that torch uses by default
+        stream = wp.ScopedStream(wp.Stream(device)) if device.is_cuda else nullcontext()
         try:
-            with wp.ScopedCapture(device=self._model.wp_device, force_module_load=False) as capture:
+            with stream, wp.ScopedCapture(device=device, force_module_load=False) as capture:
                 launch()
         finally:
             gc.enable()
