@@ -7,6 +7,7 @@ import numpy as np
 from ddg_warp.kernels.solve import cyclic_reduction
 from ddg_warp.kernels.terms import ALL
 from ddg_warp.scene.scene import Dynamics
+from ddg_warp.solve.chains.step import DIRECT
 from ddg_warp.solve.choice import automatic, net_preconditioner
 from ddg_warp.solve.net.chains import Chains
 from ddg_warp.solve.net.system import NetSystem
@@ -51,7 +52,7 @@ def report(model) -> str:
 
 
 def _split_errors(group, s: float) -> np.ndarray:
-    return group.split_errors(s) if automatic(group) == "sweep" else np.array([np.inf])
+    return group.split_errors(s) if automatic(group) in DIRECT else np.array([np.inf])
 
 
 def step_lines(model, errors_of: Callable) -> list[str]:

@@ -68,6 +68,7 @@ def sweep_kernel(
     kept_size = beyond + (tension.kept_rows(nb) if split else 0)
     Rows, Kept = wp.types.vector(rows, linear), wp.types.vector(kept_size, linear)
     Pending, eliminate = tension.functions(nb, linear)
+    longer = tension.longer_function(dim, real, linear)
     vertex_rows, edge_rows, tensions = kind.vertex_strains, kind.edge_strains, kind.tensions
     exact, begin = exact_from is not None, exact_from or 0
     slack_row = kind.factor_rows
@@ -468,10 +469,7 @@ def sweep_kernel(
                 rotation = wp.max(rotation, wp.length_sq(bent) / span_sq)
                 if wp.static(split):
                     slack = F[wp.static(slack_row), j, r]
-                    longer = slack * pull * per_root
-                    if slack == linear(0.0):
-                        longer = linear(wp.dot(bent, x_ahead - here) / wp.sqrt(span_sq))
-                    direction[wp.static(nb), j, r] = longer
+                    direction[wp.static(nb), j, r] = longer(slack, pull, per_root, x_ahead - here, bent)
             x_ahead = here
             x[j, r] = here + dx
             if wp.static(twist):

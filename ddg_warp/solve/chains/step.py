@@ -97,7 +97,7 @@ class ChainStep(PartStep):
 
     def split_errors(self, s: float) -> np.ndarray:
         """Of every rod; infinite where the solver cannot take tensions for unknowns."""
-        return self.group.split_errors(s) if type(self.newton) is ChainNewton else super().split_errors(s)
+        return self.group.split_errors(s) if type(self.newton) in DIRECT.values() else super().split_errors(s)
 
     def straighten(self, s: float) -> None:
         """As of `PartStep`; and what float32 matrices carry."""
@@ -145,8 +145,6 @@ def _newton(model, group, integrator, means) -> ChainNewton:
         raise SceneError(
             f"linear {linear!r}: rod {group.host.rods[0]} is closed; use 'auto' or a preconditioner of PCG"
         )
-    if linear == "sweep":
-        return ChainNewton(*given, *last, split=means.split)
     if linear in DIRECT:
-        return DIRECT[linear](*given, *last)
+        return DIRECT[linear](*given, *last, split=means.split)
     return PcgNewton(*given, linear, *last)
