@@ -36,10 +36,7 @@ def _block_functions(nb: int, linear, first: bool, tensions: int):
     """
     nb2 = nb**2
     H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
-    if tensions:
-        factor_block, lower, lower_vector, upper_vector, congruence = pivot.signed_functions(nb, tensions, linear)
-    else:
-        factor_block, lower, _, lower_vector, upper_vector, congruence = pivot.functions(nb, linear)
+    factor_block, lower, _, lower_vector, upper_vector, congruence = pivot.signed_functions(nb, tensions, linear)
 
     @wp.func
     def place(i: int, p: int):

@@ -130,7 +130,9 @@ def functions(size: int, real, sides: int | None = None):
 
 @cache
 def signed_functions(size: int, negative: int, real):
-    """factor, lower, lower_vector, upper_vector, congruence of a quasi-definite block: its last `negative` pivots are to be so."""
+    """The same of a quasi-definite block: its last `negative` pivots are to be so; those of a definite one, if there are none."""
+    if not negative:
+        return functions(size, real)
     H, M = wp.types.vector(size, real), wp.types.matrix((size, size), real)
     tiny, positive = wp.constant(real(2.3e-16 if real == wp.float64 else 1.2e-7)), size - negative
     *_, congruence = functions(size, real)
@@ -174,6 +176,17 @@ def signed_functions(size: int, negative: int, real):
         return Z
 
     @wp.func
+    def upper(L: M, inverse: H, Z: M):
+        U = M()
+        for i in range(wp.static(size)):
+            row = wp.static(size - 1) - i
+            u = Z[row] * inverse[row]
+            for j in range(row + 1, wp.static(size)):
+                u -= L[j, row] * U[j]
+            U[row] = u
+        return U
+
+    @wp.func
     def lower_vector(L: M, b: H):
         z = H()
         for i in range(wp.static(size)):
@@ -194,4 +207,4 @@ def signed_functions(size: int, negative: int, real):
             u[row] = v
         return u
 
-    return factor, lower, lower_vector, upper_vector, congruence
+    return factor, lower, upper, lower_vector, upper_vector, congruence

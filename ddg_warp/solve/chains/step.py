@@ -92,7 +92,7 @@ class ChainStep(PartStep):
         return kernels
 
     def float32_errors(self, s: float) -> np.ndarray:
-        """Of every rod; see `precision.float32_errors`."""
+        """Of every rod; see `precision.float32_error`."""
         return self.group.float32_errors(s)
 
     def split_errors(self, s: float) -> np.ndarray:
