@@ -36,6 +36,19 @@ def left_out_function(term: Term, real):
 
 
 @cache
+def carried_function(real):
+    """share(k, carried) -> (root of k' / k, s) of an edge, s = 0 where the matrix carries all of k; see `kernels.solve.tension`."""
+
+    @wp.func
+    def share(stiffness: real, carried: real):
+        if stiffness > carried:
+            return wp.sqrt(carried / stiffness), carried / (stiffness - carried)
+        return real(1.0), real(0.0)
+
+    return share
+
+
+@cache
 def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool, split: bool):
     """evaluate_at of one term: writes its factor rows; returns its energy, derivative with respect to the window, stiffness.
 
@@ -53,7 +66,7 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool, 
     has_tension, dim = term.measure.tensions > 0, kind.dim
     splits = split and has_tension
     bends = curved and term.measure.span == 2
-    left_out = left_out_function(term, real)
+    left_out, share = left_out_function(term, real), carried_function(real)
     dofs = [*range(dim * term.measure.span), *(dim * kind.span + i for i in range(term.measure.angles))]
     places = tuple(packed_index(kind.window, dofs[i], dofs[j]) for i in range(size) for j in range(i, size))
     where = wp.types.vector(len(places), int)(*places)
@@ -120,15 +133,10 @@ def evaluate_functions(kind: ChainKind, index: int, real, linear, curved: bool, 
                 factor[wp.static(tension_row), k, r] = linear(c)
         root = root_of(e, p, shift) * wp.sqrt(w)
         if wp.static(splits):
-            part = real(1.0)
             whole = real(0.0)
             for i in range(wp.static(dim)):
                 whole += jacobian[0, i] * jacobian[0, i]
-            whole *= root[0] * root[0]
-            rest = real(0.0)
-            if whole > carried:
-                part = wp.sqrt(carried / whole)
-                rest = carried / (whole - carried)
+            part, rest = share(whole * root[0] * root[0], carried)
             factor[wp.static(kind.factor_rows), k, r] = linear(rest)
         if not frozen:
             for m in range(wp.static(n)):

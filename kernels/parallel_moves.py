@@ -17,14 +17,14 @@ from ddg_warp.kernels.turns import onward_function
 
 
 @cache
-def move_kernels(kind: ChainKind, real, linear):
+def move_kernels(kind: ChainKind, real, linear, split: bool = False):
     """`turn`, `scan` and `offset`, the prefix sum of turned edges, then `move`, which puts nodes or frames; see `search.place`.
 
     `turn` also carries frames, into a second array, as neighbours still read those of before.
     """
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
-    step_of, excess, put, carry = move_functions(kind, real, linear)
+    step_of, excess, put, carry = move_functions(kind, real, linear, split)
     onward_of = onward_function(real)
     _, reference_twist, _ = frames.functions(real)
 

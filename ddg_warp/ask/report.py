@@ -7,6 +7,7 @@ import numpy as np
 from ddg_warp.kernels.solve import cyclic_reduction
 from ddg_warp.kernels.terms import ALL
 from ddg_warp.scene.scene import Dynamics
+from ddg_warp.solve.chains.step import DIRECT
 from ddg_warp.solve.choice import automatic, net_preconditioner
 from ddg_warp.solve.net.chains import Chains
 from ddg_warp.solve.net.system import NetSystem
@@ -51,7 +52,7 @@ def report(model) -> str:
 
 
 def _split_errors(group, s: float) -> np.ndarray:
-    return group.split_errors(s) if automatic(group) == "sweep" else np.array([np.inf])
+    return group.split_errors(s) if automatic(group) in DIRECT else np.array([np.inf])
 
 
 def step_lines(model, errors_of: Callable) -> list[str]:
@@ -82,10 +83,11 @@ def net_lines(model) -> list[str]:
         lines.append(f"  {part.term.name}: {part.elements * model.worlds} elements, {measure} x {density}")
     if host.drag:
         lines.append(f"  drag on {host.drag[0].shape[1]} edges of rods, implicit")
-    reals, solver, bands = 9 * table.positions, f"PCG ({name})", ""
+    reals, solver, bands, split = 9 * table.positions, f"PCG ({name})", "", False
     if chains and chains.banded:
         chains.plan.bind(host, table.rows.numpy(), table.columns.numpy(), chains.kept)
         solver = "elimination along rods, exact" if chains.plan.complete else solver
+        split = chains.splits
         places, block = int(chains.plan.count.sum()), chains.plan.block
         reals += 3 * block**2 * chains.plan.chain.size
         bands = f" and {places} places of rods in bands of {block} x {block}"
@@ -94,7 +96,9 @@ def net_lines(model) -> list[str]:
         f"  solver: {solver}, one Newton loop a world, linear algebra in {linear.__name__}; "
         f"H: {table.entries} blocks of 3 x 3{bands}, {size / 1e6:.3g} MB"
     )
-    return lines + step_lines(model, lambda s: (host.rod_errors(s), np.array([np.inf])))
+    return lines + step_lines(
+        model, lambda s: (host.rod_errors(s), host.split_errors(s) if split else np.array([np.inf]))
+    )
 
 
 def bytes_per_node(model, group) -> int:

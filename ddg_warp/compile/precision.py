@@ -75,18 +75,12 @@ def stiffnesses(kind, mass: np.ndarray, length: np.ndarray, parameters: dict, s:
     return np.broadcast_to(stretching, length.shape), np.broadcast_to(bending, length.shape), softest
 
 
-def float32_errors(kind, mass: np.ndarray, length: np.ndarray, parameters: dict, s: float) -> np.ndarray:
-    """Estimate of the relative error that a float32 solution makes in the direction of rods of one kind (R,).
-
-    The rounding unit times the ratio of the stiffest to the softest mode. For a curved steel rod of r/L = 2e-3 (64 nodes, 1/240 s) it
-    gives 0.1, where 9 % were measured. Arguments as of `stiffnesses`.
-    """
-    stretching, _, softest = stiffnesses(kind, mass, length, parameters, s)
-    return float32_error(stretching, softest)
-
-
 def float32_error(stiffest, softest) -> np.ndarray:
-    """The rounding unit of float32 times the ratio of stiffnesses [N/m]."""
+    """Estimate of the relative error that a float32 solution makes in a direction.
+
+    The rounding unit times the ratio of the stiffest to the softest mode [N/m]. For a curved steel rod of r/L = 2e-3 (64 nodes,
+    1/240 s) it gives 0.1, where 9 % were measured.
+    """
     with np.errstate(divide="ignore"):
         return 0.5 * float(np.finfo(np.float32).eps) * np.asarray(stiffest) / softest
 

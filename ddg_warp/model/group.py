@@ -86,7 +86,7 @@ class Group:
         return precision.stiffnesses(self.kind, mass, length, self.parameters.values, s)
 
     def float32_errors(self, s: float) -> np.ndarray:
-        """What float32 makes of every rod (columns,) over a step of s [s]; see `precision.float32_errors`."""
+        """What float32 makes of every rod (columns,) over a step of s [s]; see `precision.float32_error`."""
         stretching, _, softest = self.stiffnesses(s)
         return precision.float32_error(stretching, softest)
 

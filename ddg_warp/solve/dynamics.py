@@ -35,8 +35,8 @@ class Integrator:
             state = integrator.step(state, dt=0.01)
 
     In mixed precision, groups whose float32 factors would be poor at the step taken (stiff, finely divided rods and long steps) take
-    tensions of edges for unknowns of their own, or, where that does not do or is not to be had (closed rods, nets, few and long rods),
-    are solved in float64; `statistics()["linear"]` says which.
+    tensions of edges for unknowns of their own, or, where that does not do or is not to be had (closed rods, and rods joined to what
+    moves), are solved in float64; `statistics()["linear"]` says which.
 
     A step is one captured graph: nothing in it allocates or waits for the host. On CUDA, outcomes are read every
     `check_every` steps; a rod that failed rests at its last good state meanwhile, and the others go on.

@@ -3,13 +3,17 @@
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.solve import cyclic_reduction
+from ddg_warp.kernels.solve import cyclic_reduction, paired
 
 
 class CyclicReduction:
-    """Levels of the reduction of open chains of at most `nodes` nodes of `nb` dofs; see `kernels.solve.cyclic_reduction`."""
+    """Levels of the reduction of open chains of at most `nodes` nodes of `nb` dofs; see `kernels.solve.cyclic_reduction`.
 
-    def __init__(self, nb: int, nodes: int, columns: int, linear, device):
+    Args:
+        tensions: how many dofs of a node are; with any, the system comes in the form of a level. See `kernels.solve.paired`.
+    """
+
+    def __init__(self, nb: int, nodes: int, columns: int, linear, device, tensions: int = 0):
         self.columns, self.device, self.dofs = columns, device, 2 * nb
         self.blocks = [-(-nodes // 2)]  # of every level
         while self.blocks[-1] > 1:
@@ -23,8 +27,10 @@ class CyclicReduction:
         self.rights = [vectors(right_rows, blocks) for blocks in self.blocks[1:]]
         self.kept = [vectors(kept_rows, blocks // 2) for blocks in self.blocks[:-1]]
         levels = len(self.kept)
-        self._reduce = [cyclic_reduction.reduce_kernel(nb, linear, level == 0) for level in range(levels)]
-        self._last = cyclic_reduction.last_kernel(nb, linear, levels == 0)
+        self._reduce = [
+            cyclic_reduction.reduce_kernel(nb, linear, not tensions and level == 0, tensions) for level in range(levels)
+        ]
+        self._last = cyclic_reduction.last_kernel(nb, linear, not tensions and levels == 0, tensions)
         self._expand = cyclic_reduction.expand_kernel(nb, linear)
 
     @property
@@ -64,3 +70,45 @@ class CyclicReduction:
                 [solution],
                 device=self.device,
             )
+
+
+class TensionReduction:
+    """The same of a group of rods with the tensions of their edges as unknowns; see `kernels.solve.paired`."""
+
+    def __init__(self, group, real, linear, device):
+        kind, columns = group.kind, group.columns
+        size = kind.block + paired.TENSIONS
+        self.group, self.device = group, device
+        self.levels = CyclicReduction(size, group.nodes, columns, linear, device, paired.TENSIONS)
+        matrix_rows, right_rows, _ = cyclic_reduction.level_rows(size)
+        pairs = self.levels.blocks[0]
+        self.matrix, self.right = (
+            arrays.allocate((rows, pairs, columns), linear, device) for rows in (matrix_rows, right_rows)
+        )
+        self.solution = arrays.allocate((size, group.nodes, columns), linear, device)
+        self._pair = paired.pair_kernel(kind, linear)
+        self._unpair = paired.unpair_kernel(kind, real, linear)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [self._pair, self._unpair, *self.levels.kernels]
+
+    def solve(self, blocks, factor, right, x, islands, direction: wp.array) -> None:
+        """Directions of wanted rods and what their edges lengthen by, from the blocks of nodes and the factor of elements."""
+        group = self.group
+        wp.launch(
+            self._pair,
+            self.right.shape,
+            [blocks, factor, group.fixed, right, group.count, islands.wanted],
+            [self.matrix, self.right],
+            device=self.device,
+        )
+        self.levels.solve(self.matrix, self.right, group.count, islands.wanted, self.solution, islands.bad)
+        wp.launch(
+            self._unpair,
+            self.solution.shape[1:],
+            [self.solution, factor, x, group.count, *islands.arrays],
+            [direction],
+            device=self.device,
+        )

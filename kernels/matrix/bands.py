@@ -8,9 +8,10 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.drag import mass_type
-from ddg_warp.kernels.islands import WANTED
+from ddg_warp.kernels.islands import CARRIED, WANTED
 from ddg_warp.kernels.matrix.block_band import block_functions
-from ddg_warp.kernels.matrix.chain_blocks import blocks_function, layout_type, value_function
+from ddg_warp.kernels.matrix.chain_blocks import blocks_function, layout_type
+from ddg_warp.kernels.matrix.chain_places import behind_function, place_dofs, value_function
 from ddg_warp.kernels.matrix.sliced import product_functions
 from ddg_warp.kernels.net.places import along_type
 from ddg_warp.kernels.terms import Term
@@ -27,17 +28,18 @@ def band_kernels(
     exact_from: tuple[int | None, ...],
     drag: bool,
     serial: bool,
+    split: bool = False,
 ):
     """assemble(...): blocks of places, see `blocks_function`; clear(...): positions of H that they took over; product(...): H p on
     free dofs, and p . H p block by block.
     """
-    nb = 4 if twist else 3
+    nb = place_dofs(twist, split)
     H, B = wp.types.vector(3, linear), wp.types.vector(nb, linear)
     Mass, Layout, Along, until = mass_type(real, drag), layout_type(), along_type(real, linear), until_function(serial)
     _, store, _, _ = block_functions(nb, linear)
     times, free = product_functions(linear)
-    blocks_at = blocks_function(terms, twist, span, real, linear, exact_from, drag)
-    value = value_function(twist, linear)
+    blocks_at = blocks_function(terms, twist, span, real, linear, exact_from, drag, split)
+    value = value_function(twist, linear, split)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def assemble(
@@ -144,3 +146,37 @@ def band_kernels(
         dots_out[w, b] = wp.dot(p[i], y)
 
     return assemble, clear, product
+
+
+@cache
+def lengthen_kernel(terms: tuple[Term, ...], real, linear):
+    """lengthen(...): slack of the edges behind places, and what they lengthen by, from solutions that end with tensions."""
+    Layout, Along = layout_type(), along_type(real, linear)
+    behind = behind_function(terms, real, linear)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def lengthen(
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        layout: Layout,
+        own0: Along,
+        own1: Along,
+        own2: Along,
+        own3: Along,
+        own4: Along,
+        own5: Along,
+        values: wp.array3d(dtype=linear),
+        longer_out: wp.array3d(dtype=linear),
+    ):
+        k, r = wp.tid()
+        w = r / layout.count.shape[0]
+        c = r - w * layout.count.shape[0]
+        if flags[WANTED, w] == 0 or k >= layout.count[c]:
+            return
+        _t, slack = behind(own0, own1, own2, own3, own4, own5, k, c, w)
+        longer_out[0, k, r] = slack
+        longer_out[1, k, r] = (
+            slack * values[values.shape[0] - 1, k, r] * linear(real(1.0) / wp.sqrt(scalars[CARRIED, w]))
+        )
+
+    return lengthen

@@ -224,15 +224,16 @@ def product_function(kind: ChainKind, linear):
 
 
 @cache
-def factor_function(nb: int, span: int, linear):
+def factor_function(nb: int, span: int, linear, tensions: int = 0):
     """factorise(blocks, out, n, r): block LDL^T of an open chain of n nodes; returns how many pivots were lost.
 
-    Writes U = D^-1 E, D^-1 F, L and inverse pivots of every node (3 nb^2 + nb rows); `out` may be the array of the blocks.
+    Writes U = D^-1 E, D^-1 F, L and inverse pivots of every node (3 nb^2 + nb rows); `out` may be the array of the blocks. The last
+    of the dofs of a node may be `tensions`, with negative pivots.
     """
     nb2 = nb**2
     M = wp.types.matrix((nb, nb), linear)
     load, store, _, put = block_functions(nb, linear)
-    factor, lower, upper, _, _, congruence = pivot.functions(nb, linear)
+    factor, lower, upper, _, _, congruence = pivot.signed_functions(nb, tensions, linear)
 
     @wp.func
     def factorise(blocks: wp.array3d(dtype=linear), out: wp.array3d(dtype=linear), n: int, r: int):
@@ -303,7 +304,7 @@ def factor_kernel(kind: ChainKind, linear):
 
 
 @cache
-def substitute_function(nb: int, span: int, linear, dotted: bool = False):
+def substitute_function(nb: int, span: int, linear, dotted: bool = False, tensions: int = 0):
     """substitute(factor, v, out, n, r, s): out = (L D L^T)^-1 v along a chain; returns v . out if it is `dotted`.
 
     The factors lie in column r, the vectors in column s.
@@ -311,7 +312,7 @@ def substitute_function(nb: int, span: int, linear, dotted: bool = False):
     nb2 = nb**2
     H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     load, _, vector, put = block_functions(nb, linear)
-    _, _, _, lower_vector, upper_vector, _ = pivot.functions(nb, linear)
+    _, _, _, lower_vector, upper_vector, _ = pivot.signed_functions(nb, tensions, linear)
 
     @wp.func
     def substitute(

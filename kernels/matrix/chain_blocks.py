@@ -10,6 +10,7 @@ import warp as wp
 
 from ddg_warp.kernels.drag import mass_type
 from ddg_warp.kernels.islands import CLAMPED, COEFFICIENT, ITERATION
+from ddg_warp.kernels.matrix.chain_places import behind_function, place_dofs, place_functions
 from ddg_warp.kernels.matrix.sliced import second_function
 from ddg_warp.kernels.net.elements import part_function
 from ddg_warp.kernels.net.places import along_type, one_function
@@ -18,71 +19,10 @@ from ddg_warp.kernels.threads import first_of
 
 
 @cache
-def place_functions(twist: bool, linear):
-    """free_of(held): by bits, 1 at the free dofs of a place, else 0; block_of(...): its block with another one from positions of H."""
-    nb = 4 if twist else 3
-    B, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
-
-    @wp.func
-    def free_of(held: wp.uint8):
-        f = B()
-        for d in range(wp.static(nb)):
-            f[d] = linear(1 - ((int(held) >> d) & 1))
-        return f
-
-    @wp.func
-    def block_of(matrix: wp.array2d(dtype=linear), places: wp.array3d(dtype=int), row: int, k: int, c: int, first: int):
-        m = M()
-        p = places[row, k, c]
-        if p >= 0:
-            for i in range(3):
-                for j in range(3):
-                    m[i, j] = matrix[3 * i + j, p + first]
-        if wp.static(twist):
-            p = places[row + 1, k, c]
-            if p >= 0:
-                for i in range(3):
-                    m[i, 3] = matrix[3 * i, p + first]
-            p = places[row + 2, k, c]
-            if p >= 0:
-                for j in range(3):
-                    m[3, j] = matrix[j, p + first]
-            p = places[row + 3, k, c]
-            if p >= 0:
-                m[3, 3] = matrix[0, p + first]
-        return m
-
-    return free_of, block_of
-
-
-@cache
-def value_function(twist: bool, linear):
-    """value(v, places, k, c, shift): of a vector of blocks, what belongs to a place; blocks of the world begin at `shift`."""
-    H, B = wp.types.vector(3, linear), wp.types.vector(4 if twist else 3, linear)
-
-    @wp.func
-    def value(v: wp.array(dtype=H), places: wp.array3d(dtype=int), k: int, c: int, shift: int):
-        u = B()
-        node = places[0, k, c]
-        if node >= 0:
-            x = v[node + shift]
-            for d in range(3):
-                u[d] = x[d]
-        if wp.static(twist):
-            angle = places[1, k, c]
-            if angle >= 0:
-                x = v[angle + shift]
-                u[3] = x[0]
-        return u
-
-    return value
-
-
-@cache
-def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tuple[bool, ...]):
+def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tuple[bool, ...], split: bool = False):
     """add(along..., k, c, w, late) -> D, E, F of what the last of the terms, and by calling itself those before, add at a place."""
     term, curved = terms[-1], exact[-1]
-    measure, nb = term.measure, 4 if twist else 3
+    measure, nb = term.measure, place_dofs(twist, split)
     B, M, Along = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear), along_type(real, linear)
     n, size, nodes, angles, tensions = (
         len(measure.strains),
@@ -92,7 +32,7 @@ def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tupl
         measure.tensions,
     )
     second_of = second_function(measure, linear) if curved else None
-    before = sum_function(terms[:-1], twist, real, linear, exact[:-1]) if len(terms) > 1 else None
+    before = sum_function(terms[:-1], twist, real, linear, exact[:-1], split) if len(terms) > 1 else None
     first, one = len(terms) == 1, one_function(len(terms) - 1, real, linear)
     part = part_function(measure, linear)
 
@@ -203,19 +143,29 @@ def layout_type():
 
 @cache
 def blocks_function(
-    terms: tuple[Term, ...], twist: bool, span: int, real, linear, exact_from: tuple[int | None, ...], drag: bool
+    terms: tuple[Term, ...],
+    twist: bool,
+    span: int,
+    real,
+    linear,
+    exact_from: tuple[int | None, ...],
+    drag: bool,
+    split: bool = False,
 ):
     """blocks_at(...) -> D, E, F of a place on free dofs, those of the identity on others.
 
     `exact_from` says of each term from which iteration on it has second derivatives, one for all, or None where it has none. Without
-    terms all blocks are taken from positions of H.
+    terms all blocks are taken from positions of H. With `split` the last dof of a place is the tension of the edge behind it, see
+    `kernels.solve.tension`: it is eliminated after both of its nodes. A place without one has a row of the identity with a minus.
     """
-    nb = 4 if twist else 3
-    parts = nb - 2  # blocks of a place: node, and angle of the edge ahead
+    nb = place_dofs(twist, split)
+    parts = 1 + twist  # blocks of a place: node, and angle of the edge ahead
     B, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     Mass, Layout, Along = mass_type(real, drag), layout_type(), along_type(real, linear)
-    free_of, block_of = place_functions(twist, linear)
-    add = sum_function(terms, twist, real, linear, tuple(first is not None for first in exact_from)) if terms else None
+    free_of, block_of = place_functions(twist, linear, split)
+    late_terms = tuple(first is not None for first in exact_from)
+    add = sum_function(terms, twist, real, linear, late_terms, split) if terms else None
+    behind = behind_function(terms, real, linear) if split else None
     begin = next((first for first in exact_from if first is not None), 0)
 
     @wp.func
@@ -271,12 +221,25 @@ def blocks_function(
         listed = layout.places.shape[0] > wp.static(parts)
         if listed:
             D += block_of(matrix, layout.places, wp.static(parts), k, c, first)
+        if wp.static(split):
+            t, slack = behind(own0, own1, own2, own3, own4, own5, k, c, w)
+            D[wp.static(nb - 1), wp.static(nb - 1)] = linear(-1.0)
+            if slack > linear(0.0):
+                D[wp.static(nb - 1), wp.static(nb - 1)] = -slack
+                for d in range(3):
+                    D[d, wp.static(nb - 1)] = t[d]
+                    D[wp.static(nb - 1), d] = t[d]
         if here != wp.uint8(0):
             f = free_of(here)
             D = wp.cw_mul(D, wp.outer(f, f)) + wp.diag(B(linear(1.0)) - f)
         if k + 1 < n and layout.chain[k + 1, c] == layout.chain[k, c]:
             if listed:
                 E += block_of(matrix, layout.places, wp.static(parts + parts**2), k, c, first)
+            if wp.static(split):
+                t, slack = behind(own0, own1, own2, own3, own4, own5, k + 1, c, w)
+                if slack > linear(0.0):
+                    for d in range(3):
+                        E[d, wp.static(nb - 1)] = -t[d]
             if (here | layout.held[k + 1, c]) != wp.uint8(0):
                 E = wp.cw_mul(E, wp.outer(free_of(here), free_of(layout.held[k + 1, c])))
         else:

@@ -13,8 +13,8 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.evaluate import left_out_function
-from ddg_warp.kernels.islands import CLAMPED, ITERATION, SLOT, STALE, STATUS
+from ddg_warp.kernels.evaluate import carried_function, left_out_function
+from ddg_warp.kernels.islands import CARRIED, CLAMPED, ITERATION, SLOT, STALE, STATUS
 from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.terms import Term
 from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
@@ -300,7 +300,15 @@ def part_function(measure: Measure, real):
 
 
 @cache
-def evaluate_kernel(term: Term, real, linear, exact_from: int | None = None, local: bool = False, serial: bool = False):
+def evaluate_kernel(
+    term: Term,
+    real,
+    linear,
+    exact_from: int | None = None,
+    local: bool = False,
+    serial: bool = False,
+    split: bool = False,
+):
     """The kernel of a Newton iteration: energy, gradient and Gauss-Newton factor of one term, written a slot.
 
     Factor rows are vectors [strain * slots + slot][element], or if `local` reals [strain * size + dof][element], as the gradient, which
@@ -313,8 +321,12 @@ def evaluate_kernel(term: Term, real, linear, exact_from: int | None = None, loc
 
     Of terms whose measure has second derivatives `second_out` holds, from iteration `exact_from` on, what F and the geometric
     stiffness leave out of the exact Hessian, packed over the local dofs; before, and in `clamped` worlds, it is not written.
+
+    With `split`, factors of edges have what the matrix carries of their stiffness, and `tension_out` their slack behind the tension:
+    see `kernels.solve.tension`.
     """
     Elements, share, until = elements_type(real), share_function(serial), until_function(serial)
+    share_of_edge = carried_function(real) if split else None
     measure, density = term.measure, term.density
     V, F = wp.types.vector(3, real), wp.types.vector(3, linear)
     Q, S, E, _ = measure.types(real)
@@ -412,8 +424,14 @@ def evaluate_kernel(term: Term, real, linear, exact_from: int | None = None, loc
                     put(factor_out, m, rows[m] * weight, tid)
             else:
                 for m in range(wp.static(n)):
-                    stiffest = wp.max(stiffest, w * root[m] * root[m] * wp.dot(jacobian[m], jacobian[m]))
-                    put(factor_out, m, jacobian[m] * (root[m] * weight), tid)
+                    stiffness = w * root[m] * root[m] * wp.dot(jacobian[m], jacobian[m])
+                    stiffest = wp.max(stiffest, stiffness)
+                    scale = root[m] * weight
+                    if wp.static(split):
+                        part, slack = share_of_edge(stiffness, scalars[CARRIED, world])
+                        tension_out[wp.static(tensions), tid] = linear(slack)
+                        scale *= part
+                    put(factor_out, m, jacobian[m] * scale, tid)
             stiffness_out[tid] = linear(stiffest)
             if wp.static(packed > 0):
                 if flags[ITERATION, world] >= wp.static(begin) and flags[CLAMPED, world] == 0:

@@ -11,8 +11,9 @@ from ddg_warp.kernels.turns import edge_functions, onward_function, place_functi
 
 @cache
 def turn_kernels(real, linear):
-    """What turns edges: bend(...) finds predictors that have to, aim(...) makes steps of them; turn(...) turns edges, a thread each;
-    place(...) sums them along the rods of one level, a thread each, and put(...) takes their nodes there.
+    """What turns edges: bend(...) finds predictors that have to, aim(...) makes steps of them; turn(...) turns edges, a thread each,
+    turn_longer(...) those whose tensions say how much they lengthen; place(...) sums them along the rods of one level, a thread
+    each, and put(...) takes their nodes there.
     """
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     along_edge, excess_of = edge_functions(3, real)
@@ -131,6 +132,36 @@ def turn_kernels(real, linear):
         excess_out[w, p] = excess_of(edge, step, along_edge(edge, step), onward_of(straight[w], onward))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def turn_longer(
+        nodes: wp.array(dtype=int),
+        ahead: wp.array(dtype=int),
+        base: wp.array(dtype=V),
+        direction: wp.array(dtype=H),
+        step_length: wp.array(dtype=real),
+        todo: wp.array(dtype=int),
+        blocks: int,
+        places: wp.array2d(dtype=int),
+        longer: wp.array3d(dtype=linear),
+        columns: int,
+        excess_out: wp.array2d(dtype=V),
+    ):
+        """The same, with slack and lengthening of edges at the places (k, column) of the nodes ahead; see `solve.net.chains`."""
+        p, w = wp.tid()
+        if todo[w] != wp.static(PLACE):
+            return
+        a = nodes[p] + w * blocks
+        b = ahead[p] + w * blocks
+        amount = step_length[w]
+        step = move_of(direction, b, amount) - move_of(direction, a, amount)
+        edge = base[b] - base[a]
+        stretch = along_edge(edge, step)
+        if places[0, p] >= 0:
+            c = places[1, p] + w * columns
+            if longer[0, places[0, p], c] > linear(0.0):
+                stretch = real(longer[1, places[0, p], c]) * amount
+        excess_out[w, p] = excess_of(edge, step, stretch, 0)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def place(
         rods: wp.array(dtype=int),
         start: wp.array(dtype=int),
@@ -195,4 +226,4 @@ def turn_kernels(real, linear):
         block = nodes[p] + w * blocks
         q[block] = base[block] + move_of(direction, block, step_length[w]) + free
 
-    return bend, aim, turn, place, put
+    return bend, aim, turn, turn_longer, place, put

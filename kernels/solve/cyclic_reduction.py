@@ -8,7 +8,8 @@ A_i and couplings B_i to block i + 1. A level eliminates every odd block and lea
     x_u = A_u^-1 r_u - (A_u^-1 B_j^T) x_j - (A_u^-1 B_u) x_j+2 .
 
 It is an elimination in another order than the sweep's, so that the pivots of a definite matrix are positive here too, and lost
-ones mean the same. Nodes past the end of a rod are rows of the identity.
+ones mean the same. Nodes past the end of a rod are rows of the identity. Nodes may also have tensions among their dofs, the last ones:
+see `paired`.
 """
 
 from functools import cache
@@ -28,14 +29,14 @@ def level_rows(nb: int) -> tuple[int, int, int]:
 
 
 @cache
-def _block_functions(nb: int, linear, first: bool):
+def _block_functions(nb: int, linear, first: bool, tensions: int):
     """factor, solve, own_column, right_side of diagonal blocks, and column, product of a coupling X, from nodes or a level.
 
     X is the coupling B_i, or its transpose where it is `turned`, so that one code serves both neighbours of a block.
     """
     nb2 = nb**2
     H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
-    factor_block, lower, _, lower_vector, upper_vector, congruence = pivot.functions(nb, linear)
+    factor_block, lower, _, lower_vector, upper_vector, congruence = pivot.signed_functions(nb, tensions, linear)
 
     @wp.func
     def place(i: int, p: int):
@@ -159,15 +160,16 @@ def _block_functions(nb: int, linear, first: bool):
 
 
 @cache
-def reduce_kernel(nb: int, linear, first: bool):
+def reduce_kernel(nb: int, linear, first: bool, tensions: int = 0):
     """One level: the even blocks take what the odd ones leave, and keep what the odd ones' solution needs.
 
+    The first one reads blocks of nodes; of the dofs of a node the last ones may be `tensions`, with negative pivots.
     Thread c of a block has column c of its matrix, then the right-hand side, then the columns of its coupling. Each factors both
     neighbours for itself, one after the other in a loop that is not unrolled: that keeps them in registers.
     """
     nb2 = nb**2
     H = wp.types.vector(nb, linear)
-    factor, solve, own_column, right_side, column, product = _block_functions(nb, linear, first)
+    factor, solve, own_column, right_side, column, product = _block_functions(nb, linear, first, tensions)
 
     @wp.func
     def put(A: wp.array3d(dtype=linear), row: int, stride: int, k: int, r: int, v: H):
@@ -253,9 +255,9 @@ def reduce_kernel(nb: int, linear, first: bool):
 
 
 @cache
-def last_kernel(nb: int, linear, first: bool):
+def last_kernel(nb: int, linear, first: bool, tensions: int = 0):
     """Solution of the one block that is left: the first two nodes of a rod."""
-    factor, solve, _, right_side, *_ = _block_functions(nb, linear, first)
+    factor, solve, _, right_side, *_ = _block_functions(nb, linear, first, tensions)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def last(

@@ -28,25 +28,26 @@ from ddg_warp.kernels.matrix.block_band import (
     substitute_all_function,
     substitute_function,
 )
-from ddg_warp.kernels.matrix.chain_blocks import place_functions
+from ddg_warp.kernels.matrix.chain_places import place_dofs, place_functions
 from ddg_warp.kernels.solve.joints import coupling_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 
 @cache
-def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool):
+def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, split: bool = False):
     """factorise(...): H_II; load(...), solve(...): its solutions; finish(...): z of every block and r . z.
 
     solve_all(...) takes all movements of a joint, `sides`, at once; follow(...) adds V z_J. Between worlds and their columns are
     spread(...) and note(...).
     """
-    nb = 4 if twist else 3
-    parts = nb - 2  # blocks of a place: node, and angle of the edge ahead
+    nb = place_dofs(twist, split)
+    parts, angle = 1 + twist, 2 + twist  # blocks of a place, node and angle of the edge ahead; where that is
     H, B = wp.types.vector(3, linear), wp.types.vector(nb, linear)
     _, _, _, put = block_functions(nb, linear)
-    factor, substitute = factor_function(nb, span, linear), substitute_function(nb, span, linear)
+    factor = factor_function(nb, span, linear, int(split))
+    substitute = substitute_function(nb, span, linear, tensions=int(split))
     substitute_all = substitute_all_function(nb, span, linear, sides)
-    free_of, _ = place_functions(twist, linear)
+    free_of, _ = place_functions(twist, linear, split)
     until = until_function(serial)
     multiply, _ = coupling_functions(linear)
 
@@ -111,7 +112,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool):
                         for d in range(3):
                             u[d] = v[d]
                     else:
-                        u[wp.static(nb - 1)] = v[0]
+                        u[wp.static(angle)] = v[0]
             if held[k, c] != wp.uint8(0):
                 u = wp.cw_mul(u, free_of(held[k, c]))
             put(values_out, 0, k, s, u)
@@ -220,7 +221,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool):
                 if b < nodes:
                     z[i] = H(values[0, k, r], values[1, k, r], values[2, k, r])
                 else:
-                    z[i] = H(values[wp.static(nb - 1), k, r], linear(0.0), linear(0.0))
+                    z[i] = H(values[wp.static(angle), k, r], linear(0.0), linear(0.0))
             if joint_row[b] >= 0:
                 z[i] = moved[w * joint_rows + joint_row[b]]
             dots_out[w, b] = wp.dot(residual[i], z[i])

@@ -126,3 +126,85 @@ def functions(size: int, real, sides: int | None = None):
         return out
 
     return factor, lower, upper, lower_vector, upper_vector, congruence
+
+
+@cache
+def signed_functions(size: int, negative: int, real):
+    """The same of a quasi-definite block: its last `negative` pivots are to be so; those of a definite one, if there are none."""
+    if not negative:
+        return functions(size, real)
+    H, M = wp.types.vector(size, real), wp.types.matrix((size, size), real)
+    tiny, positive = wp.constant(real(2.3e-16 if real == wp.float64 else 1.2e-7)), size - negative
+    *_, congruence = functions(size, real)
+
+    @wp.func
+    def inverse_pivot(d: real, diagonal: real, sign: real):
+        """1/d and 0, or for a pivot lost to rounding or of the other sign: that of a small one of its own, and 1."""
+        floor = tiny * wp.abs(diagonal)
+        if sign * d > floor:
+            return real(1.0) / d, int(0)
+        return sign / wp.max(wp.abs(d), wp.max(floor, tiny)), int(1)
+
+    @wp.func
+    def factor(A: M):
+        L = M()
+        W = M()  # L D
+        inverse = H()
+        lost = int(0)
+        for i in range(wp.static(size)):
+            d = A[i, i]
+            for j in range(i):
+                w = A[i, j]
+                for k in range(j):
+                    w -= L[j, k] * W[i, k]
+                W[i, j] = w
+                L[i, j] = w * inverse[j]
+                d -= L[i, j] * w
+            own, bad = inverse_pivot(d, A[i, i], wp.where(i < wp.static(positive), real(1.0), real(-1.0)))
+            inverse[i] = own
+            lost += bad
+        return L, inverse, lost
+
+    @wp.func
+    def lower(L: M, B: M):
+        Z = M()
+        for i in range(wp.static(size)):
+            z = B[i]
+            for j in range(i):
+                z -= L[i, j] * Z[j]
+            Z[i] = z
+        return Z
+
+    @wp.func
+    def upper(L: M, inverse: H, Z: M):
+        U = M()
+        for i in range(wp.static(size)):
+            row = wp.static(size - 1) - i
+            u = Z[row] * inverse[row]
+            for j in range(row + 1, wp.static(size)):
+                u -= L[j, row] * U[j]
+            U[row] = u
+        return U
+
+    @wp.func
+    def lower_vector(L: M, b: H):
+        z = H()
+        for i in range(wp.static(size)):
+            v = b[i]
+            for j in range(i):
+                v -= L[i, j] * z[j]
+            z[i] = v
+        return z
+
+    @wp.func
+    def upper_vector(L: M, inverse: H, z: H):
+        u = H()
+        for i in range(wp.static(size)):
+            row = wp.static(size - 1) - i
+            v = z[row] * inverse[row]
+            for j in range(row + 1, wp.static(size)):
+                v -= L[j, row] * u[j]
+            u[row] = v
+        return u
+
+    return factor, lower, upper, lower_vector, upper_vector, congruence

@@ -39,8 +39,10 @@ from ddg_warp.kernels.islands import (
 )
 from ddg_warp.kernels.judge import judge_functions
 from ddg_warp.kernels.matrix import geometric
+from ddg_warp.kernels.matrix.block_band import block_functions
 from ddg_warp.kernels.search import PLACE, RELAG, search_functions
 from ddg_warp.kernels.solve import pivot, tension
+from ddg_warp.kernels.solve.read_ahead import keep_functions, read_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
 
@@ -66,86 +68,15 @@ def sweep_kernel(
     ahead = kind.serial or linear == wp.float32
     beyond = 2 * nb2 + nb  # of what is kept, where that of tensions begins
     kept_size = beyond + (tension.kept_rows(nb) if split else 0)
-    Rows, Kept = wp.types.vector(rows, linear), wp.types.vector(kept_size, linear)
     Pending, eliminate = tension.functions(nb, linear)
+    longer = tension.longer_function(dim, real, linear)
     vertex_rows, edge_rows, tensions = kind.vertex_strains, kind.edge_strains, kind.tensions
     exact, begin = exact_from is not None, exact_from or 0
     slack_row = kind.factor_rows
     aa, ab, ac, bb, bc, cc = geometric.block_functions(kind, linear)
-
-    @wp.func
-    def rows_of(F: wp.array3d(dtype=linear), k: int, r: int):
-        """What the elements that begin at a node have written, if that is read ahead."""
-        v = Rows()
-        if wp.static(ahead):
-            for i in range(wp.static(rows)):
-                v[i] = F[i, k, r]
-        return v
-
-    @wp.func
-    def right_of(right: wp.array3d(dtype=linear), k: int, r: int):
-        v = H()
-        for i in range(wp.static(nb)):
-            v[i] = right[i, k, r]
-        return v
-
-    @wp.func
-    def entry(f: Rows, F: wp.array3d(dtype=linear), row: int, k: int, r: int):
-        if wp.static(ahead):
-            return f[row]
-        else:
-            return F[row, k, r]
-
-    @wp.func
-    def part(f: Rows, F: wp.array3d(dtype=linear), row: int, k: int, r: int):
-        v = H()
-        for d in range(wp.static(dim)):
-            v[d] = entry(f, F, row + d, k, r)
-        return v
-
-    @wp.func
-    def with_angle(f: Rows, F: wp.array3d(dtype=linear), row: int, k: int, r: int, v: H):
-        u = v
-        if wp.static(twist):
-            u[wp.static(angle)] = entry(f, F, row, k, r)
-        return u
-
-    @wp.func
-    def positions(c: linear):
-        u = M()
-        for d in range(wp.static(dim)):
-            u[d, d] = c
-        return u
-
-    @wp.func
-    def store(Y: wp.array3d(dtype=linear), row: int, k: int, r: int, m: M):
-        for i in range(wp.static(nb)):
-            for j in range(wp.static(nb)):
-                Y[row + i * wp.static(nb) + j, k, r] = m[i, j]
-
-    @wp.func
-    def kept(Y: wp.array3d(dtype=linear), k: int, r: int):
-        """What the elimination of a node has left, if that is read ahead."""
-        v = Kept()
-        if wp.static(ahead):
-            for i in range(wp.static(kept_size)):
-                v[i] = Y[i, k, r]
-        return v
-
-    @wp.func
-    def left_at(left: Kept, Y: wp.array3d(dtype=linear), row: int, k: int, r: int):
-        if wp.static(ahead):
-            return left[row]
-        else:
-            return Y[row, k, r]
-
-    @wp.func
-    def times(left: Kept, Y: wp.array3d(dtype=linear), row: int, k: int, r: int, e: H):
-        v = H()
-        for i in range(wp.static(nb)):
-            for j in range(wp.static(nb)):
-                v[i] = v[i] + left_at(left, Y, row + i * wp.static(nb) + j, k, r) * e[j]
-        return v
+    rows_of, entry, part, with_angle, positions = read_functions(kind, linear, rows, ahead)
+    kept, left_at, times = keep_functions(nb, linear, kept_size, ahead)
+    _, store, vector, _ = block_functions(nb, linear)
 
     # what exceeds 255 registers goes to shared memory: 8 % on an H200; with tensions it is too much, and costs 12 %
     @wp.kernel(
@@ -209,7 +140,7 @@ def sweep_kernel(
             pending.pivot = linear(1.0)
         # What the next node has is read before this one is dealt with: a thread that walks waits for memory most of the time.
         f = rows_of(F, 0, r)
-        rj = right_of(right, 0, r)
+        rj = vector(right, 0, 0, r)
         mask = fixed[0, r]
         more = energy_change[0, r]
         rounding = energy_noise[0, r]
@@ -222,7 +153,7 @@ def sweep_kernel(
         for j in range(n):
             next = wp.min(j + 1, n - 1)
             f_ahead = rows_of(F, next, r)
-            r_ahead = right_of(right, next, r)
+            r_ahead = vector(right, 0, next, r)
             mask_ahead = fixed[next, r]
             more_ahead = energy_change[next, r]
             rounding_ahead = energy_noise[next, r]
@@ -468,10 +399,7 @@ def sweep_kernel(
                 rotation = wp.max(rotation, wp.length_sq(bent) / span_sq)
                 if wp.static(split):
                     slack = F[wp.static(slack_row), j, r]
-                    longer = slack * pull * per_root
-                    if slack == linear(0.0):
-                        longer = linear(wp.dot(bent, x_ahead - here) / wp.sqrt(span_sq))
-                    direction[wp.static(nb), j, r] = longer
+                    direction[wp.static(nb), j, r] = longer(slack, pull, per_root, x_ahead - here, bent)
             x_ahead = here
             x[j, r] = here + dx
             if wp.static(twist):

@@ -84,3 +84,20 @@ def functions(size: int, linear):
         return out
 
     return Pending, eliminate
+
+
+@cache
+def longer_function(dim: int, real, linear):
+    """longer(slack, pull, per_root, edge, step): what an edge lengthens by, from its tension or, without slack, from its step.
+
+    `pull` is its tension, `per_root` the reciprocal of sqrt(k'), and `step` the difference of the displacements of its nodes.
+    """
+    V = wp.types.vector(dim, real)
+
+    @wp.func
+    def longer(slack: linear, pull: linear, per_root: linear, edge: V, step: V):
+        if slack == linear(0.0):
+            return linear(wp.dot(step, edge) / wp.length(edge))
+        return slack * pull * per_root
+
+    return longer

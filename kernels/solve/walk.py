@@ -11,7 +11,8 @@ import warp as wp
 from ddg_warp.kernels.drag import mass_type
 from ddg_warp.kernels.islands import WANTED
 from ddg_warp.kernels.matrix.block_band import block_functions
-from ddg_warp.kernels.matrix.chain_blocks import blocks_function, layout_type, value_function
+from ddg_warp.kernels.matrix.chain_blocks import blocks_function, layout_type
+from ddg_warp.kernels.matrix.chain_places import value_function
 from ddg_warp.kernels.net.places import along_type
 from ddg_warp.kernels.solve import pivot
 from ddg_warp.kernels.terms import Term

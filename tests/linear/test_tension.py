@@ -1,4 +1,4 @@
-"""Tensions as unknowns of the sweep: the same directions as without, and in float32 as good ones however stiff edges are."""
+"""Tensions as unknowns of direct solvers: the same directions as without, and in float32 as good ones however stiff edges are."""
 
 import numpy as np
 import pytest
@@ -7,12 +7,16 @@ import warp as wp
 import ddg_warp as ddg
 from ddg_warp import arrays
 from ddg_warp.scenes import hair as curled
-from ddg_warp.solve.chains.newton import ChainNewton, NewtonOptions
+from ddg_warp.solve import choice
+from ddg_warp.solve.chains.newton import NewtonOptions
+from ddg_warp.solve.chains.partitioned import PartitionedNewton
+from ddg_warp.solve.chains.step import DIRECT
 
 KINDS = {"twist": {}, "untwisted": {"twist": False}, "planar": {"dimension": 2}}
 EVERY_KIND = pytest.mark.parametrize(
     "name", [pytest.param(name, marks=() if name == "twist" else pytest.mark.slow) for name in KINDS]
 )
+EVERY_SOLVER = pytest.mark.parametrize("solver", list(DIRECT))
 
 
 def rods(name: str, axial: float, supports: str = "many", natural: str = "straight") -> ddg.Scene:
@@ -36,7 +40,13 @@ def rods(name: str, axial: float, supports: str = "many", natural: str = "straig
 
 
 def directions(
-    scene: ddg.Scene, device, linear, carried: float | None, psd: str = "gauss_newton", kept: bool = False
+    scene: ddg.Scene,
+    device,
+    linear,
+    carried: float | None,
+    psd: str = "gauss_newton",
+    kept: bool = False,
+    solver: str = "sweep",
 ) -> list:
     """First Newton direction of every group from a rough iterate, (dofs, nodes, rods), its edges, and the nodes of rods.
 
@@ -45,7 +55,7 @@ def directions(
     random, found = np.random.default_rng(11), []
     model = scene.build(device, "float64")
     for group, state in zip(model.groups, model.state().groups, strict=True):
-        newton = ChainNewton(model, group, NewtonOptions(psd=psd), linear, split=carried is not None)
+        newton = DIRECT[solver](model, group, NewtonOptions(psd=psd), linear, split=carried is not None)
         x = arrays.download(state.x)
         noise = 1e-3 * random.normal(size=x.shape)
         mask = (arrays.download(group.fixed)[..., None] >> np.arange(group.kind.dim)) & 1
@@ -80,8 +90,15 @@ def error(found: np.ndarray, exact: np.ndarray) -> float:
 
 @EVERY_KIND
 @pytest.mark.parametrize("supports", ["many", "none"])
-@pytest.mark.parametrize("psd", ["gauss_newton", pytest.param("none", marks=pytest.mark.slow)])
-def test_directions_are_those_of_the_whole_matrix(device, name, supports, psd):
+@pytest.mark.parametrize(
+    ("psd", "solver"),
+    [
+        ("gauss_newton", "sweep"),
+        ("gauss_newton", "partitioned"),
+        pytest.param("none", "sweep", marks=pytest.mark.slow),  # which cyclic reduction refuses
+    ],
+)
+def test_directions_are_those_of_the_whole_matrix(device, name, supports, psd, solver):
     """H + r^T r / s is the Schur complement of [H r^T; r -s], whatever the share of the stiffness that H carries."""
     scene = rods(
         name, 9.0, supports, "shape" if psd == "none" and name != "untwisted" else "straight"
@@ -89,7 +106,7 @@ def test_directions_are_those_of_the_whole_matrix(device, name, supports, psd):
     exact = directions(scene, device, wp.float64, None, psd)
     for carried in (1e-3, 1.0, 5.0, 1e3):  # edges have some 9; the last leaves no tension
         for (found, edges, count), (expected, *_) in zip(
-            directions(scene, device, wp.float64, carried, psd), exact, strict=True
+            directions(scene, device, wp.float64, carried, psd, solver=solver), exact, strict=True
         ):
             assert error(found[:-1], expected) < 1e-9
             dim = edges.shape[2]
@@ -100,17 +117,75 @@ def test_directions_are_those_of_the_whole_matrix(device, name, supports, psd):
             np.testing.assert_allclose(found[-1, :-1][inside], along[inside], rtol=0, atol=1e-9 * np.abs(steps).max())
 
 
-def test_float32_is_as_good_however_stiff_edges_are(device):
+@EVERY_SOLVER
+def test_float32_is_as_good_however_stiff_edges_are(device, solver):
     """Errors of directions: those of tensions do not grow with EA; without tensions they do, by a hundred for a hundred."""
     errors = {True: [], False: []}
     for axial in (1e2, 1e4, 1e6, 1e8):
         scene = rods("twist", axial, "root")
         exact = directions(scene, device, wp.float64, None, kept=True)
         for split, found in errors.items():
-            got = directions(scene, device, wp.float32, 1e2 if split else None, kept=True)
+            got = directions(scene, device, wp.float32, 1e2 if split else None, kept=True, solver=solver)
             found.append(max(error(a[: b.shape[0]], b) for (a, *_), (b, *_) in zip(got, exact, strict=True)))
     assert max(errors[True]) < 1e-3
     assert errors[False][-1] > 1e2 * errors[True][-1]
+
+
+def held(nodes: int, axial: float, device) -> PartitionedNewton:
+    """A wavy rod of 1 m by cyclic reduction, with tensions, after one iteration; held at its ends and within, where tensions wait."""
+    along = np.linspace(0.0, 1.0, nodes)
+    points = np.stack([along, 0.05 * np.sin(20.0 * along), 0.05 * np.cos(14.0 * along)], axis=1)
+    scene = ddg.Scene()
+    section = ddg.Stiffness(EA=axial, EI1=1.0, EI2=1.2, GJ=0.7, mass_per_length=1.0, rotary_inertia=1e-4)
+    rod = scene.add_rod(points, section=section)
+    scene.clamp(rod, edges=[0, nodes - 2])
+    scene.fix(rod, [30, 101, 103])
+    scene.fix(rod, [72], components="y")
+    model = scene.build(device, "mixed")
+    group, state = model.groups[0], model.state().groups[0]
+    newton = PartitionedNewton(model, group, NewtonOptions(), split=True)
+    for array in (newton.x, newton.target):
+        wp.copy(array, state.x)
+    wp.copy(newton.frame, state.frame)
+    newton.islands.coefficient.fill_(2.5e5)
+    newton.islands.rate.fill_(500.0)
+    newton.islands.carried.fill_(2e5)
+    newton.iterate(state.last)
+    assert (newton.islands.lost.numpy() == 0).all()
+    return newton
+
+
+def dense(newton: PartitionedNewton) -> tuple[np.ndarray, np.ndarray]:
+    """What [H r^T; r -s] makes of the residual in float64, from the same blocks, rows and slacks: (nodes, dofs), lengthening."""
+    kind, n = newton.group.kind, newton.group.nodes
+    nb = kind.block
+    blocks = arrays.download(newton.blocks)[..., 0].astype(float).reshape(3, nb, nb, n)
+    factor = arrays.download(newton.factor)[..., 0].astype(float)
+    fixed = (arrays.download(newton.group.fixed)[:, :1] >> np.arange(nb)) & 1
+    slack, H, rows = factor[-1, :-1], np.zeros((n, nb, n, nb)), np.zeros((n - 1, n, nb))
+    for k in range(n):
+        for ahead in range(min(3, n - k)):
+            H[k, :, k + ahead] = blocks[ahead, ..., k]
+            H[k + ahead, :, k] = blocks[ahead, ..., k].T
+    first = kind.vertex_strains * kind.window
+    for k in range(n - 1):
+        rows[k, k, : kind.dim] = -factor[first : first + kind.dim, k]
+        rows[k, k + 1, : kind.dim] = factor[first : first + kind.dim, k]
+    rows *= fixed == 0
+    H, rows = H.reshape(n * nb, n * nb), rows.reshape(n - 1, n * nb)
+    right = np.concatenate([arrays.download(newton.right)[..., 0].astype(float).T.ravel(), np.zeros(n - 1)])
+    found = np.linalg.solve(np.block([[H, rows.T], [rows, -np.diag(slack)]]), right)
+    return found[: n * nb].reshape(n, nb), slack * found[n * nb :] / np.sqrt(newton.islands.carried.numpy()[0])
+
+
+@pytest.mark.parametrize("axial", [1e4, 1e6, 1e8, 1e10, 1e12])  # EA L^2 / EI
+def test_cyclic_reduction_is_a_dense_solve(device, axial):
+    """In float32 of 150 nodes, of which one in 15 is held or beside one that is, within a thousandth whatever EA is."""
+    newton = held(150, axial, device)
+    found = arrays.download(newton.direction)[..., 0].T
+    expected, longer = dense(newton)
+    np.testing.assert_allclose(found[:, :-1], expected, rtol=0, atol=1e-3 * np.abs(expected).max())
+    np.testing.assert_allclose(found[:-1, -1], longer, rtol=0, atol=1e-3 * np.abs(longer).max())
 
 
 def hair(nodes: int) -> ddg.Scene:
@@ -138,10 +213,11 @@ def advance(scene: ddg.Scene, device, precision: str, dt: float, steps: int, **o
         pytest.param(32, 1.0 / 120.0, "implicit_midpoint", marks=pytest.mark.slow),
     ],
 )
-def test_hair_moves_as_in_float64(device, nodes, dt, scheme):
+@EVERY_SOLVER
+def test_hair_moves_as_in_float64(device, nodes, dt, scheme, solver):
     """Within 1e-6 m of float64 at rtol 1e-10, in as many iterations, and without retries."""
     steps = round(0.25 / dt)
-    options = {"scheme": scheme} | ({"energy_bound": None} if scheme == "implicit_midpoint" else {})
+    options = {"scheme": scheme, "linear": solver} | ({"energy_bound": None} if scheme == "implicit_midpoint" else {})
     exact, one = advance(hair(nodes), device, "float64", dt, steps, rtol=1e-10, **options)
     usual, two = advance(hair(nodes), device, "float64", dt, steps, **options)
     found, other = advance(hair(nodes), device, "mixed", dt, steps, **options)
@@ -151,6 +227,27 @@ def test_hair_moves_as_in_float64(device, nodes, dt, scheme):
     assert other["newton_iterations"]["mean"] < 1.1 * two["newton_iterations"]["mean"]
     assert other["newton_iterations"]["max"] <= 10
     assert other["retries"] == 0
+
+
+@pytest.mark.slow
+def test_a_long_cable_moves_as_in_float64(device):
+    """Steel, 10 m of 640 nodes, swings between two clamps by cyclic reduction; float32 alone has no digits for its stretching."""
+    found = {}
+    for precision in ("float64", "mixed"):
+        scene = ddg.Scene(gravity=(0.0, -3.0, -9.81))
+        points = np.linspace([0.0, 0.0, 0.0], [9.0, 0.0, 0.0], 640)
+        points[:, 2] = -2.0 * np.sin(np.pi * points[:, 0] / 9.0)
+        rod = scene.add_rod(
+            points, section=ddg.Circle(1e-3), material=ddg.Material(young=2e11, poisson=0.3, density=7800.0)
+        )
+        scene.clamp(rod, edges=[0, 638])
+        found[precision] = advance(scene, device, precision, 1.0 / 240.0, 60, linear="partitioned")
+    (exact, one), (x, two) = found["float64"], found["mixed"]
+    assert two["linear"] == ["float32 with tensions"]
+    assert np.abs(exact - points).max() > 0.05
+    assert np.abs(x - exact).max() < 1e-6
+    assert two["newton_iterations"]["mean"] < 1.1 * one["newton_iterations"]["mean"]
+    assert one["retries"] == two["retries"] == 0
 
 
 def test_bending_beyond_float32_is_solved_in_float64(device):
@@ -165,11 +262,15 @@ def test_bending_beyond_float32_is_solved_in_float64(device):
     assert statistics["linear"] == ["float64"]
 
 
-def test_the_report_says_what_steps_take(device):
+def test_the_report_says_what_steps_take(device, monkeypatch):
     """Of the scene's analysis: what float32 alone carries, with tensions, and in float64; a soft rod needs nothing of it."""
     said = "over steps of 0.0166667 s: edges turned, second derivatives"
-    for precision, linear in (("mixed", ", linear algebra in float32 with tensions"), ("float64", "")):
-        assert said + linear + "\n" in hair(32).build(device, precision).report()
+    for solver, reduced in (("chain sweep", False), ("cyclic reduction", True)):
+        monkeypatch.setattr(choice, "long_and_few", lambda *given, reduced=reduced: reduced)
+        for precision, linear in (("mixed", ", linear algebra in float32 with tensions"), ("float64", "")):
+            report = hair(32).build(device, precision).report()
+            assert said + linear + "\n" in report
+            assert f"solver: {solver}" in report
     soft = ddg.Scene(analysis=ddg.Dynamics(dt=1.0 / 240.0, duration=1.0))
     rod = soft.add_rod(
         np.linspace([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], 32), section=ddg.Circle(2e-3), material=ddg.Material(1e7)

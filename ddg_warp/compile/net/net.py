@@ -13,7 +13,7 @@ from ddg_warp.compile import axisymmetric
 from ddg_warp.compile import shells as shell_terms
 from ddg_warp.compile.loads import accumulate
 from ddg_warp.compile.net.outwards import Outwards, outwards
-from ddg_warp.compile.precision import float32_error, float32_errors
+from ddg_warp.compile.precision import float32_error, largest_carried, stiffnesses
 from ddg_warp.compile.rods import Piece
 from ddg_warp.compile.storage import Along, RodPlaces, Storage
 from ddg_warp.compile.tolerance import Bodies
@@ -206,16 +206,28 @@ class Net(Storage):
         """Their lengths at rest (E,) [m]."""
         return np.linalg.norm(np.diff(self.rest[self.edges], axis=1)[:, 0], axis=1)
 
-    def rod_errors(self, s: float) -> np.ndarray:
-        """What float32 makes of every rod over a step of s [s] (rods,); see `precision.float32_errors`."""
-        errors = {}
+    def rod_stiffnesses(self, s: float) -> np.ndarray:
+        """Stiffnesses of every rod over a step of s [s] (3, rods); see `precision.stiffnesses`."""
+        found = {}
         for p in {id(rod.piece): rod.piece for rod in self.rods}.values():
             mass = (
                 p.mass.mean(1) + s * drag.least(p.drag) * p.length / p.mass.shape[1] if p.kind.drag else p.mass.mean(1)
             )
             parameters = {name: v.T for name, v in p.parameters.items()}
-            errors[id(p)] = float32_errors(p.kind, mass, p.length, parameters, s)
-        return np.array([errors[id(rod.piece)][rod.row] for rod in self.rods])
+            found[id(p)] = np.array(stiffnesses(p.kind, mass, p.length, parameters, s))
+        return np.array([found[id(rod.piece)][:, rod.row] for rod in self.rods]).reshape(-1, 3).T
+
+    def rod_errors(self, s: float) -> np.ndarray:
+        """What float32 makes of every rod over a step of s [s] (rods,); see `precision.float32_error`."""
+        stretching, _, softest = self.rod_stiffnesses(s)
+        return float32_error(stretching, softest)
+
+    def split_errors(self, s: float) -> np.ndarray:
+        """The same with tensions as unknowns; infinite where they cannot be, of more than one stretch."""
+        _, bending, softest = self.rod_stiffnesses(s)
+        errors = float32_error(np.maximum(bending, largest_carried(softest.min(initial=np.inf))), softest)
+        kinds = (rod.piece.kind for rod in self.rods)
+        return np.where([kind.edge_strains == kind.tensions == 1 for kind in kinds], errors, np.inf)
 
     def shell_errors(self, s: float) -> np.ndarray:
         """The same of shells (shells,): their membrane against inertia over a step and the lowest bending mode of a plate."""

@@ -14,8 +14,8 @@ class AssembledNewton(ChainNewton):
         blocks: D, E and F of every node, (3 block^2, nodes, columns).
     """
 
-    def __init__(self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False):
-        super().__init__(model, group, options, linear, midpoint)
+    def __init__(self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False, split: bool = False):
+        super().__init__(model, group, options, linear, midpoint, split)
         kind = group.kind
         self.blocks = self.vectors(3 * kind.block**2)
         self.islands.placed.fill_(1)  # `base` holds where every step comes from

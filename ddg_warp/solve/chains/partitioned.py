@@ -10,7 +10,7 @@ from ddg_warp.errors import SceneError
 from ddg_warp.kernels import parallel_moves, parallel_search
 from ddg_warp.solve.chains.assembled import AssembledNewton
 from ddg_warp.solve.chains.newton import NewtonOptions
-from ddg_warp.solve.reduction import CyclicReduction
+from ddg_warp.solve.reduction import CyclicReduction, TensionReduction
 
 
 class PartitionedNewton(AssembledNewton):
@@ -19,10 +19,10 @@ class PartitionedNewton(AssembledNewton):
     An iteration is about 2 log2(n) + 10 launches. Loops of one thread run over sqrt(n) nodes or ranges of nodes.
     """
 
-    def __init__(self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False):
+    def __init__(self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False, split: bool = False):
         if options.psd == "none":
             raise SceneError("psd 'none': linear 'partitioned' cannot stop at an indefinite matrix; use 'sweep'")
-        super().__init__(model, group, options, linear, midpoint)
+        super().__init__(model, group, options, linear, midpoint, split)
         kind, device, real = group.kind, model.wp_device, self.real
         vector, columns = wp.types.vector(kind.dim, real), group.columns
         self.width = math.isqrt(group.nodes - 1) + 1
@@ -34,16 +34,22 @@ class PartitionedNewton(AssembledNewton):
         self.mean = wp.zeros(columns, dtype=vector, device=device)
         self.held = arrays.upload(_held_neighbours(group), int, device)
         self.new_frame = arrays.allocate(self.frame.shape, real, device)
-        self.reduction = CyclicReduction(kind.block, group.nodes, columns, self.linear, device)
+        if split:
+            self.reduction = TensionReduction(group, real, self.linear, device)
+        else:
+            self.reduction = CyclicReduction(kind.block, group.nodes, columns, self.linear, device)
+        self.split = split
         self._weigh, self._gauge = parallel_search.sum_kernels(kind, real, self.linear)
         self._judge, self._take = parallel_search.decide_kernels(kind, real, self.linear, self.exact)
-        self._moves = parallel_moves.move_kernels(kind, real, self.linear)
+        self._moves = parallel_moves.move_kernels(kind, real, self.linear, split)
+        self._turn_ahead, *_ = parallel_moves.move_kernels(kind, real, self.linear)
         self._aim, self._renew = parallel_moves.predict_kernels(kind, real, self.linear)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         own = [self._weigh, self._gauge, self._judge, self._take, *self._moves, self._aim, self._renew]
+        own += [self._turn_ahead] * self.split  # without, it is among the moves
         around = [kernel for kernel in self.kernels_around if kernel is not self._predict]  # it has its own
         return [*around, self._assemble, *own, *self.reduction.kernels]
 
@@ -56,7 +62,7 @@ class PartitionedNewton(AssembledNewton):
             [before.x, before.v, group.fixed, group.count, *self.islands.arrays, self.x],
             [self.base, self.direction],
         )
-        self.move(onward=not self.midpoint)
+        self.move(predicted=True)
         if self.midpoint and group.kind.twist:
             wp.launch(self._renew, group.columns, self.islands.arrays, device=self.device)
             self.move()
@@ -89,7 +95,10 @@ class PartitionedNewton(AssembledNewton):
     def direct(self) -> None:
         """Directions by cyclic reduction."""
         islands = self.islands
-        self.reduction.solve(self.blocks, self.right, self.group.count, islands.wanted, self.direction, islands.bad)
+        if self.split:
+            self.reduction.solve(self.blocks, self.factor, self.right, self.x, islands, self.direction)
+        else:
+            self.reduction.solve(self.blocks, self.right, self.group.count, islands.wanted, self.direction, islands.bad)
 
     def take(self) -> None:
         """Lengths of the steps along the directions."""
@@ -107,16 +116,17 @@ class PartitionedNewton(AssembledNewton):
             device=self.device,
         )
 
-    def move(self, onward: bool = False) -> None:
+    def move(self, predicted: bool = False) -> None:
         """Do what is left to do with every rod: a step, straight or with edges turned, or frames of its iterate.
 
-        `onward`: whether the step repeats the last one; see `kernels.turns`.
+        `predicted`: whether the step is the predictor's, which has no tensions and may repeat the last one; see `kernels.turns`.
         """
         group, islands, (turn, scan, offset, move) = self.group, self.islands, self._moves
         self._launch(
-            turn,
+            self._turn_ahead if predicted else turn,
             group.nodes,
-            [group.count, islands.todo, self.direction, islands.step_length, islands.turn, int(onward)]
+            [group.count, islands.todo, self.direction, islands.step_length, islands.turn]
+            + [int(predicted and not self.midpoint)]
             + [self.base, self.x, self.frame],
             [self.prefix, self.new_frame],
         )

@@ -99,12 +99,12 @@ class ChainStep(PartStep):
         return kernels
 
     def float32_errors(self, s: float) -> np.ndarray:
-        """Of every rod; see `precision.float32_errors`."""
+        """Of every rod; see `precision.float32_error`."""
         return self.group.float32_errors(s)
 
     def split_errors(self, s: float) -> np.ndarray:
         """Of every rod; infinite where the solver cannot take tensions for unknowns."""
-        return self.group.split_errors(s) if type(self.newton) is ChainNewton else super().split_errors(s)
+        return self.group.split_errors(s) if type(self.newton) in DIRECT.values() else super().split_errors(s)
 
     def straighten(self, s: float) -> None:
         """As of `PartStep`; and what float32 matrices carry."""
@@ -153,8 +153,6 @@ def _newton(model, group, integrator, means) -> ChainNewton:
         raise SceneError(
             f"linear {linear!r}: rod {group.host.rods[0]} is closed; use 'auto' or a preconditioner of PCG"
         )
-    if linear == "sweep":
-        return ChainNewton(*given, *last, split=means.split)
     if linear in DIRECT:
-        return DIRECT[linear](*given, *last)
+        return DIRECT[linear](*given, *last, split=means.split)
     return PcgNewton(*given, linear, *last)

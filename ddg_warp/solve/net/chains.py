@@ -7,7 +7,7 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.matrix.bands import band_kernels
+from ddg_warp.kernels.matrix.bands import band_kernels, lengthen_kernel
 from ddg_warp.kernels.matrix.chain_blocks import layout_type
 from ddg_warp.kernels.matrix.sliced import SETS
 from ddg_warp.kernels.net.places import along_type, place_kernel
@@ -26,29 +26,38 @@ class Chains:
     Args:
         net: its `DeviceNet`.
         banded: whether blocks of H between their places are kept here, in bands, and not among the positions of a `NetSystem`.
+        split: whether tensions of edges are unknowns, see `kernels.solve.tension`; where `splits` says that they can be.
 
     Attributes:
         exact: whether the preconditioner is the inverse of H, so that a direction takes no conjugate gradients; see `bind`.
+        longer (2, longest, columns): if `split`, slack and lengthening of the edges behind places by the last direction.
 
     Raises:
         SceneError: the net has no rods.
     """
 
-    def __init__(self, net, banded: bool):
+    def __init__(self, net, banded: bool, split: bool = False):
         if not net.host.rods:
             raise SceneError("preconditioner 'chain' is of nets with rods; this one has none")
-        self.net, self.device = net, net.device
-        self.plan = ChainPlan(net.host)
+        self.net, self.device, self.split = net, net.device, split
+        self.plan = ChainPlan(net.host, split)
         self.along = [i for i, part in enumerate(net.sets) if part.host.along]
         self.banded = banded and len(self.along) <= SETS
         self.kept = self.plan.where >= 0 if self.banded else None
 
     @classmethod
-    def of(cls, net, preconditioner: str, banded: bool = True) -> "Chains | None":
+    def of(cls, net, preconditioner: str, banded: bool = True, split: bool = False) -> "Chains | None":
         """The chains of a preconditioner, in bands where these serve it; None of one without chains."""
         if preconditioner not in ("chain", "chain_multilevel"):
             return None
-        return cls(net, banded and preconditioner == "chain" and not net.host.frames)
+        return cls(net, banded and preconditioner == "chain" and not net.host.frames, split)
+
+    @property
+    def splits(self) -> bool:
+        """Whether tensions of edges may be unknowns, once the plan is bound: of chains alone, each walked along by a thread."""
+        longest, width = self.plan.chain.shape
+        few = long_and_few(longest, self.net.worlds * width, wp.get_device(self.device))
+        return self.split or (self.banded and self.plan.alone and not few)
 
     def bind(
         self, table, written: list[dict], real, linear, exact_from: tuple, drag: bool, reuse: bool = False
@@ -74,7 +83,7 @@ class Chains:
         block = plan.block
         self.factors = arrays.allocate((3 * block**2 + block, self.longest, self.columns), linear, device)
         self.reduction = None
-        if long_and_few(self.longest, self.columns, wp.get_device(device)):
+        if not self.split and long_and_few(self.longest, self.columns, wp.get_device(device)):
             self.reduction = CyclicReduction(block, self.longest, self.columns, linear, device)
             self._all = put(np.tile(plan.count, worlds))
             self._wanted, self._bad = (put(np.zeros(self.columns)) for _ in range(2))
@@ -100,7 +109,7 @@ class Chains:
         terms = tuple(net.sets[i].term for i in sets)
         late = tuple(exact_from[i] for i in sets)
         self._assemble, self._clear, self._product = band_kernels(
-            terms, plan.twist, plan.span, real, linear, late, drag, serial
+            terms, plan.twist, plan.span, real, linear, late, drag, serial, self.split
         )
         self._layout = layout_type()()
         for name in ("places", "chain", "count", "held"):
@@ -113,11 +122,14 @@ class Chains:
             apart = np.zeros(net.blocks, np.uint8)
             apart[self.elsewhere] = 1
             self._apart = wp.array(apart, dtype=wp.uint8, device=device)
-        made = elimination.chain_kernels(plan.twist, plan.span, linear, plan.size, serial)
+        made = elimination.chain_kernels(plan.twist, plan.span, linear, plan.size, serial, self.split)
         self._factorise, self._load, self._solve, self._solve_all, self._follow, self._finish, *self._columns = made
         self._measure, self._meet = joints.joint_kernels(linear) if self.joints else (None, None)
         self._walk = None
-        if self.exact and serial and not (self.reduction or reuse):
+        if self.split:
+            self.longer = arrays.allocate((2, self.longest, self.columns), linear, device)
+            self._lengthen = lengthen_kernel(terms, real, linear)
+        if self.exact and serial and not (self.reduction or reuse or self.split):
             self._walk = walk_kernel(terms, plan.twist, plan.span, real, linear, late, drag, self.joints > 0)
 
     @property
@@ -132,6 +144,7 @@ class Chains:
             own += [] if self._walk else [(self._factorise, SERIAL), (self._solve, SERIAL)]
             own += [(self._solve_all, SERIAL)] if self.coupled else []
         own += [self._balance] if self.banded else []
+        own += [self._lengthen] if self.split else []
         own += [self._clear] if self._clears else []
         own += [self._product] if self.banded and not self.exact else []
         own += [self._follow] if self.met is not None else []
@@ -187,6 +200,9 @@ class Chains:
             self.assemble(matrix, mass, anew)
             self.prepare(matrix, fixed, anew.wanted, lost)
             self.apply(matrix, right, islands.wanted, z, dots)
+            if self.split:
+                inputs = [*islands.arrays, self._layout, *self._own, self.values]
+                self._launch(self._lengthen, (self.longest, self.columns), inputs, [self.longer])
             return
         self._launch(
             self._walk,

@@ -11,6 +11,7 @@ from ddg_warp.compile.tolerance import outer_forces
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.drag import block_inertia
 from ddg_warp.kernels.islands import Islands
+from ddg_warp.kernels.matrix.chain_places import splits
 from ddg_warp.kernels.net import elements, newton
 from ddg_warp.kernels.solve import krylov, pcg
 from ddg_warp.solve.chains.newton import EARLY, FROZEN, FROZEN_ONLY, NewtonOptions
@@ -38,6 +39,7 @@ class NetNewton:
         linear: scalar type of the linear algebra; that of the model by default.
         drag: whether a block has more than a mass; see `kernels.drag`.
         reuse: whether the matrix of a step's first iterate serves the whole step.
+        split: whether edges may be stiffer than the matrix carries, where that can be; see `Chains.splits`.
     """
 
     banded = True  # whether chains keep their part of H, which holds on free dofs alone
@@ -50,6 +52,7 @@ class NetNewton:
         linear=None,
         drag: bool = False,
         reuse: bool = False,
+        split: bool = False,
     ):
         if reuse and options.psd not in FROZEN:
             raise SceneError(FROZEN_ONLY.format(options.psd))
@@ -63,7 +66,7 @@ class NetNewton:
         serial = arrays.serial(device)
         self.worlds, self.all = worlds, worlds * blocks
         V, H = net.vector, wp.types.vector(3, self.linear)
-        self.chains = Chains.of(net, preconditioner, self.banded)
+        self.chains = Chains.of(net, preconditioner, self.banded, split)
         self.system = NetSystem(net, self.chains and self.chains.kept)
 
         def make(shape, dtype):
@@ -103,7 +106,9 @@ class NetNewton:
         self.exact_from = tuple((0 if self.psd == "none" else EARLY) if wanted else None for wanted in exact)
         banded = self.chains is not None and self.chains.banded
         self.local = tuple(banded and part.host.along for part in net.sets)  # whether derivatives are of the local dofs
-        self.parts = [self._part(*given, make, H) for given in zip(net.sets, exact, self.local, strict=True)]
+        self.split = tuple(split and own and splits(part.term) for own, part in zip(self.local, net.sets, strict=True))
+        sets = zip(net.sets, exact, self.local, self.split, strict=True)
+        self.parts = [self._part(*given, make, H) for given in sets]
         ends = host.edges
         self.ends = wp.array(np.ascontiguousarray(ends, np.int32), dtype=int, device=device)
         # curvature is linear in the angles of mesh edges: they need no cap, which would shorten the steps of all else
@@ -119,8 +124,8 @@ class NetNewton:
         lengths = host.edge_lengths
         self.arm, self.longest = float(lengths.mean()), float(lengths.max())
         self._evaluate = [
-            elements.evaluate_kernel(part.term, self.real, self.linear, *kind, serial)
-            for part, *kind in zip(net.sets, self.exact_from, self.local, strict=True)
+            elements.evaluate_kernel(part.term, self.real, self.linear, late, local, serial, own)
+            for part, late, local, own in zip(net.sets, self.exact_from, self.local, self.split, strict=True)
         ]
         if self.chains:
             self.chains.bind(self.system, self.parts, self.real, self.linear, self.exact_from, drag, reuse)
@@ -158,7 +163,7 @@ class NetNewton:
         turns = (part.parameters[name] * part.parameters["measure"] for part in bending for name in part.term.rest)
         return "progressive" if any(np.abs(turn).max() > STRAIGHT for turn in turns) else "gauss_newton"
 
-    def _part(self, part, exact: bool, local: bool, make, H) -> dict:
+    def _part(self, part, exact: bool, local: bool, split: bool, make, H) -> dict:
         """What the elements of a set write."""
         measure, count = part.term.measure, self.worlds * part.elements
         rows, factor, gradient = (
@@ -170,7 +175,7 @@ class NetNewton:
 
         return {
             "factor": lay(len(measure.strains) * rows, factor),
-            "tension": lay(max(1, measure.tensions), self.linear),
+            "tension": lay(max(1, measure.tensions) + split, self.linear),
             "second": lay(measure.packed, self.linear) if exact else make((1, 1), self.linear),
             "gradient": lay(rows, gradient),
             "energy": lay(2, self.real),

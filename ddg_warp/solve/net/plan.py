@@ -3,6 +3,7 @@
 import numpy as np
 
 from ddg_warp.errors import SceneError
+from ddg_warp.kernels.matrix.chain_places import place_dofs
 from ddg_warp.solve.net.system import lists
 
 
@@ -13,6 +14,9 @@ class ChainPlan:
     of rigid joints, and the last places of a closed rod, so that what is left couples over two places at most; what acts from afar,
     as dipoles do, is left out. It falls into chains at rigid joints, not at hinged ones, over which a rod bends. Short chains lie
     behind each other in columns as long as the longest chain, so that little memory is padding. Nodes that are held take no part.
+
+    Args:
+        split: whether places have the tension of the edge behind them; then a chain goes on to the joint where its last edge ends.
 
     Attributes:
         twist, span: whether chains have angles, and over how many places they couple.
@@ -35,7 +39,8 @@ class ChainPlan:
             any, or one chain meets two of one colour.
     """
 
-    def __init__(self, host):
+    def __init__(self, host, split: bool = False):
+        self.split = split
         self._blocks, self._held = host.blocks, host.fixed.all(1)
         lengths = [len(rod.all_nodes) for rod in host.rods]
         self._first = dict(zip((rod.rod for rod in host.rods), np.cumsum([0, *lengths[:-1]]), strict=True))
@@ -53,6 +58,8 @@ class ChainPlan:
         for step in (1, 2):
             goes_on[place[reach == 2] - step + 1] = True
         goes_on[place[reach == 1]] = True
+        if split:
+            goes_on[1:] |= (kept | goes_on)[:-1] & (rod[1:] == rod[:-1])
         kept |= goes_on  # also places without dofs that a chain passes over
         chain = np.cumsum(~goes_on)[kept]
         self.twist, self.span = bool((angle >= 0).any()), 2 if (reach == 2).any() else 1
@@ -61,7 +68,12 @@ class ChainPlan:
     @property
     def block(self) -> int:
         """Dofs of a place."""
-        return 4 if self.twist else 3
+        return place_dofs(self.twist, self.split)
+
+    @property
+    def alone(self) -> bool:
+        """Whether the elimination is that of all of H and no chain meets a joint, so that every tension ends in one chain."""
+        return self.complete and not len(self.of_places[1])
 
     def bind(self, host, rows: np.ndarray, columns: np.ndarray, kept: np.ndarray | None) -> None:
         """Find everything among the rows and columns of positions of H; see `Chains.kept`."""
@@ -89,6 +101,12 @@ class ChainPlan:
             row, column = self._at[:, first + (k + i) % n]
             there = row >= 0
             at[row[there], column[there]] = np.flatnonzero(there)
+        return result
+
+    def places_ahead(self, rod: np.ndarray) -> np.ndarray:
+        """Place k and column of the next node (2, nodes) of all rods one after the other, given the rod of every node; -1 for none."""
+        result = np.full(self._at.shape, -1)
+        result[:, :-1] = np.where(rod[1:] == rod[:-1], self._at[:, 1:], -1)
         return result
 
     def held(self, host) -> np.ndarray:

@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
+from ddg_warp.compile.precision import largest_carried
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.net import elements, newton
 from ddg_warp.model.net import NetState
@@ -48,7 +49,7 @@ class NetStep(PartStep):
         reuse = integrator.solver == "projective"
         if options.psd == "auto" and means.stiff and not reuse:
             options = replace(options, psd="progressive")
-        solver = NetNewton(model, options, preconditioner, means.linear, host.drag is not None, reuse)
+        solver = NetNewton(model, options, preconditioner, means.linear, host.drag is not None, reuse, means.split)
         super().__init__(integrator, model, solver, means, counts_of)
         if counts_of is not None:
             self.newton.pcg_work = counts_of.newton.pcg_work
@@ -133,8 +134,21 @@ class NetStep(PartStep):
         return kernels
 
     def float32_errors(self, s: float) -> np.ndarray:
-        """The largest of a rod (1,); see `precision.float32_errors`."""
+        """The largest of a rod (1,); see `precision.float32_error`."""
         return self.net.host.rod_errors(s).max(initial=0.0, keepdims=True)
+
+    def split_errors(self, s: float) -> np.ndarray:
+        """The same with tensions as unknowns; infinite where they cannot be."""
+        chains, host = self.newton.chains, self.net.host
+        if not (chains and chains.splits) or self.newton.frozen:
+            return super().split_errors(s)
+        return host.split_errors(s).max(initial=0.0, keepdims=True)
+
+    def straighten(self, s: float) -> None:
+        """As of `PartStep`; and what float32 matrices carry, of the rod that is the softest."""
+        super().straighten(s)
+        if any(self.newton.split):
+            self.islands.carried.fill_(float(largest_carried(self.net.host.rod_stiffnesses(s)[2].min())))
 
     def who(self, world: int) -> str:
         """The net of a world."""

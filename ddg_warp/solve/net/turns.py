@@ -18,7 +18,7 @@ class Turns:
         def put(values):
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
 
-        self._bend, self._aim, *self._kernels = turn_kernels(newton.real, newton.linear)
+        self._bend, self._aim, self._turn, self._turn_longer, *self._kernels = turn_kernels(newton.real, newton.linear)
         loops = np.array([rod.piece.kind.closed for rod in host.rods], int)
         free = np.flatnonzero(~plan.anchored)
         rod = np.repeat(np.arange(len(loops)), np.diff(plan.start))
@@ -26,6 +26,10 @@ class Turns:
         self._nodes, self._ahead = put(plan.nodes), put(plan.nodes[plan.ahead(loops)])
         self._anchored = arrays.upload(plan.anchored.astype(np.uint8), wp.uint8, device)
         self._rods = [put(plan.start), self._nodes, self._anchored, put(plan.last_anchors()), put(loops)]
+        chains = newton.chains
+        self._behind = []  # of every edge, the place that has its tension, and what tensions say
+        if any(newton.split):
+            self._behind = [put(chains.plan.places_ahead(rod)), chains.longer, chains.width]
         self._ends = put(np.concatenate([rod.ends for rod in host.rods]))
         vector = wp.types.vector(3, newton.real)
         self._excess, self._shift = (
@@ -35,7 +39,7 @@ class Turns:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [self._bend, self._aim, *self._kernels]
+        return [self._bend, self._aim, self._turn, *([self._turn_longer] if self._behind else []), *self._kernels]
 
     def predict(self, v: wp.array, onward: bool) -> None:
         """Turn the edges of predictors by velocities v that turn them far, instead of stretching them.
@@ -53,21 +57,23 @@ class Turns:
         newton, net = self.newton, self.net
         inputs = [newton.q, newton.base, v, newton.held, *newton.islands.arrays, net.blocks]
         wp.launch(self._aim, newton.all, inputs, [newton.direction], device=net.device)
-        self.place(onward)
+        self.place(onward, predicted=True)
         newton.direction.zero_()  # solvers leave out what is held
 
     def turn(self, state) -> None:
         """Place the nodes of rods whose edges turn, and renew the frames that `state` lags where that is to be done."""
-        self.place()
+        self.place(predicted=False)
         if self.net.edges:
             self.net.renew(state, self.newton.q, self.newton.islands.todo)
 
-    def place(self, onward: bool = False) -> None:
-        """Nodes of rods, once the straight step has moved everything; `onward`: see `predict`."""
+    def place(self, onward: bool = False, predicted: bool = False) -> None:
+        """Nodes of rods, once the straight step has moved everything; `onward`: see `predict`. Predictors have no tensions."""
         newton, net = self.newton, self.net
-        turn, place, put = self._kernels
+        place, put = self._kernels
         moved = [newton.base, newton.direction, newton.islands.step_length, newton.islands.todo]
-        inputs = [self._nodes, self._ahead, *moved, newton.islands.turn, int(onward), net.blocks]
+        turn, inputs = self._turn, [self._nodes, self._ahead, *moved, newton.islands.turn, int(onward), net.blocks]
+        if self._behind and not predicted:
+            turn, inputs = self._turn_longer, [self._nodes, self._ahead, *moved, net.blocks, *self._behind]
         wp.launch(turn, (len(self._nodes), net.worlds), inputs, [self._excess], device=net.device)
         for rods, places in self._levels:
             inputs = [rods, *self._rods, newton.q, *moved, net.blocks, self._excess]

@@ -1,0 +1,109 @@
+"""Places of a net's chains: their dofs, and what vectors, positions of H and edges have there.
+
+A place of a chain has a node and the angle of the edge ahead of it, a block of -1 where it has none, and, where edges are split, the
+tension of the edge behind it; see `kernels.solve.tension`.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.net.places import along_type, one_function
+from ddg_warp.kernels.terms import Term
+from ddg_warp.kernels.threads import first_of
+
+
+def place_dofs(twist: bool, split: bool = False) -> int:
+    """Dofs of a place: its node, with `twist` the angle of the edge ahead, and at last, if `split`, the tension of the edge behind."""
+    return 3 + twist + split
+
+
+@cache
+def place_functions(twist: bool, linear, split: bool = False):
+    """free_of(held): by bits, 1 at the free dofs of a place, else 0; block_of(...): its block with another one from positions of H."""
+    nb = place_dofs(twist, split)
+    B, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
+
+    @wp.func
+    def free_of(held: wp.uint8):
+        f = B()
+        for d in range(wp.static(nb)):
+            f[d] = linear(1 - ((int(held) >> d) & 1))
+        return f
+
+    @wp.func
+    def block_of(matrix: wp.array2d(dtype=linear), places: wp.array3d(dtype=int), row: int, k: int, c: int, first: int):
+        m = M()
+        p = places[row, k, c]
+        if p >= 0:
+            for i in range(3):
+                for j in range(3):
+                    m[i, j] = matrix[3 * i + j, p + first]
+        if wp.static(twist):
+            p = places[row + 1, k, c]
+            if p >= 0:
+                for i in range(3):
+                    m[i, 3] = matrix[3 * i, p + first]
+            p = places[row + 2, k, c]
+            if p >= 0:
+                for j in range(3):
+                    m[3, j] = matrix[j, p + first]
+            p = places[row + 3, k, c]
+            if p >= 0:
+                m[3, 3] = matrix[0, p + first]
+        return m
+
+    return free_of, block_of
+
+
+@cache
+def value_function(twist: bool, linear, split: bool = False):
+    """value(v, places, k, c, shift): of a vector of blocks, what belongs to a place; blocks of the world begin at `shift`."""
+    H, B = wp.types.vector(3, linear), wp.types.vector(place_dofs(twist, split), linear)
+
+    @wp.func
+    def value(v: wp.array(dtype=H), places: wp.array3d(dtype=int), k: int, c: int, shift: int):
+        u = B()
+        node = places[0, k, c]
+        if node >= 0:
+            x = v[node + shift]
+            for d in range(3):
+                u[d] = x[d]
+        if wp.static(twist):
+            angle = places[1, k, c]
+            if angle >= 0:
+                x = v[angle + shift]
+                u[3] = x[0]
+        return u
+
+    return value
+
+
+def splits(term: Term) -> bool:
+    """Whether the stiffness of the elements of a term is that of edges, which may be `split`."""
+    return term.measure.tensions == len(term.measure.strains) == 1
+
+
+@cache
+def behind_function(terms: tuple[Term, ...], real, linear):
+    """behind(along..., k, c, w) -> row and slack of the edge that ends at a place, no slack where it has no tension of its own."""
+    H, Along = wp.types.vector(3, linear), along_type(real, linear)
+    first, one, own_splits = len(terms) == 1, one_function(len(terms) - 1, real, linear), splits(terms[-1])
+    before = None if first else behind_function(terms[:-1], real, linear)
+
+    @wp.func
+    def behind(own0: Along, own1: Along, own2: Along, own3: Along, own4: Along, own5: Along, k: int, c: int, w: int):
+        own = one(own0, own1, own2, own3, own4, own5)
+        t = H()
+        slack = linear(0.0)
+        if wp.static(not first):
+            t, slack = before(own0, own1, own2, own3, own4, own5, k, c, w)
+        if wp.static(own_splits):
+            e = own.at[1, k, c]
+            if e >= 0:
+                e += first_of(w, own.elements)
+                t = H(own.factor[0, e], own.factor[1, e], own.factor[2, e])
+                slack = own.tension[1, e]
+        return t, slack
+
+    return behind

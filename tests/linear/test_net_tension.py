@@ -1,0 +1,152 @@
+"""Tensions as unknowns of islands whose chains are eliminated at once: directions as without, and motion as in float64."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import ddg_warp as ddg
+from ddg_warp import arrays
+from ddg_warp.scenes import hair
+from ddg_warp.solve.chains.newton import NewtonOptions
+from ddg_warp.solve.net.newton import NetNewton
+
+HAIR = ddg.Material(young=4e9, poisson=0.4, density=1300.0, viscosity=1e-3)
+
+
+def held(axial: float = 1e4, twist: bool = True) -> ddg.Scene:
+    """Wavy rods that begin, end, and do both in held joints, one that bends on over a held joint; single nodes are held, too."""
+    scene = ddg.Scene()
+    along = np.linspace(0.0, 3.0, 25)
+    bend = {"EI2": 0.9} if twist else {}
+    section = ddg.Stiffness(EA=axial, EI1=0.6, GJ=0.5, mass_per_length=0.7, rotary_inertia=1e-3, **bend)
+    for i, joints in enumerate(([0], [24], [0, 24], [9])):
+        points = np.stack([along, 0.2 * np.sin(4.0 * along) + i, 0.2 * np.cos(3.0 * along)], axis=1)
+        rod = scene.add_rod(points, section=section, natural="straight", twist=twist)
+        for k in joints:
+            stub = scene.add_rod(
+                points[k] + np.linspace([0.0, 0.0, 1.0], [0.0, 0.0, 0.0], 3), section=section, twist=twist
+            )
+            scene.fix(stub, [0, 1, 2])
+            scene.join([(rod, k), (stub, -1)], rigid=False)
+        scene.fix(rod, [14])
+        scene.fix(rod, [17], components="y")
+    return scene
+
+
+def direction(
+    scene: ddg.Scene, device, linear, carried: float | None, noise: float = 1e-3
+) -> tuple[NetNewton, np.ndarray]:
+    """A solver of two worlds, iterates off their rest by `noise` [m], and the first direction (worlds, blocks, 3)."""
+    random, model = np.random.default_rng(3), scene.build(device, "float64", worlds=2)
+    newton = NetNewton(model, NewtonOptions(psd="gauss_newton"), "chain", linear, split=carried is not None)
+    state, islands = model.state().net, newton.islands
+    q = state.q.numpy()
+    free = np.tile(~model.net.host.fixed, (2, 1))
+    for array, size in ((newton.q, noise), (newton.base, noise), (newton.target, 1e-3)):
+        array.assign(q + size * random.normal(size=q.shape) * free)
+    islands.coefficient.fill_(100.0)
+    islands.rate.fill_(10.0)
+    islands.clamped.fill_(1)
+    islands.carried.fill_(carried or 0.0)
+    newton.evaluate(state)
+    newton.balance()
+    islands.wanted.fill_(1)
+    newton.assemble()
+    newton.direct()
+    assert newton.chains.splits
+    assert (newton.negative.numpy() == 0).all()
+    return newton, newton.direction.numpy().astype(float).reshape(2, -1, 3)
+
+
+@pytest.mark.parametrize("twist", [True, False])
+def test_directions_are_those_of_the_whole_matrix(device, twist):
+    """Whatever the share of the stiffness that H carries; and edges with a tension lengthen by what it says."""
+    scene = held(twist=twist)
+    _, exact = direction(scene, device, wp.float64, None)
+    for carried in (1.0, 1e4, 1e9):  # edges have some 8e4; the last leaves no tension
+        newton, found = direction(scene, device, wp.float64, carried)
+        np.testing.assert_allclose(found, exact, rtol=0, atol=1e-9 * np.abs(exact).max())
+        part = next(part for part in newton.net.sets if part.term.measure.tensions)
+        a, b = part.host.slots[:2]
+        q = newton.q.numpy().reshape(2, -1, 3)
+        edges, steps = q[:, b] - q[:, a], found[:, b] - found[:, a]
+        along = np.sum(edges * steps, axis=-1) / np.linalg.norm(edges, axis=-1)
+        at = newton.chains.plan.elements(newton.net.host, part.host)[1]
+        k, c = np.nonzero(at >= 0)
+        longer = arrays.download(newton.chains.longer).reshape(2, newton.chains.longest, 2, -1)
+        slack, lengthening = longer[:, k, :, c].transpose(1, 2, 0)
+        assert (slack > 0.0).any() == (carried < 1e9)
+        expected = along[:, at[k, c]]
+        there = slack > 0.0
+        np.testing.assert_allclose(
+            lengthening[there], expected[there], rtol=0, atol=1e-9 * np.abs(steps).max(initial=0.0)
+        )
+
+
+def test_float32_is_as_good_however_stiff_edges_are(device):
+    """Errors of directions with tensions do not grow with EA; without they do. Edges have kept their lengths."""
+    errors = {1e2: [], None: []}
+    for axial in (1e4, 1e6, 1e8):
+        scene = held(axial)
+        _, exact = direction(scene, device, wp.float64, 1e2, 0.0)
+        for carried, found in errors.items():
+            _, got = direction(scene, device, wp.float32, carried, 0.0)
+            found.append(np.abs(got - exact).max() / np.abs(exact).max())
+    assert max(errors[1e2]) < 1e-3
+    assert errors[None][-1] > 30.0 * errors[1e2][-1]
+
+
+def island(nodes: int, strands: int = 3, backwards: bool = False) -> ddg.Scene:
+    """Hair in one island: the roots are joined to stubs that are held."""
+    scene = ddg.Scene(gravity=(3.0, 0.0, -9.81), analysis=ddg.Dynamics(dt=1.0 / 60.0, duration=1.0))
+    given = {"section": ddg.Circle(40e-6), "material": HAIR}
+    for points in hair.curls(strands, nodes):
+        rod = scene.add_rod(points[::-1] if backwards else points, natural="shape", **given)
+        stub = scene.add_rod(np.linspace(points[0] + [0.0, 0.0, 0.02], points[0], 3), **given)
+        scene.clamp(stub, edges=[0, 1])
+        scene.join([(rod, -1 if backwards else 0), (stub, -1)], rigid=False)
+    return scene
+
+
+def advance(scene: ddg.Scene, device, precision: str, dt: float, steps: int, **options):
+    """Points after some steps, and the statistics."""
+    model = scene.build(device, precision)
+    integrator, state = ddg.Integrator(model, **options), model.state()
+    for _ in range(steps):
+        state = integrator.step(state, dt)
+    integrator.check(state)
+    return state.points(), integrator.statistics()
+
+
+@pytest.mark.parametrize(
+    ("nodes", "backwards", "scheme"),
+    [
+        (32, False, "implicit_euler"),
+        pytest.param(32, True, "implicit_euler", marks=pytest.mark.slow),
+        pytest.param(128, False, "implicit_euler", marks=pytest.mark.slow),
+        pytest.param(32, False, "implicit_midpoint", marks=pytest.mark.slow),
+    ],
+)
+def test_hair_in_one_island_moves_as_in_float64(device, nodes, backwards, scheme):
+    """Within 1e-6 m of float64 at rtol 1e-10, in as many iterations, and without retries."""
+    given = (1.0 / 60.0, 15) if scheme == "implicit_euler" else (1.0 / 120.0, 30)
+    options = {"scheme": scheme} | ({"energy_bound": None} if scheme == "implicit_midpoint" else {})
+    scene = island(nodes, backwards=backwards)
+    exact, _ = advance(scene, device, "float64", *given, rtol=1e-10, **options)
+    _, usual = advance(scene, device, "float64", *given, **options)
+    found, mixed = advance(scene, device, "mixed", *given, **options)
+    assert mixed["linear"] == ["float32 with tensions"]
+    assert np.abs(found - exact).max() < 1e-6
+    assert mixed["newton_iterations"]["mean"] < 1.1 * usual["newton_iterations"]["mean"]
+    assert mixed["retries"] == mixed["pcg_iterations"] == 0
+
+
+def test_the_report_says_what_islands_take(device):
+    """Chains on their own take tensions; those that meet a free joint are solved in float64."""
+    said = "over steps of 0.0166667 s: edges turned, second derivatives, linear algebra in "
+    assert said + "float32 with tensions" in island(32).build(device, "mixed").report()
+    scene = island(32)
+    tip = scene.batches[0].points[0, -1]
+    twig = scene.add_rod(np.linspace(tip, tip + [0.1, 0.0, 0.0], 10), section=ddg.Circle(40e-6), material=HAIR)
+    scene.join([(0, -1), (twig, 0)], rigid=False)
+    assert said + "float64" in scene.build(device, "mixed").report()
