@@ -12,6 +12,7 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
+from ddg_warp.kernels import outcome
 from ddg_warp.learn.adjoint import Adjoint, EquilibriumAdjoint
 from ddg_warp.learn.chains import Kept
 from ddg_warp.learn.net import NetKept
@@ -60,6 +61,13 @@ def tensors(state, names: list[Field]) -> list[torch.Tensor]:
     return [wp.to_torch(found[field.name], requires_grad=False) for field in names]
 
 
+def copies(values: list[torch.Tensor]) -> list[torch.Tensor]:
+    """Of tensors, as they lie."""
+    found = [torch.empty_like(value) for value in values]
+    torch._foreach_copy_(found, values)
+    return found
+
+
 class Engine:
     """Steps and gradients of a model with its worlds.
 
@@ -72,14 +80,14 @@ class Engine:
     """
 
     def __init__(self, model, scheme: str, options: dict):
-        self.model = model
+        self.model, self.device = model, str(wp.device_to_torch(model.wp_device))
         self._midpoint = scheme == "implicit_midpoint"
         self.integrator = Integrator(model, scheme, failures="flag", check_every=FOREVER, energy_bound=None, **options)
         self.adjoint = self._equilibria = None
         self.fields = fields(model)
         self.before, self.after = (buffer.own for buffer in self.integrator._buffers)
         self.source, self.target = (tensors(state, self.fields) for state in (self.before, self.after))
-        self._tables, self._places_found = {}, {}
+        self._tables, self._places_found, self._views = {}, {}, {}
         self._written, self._held = {}, {}
         self._graphs = None
 
@@ -151,10 +159,13 @@ class Engine:
                 f"parameters: {name} has shape {shape}; give (), ({worlds}, 1) for each world, (1, {count}) for each element, or "
                 f"({worlds}, {count})"
             )
-        wide = wide.to(device=str(wp.device_to_torch(self.model.wp_device)), dtype=real)
+        wide = wide.to(device=self.device, dtype=real)
         result = []
         for _, rows, chain in found:
-            own = wide[:, rows.reshape(-1)]
+            if values.shape[-1:] in ((), (1,)) or shape == (worlds,) != (count,):  # alike in all elements
+                own = wide[:, :1].expand(worlds, rows.numel())
+            else:  # whose reverse adds to each element once, so in one order
+                own = wide.index_select(1, rows.reshape(-1))
             if chain:
                 own = own.reshape(worlds, *rows.shape).permute(1, 0, 2).reshape(rows.shape[0], -1)
             result.append(own)
@@ -210,35 +221,43 @@ class Engine:
 
     # steps
 
-    def forward(self, start: float, dt: float, state, controls: dict) -> list[torch.Tensor]:
-        """The state after a step, its tensors, and of every part what tells whether it has a gradient (islands,)."""
+    def forward(self, start: float, dt: float, state, controls: dict, graded: bool) -> list[torch.Tensor]:
+        """The state after a step, its tensors, and of every part what tells whether it has a gradient (islands,), if that is asked."""
         integrator = self.integrator
         self.fill(self.source, state)
         integrator.forget()
         integrator._prepare(dt, self.before)
         self._give(controls)
         integrator.advance(0, start, dt)
-        return [tensor.clone() for tensor in self.target] + [self._smooth(part) for part in integrator._parts]
+        return copies(self.target) + [self._smooth(part, graded) for part in integrator._parts]
 
     @staticmethod
     def fill(places: list[torch.Tensor], values) -> None:
         """Copy tensors to where they are read."""
-        for place, value in zip(places, values, strict=True):
-            place.copy_(value)
+        torch._foreach_copy_(places, list(values))
 
-    def _smooth(self, part) -> torch.Tensor:
+    def _smooth(self, part, graded: bool) -> torch.Tensor:
         """One for islands whose step was one solve in the frames that it began with, else not a number."""
-        portion = wp.to_torch(part.islands.portion, requires_grad=False)
-        smooth = portion == 1.0
-        if part is not self.integrator._net:
-            if part.group.kind.twist:
-                before = wp.to_torch(self.before.groups[part.index].frame, requires_grad=False)
-                smooth = smooth & (wp.to_torch(part.newton.frame, requires_grad=False) == before).all(0).all(0)
-        elif part.net.edges:
-            before = wp.to_torch(self.before.net.frame, requires_grad=False)
-            same = wp.to_torch(part._lagged[0], requires_grad=False) == before
-            smooth = smooth & same.all(0).reshape(len(portion), -1).all(1)
-        smooth = smooth & (wp.to_torch(part.islands.status, requires_grad=False) <= 2)
+        key = "smooth", id(part)
+        if key not in self._views:  # of parts that there are; one made anew has another place
+            net = part is self.integrator._net
+            frames = ()
+            if net and part.net.edges:
+                frames = part._lagged[0], self.before.net.frame
+            elif not net and part.group.kind.twist:
+                frames = part.newton.frame, self.before.groups[part.index].frame
+            views = [
+                wp.to_torch(array, requires_grad=False)
+                for array in (part.islands.status, part.islands.portion, *frames)
+            ]
+            self._views[key] = part, views, torch.ones_like(views[1])
+        _, (status, portion, *frames), ones = self._views[key]
+        if not graded:
+            return ones.clone()
+        smooth = (portion == 1.0) & (status <= outcome.CONVERGED_TO_ROUNDING)
+        if frames:
+            same = (frames[0] == frames[1]).all(0)
+            smooth &= same.all(0) if same.ndim == 2 else same.reshape(len(portion), -1).all(1)
         return torch.where(smooth, 1.0, float("nan")).to(portion.dtype)
 
     def _give(self, controls: dict) -> None:
@@ -318,7 +337,7 @@ class Engine:
             for own in adjoint.chains
         ]
         found.grips = self.model.empty_state().grips
-        return [tensor.clone() for tensor in tensors(found, self.fields)], inputs
+        return copies(tensors(found, self.fields)), inputs
 
     def _net_kept(self, dt: float) -> NetKept:
         """Of the net: joints' rotations are those at the rates of the step, as their dofs begin it at zero."""
@@ -344,7 +363,7 @@ class Engine:
             torch.ones(len(part.islands), dtype=state[0].dtype, device=state[0].device)
             for part in self.integrator._parts
         ]
-        return [tensor.clone() for tensor in tensors(found, self.fields)] + ones
+        return copies(tensors(found, self.fields)) + ones
 
     def balance_backward(self, end: float, state, given) -> list:
         """Derivatives by what an equilibrium at the load parameter `end` reads, part by part."""
@@ -448,8 +467,7 @@ class Engine:
 
     def _places(self, key, find) -> list[torch.Tensor]:
         if key not in self._places_found:
-            device = str(wp.device_to_torch(self.model.wp_device))
-            self._places_found[key] = [torch.as_tensor(np.asarray(v), device=device) for v in find()]
+            self._places_found[key] = [torch.as_tensor(np.asarray(v), device=self.device) for v in find()]
         return self._places_found[key]
 
     def _by_world(self, flags) -> torch.Tensor:
@@ -463,40 +481,55 @@ class Engine:
 
     def points(self, values, own: str, blocks: str) -> torch.Tensor:
         """Points (worlds, P, 3) from the tensors of a state."""
-        model, worlds = self.model, self.model.worlds
-        real = wp.dtype_to_torch(model.types.real)
-        result = torch.zeros((worlds, model.points_count, 3), dtype=real, device=values[0].device)
+        model, found = self.model, []
         for i, group in enumerate(model.groups):
-            k, column, rows = self._places(("points", i), lambda group=group: model.order.places(group))
-            found = values[self._of(f"{i}/{own}")].reshape(group.nodes, worlds, group.rods, -1)[k, :, column]
-            axes = torch.as_tensor(list(group.host.axes), device=found.device)
-            result = result.index_put(
-                (torch.arange(worlds, device=found.device)[:, None, None], rows[:, None], axes), found.movedim(1, 0)
-            )
+            x = values[self._of(f"{i}/{own}")].reshape(-1, group.kind.dim)
+            if group.kind.dim == 2:
+                x = torch.stack([x[:, 0], torch.zeros_like(x[:, 0]), x[:, 1]], 1)
+            found.append(x)
         if model.net is not None:
-            rows, blocks_of = self._places(("points", "net"), lambda: model.order.net_rows)
-            found = values[self._of(f"net/{blocks}")].reshape(worlds, -1, 3)[:, blocks_of]
-            result = result.index_put((torch.arange(worlds, device=found.device)[:, None], rows), found)
-        return result
+            found.append(values[self._of(f"net/{blocks}")])
+        return self._picked("points", found, self._point_rows).view(model.worlds, model.points_count, 3)
 
     def edges(self, values) -> torch.Tensor:
         """Angles (worlds, edges) from the tensors of a state."""
-        model, worlds = self.model, self.model.worlds
-        real = wp.dtype_to_torch(model.types.real)
-        result = torch.zeros((worlds, model.order.edges_count), dtype=real, device=values[0].device)
-        for i, group in enumerate(model.groups):
-            if group.kind.twist:
-                k, column, rows = self._places(("edges", i), lambda group=group: model.order.edge_places(group))
-                found = values[self._of(f"{i}/theta")].reshape(group.nodes, worlds, group.rods)[k, :, column]
-                result = result.index_put((torch.arange(worlds, device=found.device)[:, None], rows), found.T)
+        model = self.model
+        twisted = [i for i, group in enumerate(model.groups) if group.kind.twist]
+        found = [values[self._of(f"{i}/theta")].reshape(-1) for i in twisted]
         if model.net is not None:
-            q = values[self._of("net/q")].reshape(worlds, -1, 3)
-            for rod in model.net.host.rods:
-                first = int(model.order.edge_starts[rod.rod])
-                rows = torch.arange(first, first + len(rod.edges), device=q.device)
-                found = q[:, torch.as_tensor(rod.edges, device=q.device), 0]
-                result = result.index_put((torch.arange(worlds, device=q.device)[:, None], rows), found)
-        return result
+            found.append(values[self._of("net/q")][:, 0])
+        none = torch.zeros(1, dtype=values[0].dtype, device=values[0].device)
+        return self._picked("edges", [*found, none], self._edge_rows).view(model.worlds, -1)
+
+    def _picked(self, key: str, found: list[torch.Tensor], find) -> torch.Tensor:
+        """Rows of what was found, one behind the other."""
+        (rows,) = self._places(("picked", key), lambda: [find([len(own) for own in found])])
+        return (found[0] if len(found) == 1 else torch.cat(found)).index_select(0, rows)
+
+    def _point_rows(self, sizes: list[int]) -> np.ndarray:
+        model, worlds = self.model, self.model.worlds
+        rows, first = np.zeros((worlds, model.points_count), np.int64), np.cumsum([0, *sizes])
+        world = np.arange(worlds)[:, None]
+        for at, group in zip(first, model.groups, strict=False):
+            k, column, own = model.order.places(group)
+            rows[:, own] = at + k * group.columns + world * group.rods + column
+        if model.net is not None:
+            own, blocks = model.order.net_rows
+            rows[:, own] = first[len(model.groups)] + world * model.net.blocks + blocks
+        return rows.ravel()
+
+    def _edge_rows(self, sizes: list[int]) -> np.ndarray:
+        model, worlds = self.model, self.model.worlds
+        first = np.cumsum([0, *sizes])
+        rows, world = np.full((worlds, model.order.edges_count), first[-2]), np.arange(worlds)[:, None]
+        twisted = [group for group in model.groups if group.kind.twist]
+        for at, group in zip(first, twisted, strict=False):
+            k, column, own = model.order.edge_places(group)
+            rows[:, own] = at + k * group.columns + world * group.rods + column
+        for rod in model.net.host.rods if model.net is not None else ():
+            own = model.order.edge_starts[rod.rod] + np.arange(len(rod.edges))
+            rows[:, own] = first[len(twisted)] + world * model.net.blocks + rod.edges
+        return rows.ravel()
 
     def put_points(self, values: list, own: str, blocks: str, points: torch.Tensor) -> list:
         """Tensors of a state with points (P, 3) or (worlds, P, 3) in place of its own.

@@ -262,6 +262,7 @@ class Simulator(torch.nn.Module):
             fields=tuple(engine.fields),
             parameters=tuple(name for name, _ in full),
             controls=tuple(controls),
+            graded=torch.is_grad_enabled(),
         )
 
 

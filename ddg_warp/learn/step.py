@@ -14,6 +14,7 @@ class Call:
         start, dt: time at its start and length [s].
         fields: tensors of the state.
         parameters, controls: names of those that follow; of a parameter as many as parts have it.
+        graded: whether gradients may be asked for.
     """
 
     engines: object
@@ -23,6 +24,7 @@ class Call:
     fields: tuple
     parameters: tuple
     controls: tuple
+    graded: bool
 
     @property
     def engine(self):
@@ -54,7 +56,7 @@ class Step(torch.autograd.Function):
         with engine.stream():
             state, parameters, controls = call.split(tensors)
             engine.write(call.parameters, parameters)
-            return tuple(engine.forward(call.start, call.dt, state, controls))
+            return tuple(engine.forward(call.start, call.dt, state, controls, call.graded))
 
     @staticmethod
     def setup_context(ctx, inputs, output):
