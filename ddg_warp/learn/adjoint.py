@@ -85,11 +85,13 @@ class Adjoint:
             _require_minimum(own, part)
         return found
 
-    def upload(self, start: float, dt: float) -> None:
-        """What supports do in the step whose reverse follows."""
+    def upload(self, start: float, dt: float) -> bool:
+        """What supports do in the step whose reverse follows, and what suits it; whether that is another solver than before."""
+        changed = [own.solve.suit(self.integrator._solved(dt)) for own in self.chains]
         for own in (*self.chains, *([self.net] if self.net else [])):
             if own.supports:
                 own.supports.upload(start, start + dt)
+        return any(changed)
 
     def pull_parts(self, before: State, after: State, parts: list, given: State, s: float) -> tuple[State, list]:
         """The same without a check, for solves over s [s]; what it returns is written anew by the next call."""

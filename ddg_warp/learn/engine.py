@@ -88,7 +88,7 @@ class Engine:
         self.before, self.after = (buffer.own for buffer in self.integrator._buffers)
         self.source, self.target = (tensors(state, self.fields) for state in (self.before, self.after))
         self._tables, self._places_found, self._views = {}, {}, {}
-        self._written, self._held = {}, {}
+        self._written, self._held, self._tables_seen, self._streams = {}, {}, {}, {}
         self._graphs = None
 
     # parameters
@@ -215,6 +215,14 @@ class Engine:
                 self._held[id(table), key] = given  # so that nothing else gets its id
 
     def _view(self, table, key: str, shape: tuple) -> torch.Tensor:
+        buffer, view = self._tables_seen.get((id(table), key), (None, None))
+        if buffer is not table.buffer:
+            buffer, view = table.buffer, self._look(table, key, shape)
+            self._tables_seen[id(table), key] = buffer, view
+        return view
+
+    @staticmethod
+    def _look(table, key: str, shape: tuple) -> torch.Tensor:
         row = list(table.values).index(key)
         offset = sum(values.size for values in list(table.values.values())[:row])
         return wp.to_torch(table.buffer, requires_grad=False)[offset : offset + shape[0] * shape[1]].view(shape)
@@ -225,10 +233,9 @@ class Engine:
         """The state after a step, its tensors, and of every part what tells whether it has a gradient (islands,), if that is asked."""
         integrator = self.integrator
         self.fill(self.source, state)
-        integrator.forget()
         integrator._prepare(dt, self.before)
         self._give(controls)
-        integrator.advance(0, start, dt)
+        integrator.advance(0, start, dt, anew=True)
         return copies(self.target) + [self._smooth(part, graded) for part in integrator._parts]
 
     @staticmethod
@@ -316,7 +323,8 @@ class Engine:
         self.fill(self.source, before)
         self.fill(self.target, after)
         self.fill(self._by_state, given)
-        adjoint.upload(start, dt)
+        if adjoint.upload(start, dt):
+            self._graphs.clear()
         s, parts = self.integrator._solved(dt), list(self._parts)
         for kept, end in zip(parts if self._midpoint else (), self.after.groups, strict=False):
             x, ends = wp.to_torch(kept.x, requires_grad=False), (end.x, kept.before.x)
@@ -381,8 +389,10 @@ class Engine:
         """Launches on torch's stream; on the CPU there is one order for all."""
         if not self.model.wp_device.is_cuda:
             return nullcontext()
-        stream = wp.stream_from_torch(torch.cuda.current_stream(wp.device_to_torch(self.model.wp_device)))
-        return wp.ScopedStream(stream)
+        own = torch.cuda.current_stream(self.device)
+        if own not in self._streams:
+            self._streams[own] = wp.stream_from_torch(own)
+        return wp.ScopedStream(self._streams[own])
 
     def solved(self, flags) -> list[torch.Tensor]:
         """Flags of a step, not numbers where its reverse has failed, too: of rods that are at no minimum."""

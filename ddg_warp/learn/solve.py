@@ -9,6 +9,7 @@ from scipy.sparse.linalg import splu
 
 from ddg_warp import arrays
 from ddg_warp.errors import SolverError
+from ddg_warp.kernels.adjoint import step
 from ddg_warp.solve.chains.assembled import AssembledNewton
 from ddg_warp.solve.chains.newton import ChainNewton, NewtonOptions
 from ddg_warp.solve.chains.tangent import ChainTangent
@@ -16,6 +17,7 @@ from ddg_warp.solve.choice import automatic
 from ddg_warp.solve.direct import SingularError, regular
 from ddg_warp.solve.reduction import CyclicReduction
 
+CLOSE = 1e-4  # relative error of float32 solutions up to which gradients take them
 SINGULAR = 1e-6  # part of a right-hand side that a solution may miss; a singular matrix, which has been made regular, misses more
 
 
@@ -116,30 +118,46 @@ class ChainSolve:
 
     def __init__(self, model, group):
         self.model, self.group = model, group
-        real, device, kind = model.types.real, model.wp_device, group.kind
         self.host = HostSolve(ChainTangent(model, group, 0))
         self.system = self.reduction = self.failed = None
-        if kind.closed:
+        if group.kind.closed:
             return
-        given = model, group, NewtonOptions(psd="none"), real
+        self._built(model.types.linear)
+
+    def suit(self, s: float) -> bool:
+        """From now on solve by what suits steps of s [s], too, in the precision of the model's linear algebra where that leaves w right
+        to `CLOSE`; whether that is another solver."""
+        real = self.model.types.real
+        if self.system is None or self.system.linear is real or self.group.float32_errors(s).max() <= CLOSE:
+            return False
+        self._built(real)
+        return True
+
+    def _built(self, linear) -> None:
+        model, group, kind, device = self.model, self.group, self.group.kind, self.model.wp_device
+        given = model, group, NewtonOptions(psd="none"), linear
+        self._cast = step.cast_kernels(model.types.real, linear) if linear is not model.types.real else None
         if automatic(group) == "sweep":
             self.system = ChainNewton(*given)
             self._moved = self.system.x, self.system.theta  # what the sweep moves along w
             self.failed = self.system.islands.status
         else:
             self.system = AssembledNewton(*given)
-            self.reduction = CyclicReduction(kind.block, group.nodes, group.columns, real, device)
+            self.reduction = CyclicReduction(kind.block, group.nodes, group.columns, linear, device)
             self._wanted = wp.full(group.columns, 1, dtype=int, device=device)
             self.failed = self.system.islands.bad
+
+        self._right, self._found = self.system.right, self.system.direction
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         if self.system is None:
             return []
+        around = [(self.system._evaluate, 128), *(self._cast or ())]
         if self.reduction is None:
-            return [(self.system._evaluate, 128), (self.system._sweep, self.system._threads)]
-        return [(self.system._evaluate, 128), self.system._assemble, *self.reduction.kernels]
+            return [*around, (self.system._sweep, self.system._threads)]
+        return [*around, self.system._assemble, *self.reduction.kernels]
 
     def __call__(self, solved, last: wp.array, s: float, right: wp.array, w: wp.array) -> None:
         """Write w (block, n, R), zero at held dofs, for a right-hand side that is zero there.
@@ -165,15 +183,21 @@ class ChainSolve:
         islands.rate.fill_(rate)
         islands.unbalanced.fill_(1)  # every rod wants its matrix
         system.evaluate(last)
+        found = w
+        if self._cast:
+            wp.launch(self._cast[0], right.shape, [right], [self._right], device=system.device)
+            right, found = self._right, self._found
         if self.reduction is None:
             islands.stale.zero_()  # frames are as they were in the step
-            (system.x, system.theta), system.right, system.direction = self._moved, right, w
+            (system.x, system.theta), system.right, system.direction = self._moved, right, found
             arrays.copy(system.x, solved.x)
             arrays.copy(system.theta, solved.theta)
             system.eliminate()
         else:
             system.assemble_blocks()
-            self.reduction.solve(system.blocks, right, self.group.count, self._wanted, w, islands.bad)
+            self.reduction.solve(system.blocks, right, self.group.count, self._wanted, found, islands.bad)
+        if self._cast:
+            wp.launch(self._cast[1], w.shape, [found], [w], device=system.device)
 
     def _on_host(self, solved, last, rate: float, coefficient: float, right: wp.array, w: wp.array) -> None:
         data = SimpleNamespace(x=solved.x, theta=solved.theta, frame=solved.frame, last=last)

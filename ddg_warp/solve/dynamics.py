@@ -150,11 +150,17 @@ class Integrator:
             for part in self._parts:
                 part.straighten(self._solved(dt))
 
-    def advance(self, source: int, start: float, dt: float) -> None:
-        """A step from what one buffer holds, at the time `start`, to the other."""
+    def advance(self, source: int, start: float, dt: float, anew: bool = False) -> None:
+        """A step from what one buffer holds, at the time `start`, to the other; `anew` where it is from elsewhere: see `forget`."""
         for part in self._parts:
             part.prescribe(start, start + dt)
-        self._graphs.replay((source, self.given is not None and self.given.any), lambda: self._launch(source))
+
+        def launch():
+            if anew:
+                self.forget()
+            self._launch(source)
+
+        self._graphs.replay((source, anew, self.given is not None and self.given.any), launch)
 
     def check(self, state: State) -> None:
         """Read the outcomes of all steps since the last reading.

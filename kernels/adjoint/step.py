@@ -192,3 +192,18 @@ def angle_kernel(dim: int, real, midpoint: bool):
             wp.atomic_sub(node_out, c, where[i, 2] / columns, r, share)
 
     return pull
+
+
+@cache
+def cast_kernels(real, linear):
+    """down(values, out) and up(values, out): arrays of three dimensions from one precision to another."""
+
+    def made(source, target):
+        @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+        def cast(values: wp.array3d(dtype=source), out: wp.array3d(dtype=target)):
+            i, k, r = wp.tid()
+            out[i, k, r] = target(values[i, k, r])
+
+        return cast
+
+    return made(real, linear), made(linear, real)

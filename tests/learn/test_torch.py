@@ -8,6 +8,7 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.errors import SceneError
+from tests.learn import differences
 from tests.learn.differences import TIGHT, built
 from tests.learn.test_adjoint import CLOSE, CURVE, DT, SCENES, SOFT, a_scene
 
@@ -275,3 +276,16 @@ def test_what_does_not_fit_is_refused(parameters, controls, message):
     own = simulator("twisted")
     with pytest.raises(SceneError, match=message):
         own.step(own.initial_state(2), parameters, controls)
+
+
+@pytest.mark.parametrize("name", ["twisted", "joined", "planar", "sheet"])
+def test_mixed_precision_is_close_to_float64(name):
+    """To 1e-4, as asked: by float32 solutions where these are good enough, else by float64."""
+    gradients = []
+    for precision in ("float64", "mixed"):
+        scene = SCENES[name]()
+        own = Simulator(scene.build(device=differences.DEVICE, precision=precision), DT, rtol=1e-9)
+        stiffness = own.parameter(STIFFNESS[name]).requires_grad_()
+        *_, state = own.rollout(own.initial_state(), {STIFFNESS[name]: stiffness}, steps=5)
+        gradients.append(torch.autograd.grad((state.positions**2).sum(), stiffness)[0])
+    assert float((gradients[1] - gradients[0]).abs().max()) < 1e-4 * float(gradients[0].abs().max())
