@@ -31,16 +31,19 @@ class WorldState:
     engine: Engine
 
     @property
+    @torch.compiler.disable
     def positions(self) -> torch.Tensor:
         """Points (B, P, 3) [m], in the order of `State.points`."""
         return self.engine.points(self.values, "x", "q")
 
     @property
+    @torch.compiler.disable
     def velocities(self) -> torch.Tensor:
         """Their velocities (B, P, 3) [m/s]."""
         return self.engine.points(self.values, "v", "v")
 
     @property
+    @torch.compiler.disable
     def angles(self) -> torch.Tensor:
         """Angles of edges (B, edges) [rad], zero where there is no twist."""
         return self.engine.edges(self.values)
@@ -108,6 +111,7 @@ class Simulator(torch.nn.Module):
     def __deepcopy__(self, memo):
         return type(self)(self.model, self.dt, scheme=self.scheme, **self.options)
 
+    @torch.compiler.disable
     def initial_state(self, batch: int | None = None, positions=None, velocities=None) -> WorldState:
         """The first state of so many worlds: at rest, or elsewhere.
 
@@ -128,6 +132,7 @@ class Simulator(torch.nn.Module):
                 values = engine.put_points(values, *names, what)
         return WorldState(tuple(values), 0.0, engine)
 
+    @torch.compiler.disable  # what is compiled goes on behind it: launches of Warp are nothing that a compiler sees
     def step(self, state: WorldState, parameters: dict | None = None, controls: dict | None = None) -> WorldState:
         """The state after a step of dt.
 
@@ -138,6 +143,7 @@ class Simulator(torch.nn.Module):
 
     forward = step
 
+    @torch.compiler.disable
     def rollout(
         self,
         state: WorldState,
@@ -183,6 +189,7 @@ class Simulator(torch.nn.Module):
             result += saved
         return result
 
+    @torch.compiler.disable
     def equilibrium(
         self, parameters: dict | None = None, *, state: WorldState | None = None, batch: int | None = None, **options
     ) -> WorldState:

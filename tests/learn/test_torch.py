@@ -289,3 +289,68 @@ def test_mixed_precision_is_close_to_float64(name):
         *_, state = own.rollout(own.initial_state(), {STIFFNESS[name]: stiffness}, steps=5)
         gradients.append(torch.autograd.grad((state.positions**2).sum(), stiffness)[0])
     assert float((gradients[1] - gradients[0]).abs().max()) < 1e-4 * float(gradients[0].abs().max())
+
+
+def test_compiled_functions_go_on_around_steps():
+    own, term = simulator("twisted"), STIFFNESS["twisted"]
+
+    def loss(stiffness):
+        state = own.step(own.initial_state(), {term: stiffness * 2.0})
+        return (torch.sin(state.positions) ** 2).sum()
+
+    stiffness = torch.tensor(1e-4, dtype=torch.float64, requires_grad=True)
+    compiled = torch.compile(loss, backend="aot_eager")
+    (found,) = torch.autograd.grad(compiled(stiffness), stiffness)
+    (wanted,) = torch.autograd.grad(loss(stiffness), stiffness)
+    torch.testing.assert_close(found, wanted)
+
+
+def _learn(rank: int, folder: str, out: str) -> None:
+    """One of two processes that share a parameter and have a world each: half a step of descent."""
+    import torch.distributed as dist
+
+    dist.init_process_group("gloo", init_method=f"file://{folder}/meet", rank=rank, world_size=2)
+    own = simulator("twisted")
+    module = torch.nn.parallel.DistributedDataParallel(RodParameters(own, names=("bending",)))
+    speed = torch.full((1, own.model.points_count, 3), 0.1 * (rank + 1.0), dtype=torch.float64)
+    state = own.step(own.initial_state(velocities=speed), module())
+    (state.positions**2).sum().backward()
+    torch.save(module.module.logarithms["bending"].grad, f"{out}{rank}")
+    dist.destroy_process_group()
+
+
+def test_two_processes_share_a_gradient(tmp_path, device):
+    """DistributedDataParallel takes the mean of what both have found."""
+    if device != "cpu":
+        pytest.skip("gloo is for the CPU")
+    torch.multiprocessing.spawn(_learn, (str(tmp_path), str(tmp_path / "gradient")), nprocs=2)
+    found = [torch.load(tmp_path / f"gradient{rank}") for rank in range(2)]
+    torch.testing.assert_close(found[0], found[1], rtol=0.0, atol=0.0)
+    own, factors = simulator("twisted"), None
+    total = 0.0
+    for rank in range(2):
+        factors = RodParameters(own, names=("bending",))
+        speed = torch.full((1, own.model.points_count, 3), 0.1 * (rank + 1.0), dtype=torch.float64)
+        state = own.step(own.initial_state(velocities=speed), factors())
+        (state.positions**2).sum().backward()
+        total = total + 0.5 * factors.logarithms["bending"].grad
+    torch.testing.assert_close(found[0], total, rtol=1e-10, atol=0.0)
+
+
+@pytest.mark.gpu
+def test_steps_run_on_the_stream_that_torch_uses():
+    """What a side stream has yet to write is what a step there reads, and the other way round."""
+    own = simulator("twisted")
+    first = own.step(own.initial_state()).positions
+    side = torch.cuda.Stream()
+    with torch.cuda.stream(side):
+        speed = torch.zeros((1, own.model.points_count, 3), dtype=torch.float64)
+        torch.cuda._sleep(50_000_000)
+        speed += 1.0
+        speed.requires_grad_()
+        state = own.step(own.initial_state(velocities=speed - 1.0))
+        (gradient,) = torch.autograd.grad((state.positions**2).sum(), speed)
+        found, slope = state.positions.clone(), gradient.abs().sum()
+    side.synchronize()
+    torch.testing.assert_close(found, first, rtol=0.0, atol=0.0)
+    assert float(slope) > 0.0
