@@ -195,7 +195,13 @@ class Simulator(torch.nn.Module):
 
         Raises:
             SolverError: there is none, in one of the worlds.
+            SceneError: the state has a history of gradients, which would end here.
         """
+        if state is not None and torch.is_grad_enabled() and any(value.requires_grad for value in state.values):
+            raise SceneError(
+                "equilibrium: no gradient goes to the state where the search begins, which places what is held, yet; give "
+                "state.detach()"
+            )
         state = state or self.initial_state(batch)
         engine, end = state.engine, float(options.get("end", 1.0))
         full = self._full(engine, parameters)
