@@ -59,6 +59,8 @@ class Case:
         self.engine = self.simulator.engine(WORLDS)
         self.model = self.engine.model
         self.axes = torch.tensor([1.0, 0.0, 1.0] if self.flat else [1.0, 1.0, 1.0], dtype=REAL)
+        along_z = bool(self.model.scene.axisymmetric_shells)  # the only gravity that these may have
+        self.down = torch.tensor([0.0, 0.0, 1.0], dtype=REAL) if along_z else self.axes
         points, edges = self.model.points_count, self.model.order.edges_count
         shape = (WORLDS, points, 3)
         self.weights = self._normal(*shape), 0.1 * self._normal(*shape), 0.1 * self._normal(WORLDS, edges)
@@ -145,6 +147,7 @@ class Case:
         twisted = any(group.kind.twist for group in self.model.groups) or bool(
             self.model.net is not None and self.model.net.edges
         )
+        gravity = torch.tensor(self.model.scene.gravity, dtype=REAL)
         place = self._normal(WORLDS, points, 3) * self.axes
         yield self._state("positions", 0.1, lambda x: self._moved("x", "q", x * place))
         if twisted:
@@ -164,12 +167,9 @@ class Case:
                 yield self._control("moments", 1e-4, self._normal(WORLDS, edges))
             if self.model.grips:
                 yield self._control("poses", 0.1, self._normal(WORLDS, len(self.model.grips), 6), self.poses)
-            yield self._control(
-                "gravity", 10.0, self._normal(WORLDS, 3) * self.axes, torch.tensor(self.model.scene.gravity, dtype=REAL)
-            )
-        gravity = torch.tensor(self.model.scene.gravity, dtype=REAL)
+            yield self._control("gravity", 10.0, self._normal(WORLDS, 3) * self.down, gravity)
         if self.statics:
-            yield self._shared("gravity", 10.0, lambda x: {"gravity": (gravity + x * self.axes).tolist()})
+            yield self._shared("gravity", 10.0, lambda x: {"gravity": (gravity + x * self.down).tolist()})
         else:
             timed = self._without_step()
             yield self._shared("time step", DT, lambda x: {"dt": DT + float(x)}, timed)
@@ -250,7 +250,7 @@ class Case:
         total = 0.0
         for each, axes in zip(read, [group.host.axes for group in self.model.groups] + [(0, 1, 2)], strict=False):
             values = wp.to_torch(each.gravity, requires_grad=False).cpu()
-            total += float((values.reshape(-1, values.shape[-1]).sum(0) * self.axes[list(axes)]).sum())
+            total += float((values.reshape(-1, values.shape[-1]).sum(0) * self.down[list(axes)]).sum())
         return {"gravity": total, "density": self._by_density(read)}
 
     def _by_end(self, state: WorldState) -> list[torch.Tensor]:
