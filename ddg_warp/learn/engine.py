@@ -552,6 +552,26 @@ class Engine:
             values[at] = whole.index_put(place, points[:, rows]).reshape(values[at].shape)
         return values
 
+    def turn_edges(self, values, own: str, blocks: str, more: torch.Tensor) -> list:
+        """Tensors of a state with something added to the angles of its edges (worlds, edges), or to their rates."""
+        values, model, worlds = list(values), self.model, self.model.worlds
+        of = torch.arange(worlds, device=values[0].device)
+        for i, group in enumerate(model.groups):
+            if group.kind.twist:
+                k, column, rows = self._places(("edges", i), lambda group=group: model.order.edge_places(group))
+                at = self._of(f"{i}/{own}")
+                wide = torch.zeros_like(values[at]).reshape(group.nodes, worlds, group.rods)
+                wide = wide.index_put((k[:, None], of[None], column[:, None]), more[:, rows].T)
+                values[at] = values[at] + wide.reshape(values[at].shape)
+        for rod in model.net.host.rods if model.net is not None else ():
+            first, at = int(model.order.edge_starts[rod.rod]), self._of(f"net/{blocks}")
+            wide = torch.zeros_like(values[at]).reshape(worlds, -1, 3)
+            rows = torch.as_tensor(rod.edges, device=wide.device)[None]
+            added = more[:, first : first + len(rod.edges)]
+            wide = wide.index_put((of[:, None], rows, torch.zeros_like(rows)), added)
+            values[at] = values[at] + wide.reshape(values[at].shape)
+        return values
+
 
 def _last(rows: np.ndarray, blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows of points and their blocks, of points that are one (joined) the last alone."""

@@ -54,23 +54,20 @@ class Case:
     def __init__(self, name: str, analysis: str, device: str):
         self.name, self.analysis, self.device = name, analysis, device
         self.statics = analysis == "statics"
-        self.random = torch.Generator().manual_seed(5)
+        self.random = torch.Generator("cpu").manual_seed(5)
         self.simulator = self.built()
         self.engine = self.simulator.engine(WORLDS)
         self.model = self.engine.model
-        self.axes = torch.tensor([1.0, 0.0, 1.0] if self.flat else [1.0, 1.0, 1.0], dtype=REAL)
-        along_z = bool(self.model.scene.axisymmetric_shells)  # the only gravity that these may have
-        self.down = torch.tensor([0.0, 0.0, 1.0], dtype=REAL) if along_z else self.axes
+        turned = bool(self.model.scene.axisymmetric_shells)  # whose gravity is along z alone
+        flat = turned or self.model.scene.dimension == 2
+        self.place = self.engine.source[0].device
+        self.axes = self._tensor([1.0, 0.0, 1.0] if flat else [1.0, 1.0, 1.0])
+        self.down = self._tensor([0.0, 0.0, 1.0]) if turned else self.axes
         points, edges = self.model.points_count, self.model.order.edges_count
         shape = (WORLDS, points, 3)
         self.weights = self._normal(*shape), 0.1 * self._normal(*shape), 0.1 * self._normal(WORLDS, edges)
         self.state = self._first()
         self.poses = 1e-3 * self._normal(WORLDS, len(self.model.grips), 6)
-
-    @property
-    def flat(self) -> bool:
-        """Whether all is in the plane of x and z."""
-        return self.simulator.model.scene.dimension == 2 or bool(self.simulator.model.scene.axisymmetric_shells)
 
     def built(self, dt: float = DT, **changes) -> Simulator:
         """A simulator of the scene with changes; see `scene_of`."""
@@ -78,7 +75,10 @@ class Case:
         return Simulator(model, dt, scheme="implicit_euler" if self.statics else self.analysis, **TIGHT)
 
     def _normal(self, *shape: int) -> torch.Tensor:
-        return torch.randn(shape, generator=self.random, dtype=REAL).to(self.engine.source[0].device)
+        return torch.randn(shape, generator=self.random, dtype=REAL, device="cpu").to(self.place)
+
+    def _tensor(self, values) -> torch.Tensor:
+        return torch.as_tensor(values, dtype=REAL, device=self.place)
 
     def _first(self) -> WorldState:
         """An equilibrium, or a state on the way with random velocities and spins."""
@@ -88,9 +88,10 @@ class Case:
             state = self.simulator.initial_state(WORLDS)
             for _ in range(3):
                 state = self.simulator.step(state)
-            speed = state.velocities + self._rates()
-            values = self.engine.put_points(state.values, "v", "v", speed)
-            values = self._angles(values, "omega", "v", 3.0 * self._normal(WORLDS, self.model.order.edges_count))
+            values = self.engine.put_points(state.values, "v", "v", state.velocities + self._rates())
+            values = self.engine.turn_edges(
+                values, "omega", "v", 3.0 * self._normal(WORLDS, self.model.order.edges_count)
+            )
         return WorldState(tuple(values), state.time, self.engine)
 
     def _rates(self) -> torch.Tensor:
@@ -99,30 +100,9 @@ class Case:
         frames = self.model.net.host.frames if self.model.net is not None else {}
         for row, block in zip(*self.model.order.net_rows, strict=True) if frames else ():
             if block in frames:
-                held = torch.as_tensor(frames[block][self.model.net.host.fixed[block]], dtype=REAL)
+                held = self._tensor(frames[block][self.model.net.host.fixed[block]])
                 found[:, row] -= found[:, row] @ held.T @ held
         return found
-
-    def _angles(self, values, own: str, blocks: str, more: torch.Tensor) -> list:
-        """Tensors of a state with something added to the angles of its edges (worlds, edges), or to their rates."""
-        values, engine, model = list(values), self.engine, self.model
-        for i, group in enumerate(model.groups):
-            if group.kind.twist:
-                k, column, rows = engine._places(("edges", i), lambda group=group: model.order.edge_places(group))
-                at = engine._of(f"{i}/{own}")
-                wide = torch.zeros_like(values[at]).reshape(group.nodes, WORLDS, group.rods)
-                wide = wide.index_put((k[:, None], torch.arange(WORLDS)[None], column[:, None]), more[:, rows].T)
-                values[at] = values[at] + wide.reshape(values[at].shape)
-        for rod in model.net.host.rods if model.net is not None else ():
-            first, at = int(model.order.edge_starts[rod.rod]), engine._of(f"net/{blocks}")
-            wide = torch.zeros_like(values[at]).reshape(WORLDS, -1, 3)
-            rows = torch.as_tensor(rod.edges, device=wide.device)
-            own_rows = more[:, first : first + len(rod.edges)]
-            wide = wide.index_put((torch.arange(WORLDS)[:, None], rows[None], torch.zeros_like(rows)[None]), own_rows)
-            values[at] = values[at] + wide.reshape(values[at].shape)
-        return values
-
-    # the loss
 
     def loss(self, state: WorldState) -> torch.Tensor:
         """Of a state at the end."""
@@ -139,26 +119,27 @@ class Case:
         *_, state = simulator.rollout(state, parameters, controls, steps=STEPS)
         return state
 
-    # inputs
-
     def inputs(self) -> Iterator[Input]:
         """All that this object has."""
         points, edges = self.model.points_count, self.model.order.edges_count
-        twisted = any(group.kind.twist for group in self.model.groups) or bool(
-            self.model.net is not None and self.model.net.edges
-        )
-        gravity = torch.tensor(self.model.scene.gravity, dtype=REAL)
+        net = self.model.net
+        twisted = any(group.kind.twist for group in self.model.groups) or bool(net is not None and net.edges)
+        gravity = self._tensor(self.model.scene.gravity)
         place = self._normal(WORLDS, points, 3) * self.axes
         yield self._state("positions", 0.1, lambda x: self._moved("x", "q", x * place))
         if twisted:
             angle = self._normal(WORLDS, edges)
-            yield self._state("angles", 1.0, lambda x: self._turned("theta", "q", x * angle))
+            yield self._state(
+                "angles", 1.0, lambda x: self.engine.turn_edges(self.state.values, "theta", "q", x * angle)
+            )
         if not self.statics:
             rate = self._rates()
             yield self._state("velocities", 1.0, lambda x: self._moved("v", "v", x * rate))
             if twisted:
                 spin = self._normal(WORLDS, edges)
-                yield self._state("spins", 10.0, lambda x: self._turned("omega", "v", x * spin))
+                yield self._state(
+                    "spins", 10.0, lambda x: self.engine.turn_edges(self.state.values, "omega", "v", x * spin)
+                )
         for name in dict.fromkeys(self.engine.names()):
             yield self._parameter(name)
         if not self.statics:
@@ -169,15 +150,16 @@ class Case:
                 yield self._control("poses", 0.1, self._normal(WORLDS, len(self.model.grips), 6), self.poses)
             yield self._control("gravity", 10.0, self._normal(WORLDS, 3) * self.down, gravity)
         if self.statics:
+            for name in ("forces", "moments", "poses"):
+                yield self._shared(
+                    name, 1.0, dict, "no gradient goes to controls of an equilibrium: it has those of its scene"
+                )
             yield self._shared("gravity", 10.0, lambda x: {"gravity": (gravity + x * self.down).tolist()})
         else:
             timed = self._without_step()
             yield self._shared("time step", DT, lambda x: {"dt": DT + float(x)}, timed)
             yield self._shared("mass damping", 1.0, lambda x: {"mass_damping": 0.7 + float(x)})
         yield self._shared("density", 1.0, lambda x: {"density": 1.0 + float(x)})
-
-    def _turned(self, own: str, blocks: str, by: torch.Tensor) -> list:
-        return self._angles(self.state.values, own, blocks, by)
 
     def _moved(self, own: str, blocks: str, by: torch.Tensor) -> list:
         at = self.engine.points(self.state.values, own, blocks)
@@ -189,12 +171,9 @@ class Case:
     def _parameter(self, name: str) -> Input:
         usual = self.engine.value(name)
         size = float(usual.abs().max()) or self._size_of_family(name)
-        direction = (0.5 + torch.rand(usual.shape, generator=self.random, dtype=REAL)).to(usual.device)
+        direction = 0.5 + torch.rand(usual.shape, generator=self.random, dtype=REAL, device="cpu").to(self.place)
 
-        def loss(x):
-            return self.loss(self.end(self.simulator, parameters={name: usual + x * direction}))
-
-        return Input(name, size, loss)
+        return Input(name, size, lambda x: self.loss(self.end(self.simulator, None, {name: usual + x * direction})))
 
     def _size_of_family(self, name: str) -> float:
         """Of the largest of a family, such as the components of a metric; one where all are zero."""
@@ -207,8 +186,7 @@ class Case:
 
     def _without_step(self) -> str:
         """Why lengths of steps have no derivative; empty where they have one."""
-        scene = self.model.scene
-        field = scene.applied_field
+        field = self.model.scene.applied_field
         moved = [motion for motion in self.model.motions if not isinstance(motion, Grip)]
         parts = [*self.model.groups, *([self.model.net] if self.model.net is not None else [])]
         loads = any(part.host.timed for part in parts)
@@ -238,10 +216,10 @@ class Case:
         for before, after in zip(states[-2::-1], states[:0:-1], strict=True):
             given, read = self.engine.backward(before.time, DT, before.values, after.values, given)
             for each in read:
-                by_rate = _sum(each.rate) + sum(_sum(own) for own in getattr(each, "elements_rate", []))
+                by_rate = sum(own.numpy().sum() for own in (each.rate, *getattr(each, "elements_rate", ())))
                 # an implicit step is over dt, the midpoint rule's over half of it
                 sums["time step"] -= by_rate / DT**2 * (2.0 if self.analysis == "implicit_midpoint" else 1.0)
-                sums["mass damping"] += _sum(each.damping)
+                sums["mass damping"] += each.damping.numpy().sum()
             sums["density"] += self._by_density(read)
         return sums
 
@@ -249,29 +227,24 @@ class Case:
         read = self.engine.balance_backward(1.0, self.state.values, self._by_end(self.state))
         total = 0.0
         for each, axes in zip(read, [group.host.axes for group in self.model.groups] + [(0, 1, 2)], strict=False):
-            values = wp.to_torch(each.gravity, requires_grad=False).cpu()
+            values = wp.to_torch(each.gravity, requires_grad=False)
             total += float((values.reshape(-1, values.shape[-1]).sum(0) * self.down[list(axes)]).sum())
         return {"gravity": total, "density": self._by_density(read)}
 
     def _by_end(self, state: WorldState) -> list[torch.Tensor]:
         leaves = [value.detach().requires_grad_() for value in state.values]
-        found = torch.autograd.grad(
-            self.loss(WorldState(tuple(leaves), state.time, self.engine)), leaves, allow_unused=True
-        )
+        loss = self.loss(WorldState(tuple(leaves), state.time, self.engine))
+        found = torch.autograd.grad(loss, leaves, allow_unused=True)
         return [torch.zeros_like(own) if by is None else by for own, by in zip(leaves, found, strict=True)]
 
     def _by_density(self, read: list) -> float:
         """By a factor of all masses and rotary inertia."""
-        total, parts = 0.0, list(read)
-        for group, each in zip(self.model.groups, parts, strict=False):
+        total = 0.0
+        for group, each in zip(self.model.groups, read, strict=False):
             total += float((each.mass.numpy() * group.mass.numpy()).sum())
             if group.kind.twist:
                 total += float((each.rotary.numpy() * group.rotary.numpy()).sum())
         if self.model.net is not None:
             mass = self.model.net.host.mass
-            total += float((parts[-1].mass.numpy().reshape(WORLDS, *mass.shape) * mass).sum())
+            total += float((read[-1].mass.numpy().reshape(WORLDS, *mass.shape) * mass).sum())
         return total
-
-
-def _sum(array: wp.array) -> float:
-    return float(array.numpy().sum())

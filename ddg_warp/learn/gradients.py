@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import torch
 
 from ddg_warp.errors import SceneError, SolverError
-from ddg_warp.learn.gradient_cases import REAL, Case, Input
+from ddg_warp.learn.gradient_cases import Case, Input
 from ddg_warp.learn.gradient_objects import OBJECTS
 
 RIGHT, NONE, REFUSED, WRONG, SILENT = "right", "none", "refused", "WRONG", "SILENT ZERO"  # results
@@ -28,7 +28,7 @@ def difference(own: Input, about: float, scale: float, share: float = 1.0) -> tu
     """
     h = share * min(1e-3 * own.size, CHANGE * scale / max(abs(about), 1e-12 * scale / own.size))
     with torch.no_grad():
-        at = {x: float(own.loss(torch.tensor(x * h, dtype=REAL))) for x in (2.0, 1.0, -1.0, -2.0)}
+        at = {x: float(own.loss(x * h)) for x in (2.0, 1.0, -1.0, -2.0)}
     near, far = ((at[x] - at[-x]) / (2.0 * x * h) for x in (1.0, 2.0))
     return (4.0 * near - far) / 3.0, abs(near - far)
 

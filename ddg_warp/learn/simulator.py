@@ -195,7 +195,7 @@ class Simulator(torch.nn.Module):
     def equilibrium(
         self, parameters: dict | None = None, *, state: WorldState | None = None, batch: int | None = None, **options
     ) -> WorldState:
-        """The equilibrium of every world, with gradients by parameters (by state and controls there are none).
+        """The equilibrium of every world, with gradients by parameters; controls it has none.
 
         Args:
             parameters: as of `step`.
