@@ -46,7 +46,8 @@ class ChainInputs:
         parameters: (rows of the parameter table, n, R); mass, rotary: of nodes and edges (n, R).
         load: by the forces on nodes and the moments on angles (block, n, R); zero at held dofs.
         held: by where held dofs are at the solution (block, n, R).
-        rate, damping, gravity: by what all nodes share, the share of each (n, R).
+        rate, damping, gravity: by what all nodes share, the share of each (n, R); by the rate without what motions, loads and
+            fields do as functions of time.
     """
 
     parameters: wp.array

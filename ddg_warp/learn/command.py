@@ -1,4 +1,4 @@
-"""`ddg-warp sweep SCENE`: a scene over ranges of its parameters, from the command line."""
+"""From the command line: `ddg-warp sweep SCENE`, a scene over ranges of its parameters, and `ddg-warp gradients`, their table."""
 
 import argparse
 import sys
@@ -75,6 +75,48 @@ def sweep_scene(chosen: argparse.Namespace) -> int:
     print(f"{name}: {len(episodes)} episodes: {', '.join(f'{n} {outcome}' for outcome, n in outcomes.most_common())}")
     print(f"they are in {directory}")
     return FAILED if all(episode.failed for episode in episodes) else DONE
+
+
+def add_objects(command: argparse.ArgumentParser) -> None:
+    """Add the flags of `gradients`."""
+    command.add_argument("objects", nargs="*", metavar="OBJECT", help="which, such as 'planar rod' (default: all)")
+    command.add_argument(
+        "--analysis",
+        action="append",
+        metavar="NAME",
+        help="implicit_euler, implicit_midpoint or statics (default: all)",
+    )
+    command.add_argument("--device", default="cpu", help="Warp device (default: cpu)")
+    command.add_argument("--out", type=Path, metavar="STEM", help="write all rows to STEM.csv and STEM.json, too")
+
+
+def gradients_table(chosen: argparse.Namespace) -> int:
+    """`gradients`: which inputs of which objects have gradients; fails where one is wrong, or zero without a reason."""
+    from ddg_warp.run.cli import DONE, FAILED, require_device
+    from ddg_warp.run.summary import machine, table, write_table
+
+    require_device(chosen.device)
+    try:
+        from ddg_warp.learn import gradients
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise InputError("gradients needs torch; pip install 'ddg-warp[torch]'") from error
+    asked = {"objects": (chosen.objects, gradients.OBJECTS), "--analysis": (chosen.analysis or [], gradients.ANALYSES)}
+    for what, (names, known) in asked.items():
+        for name in names:
+            if name not in known:
+                raise InputError(f"gradients: {what}: there is no {name!r}; there are {', '.join(known)}")
+    objects, analyses = (names or known for names, known in asked.values())
+    rows = list(gradients.table(objects, analyses, chosen.device))
+    print(table(gradients.gathered(rows)))
+    if chosen.out:
+        write_table(chosen.out, rows, {"command": "ddg-warp gradients", "machine": machine()})
+    bad = [row for row in rows if row["result"] in (gradients.WRONG, gradients.SILENT)]
+    print(
+        f"{len(rows)} gradients: {len(bad)} wrong; {sum(row['result'] == gradients.REFUSED for row in rows)} refused by name"
+    )
+    return FAILED if bad else DONE
 
 
 def _named(text: str):

@@ -203,7 +203,8 @@ class Engine:
             if table[key].shape != shape:
                 table.set(**{key: np.broadcast_to(table[key], shape)})
                 self.model.version += 1
-                self._written.clear()
+                # with what it holds; other tables still hold what was written
+                self._written = {place: kept for place, kept in self._written.items() if kept[0] is not table}
         now = {(id(table), key) for table, key, _ in places}
         for place in [place for place in self._written if place not in now]:  # back to what the model has
             table, (_, key) = self._written.pop(place)[0], place
@@ -295,17 +296,19 @@ class Engine:
 
     def _adjoint(self) -> Adjoint:
         if self.adjoint is None:
-            self.adjoint = Adjoint(self.integrator)
+            adjoint = Adjoint(self.integrator)
             self._given = self.model.empty_state()
             self._by_state = tensors(self._given, self.fields)
             self._graphs = Graphs(self.model, self._load)
             groups = zip(self.before.groups, self.after.groups, strict=True)
-            solved = [wp.clone(after.x) if self._midpoint else after.x for after in self.after.groups]
+            # laid out as states are, so that a graph can copy it
+            solved = [data.x for data in (self.model.empty_state() if self._midpoint else self.after).groups]
             self._parts = [
                 Kept(before, x, after.theta, before.frame, None)
                 for x, (before, after) in zip(solved, groups, strict=True)
             ]
-            self.poses = Poses(self) if self.model.grips else None
+            self.adjoint = adjoint
+            self.poses = Poses(self) if self.model.grips and not self._midpoint else None
         return self.adjoint
 
     def _load(self) -> None:
@@ -330,7 +333,7 @@ class Engine:
             x, ends = wp.to_torch(kept.x, requires_grad=False), (end.x, kept.before.x)
             torch.mul(sum(wp.to_torch(array, requires_grad=False) for array in ends), 0.5, out=x)
         if adjoint.net:
-            parts.append(self._net_kept(dt))
+            parts.append(self._net_kept(start, dt))
 
         def launch():
             self._found = adjoint.pull_parts(self.before, self.after, parts, self._given, s)
@@ -347,18 +350,28 @@ class Engine:
         found.grips = self.model.empty_state().grips
         return copies(tensors(found, self.fields)), inputs
 
-    def _net_kept(self, dt: float) -> NetKept:
+    def _net_kept(self, start: float, dt: float) -> NetKept:
         """Of the net: joints' rotations are those at the rates of the step, as their dofs begin it at zero."""
         net, before, after = self.model.net, self.before.net, self.after.net
-        solved = wp.clone(after.q)
+        solved, data = wp.clone(after.q), after.data
         q = wp.to_torch(solved, requires_grad=False)
         if self._midpoint:
             q.add_(wp.to_torch(before.q, requires_grad=False)).mul_(0.5)
+            data = self._data_between(start, dt, solved)
         spins = net.host.spins
         if spins:
             rates = wp.to_torch(after.v, requires_grad=False).reshape(net.worlds, -1, 3)[:, -spins:]
             q.view(net.worlds, -1, 3)[:, -spins:] = rates * dt
-        return NetKept(before, replace(before, q=solved, data=after.data), None)
+        return NetKept(before, replace(before, q=solved, data=data), None)
+
+    def _data_between(self, start: float, dt: float, q: wp.array) -> dict:
+        """Normals that supports turn, and the magnetic field, in the middle of a step, as its solve had them."""
+        step = self.integrator._net
+        step.prescribe(start, start + dt)
+        if step.motion:
+            step.motion.follow(self.before, self.after)
+            step.motion.direct(self.adjoint.net.supports.islands, q, self.before.net.frame)
+        return step._data
 
     # equilibria
 
@@ -438,9 +451,22 @@ class Engine:
                     result.append(values.reshape(model.worlds, len(rows)) * flags[-1][:, None])
         return result
 
+    def require(self, name: str) -> None:
+        """Refuse derivatives by a control that has none.
+
+        Raises:
+            SceneError: it has none.
+        """
+        if name == "poses" and self._midpoint:
+            raise SceneError(
+                "no gradient goes through the poses of grips by the midpoint rule yet; take 'implicit_euler', or poses.detach()"
+            )
+
     def by_control(self, name: str, value: torch.Tensor, inputs: list, flags) -> torch.Tensor:
         """Derivatives by what a step is given (worlds, ...)."""
         if name == "poses":
+            if self.poses is None:  # which `require` has refused to whoever asks for them
+                return torch.zeros_like(value)
             return self.poses.pull(inputs, value) * self._by_world(flags)[:, None, None]
         result = torch.zeros_like(value)
         model, worlds = self.model, self.model.worlds
@@ -567,6 +593,26 @@ class Engine:
             whole = values[at].reshape(worlds, -1, 3)
             place = torch.arange(worlds, device=rows.device)[:, None], blocks_of[None]
             values[at] = whole.index_put(place, points[:, rows]).reshape(values[at].shape)
+        return values
+
+    def turn_edges(self, values, own: str, blocks: str, more: torch.Tensor) -> list:
+        """Tensors of a state with something added to the angles of its edges (worlds, edges), or to their rates."""
+        values, model, worlds = list(values), self.model, self.model.worlds
+        of = torch.arange(worlds, device=values[0].device)
+        for i, group in enumerate(model.groups):
+            if group.kind.twist:
+                k, column, rows = self._places(("edges", i), lambda group=group: model.order.edge_places(group))
+                at = self._of(f"{i}/{own}")
+                wide = torch.zeros_like(values[at]).reshape(group.nodes, worlds, group.rods)
+                wide = wide.index_put((k[:, None], of[None], column[:, None]), more[:, rows].T)
+                values[at] = values[at] + wide.reshape(values[at].shape)
+        for rod in model.net.host.rods if model.net is not None else ():
+            first, at = int(model.order.edge_starts[rod.rod]), self._of(f"net/{blocks}")
+            wide = torch.zeros_like(values[at]).reshape(worlds, -1, 3)
+            rows = torch.as_tensor(rod.edges, device=wide.device)[None]
+            added = more[:, first : first + len(rod.edges)]
+            wide = wide.index_put((of[:, None], rows, torch.zeros_like(rows)), added)
+            values[at] = values[at] + wide.reshape(values[at].shape)
         return values
 
 

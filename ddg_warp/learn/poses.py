@@ -4,17 +4,12 @@ import numpy as np
 import torch
 import warp as wp
 
-from ddg_warp.errors import SceneError
-
 
 class Poses:
-    """Of an engine's model: a point X that a grip holds is at pivot + R (X - pivot) + translation, a director d at R d."""
+    """Of an engine's model, for implicit Euler: a point X that a grip holds is at pivot + R (X - pivot) + translation, a director or
+    a normal d at R d."""
 
     def __init__(self, engine):
-        if engine.integrator.scheme != "implicit_euler":
-            raise SceneError(
-                "no gradient goes through the poses of grips by the midpoint rule yet; take 'implicit_euler'"
-            )
         self.model = model = engine.model
         real = wp.dtype_to_torch(model.types.real)
         device = str(wp.device_to_torch(model.wp_device))
@@ -36,6 +31,15 @@ class Poses:
             turned = np.stack([grip_of[host.turning[:, 1]] == g for g in range(count)], 0).astype(float)
             directors = host.frame[:3].reshape(3, -1)[:, host.turning[:, 0] - host.nodes].T
             self._owned.append((own, put(places, torch.long), put(of), put(arms), put(turned), put(directors)))
+        self._normals = []  # of sets with normals that grips turn: index, their elements and rows of data, shares of grips, rest
+        moved = engine.integrator._net.motion if self.model.net is not None else None
+        for index, (where, rest) in moved.normals.items() if moved else ():
+            element, row, pose = where.numpy().T
+            grips = np.append(moved._grips.numpy(), -1)[pose]
+            shares = np.stack([grips == g for g in range(count)], 0).astype(float)
+            self._normals.append(
+                (index, put(element, torch.long), put(row, torch.long), put(shares), put(rest.numpy()))
+            )
 
     def pull(self, inputs: list, poses: torch.Tensor) -> torch.Tensor:
         """Derivatives by poses (worlds, grips, 6).
@@ -58,6 +62,12 @@ class Poses:
             if len(directors):
                 found = wp.to_torch(own.supports.by_director, requires_grad=False)
                 by_turn = by_turn + torch.einsum("gi,iwc,id->wgcd", turned, found, directors)
+        for index, element, row, shares, rest in self._normals:
+            found = wp.to_torch(inputs[-1].data[index], requires_grad=False)
+            found = found.reshape(found.shape[0], worlds, -1)[
+                row[:, None] + torch.arange(3, device=row.device), :, element[:, None]
+            ]
+            by_turn = by_turn + torch.einsum("gi,icw,id->wgcd", shares, found, rest)
         rotation = poses[..., 3:].detach().requires_grad_()
         with torch.enable_grad():
             zero = torch.zeros_like(rotation[..., 0])

@@ -1,5 +1,6 @@
 """Simulator: a model as a torch module. States go in and come out; nothing is kept between calls."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,8 @@ from ddg_warp.errors import SceneError
 from ddg_warp.learn.engine import Engine, tensors
 from ddg_warp.learn.step import Balance, Call, Step
 from ddg_warp.model import validate
+from ddg_warp.model.controls import Controls
+from ddg_warp.solve.dynamics import SCHEMES
 
 CONTROLS = {"forces": "points", "moments": "edges", "gravity": None, "poses": "grips"}
 
@@ -86,6 +89,7 @@ class Simulator(torch.nn.Module):
     def __init__(self, model, dt: float, *, scheme: str = "implicit_euler", **options):
         super().__init__()
         validate.check_model("Simulator", model)
+        arguments.choice("scheme", scheme, SCHEMES)
         self.dt = arguments.number("dt", dt, "a time step that is positive and finite [s]", lambda v: v > 0.0)
         self.model, self.scheme, self.options = model, scheme, options
         self._engines: dict[int, Engine] = {}
@@ -123,13 +127,16 @@ class Simulator(torch.nn.Module):
         Raises:
             SceneError: shapes do not fit.
         """
-        given = [v for v in (positions, velocities) if v is not None and v.ndim == 3]
-        worlds = batch or (given[0].shape[0] if given else self.model.worlds)
+        moved = {"positions": positions, "velocities": velocities}
+        moved = {name: self._tensor(name, values) for name, values in moved.items() if values is not None}
+        given = [len(values) for values in moved.values() if values.ndim == 3]
+        worlds = given[0] if given else self.model.worlds
+        worlds = worlds if batch is None else arguments.count("batch", batch)
         engine = self.engine(worlds)
         values = [tensor.clone() for tensor in tensors(engine.model.state(), engine.fields)]
-        for what, names in ((positions, ("x", "q")), (velocities, ("v", "v"))):
-            if what is not None:
-                values = engine.put_points(values, *names, what)
+        for name, arrays in (("positions", ("x", "q")), ("velocities", ("v", "v"))):
+            if name in moved:
+                values = engine.put_points(values, *arrays, moved[name])
         return WorldState(tuple(values), 0.0, engine)
 
     @torch.compiler.disable  # what is compiled goes on behind it: launches of Warp are nothing that a compiler sees
@@ -139,7 +146,8 @@ class Simulator(torch.nn.Module):
         Raises:
             SceneError: a name or shape does not fit.
         """
-        return self._step(state, self._full(state.engine, parameters), self._controls(state.engine, controls))
+        engine = self._own(state)
+        return self._step(state, self._full(engine, parameters), self._controls(engine, controls))
 
     forward = step
 
@@ -167,7 +175,8 @@ class Simulator(torch.nn.Module):
         """
         arguments.count("steps", steps)
         arguments.count("save", save)
-        engine, result, block = state.engine, [], checkpoint_every or 1
+        block = 1 if checkpoint_every is None else arguments.count("checkpoint_every", checkpoint_every)
+        engine, result = self._own(state), []
         full = self._full(engine, parameters)
 
         def some(first: int, count: int, state: WorldState, full: list) -> list[WorldState]:
@@ -193,7 +202,7 @@ class Simulator(torch.nn.Module):
     def equilibrium(
         self, parameters: dict | None = None, *, state: WorldState | None = None, batch: int | None = None, **options
     ) -> WorldState:
-        """The equilibrium of every world, with gradients by parameters (by state and controls there are none).
+        """The equilibrium of every world, with gradients by parameters; controls it has none.
 
         Args:
             parameters: as of `step`.
@@ -202,9 +211,15 @@ class Simulator(torch.nn.Module):
 
         Raises:
             SolverError: there is none, in one of the worlds.
+            SceneError: the state has a history of gradients, which would end here.
         """
+        if state is not None and torch.is_grad_enabled() and any(value.requires_grad for value in state.values):
+            raise SceneError(
+                "equilibrium: no gradient goes to the state where the search begins, which places what is held, yet; give "
+                "state.detach()"
+            )
         state = state or self.initial_state(batch)
-        engine, end = state.engine, float(options.get("end", 1.0))
+        engine, end = self._own(state), arguments.number("end", options.get("end", 1.0))
         full = self._full(engine, parameters)
         call = self._call(engine, end, full, {})
         values = [value for _, own in full for value in own]
@@ -220,16 +235,37 @@ class Simulator(torch.nn.Module):
         return self.engine(batch or self.model.worlds).value(name)
 
     def _full(self, engine: Engine, parameters: dict | None) -> list:
-        return [(name, engine.full(name, self._tensor(values))) for name, values in (parameters or {}).items()]
+        """Parameters as `Engine.full` has them; of plain numbers values are checked, as tensors may be on their way."""
+        result = []
+        for name, values in _named("parameters", "term.parameter", parameters).items():
+            engine.tables(name)  # which refuses what there is not
+            if not isinstance(values, torch.Tensor):
+                try:
+                    values = self._tensor(name, self.model.valid_values(*name.rsplit(".", 1), values))
+                except ValueError as error:
+                    raise SceneError(f"parameters: {error}") from None
+            result.append((name, engine.full(name, values)))
+        return result
 
-    def _tensor(self, values) -> torch.Tensor:
+    def _tensor(self, name: str, values) -> torch.Tensor:
         """Numbers as a tensor, in the precision of states where they have none of their own."""
         if isinstance(values, torch.Tensor):
             return values
-        return torch.as_tensor(values, dtype=wp.dtype_to_torch(self.model.types.real))
+        try:
+            return torch.as_tensor(values, dtype=wp.dtype_to_torch(self.model.types.real))
+        except (TypeError, ValueError, RuntimeError):
+            raise SceneError(f"{name} = {values!r}; give numbers or a tensor") from None
+
+    def _own(self, state: WorldState) -> Engine:
+        """The engine of a state, of this simulator."""
+        if not isinstance(state, WorldState) or state.engine not in self._engines.values():
+            what = "another simulator's" if isinstance(state, WorldState) else repr(state)
+            raise SceneError(f"the state is {what}; take one that initial_state, step or equilibrium of this one gave")
+        return state.engine
 
     def _controls(self, engine: Engine, controls: dict | None) -> dict:
         model, worlds = engine.model, engine.model.worlds
+        controls = _named("controls", "forces", controls)
         real = wp.dtype_to_torch(model.types.real)
         shapes = {
             "forces": (model.points_count, 3),
@@ -238,10 +274,10 @@ class Simulator(torch.nn.Module):
             "poses": (len(model.grips), 6),
         }
         result = {}
-        for name, values in (controls or {}).items():
+        for name, values in controls.items():
             if name not in shapes:
                 raise SceneError(f"controls: there is no {name!r}; there are {', '.join(shapes)}")
-            own, shape = self._tensor(values), shapes[name]
+            own, shape = self._tensor(f"controls: {name}", values), shapes[name]
             if tuple(own.shape) not in (shape, (worlds, *shape)):
                 raise SceneError(
                     f"controls: {name} have shape {tuple(own.shape)}; they are {shape} or {(worlds, *shape)}"
@@ -250,6 +286,8 @@ class Simulator(torch.nn.Module):
                 raise SceneError(
                     "controls: poses of no grip; hold something by Grip(...), as in scene.clamp(rod, motion=Grip())"
                 )
+            if not isinstance(values, torch.Tensor):  # finite, and on what it can act on
+                Controls(**{name: own.cpu().numpy()}).checked(model)
             result[name] = own.to(device=str(wp.device_to_torch(model.wp_device)), dtype=real).expand(worlds, *shape)
         return result
 
@@ -271,6 +309,13 @@ class Simulator(torch.nn.Module):
             controls=tuple(controls),
             graded=torch.is_grad_enabled(),
         )
+
+
+def _named(what: str, example: str, values) -> dict:
+    """A dictionary by names; nothing for None."""
+    if not (values is None or isinstance(values, Mapping)):
+        raise SceneError(f"{what} are {values!r}; give a dictionary such as {{{example!r}: ...}}")
+    return dict(values or {})
 
 
 class _Recipe:

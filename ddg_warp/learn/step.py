@@ -69,6 +69,10 @@ class Step(torch.autograd.Function):
     @staticmethod
     def backward(ctx, *given):
         call, saved = ctx.call, ctx.saved_tensors
+        first = 1 + len(saved) - ctx.results - len(call.controls)
+        for name, needed in zip(call.controls, ctx.needs_input_grad[first:], strict=True):
+            if needed:
+                call.engine.require(name)
         found = iter(Pull.apply(call, *saved, *given[: len(call.fields)]))
         count = len(saved) - ctx.results - len(call.fields)
         by_state = [next(found) if field.smooth else None for field in call.fields]
@@ -87,7 +91,7 @@ class Step(torch.autograd.Function):
 class Balance(torch.autograd.Function):
     """balance(call, options, *tensors) -> the tensors of the equilibrium from a state, with gradients by parameters; see `Step`.
 
-    Where it starts from has no gradient: an equilibrium does not depend on that.
+    Where it starts from has no gradient: an equilibrium depends on that by where things are held alone, which `Simulator` refuses.
     """
 
     @staticmethod

@@ -15,6 +15,9 @@ class Supports:
     Args:
         part: `Group` or `DeviceNet`.
 
+    Attributes:
+        islands: that are at the start of a step and solve all of it.
+
     Raises:
         SceneError: a motion turns an edge that it does not hold at both ends.
     """
@@ -23,8 +26,8 @@ class Supports:
         self.model, self.part, real = model, part, model.types.real
         host = part.host
         self.motion = Motion(model, part)
-        self._islands = Islands(part.columns, real, model.wp_device)
-        self._islands.portion.fill_(1.0)
+        self.islands = Islands(part.columns, real, model.wp_device)
+        self.islands.portion.fill_(1.0)
         self._angles = angle_kernel(part.dim, real, False)
         turning, ends = host.turning[:, 0], host.edge_ends(host.turning[:, 0])
         loose = np.flatnonzero(~host.holding(ends).all((1, 2)))
@@ -60,7 +63,7 @@ class Supports:
         motion = self.motion
         motion.follow(before, after)
         if len(motion.angles):
-            read = [motion.angles, motion.directors, motion.pose, motion.stride, *self._islands.arrays]
+            read = [motion.angles, motion.directors, motion.pose, motion.stride, *self.islands.arrays]
             wp.launch(
                 self._angles,
                 (len(motion.angles), self.model.worlds),

@@ -145,10 +145,7 @@ class Model:
         Raises:
             ValueError: nothing has the term, the term has no such parameter, or the shape or a value is wrong; nothing is changed.
         """
-        parts = self.net.sets if self.net is not None else ()
-        terms: dict[str, dict] = {}
-        for own in (*(t for group in self.groups for t in group.kind.terms), *(part.term for part in parts)):
-            terms.setdefault(own.name, {}).update({known.name: known for known in own.parameters})
+        parts, terms = self.net.sets if self.net is not None else (), self._terms()
         if not isinstance(term, str) or term not in terms:
             raise ValueError(
                 f"set_parameter: no rod or shell has the term {term!r}; this model has {', '.join(sorted(terms))}"
@@ -156,14 +153,7 @@ class Model:
         known = terms[term]
         if not isinstance(parameter, str) or parameter not in known:
             raise ValueError(f"set_parameter: {term} has no parameter {parameter!r}; it has {', '.join(known)}")
-        name, (rule, holds) = f"{term}.{parameter}", known[parameter].valid
-        try:
-            values = np.array(values, float)
-        except (TypeError, ValueError):
-            raise ValueError(f"{name} = {values!r}; give numbers") from None
-        bad = np.flatnonzero(~(np.isfinite(values) & holds(values)))
-        if bad.size:
-            raise ValueError(f"{name}: value {bad[0]} is {values.ravel()[bad[0]]:g}; it is finite and {rule}")
+        name, values = f"{term}.{parameter}", self.valid_values(term, parameter, values)
         for group in self.groups:
             if name in group.parameters.values:
                 group.set_parameter(name, values)
@@ -171,6 +161,30 @@ class Model:
             if part.term.name == term and parameter in part.parameters.values:
                 part.set_parameter(parameter, values)
         self.version += 1
+
+    def valid_values(self, term: str, parameter: str, values) -> np.ndarray:
+        """Values of a parameter that there is as an array of numbers.
+
+        Raises:
+            ValueError: they are no numbers, not finite, or none that the parameter may have.
+        """
+        name, (rule, holds) = f"{term}.{parameter}", self._terms()[term][parameter].valid
+        try:
+            values = np.array(values, float)
+        except (TypeError, ValueError):
+            raise ValueError(f"{name} = {values!r}; give numbers") from None
+        bad = np.flatnonzero(~(np.isfinite(values) & holds(values)))
+        if bad.size:
+            raise ValueError(f"{name}: value {bad[0]} is {values.ravel()[bad[0]]:g}; it is finite and {rule}")
+        return values
+
+    def _terms(self) -> dict[str, dict]:
+        """Parameters of all terms: term -> name -> `Parameter`."""
+        parts = self.net.sets if self.net is not None else ()
+        terms: dict[str, dict] = {}
+        for own in (*(t for group in self.groups for t in group.kind.terms), *(part.term for part in parts)):
+            terms.setdefault(own.name, {}).update({known.name: known for known in own.parameters})
+        return terms
 
     def set_rest(self, shell: int, *, points=None, metric=None, curvature=None, angle=None) -> None:
         """Change the rest shape of a shell in every world: growth, swelling, bilayers, creases, pre-stress.

@@ -1,4 +1,4 @@
-"""The command line: `ddg-warp run | sweep | list | check | bench | export | info`.
+"""The command line: `ddg-warp run | sweep | list | check | gradients | bench | export | info`.
 
 Exit codes: 0 done; 1 a check or the solver failed; 2 a mistake in what was asked for; 130 interrupted.
 """
@@ -103,6 +103,10 @@ def parser(arguments: list[str]) -> Parser:
     )
     check.add_argument("--precision", choices=("float64", "float32"), default="float64", help="default: float64")
     check.add_argument("--device", default="cpu", help="Warp device (default: cpu)")
+
+    gradients = commands.add_parser("gradients", help="compare gradients of steps and equilibria with differences")
+    gradients.set_defaults(command=command.gradients_table)
+    command.add_objects(gradients)
 
     bench = commands.add_parser("bench", help="measure a scene's error against its time")
     bench.set_defaults(command=bench_scene)

@@ -270,6 +270,15 @@ def test_a_stiffness_is_found_again():
         (None, {"force": torch.zeros(3)}, "there is no 'force'; there are forces"),
         (None, {"gravity": torch.zeros(4)}, r"gravity have shape \(4,\); they are \(3,\) or \(2, 3\)"),
         (None, {"poses": torch.zeros((0, 6))}, "poses of no grip"),
+        ([1.0], None, r"parameters are \[1.0\]; give a dictionary"),
+        (None, torch.zeros(3), "controls are tensor.*give a dictionary"),
+        ({"rod_stretch": 1.0}, None, "nothing has 'rod_stretch'; this model has"),
+        ({"rod_stretch.stiffness": "stiff"}, None, "rod_stretch.stiffness = 'stiff'; give numbers"),
+        ({"rod_stretch.stiffness": -1.0}, None, "rod_stretch.stiffness: value 0 is -1; it is finite and not negative"),
+        ({"rod_stretch.measure": [[1.0], [0.0]]}, None, "rod_stretch.measure: value 1 is 0; it is finite and positive"),
+        ({"rod_stretch.rest": np.nan}, None, "rod_stretch.rest: value 0 is nan; it is finite"),
+        (None, {"gravity": (0.0, np.nan, 0.0)}, "gravity: entry 1 is not finite"),
+        (None, {"forces": "none"}, "controls: forces = 'none'; give numbers or a tensor"),
     ],
 )
 def test_what_does_not_fit_is_refused(parameters, controls, message):
@@ -354,3 +363,20 @@ def test_steps_run_on_the_stream_that_torch_uses():
     side.synchronize()
     torch.testing.assert_close(found, first, rtol=0.0, atol=0.0)
     assert float(slope) > 0.0
+
+
+def test_calls_that_do_not_fit_are_refused():
+    own, planar = simulator("twisted"), simulator("planar")
+    state = own.initial_state()
+    force = np.ones((planar.model.points_count, 3))
+    for call, message in (
+        (lambda: own.step(None), "the state is None; take one that initial_state"),
+        (lambda: planar.step(state), "the state is another simulator's"),
+        (lambda: own.initial_state(0), "batch = 0"),
+        (lambda: own.initial_state(positions="here"), "positions = 'here'; give numbers or a tensor"),
+        (lambda: own.rollout(state, steps=3, checkpoint_every=-1), "checkpoint_every = -1"),
+        (lambda: Simulator(own.model, DT, scheme="leapfrog"), "scheme is 'leapfrog'"),
+        (lambda: planar.step(planar.initial_state(), None, {"forces": force}), "point 0 stays in the plane of x and z"),
+    ):
+        with pytest.raises(SceneError, match=message):
+            call()

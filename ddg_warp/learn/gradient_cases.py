@@ -1,0 +1,250 @@
+"""An object under an analysis, its inputs, and how a loss depends on them; see `ddg_warp.learn.gradients`."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+
+from ddg_warp.errors import SceneError
+from ddg_warp.learn.gradient_objects import scene_of
+from ddg_warp.learn.simulator import Simulator, WorldState
+from ddg_warp.scene.grip import Grip
+
+WORLDS, DT, STEPS = 2, 0.01, 2
+TIGHT = {"rtol": 1e-13}
+REAL = torch.float64
+
+
+@dataclass
+class Input:
+    """Something that steps read, along a direction.
+
+    Attributes:
+        name: how it is called.
+        size: of a change as large as the input itself, by which x counts.
+        loss: x -> the loss with the input moved by x along the direction; x a tensor () or a number.
+        gradient: () -> its derivative at zero; by default that of torch.
+    """
+
+    name: str
+    size: float
+    loss: Callable
+    gradient: Callable | None = None
+
+    def found(self) -> float:
+        """The derivative at zero; zero where torch says that there is none."""
+        if self.gradient:
+            return self.gradient()
+        x = torch.zeros((), dtype=REAL, requires_grad=True)
+        loss = self.loss(x)
+        if not loss.requires_grad:
+            return 0.0
+        (found,) = torch.autograd.grad(loss, x, allow_unused=True)
+        return 0.0 if found is None else float(found)
+
+
+class Case:
+    """An object under an analysis: its inputs and how the loss depends on them.
+
+    Args:
+        name: among `OBJECTS`; analysis: among `ANALYSES`.
+    """
+
+    def __init__(self, name: str, analysis: str, device: str):
+        self.name, self.analysis, self.device = name, analysis, device
+        self.statics = analysis == "statics"
+        self.random = torch.Generator("cpu").manual_seed(5)
+        self.simulator = self.built()
+        self.engine = self.simulator.engine(WORLDS)
+        self.model = self.engine.model
+        turned = bool(self.model.scene.axisymmetric_shells)  # whose gravity is along z alone
+        flat = turned or self.model.scene.dimension == 2
+        self.place = self.engine.source[0].device
+        self.axes = self._tensor([1.0, 0.0, 1.0] if flat else [1.0, 1.0, 1.0])
+        self.down = self._tensor([0.0, 0.0, 1.0]) if turned else self.axes
+        points, edges = self.model.points_count, self.model.order.edges_count
+        shape = (WORLDS, points, 3)
+        self.weights = self._normal(*shape), 0.1 * self._normal(*shape), 0.1 * self._normal(WORLDS, edges)
+        self.state = self._first()
+        self.poses = 1e-3 * self._normal(WORLDS, len(self.model.grips), 6)
+
+    def built(self, dt: float = DT, **changes) -> Simulator:
+        """A simulator of the scene with changes; see `scene_of`."""
+        model = scene_of(self.name, **changes).build(device=self.device, precision="float64")
+        return Simulator(model, dt, scheme="implicit_euler" if self.statics else self.analysis, **TIGHT)
+
+    def _normal(self, *shape: int) -> torch.Tensor:
+        return torch.randn(shape, generator=self.random, dtype=REAL, device="cpu").to(self.place)
+
+    def _tensor(self, values) -> torch.Tensor:
+        return torch.as_tensor(values, dtype=REAL, device=self.place)
+
+    def _first(self) -> WorldState:
+        """An equilibrium, or a state on the way with random velocities and spins."""
+        with torch.no_grad():
+            if self.statics:
+                return self.simulator.equilibrium(batch=WORLDS, **TIGHT)
+            state = self.simulator.initial_state(WORLDS)
+            for _ in range(3):
+                state = self.simulator.step(state)
+            values = self.engine.put_points(state.values, "v", "v", state.velocities + self._rates())
+            values = self.engine.turn_edges(
+                values, "omega", "v", 3.0 * self._normal(WORLDS, self.model.order.edges_count)
+            )
+        return WorldState(tuple(values), state.time, self.engine)
+
+    def _rates(self) -> torch.Tensor:
+        """Random velocities (worlds, P, 3), of nodes on oblique planes within these."""
+        found = 0.3 * self._normal(WORLDS, self.model.points_count, 3) * self.axes
+        frames = self.model.net.host.frames if self.model.net is not None else {}
+        for row, block in zip(*self.model.order.net_rows, strict=True) if frames else ():
+            if block in frames:
+                held = self._tensor(frames[block][self.model.net.host.fixed[block]])
+                found[:, row] -= found[:, row] @ held.T @ held
+        return found
+
+    def loss(self, state: WorldState) -> torch.Tensor:
+        """Of a state at the end."""
+        terms = [(self.weights[0] * state.positions).sum(), (self.weights[2] * state.angles).sum()]
+        return sum(terms) + (0.0 if self.statics else (self.weights[1] * state.velocities).sum())
+
+    def end(self, simulator: Simulator, values=None, parameters=None, controls=None) -> WorldState:
+        """The last state, from the tensors of the first one."""
+        state = WorldState(tuple(values or self.state.values), self.state.time, simulator.engine(WORLDS))
+        if self.statics:
+            return simulator.equilibrium(parameters, state=state, start=1.0, **TIGHT)
+        if self.model.grips:
+            controls = {"poses": self.poses} | (controls or {})
+        *_, state = simulator.rollout(state, parameters, controls, steps=STEPS)
+        return state
+
+    def inputs(self) -> Iterator[Input]:
+        """All that this object has."""
+        points, edges = self.model.points_count, self.model.order.edges_count
+        net = self.model.net
+        twisted = any(group.kind.twist for group in self.model.groups) or bool(net is not None and net.edges)
+        gravity = self._tensor(self.model.scene.gravity)
+        place = self._normal(WORLDS, points, 3) * self.axes
+        yield self._state("positions", 0.1, lambda x: self._moved("x", "q", x * place))
+        if twisted:
+            angle = self._normal(WORLDS, edges)
+            yield self._state(
+                "angles", 1.0, lambda x: self.engine.turn_edges(self.state.values, "theta", "q", x * angle)
+            )
+        if not self.statics:
+            rate = self._rates()
+            yield self._state("velocities", 1.0, lambda x: self._moved("v", "v", x * rate))
+            if twisted:
+                spin = self._normal(WORLDS, edges)
+                yield self._state(
+                    "spins", 10.0, lambda x: self.engine.turn_edges(self.state.values, "omega", "v", x * spin)
+                )
+        for name in dict.fromkeys(self.engine.names()):
+            yield self._parameter(name)
+        if not self.statics:
+            yield self._control("forces", 1e-2, self._normal(WORLDS, points, 3) * self.axes)
+            if twisted:
+                yield self._control("moments", 1e-4, self._normal(WORLDS, edges))
+            if self.model.grips:
+                yield self._control("poses", 0.1, self._normal(WORLDS, len(self.model.grips), 6), self.poses)
+            yield self._control("gravity", 10.0, self._normal(WORLDS, 3) * self.down, gravity)
+        if self.statics:
+            for name in ("forces", "moments", "poses"):
+                yield self._shared(
+                    name, 1.0, dict, "no gradient goes to controls of an equilibrium: it has those of its scene"
+                )
+            yield self._shared("gravity", 10.0, lambda x: {"gravity": (gravity + x * self.down).tolist()})
+        else:
+            timed = self._without_step()
+            yield self._shared("time step", DT, lambda x: {"dt": DT + float(x)}, timed)
+            yield self._shared("mass damping", 1.0, lambda x: {"mass_damping": 0.7 + float(x)})
+        yield self._shared("density", 1.0, lambda x: {"density": 1.0 + float(x)})
+
+    def _moved(self, own: str, blocks: str, by: torch.Tensor) -> list:
+        at = self.engine.points(self.state.values, own, blocks)
+        return self.engine.put_points(self.state.values, own, blocks, at + by)
+
+    def _state(self, name: str, size: float, values: Callable) -> Input:
+        return Input(name, size, lambda x: self.loss(self.end(self.simulator, values(x))))
+
+    def _parameter(self, name: str) -> Input:
+        usual = self.engine.value(name)
+        size = float(usual.abs().max()) or self._size_of_family(name)
+        direction = 0.5 + torch.rand(usual.shape, generator=self.random, dtype=REAL, device="cpu").to(self.place)
+
+        return Input(name, size, lambda x: self.loss(self.end(self.simulator, None, {name: usual + x * direction})))
+
+    def _size_of_family(self, name: str) -> float:
+        """Of the largest of a family, such as the components of a metric; one where all are zero."""
+        family = name.rstrip("0123456789")
+        alike = [own for own in dict.fromkeys(self.engine.names()) if own.rstrip("0123456789") == family]
+        return max(float(self.engine.value(own).abs().max()) for own in alike) or 1.0
+
+    def _control(self, name: str, size: float, direction: torch.Tensor, usual=0.0) -> Input:
+        return Input(name, size, lambda x: self.loss(self.end(self.simulator, controls={name: usual + x * direction})))
+
+    def _without_step(self) -> str:
+        """Why lengths of steps have no derivative; empty where they have one."""
+        field = self.model.scene.applied_field
+        moved = [motion for motion in self.model.motions if not isinstance(motion, Grip)]
+        parts = [*self.model.groups, *([self.model.net] if self.model.net is not None else [])]
+        loads = any(part.host.timed for part in parts)
+        if moved or loads or (field is not None and (callable(field.value) or callable(field.gradient))):
+            return "the reverse does not differentiate motions, loads and fields that are functions of time"
+        return ""
+
+    def _shared(self, name: str, size: float, changes: Callable, why: str = "") -> Input:
+        """Of what is no tensor: differences build the scene anew. `why` there is no derivative, if there is none."""
+
+        def gradient() -> float:
+            if why:
+                raise SceneError(why)
+            return float(self.reverse()[name])
+
+        return Input(name, size, lambda x: self.loss(self.end(self.built(**changes(x)))), gradient)
+
+    def reverse(self) -> dict[str, float]:
+        """Derivatives by what is no tensor, from the reverse of every step."""
+        self.engine.write((), [])  # parameters are those of the model
+        if self.statics:
+            return self._of_equilibrium()
+        states, sums = [self.state], {"time step": 0.0, "mass damping": 0.0, "density": 0.0}
+        for _ in range(STEPS):
+            states.append(self.simulator.step(states[-1], None, {"poses": self.poses} if self.model.grips else None))
+        given = self._by_end(states[-1])
+        for before, after in zip(states[-2::-1], states[:0:-1], strict=True):
+            given, read = self.engine.backward(before.time, DT, before.values, after.values, given)
+            for each in read:
+                by_rate = sum(own.numpy().sum() for own in (each.rate, *getattr(each, "elements_rate", ())))
+                # an implicit step is over dt, the midpoint rule's over half of it
+                sums["time step"] -= by_rate / DT**2 * (2.0 if self.analysis == "implicit_midpoint" else 1.0)
+                sums["mass damping"] += each.damping.numpy().sum()
+            sums["density"] += self._by_density(read)
+        return sums
+
+    def _of_equilibrium(self) -> dict[str, float]:
+        read = self.engine.balance_backward(1.0, self.state.values, self._by_end(self.state))
+        total = 0.0
+        for each, axes in zip(read, [group.host.axes for group in self.model.groups] + [(0, 1, 2)], strict=False):
+            values = wp.to_torch(each.gravity, requires_grad=False)
+            total += float((values.reshape(-1, values.shape[-1]).sum(0) * self.down[list(axes)]).sum())
+        return {"gravity": total, "density": self._by_density(read)}
+
+    def _by_end(self, state: WorldState) -> list[torch.Tensor]:
+        leaves = [value.detach().requires_grad_() for value in state.values]
+        loss = self.loss(WorldState(tuple(leaves), state.time, self.engine))
+        found = torch.autograd.grad(loss, leaves, allow_unused=True)
+        return [torch.zeros_like(own) if by is None else by for own, by in zip(leaves, found, strict=True)]
+
+    def _by_density(self, read: list) -> float:
+        """By a factor of all masses and rotary inertia."""
+        total = 0.0
+        for group, each in zip(self.model.groups, read, strict=False):
+            total += float((each.mass.numpy() * group.mass.numpy()).sum())
+            if group.kind.twist:
+                total += float((each.rotary.numpy() * group.rotary.numpy()).sum())
+        if self.model.net is not None:
+            mass = self.model.net.host.mass
+            total += float((read[-1].mass.numpy().reshape(WORLDS, *mass.shape) * mass).sum())
+        return total

@@ -1,0 +1,185 @@
+"""Small scenes of every kind of object, which `ddg-warp gradients` asks for their gradients."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ddg_warp.geometry import meshes
+from ddg_warp.scene.grip import Grip
+from ddg_warp.scene.material import Circle, Ellipse, Material, Ribbon
+from ddg_warp.scene.motion import Motion
+from ddg_warp.scene.scene import Scene
+
+T = np.linspace(0.0, 1.0, 6)
+CURVE = np.stack([0.3 * T, 0.05 * np.sin(3.0 * T), 0.04 * np.cos(5.0 * T)], axis=1)
+RIM, ANGLES = np.linspace(0.0, 0.8, 6), np.linspace(0.0, 2.0 * np.pi, 7, endpoint=False)
+SIDE = (0.3, 0.2)  # of sheets [m]
+
+
+def soft(scale: float = 1.0) -> Material:
+    """What all are made of, so many times as dense."""
+    return Material(young=1e6, density=1000.0 * scale, viscosity=0.01)
+
+
+def _rod(points=CURVE, section=None, hold: Callable | None = None, more: Callable | None = None, **options) -> Callable:
+    """A rod that is clamped at its first edge, or held by `hold(scene, rod)`, with `more(scene, rod)`."""
+
+    def add(scene: Scene, material: Material) -> None:
+        rod = scene.add_rod(points, section=section or Ellipse(0.004, 0.003), material=material, **options)
+        (hold or (lambda scene, rod: scene.clamp(rod)))(scene, rod)
+        if more:
+            more(scene, rod)
+
+    return add
+
+
+def _joined(rigid: bool = True, flat: bool = False) -> Callable:
+    """Three rods that meet in a point; hinged ones are held at their far ends, too."""
+
+    def add(scene: Scene, material: Material) -> None:
+        keep, last = np.array([1.0, not flat, 1.0]), len(CURVE) - 1
+        rods = [scene.add_rod(CURVE * keep, section=Ellipse(0.004, 0.003), material=material)]
+        for y, z in ((0.2, 0.1), (-0.2, 0.05)):
+            points = (CURVE[-1] + np.stack([0.1 * T, y * T, z * T], axis=1)) * keep
+            rods.append(scene.add_rod(points, section=Circle(0.003), material=material))
+        scene.clamp(rods[0])
+        scene.fix(rods[1], [last], components="xz")
+        scene.join([(rods[0], last), (rods[1], 0), (rods[2], 0)], rigid=rigid)
+        if not rigid:
+            scene.clamp(rods[1:], edges=[-1])
+
+    return add
+
+
+def _sheet(bending: str, hold: Callable | None = None, more: Callable | None = None, **options) -> Callable:
+    """A wavy sheet held at its first vertices, or by `hold(scene, shell, points)`."""
+
+    def add(scene: Scene, material: Material) -> None:
+        points, triangles = meshes.rectangle(3, 2, SIDE)
+        points = np.array(points, float)
+        if bending != "isometric":  # which is flat at rest
+            points[:, 2] = 0.02 * np.sin(9.0 * points[:, 0])
+        shell = scene.add_shell(points, triangles, thickness=0.004, material=material, bending=bending, **options)
+        first = np.flatnonzero(points[:, 0] <= 0.0 if hold or bending != "isometric" else points[:, 0] <= 0.11)
+        (hold or (lambda scene, shell, first: scene.hold(shell, [*first, len(points) - 1])))(scene, shell, first)
+        if more:
+            more(scene, shell)
+
+    return add
+
+
+def _turned_sheet(scene: Scene, material: Material) -> None:
+    """A sheet along the diagonal of space, on a symmetry plane across it."""
+    points, triangles = meshes.rectangle(3, 2, SIDE)
+    points = np.array(points, float)
+    along, across = np.array([0.8, 0.6, 0.0]), np.array([-0.6, 0.8, 0.0])
+    first = np.flatnonzero(points[:, 0] <= 0.0)
+    points = points[:, :1] * along + points[:, 1:2] * across
+    shell = scene.add_shell(points, triangles, thickness=0.004, material=material)
+    scene.symmetry(shell, first, tuple(along))
+    scene.hold(shell, [0])
+    scene.hold(shell, [len(points) - 1], components="z")
+
+
+def _stiffened(scene: Scene, material: Material) -> None:
+    points, triangles = meshes.rectangle(3, 2, SIDE)
+    shell = scene.add_shell(points, triangles, thickness=0.004, material=material)
+    points = np.asarray(points)
+    scene.hold(shell, [0, 4, 8])
+    row = np.flatnonzero(points[:, 1] == 0.0)
+    rod = scene.add_rod(points[row], section=Circle(0.003), material=material)
+    scene.attach(rod, range(len(row)), shell, row)
+
+
+def _dome(scene: Scene, material: Material) -> None:
+    points = np.column_stack([0.3 * np.sin(RIM), 0.3 * np.cos(RIM)])
+    shell = scene.add_axisymmetric_shell(points, thickness=0.004, material=material)
+    scene.clamp_ring(shell, "last")
+
+
+def _magnetised(magnetisation, field, dipoles: bool = False) -> Callable:
+    def magnetise(scene: Scene, rod: int) -> None:
+        scene.magnetize(rod, magnetisation)
+        scene.magnetic_field(field, gradient=np.diag([1e-2, 1e-2, -2e-2]))
+        if dipoles:
+            scene.add_dipoles()
+
+    return magnetise
+
+
+def _timed(t: float) -> tuple:
+    return (0.0, 2e-2 * t, 1e-2)
+
+
+SWING = Motion(
+    translation=lambda t: (0.05 * np.sin(9.0 * t), 0.1 * t, 0.0), angle=lambda t: 4.0 * t, axis=(0.3, 1.0, 0.2)
+)
+
+# name -> dimension of the scene, and what is added to it
+OBJECTS: dict[str, tuple[int, Callable]] = {
+    "rod": (3, _rod()),
+    "rod clamped at its end": (3, _rod(section=Circle(0.004), hold=lambda s, r: s.clamp_end(r))),
+    "rod without twist": (
+        3,
+        _rod(section=Circle(0.004), natural="straight", twist=False, hold=lambda s, r: s.fix(r, [0, -1])),
+    ),
+    "planar rod": (2, _rod(CURVE * [1.0, 0.0, 1.0], Circle(0.004))),
+    "rod by the turning angle": (3, _rod(curvature="angle")),
+    "closed rod": (
+        3,
+        _rod(0.1 * np.stack([np.cos(ANGLES), np.sin(ANGLES), 0.2 * np.sin(2.0 * ANGLES)], axis=1), closed=True),
+    ),
+    "ribbon": (3, _rod(section=Ribbon(0.01, 0.002))),
+    "rods joined rigidly": (3, _joined()),
+    "rods joined by a hinge": (3, _joined(rigid=False)),
+    "planar rods joined rigidly": (2, _joined(flat=True)),
+    **{
+        f"shell, {name}": (3, _sheet(name))
+        for name in ("midedge_dof", "midedge_boundary", "midedge", "hinge", "isometric")
+    },
+    "shell, curved membrane": (3, _sheet("midedge_dof", membrane="curved")),
+    "shell on an oblique plane": (3, _turned_sheet),
+    "rod on a shell": (3, _stiffened),
+    "shell of revolution": (3, _dome),
+    "magnetised rod": (3, _rod(more=_magnetised(2e4, (0.0, 1e-2, 1e-2)))),
+    "rod magnetised across": (3, _rod(more=_magnetised((1e4, 2e4, 1e4), _timed))),
+    "magnetised rod without twist": (
+        3,
+        _rod(
+            section=Circle(0.004),
+            natural="straight",
+            twist=False,
+            hold=lambda s, r: s.fix(r, [0, -1]),
+            more=_magnetised(2e4, _timed),
+        ),
+    ),
+    "rod of dipoles": (3, _rod(more=_magnetised(2e5, (0.0, 1e-2, 1e-2), dipoles=True))),
+    "rod with drag": (3, _rod(more=lambda s, r: s.drag(r, tangential=0.1, normal=0.2))),
+    "rod in a motion": (3, _rod(hold=lambda s, r: s.clamp(r, motion=SWING))),
+    "gripped rod": (3, _rod(hold=lambda s, r: s.clamp(r, motion=Grip(pivot=(0.1, 0.0, 0.0))))),
+    "gripped shell": (3, _sheet("midedge_dof", lambda s, k, first: s.hold(k, first, motion=Grip()))),
+    "shell clamped by a grip": (
+        3,
+        _sheet("midedge_dof", lambda s, k, first: s.clamp_boundary(k, first, motion=Grip())),
+    ),
+    "shell clamped in a motion": (
+        3,
+        _sheet("midedge_dof", lambda s, k, first: s.clamp_boundary(k, first, motion=SWING)),
+    ),
+    "rod under a couple": (3, _rod(more=lambda s, r: s.add_couple(r, -1, (1e-4, 2e-4, -1e-4)))),
+    "shell under pressure": (3, _sheet("midedge_dof", more=lambda s, k: s.add_pressure(k, 5.0))),
+}
+
+
+def scene_of(name: str, gravity=(0.5, 0.0, -9.81), mass_damping: float = 0.7, density: float = 1.0) -> Scene:
+    """The scene of an object; `density` is a factor.
+
+    Args:
+        gravity, mass_damping: as of `Scene`.
+    """
+    dimension, add = OBJECTS[name]
+    if add is _dome:  # turns about the direction of gravity
+        gravity = (0.0, 0.0, gravity[2])
+    scene = Scene(gravity=tuple(gravity), mass_damping=mass_damping, dimension=dimension)
+    add(scene, soft(density))
+    return scene

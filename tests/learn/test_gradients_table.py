@@ -1,0 +1,127 @@
+"""The table of gradients: every input is right or refused by name; what the command says of it, and holes that it has found."""
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp.errors import SceneError
+from ddg_warp.run.cli import main
+from tests.learn.differences import TIGHT, built
+from tests.learn.test_adjoint import CURVE, DT, SCENES, SOFT
+
+torch = pytest.importorskip("torch")
+from ddg_warp.learn import gradient_objects, gradients  # noqa: E402
+from ddg_warp.torch import Simulator  # noqa: E402
+
+FAST = (
+    ("rod", "statics"),
+    ("rod without twist", "implicit_midpoint"),
+    ("planar rod", "implicit_euler"),
+    ("rods joined rigidly", "implicit_euler"),
+    ("shell, hinge", "implicit_midpoint"),
+    ("shell of revolution", "implicit_euler"),
+    ("shell clamped by a grip", "implicit_euler"),
+    ("shell clamped in a motion", "implicit_midpoint"),
+    ("magnetised rod without twist", "implicit_midpoint"),
+    ("rod with drag", "implicit_euler"),
+)
+WORDS = ("no gradient goes", "does not differentiate", "serves statics and spectra")  # of which refusals have one
+
+
+def right(rows: list[dict]) -> None:
+    bad = [row for row in rows if row["result"] not in (gradients.RIGHT, gradients.NONE, gradients.REFUSED)]
+    assert rows
+    assert not bad
+    for row in rows:
+        assert row["result"] != gradients.REFUSED or any(word in row["reason"] for word in WORDS), row
+
+
+@pytest.mark.parametrize(
+    ("name", "analysis"),
+    [
+        pytest.param(name, analysis, marks=() if (name, analysis) in FAST else pytest.mark.slow)
+        for name in gradients.OBJECTS
+        for analysis in gradients.ANALYSES
+    ],
+)
+def test_every_input_is_right_or_refused(device, name, analysis):
+    rows = list(gradients.table([name], [analysis], device))
+    right(rows)
+    if analysis == "implicit_euler" and not any(word in name for word in ("drag", "couple", "pressure", "curved")):
+        refused = [row["input"] for row in rows if row["result"] == gradients.REFUSED]
+        assert set(refused) <= {"time step"}
+
+
+@pytest.mark.parametrize("analysis", ["implicit_euler", "statics"])
+def test_a_law_of_ones_own(device, analysis, monkeypatch):
+    from tests.test_laws import saturating
+
+    law = {"rod_bend_twist": ddg.Law(saturating, modulus=1e-4, limit=5.0)}
+
+    def add(scene, material):
+        scene.clamp(scene.add_rod(CURVE, section=ddg.Circle(0.004), material=material, laws=law, natural="straight"))
+
+    monkeypatch.setitem(gradient_objects.OBJECTS, "own", (3, add))
+    rows = list(gradients.table(["own"], [analysis], device))
+    right(rows)
+    assert {"rod_bend_twist.modulus", "rod_bend_twist.limit"} <= {r["input"] for r in rows if r["result"] == "right"}
+
+
+def test_the_command_prints_it(tmp_path, capsys):
+    assert main(["gradients", "planar rod", "--analysis", "implicit_euler", "--out", str(tmp_path / "table")]) == 0
+    printed = capsys.readouterr().out
+    assert "planar_bend.stiffness" in printed
+    assert "0 wrong" in printed
+    assert (tmp_path / "table.csv").read_text().startswith("object,analysis,input,result,error,reason")
+    assert main(["gradients", "balloon"]) == 2
+    assert "there is no 'balloon'; there are rod" in capsys.readouterr().err
+
+
+def test_what_is_wrong_fails(monkeypatch, capsys):
+    """A gradient that is lost, and one that is off."""
+    usual = gradients.Input.found
+    spoilt = {"velocities": 0.0, "gravity": 1.01}
+    monkeypatch.setattr(gradients.Input, "found", lambda own: usual(own) * spoilt.get(own.name, 1.0))
+    assert main(["gradients", "planar rod", "--analysis", "implicit_euler"]) == 1
+    printed = capsys.readouterr().out
+    assert "SILENT ZERO" in printed
+    assert "WRONG" in printed
+    assert "2 wrong" in printed
+
+
+def test_parameters_of_several_tables_one_after_the_other():
+    """Shells have a table for each term: what one was given ends with the step, whatever another is given next."""
+    own = Simulator(built(SCENES["sheet"]()), DT, **TIGHT)
+    state = own.step(own.step(own.initial_state()))
+    usual = own.step(state).positions
+    stretch, bend = (next(n for n in own.engine(1).names() if n.startswith(k)) for k in ("shell_stretch", "shell_bend"))
+    own.step(state, {stretch: 2.0 * own.parameter(stretch)})
+    bent = own.step(state, {bend: own.parameter(bend)}).positions
+    torch.testing.assert_close(bent, usual, rtol=0.0, atol=0.0)
+
+
+def test_an_equilibrium_refuses_a_history():
+    own = Simulator(built(SCENES["planar"]()), DT)
+    points = torch.tensor(own.model.state().points()).requires_grad_()
+    state = own.initial_state(positions=points)
+    with pytest.raises(SceneError, match=r"no gradient goes to the state where the search begins.*detach"):
+        own.equilibrium(state=state)
+    assert torch.isfinite(own.equilibrium(state=state.detach()).positions).all()
+
+
+def test_poses_by_the_midpoint_rule():
+    """They are refused to whoever asks for their gradient, time and again, and to nobody else."""
+    scene = ddg.Scene()
+    rod = scene.add_rod(CURVE, section=ddg.Circle(0.004), material=SOFT, natural="straight", twist=False)
+    scene.fix(rod, [0, -1], motion=ddg.Grip())
+    own = Simulator(built(scene), DT, scheme="implicit_midpoint", **TIGHT)
+    poses, k = torch.zeros((1, 6), dtype=torch.float64), own.parameter("rod_stretch.stiffness").requires_grad_()
+    for _ in range(2):
+        loss = (own.step(own.initial_state(), None, {"poses": poses.clone().requires_grad_()}).positions ** 2).sum()
+        with pytest.raises(SceneError, match=r"poses of grips by the midpoint rule yet; take 'implicit_euler', or"):
+            loss.backward()
+    poses[0, 0] = 1e-3
+    loss = (own.step(own.initial_state(), {"rod_stretch.stiffness": k}, {"poses": poses}).positions ** 2).sum()
+    (found,) = torch.autograd.grad(loss, k)
+    assert np.isfinite(float(found.sum()))
+    assert found.any()
