@@ -24,6 +24,7 @@ SMALL = {
     "helical_flagellum": {"n": 24},
     "helical_spring": {"n": 200},
     "hinged_roof": {"n": 6, "steps": 16},
+    "identify_stiffness": {},
     "leaf": {"cells": 20},
     "lee_frame": {"n": 40},
     "localized_helix": {},

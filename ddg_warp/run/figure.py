@@ -181,6 +181,33 @@ def levels_plot(path, names: list[str], marks: Mapping[str, list], usual: list[f
     _save(figure, path)
 
 
+def lines_plot(path, lines: Iterable[tuple], x: str, y: str, title: str = "", log: bool = False) -> None:
+    """Draws lines over one axis, those of equal labels alike.
+
+    Args:
+        path: The picture to write; its suffix is the format.
+        lines: Label, places along x and y, and style of each: one of matplotlib's lines ("-") or markers ("o").
+        x, y: Labels of the axes, with their units.
+        title: A line above.
+        log: Whether the vertical axis is logarithmic.
+    """
+    figure = Figure(figsize=(7.0, 4.6), layout="constrained")
+    plot, lines = figure.add_subplot(), list(lines)
+    labels = list(dict.fromkeys(label for label, *_ in lines))
+    shown = set()
+    for label, along, values, style in lines:
+        color = TIME_COLORS(0.25 + 0.7 * labels.index(label) / max(1, len(labels) - 1))
+        told = label if label not in shown else None
+        plot.plot(along, values, style, color=color, markersize=3.5, linewidth=1.5, alpha=0.9, label=told)
+        shown.add(label)
+    plot.set(xlabel=x, ylabel=y, yscale="log" if log else "linear")
+    plot.set_title(textwrap.fill(title, 80), loc="left", fontsize=11)
+    plot.grid(color="0.92", linewidth=0.6)
+    plot.spines[["top", "right"]].set_visible(False)
+    plot.legend(frameon=False, fontsize=9)
+    _save(figure, path)
+
+
 def path_plot(path, file, title: str = "", unit: str = "m") -> None:
     """Draws the load parameter over every watched displacement: full where stable, broken where not, special points marked.
 
