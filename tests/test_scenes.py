@@ -24,6 +24,7 @@ SMALL = {
     "helical_flagellum": {"n": 24},
     "helical_spring": {"n": 200},
     "hinged_roof": {"n": 6, "steps": 16},
+    "identify_from_statics": {},
     "identify_stiffness": {},
     "inverse_rest_shape": {"strands": 2},
     "leaf": {"cells": 20},
@@ -68,7 +69,7 @@ LONG = (
     "deep_arch",
     "leaf",
 )
-LEARNED = ("identify_stiffness", "inverse_rest_shape")
+LEARNED = ("identify_from_statics", "identify_stiffness", "inverse_rest_shape")
 
 
 def checked(name: str, device: str, **given) -> None:
