@@ -39,6 +39,7 @@ SMALL = {
     "plate_square": {"cells": 16},
     "post_buckling": {"n": 50},
     "pullout_cylinder": {"n": 12},
+    "reach": {"n": 16},
     "ribbon_bistable": {"n": 40},
     "ribbon_helix": {"n": 50},
     "right_angle_frame": {},
@@ -69,7 +70,7 @@ LONG = (
     "deep_arch",
     "leaf",
 )
-LEARNED = ("identify_from_statics", "identify_stiffness", "inverse_rest_shape")
+LEARNED = ("identify_from_statics", "identify_stiffness", "inverse_rest_shape", "reach")
 
 
 def checked(name: str, device: str, **given) -> None:
