@@ -46,6 +46,7 @@ SMALL = {
     "roll_up": {"n": 100},
     "sedimenting_rod": {},
     "slit_annulus": {},
+    "soft_gripper": {"fingers": 1},
     "sphere_indentation": {"rings": 16},
     "spinning_rod": {"steps": 100},
     "steel_wire": {},
@@ -70,7 +71,7 @@ LONG = (
     "deep_arch",
     "leaf",
 )
-LEARNED = ("identify_from_statics", "identify_stiffness", "inverse_rest_shape", "reach")
+LEARNED = ("identify_from_statics", "identify_stiffness", "inverse_rest_shape", "reach", "soft_gripper")
 
 
 def checked(name: str, device: str, **given) -> None:
