@@ -119,6 +119,24 @@ def test_hair_is_shown_with_its_head_side_by_side(drawn):
     assert len(drawn[0].axes) == 3
 
 
+def test_what_is_learned_is_drawn(drawn):
+    """Lines of one label have one color and one entry of the legend; shapes that have names are told by them."""
+    x = np.arange(3.0)
+    lines = [("seen", x, x, "o"), ("learned", x, 2.0 * x, "-"), ("learned", x, 3.0 * x, "-")]
+    figure.lines_plot("unused.png", lines, "time [s]", "height [m]")
+    (plot,) = drawn[0].axes
+    assert [text.get_text() for text in plot.get_legend().get_texts()] == ["seen", "learned"]
+    assert plot.lines[1].get_color() == plot.lines[2].get_color() != plot.lines[0].get_color()
+    points, scene = np.eye(3), ddg.Scene()
+    scene.add_rod(points, section=ddg.Stiffness(EA=1.0, EI1=1.0, GJ=1.0, mass_per_length=1.0, radius=1e-4))
+    model, names = scene.build("cpu"), ["sags", "hangs"]
+    for side_by_side in (True, False):
+        shapes = [(0.0, points), (1.0, 2.0 * points)]
+        figure.rods_picture(model, shapes, "unused.png", names=names, side_by_side=side_by_side)
+    assert [plot.get_title() for plot in drawn[1].axes] == names
+    assert [text.get_text() for text in drawn[2].axes[1].get_yticklabels()] == names
+
+
 def test_slim_shapes_fit_their_panels(drawn):
     """Strands that hang are seen whole, and as slim as they are."""
     module = load_scene("hair")

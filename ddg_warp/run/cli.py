@@ -244,10 +244,11 @@ def draw(directory: Path, module, result, shapes: int = 6) -> None:
 
     Statics and paths have the load parameter instead of the time; a path of equilibria goes to DIR/path.png, too, load over
     displacements. A scene may declare `LENGTH_UNIT`, and `picture(result, frames)`, which returns what `figure.rods_picture` is to
-    draw instead of the frames, points by time: `points_by_time` and other arguments of it.
+    draw instead of the frames, points by time: `points_by_time` and other arguments of it. One that learns may declare `plot(result)`,
+    arguments of `figure.lines_plot`, which goes to DIR/learned.png once its check has put what it learned into `result.learned`.
     """
     try:
-        from ddg_warp.run.figure import path_plot, rods_picture
+        from ddg_warp.run.figure import lines_plot, path_plot, rods_picture
     except ModuleNotFoundError as error:
         print(f"no picture without {error.name}: `pip install matplotlib`", file=sys.stderr)
         return
@@ -270,6 +271,8 @@ def draw(directory: Path, module, result, shapes: int = 6) -> None:
         rods_picture(reader, path=directory / "picture.png", title=title, **options)
     if result.path is not None:
         path_plot(result.path, directory / "path.png", title, unit)
+    if result.learned is not None:
+        lines_plot(directory / "learned.png", **module.plot(result))
 
 
 def list_all(chosen: argparse.Namespace) -> int:

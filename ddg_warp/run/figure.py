@@ -43,6 +43,7 @@ def rods_picture(
     title: str = "",
     *,
     label: str = "time [s]",
+    names: list[str] | None = None,
     unit: str = "m",
     values: np.ndarray | None = None,
     colors: np.ndarray | None = None,
@@ -59,6 +60,7 @@ def rods_picture(
         path: The picture to write; its suffix is the format.
         title: A line above.
         label: What tells the shapes apart, with its unit.
+        names: Names of the shapes, in order, that are shown instead of their times.
         unit: That of lengths.
         values: A number at each point, shape (P,) of all worlds, which colors the latest shape; `label` is then its name.
         colors: RGB of each rod, shape (R, 3), instead of a color a time.
@@ -110,11 +112,10 @@ def rods_picture(
             if not len(flat):
                 sides = np.ptp([plot.get_xlim(), plot.get_ylim(), plot.get_zlim()], axis=1)
                 plot.set_box_aspect(sides, zoom=CLOSE * _to_fit(sides))
-            plot.set_title(
-                f"{label.partition(' [')[0]} {time:.3g} {label.partition('[')[2].rstrip(']')}", fontsize=9, color=GREY
-            )
+            told = f"{label.partition(' [')[0]} {time:.3g} {label.partition('[')[2].rstrip(']')}"
+            plot.set_title(told if names is None else names[number], fontsize=9, color=GREY)
     if not side_by_side:
-        _explain_times(figure, plots[0], times, norm, label, values)
+        _explain_times(figure, plots[0], times, norm, label, values, names)
     figure.suptitle(textwrap.fill(title, round(TITLE * figure.get_figwidth())), x=0.03, ha="left", fontsize=11)
     _save(figure, path)
 
@@ -178,6 +179,33 @@ def levels_plot(path, names: list[str], marks: Mapping[str, list], usual: list[f
     plot.grid(color="0.92", linewidth=0.6)
     plot.spines[["top", "right"]].set_visible(False)
     plot.legend(frameon=False, fontsize=8, ncols=len(marks) + 1, loc="lower left", bbox_to_anchor=(0.0, 1.0))
+    _save(figure, path)
+
+
+def lines_plot(path, lines: Iterable[tuple], x: str, y: str, title: str = "", log: bool = False) -> None:
+    """Draws lines over one axis, those of equal labels alike.
+
+    Args:
+        path: The picture to write; its suffix is the format.
+        lines: Label, places along x and y, and style of each: one of matplotlib's lines ("-") or markers ("o").
+        x, y: Labels of the axes, with their units.
+        title: A line above.
+        log: Whether the vertical axis is logarithmic.
+    """
+    figure = Figure(figsize=(7.0, 4.6), layout="constrained")
+    plot, lines = figure.add_subplot(), list(lines)
+    labels = list(dict.fromkeys(label for label, *_ in lines))
+    shown = set()
+    for label, along, values, style in lines:
+        color = TIME_COLORS(0.25 + 0.7 * labels.index(label) / max(1, len(labels) - 1))
+        told = label if label not in shown else None
+        plot.plot(along, values, style, color=color, markersize=3.5, linewidth=1.5, alpha=0.9, label=told)
+        shown.add(label)
+    plot.set(xlabel=x, ylabel=y, yscale="log" if log else "linear")
+    plot.set_title(textwrap.fill(title, 80), loc="left", fontsize=11)
+    plot.grid(color="0.92", linewidth=0.6)
+    plot.spines[["top", "right"]].set_visible(False)
+    plot.legend(frameon=False, fontsize=9)
     _save(figure, path)
 
 
@@ -337,15 +365,16 @@ def _seen_height(sides: np.ndarray) -> float:
     return float(seen @ sides / np.linalg.norm(sides))
 
 
-def _explain_times(figure: Figure, plot, times: np.ndarray, norm: Normalize, label: str, values) -> None:
+def _explain_times(figure: Figure, plot, times: np.ndarray, norm: Normalize, label: str, values, names) -> None:
     """A color bar with a tick at each time drawn, or over the values that color the latest shape."""
     if len(times) == 1 and values is None:
         return
     gap = 0.10 if plot.name == "3d" else 0.03  # room for the label of the z axis
     bar = figure.colorbar(ScalarMappable(norm, TIME_COLORS), ax=plot, shrink=0.6, aspect=28, pad=gap)
-    bar.set_label(label, fontsize=9)
+    if names is None or values is not None:
+        bar.set_label(label, fontsize=9)
     if values is None:
-        bar.set_ticks(times, labels=[f"{time:.3g}" for time in times])
+        bar.set_ticks(times, labels=names or [f"{time:.3g}" for time in times])
     bar.ax.tick_params(labelsize=8)
     bar.outline.set_visible(False)
 

@@ -36,6 +36,7 @@ class Result:
         failure: Why the run ended early; empty where it did not.
         outcome: "converged", or the name of the outcome that ended the run early.
         path: The path of equilibria that was followed, if that was the analysis (`ddg_warp.scene.path.Path`).
+        learned: What the scene's check learned from the run, for its plot; None where it learns nothing.
     """
 
     scene: Scene
@@ -52,6 +53,7 @@ class Result:
     failure: str = ""
     outcome: str = "converged"
     path: Any = None
+    learned: Any = None
 
     def __repr__(self) -> str:
         reached = f"{self.times[0]:g} to {self.times[-1]:g}" if self.times else "none"

@@ -1,0 +1,183 @@
+"""Identification: EI, GJ and viscosity of a rod from a recorded motion with noise, by gradients of a coarser simulator.
+
+The run is the recording: a quarter circle of wire, clamped level at one end, falls and swings; its own weight bends and twists it.
+Four markers on it are seen every 20 ms, each coordinate with noise. `check` then learns: rods of a third of the edges, stepped by
+implicit Euler instead of the midpoint rule in longer steps, start from wrong values and move them down the gradient of the sum of
+squares of what is off. Error bars are those of least squares, the inverse of the Hessian at the minimum, which holds what noise does
+but not what the other discretisation does. In steps of implicit Euler with dt w << 1 a mode loses as much as a viscosity of dt takes
+from it, 1 / |1 + i w dt| = 1 - (w dt)^2 / 2: what is learned of the viscosity is short of it by dt.
+"""
+
+import numpy as np
+
+import ddg_warp as ddg
+from ddg_warp.run.check import once_reached
+from ddg_warp.scenes import _learn
+
+LENGTH = 0.3  # m, along the arc
+MASS = 0.055  # kg/m
+TRUTH = {"EI": 4.0e-3, "GJ": 2.4e-3, "viscosity": 0.03}  # N m^2, N m^2, s
+GUESS = {"EI": 2.0, "GJ": 0.6, "viscosity": 0.5}  # over the truth
+NAMES = {
+    "EI": ("rod_bend_twist.stiffness_1", "rod_bend_twist.stiffness_2"),
+    "GJ": ("rod_bend_twist.stiffness_3",),
+    "viscosity": ("rod_bend_twist.viscosity",),
+}
+MARKERS = 4  # at a quarter, half, three quarters and the whole of the length
+SEEN = 0.02  # s, between frames of the camera
+DURATION = 0.8  # s
+NOISE = 1e-3  # m, standard deviation of a coordinate
+EDGES, DT = 16, 0.0025  # of the learner's rod, and of its steps [s]
+DISCRETE = 0.01  # relative error that edges and steps of the learner leave
+SOURCE = "what the recording was made with"
+
+
+def build(n: int = 48, step: float = 0.002) -> ddg.Scene:
+    """The rod that is recorded, at rest where it is not in equilibrium.
+
+    Args:
+        n: edges, a multiple of the markers
+        step: time step [s], which goes a whole number of times into 20 ms
+    """
+    if n < 2 * MARKERS or n % MARKERS or abs(SEEN / step - round(SEEN / step)) > 1e-6:
+        raise ValueError(f"n = {n}, step = {step}: take a multiple of {MARKERS} edges and a part of {SEEN} s")
+    return rod(n, TRUTH, ddg.Dynamics(dt=step, duration=DURATION, scheme="implicit_midpoint"))
+
+
+def rod(n: int, values: dict[str, float], analysis: ddg.Dynamics) -> ddg.Scene:
+    """A quarter circle in the plane of x and y of so many edges, with these stiffnesses and this viscosity."""
+    angle, radius = np.linspace(0.0, 0.5 * np.pi, n + 1), LENGTH / (0.5 * np.pi)
+    points = radius * np.stack([np.sin(angle), 1.0 - np.cos(angle), 0.0 * angle], axis=1)
+    section = ddg.Stiffness(
+        EA=1000.0,
+        EI1=values["EI"],
+        GJ=values["GJ"],
+        mass_per_length=MASS,
+        rotary_inertia=4.4e-7,
+        radius=0.004,
+        viscosity=values["viscosity"],
+    )
+    scene = ddg.Scene(analysis=analysis)
+    scene.clamp_end(scene.add_rod(points, section=section, name="rod"), "first")
+    return scene
+
+
+def markers(points):
+    """Markers (..., 4, 3) on a rod (..., nodes, 3)."""
+    apart = (points.shape[-2] - 1) // MARKERS
+    return points[..., apart::apart, :]
+
+
+def observe(model, state) -> dict[str, float]:
+    """Coordinates of the markers [m], without noise."""
+    places = markers(state.points().reshape(-1, 3)[: int(model.curves.counts[0])])
+    return {
+        f"{axis}{number + 1}": float(p)
+        for number, place in enumerate(places)
+        for axis, p in zip("xyz", place, strict=True)
+    }
+
+
+def recording(result) -> np.ndarray:
+    """What the camera saw (frames, 4, 3) [m], from 20 ms on, with noise."""
+    every = round(SEEN / result.dt)
+    exact = np.stack([result.series[f"{axis}{k + 1}"] for k in range(MARKERS) for axis in "xyz"], axis=1)
+    seen = exact[every::every].reshape(-1, MARKERS, 3)
+    return seen + np.random.default_rng(0).normal(scale=NOISE, size=seen.shape)
+
+
+def learn(seen: np.ndarray) -> dict:
+    """EI, GJ and viscosity from a recording (frames, 4, 3) [m].
+
+    Returns:
+        "values" and their "deviations" relative to them (one standard deviation) by name; "losses" of the search; the motion of
+        the markers as "guessed" and as "learned" (frames, 4, 3).
+    """
+    import torch
+
+    from ddg_warp.torch import Simulator
+
+    guess = {name: GUESS[name] * TRUTH[name] for name in TRUTH}
+    simulator = Simulator(rod(EDGES, guess, ddg.Dynamics(dt=DT, duration=DURATION)).build("cpu", "float64"), DT)
+    target, save = torch.tensor(seen), round(SEEN / DT)
+
+    def motion(logarithms):
+        """Markers (frames, worlds, 4, 3) of worlds with logarithms (worlds, 3) of the parameters over the first guess."""
+        parameters = {
+            own: guess[name] * logarithms[:, k : k + 1].exp() for k, name in enumerate(NAMES) for own in NAMES[name]
+        }
+        states = simulator.rollout(
+            simulator.initial_state(len(logarithms)), parameters, steps=save * len(seen), save=save
+        )
+        return torch.stack([markers(state.positions) for state in states])
+
+    def losses(logarithms):
+        """Half the sum of squares over the variance of the noise, of every world."""
+        return 0.5 * (((motion(logarithms) - target[:, None]) / NOISE) ** 2).sum((0, 2, 3))
+
+    start = torch.zeros((1, len(TRUTH)), dtype=torch.float64)
+    found, history = _learn.minimise(lambda x: losses(x)[0] / target.numel(), start)
+    covariance = np.linalg.inv(_learn.hessian(losses, found[0]))
+    with torch.no_grad():
+        guessed, learned = (motion(x)[:, 0].numpy() for x in (start, found))
+    return {
+        "values": dict(zip(TRUTH, (np.array(list(guess.values())) * np.exp(found[0].numpy())).tolist(), strict=True)),
+        "deviations": dict(zip(TRUTH, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
+        "losses": history,
+        "guessed": guessed,
+        "learned": learned,
+    }
+
+
+def check(result) -> list[ddg.Check]:
+    """Parameters within two standard deviations and what the discretisation leaves; what is left over is noise."""
+    names = {"EI": "EI [N m^2]", "GJ": "GJ [N m^2]", "viscosity": "viscosity, and dt of implicit Euler [s]"}
+    left = "what is off over the noise, root mean square"
+
+    def make() -> list[ddg.Check]:
+        result.learned = {"seen": recording(result)}
+        result.learned |= learn(result.learned["seen"])
+        values, deviations = result.learned["values"], result.learned["deviations"]
+        off = np.sqrt(np.mean(((result.learned["learned"] - result.learned["seen"]) / NOISE) ** 2))
+        made = [
+            ddg.Check(
+                names[name],
+                values[name] + (DT if name == "viscosity" else 0.0),
+                truth,
+                2.0 * deviations[name] + DISCRETE,
+                f"{SOURCE}; learned to {100.0 * deviations[name]:.1f} %, one deviation",
+                relative=True,
+            )
+            for name, truth in TRUTH.items()
+        ]
+        return [*made, ddg.Check(left, off, 1.0, 0.1, "a standard deviation of noise")]
+
+    names_all = [*names.values(), left]
+    return _learn.skipped(names_all) or once_reached(result, DURATION, names_all, make)
+
+
+def plot(result) -> dict:
+    """Height of every marker: recorded, at the first guess and as learned."""
+    found, lines = result.learned, []
+    times = SEEN * (1.0 + np.arange(len(found["seen"])))
+    for k in range(MARKERS):
+        kinds = (("recorded", "seen", "o"), ("first guess", "guessed", "--"), ("learned", "learned", "-"))
+        lines += [(label, times, 1e3 * found[name][:, k, 2], style) for label, name, style in kinds]
+    told = ", ".join(f"{name} to {100.0 * d:.1f} %" for name, d in found["deviations"].items())
+    return {
+        "lines": lines,
+        "x": "time [s]",
+        "y": "height of the markers [mm]",
+        "title": f"Learned from markers: {told}",
+    }
+
+
+def benchmark() -> ddg.bench.Study:
+    """The tip of the recorded rod over its edges and steps."""
+    return ddg.bench.Study(
+        {"n": (12, 24, 48), "dt": (0.01, 0.005, 0.002)},
+        lambda result: result.state.points()[-1],
+        {"n": 96, "dt": 0.001},
+        series=("dt",),
+        unit="m",
+    )

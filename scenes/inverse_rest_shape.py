@@ -1,0 +1,171 @@
+"""Inverse design: rods that take the shape they were drawn in under their own weight, by gradients of equilibria.
+
+Curled strands that hang, and a shelf, a rod held level by one end, are drawn as they are to be in equilibrium. With the drawn shape as
+their natural one they sag. `learn`, which `build` calls, moves the natural curvatures and twists of all vertices down the gradient of
+what is off in the equilibrium, until strands hang and the shelf lies as drawn; the scene is built with these, released without weight,
+and loaded by it. What is off is measured by second differences of positions, which are sensitive to the curvature of their own
+vertex, so that the search is well conditioned; root and tip weigh alike. Reference: moments about the vertices of a rod held at
+one end follow from statics alone, so that K (k - k0) of the drawn shape is known; along the shelf k0 = w (L - s)^2 / 2 EI.
+The natural shape is not unique, as a round section may turn about its line; moments are. Lengths are not learned: strands stay longer
+than drawn by their stretch, w L^2 / 2 EA.
+"""
+
+from functools import cache
+
+import numpy as np
+
+import ddg_warp as ddg
+from ddg_warp.scenes import _learn
+
+LENGTH = 0.3  # m, of a strand from root to tip, and of the shelf along itself
+CURL = 0.015  # m, radius at the tip
+PITCH = 0.1  # m
+SPACING = 0.05  # m, between roots
+RADIUS, SHELF = 1e-3, 3e-3  # m, of strands and of the shelf
+MATERIAL = ddg.Material(young=2.0e7, poisson=0.4, density=1300.0)
+GRAVITY = 9.81  # m/s^2
+NAMES = [f"rod_bend_twist.rest_{k}" for k in (1, 2, 3)]
+STATICS = "statics of the drawn shape"
+
+
+def build(strands: int = 8, nodes: int = 32) -> ddg.Scene:
+    """Strands and shelf with the natural shape that was learned for them; building takes as long as learning it.
+
+    Args:
+        strands: how many
+        nodes: of each rod
+    """
+    if strands < 1 or nodes < 8:
+        raise ValueError(f"strands = {strands}, nodes = {nodes}: take 1 strand and 8 nodes at least")
+    _learn.require_torch("inverse_rest_shape")
+    return rods(strands, nodes, learn(strands, nodes))
+
+
+def rods(strands: int, nodes: int, natural: np.ndarray | None = None) -> ddg.Scene:
+    """The rods as drawn, held by their first edges.
+
+    Args:
+        strands, nodes: as of `build`.
+        natural: natural curvatures and twist (3, strands + 1, nodes - 2) [1/m]; by default those of the drawn shape.
+    """
+    scene, drawn = ddg.Scene(gravity=(0.0, 0.0, -GRAVITY), analysis=ddg.Statics(load_steps=4)), shapes(strands, nodes)
+    for points, rows, radius, name in (
+        (drawn[:-1], slice(0, strands), RADIUS, "strands"),
+        (drawn[-1:], slice(strands, None), SHELF, "shelf"),
+    ):
+        own = "shape" if natural is None else tuple(natural[:, rows])
+        added = scene.add_rods(
+            points, section=ddg.Circle(radius), material=MATERIAL, natural=own, curvature="angle", name=name
+        )
+        scene.clamp(added, edges=[0])
+    return scene
+
+
+def shapes(strands: int, nodes: int) -> np.ndarray:
+    """Drawn points (strands + 1, nodes, 3) [m]: curls that grow along strands, each turned a bit further, and the shelf along x."""
+    down = np.linspace(0.0, LENGTH, nodes)
+    number = np.arange(strands)[:, None]
+    curl = CURL * down / LENGTH * np.exp(2j * np.pi * (down / PITCH + number / strands))
+    hanging = np.stack([curl.real + SPACING * number, curl.imag, np.broadcast_to(-down, curl.shape)], axis=2)
+    shelf = np.stack([down, 0.0 * down, 0.0 * down], axis=1) + [-LENGTH - SPACING, 0.0, -0.5 * LENGTH]
+    return np.concatenate([hanging, shelf[None]])
+
+
+@cache
+def learn(strands: int, nodes: int) -> np.ndarray:
+    """Natural curvatures and twist (3, strands + 1, nodes - 2) [1/m] with which the rods are in equilibrium as drawn."""
+    import torch
+
+    from ddg_warp.torch import Simulator
+
+    simulator = Simulator(rods(strands, nodes).build("cpu", "float64"), dt=0.01)
+    drawn = torch.tensor(shapes(strands, nodes))
+    first = torch.stack([simulator.parameter(name)[0] for name in NAMES])
+
+    def loss(change):
+        parameters = dict(zip(NAMES, (first + change / LENGTH).unsqueeze(1), strict=True))
+        off = simulator.equilibrium(parameters).positions.reshape(drawn.shape) - drawn
+        return ((off.diff(dim=1).diff(dim=1) * nodes**2 / LENGTH) ** 2).mean()
+
+    found, _ = _learn.minimise(loss, torch.zeros_like(first), iterations=100, tolerance=1e-10)
+    return (first + found / LENGTH).reshape(3, strands + 1, nodes - 2).numpy()
+
+
+def size(result) -> tuple[int, int]:
+    """Strands and nodes of a run."""
+    strands, shelf = result.model.scene.batches
+    return len(strands.points), shelf.points.shape[1]
+
+
+def moments(points: np.ndarray, weight: float) -> np.ndarray:
+    """Moments (rods, nodes - 2) [N m] of what is beyond, about the inner nodes of rods (rods, nodes, 3) of a weight [N/m]."""
+    half = 0.5 * weight * np.linalg.norm(np.diff(points, axis=1), axis=2)
+    load = np.pad(half, ((0, 0), (1, 0))) + np.pad(half, ((0, 0), (0, 1)))
+    arms = points[:, None, :, :2] - points[:, 1:-1, None, :2]  # weights act along z: level arms alone count
+    beyond = np.arange(points.shape[1]) > np.arange(1, points.shape[1] - 1)[:, None]
+    return np.linalg.norm((arms * (load[:, None] * beyond)[..., None]).sum(2), axis=2)
+
+
+def check(result) -> list[ddg.Check]:
+    """Everything where it was drawn, but for its stretch; the natural shape against statics."""
+    from ddg_warp.ask import inquiry
+
+    strands, nodes = size(result)
+    drawn, natural = shapes(strands, nodes), learn(strands, nodes)
+    off = np.linalg.norm(result.state.points().reshape(drawn.shape) - drawn, axis=2).max(1)
+    sections = [ddg.Circle(radius).stiffness(MATERIAL) for radius in (RADIUS, SHELF)]
+    weights = [GRAVITY * section.mass_per_length for section in sections]
+    arc = np.linalg.norm(np.diff(drawn, axis=1), axis=2).sum(1).max()
+
+    stresses = inquiry.stresses(result.model, result.state)["rod_bend_twist"]
+    found = np.stack([np.linalg.norm(own, axis=-1) for own in stresses[:strands]])
+    known = moments(drawn[:-1], weights[0])
+
+    along = LENGTH * np.arange(1, nodes - 1) / (nodes - 1)
+    shelf = weights[1] * (LENGTH - along) ** 2 / (2.0 * sections[1].EI1)
+    curvature = np.linalg.norm(natural[:2, -1], axis=0)
+    tolerance = min(ddg.Check.COARSEST, 0.01 * (32.0 / nodes) ** 2)
+    return [
+        ddg.Check(
+            "strands from where they are drawn [m]",
+            off[:-1].max(),
+            0.0,
+            1.5 * weights[0] * arc**2 / (2.0 * sections[0].EA),
+            "their stretch, which is not learned",
+        ),
+        ddg.Check("shelf from where it is drawn [m]", off[-1], 0.0, 1e-5 * LENGTH, "drawn shape"),
+        ddg.Check(
+            "shelf's natural curvature at its root [1/m]", curvature[0], shelf[0], 1e-3, "w (L - s)^2 / 2 EI", True
+        ),
+        ddg.Check(
+            "moments off statics, largest over the largest moment",
+            np.abs(found - known).max() / known.max(),
+            0.0,
+            tolerance,
+            STATICS,
+        ),
+    ]
+
+
+def picture(result, frames) -> dict:
+    """How rods hang whose natural shape is that drawn, the learned natural shape, and how rods hang that have it."""
+    from ddg_warp.solve.statics import solve
+
+    strands, nodes = size(result)
+    weightless = rods(strands, nodes, learn(strands, nodes))
+    weightless.gravity = (0.0, 0.0, 0.0)
+    bare, free = (solve(scene.build("cpu", "float64")).points() for scene in (rods(strands, nodes), weightless))
+    return {
+        "points_by_time": [(0.0, bare), (1.0, free), (2.0, result.state.points())],
+        "names": [
+            "natural shape as drawn: sags",
+            "learned natural shape, without weight",
+            "and with its weight: as drawn",
+        ],
+        "side_by_side": True,
+    }
+
+
+def benchmark() -> ddg.bench.Study:
+    """Moments against statics over the nodes of the rods."""
+    return ddg.bench.Study({"nodes": (12, 16, 24, 32)}, "moments off", fixed={"strands": 2})
