@@ -51,6 +51,7 @@ class Adjoint:
         self.integrator, self.model = integrator, integrator.model
         self.chains = [ChainAdjoint(self.model, group, integrator.scheme) for group in self.model.groups]
         self.net = NetAdjoint(self.model, integrator.scheme) if self.model.net is not None else None
+        self._grips = self.model.empty_state().grips  # of derivatives by states, which have none by these
 
     def step(self, state: State, dt: float) -> tuple[State, Tape]:
         """The state after a step, and what its reverse needs, which stays valid for as long as it is held."""
@@ -104,7 +105,7 @@ class Adjoint:
         if self.net:
             net, read = self.net.pull(parts[-1], after.net, given.net, s, (before, after))
             inputs.append(read)
-        return State(self.model, groups, net, before.time, self.model.empty_state().grips), inputs
+        return State(self.model, groups, net, before.time, self._grips), inputs
 
 
 @launches

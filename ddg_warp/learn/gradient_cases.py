@@ -88,8 +88,8 @@ class Case:
             state = self.simulator.initial_state(WORLDS)
             for _ in range(3):
                 state = self.simulator.step(state)
-            values = self.engine.put_points(state.values, "v", "v", state.velocities + self._rates())
-            values = self.engine.turn_edges(
+            values = self.engine.layout.put_points(state.values, "v", "v", state.velocities + self._rates())
+            values = self.engine.layout.turn_edges(
                 values, "omega", "v", 3.0 * self._normal(WORLDS, self.model.order.edges_count)
             )
         return WorldState(tuple(values), state.time, self.engine)
@@ -130,7 +130,7 @@ class Case:
         if twisted:
             angle = self._normal(WORLDS, edges)
             yield self._state(
-                "angles", 1.0, lambda x: self.engine.turn_edges(self.state.values, "theta", "q", x * angle)
+                "angles", 1.0, lambda x: self.engine.layout.turn_edges(self.state.values, "theta", "q", x * angle)
             )
         if not self.statics:
             rate = self._rates()
@@ -138,9 +138,9 @@ class Case:
             if twisted:
                 spin = self._normal(WORLDS, edges)
                 yield self._state(
-                    "spins", 10.0, lambda x: self.engine.turn_edges(self.state.values, "omega", "v", x * spin)
+                    "spins", 10.0, lambda x: self.engine.layout.turn_edges(self.state.values, "omega", "v", x * spin)
                 )
-        for name in dict.fromkeys(self.engine.names()):
+        for name in dict.fromkeys(self.engine.tables.names()):
             yield self._parameter(name)
         if not self.statics:
             yield self._control("forces", 1e-2, self._normal(WORLDS, points, 3) * self.axes)
@@ -162,14 +162,14 @@ class Case:
         yield self._shared("density", 1.0, lambda x: {"density": 1.0 + float(x)})
 
     def _moved(self, own: str, blocks: str, by: torch.Tensor) -> list:
-        at = self.engine.points(self.state.values, own, blocks)
-        return self.engine.put_points(self.state.values, own, blocks, at + by)
+        at = self.engine.layout.points(self.state.values, own, blocks)
+        return self.engine.layout.put_points(self.state.values, own, blocks, at + by)
 
     def _state(self, name: str, size: float, values: Callable) -> Input:
         return Input(name, size, lambda x: self.loss(self.end(self.simulator, values(x))))
 
     def _parameter(self, name: str) -> Input:
-        usual = self.engine.value(name)
+        usual = self.engine.tables.value(name)
         size = float(usual.abs().max()) or self._size_of_family(name)
         direction = 0.5 + torch.rand(usual.shape, generator=self.random, dtype=REAL, device="cpu").to(self.place)
 
@@ -178,8 +178,8 @@ class Case:
     def _size_of_family(self, name: str) -> float:
         """Of the largest of a family, such as the components of a metric; one where all are zero."""
         family = name.rstrip("0123456789")
-        alike = [own for own in dict.fromkeys(self.engine.names()) if own.rstrip("0123456789") == family]
-        return max(float(self.engine.value(own).abs().max()) for own in alike) or 1.0
+        alike = [own for own in dict.fromkeys(self.engine.tables.names()) if own.rstrip("0123456789") == family]
+        return max(float(self.engine.tables.value(own).abs().max()) for own in alike) or 1.0
 
     def _control(self, name: str, size: float, direction: torch.Tensor, usual=0.0) -> Input:
         return Input(name, size, lambda x: self.loss(self.end(self.simulator, controls={name: usual + x * direction})))
@@ -206,7 +206,7 @@ class Case:
 
     def reverse(self) -> dict[str, float]:
         """Derivatives by what is no tensor, from the reverse of every step."""
-        self.engine.write((), [])  # parameters are those of the model
+        self.engine.tables.write((), [])  # parameters are those of the model
         if self.statics:
             return self._of_equilibrium()
         states, sums = [self.state], {"time step": 0.0, "mass damping": 0.0, "density": 0.0}

@@ -10,7 +10,8 @@ from torch.utils import checkpoint
 
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError
-from ddg_warp.learn.engine import Engine, tensors
+from ddg_warp.learn.engine import Engine
+from ddg_warp.learn.layout import tensors
 from ddg_warp.learn.step import Balance, Call, Step
 from ddg_warp.model import validate
 from ddg_warp.model.controls import Controls
@@ -24,7 +25,7 @@ class WorldState:
     """A state of B worlds as tensors, which lie as the device likes it; `positions` and the like are in the user's order.
 
     Attributes:
-        values: the arrays of a `State` by the order of `Engine.fields`.
+        values: the arrays of a `State` by the order of `Layout.fields`.
         time: [s], of all worlds.
         engine: what knows their meaning.
     """
@@ -37,19 +38,19 @@ class WorldState:
     @torch.compiler.disable
     def positions(self) -> torch.Tensor:
         """Points (B, P, 3) [m], in the order of `State.points`."""
-        return self.engine.points(self.values, "x", "q")
+        return self.engine.layout.points(self.values, "x", "q")
 
     @property
     @torch.compiler.disable
     def velocities(self) -> torch.Tensor:
         """Their velocities (B, P, 3) [m/s]."""
-        return self.engine.points(self.values, "v", "v")
+        return self.engine.layout.points(self.values, "v", "v")
 
     @property
     @torch.compiler.disable
     def angles(self) -> torch.Tensor:
         """Angles of edges (B, edges) [rad], zero where there is no twist."""
-        return self.engine.edges(self.values)
+        return self.engine.layout.edges(self.values)
 
     def detach(self) -> "WorldState":
         """The same without history."""
@@ -136,7 +137,7 @@ class Simulator(torch.nn.Module):
         values = [tensor.clone() for tensor in tensors(engine.model.state(), engine.fields)]
         for name, arrays in (("positions", ("x", "q")), ("velocities", ("v", "v"))):
             if name in moved:
-                values = engine.put_points(values, *arrays, moved[name])
+                values = engine.layout.put_points(values, *arrays, moved[name])
         return WorldState(tuple(values), 0.0, engine)
 
     @torch.compiler.disable  # what is compiled goes on behind it: launches of Warp are nothing that a compiler sees
@@ -232,19 +233,19 @@ class Simulator(torch.nn.Module):
 
     def parameter(self, name: str, batch: int | None = None) -> torch.Tensor:
         """The values that the model has of a parameter "term.parameter" (B, E)."""
-        return self.engine(batch or self.model.worlds).value(name)
+        return self.engine(batch or self.model.worlds).tables.value(name)
 
     def _full(self, engine: Engine, parameters: dict | None) -> list:
-        """Parameters as `Engine.full` has them; of plain numbers values are checked, as tensors may be on their way."""
+        """Parameters as `Tables.full` has them; of plain numbers values are checked, as tensors may be on their way."""
         result = []
         for name, values in _named("parameters", "term.parameter", parameters).items():
-            engine.tables(name)  # which refuses what there is not
+            engine.tables.of(name)  # which refuses what there is not
             if not isinstance(values, torch.Tensor):
                 try:
                     values = self._tensor(name, self.model.valid_values(*name.rsplit(".", 1), values))
                 except ValueError as error:
                     raise SceneError(f"parameters: {error}") from None
-            result.append((name, engine.full(name, values)))
+            result.append((name, engine.tables.full(name, values)))
         return result
 
     def _tensor(self, name: str, values) -> torch.Tensor:

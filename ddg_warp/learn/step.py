@@ -44,7 +44,7 @@ class Call:
     @property
     def axes(self) -> list[int]:
         """The same of all tensors."""
-        return self.state_axes + self.engine.parameter_axes(self.parameters) + [0] * len(self.controls)
+        return self.state_axes + self.engine.tables.axes(self.parameters) + [0] * len(self.controls)
 
 
 class Step(torch.autograd.Function):
@@ -55,7 +55,7 @@ class Step(torch.autograd.Function):
         engine = call.engine
         with engine.stream():
             state, parameters, controls = call.split(tensors)
-            engine.write(call.parameters, parameters)
+            engine.tables.write(call.parameters, parameters)
             return tuple(engine.forward(call.start, call.dt, state, controls, call.graded))
 
     @staticmethod
@@ -72,7 +72,7 @@ class Step(torch.autograd.Function):
         first = 1 + len(saved) - ctx.results - len(call.controls)
         for name, needed in zip(call.controls, ctx.needs_input_grad[first:], strict=True):
             if needed:
-                call.engine.require(name)
+                call.engine.controls.require(name)
         found = iter(Pull.apply(call, *saved, *given[: len(call.fields)]))
         count = len(saved) - ctx.results - len(call.fields)
         by_state = [next(found) if field.smooth else None for field in call.fields]
@@ -99,7 +99,7 @@ class Balance(torch.autograd.Function):
         engine = call.engine
         state, parameters, _ = call.split(tensors)
         with engine.stream():
-            engine.write(call.parameters, parameters)
+            engine.tables.write(call.parameters, parameters)
             return tuple(engine.balance(state, dict(options)))
 
     @staticmethod
@@ -118,9 +118,9 @@ class Balance(torch.autograd.Function):
         tensors, output = saved[: -ctx.results], saved[-ctx.results :]
         _, parameters, _ = call.split(tensors)
         with engine.stream():
-            engine.write(call.parameters, parameters)
+            engine.tables.write(call.parameters, parameters)
             inputs = engine.balance_backward(call.start, output[:count], given[:count])
-            found = engine.by_parameters(call.parameters, inputs, output[count:])
+            found = engine.tables.pull(call.parameters, inputs, output[count:])
         return None, None, *([None] * count), *found
 
 
@@ -139,16 +139,16 @@ class Pull(torch.autograd.Function):
         state, parameters, controls = call.split(tensors)
         flags = output[count:]
         with engine.stream():
-            engine.write(call.parameters, parameters)
+            engine.tables.write(call.parameters, parameters)
             found, inputs = engine.backward(call.start, call.dt, state, output[:count], given)
             flags = engine.solved(flags)
             by_state = [
-                engine.flagged(values, field, flags)
+                engine.layout.flagged(values, field, flags)
                 for values, field in zip(found, call.fields, strict=True)
                 if field.smooth
             ]
-            by_parameters = engine.by_parameters(call.parameters, inputs, flags)
-            by_controls = [engine.by_control(name, controls[name], inputs, flags) for name in call.controls]
+            by_parameters = engine.tables.pull(call.parameters, inputs, flags)
+            by_controls = [engine.controls.pull(name, controls[name], inputs, flags) for name in call.controls]
         return *by_state, *by_parameters, *by_controls
 
     @staticmethod

@@ -94,7 +94,9 @@ def test_parameters_of_several_tables_one_after_the_other():
     own = Simulator(built(SCENES["sheet"]()), DT, **TIGHT)
     state = own.step(own.step(own.initial_state()))
     usual = own.step(state).positions
-    stretch, bend = (next(n for n in own.engine(1).names() if n.startswith(k)) for k in ("shell_stretch", "shell_bend"))
+    stretch, bend = (
+        next(n for n in own.engine(1).tables.names() if n.startswith(k)) for k in ("shell_stretch", "shell_bend")
+    )
     own.step(state, {stretch: 2.0 * own.parameter(stretch)})
     bent = own.step(state, {bend: own.parameter(bend)}).positions
     torch.testing.assert_close(bent, usual, rtol=0.0, atol=0.0)

@@ -1,0 +1,93 @@
+"""Loads and poses that a step is given, and derivatives by them."""
+
+import numpy as np
+import torch
+import warp as wp
+
+from ddg_warp.errors import SceneError
+from ddg_warp.solve.controls import LOADS
+
+
+class StepControls:
+    """Of an engine: what its steps are given."""
+
+    def __init__(self, engine):
+        self.engine, self.model, self.layout = engine, engine.model, engine.layout
+
+    def give(self, controls: dict) -> None:
+        """Hand the integrator loads and poses."""
+        engine, integrator, model = self.engine, self.engine.integrator, self.model
+        if integrator.given is None and any(name in controls for name in LOADS):
+            integrator._control({"gravity": np.array(model.scene.gravity, float)[None]}, 0)
+        if integrator.given is not None:
+            given = integrator.given
+            given.any = any(name in controls for name in LOADS)
+            for name in LOADS:
+                place = wp.to_torch(getattr(given, name), requires_grad=False)
+                if name in controls:
+                    value = controls[name]
+                    if name == "gravity":
+                        value = value - torch.as_tensor(given._usual, dtype=value.dtype, device=value.device)
+                    place.copy_(value)
+                else:
+                    place.zero_()
+        if model.grips:
+            place = wp.to_torch(engine.after.grips.pose, requires_grad=False)
+            if "poses" in controls:
+                place.copy_(controls["poses"].reshape(-1, 6).T)
+            else:
+                place.copy_(wp.to_torch(engine.before.grips.pose, requires_grad=False))
+
+    def require(self, name: str) -> None:
+        """Refuse derivatives by a control that has none.
+
+        Raises:
+            SceneError: it has none.
+        """
+        if name == "poses" and self.engine.midpoint:
+            raise SceneError(
+                "no gradient goes through the poses of grips by the midpoint rule yet; take 'implicit_euler', or poses.detach()"
+            )
+
+    def pull(self, name: str, value: torch.Tensor, inputs: list, flags) -> torch.Tensor:
+        """Derivatives by what a step is given (worlds, ...)."""
+        if name == "poses":
+            if self.engine.poses is None:  # which `require` has refused to whoever asks for them
+                return torch.zeros_like(value)
+            return self.engine.poses.pull(inputs, value) * self._by_world(flags)[:, None, None]
+        result = torch.zeros_like(value)
+        model, worlds = self.model, self.model.worlds
+        for i, group in enumerate(model.groups):
+            found = inputs[i]
+            if name == "gravity":
+                own = wp.to_torch(found.gravity, requires_grad=False) * flags[i][:, None]
+                own = own.reshape(group.nodes, worlds, group.rods, -1).sum((0, 2))
+                result[:, list(group.host.axes)] += own
+                continue
+            w = (wp.to_torch(found.load, requires_grad=False) * flags[i]).reshape(-1, group.nodes, worlds, group.rods)
+            if name == "forces":
+                k, column, rows = self.layout.places(("points", i), lambda group=group: model.order.places(group))
+                result[:, rows[:, None], torch.tensor(group.host.axes)] = w[: group.kind.dim, k, :, column].permute(
+                    2, 0, 1
+                )
+            elif group.kind.twist:
+                k, column, rows = self.layout.places(("edges", i), lambda group=group: model.order.edge_places(group))
+                result[:, rows] = w[group.kind.dim, k, :, column].T
+        if model.net is not None:
+            found = inputs[-1]
+            if name == "gravity":
+                own = wp.to_torch(found.gravity, requires_grad=False).reshape(worlds, -1, 3).sum(1)
+                return result + own * flags[-1][:, None]
+            w = wp.to_torch(found.load, requires_grad=False).reshape(worlds, -1, 3) * flags[-1][:, None, None]
+            if name == "forces":
+                rows, blocks = self.layout.places(("points", "net"), lambda: model.order.net_rows)
+                result[:, rows] = w[:, blocks]
+            else:
+                for rod in model.net.host.rods:
+                    first = int(model.order.edge_starts[rod.rod])
+                    result[:, first : first + len(rod.edges)] = w[:, torch.as_tensor(rod.edges), 0]
+        return result
+
+    def _by_world(self, flags) -> torch.Tensor:
+        """One for worlds in which all has gradients."""
+        return torch.stack([flag.reshape(self.model.worlds, -1).sum(1) * 0.0 + 1.0 for flag in flags]).prod(0)
