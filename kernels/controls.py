@@ -7,13 +7,15 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.threads import CPU_OPTIONS
+
 
 @cache
 def load_kernel(real):
     """Loads on all places of a storage in every world, and their sizes as `ddg_warp.compile.tolerance` counts them."""
     V = wp.types.vector(3, real)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def add(
         shared: wp.array(dtype=V),
         constant: wp.array(dtype=V),
@@ -57,7 +59,7 @@ def load_kernel(real):
 def sum_kernel(real):
     """Sums of the sizes over the places of each body, of the worlds one after the other."""
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def add(
         size: wp.array2d(dtype=real),
         starts: wp.array(dtype=int),
@@ -81,7 +83,7 @@ def share_kernel(real):
     As `Bodies.loads` and `Allowed.assign`: a world without any load has the scale 0 and loads 1, another one the scale 1.
     """
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def share(
         starts: wp.array(dtype=int),
         items: wp.array(dtype=int),
@@ -118,7 +120,7 @@ def share_kernel(real):
 def limit_kernel(real):
     """What residuals may be at rtol = 1: the largest, over what a block or part belongs to, of the load of the body times a weight."""
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def limit(
         load: wp.array(dtype=real),
         bodies: int,

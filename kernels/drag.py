@@ -197,7 +197,7 @@ def net_kernels(real):
     Inertia = block_inertia(real)
     half = edge_function(3, real)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def resist(
         q0: wp.array(dtype=V),
         v0: wp.array(dtype=V),
@@ -248,7 +248,7 @@ def net_kernels(real):
             moved = wp.length(q[i] - q0[i]) + wp.length(u) / rate
             wp.atomic_max(scalars, LOAD_SCALE, w, real(nodes) * moved * wp.max(wp.get_diag(block.resistance)))
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def settle(
         q: wp.array(dtype=V),
         inertia: wp.array2d(dtype=Inertia),

@@ -13,6 +13,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.chain import ChainKind, gather_functions
+from ddg_warp.kernels.threads import CPU_OPTIONS
 from ddg_warp.kernels.variation import variation_functions
 
 
@@ -110,7 +111,7 @@ def term_kernels(kind: ChainKind, index: int, real, reverse: bool = False):
         e, jacobian = jacobian_of(local(q), short(s), w)
         return spread((slope_of(e, p) * w) * jacobian)
 
-    @wp.kernel(module="unique", enable_backward=reverse)
+    @wp.kernel(module="unique", enable_backward=reverse, module_options=CPU_OPTIONS)
     def energy(
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
@@ -130,7 +131,7 @@ def term_kernels(kind: ChainKind, index: int, real, reverse: bool = False):
             q = local(window(x, theta, k, n, whole, r))
             energy_out[k, r] = w * energy_of(strains_of(q, short(lagged(frame, k, n, whole, r)), w), p)
 
-    @wp.kernel(module="unique", enable_backward=reverse)
+    @wp.kernel(module="unique", enable_backward=reverse, module_options=CPU_OPTIONS)
     def gradient(
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
@@ -151,7 +152,7 @@ def term_kernels(kind: ChainKind, index: int, real, reverse: bool = False):
             for i in range(wp.static(size)):
                 gradient_out[i, k, r] = f[i]
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def hessian(
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
@@ -188,7 +189,7 @@ def strain_kernel(kind: ChainKind, real):
     strains_of_all = _strain_functions(kind, len(kind.terms) - 1, real)
     closed = kind.closed
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def strains(
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),

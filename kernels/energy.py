@@ -200,7 +200,7 @@ def judge_kernel(real):
     and farther from zero.
     """
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def judge(
         rows: wp.array3d(dtype=real),
         bound: real,

@@ -27,6 +27,7 @@ from ddg_warp.kernels.islands import (
     WANTED,
 )
 from ddg_warp.kernels.search import PLACE, RELAG, search_functions, shorter_function
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 STOP, DIRECT = 0, 3  # beside PLACE and RELAG: nothing more to do, and a direction is wanted
 
@@ -122,7 +123,7 @@ def judge_kernel(kind: ChainKind, real, linear):
     balanced, decide = judge_functions(kind.twist, real)
     twist, nb = kind.twist, kind.block
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def judge(
         residual: wp.array3d(dtype=linear),
         change: wp.array2d(dtype=real),

@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.kernels.gather import column_of, point_functions
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 
 @cache
@@ -60,7 +61,7 @@ def follower_kernel(name: str, count: int, dim: int, real):
     get, _ = point_functions(dim, real)
     forces = force_functions(real)[name]
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def follow(
         x: wp.array2d(dtype=P),
         places: wp.array2d(dtype=int),
@@ -97,7 +98,7 @@ def spread_kernel(dim: int, real):
     V, P = wp.types.vector(3, real), wp.types.vector(dim, real) if dim > 1 else real
     _, put = point_functions(max(2, dim), real)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def spread(
         places: wp.array(dtype=int),
         dead: wp.array(dtype=V),

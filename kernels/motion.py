@@ -15,6 +15,7 @@ import warp as wp
 from ddg_warp.kernels import frames
 from ddg_warp.kernels.gather import column_of, point_functions
 from ddg_warp.kernels.islands import PORTION, PROGRESS
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 POSE = 21  # reals of a motion over a step
 
@@ -84,7 +85,7 @@ def support_kernels(dim: int, real, midpoint: bool):
     _, placed, branch = functions(real)
     reached = reached_function(real, midpoint)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def nodes(
         where: wp.array2d(dtype=int),
         rest: wp.array(dtype=X),
@@ -113,7 +114,7 @@ def support_kernels(dim: int, real, midpoint: bool):
                 here[d] = p[d]
         put(x, place, w, columns, here)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def angles(
         where: wp.array2d(dtype=int),
         rest: wp.array(dtype=X),
@@ -173,7 +174,7 @@ def grip_kernel(real):
             return X()
         return v * (real(2.0) * wp.atan2(size, wp.abs(q[3])) / size)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def grip(
         grips: wp.array(dtype=int),
         count: int,

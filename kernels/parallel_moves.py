@@ -13,6 +13,7 @@ from ddg_warp.kernels.chain import ChainKind
 from ddg_warp.kernels.islands import ANGLE_CHANGE, BENT, CAUTIOUS, PROGRESS, RATE, STEP_LENGTH, TODO
 from ddg_warp.kernels.search import PLACE, RELAG, move_functions
 from ddg_warp.kernels.step import predicted_function
+from ddg_warp.kernels.threads import CPU_OPTIONS
 from ddg_warp.kernels.turns import onward_function
 
 
@@ -28,7 +29,7 @@ def move_kernels(kind: ChainKind, real, linear, split: bool = False):
     onward_of = onward_function(real)
     _, reference_twist, _ = frames.functions(real)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def turn(
         count: wp.array(dtype=int),
         todo: wp.array(dtype=int),
@@ -61,7 +62,7 @@ def move_kernels(kind: ChainKind, real, linear, split: bool = False):
                     twisted = reference_twist(u, u1, t, t1, twisted)
                 frame_out[6, k, r] = twisted
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def scan(
         count: wp.array(dtype=int),
         todo: wp.array(dtype=int),
@@ -86,7 +87,7 @@ def move_kernels(kind: ChainKind, real, linear, split: bool = False):
         sum_out[0, i, r] = running
         sum_out[1, i, r] = area
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def offset(
         count: wp.array(dtype=int),
         todo: wp.array(dtype=int),
@@ -128,7 +129,7 @@ def move_kernels(kind: ChainKind, real, linear, split: bool = False):
         """What lies between a held node and where the straight step ends."""
         return x[k, r] - base[k, r] - step_of(direction, k, r) * amount
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def move(
         count: wp.array(dtype=int),
         fixed: wp.array2d(dtype=wp.uint8),
@@ -189,7 +190,7 @@ def predict_kernels(kind: ChainKind, real, linear):
     V = wp.types.vector(dim, real)
     predicted = predicted_function(dim, real)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def aim(
         x0: wp.array2d(dtype=V),
         v0: wp.array2d(dtype=V),
@@ -217,7 +218,7 @@ def predict_kernels(kind: ChainKind, real, linear):
             for d in range(wp.static(dim)):
                 direction_out[d, k, r] = linear(step[d])
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def renew(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real)):
         r = wp.tid()
         flags[TODO, r] = wp.where(scalars[PROGRESS, r] < real(1.0), wp.static(RELAG), 0)

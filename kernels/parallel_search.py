@@ -27,6 +27,7 @@ from ddg_warp.kernels.islands import (
 )
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
 from ddg_warp.kernels.search import PLACE, STRAIGHT
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 
 @cache
@@ -38,7 +39,7 @@ def sum_kernels(kind: ChainKind, real, linear):
     dim, nb = kind.dim, kind.block
     V = wp.types.vector(dim, real)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def weigh(
         residual: wp.array3d(dtype=linear),
         change: wp.array2d(dtype=real),
@@ -68,7 +69,7 @@ def sum_kernels(kind: ChainKind, real, linear):
         partial_out[2, i, r] = square
         partial_out[3, i, r] = worst
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def gauge(
         residual: wp.array3d(dtype=linear),
         direction: wp.array3d(dtype=linear),
@@ -107,7 +108,7 @@ def decide_kernels(kind: ChainKind, real, linear, exact: bool):
     balanced, decide = judge_functions(kind.twist, real)
     out_of_patience = patience_function(real)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def judge(
         partial: wp.array3d(dtype=real),
         ranges: int,
@@ -145,7 +146,7 @@ def decide_kernels(kind: ChainKind, real, linear, exact: bool):
             flags[TODO, r] = what
             scalars[ANGLE_CHANGE, r] = scalars[STEP_LENGTH, r] - taken
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def take(
         partial: wp.array3d(dtype=real),
         ranges: int,

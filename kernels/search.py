@@ -7,6 +7,7 @@ import warp as wp
 from ddg_warp.kernels import frames
 from ddg_warp.kernels.chain import ChainKind, gather_functions
 from ddg_warp.kernels.islands import ANGLE_CHANGE, PLACED, STEP_LENGTH, TODO
+from ddg_warp.kernels.threads import CPU_OPTIONS
 from ddg_warp.kernels.turns import edge_functions, place_function
 
 PLACE, RELAG, STRAIGHT = 1, 2, 4  # what is left to be done with an iterate: turn edges, renew frames, move straight
@@ -202,7 +203,7 @@ def adjust_kernel(kind: ChainKind, real, linear, split: bool = False):
     V = wp.types.vector(dim, real)
     place, turn_angles, relag, _ = search_functions(kind, real, linear, split)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def adjust(
         count: wp.array(dtype=int),
         fixed: wp.array2d(dtype=wp.uint8),

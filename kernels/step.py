@@ -142,7 +142,7 @@ def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
     place, _, relag, _ = search_functions(kind, real, linear)
     predicted, onward_of = predicted_function(dim, real), onward_function(real)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def predict(
         x0: wp.array2d(dtype=V),
         v0: wp.array2d(dtype=V),
@@ -178,7 +178,7 @@ def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
 def start_kernel(real):
     """Starts a step: every rod that has not been given up has all of it to do."""
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def start(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real)):
         r = wp.tid()
         scalars[PORTION, r] = real(1.0)
@@ -312,7 +312,7 @@ def advance_kernel(real):
     solves, retries, lost pivots.
     """
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def advance(
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),

@@ -4,10 +4,12 @@ from functools import cache
 
 import warp as wp
 
-# Fused multiply-adds are what a CUDA build uses too. They and inlining halve the CPU's time for a sweep (1.9 to 0.9 of it each); pairs
-# instead of eights save the shuffles of small matrices, a tenth of it.
+# Of all kernels. Fused multiply-adds are what a CUDA build uses too. They and inlining halve the CPU's time for a sweep (1.9 to 0.9 of
+# it each); pairs instead of eights save the shuffles of small matrices, a tenth of it. Warp 1.19's own flags stop LLVM's SLP vectorizer
+# at a depth of 4, where it miscompiles large reverse-mode kernels for AVX-512: they read registers that nothing has written. 12 is
+# LLVM's own depth, said here because such options stay set in a process.
 CPU_OPTIONS = {
-    "cpu_compiler_flags": "-march=native -ffp-contract=fast -mprefer-vector-width=128"
+    "cpu_compiler_flags": "-march=native -ffp-contract=fast -mprefer-vector-width=128 -mllvm=-slp-recursion-max-depth=12"
     " -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000"
 }
 

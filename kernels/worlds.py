@@ -9,6 +9,7 @@ import warp as wp
 
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.islands import REASON, STATUS
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 
 @cache
@@ -18,7 +19,7 @@ def select_kernel(dtype, serial: bool):
     A thread takes one entry (row, row, world, entry of it), or all of a world if `serial`.
     """
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def select(
         mask: wp.array(dtype=int),
         share: int,
@@ -44,7 +45,7 @@ def select_kernel(dtype, serial: bool):
 def island_kernels():
     """note(...), seal(...), enter(...) of worlds in which an island was given up in this step; clear(...) of worlds that start anew."""
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def note(
         flags: wp.array2d(dtype=int),
         share: int,
@@ -59,7 +60,7 @@ def island_kernels():
             wp.atomic_max(failed, w, flags[REASON, i])
             any_failed[0] = 1
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def seal(failed: wp.array(dtype=int), share: int, flags: wp.array2d(dtype=int)):
         """Have the others in their worlds rest, too, for no reason of their own."""
         i = wp.tid()
@@ -67,13 +68,13 @@ def island_kernels():
             flags[STATUS, i] = wp.static(outcome.GIVEN_UP)
             flags[REASON, i] = 0
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def enter(failed: wp.array(dtype=int), resting: wp.array(dtype=int)):
         w = wp.tid()
         if failed[w] != 0:
             resting[w] = failed[w]
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def clear(mask: wp.array(dtype=int), share: int, flags: wp.array2d(dtype=int)):
         i = wp.tid()
         if mask[i / share] != 0:
@@ -88,7 +89,7 @@ def forget_kernel(dtype):
     """Zeroes columns of worlds of a mask."""
     zero = wp.constant(dtype(0))
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def forget(mask: wp.array(dtype=int), share: int, out: wp.array2d(dtype=dtype)):
         row, i = wp.tid()
         if mask[i / share] != 0:

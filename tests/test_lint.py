@@ -16,7 +16,7 @@ PAIR = "@wp.func\ndef g(x: real):\n    return x, x\n\n"
 FUNC = "@wp.func\ndef f(q: V, a: real):\n    "
 GRAD = "\n    return q\nw = wp.grad(f)\n"
 KERNEL, NO_ADJOINT = (
-    f"@wp.kernel(module='unique', enable_backward={on})\ndef k(q: V, a: real, out: wp.array(dtype=real)):\n    "
+    f"@wp.kernel(module='unique', enable_backward={on}, module_options=O)\ndef k(q: V, a: real, out: wp.array(dtype=real)):\n    "
     for on in (True, False)
 )
 
@@ -29,8 +29,8 @@ FAULTS = {
     "component augmented": ("self-overwrite", KERNEL + "q[0] += a\n"),
     "array from itself": ("self-overwrite", KERNEL + "out[0] = out[0] * a\n"),
     "annotations": ("annotations", "from __future__ import annotations\n"),
-    "kernel without keyword": ("enable-backward", "@wp.kernel\ndef k(a: real):\n    pass\n"),
-    "kernel with others": ("enable-backward", "@wp.kernel(module='unique')\ndef k(a: real):\n    pass\n"),
+    "kernel without keyword": ("enable-backward", "@wp.kernel(module_options=O)\ndef k(a: real):\n    pass\n"),
+    "flags of Warp": ("cpu-options", "@wp.kernel(module='unique', enable_backward=False)\ndef k(a: real):\n    pass\n"),
     "literal in a product": ("float-literal", FUNC + "return 0.5 * a\n"),
     "literal as argument": ("float-literal", FUNC + "return wp.max(a, -1.0e-3)\n"),
     "static of a loop": (

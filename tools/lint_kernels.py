@@ -8,6 +8,7 @@ self-overwrite    `q[0] = q[0] * a`, or `q[0] += a` on a vector: reverse mode re
                   that these call, and the files that a differentiated file imports.
 annotations       `from __future__ import annotations` turns the types of kernel arguments into strings.
 enable-backward   Every kernel says whether it has an adjoint, which doubles to quadruples its compile time.
+cpu-options       Every kernel names its module_options: Warp's own flags for the CPU miscompile large ones (kernels/threads.py).
 float-literal     A bare literal is float32: write real(0.5) or linear(0.5).
 static-variable   `wp.static(places[i])` of a loop variable: Warp resolves it by generating the code of the whole kernel each time
                   it is defined, and hashes a function otherwise once that has happened, so that it is compiled twice. Index a
@@ -119,6 +120,8 @@ def _lint_file(source: Source, differentiated: bool) -> Iterator[Finding]:
     for function in source.device_functions:
         if _decorator(function) == "wp.kernel" and _keyword(function, "enable_backward") is None:
             yield find("enable-backward", function, f"kernel {function.name}: set enable_backward=True or False")
+        if _decorator(function) == "wp.kernel" and _keyword(function, "module_options") is None:
+            yield find("cpu-options", function, f"kernel {function.name}: give module_options=CPU_OPTIONS")
         for node in _indexed_tuples(function, source.tuple_functions):
             yield find("tuple-index", node, f"{ast.unparse(node)} indexes a returned tuple; unpack it")
         for node in _bare_floats(function):

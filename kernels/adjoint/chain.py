@@ -11,6 +11,7 @@ import warp as wp
 from ddg_warp.kernels.balance import node_functions
 from ddg_warp.kernels.chain import ChainKind, gather_functions
 from ddg_warp.kernels.element import term_functions
+from ddg_warp.kernels.threads import CPU_OPTIONS
 from ddg_warp.kernels.variation import carried_function, variation_functions
 
 
@@ -53,7 +54,7 @@ def pull_kernel(kind: ChainKind, index: int, real):
                     q[wp.static(dim * span + 1)] = v[wp.static(dim), b, r]
         return q
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pull(
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
@@ -110,7 +111,7 @@ def strain_kernel(kind: ChainKind, index: int, real):
     row, _, _, strain_row = kind.places()[index]
     missing, frames = 0 if kind.closed else measure.span, measure.lag_size > 0
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pull(
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
@@ -163,7 +164,7 @@ def frame_kernel(kind: ChainKind, real):
     def three(a: wp.array3d(dtype=real), row: int, k: int, r: int):
         return X(a[row, k, r], a[row + 1, k, r], a[row + 2, k, r])
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pull(
         x: wp.array2d(dtype=V),
         frame: wp.array3d(dtype=real),
@@ -194,7 +195,7 @@ def gather_kernels(kind: ChainKind, real):
     dim, twist, closed, window = kind.dim, kind.twist, kind.closed, kind.window
     _, behind, _, edge_force = node_functions(kind, real)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def nodes(window_in: wp.array3d(dtype=real), count: wp.array(dtype=int), dof_out: wp.array3d(dtype=real)):
         k, r = wp.tid()
         n = count[r]
@@ -217,7 +218,7 @@ def gather_kernels(kind: ChainKind, real):
                         dof_out[wp.static(dim), k, r] + window_in[wp.static(window - 1), b, r]
                     )
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def edges(lag_in: wp.array3d(dtype=real), count: wp.array(dtype=int), frame_out: wp.array3d(dtype=real)):
         k, r = wp.tid()
         n = count[r]

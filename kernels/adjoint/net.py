@@ -11,6 +11,7 @@ import warp as wp
 from ddg_warp.kernels.net import elements
 from ddg_warp.kernels.net.elements import FRAME, elements_type, place_function
 from ddg_warp.kernels.terms import Term
+from ddg_warp.kernels.threads import CPU_OPTIONS
 from ddg_warp.kernels.variation import carried_function, variation_functions
 
 
@@ -28,7 +29,7 @@ def pull_kernel(term: Term, real):
     slots, rows, data = measure.slots, len(term.parameter_names) - 1, measure.lag_size + measure.data_size
     lagged = density.lagged
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pull(
         given: Elements,
         w: wp.array(dtype=V),
@@ -70,7 +71,7 @@ def strain_kernel(term: Term, real):
     _, strained = variation_functions(term, real)
     slots, data = measure.slots, measure.lag_size + measure.data_size
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pull(
         given: Elements,
         by: wp.array2d(dtype=real),
@@ -110,7 +111,7 @@ def lag_kernel(term: Term, real):
     def advanced(q: Q, s: S, f: L):
         return wp.dot(advance(q, s), f)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pull(
         given: Elements,
         by: wp.array2d(dtype=real),
@@ -142,7 +143,7 @@ def frame_kernel(real):
     def three(a: wp.array2d(dtype=real), row: int, f: int):
         return V(a[row, f], a[row + 1, f], a[row + 2, f])
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pull(
         q: wp.array(dtype=V),
         ends: wp.array2d(dtype=int),
@@ -176,7 +177,7 @@ def gather_kernels(real):
     """
     V = wp.types.vector(3, real)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def slots(
         starts: wp.array(dtype=int),
         items: wp.array(dtype=int),
@@ -193,7 +194,7 @@ def gather_kernels(real):
             total += slot_in[items[at] / count, items[at] % count + world * count]
         out[tid] = total
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def frames(
         starts: wp.array(dtype=int),
         items: wp.array(dtype=int),
@@ -221,7 +222,7 @@ def step_kernels(real, midpoint: bool):
     share = real(2.0 if midpoint else 1.0)
     kept = real(1.0 if midpoint else 0.0)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def solution(
         q: wp.array(dtype=V),
         v: wp.array(dtype=V),
@@ -238,7 +239,7 @@ def step_kernels(real, midpoint: bool):
             total += q[i] + v[i] * rate
         out[i] = total * share
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def start(
         q: wp.array(dtype=V),
         v: wp.array(dtype=V),

@@ -12,6 +12,7 @@ from ddg_warp.kernels.chain import ChainKind
 from ddg_warp.kernels.gather import column_of, point_functions
 from ddg_warp.kernels.motion import functions as motion_functions
 from ddg_warp.kernels.motion import reached_function
+from ddg_warp.kernels.threads import CPU_OPTIONS
 from ddg_warp.kernels.variation import angle_function
 
 
@@ -27,7 +28,7 @@ def step_kernels(kind: ChainKind, real, midpoint: bool):
     share = real(2.0 if midpoint else 1.0)  # of the solution in the end
     kept = real(1.0 if midpoint else 0.0)  # of minus the start in the end
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def solution(
         x: wp.array2d(dtype=V),
         v: wp.array2d(dtype=V),
@@ -55,7 +56,7 @@ def step_kernels(kind: ChainKind, real, midpoint: bool):
             dof_out[wp.static(dim), k, r] = turn
             right_out[wp.static(dim), k, r] = wp.where(((mask >> wp.static(dim)) & 1) == 0, turn, real(0.0))
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def start(
         # the end: derivatives by it
         x: wp.array2d(dtype=V),
@@ -157,7 +158,7 @@ def angle_kernel(dim: int, real, midpoint: bool):
     angle = angle_function(real)
     planar = dim == 2
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pull(
         where: wp.array2d(dtype=int),
         rest: wp.array(dtype=X),
@@ -199,7 +200,7 @@ def cast_kernels(real, linear):
     """down(values, out) and up(values, out): arrays of three dimensions from one precision to another."""
 
     def made(source, target):
-        @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+        @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
         def cast(values: wp.array3d(dtype=source), out: wp.array3d(dtype=target)):
             i, k, r = wp.tid()
             out[i, k, r] = target(values[i, k, r])

@@ -69,7 +69,7 @@ def band_kernels(
             if wp.static(span == 2):
                 store(blocks_out, wp.static(2 * nb**2), k, r, F)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def clear(
         taken: wp.array(dtype=int), wanted: wp.array(dtype=int), positions: int, matrix: wp.array2d(dtype=linear)
     ):
@@ -154,7 +154,7 @@ def lengthen_kernel(terms: tuple[Term, ...], real, linear):
     Layout, Along = layout_type(), along_type(real, linear)
     behind = behind_function(terms, real, linear)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def lengthen(
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),

@@ -9,6 +9,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.chain import ChainKind, gather_functions
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 SWEEPS = 12  # of Jacobi's method; 8 x 8 matrices take 5 or 6
 
@@ -98,7 +99,7 @@ def project_kernel(kind: ChainKind, real, linear):
                         out[i, j] = out[i, j] - a[p, p] * v[i, p] * v[j, p]
         return out
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
     def project(
         x: wp.array2d(dtype=V),
         count: wp.array(dtype=int),

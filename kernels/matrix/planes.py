@@ -8,13 +8,15 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.threads import CPU_OPTIONS
+
 
 @cache
 def turn_kernel(real, back: bool):
     """turn(...): vectors of the blocks `where` into their frames, or back, in the worlds that want it."""
     V, F = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def turn(
         where: wp.array(dtype=int),
         frames: wp.array(dtype=F),
@@ -39,7 +41,7 @@ def matrix_kernel(linear):
     """turn(...): entries of H whose row or column is in a frame, in the worlds that want H."""
     F = wp.types.matrix((3, 3), linear)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def turn(
         entries: wp.array2d(dtype=int),
         frames: wp.array(dtype=F),

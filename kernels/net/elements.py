@@ -184,7 +184,7 @@ def term_kernels(term: Term, real, reverse: bool = False):
         e, jacobian = jacobian_of(q, s, w)
         return (slope_of(e, p) * w) * jacobian
 
-    @wp.kernel(module="unique", enable_backward=reverse)
+    @wp.kernel(module="unique", enable_backward=reverse, module_options=CPU_OPTIONS)
     def energy(
         given: Elements,
         energy_out: wp.array(dtype=real),
@@ -194,7 +194,7 @@ def term_kernels(term: Term, real, reverse: bool = False):
         x, s, w, p = gather(given, given.q, world, e - world * given.elements)
         energy_out[e] = w * energy_of(strains_of(x, s, w), p)
 
-    @wp.kernel(module="unique", enable_backward=reverse)
+    @wp.kernel(module="unique", enable_backward=reverse, module_options=CPU_OPTIONS)
     def gradient(
         given: Elements,
         gradient_out: wp.array2d(dtype=V),
@@ -206,7 +206,7 @@ def term_kernels(term: Term, real, reverse: bool = False):
         for i in range(wp.static(slots_count)):
             gradient_out[i, e] = spread(f, i)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def hessian(
         given: Elements,
         extra: wp.array2d(dtype=real),
@@ -228,7 +228,7 @@ def term_kernels(term: Term, real, reverse: bool = False):
         for i in range(wp.static(size)):
             hessian_out[e, i, column] = dq[i]
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def strains(
         given: Elements,
         stressed: int,
@@ -246,7 +246,7 @@ def term_kernels(term: Term, real, reverse: bool = False):
             for i in range(wp.static(n)):
                 stress_out[i, e] = stress[i]
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
     def linear_stress(
         given: Elements,
         step: wp.array(dtype=V),

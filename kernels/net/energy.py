@@ -54,7 +54,7 @@ def block_kernel(real, drag: bool = False):
     """Rows of the blocks of a net: work of loads that follow, kinetic energy at the end of the step, what damping and drag take in."""
     V, Mass = wp.types.vector(3, real), mass_type(real, drag)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def measure(
         q0: wp.array(dtype=V),
         v0: wp.array(dtype=V),

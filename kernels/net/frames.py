@@ -104,7 +104,7 @@ def reset_kernel(real):
     """Rotations of joints start from zero once their frames have taken them over."""
     V = wp.types.vector(3, real)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def reset(first: int, spins: int, blocks: int, q: wp.array(dtype=V)):
         tid = wp.tid()
         q[first + tid % spins + tid / spins * blocks] = V()

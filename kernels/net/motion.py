@@ -6,6 +6,7 @@ import warp as wp
 
 from ddg_warp.kernels import motion
 from ddg_warp.kernels.islands import MOVED, PORTION, PROGRESS
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 
 @cache
@@ -20,7 +21,7 @@ def normal_kernels(real, midpoint: bool):
         for d in range(3):
             data[where[i, 1] + d, where[i, 0] + shift] = n[d]
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def normals(
         where: wp.array2d(dtype=int),
         rest: wp.array(dtype=V),
@@ -37,7 +38,7 @@ def normal_kernels(real, midpoint: bool):
             n = turned(pose, where[i, 2] + w * stride, reached(scalars, w), rest[i])
             write(where, i, w * elements, n, data_out)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def turn(
         where: wp.array2d(dtype=int),
         rest: wp.array(dtype=V),
@@ -66,7 +67,7 @@ def normal_kernels(real, midpoint: bool):
 def field_kernel(real):
     """Field and gradient among the data of elements, from row `first` on, in worlds that `moved`; others keep theirs."""
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def put(
         field: wp.array(dtype=real),
         first: int,

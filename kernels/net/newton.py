@@ -45,7 +45,7 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool):
     balanced, decide = judge_functions(renews, real)
     share, until = share_function(serial), until_function(serial)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def judge(
         change: wp.array(dtype=real),
         noise: wp.array(dtype=real),
@@ -168,7 +168,7 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool):
             largest = wp.where(turn > largest, turn, largest)
         turn_out[w, start] = largest
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def take(
         decrease: wp.array(dtype=real),
         turn: wp.array(dtype=real),
@@ -226,7 +226,7 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool):
 def freeze_kernel():
     """freeze(...): where a direction is wanted of a matrix that is `done`, flags say that none is; others are done now."""
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def freeze(flags: wp.array2d(dtype=int), done: wp.array(dtype=int)):
         w = wp.tid()
         if done[w] != 0:
@@ -325,7 +325,7 @@ def static_kernels(real, linear):
     """follow(...), less(...) and far(...) of an equilibrium; see `ddg_warp.solve.net.statics`."""
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def follow(
         q: wp.array(dtype=V),
         base: wp.array(dtype=V),
@@ -342,13 +342,13 @@ def static_kernels(real, linear):
             k = i - w * blocks
             change[w, k] = change[w, k] + real(0.5) * wp.dot(q[i] - base[i], here[i] - there[i])
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def less(product: wp.array(dtype=H), right: wp.array(dtype=H)):
         """Takes one vector of blocks from another."""
         i = wp.tid()
         right[i] = right[i] - product[i]
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def far(turn: wp.array(dtype=real), rotation_cap: real, wanted: wp.array(dtype=int)):
         """Ends the solves of worlds whose direction turns something by more than the cap already."""
         w = wp.tid()

@@ -6,6 +6,7 @@ import warp as wp
 
 from ddg_warp.kernels.islands import CAUTIOUS, RATE, STEP_LENGTH, TODO, TURN, TURNING
 from ddg_warp.kernels.search import PLACE
+from ddg_warp.kernels.threads import CPU_OPTIONS
 from ddg_warp.kernels.turns import edge_functions, onward_function, place_function
 
 
@@ -67,7 +68,7 @@ def turn_kernels(real, linear):
 
     place_rod = place_function(3, real, Rod, excess, anchored, added, shift_by)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def bend(
         q: wp.array(dtype=V),
         base: wp.array(dtype=V),
@@ -87,7 +88,7 @@ def turn_kernels(real, linear):
             flags[TURNING, 0] = 1
             scalars[STEP_LENGTH, w] = real(1.0)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def aim(
         q: wp.array(dtype=V),
         base: wp.array(dtype=V),
@@ -107,7 +108,7 @@ def turn_kernels(real, linear):
                 d = v[i] * wp.where(flags[CAUTIOUS, w] == 0, real(1.0) / scalars[RATE, w], real(0.0))
             direction_out[i] = H(linear(d[0]), linear(d[1]), linear(d[2]))
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def turn(
         nodes: wp.array(dtype=int),
         ahead: wp.array(dtype=int),
@@ -131,7 +132,7 @@ def turn_kernels(real, linear):
         edge = base[b] - base[a]
         excess_out[w, p] = excess_of(edge, step, along_edge(edge, step), onward_of(straight[w], onward))
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def turn_longer(
         nodes: wp.array(dtype=int),
         ahead: wp.array(dtype=int),
@@ -161,7 +162,7 @@ def turn_kernels(real, linear):
                 stretch = real(longer[1, places[0, p], c]) * amount
         excess_out[w, p] = excess_of(edge, step, stretch, 0)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def place(
         rods: wp.array(dtype=int),
         start: wp.array(dtype=int),
@@ -200,7 +201,7 @@ def turn_kernels(real, linear):
         rod.anchor = anchor[r]
         place_rod(rod)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def put(
         places: wp.array(dtype=int),
         nodes: wp.array(dtype=int),

@@ -132,13 +132,13 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
         if wanted[w] == 1:
             _product = substitute(factors, values, values, count[r - w * count.shape[0]], r, s)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def spread(wanted: wp.array(dtype=int), columns: int, wanted_out: wp.array(dtype=int)):
         """For `kernels.solve.cyclic_reduction`: which columns are wanted."""
         r = wp.tid()
         wanted_out[r] = wp.where(wanted[r / columns] == 1, 1, 0)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def note(columns: int, bad: wp.array(dtype=int), lost: wp.array(dtype=int)):
         """Which worlds lost pivots; starts counting them anew."""
         r = wp.tid()
@@ -163,7 +163,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
             first = colour * wp.static(sides) * columns + r
             substitute_all(factors, values, count[r - w * count.shape[0]], r, first, columns)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def follow(
         met: wp.array3d(dtype=int),
         count: wp.array(dtype=int),

@@ -6,6 +6,7 @@ import warp as wp
 
 from ddg_warp.kernels.matrix.sliced import product_functions
 from ddg_warp.kernels.solve.krylov import inverse_function
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 
 @cache
@@ -84,7 +85,7 @@ def joint_kernels(linear):
             y += multiply(matrix, p + first, v)
         return y
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def measure(
         matrix: wp.array2d(dtype=linear),
         columns: wp.array(dtype=int),
@@ -155,7 +156,7 @@ def joint_kernels(linear):
         parts_out[1, i] = Q
         parts_out[2, i] = R
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def meet(
         matrix: wp.array2d(dtype=linear),
         columns: wp.array(dtype=int),

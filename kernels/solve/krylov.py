@@ -10,6 +10,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.matrix.sliced import product_functions
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 TILE = 4096  # entries that one block of threads sums
 TILES = 1024  # largest number of such blocks in a world
@@ -20,7 +21,7 @@ THREADS = 256
 def sum_kernels(real, largest: bool = False):
     """partial(values (worlds, n), (worlds, tiles)) and total(tiles, (worlds,)): sums of rows, or their largest entries."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
     def partial(values: wp.array2d(dtype=real), tiles_out: wp.array2d(dtype=real)):
         w, b = wp.tid()
         tile = wp.tile_load(values, shape=(1, wp.static(TILE)), offset=(w, b * wp.static(TILE)))
@@ -29,7 +30,7 @@ def sum_kernels(real, largest: bool = False):
         else:
             wp.tile_store(tiles_out[w], wp.tile_sum(tile), offset=b)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
     def total(tiles: wp.array2d(dtype=real), sum_out: wp.array(dtype=real)):
         w = wp.tid()
         tile = wp.tile_load(tiles, shape=(1, wp.static(TILES)), offset=(w, 0))
@@ -45,7 +46,7 @@ def sum_kernels(real, largest: bool = False):
 def serial_sum_kernel(real, largest: bool = False):
     """The same by one thread a row, for the CPU, which has one."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
     def total(values: wp.array2d(dtype=real), sum_out: wp.array(dtype=real)):
         w = wp.tid()
         s = real(0.0)
@@ -97,7 +98,7 @@ def solver_kernels(linear):
         """Curvature that is negative, or lost to rounding: the solve ends with what it has, or a step of steepest descent."""
         return not curvature > eps * rho * linear(1.0e-6)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def invert(
         matrix: wp.array2d(dtype=linear),
         diagonal: wp.array(dtype=int),
@@ -128,7 +129,7 @@ def solver_kernels(linear):
                 inverse[d, d] = f[d] / wp.max(wp.abs(m[d, d]), linear(1.0e-30))
         inverse_out[i] = inverse
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def start(
         right: wp.array(dtype=H),
         inverse: wp.array(dtype=M),
@@ -150,7 +151,7 @@ def solver_kernels(linear):
         p_out[i] = z
         dots_out[w, i - w * blocks] = wp.dot(r, z)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def begin(
         total: wp.array(dtype=linear),
         wanted: wp.array(dtype=int),
@@ -172,7 +173,7 @@ def solver_kernels(linear):
         else:
             wanted[w] = 3
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def product(
         matrix: wp.array2d(dtype=linear),
         columns: wp.array(dtype=int),
@@ -195,7 +196,7 @@ def solver_kernels(linear):
         product_out[i] = y
         dots_out[w, k] = wp.dot(p[i], y)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def advance(
         p: wp.array(dtype=H),
         product: wp.array(dtype=H),
@@ -228,7 +229,7 @@ def solver_kernels(linear):
         z_out[i] = z
         dots_out[w, k] = wp.dot(r, z)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def turn(
         z: wp.array(dtype=H),
         total: wp.array(dtype=linear),
@@ -243,7 +244,7 @@ def solver_kernels(linear):
         if wanted[w] == 1:
             p[i] = z[i] + (total[w] / rho[w]) * p[i]
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def test(
         total: wp.array(dtype=linear),
         curvature: wp.array(dtype=linear),
@@ -280,7 +281,7 @@ def confirm_kernels(real, linear):
     """compare(...) of what a solve leaves in every block with what it may be; confirm(...) that it is little enough."""
     H = wp.types.vector(3, linear)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def compare(
         residual: wp.array(dtype=H),
         allowed: wp.array(dtype=real),
@@ -293,7 +294,7 @@ def confirm_kernels(real, linear):
         if wanted[w] == 2:
             ratio_out[w, i - w * blocks] = real(wp.max(wp.abs(residual[i]))) / allowed[i]
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def confirm(
         worst: wp.array(dtype=real),
         goal: wp.array(dtype=real),

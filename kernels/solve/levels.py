@@ -15,6 +15,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.matrix.sliced import product_functions
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 GROUP = 8  # members of a group
 PIECE = 32  # blocks of H that one thread sums
@@ -26,7 +27,7 @@ def level_kernels(linear):
     H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
     _, free = product_functions(linear)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def collect(
         matrix: wp.array2d(dtype=linear),
         rows: wp.array(dtype=int),
@@ -56,7 +57,7 @@ def level_kernels(linear):
             m += wp.cw_mul(block, wp.outer(free(fixed[rows[p]]), free(fixed[columns[p]])))
         sum_out[i] = m
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def gather(
         piece_sums: wp.array(dtype=M),
         pieces: int,
@@ -93,7 +94,7 @@ def level_kernels(linear):
             inverse = wp.diag(wp.cw_mul(s, s))
         inverse_out[i] = inverse
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def restrict(
         values: wp.array(dtype=H),
         order: wp.array(dtype=int),
@@ -117,7 +118,7 @@ def level_kernels(linear):
             total += values[at + w * stride]
         sum_out[i] = total
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def correct(
         inverse: wp.array(dtype=M),
         sums: wp.array(dtype=H),
@@ -138,7 +139,7 @@ def level_kernels(linear):
             z += above[g / wp.static(GROUP) + w * above_groups]
         correction_out[i] = z
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def finish(
         residual: wp.array(dtype=H),
         correction: wp.array(dtype=H),

@@ -18,6 +18,7 @@ import warp as wp
 from ddg_warp.kernels.chain import ChainKind
 from ddg_warp.kernels.islands import CARRIED, WANTED
 from ddg_warp.kernels.solve import tension
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 TENSIONS = 2  # rows of a node for tensions
 
@@ -80,7 +81,7 @@ def pair_kernel(kind: ChainKind, linear):
             return linear(0.0)
         return blocks[(l - k) * wp.static(nb2) + i * wp.static(nb) + j, k, r]
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pair(
         blocks: wp.array3d(dtype=linear),
         F: wp.array3d(dtype=linear),
@@ -120,7 +121,7 @@ def unpair_kernel(kind: ChainKind, real, linear):
     V, slack_row = wp.types.vector(dim, real), kind.factor_rows
     longer = tension.longer_function(dim, real, linear)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def unpair(
         solution: wp.array3d(dtype=linear),
         F: wp.array3d(dtype=linear),

@@ -26,6 +26,7 @@ from ddg_warp.kernels.islands import (
 from ddg_warp.kernels.matrix.block_band import block_functions, product_function, substitute_function
 from ddg_warp.kernels.search import search_functions
 from ddg_warp.kernels.solve import pivot
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 PRECONDITIONERS = ("jacobi", "block_jacobi", "chain")
 
@@ -78,7 +79,7 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
             total += wp.dot(here, u)
         return total
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def start(
         blocks: wp.array3d(dtype=linear),
         factors: wp.array3d(dtype=linear),
@@ -112,7 +113,7 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
         else:
             wanted[r] = 2
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def product(
         blocks: wp.array3d(dtype=linear),
         p: wp.array3d(dtype=linear),
@@ -128,7 +129,7 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
         if wanted[r] == 1 and k < count[r]:
             put(q_out, 0, k, r, times(blocks, p, k, count[r], r))
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def advance(
         blocks: wp.array3d(dtype=linear),
         factors: wp.array3d(dtype=linear),
@@ -193,7 +194,7 @@ def repeat_kernel(real, fails: bool, exact: bool = True):
 
     out_of_patience = patience_function(real)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
     def repeat(done: int, flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), negative: wp.array(dtype=int)):
         r = wp.tid()
         if flags[WANTED, r] == 0:
@@ -227,7 +228,7 @@ def take_kernel(kind: ChainKind, real, linear):
     place, turn_angles, _, _ = search_functions(kind, real, linear)
     nb = kind.block
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def take(
         first_residual: wp.array3d(dtype=linear),
         iterations: wp.array(dtype=int),
