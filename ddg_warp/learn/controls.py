@@ -2,9 +2,9 @@
 
 import numpy as np
 import torch
-import warp as wp
 
 from ddg_warp.errors import SceneError
+from ddg_warp.learn.layout import view
 from ddg_warp.solve.controls import LOADS
 
 
@@ -23,7 +23,7 @@ class StepControls:
             given = integrator.given
             given.any = any(name in controls for name in LOADS)
             for name in LOADS:
-                place = wp.to_torch(getattr(given, name), requires_grad=False)
+                place = view(getattr(given, name))
                 if name in controls:
                     value = controls[name]
                     if name == "gravity":
@@ -32,11 +32,11 @@ class StepControls:
                 else:
                     place.zero_()
         if model.grips:
-            place = wp.to_torch(engine.after.grips.pose, requires_grad=False)
+            place = view(engine.after.grips.pose)
             if "poses" in controls:
                 place.copy_(controls["poses"].reshape(-1, 6).T)
             else:
-                place.copy_(wp.to_torch(engine.before.grips.pose, requires_grad=False))
+                place.copy_(view(engine.before.grips.pose))
 
     def require(self, name: str) -> None:
         """Refuse derivatives by a control that has none.
@@ -60,11 +60,11 @@ class StepControls:
         for i, group in enumerate(model.groups):
             found = inputs[i]
             if name == "gravity":
-                own = wp.to_torch(found.gravity, requires_grad=False) * flags[i][:, None]
+                own = view(found.gravity) * flags[i][:, None]
                 own = own.reshape(group.nodes, worlds, group.rods, -1).sum((0, 2))
                 result[:, list(group.host.axes)] += own
                 continue
-            w = (wp.to_torch(found.load, requires_grad=False) * flags[i]).reshape(-1, group.nodes, worlds, group.rods)
+            w = (view(found.load) * flags[i]).reshape(-1, group.nodes, worlds, group.rods)
             if name == "forces":
                 k, column, rows = self.layout.places(("points", i), lambda group=group: model.order.places(group))
                 result[:, rows[:, None], torch.tensor(group.host.axes)] = w[: group.kind.dim, k, :, column].permute(
@@ -76,9 +76,9 @@ class StepControls:
         if model.net is not None:
             found = inputs[-1]
             if name == "gravity":
-                own = wp.to_torch(found.gravity, requires_grad=False).reshape(worlds, -1, 3).sum(1)
+                own = view(found.gravity).reshape(worlds, -1, 3).sum(1)
                 return result + own * flags[-1][:, None]
-            w = wp.to_torch(found.load, requires_grad=False).reshape(worlds, -1, 3) * flags[-1][:, None, None]
+            w = view(found.load).reshape(worlds, -1, 3) * flags[-1][:, None, None]
             if name == "forces":
                 rows, blocks = self.layout.places(("points", "net"), lambda: model.order.net_rows)
                 result[:, rows] = w[:, blocks]

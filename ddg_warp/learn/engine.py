@@ -10,11 +10,11 @@ import torch
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels import outcome
+from ddg_warp.kernels.adjoint.step import smooth_kernel
 from ddg_warp.learn.adjoint import Adjoint, EquilibriumAdjoint
 from ddg_warp.learn.chains import Kept
 from ddg_warp.learn.controls import StepControls
-from ddg_warp.learn.layout import Layout, copies, tensors
+from ddg_warp.learn.layout import Layout, copies, tensors, view
 from ddg_warp.learn.net import NetKept
 from ddg_warp.learn.poses import Poses
 from ddg_warp.learn.tables import Tables
@@ -48,8 +48,8 @@ class Engine:
         self.before, self.after = (buffer.own for buffer in self.integrator._buffers)
         self.source, self.target = (tensors(state, self.fields) for state in (self.before, self.after))
         self.controls = StepControls(self)
-        self._views, self._streams = {}, {}
-        self._graphs = None
+        self._flagged, self._streams = {}, {}
+        self._graphs = self._by_start = None
 
     # steps
 
@@ -69,27 +69,23 @@ class Engine:
 
     def _smooth(self, part, graded: bool) -> torch.Tensor:
         """One for islands whose step was one solve in the frames that it began with, else not a number."""
-        key = "smooth", id(part)
-        if key not in self._views:  # of parts that there are; one made anew has another place
-            net = part is self.integrator._net
-            frames = ()
-            if net and part.net.edges:
-                frames = part._lagged[0], self.before.net.frame
-            elif not net and part.group.kind.twist:
-                frames = part.newton.frame, self.before.groups[part.index].frame
-            views = [
-                wp.to_torch(array, requires_grad=False)
-                for array in (part.islands.status, part.islands.portion, *frames)
-            ]
-            self._views[key] = part, views, torch.ones_like(views[1])
-        _, (status, portion, *frames), ones = self._views[key]
-        if not graded:
-            return ones.clone()
-        smooth = (portion == 1.0) & (status <= outcome.CONVERGED_TO_ROUNDING)
-        if frames:
-            same = (frames[0] == frames[1]).all(0)
-            smooth &= same.all(0) if same.ndim == 2 else same.reshape(len(portion), -1).all(1)
-        return torch.where(smooth, 1.0, float("nan")).to(portion.dtype)
+        key = id(part)
+        if key not in self._flagged:  # of parts that there are; one made anew has another place
+            islands, real, device = part.islands, self.model.types.real, self.model.wp_device
+            if part is self.integrator._net:
+                frames = (part._lagged[0], self.before.net.frame) if part.net.edges else ()
+                frames = [frame.reshape((6, self.model.worlds, -1)).transpose((0, 2, 1)) for frame in frames]
+            else:
+                frames = (part.newton.frame, self.before.groups[part.index].frame) if part.group.kind.twist else ()
+            found = wp.ones(len(islands), dtype=real, device=device)
+            read = [*islands.arrays, *(frames or 2 * [wp.zeros((0, 0, 0), dtype=real, device=device)]), found]
+            launch = wp.launch(smooth_kernel(real), len(islands), read, device=device, record_cmd=True)
+            self._flagged[key] = part, launch, found, view(found)
+        _, launch, _, flags = self._flagged[key]
+        if graded:
+            launch.launch()
+            return flags.clone()
+        return torch.ones_like(flags)
 
     # gradients
 
@@ -108,8 +104,8 @@ class Engine:
             self._graphs.clear()
         s, parts = self.integrator._solved(dt), list(self._parts)
         for kept, end in zip(parts if self.midpoint else (), self.after.groups, strict=False):
-            x, ends = wp.to_torch(kept.x, requires_grad=False), (end.x, kept.before.x)
-            torch.mul(sum(wp.to_torch(array, requires_grad=False) for array in ends), 0.5, out=x)
+            x, ends = view(kept.x), (end.x, kept.before.x)
+            torch.mul(sum(view(array) for array in ends), 0.5, out=x)
         if adjoint.net:
             parts.append(self._net_kept(start, dt))
 
@@ -121,11 +117,10 @@ class Engine:
         else:
             launch()
         found, inputs = self._found
-        self._solved_by = [
-            None if own.solve.failed is None else wp.to_torch(own.solve.failed, requires_grad=False) == 0
-            for own in adjoint.chains
-        ]
-        return copies(tensors(found, self.fields)), inputs
+        self._solved_by = [own.solve.failed for own in adjoint.chains]
+        if self._by_start is None or adjoint.net:  # memory of rods' derivatives stays
+            self._by_start = tensors(found, self.fields)
+        return self._by_start, inputs
 
     def _adjoint(self) -> Adjoint:
         if self.adjoint is None:
@@ -152,13 +147,13 @@ class Engine:
         """Of the net: joints' rotations are those at the rates of the step, as their dofs begin it at zero."""
         net, before, after = self.model.net, self.before.net, self.after.net
         solved, data = wp.clone(after.q), after.data
-        q = wp.to_torch(solved, requires_grad=False)
+        q = view(solved)
         if self.midpoint:
-            q.add_(wp.to_torch(before.q, requires_grad=False)).mul_(0.5)
+            q.add_(view(before.q)).mul_(0.5)
             data = self._data_between(start, dt, solved)
         spins = net.host.spins
         if spins:
-            rates = wp.to_torch(after.v, requires_grad=False).reshape(net.worlds, -1, 3)[:, -spins:]
+            rates = view(after.v).reshape(net.worlds, -1, 3)[:, -spins:]
             q.view(net.worlds, -1, 3)[:, -spins:] = rates * dt
         return NetKept(before, replace(before, q=solved, data=data), None)
 
@@ -207,8 +202,8 @@ class Engine:
 
     def solved(self, flags) -> list[torch.Tensor]:
         """Flags of a step, not numbers where its reverse has failed, too: of rods that are at no minimum."""
-        ones = zip(flags, [*self._solved_by, None], strict=False)
-        return [flag if ok is None else torch.where(ok, flag, float("nan")) for flag, ok in ones]
+        found = zip(flags, [*self._solved_by, None], strict=False)
+        return [flag if bad is None else torch.where(view(bad) == 0, flag, float("nan")) for flag, bad in found]
 
     @property
     def parts(self) -> int:

@@ -32,10 +32,15 @@ def fields(model) -> list[Field]:
     return result
 
 
+def view(array: wp.array) -> torch.Tensor:
+    """A tensor that looks at an array."""
+    return wp.to_torch(array, requires_grad=False)
+
+
 def tensors(state, names: list[Field]) -> list[torch.Tensor]:
     """Tensors that look at the arrays of a state."""
     found = {f"{part}/{name}": array for part, data in state.parts().items() for name, array in data.arrays().items()}
-    return [wp.to_torch(found[field.name], requires_grad=False) for field in names]
+    return [view(found[field.name]) for field in names]
 
 
 def copies(values: list[torch.Tensor]) -> list[torch.Tensor]:
@@ -127,14 +132,17 @@ class Layout:
             values[at] = values[at] + wide.reshape(values[at].shape)
         return values
 
-    def flagged(self, values: torch.Tensor, field: Field, flags) -> torch.Tensor:
-        """Derivatives by an array of a state, not numbers where the step has none."""
+    def flagged(self, values: list[torch.Tensor], flags) -> list[torch.Tensor]:
+        """Derivatives by the arrays of a state that have some, not numbers where the step has none."""
+        found = [(value, field) for value, field in zip(values, self.fields, strict=True) if field.smooth]
+        return list(torch._foreach_mul([value for value, _ in found], [self._flag(*own, flags) for own in found]))
+
+    def _flag(self, values: torch.Tensor, field: Field, flags) -> torch.Tensor:
+        """Flags of islands as they lie along such an array."""
         flag = flags[self._part(field.name.partition("/")[0])]
         if values.shape[field.axis] != len(flag):  # entries of a net, world by world
             flag = flag.repeat_interleave(values.shape[field.axis] // len(flag))
-        shape = [1] * values.ndim
-        shape[field.axis] = -1
-        return values * flag.reshape(shape)
+        return flag if values.ndim == field.axis + 1 else flag[:, None]
 
     def places(self, key, find) -> list[torch.Tensor]:
         if key not in self._places:

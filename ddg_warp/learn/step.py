@@ -1,5 +1,6 @@
 """A time step as a function that torch differentiates and batches; see `ddg_warp.learn.engine`."""
 
+import inspect
 from dataclasses import dataclass, replace
 
 import torch
@@ -142,11 +143,7 @@ class Pull(torch.autograd.Function):
             engine.tables.write(call.parameters, parameters)
             found, inputs = engine.backward(call.start, call.dt, state, output[:count], given)
             flags = engine.solved(flags)
-            by_state = [
-                engine.layout.flagged(values, field, flags)
-                for values, field in zip(found, call.fields, strict=True)
-                if field.smooth
-            ]
+            by_state = engine.layout.flagged(found, flags)
             by_parameters = engine.tables.pull(call.parameters, inputs, flags)
             by_controls = [engine.controls.pull(name, controls[name], inputs, flags) for name in call.controls]
         return *by_state, *by_parameters, *by_controls
@@ -165,6 +162,14 @@ class Pull(torch.autograd.Function):
         smooth = [field.axis for field in call.fields if field.smooth]
         given = [*axes, *call.state_axes, *[0] * call.engine.parts, *call.state_axes]
         return _folded(Pull, info.batch_size, in_dims, call, tensors, given, smooth + axes[len(call.fields) :])
+
+
+for own in (
+    Step,
+    Balance,
+    Pull,
+):  # which torch asks for in every call, and which takes as long as all that it does then
+    own.forward.__signature__ = inspect.signature(own.forward)
 
 
 def _folded(function, batch: int, in_dims, call: Call, tensors, axes: list[int], axes_found: list[int]):

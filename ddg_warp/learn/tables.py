@@ -5,6 +5,7 @@ import torch
 import warp as wp
 
 from ddg_warp.errors import SceneError
+from ddg_warp.learn.layout import view
 
 
 class Tables:
@@ -12,7 +13,8 @@ class Tables:
 
     def __init__(self, model):
         self.model = model
-        self._found, self._written, self._held, self._views = {}, {}, {}, {}
+        self._found, self._row_of, self._seen = {}, {}, {}
+        self._written, self._held, self._views = {}, {}, {}
 
     def of(self, name: str) -> list:
         """Parts whose table has a parameter "term.parameter": (table, its full shape, rows of its elements among all).
@@ -131,21 +133,32 @@ class Tables:
 
     def pull(self, names: tuple, inputs: list, flags) -> list[torch.Tensor]:
         """Derivatives by full parameters, in the order of `write`."""
-        result, model = [], self.model
+        result, worlds = [], self.model.worlds
         for name in names:
-            own = name.rpartition(".")[2]
-            for table, rows, chain in self.of(name)[1]:
+            for (_, rows, chain), (index, row) in zip(self.of(name)[1], self._rows(name), strict=True):
                 if chain:
-                    index = next(i for i, group in enumerate(model.groups) if group.parameters is table)
-                    row = list(table.values).index(name)
-                    values = wp.to_torch(inputs[index].parameters, requires_grad=False)[row]
-                    result.append(values * flags[index])
+                    result.append(self._by(inputs[index].parameters)[row] * flags[index])
                 else:
-                    index = next(i for i, part in enumerate(model.net.sets) if part.parameters is table)
-                    row = list(table.values).index(own)
-                    values = wp.to_torch(inputs[-1].parameters[index], requires_grad=False)[row]
-                    result.append(values.reshape(model.worlds, len(rows)) * flags[-1][:, None])
+                    values = view(inputs[-1].parameters[index])[row]
+                    result.append(values.reshape(worlds, len(rows)) * flags[-1][:, None])
         return result
+
+    def _by(self, array: wp.array) -> torch.Tensor:
+        """A tensor that looks at derivatives of rods, whose memory stays."""
+        if id(array) not in self._seen:
+            self._seen[id(array)] = array, view(array)
+        return self._seen[id(array)][1]
+
+    def _rows(self, name: str) -> list[tuple[int, int]]:
+        """Of the parts that have a parameter, in the order of `of`: which it is, and the row that it has in their tables."""
+        if name not in self._row_of:
+            model, own, found = self.model, name.rpartition(".")[2], []
+            for table, _, chain in self.of(name)[1]:
+                parts = model.groups if chain else model.net.sets
+                index = next(i for i, part in enumerate(parts) if part.parameters is table)
+                found.append((index, list(table.values).index(name if chain else own)))
+            self._row_of[name] = found
+        return self._row_of[name]
 
     @staticmethod
     def _inside(group, name: str) -> np.ndarray:
@@ -169,4 +182,4 @@ class Tables:
     def _look(table, key: str, shape: tuple) -> torch.Tensor:
         row = list(table.values).index(key)
         offset = sum(values.size for values in list(table.values.values())[:row])
-        return wp.to_torch(table.buffer, requires_grad=False)[offset : offset + shape[0] * shape[1]].view(shape)
+        return view(table.buffer)[offset : offset + shape[0] * shape[1]].view(shape)

@@ -8,8 +8,10 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels import outcome
 from ddg_warp.kernels.chain import ChainKind
 from ddg_warp.kernels.gather import column_of, point_functions
+from ddg_warp.kernels.islands import PORTION, STATUS
 from ddg_warp.kernels.motion import functions as motion_functions
 from ddg_warp.kernels.motion import reached_function
 from ddg_warp.kernels.threads import CPU_OPTIONS
@@ -193,6 +195,29 @@ def angle_kernel(dim: int, real, midpoint: bool):
             wp.atomic_sub(node_out, c, where[i, 2] / columns, r, share)
 
     return pull
+
+
+@cache
+def smooth_kernel(real):
+    """smooth(...): one for islands whose step was one solve in the frames that it began with, else not a number."""
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def smooth(
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        frame: wp.array3d(dtype=real),
+        began: wp.array3d(dtype=real),
+        smooth_out: wp.array(dtype=real),
+    ):
+        """Frames (component, edge, island) are those of the last solve and of the start."""
+        r = wp.tid()
+        same = flags[STATUS, r] <= wp.static(outcome.CONVERGED_TO_ROUNDING) and scalars[PORTION, r] == real(1.0)
+        for k in range(frame.shape[1]):
+            for c in range(frame.shape[0]):
+                same = same and frame[c, k, r] == began[c, k, r]
+        smooth_out[r] = wp.where(same, real(1.0), real(wp.nan))
+
+    return smooth
 
 
 @cache
