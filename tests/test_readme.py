@@ -15,7 +15,11 @@ COMMANDS = re.findall(
     r"^    (ddg-warp (?:run|sweep|bench|check|gradients|export|info|list).*?)(?: *#.*)?$", README.read_text(), re.M
 )
 LONG = ("strands", "bench")
-OPTIONAL = {"torch": "import torch", "gymnasium": "gymnasium_env"}  # packages, and words of the examples that need them
+OPTIONAL = {
+    "torch": "import torch",
+    "gymnasium": "gymnasium_env",
+    "jax": "import jax",
+}  # packages, and words of the examples that need them
 
 
 @pytest.fixture(scope="module")
