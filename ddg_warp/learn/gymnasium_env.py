@@ -1,8 +1,10 @@
 """An `Environment` as a vector environment of gymnasium.
 
-envs = VectorEnvironment(environment)
-observations, infos = envs.reset(seed=0)
-observations, rewards, terminations, truncations, infos = envs.step(envs.action_space.sample())
+    envs = VectorEnvironment(environment)
+    observations, infos = envs.reset(seed=0)
+    observations, rewards, terminations, truncations, infos = envs.step(envs.action_space.sample())
+
+Episodes that end begin anew in the same step.
 """
 
 import numpy as np

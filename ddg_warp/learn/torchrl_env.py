@@ -1,8 +1,10 @@
 """An `Environment` as one of TorchRL.
 
-env = TorchRLEnvironment(environment, differentiable=True)
-rollout = env.rollout(40, policy)
-rollout["next", "reward"].sum().backward()  # through the policy and all steps
+    env = TorchRLEnvironment(environment, differentiable=True)
+    rollout = env.rollout(40, policy)
+    rollout["next", "reward"].sum().backward()
+
+goes back through the policy and all steps.
 """
 
 try:
