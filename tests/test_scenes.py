@@ -40,6 +40,7 @@ SMALL = {
     "post_buckling": {"n": 50},
     "pullout_cylinder": {"n": 12},
     "reach": {"n": 16},
+    "residual_network": {"n": 24},
     "ribbon_bistable": {"n": 40},
     "ribbon_helix": {"n": 50},
     "right_angle_frame": {},
@@ -70,8 +71,16 @@ LONG = (
     "localized_helix",
     "deep_arch",
     "leaf",
+    "residual_network",
 )
-LEARNED = ("identify_from_statics", "identify_stiffness", "inverse_rest_shape", "reach", "soft_gripper")
+LEARNED = (
+    "identify_from_statics",
+    "identify_stiffness",
+    "inverse_rest_shape",
+    "reach",
+    "residual_network",
+    "soft_gripper",
+)
 
 
 def checked(name: str, device: str, **given) -> None:
