@@ -37,6 +37,7 @@ SMALL = {
     "pinched_cylinder": {"n": 12, "steps": 1, "load": 1e-3},
     "plate_buckling": {"cells": 12},
     "plate_square": {"cells": 16},
+    "policy": {"count": 1},
     "post_buckling": {"n": 50},
     "pullout_cylinder": {"n": 12},
     "reach": {"n": 16},
@@ -71,12 +72,14 @@ LONG = (
     "localized_helix",
     "deep_arch",
     "leaf",
+    "policy",
     "residual_network",
 )
 LEARNED = (
     "identify_from_statics",
     "identify_stiffness",
     "inverse_rest_shape",
+    "policy",
     "reach",
     "residual_network",
     "soft_gripper",
