@@ -1,5 +1,6 @@
 """What scenes that learn share: a quasi-Newton search, error bars, and what is said where torch is missing."""
 
+from contextlib import contextmanager
 from importlib.util import find_spec
 
 import numpy as np
@@ -21,6 +22,19 @@ def require_torch(scene: str) -> None:
     """
     if not find_spec("torch"):
         raise ValueError(f"{scene} is learned when it is built, by torch: `pip install ddg-warp[torch]`")
+
+
+@contextmanager
+def one_thread():
+    """Have torch work on one thread: its tensors are small here, and others would wait for each other longer than they work."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def minimise(loss, start, iterations: int = 40, tolerance: float = 1e-9):

@@ -15,6 +15,11 @@ COMMANDS = re.findall(
     r"^    (ddg-warp (?:run|sweep|bench|check|gradients|export|info|list).*?)(?: *#.*)?$", README.read_text(), re.M
 )
 LONG = ("strands", "bench")
+OPTIONAL = {
+    "torch": "import torch",
+    "gymnasium": "gymnasium_env",
+    "jax": "import jax",
+}  # packages, and words of the examples that need them
 
 
 @pytest.fixture(scope="module")
@@ -24,21 +29,21 @@ def folder(tmp_path_factory) -> Path:
 
 
 def test_examples(folder, device):
-    """One script of all of them, in their order; a block with a file is that file, and one of torch is left out without it."""
+    """One script of all of them, in their order; a block with a file is that file, and one of what is not installed is left out."""
     assert BLOCKS
-    torch = find_spec("torch") is not None
+    missing = [name for name, words in OPTIONAL.items() if find_spec(name) is None]
     lines = [f"import warp as wp; wp.set_device({device!r})"]
     for file, text in BLOCKS:
         if file:
             (folder / file).write_text(text)
-        elif torch or "import torch" not in text:
+        elif not any(OPTIONAL[name] in text for name in missing):
             lines.append(text)
     done = subprocess.run(
         [sys.executable, "-c", "\n".join(lines)], cwd=folder, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr[-3000:]
-    if not torch:
-        pytest.skip("all passed but those of torch, which is not installed")
+    if missing:
+        pytest.skip(f"all passed but those of {', '.join(missing)}, not installed")
 
 
 def test_commands(folder):

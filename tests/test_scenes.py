@@ -37,9 +37,11 @@ SMALL = {
     "pinched_cylinder": {"n": 12, "steps": 1, "load": 1e-3},
     "plate_buckling": {"cells": 12},
     "plate_square": {"cells": 16},
+    "policy": {"count": 1},
     "post_buckling": {"n": 50},
     "pullout_cylinder": {"n": 12},
     "reach": {"n": 16},
+    "residual_network": {"n": 24},
     "ribbon_bistable": {"n": 40},
     "ribbon_helix": {"n": 50},
     "right_angle_frame": {},
@@ -70,8 +72,18 @@ LONG = (
     "localized_helix",
     "deep_arch",
     "leaf",
+    "policy",
+    "residual_network",
 )
-LEARNED = ("identify_from_statics", "identify_stiffness", "inverse_rest_shape", "reach", "soft_gripper")
+LEARNED = (
+    "identify_from_statics",
+    "identify_stiffness",
+    "inverse_rest_shape",
+    "policy",
+    "reach",
+    "residual_network",
+    "soft_gripper",
+)
 
 
 def checked(name: str, device: str, **given) -> None:

@@ -82,6 +82,11 @@ class State:
         groups = {str(i): group for i, group in enumerate(self.groups)}
         return groups | {name: part for name, part in others.items() if part is not None}
 
+    def arrays(self) -> dict[str, wp.array]:
+        """Device arrays "part/name" as they are stored, see `GroupState`; each goes to other libraries without a copy, by DLPack:
+        `torch.from_dlpack(state.arrays()["0/x"])`."""
+        return {f"{part}/{name}": array for part, own in self.parts().items() for name, array in own.arrays().items()}
+
     def points(self) -> np.ndarray:
         """Positions (P, 3) [m], or (worlds, P, 3): nodes in the order of `model.curves` (rods, meridians), then vertices."""
         return self.model.order.nodes([arrays.download(group.x) for group in self.groups], self.net and self.net.q)
@@ -139,7 +144,4 @@ class State:
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Everything a bitwise restart needs."""
-        data = {"time": np.float64(self.time)}
-        for part, values in self.parts().items():
-            data |= {f"{part}/{name}": arrays.download(array) for name, array in values.arrays().items()}
-        return data
+        return {"time": np.float64(self.time)} | {name: arrays.download(array) for name, array in self.arrays().items()}

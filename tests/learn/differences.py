@@ -17,12 +17,7 @@ def built(scene):
 
 def entries(state) -> dict[str, object]:
     """All arrays of a state by name that hold something."""
-    return {
-        f"{part}/{name}": array
-        for part, values in state.parts().items()
-        for name, array in values.arrays().items()
-        if array.size > 1
-    }
+    return {name: array for name, array in state.arrays().items() if array.size > 1}
 
 
 class Meaning:

@@ -1,0 +1,89 @@
+"""An `Environment` as a vector environment of gymnasium.
+
+    envs = VectorEnvironment(environment)
+    observations, infos = envs.reset(seed=0)
+    observations, rewards, terminations, truncations, infos = envs.step(envs.action_space.sample())
+
+Episodes that end begin anew in the same step.
+"""
+
+import numpy as np
+
+try:
+    import gymnasium
+    import torch
+    from gymnasium.vector import AutoresetMode, VectorEnv
+    from gymnasium.vector.utils import batch_space
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        "vector environments need gymnasium: `pip install 'ddg-warp[gym]'`", name=error.name
+    ) from error
+
+from ddg_warp.errors import SceneError
+from ddg_warp.learn.environment import Environment
+
+
+class VectorEnvironment(VectorEnv):
+    """Worlds as sub-environments: those that end start anew in the same step (`AutoresetMode.SAME_STEP`).
+
+    The observation after such a step is the first of the next episode; `infos["final_obs"]` has the last of the one that ended, and
+    `infos["final_info"]["outcome"]` how its last step ended: "converged", or why it could not be solved, as `Integrator.outcomes` says.
+    Whatever seed is given, every world draws from a stream of its own.
+
+    Args:
+        environment: what it steps. Actions are float32, and observations as `observe` gives them.
+    """
+
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012 - as of gymnasium
+
+    def __init__(self, environment: Environment):
+        self.environment, self.num_envs = environment, environment.worlds
+        bounds = environment.bounds.cpu().numpy().astype(np.float32)
+        seen = torch.zeros(0, dtype=environment.observation_dtype).numpy().dtype
+        self.single_action_space = gymnasium.spaces.Box(-bounds, bounds, dtype=np.float32)
+        self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (environment.observations,), seen)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self._generators = self._now = None
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        """First observations of new episodes in all worlds, of streams that go on where no seed is given.
+
+        Raises:
+            SceneError: there are no options.
+        """
+        if options:
+            raise SceneError(f"reset: options are {options}; there are none")
+        super().reset(seed=seed)
+        if seed is not None or self._generators is None:
+            self._generators = self.environment.generators(self.np_random_seed)
+        with torch.no_grad():
+            self._now = self.environment.begin(self._generators)
+            return _numpy(self.environment.observe(self._now)), {}
+
+    def step(self, actions):
+        """Observations, rewards, terminations, truncations and infos after actions (B, actions).
+
+        Raises:
+            SceneError: nothing has been reset, or actions do not fit.
+        """
+        if self._now is None:
+            raise SceneError("step: no episode has begun; call reset first")
+        own = self.environment
+        with torch.no_grad():
+            now = own.step(self._now, np.asarray(actions))
+            observations, rewards, ended = own.observe(now), own.reward(now), own.ended(now)
+            over, infos = ended[0] | ended[1], {}
+            if over.any():
+                for world in torch.nonzero(over).flatten().tolist():
+                    final = {"final_obs": _numpy(observations[world]), "final_info": {"outcome": now.outcomes[world]}}
+                    infos = self._add_info(infos, final, world)
+                now = own.begin(self._generators, now, over)
+                observations = own.observe(now)
+        self._now = now
+        return _numpy(observations), _numpy(rewards).astype(float), _numpy(ended[0]), _numpy(ended[1]), infos
+
+
+def _numpy(values: torch.Tensor) -> np.ndarray:
+    """An array of its own."""
+    return values.cpu().numpy().copy()

@@ -1,0 +1,78 @@
+"""Functions of torch tensors, such as roll-outs of a `Simulator`, as functions of JAX arrays with gradients.
+
+    def tip(stiffness):  # of torch
+        return simulator.rollout(start, {"rod_bend_twist.stiffness_1": stiffness}, steps=10)[-1].positions[:, -1]
+
+    tip = from_torch(tip, (2, 3))
+    gradient = jax.grad(lambda stiffness: tip(stiffness).sum())(3e-4)
+
+JAX asks the host for them (`jax.pure_callback`): they stand in jitted functions, and are of one order of derivatives, in reverse.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+try:
+    import jax
+    import torch
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError("functions of JAX need jax: `pip install 'ddg-warp[jax]'`", name=error.name) from error
+
+from ddg_warp.errors import SceneError
+
+
+def from_torch(function: Callable, shape: tuple[int, ...], dtype=None) -> Callable:
+    """A function of torch tensors as one of JAX arrays, with the gradient that torch finds.
+
+    Values pass through the host's memory, in float64 where JAX has that: set `jax_enable_x64`, as its gradients are float32 else.
+
+    Args:
+        function: of tensors, all of floating point, that gives one tensor.
+        shape: of what it gives.
+        dtype: of what it gives; by default JAX's own, float32 or float64.
+
+    Raises:
+        SceneError: the function gives something of another shape, when it is called.
+    """
+    kind = jax.dtypes.canonicalize_dtype(dtype or float)
+    result = jax.ShapeDtypeStruct(shape, kind)
+
+    def value(*arrays) -> np.ndarray:
+        with torch.no_grad():
+            return found([_tensor(array) for array in arrays]).cpu().numpy().astype(kind)
+
+    def gradients(arrays, by) -> tuple[np.ndarray, ...]:
+        inputs = [_tensor(array).requires_grad_() for array in arrays]
+        with torch.enable_grad():
+            output = found(inputs)
+        given = torch.autograd.grad(output, inputs, _tensor(by).to(output), allow_unused=True, materialize_grads=True)
+        return tuple(own.cpu().numpy().astype(array.dtype) for own, array in zip(given, arrays, strict=True))
+
+    def found(inputs: list) -> torch.Tensor:
+        output = function(*inputs)
+        if not isinstance(output, torch.Tensor) or tuple(output.shape) != tuple(shape):
+            given = tuple(output.shape) if isinstance(output, torch.Tensor) else repr(output)
+            raise SceneError(
+                f"from_torch: the function gives {given}; give a tensor of shape {tuple(shape)}, or say another shape"
+            )
+        return output
+
+    @jax.custom_vjp
+    def call(*arrays):
+        return jax.pure_callback(value, result, *arrays, vmap_method="sequential")
+
+    def forward(*arrays):
+        return call(*arrays), arrays
+
+    def backward(arrays, by):
+        alike = tuple(jax.ShapeDtypeStruct(jax.numpy.shape(array), jax.numpy.result_type(array)) for array in arrays)
+        return jax.pure_callback(gradients, alike, arrays, by, vmap_method="sequential")
+
+    call.defvjp(forward, backward)
+    return call
+
+
+def _tensor(array) -> torch.Tensor:
+    """A tensor of its own, in float64."""
+    return torch.tensor(np.asarray(array), dtype=torch.float64)

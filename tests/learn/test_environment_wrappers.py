@@ -1,0 +1,170 @@
+"""Environments as gymnasium and TorchRL have them: their own checks, episodes that end, seeds, failures, gradients."""
+
+import importlib
+import re
+import sys
+
+import numpy as np
+import pytest
+
+from ddg_warp.errors import SceneError
+
+torch = pytest.importorskip("torch")
+from ddg_warp.learn.environment import Environment  # noqa: E402
+from tests.learn.test_environment import RATES, WORLDS, draw, environment, gripped, observe, off  # noqa: E402
+
+
+@pytest.mark.parametrize(
+    ("module", "package", "extra"),
+    [("gymnasium_env", "gymnasium", "gym"), ("torchrl_env", "torchrl.data", "torchrl"), ("jax", "jax", "jax")],
+)
+def test_what_is_not_installed_is_told_with_its_extra(module, package, extra, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.delitem(sys.modules, f"ddg_warp.learn.{module}", raising=False)
+    with pytest.raises(ModuleNotFoundError, match=rf"pip install 'ddg-warp\[{extra}\]'"):
+        importlib.import_module(f"ddg_warp.learn.{module}")
+
+
+# gymnasium
+
+
+def vector(**options):
+    pytest.importorskip("gymnasium")
+    from ddg_warp.learn.gymnasium_env import VectorEnvironment
+
+    return VectorEnvironment(environment(**options))
+
+
+def test_gymnasium_finds_nothing_wrong():
+    """Its checker of environments, by one world of a vector environment; it has none of vector environments."""
+    gymnasium = pytest.importorskip("gymnasium")
+    from gymnasium.utils.env_checker import check_env
+
+    from ddg_warp.learn.gymnasium_env import VectorEnvironment
+
+    class One(gymnasium.Env):
+        """The only world of a vector environment."""
+
+        def __init__(self):
+            usual = {"observe": observe, "reward": off, "draw": draw, "steps": 50}
+            self.envs = VectorEnvironment(Environment(gripped(), 1, RATES, **usual))
+            self.action_space = self.envs.single_action_space
+            self.observation_space = self.envs.single_observation_space
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            observations, infos = self.envs.reset(seed=seed, options=options)
+            return observations[0], infos
+
+        def step(self, action):
+            *found, infos = self.envs.step(action[None])
+            observation, reward, terminated, truncated = (values[0] for values in found)
+            return observation, float(reward), bool(terminated), bool(truncated), infos
+
+    with pytest.warns(UserWarning) as told:
+        check_env(One())
+    left = [str(warning.message) for warning in told]
+    # what the author of an environment may mean: observations without bounds, actions in units, no picture
+    expected = ("minimum value is -infinity", "maximum value is infinity", "symmetric and normalized", "render modes")
+    assert not [text for text in left if not any(words in text for words in expected)]
+
+
+def test_episodes_of_gymnasium_end_and_begin_in_the_same_step():
+    envs = vector(terminated=lambda now: (now.steps >= 2) & (torch.arange(WORLDS) == 1))
+    from gymnasium.vector import AutoresetMode
+
+    assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    first, infos = envs.reset(seed=7)
+    assert first in envs.observation_space and infos == {}
+    envs.action_space.seed(1)
+    for step in range(1, 5):
+        observations, rewards, terminations, truncations, infos = envs.step(envs.action_space.sample())
+        assert observations in envs.observation_space and rewards.shape == (WORLDS,)
+        assert terminations.tolist() == [False, step % 2 == 0, False]
+        assert truncations.tolist() == [step == 4, False, step == 4]
+        over = terminations | truncations
+        assert ("final_obs" in infos) == over.any()
+        for world in np.flatnonzero(over):
+            reached = infos["final_obs"][world][:3]
+            assert -(reached**2).sum() == pytest.approx(rewards[world])
+            np.testing.assert_array_equal(observations[world, 3:], 0.0)  # poses of an episode that begins
+        assert not over.any() or set(infos["final_info"]["outcome"][over]) == {"converged"}
+
+
+def test_seeds_of_gymnasium_repeat_bit_by_bit():
+    def run(seed: int):
+        envs, seen = vector(), []
+        seen.append(envs.reset(seed=seed)[0])
+        envs.action_space.seed(0)
+        for _ in range(6):
+            observations, rewards, *_ = envs.step(envs.action_space.sample())
+            seen += [observations, rewards[:, None]]
+        return np.concatenate(seen, 1)
+
+    one = run(11)
+    np.testing.assert_array_equal(one, run(11))
+    assert (one[:, 0] != run(12)[:, 0]).all()
+    assert len({*one[:, 0].tolist()}) == WORLDS  # streams of worlds differ
+
+
+def test_gymnasium_is_told_of_failures():
+    envs = vector(own=gripped(retry_limit=0, max_iterations=4, rtol=1e-5), steps=9)
+    with pytest.raises(SceneError, match="no episode has begun"):
+        envs.step(np.zeros((WORLDS, 4)))
+    with pytest.raises(SceneError, match="options are"):
+        envs.reset(options={"low": 1})
+    envs.reset(seed=0)
+    actions = np.zeros((WORLDS, 4), np.float32)
+    actions[2] = (0.5, 0.5, 3.0, 3.0)
+    *_, terminations, _, infos = envs.step(actions)
+    assert terminations.tolist() == [False, False, True]
+    assert infos["_final_info"].tolist() == terminations.tolist()
+    assert (
+        re.fullmatch("[a-z_]+", infos["final_info"]["outcome"][2]) and infos["final_info"]["outcome"][2] != "converged"
+    )
+    *_, terminations, _, _ = envs.step(np.zeros((WORLDS, 4)))
+    assert not terminations.any()  # nothing of it is left
+
+
+# TorchRL
+
+
+def test_torchrl_finds_nothing_wrong():
+    pytest.importorskip("torchrl")
+    from torchrl.envs.utils import check_env_specs
+
+    from ddg_warp.learn.torchrl_env import TorchRLEnvironment
+
+    check_env_specs(TorchRLEnvironment(environment(), differentiable=False), seed=0)
+
+
+def test_rollouts_of_torchrl_have_gradients():
+    """A policy's gradient is that of the environment; episodes that end begin anew, by seeds that repeat."""
+    pytest.importorskip("torchrl")
+    from tensordict.nn import TensorDictModule
+
+    from ddg_warp.learn.torchrl_env import TorchRLEnvironment
+
+    found = environment()
+    torch.manual_seed(0)
+    network = torch.nn.Linear(found.observations, 4).double()
+    bounds = found.bounds
+    policy = TensorDictModule(lambda seen: bounds * torch.tanh(network(seen)), ["observation"], ["action"])
+    env = TorchRLEnvironment(found, differentiable=True)
+    env.set_seed(4)
+    rollout = env.rollout(3, policy)
+    parameters = list(network.parameters())
+    gradients = torch.autograd.grad(rollout["next", "reward"].sum(), parameters)
+    env.set_seed(4)
+    now, total = found.begin(env._generators), 0.0
+    for _ in range(3):
+        now = found.step(now, bounds * torch.tanh(network(found.observe(now))))
+        total = total + found.reward(now).sum()
+    torch.testing.assert_close(gradients, torch.autograd.grad(total, parameters), rtol=1e-12, atol=0.0)
+    env = TorchRLEnvironment(found)
+    env.set_seed(4)
+    rollout = env.rollout(6, policy, break_when_any_done=False)
+    assert not rollout["next", "reward"].requires_grad
+    assert rollout["next", "truncated"][..., 0].sum(1).tolist() == [1] * WORLDS
+    assert (rollout["observation"][:, 4, 3:] == 0.0).all()  # new episodes, at rest
+    assert (rollout["observation"][:, 4, :3] != rollout["observation"][:, 0, :3]).all()
