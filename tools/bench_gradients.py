@@ -1,15 +1,22 @@
 """What gradients cost: a step of many cantilevers from torch, forward and backward, against the integrator's step alone.
 
     python tools/bench_gradients.py [--cuda] [--out DIR]
+    python tools/bench_gradients.py --scaling [--cuda] [--out DIR]      against worlds, nodes and steps
 
 Rods of 24 nodes, clamped at their first edge and released straight, 0.01 s a step, implicit Euler, as rods of one world or a world
 each.
 `step`: `Integrator.step`; `torch`: `Simulator.step` without gradients; `forward`, `backward`: with them, by state and the bending
 stiffness of every element. `error` is that of the gradient along a direction against central differences in float64 (of the smallest
 model). Time is the least of some runs of a step. Prints a table; writes gradients_DEVICE.csv and .json.
+
+Scaling is that of roll-outs of a world a rod, in the precision that a device has by default: seconds of all steps and of their reverse,
+and what torch holds of them at most [MB], the states between steps, with and without checkpoints. It writes
+gradients_scaling_DEVICE.csv, .json and a plot of each study.
 """
 
 import argparse
+import gc
+import resource
 import sys
 import time
 from pathlib import Path
@@ -19,6 +26,7 @@ import torch
 import warp as wp
 
 import ddg_warp as ddg
+from ddg_warp.run import figure
 from ddg_warp.run.summary import machine, table, write_table
 from ddg_warp.torch import Simulator
 
@@ -80,6 +88,75 @@ def measure(count: int, worlds: bool, device: str, precision: str, runs: int) ->
     return found
 
 
+def roll_out(worlds: int, nodes: int, steps: int, every: int | None, device: str) -> dict:
+    """Seconds and memory of a roll-out and of its reverse."""
+    scene = ddg.Scene(gravity=(0.0, -2.943, -9.81))
+    points = np.linspace(0.0, 1.0, nodes)[:, None] * np.array([1.0, 0.0, 0.0])
+    scene.clamp(scene.add_rod(points, section=ddg.Circle(0.02), material=RUBBER))
+    simulator, clock = Simulator(scene.build(device, worlds=worlds), DT), Clock(wp.get_device(device))
+    stiffness = simulator.parameter(NAME).clone().requires_grad_()
+    held = 0
+
+    def run(steps: int):
+        nonlocal held
+        options = {"steps": steps, "save": steps, "checkpoint_every": every}
+        start = simulator.initial_state()
+        if device.startswith("cuda"):
+            torch.cuda.reset_peak_memory_stats()
+        before = memory(device)
+        (state,) = clock("forward", lambda: simulator.rollout(start, {NAME: stiffness}, **options))
+        held = memory(device) - before
+        loss = (state.positions[..., 2] ** 2).sum()
+        clock("backward", lambda: torch.autograd.grad(loss, stiffness))
+        if device.startswith("cuda"):
+            held = torch.cuda.max_memory_allocated() - before
+
+    run(2)
+    clock.best.clear()
+    run(steps)
+    found = {"worlds": worlds, "nodes": nodes, "steps": steps, "checkpoint every": every or 0}
+    found |= {f"{name} [s]": seconds for name, seconds in clock.best.items()}
+    return found | {"memory [MB]": held / 1e6}
+
+
+def memory(device: str) -> int:
+    """Bytes that torch holds; on the CPU those of this process."""
+    if device.startswith("cuda"):
+        return torch.cuda.memory_allocated()
+    gc.collect()
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * resource.getpagesize()
+
+
+def scaling(device: str, out: Path) -> list[dict]:
+    """Rows of all studies, and their plots."""
+    cuda, rows = device.startswith("cuda"), []
+    studies = {
+        "worlds": [(2**k, 24, 20, None) for k in range(0, 18 if cuda else 9, 2)],
+        "nodes": [(64 if cuda else 4, 2**k, 20, None) for k in range(3, 11 if cuda else 9)],
+        "steps": [(1024 if cuda else 16, 24, 10 * 2**k, every) for every in (None, 10) for k in range(6)],
+    }
+    for study, cases in studies.items():
+        for case in cases:
+            rows.append({"study": study} | roll_out(*case, device))
+            print(rows[-1], flush=True)
+        own = [row for row in rows if row["study"] == study]
+        for what, columns in (("time", ("forward [s]", "backward [s]")), ("memory", ("memory [MB]",))):
+            drawn = [
+                {study: row[study], what: row[column], "of": f"{column}{_checkpoints(row)}"}
+                for row in own
+                for column in columns
+            ]
+            picture = out / f"gradients_{what}_by_{study}_{device.partition(':')[0]}.png"
+            figure.error_plot(picture, drawn, study, what, "of", "roll-outs")
+    return rows
+
+
+def _checkpoints(row: dict) -> str:
+    every = row["checkpoint every"]
+    return f", checkpoints every {every} steps" if every else ""
+
+
 def error(device: str, precision: str) -> float:
     """Relative error of the gradient of sixty steps by a factor of all stiffnesses, against differences in float64."""
 
@@ -102,10 +179,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cuda", action="store_true")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    parser.add_argument("--scaling", action="store_true")
     parser.add_argument("--runs", type=int, default=30)
     options = parser.parse_args()
     device = "cuda:0" if options.cuda else "cpu"
     wp.config.quiet = True
+    if options.scaling:
+        rows = scaling(device, options.out)
+        write(options, "gradients_scaling", rows, device, " --scaling")
+        return 0
     cases = [(2560, False), (2560, True), (100_000, False)] if options.cuda else [(16, False), (16, True), (256, False)]
     rows = []
     for precision in ("mixed", "float64") if options.cuda else ("float64",):
@@ -113,14 +195,16 @@ def main() -> int:
         for count, worlds in cases:
             rows.append(measure(count, worlds, device, precision, options.runs) | {"error": wrong})
             print(rows[-1], flush=True)
-    print(table(rows))
-    origin = {
-        "command": "python tools/bench_gradients.py" + options.cuda * " --cuda",
-        "device": device,
-        "machine": machine(),
-    }
-    write_table(options.out / f"gradients_{device.partition(':')[0]}", rows, origin)
+    write(options, "gradients", rows, device)
     return 0
+
+
+def write(options, name: str, rows: list[dict], device: str, flags: str = "") -> None:
+    """Print and write a table."""
+    print(table(rows))
+    command = "python tools/bench_gradients.py" + flags + options.cuda * " --cuda"
+    origin = {"command": command, "device": device, "machine": machine()}
+    write_table(options.out / f"{name}_{device.partition(':')[0]}", rows, origin)
 
 
 if __name__ == "__main__":
