@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import warp as wp
-from torch.utils import checkpoint
 
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 from ddg_warp.learn.engine import Engine
 from ddg_warp.learn.layout import tensors
+from ddg_warp.learn.rollout import Plan, bytes_of, plan, roll
 from ddg_warp.learn.step import Balance, Call, Step
 from ddg_warp.model import validate
 from ddg_warp.model.controls import Controls
@@ -162,6 +162,7 @@ class Simulator(torch.nn.Module):
         steps: int,
         save: int = 1,
         checkpoint_every: int | None = None,
+        memory: float | None = None,
     ) -> list[WorldState]:
         """States after every `save` steps of so many.
 
@@ -170,34 +171,47 @@ class Simulator(torch.nn.Module):
             steps: how many.
             save: of which every so many are returned.
             checkpoint_every: keep only every so many states for gradients, and step again from there when they are asked for.
+            memory: what may be kept for gradients [bytes]: checkpoints are set as it asks for; see `plan`.
 
         Returns:
             Trajectory, without the state that it began with.
+
+        Raises:
+            SceneError: a name or shape does not fit; so much memory is too little.
         """
+        engine = self._own(state)
+
+        def given(number: int) -> dict:
+            return self._controls(engine, controls(number) if callable(controls) else controls)
+
         arguments.count("steps", steps)
-        arguments.count("save", save)
-        block = 1 if checkpoint_every is None else arguments.count("checkpoint_every", checkpoint_every)
-        engine, result = self._own(state), []
+        first = given(0)  # asked for once: what gives it may have a memory
+        every = self._plan(state, first, steps, save, checkpoint_every, memory).every
         full = self._full(engine, parameters)
+        return roll(self._step, state, full, lambda number: given(number) if number else first, steps, save, every)
 
-        def some(first: int, count: int, state: WorldState, full: list) -> list[WorldState]:
-            saved = []
-            for number in range(first, first + count):
-                own = controls(number) if callable(controls) else controls
-                state = self._step(state, full, self._controls(engine, own))
-                if (number + 1) % save == 0:
-                    saved.append(state)
-            return [*saved, state]
+    def plan(
+        self,
+        state: WorldState,
+        controls: dict | None = None,
+        *,
+        steps: int,
+        save: int = 1,
+        checkpoint_every: int | None = None,
+        memory: float | None = None,
+    ) -> Plan:
+        """What such a roll-out keeps for gradients, and how; arguments are those of `rollout`, `controls` those of a step."""
+        own = self._controls(self._own(state), controls)
+        return self._plan(state, own, arguments.count("steps", steps), save, checkpoint_every, memory)
 
-        for first in range(0, steps, block):
-            count = min(block, steps - first)
-            if checkpoint_every:
-                found = checkpoint.checkpoint(some, first, count, state, full, use_reentrant=False)
-            else:
-                found = some(first, count, state, full)
-            *saved, state = found
-            result += saved
-        return result
+    def _plan(self, state: WorldState, controls: dict, steps: int, save: int, every, memory) -> Plan:
+        arguments.count("save", save)
+        if every is not None:
+            arguments.count("checkpoint_every", every)
+        if memory is not None:
+            arguments.number("memory", memory, "bytes, more than none", lambda value: value > 0.0)
+        flags = sum(len(part.islands) for part in state.engine.integrator._parts) * state.values[0].element_size()
+        return plan(bytes_of([*state.values, *controls.values()]) + flags, steps, save, every, memory)
 
     @torch.compiler.disable
     def equilibrium(

@@ -147,6 +147,34 @@ def test_checkpoints_change_nothing():
     assert found[0] == found[1] == found[2]
 
 
+def test_roll_outs_keep_what_memory_allows():
+    own = simulator("twisted")
+    state, steps = own.initial_state(batch=3), 30
+    all_of_it = own.plan(state, steps=steps).memory
+    found = []
+    for memory in (None, all_of_it, 0.5 * all_of_it):
+        planned = own.plan(state, steps=steps, save=steps, memory=memory)
+        assert (planned.every is None) == (memory != 0.5 * all_of_it)
+        stiffness = torch.tensor(1.5e-4, dtype=torch.float64, requires_grad=True)
+        held = {}
+
+        def keep(tensor, held=held):
+            held[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+            return tensor
+
+        with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+            options = {"steps": steps, "save": steps, "memory": memory}
+            (end,) = own.rollout(state, {STIFFNESS["twisted"]: stiffness}, **options)
+        fixed = sum(value.untyped_storage().nbytes() for value in state.values) + 1000  # the start, and the parameters
+        if planned.every is None:  # with checkpoints torch saves none of them here
+            assert planned.memory <= sum(held.values()) + fixed and sum(held.values()) <= planned.memory + fixed
+        assert planned.memory <= (memory or all_of_it)
+        found.append(float(torch.autograd.grad((end.positions**2).sum(), stiffness)[0]))
+    assert found[0] == found[1] == found[2]
+    with pytest.raises(SceneError, match="rollout: 30 steps hold"):
+        own.rollout(state, steps=steps, memory=0.1 * all_of_it)
+
+
 def test_steps_are_those_of_the_integrator():
     own, model = simulator("joined"), built(SCENES["joined"]())
     integrator, state = ddg.Integrator(model, **TIGHT), model.state()
