@@ -153,17 +153,22 @@ def test_order_of_what_converges():
     assert bench.orders(study, rows)["dt"] == pytest.approx(1.0, abs=1e-6)
 
 
-def test_every_scene_has_a_study():
+def scenes() -> list:
+    """Names of all scenes; those that are learned when they are built take minutes, and torch."""
+    marks = (pytest.mark.slow, pytest.mark.skipif(find_spec("torch") is None, reason="needs torch"))
+    learned = {name: "require_torch" in path.read_text() for name, path in catalog.scene_files().items()}
+    return [pytest.param(name, marks=marks) if own else name for name, own in learned.items()]
+
+
+@pytest.mark.parametrize("name", scenes())
+def test_every_scene_has_a_study(name):
     """Its grid names what a run can set, and holds the scene's defaults or gets them as a case of their own."""
-    for name, path in catalog.scene_files().items():
-        if find_spec("torch") is None and "require_torch" in path.read_text():
-            continue  # it is learned when it is built
-        module = load_scene(name)
-        study = bench.study_of(module)
-        usual = bench.defaults(module, study, "cpu")
-        assert set(usual) == set(study.grid), name
-        assert study.cases(), name
-        assert isinstance(study.measure, str) or study.reference is not None, name
+    module = load_scene(name)
+    study = bench.study_of(module)
+    usual = bench.defaults(module, study, "cpu")
+    assert set(usual) == set(study.grid)
+    assert study.cases()
+    assert isinstance(study.measure, str) or study.reference is not None
 
 
 def test_a_scene_without_benchmark_gets_a_study(tmp_path, device):
