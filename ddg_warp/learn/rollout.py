@@ -64,8 +64,11 @@ def _of(plan: Plan) -> int:
 
 
 def bytes_of(tensors) -> int:
-    """Memory that tensors hold, without what they share by being spread."""
-    return sum(tensor.untyped_storage().nbytes() for tensor in tensors)
+    """Memory that tensors hold; directions in which they are spread take none."""
+    return sum(
+        tensor.element_size() * math.prod(n for n, stride in zip(tensor.shape, tensor.stride(), strict=True) if stride)
+        for tensor in tensors
+    )
 
 
 def roll(step, state, full, controls, steps: int, save: int, every: int | None) -> list:
