@@ -34,7 +34,7 @@ FLAGS = (
     "patience",  # how many there may be
     # the step: whether it starts from the last state instead of the predictor, and what became of it
     "cautious",
-    "retries",
+    "retries",  # of the part of the step at hand, or of the last one of a step that is done
     "reason",  # outcome of the solve that made it be given up
     "bent",  # whether the predictor has to turn edges
     "moved",  # whether this part of it succeeded

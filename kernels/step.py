@@ -339,7 +339,8 @@ def advance_kernel(real):
         if result <= wp.static(outcome.CONVERGED_TO_ROUNDING):
             scalars[PROGRESS, r] = scalars[PROGRESS, r] + scalars[PORTION, r]
             flags[CAUTIOUS, r] = 0
-            flags[RETRIES, r] = 0
+            if scalars[PROGRESS, r] < real(1.0):
+                flags[RETRIES, r] = 0
             # a step twice as long, where it starts at a multiple of its length, so that all end together
             longer = real(2.0) * scalars[PORTION, r]
             if (

@@ -39,8 +39,10 @@ def variation_functions(term: Term, real):
 
 
 @cache
-def carried_function(real):
-    """carried(e, u, t, du, dt): the reference frame (u, t) of an edge, carried along to the edge e, times (du, dt)."""
+def carried_function(real, unit: bool = True):
+    """carried(e, u, t, du, dt): the reference frame (u, t) of an edge, carried along to the edge e, times (du, dt); `unit`: made
+    orthonormal again.
+    """
     V = wp.types.vector(3, real)
     transport, *_ = frames.functions(real)
 
@@ -48,7 +50,10 @@ def carried_function(real):
     def carried(e: V, u: V, t: V, du: V, dt: V):
         new = wp.normalize(e)
         v = transport(u, t, new)
-        return wp.dot(wp.normalize(v - new * wp.dot(v, new)), du) + wp.dot(new, dt)
+        if wp.static(unit):
+            return wp.dot(wp.normalize(v - new * wp.dot(v, new)), du) + wp.dot(new, dt)
+        else:
+            return wp.dot(v, du) + wp.dot(new, dt)
 
     return carried
 

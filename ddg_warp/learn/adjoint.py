@@ -51,7 +51,12 @@ class Adjoint:
         self.integrator, self.model = integrator, integrator.model
         self.chains = [ChainAdjoint(self.model, group, integrator.scheme) for group in self.model.groups]
         self.net = NetAdjoint(self.model, integrator.scheme) if self.model.net is not None else None
-        self._grips = self.model.empty_state().grips  # of derivatives by states, which have none by these
+        self._grips = self.model.empty_state().grips  # of derivatives by states; see `ddg_warp.learn.poses`
+
+    @property
+    def parts(self) -> list:
+        """Of the groups of rods and of the net, as the integrator steps them."""
+        return [*self.chains, *([self.net] if self.net else [])]
 
     def step(self, state: State, dt: float) -> tuple[State, Tape]:
         """The state after a step, and what its reverse needs, which stays valid for as long as it is held."""
@@ -77,9 +82,10 @@ class Adjoint:
             SolverError: the step was made in parts, as a solve failed; frames were renewed in it; or it ended at no minimum.
         """
         validate.check_state("pull", self.model, given)
-        for kept, part in zip(tape.parts, self.integrator._parts, strict=True):
-            _require_one_solve(kept, part)
         self.upload(tape.before.time, tape.dt)
+        ends = tape.before, tape.after
+        for own, kept, part in zip(self.parts, tape.parts, self.integrator._parts, strict=True):
+            _require_one_solve(own, kept, ends, part)
         s = self.integrator._solved(tape.dt)
         found = _copied(*self.pull_parts(tape.before, tape.after, tape.parts, given, s))
         for own, part in zip(self.chains, self.integrator._chains, strict=True):
@@ -87,12 +93,12 @@ class Adjoint:
         return found
 
     def upload(self, start: float, dt: float) -> bool:
-        """What supports do in the step whose reverse follows, and what suits it; whether that is another solver than before."""
-        changed = [own.solve.suit(self.integrator._solved(dt)) for own in self.chains]
-        for own in (*self.chains, *([self.net] if self.net else [])):
-            if own.supports:
-                own.supports.upload(start, start + dt)
-        return any(changed)
+        """What is prescribed in the step whose reverse follows, and what suits it; whether that is anything else than before."""
+        s, changed = self.integrator._solved(dt), False
+        for own, part in zip(self.parts, self.integrator._parts, strict=True):
+            changed = own.suit(part, s) or changed
+            own.upload(start, start + dt)
+        return changed
 
     def pull_parts(self, before: State, after: State, parts: list, given: State, s: float) -> tuple[State, list]:
         """The same without a check, for solves over s [s]; what it returns is written anew by the next call."""
@@ -138,10 +144,10 @@ class EquilibriumAdjoint:
         validate.check_state("pull", self.model, given)
         inputs = []
         for own, at, by in zip(self.chains, state.groups, given.groups, strict=True):
-            kept = Kept(at, at.x, at.theta, at.frame, None, state.time)
+            kept = Kept(at, at.x, at.theta, at.frame, None, time=state.time)
             inputs += _copied(self.model.empty_state(), [own.pull(kept, at, by, np.inf)[1]])[1]
         if self.net:
-            kept = NetKept(state.net, state.net, None, state.time)
+            kept = NetKept(state.net, state.net, None, time=state.time)
             inputs.append(self.net.pull(kept, state.net, given.net, np.inf)[1])
         return inputs
 
@@ -165,13 +171,14 @@ def _require_minimum(own: ChainAdjoint, part) -> None:
         )
 
 
-def _require_one_solve(kept: Kept | NetKept, part) -> None:
-    """Refuse the reverse of a step that was made in parts, or in which frames were renewed."""
-    lagged, now = kept.frames
+def _require_one_solve(own: ChainAdjoint | NetAdjoint, kept: Kept | NetKept, states: tuple, part) -> None:
+    """Refuse the reverse of a step that was made in parts, or not from its predictor though that matters, or that renewed frames."""
+    lagged, now = own.lagged(kept.before, states), kept.frame
     changed = (lagged.numpy() != now.numpy()).any(0)
     changed = changed.any(0) if changed.ndim == 2 else changed.reshape(len(part.islands), -1).any(1)
     for bad, what in (
         (kept.whole.numpy() < 1.0, "took the step in parts, as a solve failed"),
+        ((kept.retries.numpy() > 0) & (own.predictor is not None), "started the step once more, as a solve failed"),
         (
             changed,
             "turned an edge by more than 90 degrees in the step, so that its frames were renewed on the way",

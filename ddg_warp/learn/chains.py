@@ -1,14 +1,16 @@
 """Reverse of a step of a group of rods on their own; see `ddg_warp.learn.adjoint`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.compile.storage import FREE
-from ddg_warp.errors import SceneError
 from ddg_warp.kernels.adjoint import chain, step
+from ddg_warp.learn.drag import ChainDragAdjoint
+from ddg_warp.learn.followers import Followers
+from ddg_warp.learn.predictor import ChainPredictor
 from ddg_warp.learn.solve import ChainSolve
 from ddg_warp.learn.supports import Supports
 from ddg_warp.model.state import GroupState
@@ -21,7 +23,7 @@ class Kept:
     Attributes:
         before: the state that it started from.
         x, theta: the solution of its solve; frame: the lagged frames at it.
-        whole: of every rod, the part of the step that its last solve was about.
+        whole: of every rod, the part of the step that its last solve was about; retries: how often that was tried again.
         time: load parameter of an equilibrium.
     """
 
@@ -30,12 +32,8 @@ class Kept:
     theta: wp.array
     frame: wp.array
     whole: wp.array | None
+    retries: wp.array | None = None
     time: float = 0.0
-
-    @property
-    def frames(self) -> tuple[wp.array, wp.array]:
-        """Lagged frames before the step and at its solution; another pair says that they were renewed."""
-        return self.before.frame, self.frame
 
 
 @dataclass
@@ -67,23 +65,27 @@ class ChainAdjoint:
         scheme: of the steps, None for equilibria.
 
     Raises:
-        SceneError: the rods have what no gradient goes through.
+        SceneError: a motion has no gradient; see `Supports`.
     """
 
     def __init__(self, model, group, scheme: str | None):
         self.group, self.model = group, model
         real, kind, device = model.types.real, group.kind, model.wp_device
-        _refuse(group, scheme)
+        midpoint = self._midpoint = scheme == "implicit_midpoint"
         self.device, self.real = device, real
         self.vector = wp.types.vector(kind.dim, real)
         self.solve = ChainSolve(model, group)
-        self.supports = Supports(model, group) if scheme and group.host.moves else None
+        self.supports = Supports(model, group, midpoint) if scheme and group.host.moves else None
+        motion = self.supports.motion if self.supports else None
+        self.drag = ChainDragAdjoint(model, group, midpoint) if kind.drag and scheme else None
+        self.followers = Followers(model, group, midpoint) if group.host.followers and scheme else None
+        self.predictor = ChainPredictor.of(model, group, motion, scheme)
         terms = range(len(kind.terms))
         self._pull = [chain.pull_kernel(kind, i, real) for i in terms]
         self._strain = [chain.strain_kernel(kind, i, real) for i in terms] if kind.viscous else []
         self._frame = chain.frame_kernel(kind, real) if kind.twist else None
         self._nodes, self._edges = chain.gather_kernels(kind, real)
-        self._solution, self._start = step.step_kernels(kind, real, scheme == "implicit_midpoint")
+        self._solution, self._start = step.step_kernels(kind, real, midpoint)
         self._moved = arrays.upload(np.tile(_moved(group), (1, group.worlds)), wp.uint8, device)
         self._rate = wp.zeros(group.columns, dtype=real, device=device)
         self._damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
@@ -110,11 +112,31 @@ class ChainAdjoint:
             gravity=self._make(self.vector),
         )
 
+    def suit(self, step, s: float) -> bool:
+        """From now on reverse solves of a `ChainStep` over s [s] by what suits them; whether that is anything else than before."""
+        changed = self.predictor is not None and self.predictor.suit(step, s)
+        return self.solve.suit(s) or changed
+
+    def upload(self, t0: float, t1: float) -> None:
+        """What supports, loads that follow and the fluid do between t0 and t1, the step whose reverse follows."""
+        for part in filter(None, (self.supports, self.followers, self.drag and self.drag.drag)):
+            part.upload(t0, t1)
+
+    def lagged(self, before: GroupState, states=None) -> wp.array:
+        """The frames that the solve of a step lags as long as it does not renew them; `states` as of `pull`."""
+        if self.predictor is None:
+            return before.frame
+        if self.supports:
+            self.supports.follow(*states)
+        self.predictor.find(before)
+        return self.predictor.frame
+
     def keep(self, step, before: GroupState) -> Kept:
         """What the step that a `ChainStep` has just made leaves for its reverse; `before` has to stay as it is."""
         newton, twist = step.newton, self.group.kind.twist
         theta, frame = (wp.clone(newton.theta), wp.clone(newton.frame)) if twist else (newton.theta, newton.frame)
-        return Kept(before, wp.clone(newton.x), theta, frame, wp.clone(step.islands.portion))
+        islands = step.islands
+        return Kept(before, wp.clone(newton.x), theta, frame, wp.clone(islands.portion), wp.clone(islands.retries))
 
     def pull(self, kept: Kept, after: GroupState, given: GroupState, s: float, states=None) -> tuple:
         """Derivatives by the start of a step, and by what else it read; both are written anew by the next call. Launches alone, but for
@@ -131,10 +153,21 @@ class ChainAdjoint:
         """
         group, kind, before = self.group, self.group.kind, kept.before
         start, inputs, window, lag = self._start_state, self._inputs, self._window, self._lag
-        for array in (window, lag, self._end, inputs.parameters, inputs.rate, start.frame, start.last):
+        for array in (window, lag, self._end, inputs.parameters, inputs.rate, *vars(start).values()):
             arrays.clear(array)
         self._rate.fill_(1.0 / s)
-        by_frame = given.frame
+        by_frame, lagged = (
+            given.frame,
+            start.frame,
+        )  # derivatives by frames of the end, and by those that the solve lags
+        predictor, tangents = self.predictor, before.x
+        if predictor:
+            kept = replace(kept, frame=self.lagged(before, states))
+            arrays.clear(predictor.by_x)
+            if predictor.carries:
+                lagged = predictor.by_frame
+                arrays.clear(lagged)
+            tangents = predictor.x if self._midpoint else tangents
         if kind.viscous:
             # strains of the end, which the next step is damped from
             for kernel in self._strain:
@@ -146,21 +179,33 @@ class ChainAdjoint:
                 self._launch(self._edges, [lag, group.count], [by_frame])
                 arrays.clear(lag)
         if kind.twist:
-            self._launch(self._frame, [after.x, kept.frame, group.count, by_frame], [window, start.frame])
+            self._launch(self._frame, [after.x, kept.frame, group.count, by_frame], [window, lagged])
         self._launch(self._nodes, [window, group.count], [self._end])
         end = [given.x, given.v, given.theta, given.omega, self._end]
-        self._launch(self._solution, [*end, group.fixed, group.count, self._rate], [self._dof, self._right])
-        self.solve(kept, before.last, s, self._right, inputs.load)
+        read = [*end, group.fixed, group.mass, group.rotary, group.count, self._rate]
+        self._launch(self._solution, read, [self._dof, self._right])
+        resisted = self.drag and (self.drag, before, tangents)
+        self.solve(kept, before.last, s, self._right, inputs.load, resisted)
         arrays.clear(window)
         read = [kept.x, kept.theta, kept.frame, before.last, self._rate, *self._parameters, inputs.load]
         for kernel in self._pull:
             self._launch(kernel, read, [window, lag, inputs.parameters, start.last, inputs.rate])
         self._launch(self._nodes, [window, group.count], [self._dof])
         if kind.twist:
-            self._launch(self._edges, [lag, group.count], [start.frame])
+            self._launch(self._edges, [lag, group.count], [lagged])
         if self.supports and kind.twist:
             held = self._dof[: kind.dim], self._dof[kind.dim]
-            self.supports.pull(*states, kept.x, kept.frame, *held, start.frame)
+            self.supports.follow(*states)
+            self.supports.pull(kept.x, kept.frame, *held, lagged)
+        if self.drag:
+            by_tangents = predictor.by_x if self._midpoint else None
+            read = before, tangents, kept, inputs.load, self._rate, self._dof, start, inputs.rate
+            self.drag.pull(*read, by_tangents)
+        if self.followers:
+            w = inputs.load[: kind.dim], inputs.load[kind.dim] if kind.twist else None
+            self.followers.pull(predictor.x, *w, predictor.by_x[: kind.dim])
+        if predictor:
+            predictor.pull(before, self._nodes, window, self._dof, start, inputs.rate)
         self._launch(
             self._start,
             [*end, kept.x, kept.theta, before.x, before.v, before.theta, before.omega, inputs.load, self._dof]
@@ -184,7 +229,8 @@ class ChainAdjoint:
         """Kernels to load before a capture."""
         own = [*self._pull, *self._strain, self._nodes, self._edges, self._solution, self._start]
         own += [*([self._frame] if self._frame else []), *self.solve.kernels]
-        return own + (self.supports.kernels if self.supports else [])
+        parts = (self.supports, self.drag, self.followers, self.predictor)
+        return own + [kernel for part in parts if part for kernel in part.kernels]
 
     @property
     def _parameters(self) -> list:
@@ -200,19 +246,6 @@ class ChainAdjoint:
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
         wp.launch(kernel, (self.group.nodes, self.group.columns), inputs, outputs, device=self.device)
-
-
-def _refuse(group, scheme: str | None) -> None:
-    """What has no gradient yet says so."""
-    for there, what in (
-        (group.kind.drag and scheme, "drag"),
-        (group.host.followers and scheme, "a load that follows the rod"),
-        (group.kind.twist and scheme == "implicit_midpoint", "the midpoint rule with twist"),
-    ):
-        if there:
-            raise SceneError(
-                f"rod {group.host.rods[0]}: no gradient goes through {what} yet; leave it out, or take differences"
-            )
 
 
 def _moved(group) -> np.ndarray:

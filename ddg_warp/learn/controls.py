@@ -3,7 +3,6 @@
 import numpy as np
 import torch
 
-from ddg_warp.errors import SceneError
 from ddg_warp.learn.layout import view
 from ddg_warp.solve.controls import LOADS
 
@@ -38,23 +37,10 @@ class StepControls:
             else:
                 place.copy_(view(engine.before.grips.pose))
 
-    def require(self, name: str) -> None:
-        """Refuse derivatives by a control that has none.
-
-        Raises:
-            SceneError: it has none.
-        """
-        if name == "poses" and self.engine.midpoint:
-            raise SceneError(
-                "no gradient goes through the poses of grips by the midpoint rule yet; take 'implicit_euler', or poses.detach()"
-            )
-
     def pull(self, name: str, value: torch.Tensor, inputs: list, flags) -> torch.Tensor:
         """Derivatives by what a step is given (worlds, ...)."""
         if name == "poses":
-            if self.engine.poses is None:  # which `require` has refused to whoever asks for them
-                return torch.zeros_like(value)
-            return self.engine.poses.pull(inputs, value) * self._by_world(flags)[:, None, None]
+            return self.engine.poses.by_end * self.layout.by_world(flags)[:, None, None]
         result = torch.zeros_like(value)
         model, worlds = self.model, self.model.worlds
         for i, group in enumerate(model.groups):
@@ -87,7 +73,3 @@ class StepControls:
                     first = int(model.order.edge_starts[rod.rod])
                     result[:, first : first + len(rod.edges)] = w[:, torch.as_tensor(rod.edges), 0]
         return result
-
-    def _by_world(self, flags) -> torch.Tensor:
-        """One for worlds in which all has gradients."""
-        return torch.stack([flag.reshape(self.model.worlds, -1).sum(1) * 0.0 + 1.0 for flag in flags]).prod(0)

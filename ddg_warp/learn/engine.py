@@ -16,7 +16,9 @@ from ddg_warp.learn.chains import Kept
 from ddg_warp.learn.controls import StepControls
 from ddg_warp.learn.layout import Layout, copies, tensors, view
 from ddg_warp.learn.net import NetKept
+from ddg_warp.learn.net_predictor import NetPredictor
 from ddg_warp.learn.poses import Poses
+from ddg_warp.learn.predictor import ChainPredictor
 from ddg_warp.learn.tables import Tables
 from ddg_warp.solve import statics
 from ddg_warp.solve.dynamics import Integrator
@@ -60,41 +62,52 @@ class Engine:
         integrator._prepare(dt, self.before)
         self.controls.give(controls)
         integrator.advance(0, start, dt, anew=True)
-        return copies(self.target) + [self._smooth(part, graded) for part in integrator._parts]
+        s = integrator._solved(dt)
+        return copies(self.target) + [self._smooth(part, s, graded) for part in integrator._parts]
 
     @staticmethod
     def fill(places: list[torch.Tensor], values) -> None:
         """Copy tensors to where they are read."""
         torch._foreach_copy_(places, list(values))
 
-    def _smooth(self, part, graded: bool) -> torch.Tensor:
-        """One for islands whose step was one solve in the frames that it began with, else not a number."""
-        key = id(part)
+    def _smooth(self, part, s: float, graded: bool) -> torch.Tensor:
+        """One for islands whose step was one solve over s [s] in the frames that it began with, else not a number."""
+        key, net = id(part), part is self.integrator._net
         if key not in self._flagged:  # of parts that there are; one made anew has another place
             islands, real, device = part.islands, self.model.types.real, self.model.wp_device
-            if part is self.integrator._net:
+            of = (NetPredictor, part.net) if net else (ChainPredictor, part.group)
+            predictor = of[0].of(self.model, of[1], part.motion, self.integrator.scheme)
+            if net:
                 frames = (part._lagged[0], self.before.net.frame) if part.net.edges else ()
-                frames = [frame.reshape((6, self.model.worlds, -1)).transpose((0, 2, 1)) for frame in frames]
             else:
                 frames = (part.newton.frame, self.before.groups[part.index].frame) if part.group.kind.twist else ()
+            if frames and predictor and predictor.carries:
+                frames = frames[0], predictor.frame
+            if net:
+                frames = [frame.reshape((6, self.model.worlds, -1)).transpose((0, 2, 1)) for frame in frames]
             found = wp.ones(len(islands), dtype=real, device=device)
-            read = [*islands.arrays, *(frames or 2 * [wp.zeros((0, 0, 0), dtype=real, device=device)]), found]
+            none = 2 * [wp.zeros((0, 0, 0), dtype=real, device=device)]
+            read = [*islands.arrays, int(predictor is not None), *(frames or none), found]
             launch = wp.launch(smooth_kernel(real), len(islands), read, device=device, record_cmd=True)
-            self._flagged[key] = part, launch, found, view(found)
-        _, launch, _, flags = self._flagged[key]
-        if graded:
-            launch.launch()
-            return flags.clone()
-        return torch.ones_like(flags)
+            self._flagged[key] = part, predictor, launch, found, view(found)
+        _, predictor, launch, _, flags = self._flagged[key]
+        if not graded:
+            return torch.ones_like(flags)
+        if predictor:
+            predictor.suit(part, s)
+            predictor.find(self.before.net if net else self.before.groups[part.index])
+        launch.launch()
+        return flags.clone()
 
     # gradients
 
-    def backward(self, start: float, dt: float, before, after, given) -> tuple[list[torch.Tensor], list]:
+    def backward(self, start: float, dt: float, before, after, given, posed: bool) -> tuple[list[torch.Tensor], list]:
         """Derivatives by the state before a step, and by what else it read, part by part.
 
         Args:
             start, dt: time and length of the step.
             before, after, given: tensors of the states at its ends, and of the derivatives by the latter.
+            posed: whether it was given poses of grips.
         """
         adjoint = self._adjoint()
         self.fill(self.source, before)
@@ -104,8 +117,8 @@ class Engine:
             self._graphs.clear()
         s, parts = self.integrator._solved(dt), list(self._parts)
         for kept, end in zip(parts if self.midpoint else (), self.after.groups, strict=False):
-            x, ends = view(kept.x), (end.x, kept.before.x)
-            torch.mul(sum(view(array) for array in ends), 0.5, out=x)
+            for middle, *ends in ((kept.x, end.x, kept.before.x), (kept.theta, end.theta, kept.before.theta)):
+                torch.mul(sum(view(array) for array in ends), 0.5, out=view(middle))
         if adjoint.net:
             parts.append(self._net_kept(start, dt))
 
@@ -118,6 +131,8 @@ class Engine:
             launch()
         found, inputs = self._found
         self._solved_by = [own.solve.failed for own in adjoint.chains]
+        if self.poses:
+            self.poses.pull_step(found, inputs, self._given, posed)
         if self._by_start is None or adjoint.net:  # memory of rods' derivatives stays
             self._by_start = tensors(found, self.fields)
         return self._by_start, inputs
@@ -128,15 +143,14 @@ class Engine:
             self._given = self.model.empty_state()
             self._by_state = tensors(self._given, self.fields)
             self._graphs = Graphs(self.model, self._load)
-            groups = zip(self.before.groups, self.after.groups, strict=True)
             # laid out as states are, so that a graph can copy it
-            solved = [data.x for data in (self.model.empty_state() if self.midpoint else self.after).groups]
+            solved = (self.model.empty_state() if self.midpoint else self.after).groups
             self._parts = [
-                Kept(before, x, after.theta, before.frame, None)
-                for x, (before, after) in zip(solved, groups, strict=True)
+                Kept(before, at.x, at.theta, before.frame, None)
+                for at, before in zip(solved, self.before.groups, strict=True)
             ]
             self.adjoint = adjoint
-            self.poses = Poses(self) if self.model.grips and not self.midpoint else None
+            self.poses = Poses(self) if self.model.grips else None
         return self.adjoint
 
     def _load(self) -> None:
@@ -153,8 +167,10 @@ class Engine:
             data = self._data_between(start, dt, solved)
         spins = net.host.spins
         if spins:
-            rates = view(after.v).reshape(net.worlds, -1, 3)[:, -spins:]
-            q.view(net.worlds, -1, 3)[:, -spins:] = rates * dt
+            rates = view(after.v)
+            if self.midpoint:  # the mean of those at both ends, over half of the step
+                rates = 0.25 * (rates + view(before.v))
+            q.view(net.worlds, -1, 3)[:, -spins:] = rates.reshape(net.worlds, -1, 3)[:, -spins:] * dt
         return NetKept(before, replace(before, q=solved, data=data), None)
 
     def _data_between(self, start: float, dt: float, q: wp.array) -> dict:
@@ -163,7 +179,8 @@ class Engine:
         step.prescribe(start, start + dt)
         if step.motion:
             step.motion.follow(self.before, self.after)
-            step.motion.direct(self.adjoint.net.supports.islands, q, self.before.net.frame)
+            # normals alone: angles are known
+            step.motion.direct(self.adjoint.net.supports.islands, wp.clone(q), self.before.net.frame)
         return step._data
 
     # equilibria

@@ -214,7 +214,8 @@ class Case:
             states.append(self.simulator.step(states[-1], None, {"poses": self.poses} if self.model.grips else None))
         given = self._by_end(states[-1])
         for before, after in zip(states[-2::-1], states[:0:-1], strict=True):
-            given, read = self.engine.backward(before.time, DT, before.values, after.values, given)
+            posed = bool(self.model.grips)
+            given, read = self.engine.backward(before.time, DT, before.values, after.values, given, posed)
             for each in read:
                 by_rate = sum(own.numpy().sum() for own in (each.rate, *getattr(each, "elements_rate", ())))
                 # an implicit step is over dt, the midpoint rule's over half of it

@@ -9,7 +9,7 @@ import warp as wp
 from ddg_warp.errors import SceneError
 
 # arrays of a state that have gradients, by how their names begin
-GRADIENTS = ("x", "v", "theta", "omega", "frame", "last", "q", "lag")
+GRADIENTS = ("x", "v", "theta", "omega", "frame", "last", "q", "lag", "pose")
 
 
 @dataclass(frozen=True)
@@ -139,10 +139,15 @@ class Layout:
 
     def _flag(self, values: torch.Tensor, field: Field, flags) -> torch.Tensor:
         """Flags of islands as they lie along such an array."""
-        flag = flags[self._part(field.name.partition("/")[0])]
+        part = field.name.partition("/")[0]
+        flag = self.by_world(flags) if part == "grips" else flags[self._part(part)]
         if values.shape[field.axis] != len(flag):  # entries of a net, world by world
             flag = flag.repeat_interleave(values.shape[field.axis] // len(flag))
         return flag if values.ndim == field.axis + 1 else flag[:, None]
+
+    def by_world(self, flags) -> torch.Tensor:
+        """One for worlds in which all has gradients."""
+        return torch.stack([flag.reshape(self.model.worlds, -1).sum(1) * 0.0 + 1.0 for flag in flags]).prod(0)
 
     def places(self, key, find) -> list[torch.Tensor]:
         if key not in self._places:

@@ -7,9 +7,12 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.compile.storage import FREE
-from ddg_warp.errors import SceneError
 from ddg_warp.kernels.adjoint import net as reverse
+from ddg_warp.kernels.drag import block_inertia
 from ddg_warp.kernels.net.elements import FRAME
+from ddg_warp.learn.drag import NetDragAdjoint
+from ddg_warp.learn.followers import Followers
+from ddg_warp.learn.net_predictor import NetPredictor
 from ddg_warp.learn.solve import HostSolve
 from ddg_warp.learn.supports import Supports
 from ddg_warp.model.net import NetState
@@ -24,12 +27,13 @@ class NetKept:
     before: NetState
     solved: NetState
     whole: wp.array | None
+    retries: wp.array | None = None
     time: float = 0.0
 
     @property
-    def frames(self) -> tuple[wp.array, wp.array]:
-        """As of `Kept`."""
-        return self.before.frame, self.solved.frame
+    def frame(self) -> wp.array:
+        """Lagged frames at the solution."""
+        return self.solved.frame
 
 
 @dataclass
@@ -37,7 +41,8 @@ class NetInputs:
     """Derivatives by what a step of a net read beside its state.
 
     Attributes:
-        parameters: of every element set (parameters, W E); data: by its constant data (rows, W E).
+        parameters: of every element set (parameters, W E); data, end_data: by its constant data in the solve and at the end of the step
+            (rows, W E).
         mass: by the masses of the dofs of blocks (W N,); load: by the forces on them, zero at held dofs.
         held: by where held dofs are at the solution (W N,).
         rate, damping, gravity: by what all blocks share, the share of each (W N,).
@@ -45,6 +50,7 @@ class NetInputs:
 
     parameters: list[wp.array] = field(default_factory=list)
     data: list[wp.array] = field(default_factory=list)
+    end_data: list[wp.array] = field(default_factory=list)
     mass: wp.array | None = None
     load: wp.array | None = None
     held: wp.array | None = None
@@ -61,16 +67,20 @@ class NetAdjoint:
         scheme: of the steps, None for equilibria.
 
     Raises:
-        SceneError: the net has what no gradient goes through.
+        SceneError: a motion has no gradient; see `Supports`.
     """
 
     def __init__(self, model, scheme: str | None):
         net, real = model.net, model.types.real
         self.model, self.net, self.real, self.device = model, net, real, model.wp_device
-        _refuse(model, scheme)
         self.solve = HostSolve(NetTangent(model, 0))
         host = net.host
-        self.supports = Supports(model, net) if scheme and host.moves else None
+        midpoint = scheme == "implicit_midpoint"
+        self.supports = Supports(model, net, midpoint) if scheme and host.moves else None
+        motion = self.supports.motion if self.supports else None
+        self._midpoint, drag = midpoint, bool(host.drag and scheme)
+        self.followers = Followers(model, net, midpoint) if host.followers and scheme else None
+        self.predictor = NetPredictor.of(model, net, motion, scheme)
         self._mass = wp.array(host.mass, dtype=net.vector, device=self.device)
         self._gravity = wp.array(np.array(model.scene.gravity, float)[None], dtype=net.vector, device=self.device)
         self._damping = wp.array([model.scene.mass_damping], dtype=real, device=self.device)
@@ -79,7 +89,9 @@ class NetAdjoint:
         self._lags = [reverse.lag_kernel(p.term, real) if p.term.measure.advance else None for p in net.sets]
         self._frame = reverse.frame_kernel(real)
         self._slots, self._frames = reverse.gather_kernels(real)
-        self._solution, self._start = reverse.step_kernels(real, scheme == "implicit_midpoint")
+        self._solution, self._start = reverse.step_kernels(real, midpoint, drag)
+        self.drag = NetDragAdjoint(model, net, midpoint, self._slots) if drag else None
+        self._inertia = self.drag.inertia if drag else wp.zeros((1, 1), dtype=block_inertia(real), device=self.device)
         self._meets = [self._list(part.host.slots, host.blocks) for part in net.sets]
         self._edges = self._list(np.reshape(host.ends, (-1, 2)).T, host.blocks) if net.edges else None
         self._framed = []  # of the frames that elements read
@@ -95,6 +107,24 @@ class NetAdjoint:
         upload = (wp.array(np.ascontiguousarray(v, np.int32), dtype=int, device=self.device) for v in (starts, items))
         return *upload, targets.shape[1]
 
+    def suit(self, step, s: float) -> bool:
+        """As of `ChainAdjoint`, of a `NetStep`."""
+        return self.predictor is not None and self.predictor.suit(step, s)
+
+    def upload(self, t0: float, t1: float) -> None:
+        """As of `ChainAdjoint`."""
+        for part in filter(None, (self.supports, self.followers, self.drag and self.drag.drag)):
+            part.upload(t0, t1)
+
+    def lagged(self, before: NetState, states=None) -> wp.array:
+        """As of `ChainAdjoint`."""
+        if self.predictor is None:
+            return before.frame
+        if self.supports:
+            self.supports.follow(*states)
+        self.predictor.find(before)
+        return self.predictor.state.frame
+
     def keep(self, step, before: NetState) -> NetKept:
         """What the step that a `NetStep` has just made leaves for its reverse; `before` has to stay as it is."""
         net, q = self.net, wp.clone(step.newton.q)
@@ -103,7 +133,8 @@ class NetAdjoint:
         if net.edges:
             frame, lag = step._lagged
             solved = replace(solved, frame=wp.clone(frame), lag=[wp.clone(values) for values in lag])
-        return NetKept(before, solved, wp.clone(step.islands.portion))
+        islands = step.islands
+        return NetKept(before, solved, wp.clone(islands.portion), wp.clone(islands.retries))
 
     def pull(
         self, kept: NetKept, after: NetState, given: NetState, s: float, states=None
@@ -113,9 +144,11 @@ class NetAdjoint:
         rate = 1.0 / s
         start, inputs = net.empty(), NetInputs()
         by_end, by_q = wp.zeros_like(solved.q), wp.zeros_like(solved.q)
-        frame, carried = self._rows(FRAME, net.edges), self._rows(FRAME, net.edges)
+        frame = self._rows(FRAME, net.edges)
         inputs.parameters = [self._rows(len(part.term.parameter_names), part.elements) for part in net.sets]
-        inputs.data = [self._rows(part.term.measure.data_size, part.elements) for part in net.sets]
+        inputs.data, inputs.end_data = (
+            [self._rows(part.term.measure.data_size, part.elements) for part in net.sets] for _ in range(2)
+        )
         last = net.blocks - net.host.spins
         wp.copy(frame, given.frame)
         # strains of the end, which the next step is damped from
@@ -124,25 +157,23 @@ class NetAdjoint:
             if kernel:
                 read = [net.elements(after, i), given.last[i]]
                 self._over(i, kernel, read, [slots[i], lags[i], inputs.parameters[i]])
-        self._collect(slots, lags, by_end, frame, inputs)
-        # own lagged rows of the end, whose frames are as new
-        by_lag = [self._own(i, lag, given.lag[i]) for i, lag in enumerate(lags)]
-        slots, lags = self._shares()
-        for i, kernel in enumerate(self._lags):
-            if kernel:
-                at = net.elements(after, i, solved.q)
-                at.lag = solved.lag[i]
-                self._over(i, kernel, [at, by_lag[i]], [slots[i], lags[i]])
-        self._collect(slots, lags, by_end, frame, inputs)
-        own = [self._own(i, lag) for i, lag in enumerate(lags)]
-        if net.edges:
-            ends = wp.zeros((2, net.edges * net.worlds), dtype=net.vector, device=self.device)
-            read = [solved.q, net.ends, net.blocks, solved.frame, frame]
-            self._launch(self._frame, net.edges * net.worlds, read, [ends, carried])
-            starts, items, count = self._edges
-            self._launch(self._slots, len(by_q), [starts, items, count, net.blocks, ends], [by_end])
+        self._collect(slots, lags, by_end, frame, inputs.end_data)
+        ended, predictor, by_predicted, tangents = solved.q, self.predictor, None, before.q
+        if predictor:
+            self.lagged(before, states)
+            lagged, by_predicted = predictor.state, predictor.by_q
+            by_predicted.zero_()
+            tangents = lagged.q if self._midpoint else tangents
+            solved = replace(solved, frame=lagged.frame, lag=lagged.lag)
+        if self._midpoint:
+            ended = wp.map(wp.add, solved.q, wp.map(wp.sub, solved.q, before.q))
+        carried, own = self._uncarried(solved, after, ended, frame, given.lag, lags, by_end, inputs.end_data)
         # the solve
-        self._launch(self._solution, len(by_q), [given.q, given.v, by_end, rate, last, net.blocks], [by_q])
+        if self.drag:
+            self.drag.resist(before, tangents, rate)
+        self._launch(
+            self._solution, len(by_q), [given.q, given.v, by_end, self._inertia, rate, last, net.blocks], [by_q]
+        )
         w = self._solved(kept, solved, before, rate, by_q)
         slots, lags = self._shares()
         rates = wp.full(net.worlds, rate, dtype=self.real, device=self.device)
@@ -151,24 +182,65 @@ class NetAdjoint:
             at = net.elements(replace(solved, last=before.last), i, rate=rates)
             self._over(i, kernel, [at, w], [slots[i], lags[i], inputs.parameters[i], start.last[i], by_rate])
             inputs.elements_rate.append(by_rate)
-        self._collect(slots, lags, by_q, carried, inputs)
-        start.lag = [self._own(i, lag, more) for i, (lag, more) in enumerate(zip(lags, own, strict=True))]
-        start.frame = carried
+        self._collect(slots, lags, by_q, carried, inputs.data)
+        own = [self._own(i, lag, more) for i, (lag, more) in enumerate(zip(lags, own, strict=True))]
         if self.supports:
+            self.supports.follow(*states)
             frame, by_frame = (net.frames(array) for array in (solved.frame, carried))
             held, angle = net.components(by_q), net.angles(by_q)
-            self.supports.pull(*states, net.points(solved.q), frame, held, angle, by_frame)
+            self.supports.pull(net.points(solved.q), frame, held, angle, by_frame)
         count = len(by_q)
-        inputs.mass, inputs.load, inputs.held, inputs.gravity = wp.zeros_like(by_q), w, by_q, wp.zeros_like(by_q)
         inputs.rate, inputs.damping = (wp.zeros(count, dtype=self.real, device=self.device) for _ in range(2))
+        if self.drag:
+            by_tangents = by_predicted if self._midpoint else start.q
+            read = before, tangents, solved.q, w, rate, by_q, start, inputs.rate
+            self.drag.pull(*read, by_tangents)
+        if self.followers:
+            of = net.components(w), net.angles(w), net.components(by_predicted)
+            self.followers.pull(net.points(lagged.q), *of)
+        if predictor:
+            if predictor.carries:
+                _, lags = self._shares()
+                read = before, lagged, lagged.q, carried, own, lags, by_predicted, inputs.data
+                carried, own = self._uncarried(*read)
+            predictor.pull(before, by_q, start, inputs.rate)
+        start.frame, start.lag = carried, own
+        inputs.mass, inputs.load, inputs.held, inputs.gravity = wp.zeros_like(by_q), w, by_q, wp.zeros_like(by_q)
         self._launch(
             self._start,
             count,
-            [given.q, given.v, by_end, solved.q, before.q, before.v, w, self._stays(by_q), self._mass]
+            [given.q, given.v, by_end, solved.q, before.q, before.v, w, self._stays(by_q), self._inertia, self._mass]
             + [self._gravity, net.host.nodes, last, net.blocks, rate, self._damping],
             [start.q, start.v, inputs.mass, inputs.rate, inputs.damping, inputs.gravity],
         )
         return start, inputs
+
+    def _uncarried(
+        self, before: NetState, after: NetState, q: wp.array, frame: wp.array, given: list, lags: list, by_q, by_data
+    ) -> tuple[wp.array, list[wp.array]]:
+        """Reverse of `DeviceNet.carry`: from derivatives by lagged data of `after` to those by the data of `before`, which it returns,
+        by the blocks q, which are added to `by_q`, and by constant data, which are added to `by_data`.
+
+        Args:
+            frame: by the frames of `after`, added to; given: by own lagged rows, beside what `lags`, shares of elements, bring of them.
+        """
+        net = self.net
+        by_lag = [self._own(i, lag, given[i]) for i, lag in enumerate(lags)]
+        slots, lags = self._shares()
+        for i, kernel in enumerate(self._lags):
+            if kernel:
+                at = net.elements(after, i, q)
+                at.lag = before.lag[i]
+                self._over(i, kernel, [at, by_lag[i]], [slots[i], lags[i]])
+        self._collect(slots, lags, by_q, frame, by_data)
+        carried = self._rows(FRAME, net.edges)
+        if net.edges:
+            ends = wp.zeros((2, net.edges * net.worlds), dtype=net.vector, device=self.device)
+            read = [q, net.ends, net.blocks, before.frame, frame]
+            self._launch(self._frame, net.edges * net.worlds, read, [ends, carried])
+            starts, items, count = self._edges
+            self._launch(self._slots, len(by_q), [starts, items, count, net.blocks, ends], [by_q])
+        return carried, [self._own(i, lag) for i, lag in enumerate(lags)]
 
     def _shares(self) -> tuple[list[wp.array], list[wp.array]]:
         """What slots and lagged data of every set bring, nothing yet."""
@@ -179,7 +251,7 @@ class NetAdjoint:
             lags.append(self._rows(measure.lag_size + measure.data_size, part.elements))
         return slots, lags
 
-    def _collect(self, slots, lags, by_q: wp.array, frame: wp.array, inputs: NetInputs) -> None:
+    def _collect(self, slots, lags, by_q: wp.array, frame: wp.array, by_data: list) -> None:
         """Add shares to the blocks, frames and constant data that they belong to."""
         net = self.net
         for i, (part, slot, lag) in enumerate(zip(net.sets, slots, lags, strict=True)):
@@ -188,7 +260,7 @@ class NetAdjoint:
             if self._framed[i]:
                 starts, items, count = self._framed[i]
                 self._launch(self._frames, net.edges * net.worlds, [starts, items, count, net.edges, lag], [frame])
-            size, data = part.term.measure.lag_size, inputs.data[i]
+            size, data = part.term.measure.lag_size, by_data[i]
             if part.term.measure.data_size:
                 wp.map(wp.add, lag[size:], data, out=data)
 
@@ -207,7 +279,8 @@ class NetAdjoint:
         coefficient = rate * (rate + self.model.scene.mass_damping)
         right = tangent.into(by_q.numpy().astype(float).ravel())
         state = SimpleNamespace(net=replace(solved, last=before.last))
-        w = self.solve(state, rate, coefficient, None if rate else kept.time, right)
+        more = self.drag.matrix if self.drag else None
+        w = self.solve(state, rate, coefficient, None if rate else kept.time, right, more)
         return self._upload(tangent.back(w))
 
     def _stays(self, by_q: wp.array) -> wp.array:
@@ -228,18 +301,6 @@ class NetAdjoint:
 
     def _launch(self, kernel, count: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, count, inputs, outputs, device=self.device)
-
-
-def _refuse(model, scheme: str | None) -> None:
-    """What has no gradient yet says so."""
-    host = model.net.host
-    for there, what in (
-        (host.drag and scheme, "drag"),
-        (host.followers and scheme, "a load that follows what it acts on"),
-        (model.net.edges and scheme == "implicit_midpoint", "the midpoint rule with rods that twist"),
-    ):
-        if there:
-            raise SceneError(f"the net: no gradient goes through {what} yet; leave it out, or take differences")
 
 
 def _moved(host) -> np.ndarray:

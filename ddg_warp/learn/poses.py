@@ -6,11 +6,17 @@ import warp as wp
 
 
 class Poses:
-    """Of an engine's model, for implicit Euler: a point X that a grip holds is at pivot + R (X - pivot) + translation, a director or
-    a normal d at R d."""
+    """Of an engine's model: a point X that a grip holds is at pivot + R (X - pivot) + translation, a director or a normal d at R d.
+
+    By the midpoint rule a point is at the mean of where it is at both ends of the step, and a vector is turned halfway.
+
+    Attributes:
+        by_end: derivatives by poses at the end of the last step that was pulled (worlds, grips, 6).
+    """
 
     def __init__(self, engine):
-        self.model = model = engine.model
+        self.engine, self.model, self._midpoint = engine, engine.model, engine.midpoint
+        model = self.model
         real = wp.dtype_to_torch(model.types.real)
         device = str(wp.device_to_torch(model.wp_device))
 
@@ -41,16 +47,35 @@ class Poses:
                 (index, put(element, torch.long), put(row, torch.long), put(shares), put(rest.numpy()))
             )
 
-    def pull(self, inputs: list, poses: torch.Tensor) -> torch.Tensor:
-        """Derivatives by poses (worlds, grips, 6).
+    def pull_step(self, found, inputs: list, given, posed: bool) -> None:
+        """Put derivatives by poses at the start of the engine's step into those by the state there, `found`, and keep those at the end.
 
         Args:
             inputs: what the reverse of the parts has found.
-            poses: of the grips at the end of the step (worlds, grips, 6).
+            given: derivatives by the state at the end.
+            posed: whether the step was given poses; else they are those of the start.
         """
-        worlds, count = poses.shape[:2]
-        by_shift = torch.zeros((worlds, count, 3), dtype=poses.dtype, device=poses.device)
-        by_turn = torch.zeros((worlds, count, 3, 3), dtype=poses.dtype, device=poses.device)
+
+        def looked(state) -> torch.Tensor:
+            return wp.to_torch(state.grips.pose, requires_grad=False)
+
+        states, worlds = (self.engine.before, self.engine.after, given), self.model.worlds
+        before, after, by_end = (looked(state).T.reshape(worlds, -1, 6) for state in states)
+        by_start, own = self.pull(inputs, before, after)
+        self.by_end = by_end + own
+        by_start = by_start if posed else by_start + self.by_end
+        looked(found).copy_(by_start.reshape(-1, 6).T)
+
+    def pull(self, inputs: list, before: torch.Tensor, after: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Derivatives by the poses of the grips at the start and at the end of a step (worlds, grips, 6).
+
+        Args:
+            inputs: what the reverse of the parts has found.
+            before, after: these poses.
+        """
+        worlds, count = after.shape[:2]
+        by_shift = torch.zeros((worlds, count, 3), dtype=after.dtype, device=after.device)
+        by_turn, by_turned, by_end = (by_shift.new_zeros((worlds, count, 3, 3)) for _ in range(3))
         parts = (*self.model.groups, *([self.model.net] if self.model.net is not None else []))
         for own, places, of, arms, turned, directors in self._owned:
             part = own.supports.part
@@ -61,20 +86,34 @@ class Poses:
             by_turn = by_turn + torch.einsum("wgnc,gnd->wgcd", shares, arms)
             if len(directors):
                 found = wp.to_torch(own.supports.by_director, requires_grad=False)
-                by_turn = by_turn + torch.einsum("gi,iwc,id->wgcd", turned, found, directors)
-        for index, element, row, shares, rest in self._normals:
-            found = wp.to_torch(inputs[-1].data[index], requires_grad=False)
-            found = found.reshape(found.shape[0], worlds, -1)[
-                row[:, None] + torch.arange(3, device=row.device), :, element[:, None]
-            ]
-            by_turn = by_turn + torch.einsum("gi,icw,id->wgcd", shares, found, rest)
-        rotation = poses[..., 3:].detach().requires_grad_()
+                by_turned = by_turned + torch.einsum("gi,iwc,id->wgcd", turned, found, directors)
+        if self._normals:
+            by_turned = by_turned + self._by_normals(inputs[-1].data, worlds)
+            by_end = self._by_normals(inputs[-1].end_data, worlds)
+        share = 0.5 if self._midpoint else 1.0
+        ends = [poses[..., 3:].detach().requires_grad_() for poses in (before, after)]
         with torch.enable_grad():
-            zero = torch.zeros_like(rotation[..., 0])
-            x, y, z = rotation.unbind(-1)
-            skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*rotation.shape, 3)
-            (by_rotation,) = torch.autograd.grad(torch.linalg.matrix_exp(skew), rotation, by_turn)
-        return torch.cat([by_shift, by_rotation], -1)
+            start, end = (_rotation(_quaternion(rotation)) for rotation in ends)
+            solved = _rotation(_halfway(*map(_quaternion, ends))) if self._midpoint else end
+            total = (end * (share * by_turn + by_end)).sum() + (solved * by_turned).sum()
+            if self._midpoint:
+                total = total + (start * (share * by_turn)).sum()
+            found = torch.autograd.grad(total, ends, allow_unused=True)
+        by_start, by_rotation = (
+            torch.zeros_like(r) if own is None else own for own, r in zip(found, ends, strict=True)
+        )
+        shift = (1.0 - share) * by_shift, share * by_shift
+        return torch.cat([shift[0], by_start], -1), torch.cat([shift[1], by_rotation], -1)
+
+    def _by_normals(self, data: list, worlds: int) -> torch.Tensor:
+        """Derivatives by rotations (worlds, grips, 3, 3), from those by the data of element sets with normals that grips turn."""
+        total = 0.0
+        for index, element, row, shares, rest in self._normals:
+            found = wp.to_torch(data[index], requires_grad=False)
+            found = found.reshape(found.shape[0], worlds, -1)
+            found = found[row[:, None] + torch.arange(3, device=row.device), :, element[:, None]]
+            total = total + torch.einsum("gi,icw,id->wgcd", shares, found, rest)
+        return total
 
     def _held(self, part, held: wp.array, places: torch.Tensor) -> torch.Tensor:
         """Derivatives by nodes at places, in space (worlds, nodes, 3)."""
@@ -87,3 +126,27 @@ class Poses:
         result = torch.zeros((worlds, len(places), 3), dtype=values.dtype, device=values.device)
         result[..., list(part.host.axes)] = own.permute(2, 0, 1)
         return result
+
+
+def _quaternion(rotation: torch.Tensor) -> torch.Tensor:
+    """Of rotation vectors (..., 3), its real part last (..., 4)."""
+    square = (rotation * rotation).sum(-1, keepdim=True)
+    small = square < 1e-12
+    angle = torch.where(small, torch.ones_like(square), square).sqrt()
+    sine = torch.where(small, 0.5 - square / 48.0, torch.sin(0.5 * angle) / angle)
+    return torch.cat([rotation * sine, torch.where(small, 1.0 - square / 8.0, torch.cos(0.5 * angle))], -1)
+
+
+def _halfway(start: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
+    """The quaternion halfway on the shorter way from one to another."""
+    near = torch.where((start * end).sum(-1, keepdim=True) < 0.0, -end, end)
+    return torch.nn.functional.normalize(start + near, dim=-1)
+
+
+def _rotation(quaternion: torch.Tensor) -> torch.Tensor:
+    """Its matrix (..., 3, 3)."""
+    x, y, z, w = quaternion.unbind(-1)
+    rows = [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)]
+    rows += [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)]
+    rows += [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)]
+    return torch.stack(rows, -1).reshape(*x.shape, 3, 3)

@@ -27,7 +27,9 @@ class HostSolve:
     def __init__(self, tangent):
         self.tangent = tangent
 
-    def __call__(self, state, rate: float, coefficient: float, factor: float | None, given: np.ndarray) -> np.ndarray:
+    def __call__(
+        self, state, rate: float, coefficient: float, factor: float | None, given: np.ndarray, more=None
+    ) -> np.ndarray:
         """w (size,), zero at held dofs.
 
         Args:
@@ -36,6 +38,7 @@ class HostSolve:
             coefficient: c, zero for an equilibrium [1/s^2].
             factor: load parameter of an equilibrium, whose loads L follow the dofs q; None in a step, where they do not.
             given: g (size,).
+            more: matrix that H has beside these, of drag; None for none.
 
         A singular matrix, of what can move without stiffness, serves a loss that does not depend on that motion.
 
@@ -45,6 +48,8 @@ class HostSolve:
         tangent, following = self.tangent, None
         tangent.rate = wp.full(len(tangent.rate), rate, dtype=tangent.rate.dtype, device=tangent.rate.device)
         matrix = tangent.hessian(state) + sparse.diags(coefficient * tangent.mass)
+        if more is not None:
+            matrix = matrix + tangent.matrix(more)
         if factor is not None:
             following = _total(tangent.load_stiffness(factor, tangent.dofs(state)), self._spun(state, factor))
         free = np.flatnonzero(tangent.free)
@@ -159,13 +164,14 @@ class ChainSolve:
             return [*around, (self.system._sweep, self.system._threads)]
         return [*around, self.system._assemble, *self.reduction.kernels]
 
-    def __call__(self, solved, last: wp.array, s: float, right: wp.array, w: wp.array) -> None:
+    def __call__(self, solved, last: wp.array, s: float, right: wp.array, w: wp.array, resisted=None) -> None:
         """Write w (block, n, R), zero at held dofs, for a right-hand side that is zero there.
 
         Args:
             solved: the solution `x`, `theta` and its lagged `frame`.
             last: strains of the last step.
             s: length of the implicit Euler step [s]; infinite for an equilibrium, of which `solved.time` is the load parameter.
+            resisted: with drag, its `ChainDragAdjoint`, the state before the step, and the nodes that tangents were taken from.
 
         Raises:
             SolverError: H is singular; on the host alone, see `failed`.
@@ -173,7 +179,8 @@ class ChainSolve:
         rate = 1.0 / s
         coefficient = rate * (rate + self.model.scene.mass_damping)
         if self.system is None or not rate:
-            self._on_host(solved, last, rate, coefficient, right, w)
+            more = resisted[0].matrix(*resisted[1:], rate) if resisted else None
+            self._on_host(solved, last, rate, coefficient, right, w, more)
             return
         system = self.system
         system.x, system.theta, system.frame = solved.x, solved.theta, solved.frame
@@ -182,6 +189,8 @@ class ChainSolve:
         islands.coefficient.fill_(coefficient)
         islands.rate.fill_(rate)
         islands.unbalanced.fill_(1)  # every rod wants its matrix
+        if resisted:
+            resisted[0].resist(*resisted[1:], system, islands)
         system.evaluate(last)
         found = w
         if self._cast:
@@ -199,10 +208,10 @@ class ChainSolve:
         if self._cast:
             wp.launch(self._cast[1], w.shape, [found], [w], device=system.device)
 
-    def _on_host(self, solved, last, rate: float, coefficient: float, right: wp.array, w: wp.array) -> None:
+    def _on_host(self, solved, last, rate: float, coefficient: float, right: wp.array, w: wp.array, more) -> None:
         data = SimpleNamespace(x=solved.x, theta=solved.theta, frame=solved.frame, last=last)
         groups = [data if each is self.group else None for each in self.model.groups]
         factor = None if rate else solved.time
         b = arrays.download(right).astype(float).transpose(2, 1, 0).ravel()
-        found = self.host(SimpleNamespace(groups=groups), rate, coefficient, factor, b)
+        found = self.host(SimpleNamespace(groups=groups), rate, coefficient, factor, b, more)
         arrays.assign(w, self.host.tangent.blocks(found).transpose(2, 1, 0))

@@ -70,10 +70,6 @@ class Step(torch.autograd.Function):
     @staticmethod
     def backward(ctx, *given):
         call, saved = ctx.call, ctx.saved_tensors
-        first = 1 + len(saved) - ctx.results - len(call.controls)
-        for name, needed in zip(call.controls, ctx.needs_input_grad[first:], strict=True):
-            if needed:
-                call.engine.controls.require(name)
         found = iter(Pull.apply(call, *saved, *given[: len(call.fields)]))
         count = len(saved) - ctx.results - len(call.fields)
         by_state = [next(found) if field.smooth else None for field in call.fields]
@@ -141,7 +137,8 @@ class Pull(torch.autograd.Function):
         flags = output[count:]
         with engine.stream():
             engine.tables.write(call.parameters, parameters)
-            found, inputs = engine.backward(call.start, call.dt, state, output[:count], given)
+            posed = "poses" in call.controls
+            found, inputs = engine.backward(call.start, call.dt, state, output[:count], given, posed)
             flags = engine.solved(flags)
             by_state = engine.layout.flagged(found, flags)
             by_parameters = engine.tables.pull(call.parameters, inputs, flags)

@@ -7,6 +7,7 @@ from ddg_warp.errors import SceneError
 from ddg_warp.kernels.adjoint.step import angle_kernel
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.solve.motion import Motion
+from ddg_warp.solve.net.prescribed import NetMotion
 
 
 class Supports:
@@ -22,13 +23,13 @@ class Supports:
         SceneError: a motion turns an edge that it does not hold at both ends.
     """
 
-    def __init__(self, model, part):
+    def __init__(self, model, part, midpoint: bool):
         self.model, self.part, real = model, part, model.types.real
         host = part.host
-        self.motion = Motion(model, part)
+        self.motion = NetMotion(model, midpoint) if part is model.net else Motion(model, part, midpoint)
         self.islands = Islands(part.columns, real, model.wp_device)
         self.islands.portion.fill_(1.0)
-        self._angles = angle_kernel(part.dim, real, False)
+        self._angles = angle_kernel(part.dim, real, midpoint)
         turning, ends = host.turning[:, 0], host.edge_ends(host.turning[:, 0])
         loose = np.flatnonzero(~host.holding(ends).all((1, 2)))
         if loose.size:
@@ -49,19 +50,19 @@ class Supports:
         """Poses of the motions that are functions of time."""
         self.motion.upload(t0, t1)
 
-    def pull(
-        self, before, after, x: wp.array, frame: wp.array, held: wp.array, angle: wp.array, by_frame: wp.array
-    ) -> None:
+    def follow(self, before, after) -> None:
+        """Poses of grips between the states of the model at both ends of the step; launches alone."""
+        self.motion.follow(before, after)
+
+    def pull(self, x: wp.array, frame: wp.array, held: wp.array, angle: wp.array, by_frame: wp.array) -> None:
         """Take derivatives by turned angles to those by directors (`by_director`), by the nodes of their edges and by lagged frames.
 
         Args:
-            before, after: states of the model at both ends of the step.
             x, frame: nodes at the solution [node][column], and the lagged frames [component][edge][column].
             held, angle: derivatives by nodes [component][node][column], which are added to, and by angles [edge][column].
             by_frame: derivatives by the lagged frames, which are added to.
         """
         motion = self.motion
-        motion.follow(before, after)
         if len(motion.angles):
             read = [motion.angles, motion.directors, motion.pose, motion.stride, *self.islands.arrays]
             wp.launch(

@@ -150,14 +150,15 @@ def strain_kernel(kind: ChainKind, index: int, real):
 
 
 @cache
-def frame_kernel(kind: ChainKind, real):
-    """pull(...): the reverse of `step.finish_frames_kernel`. Adds to the window, of which only its first edge counts.
+def frame_kernel(kind: ChainKind, real, unit: bool = True):
+    """pull(...): the reverse of `step.finish_frames_kernel`, or, not `unit`, of `search.relag`. Adds to the window, of which only its
+    first edge counts.
 
     The reference twist is found anew at every state; the lagged one only says which turn it is of.
     """
     V, X = wp.types.vector(kind.dim, real), wp.types.vector(3, real)
     along_node, *_ = gather_functions(kind, real)
-    carried = carried_function(real)
+    carried = carried_function(real, unit)
     closed = kind.closed
 
     @wp.func

@@ -8,6 +8,7 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.drag import block_inertia
 from ddg_warp.kernels.net import elements
 from ddg_warp.kernels.net.elements import FRAME, elements_type, place_function
 from ddg_warp.kernels.terms import Term
@@ -216,17 +217,31 @@ def gather_kernels(real):
 
 
 @cache
-def step_kernels(real, midpoint: bool):
+def step_kernels(real, midpoint: bool, drag: bool):
     """solution(...) and start(...) as of `kernels.adjoint.step`, of the blocks of a net. Joints' rotations begin every step at zero."""
     V = wp.types.vector(3, real)
     share = real(2.0 if midpoint else 1.0)
     kept = real(1.0 if midpoint else 0.0)
+
+    Inertia, settles = block_inertia(real), drag and midpoint
+
+    @wp.func
+    def swing(inertia: wp.array2d(dtype=Inertia), i: int, blocks: int):
+        """Of the rate over the solve in that at the end; see `drag.net_kernels`, settle."""
+        result = V(share, share, share)
+        if wp.static(settles):
+            node = inertia[i / blocks, i % blocks]
+            for d in range(3):
+                if node.mass[d] <= real(0.0) and node.resistance[d, d] > real(0.0):
+                    result[d] = real(1.0)
+        return result
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def solution(
         q: wp.array(dtype=V),
         v: wp.array(dtype=V),
         more: wp.array(dtype=V),
+        inertia: wp.array2d(dtype=Inertia),
         rate: real,
         last: int,
         blocks: int,
@@ -234,10 +249,10 @@ def step_kernels(real, midpoint: bool):
     ):
         """`last` is the number of blocks that are no rotations."""
         i = wp.tid()
-        total = more[i]
+        total = more[i] * share
         if i % blocks < last:
-            total += q[i] + v[i] * rate
-        out[i] = total * share
+            total += q[i] * share + wp.cw_mul(swing(inertia, i, blocks), v[i]) * rate
+        out[i] = total
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def start(
@@ -249,6 +264,7 @@ def step_kernels(real, midpoint: bool):
         v0: wp.array(dtype=V),
         w: wp.array(dtype=V),
         held: wp.array(dtype=V),
+        inertia: wp.array2d(dtype=Inertia),
         mass: wp.array(dtype=V),
         gravity: wp.array(dtype=V),
         nodes: int,
@@ -263,7 +279,7 @@ def step_kernels(real, midpoint: bool):
         damping_out: wp.array(dtype=real),
         gravity_out: wp.array(dtype=V),
     ):
-        """`held` is what is left at held dofs that no motion moves."""
+        """`held` is what is left at held dofs that no motion moves. Adds to derivatives by the start and by the rate."""
         i = wp.tid()
         k = i % blocks
         if k >= last:
@@ -273,15 +289,18 @@ def step_kernels(real, midpoint: bool):
         own = w[i]
         step = solved[i] - q0[i]
         before = v0[i]
-        q_out[i] = wp.cw_mul(m, own) * c + held[i] - (q[i] + more[i]) * kept - v[i] * (rate * share)
-        v_out[i] = wp.cw_mul(m, own) * rate - v[i] * kept
+        ended = wp.cw_mul(swing(inertia, i, blocks), v[i])
+        q_out[i] = q_out[i] + wp.cw_mul(m, own) * c + held[i] - (q[i] + more[i]) * kept - ended * rate
+        v_out[i] = v_out[i] + wp.cw_mul(m, own) * rate - (ended - v[i]) * kept
         outer = before * rate - step * c
         if k < nodes:
             outer += gravity[0]
             gravity_out[i] = wp.cw_mul(m, own)
         mass_out[i] = wp.cw_mul(own, outer)
-        rate_out[i] = share * wp.dot(v[i], step) - wp.dot(
-            wp.cw_mul(m, own), step * (real(2.0) * rate + damping[0]) - before
+        rate_out[i] = (
+            rate_out[i]
+            + wp.dot(ended, step)
+            - wp.dot(wp.cw_mul(m, own), step * (real(2.0) * rate + damping[0]) - before)
         )
         damping_out[i] = -rate * wp.dot(wp.cw_mul(m, own), step)
 

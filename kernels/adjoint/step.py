@@ -11,7 +11,7 @@ import warp as wp
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.chain import ChainKind
 from ddg_warp.kernels.gather import column_of, point_functions
-from ddg_warp.kernels.islands import PORTION, STATUS
+from ddg_warp.kernels.islands import PORTION, RETRIES, STATUS
 from ddg_warp.kernels.motion import functions as motion_functions
 from ddg_warp.kernels.motion import reached_function
 from ddg_warp.kernels.threads import CPU_OPTIONS
@@ -23,9 +23,10 @@ def step_kernels(kind: ChainKind, real, midpoint: bool):
     """solution(...): derivatives by the dofs that a solve has found, from those by the end of the step; start(...): by the start of the
     step, masses and what all nodes share, from those and from w.
 
-    `more` is what came to the dofs of the end through its frames and strains.
+    `more` is what came to the dofs of the end through its frames and strains. `start` adds.
     """
     dim, twist = kind.dim, kind.twist
+    settles = kind.drag and midpoint  # rates of what has no inertia are means over the step; see `drag.chain_kernels`
     V = wp.types.vector(dim, real)
     share = real(2.0 if midpoint else 1.0)  # of the solution in the end
     kept = real(1.0 if midpoint else 0.0)  # of minus the start in the end
@@ -38,6 +39,8 @@ def step_kernels(kind: ChainKind, real, midpoint: bool):
         omega: wp.array2d(dtype=real),
         more: wp.array3d(dtype=real),
         fixed: wp.array2d(dtype=wp.uint8),
+        mass: wp.array2d(dtype=real),
+        rotary: wp.array2d(dtype=real),
         count: wp.array(dtype=int),
         rate: wp.array(dtype=real),
         dof_out: wp.array3d(dtype=real),
@@ -48,13 +51,19 @@ def step_kernels(kind: ChainKind, real, midpoint: bool):
         if k >= count[r]:
             return
         mask = int(fixed[k, r])
-        total = x[k, r] + v[k, r] * rate[r]
+        swing = share
+        if wp.static(settles):
+            swing = wp.where(mass[k, r] <= real(0.0), real(1.0), share)
+        total = x[k, r] * share + v[k, r] * (rate[r] * swing)
         for d in range(wp.static(dim)):
-            own = share * (total[d] + more[d, k, r])
+            own = total[d] + share * more[d, k, r]
             dof_out[d, k, r] = own
             right_out[d, k, r] = wp.where(((mask >> d) & 1) == 0, own, real(0.0))
         if wp.static(twist):
-            turn = share * (theta[k, r] + omega[k, r] * rate[r] + more[wp.static(dim), k, r])
+            swing = share
+            if wp.static(settles):
+                swing = wp.where(rotary[k, r] <= real(0.0), real(1.0), share)
+            turn = share * (theta[k, r] + more[wp.static(dim), k, r]) + swing * omega[k, r] * rate[r]
             dof_out[wp.static(dim), k, r] = turn
             right_out[wp.static(dim), k, r] = wp.where(((mask >> wp.static(dim)) & 1) == 0, turn, real(0.0))
 
@@ -94,7 +103,8 @@ def step_kernels(kind: ChainKind, real, midpoint: bool):
         damping_out: wp.array2d(dtype=real),
         gravity_out: wp.array2d(dtype=V),
     ):
-        """`moved` are dofs that a motion puts in place; other held ones stay where the step starts. Adds to the rate's."""
+        """`moved` are dofs that a motion puts in place; other held ones stay where the step starts. Adds to derivatives by positions,
+        velocities, angles and the rate."""
         k, r = wp.tid()
         if k >= count[r]:
             return
@@ -116,11 +126,17 @@ def step_kernels(kind: ChainKind, real, midpoint: bool):
         step = q[k, r] - x0[k, r]
         before = v0[k, r]
         ended = v[k, r]
-        x_out[k, r] = own * (c * m) + stays - by_end * kept - ended * (rho * share)
-        v_out[k, r] = own * (rho * m) - ended * kept
+        turned = share
+        before_kept = kept
+        if wp.static(settles):
+            if m <= real(0.0):
+                turned = real(1.0)
+                before_kept = real(0.0)
+        x_out[k, r] = x_out[k, r] + own * (c * m) + stays - by_end * kept - ended * (rho * turned)
+        v_out[k, r] = v_out[k, r] + own * (rho * m) - ended * before_kept
         mass_out[k, r] = wp.dot(own, gravity[0] - step * c + before * rho)
         gravity_out[k, r] = own * m
-        by_rate = share * wp.dot(ended, step) - m * wp.dot(own, step * (real(2.0) * rho + alpha) - before)
+        by_rate = turned * wp.dot(ended, step) - m * wp.dot(own, step * (real(2.0) * rho + alpha) - before)
         by_damping = -m * rho * wp.dot(own, step)
         if wp.static(twist):
             free = real(0.0)
@@ -133,12 +149,17 @@ def step_kernels(kind: ChainKind, real, midpoint: bool):
             turn = angle[k, r] - theta0[k, r]
             spin = omega0[k, r]
             spun = omega[k, r]
-            theta_out[k, r] = (
-                free * c * j + rests - (theta[k, r] + more[wp.static(dim), k, r]) * kept - spun * (rho * share)
-            )
-            omega_out[k, r] = free * rho * j - spun * kept
+            turned = share
+            before_kept = kept
+            if wp.static(settles):
+                if j <= real(0.0):
+                    turned = real(1.0)
+                    before_kept = real(0.0)
+            by_turn = theta[k, r] + more[wp.static(dim), k, r]
+            theta_out[k, r] = theta_out[k, r] + free * c * j + rests - by_turn * kept - spun * (rho * turned)
+            omega_out[k, r] = free * rho * j - spun * before_kept
             rotary_out[k, r] = free * (spin * rho - turn * c)
-            by_rate += share * spun * turn - j * free * (turn * (real(2.0) * rho + alpha) - spin)
+            by_rate += turned * spun * turn - j * free * (turn * (real(2.0) * rho + alpha) - spin)
             by_damping -= j * rho * free * turn
         rate_out[k, r] = rate_out[k, r] + by_rate
         damping_out[k, r] = by_damping
@@ -199,12 +220,15 @@ def angle_kernel(dim: int, real, midpoint: bool):
 
 @cache
 def smooth_kernel(real):
-    """smooth(...): one for islands whose step was one solve in the frames that it began with, else not a number."""
+    """smooth(...): one for islands whose step was one solve in the frames that it began with, else not a number; at the first attempt,
+    where that is asked (`once`).
+    """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def smooth(
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
+        once: int,
         frame: wp.array3d(dtype=real),
         began: wp.array3d(dtype=real),
         smooth_out: wp.array(dtype=real),
@@ -212,6 +236,7 @@ def smooth_kernel(real):
         """Frames (component, edge, island) are those of the last solve and of the start."""
         r = wp.tid()
         same = flags[STATUS, r] <= wp.static(outcome.CONVERGED_TO_ROUNDING) and scalars[PORTION, r] == real(1.0)
+        same = same and (once == 0 or flags[RETRIES, r] == 0)
         for k in range(frame.shape[1]):
             for c in range(frame.shape[0]):
                 same = same and frame[c, k, r] == began[c, k, r]

@@ -27,13 +27,13 @@ def simulator(name: str, **options) -> Simulator:
     return Simulator(built(SCENES[name]()), DT, **TIGHT, **options)
 
 
-def gripped() -> Simulator:
+def gripped(scheme: str = "implicit_euler") -> Simulator:
     """A rod held at both ends, of which one is moved and turned."""
     scene = a_scene()
     rod = scene.add_rod(CURVE, section=ddg.Ellipse(0.004, 0.003), material=SOFT)
     scene.clamp(rod, motion=ddg.Grip(pivot=(0.1, 0.0, 0.0)))
     scene.clamp(rod, edges=[-1])
-    return Simulator(built(scene), DT, **TIGHT)
+    return Simulator(built(scene), DT, scheme=scheme, **TIGHT)
 
 
 def check(loss, values: dict, sizes: dict) -> None:
@@ -76,13 +76,16 @@ def test_everything_that_goes_in_has_a_gradient(name):
     check(loss, values, sizes | {"stiffness": 1e-3 * float(values["stiffness"].max())})
 
 
-def test_poses_and_moments_have_gradients():
-    own = gripped()
+@pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
+def test_poses_and_moments_have_gradients(scheme):
+    """Of steps that are given poses, and of one that keeps those of the last."""
+    own = gripped(scheme)
 
     def loss(poses, moments):
         state = own.initial_state(2)
         for number in range(3):
             state = own.step(state, None, {"poses": poses * (number + 1), "moments": moments})
+        state = own.step(state)
         return (state.positions**2).sum() + 0.1 * (state.angles[:, 1:-1]).sum() + 0.01 * (state.velocities**2).sum()
 
     poses = torch.tensor([[[0.001, 0.002, -0.001, 0.02, 0.01, 0.03]], [[0.0, 0.001, 0.0, 0.05, -0.04, 0.01]]])

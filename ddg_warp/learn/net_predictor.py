@@ -1,0 +1,126 @@
+"""As `ddg_warp.learn.predictor`, of a net."""
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.compile.precision import straight_turns
+from ddg_warp.kernels.adjoint import turns
+from ddg_warp.kernels.islands import Islands
+from ddg_warp.kernels.net import newton
+from ddg_warp.model.net import NetState
+from ddg_warp.solve.net.system import lists
+from ddg_warp.solve.net.turns import Turns
+
+
+class NetPredictor:
+    """Of a net; see `ChainPredictor`.
+
+    Attributes:
+        state: predicted blocks `q` with lagged data; frame: by the midpoint rule those carried there.
+        by_q: derivatives by predicted blocks, scratch.
+    """
+
+    def __init__(self, model, net, motion, midpoint: bool):
+        host, real, device = net.host, model.types.real, model.wp_device
+        self.model, self.net, self.motion, self._midpoint = model, net, motion, midpoint
+        self.carries = midpoint and net.edges > 0
+        self._islands = Islands(net.worlds, real, device)
+        self._islands.portion.fill_(1.0)
+        self._dt, self._none = (wp.zeros(net.worlds, dtype=real, device=device) for _ in range(2))
+        self._q, self._base, self._target, self.by_q, self._along = (
+            wp.zeros(net.worlds * net.blocks, dtype=net.vector, device=device) for _ in range(5)
+        )
+        self.frame, self._lag = net.lagged() if self.carries else (None, None)
+        self._begin, _ = newton.step_kernels(real, midpoint, arrays.serial(device))
+        self._unplace, self._pass_on, self._turn, self._pull = turns.net_kernels(real, midpoint)
+        plan, loops = host.outwards, np.array([rod.piece.kind.closed for rod in host.rods], int)
+        rod = np.repeat(np.arange(len(loops)), np.diff(plan.start))
+        nodes, ahead = plan.nodes, plan.nodes[plan.ahead(loops)]
+        self._nodes, self._ahead = self._put(nodes), self._put(ahead)
+        anchored = arrays.upload(plan.anchored.astype(np.uint8), wp.uint8, device)
+        self._rods = [self._put(plan.start), self._nodes, anchored, self._put(plan.last_anchors()), self._put(loops)]
+        placed = np.zeros(net.blocks, np.uint8)
+        placed[nodes[~plan.anchored]] = 1
+        self._placed = arrays.upload(placed, wp.uint8, device)
+        self._levels = []  # from the last one on: its rods, and the nodes where they are anchored with the places of each
+        for level in reversed(plan.levels):
+            places = np.flatnonzero(plan.anchored & np.isin(rod, level))
+            meets, index = np.unique(nodes[places], return_inverse=True)
+            starts, items = lists(index.ravel(), len(meets))
+            self._levels.append((self._put(level), *map(self._put, (meets, starts, places[items]))))
+        self._meets = [self._put(values) for values in lists(np.concatenate([nodes, ahead]), net.blocks)]
+        self._excess, self._added, self._by_base, self._by_step = (
+            wp.zeros((net.worlds, len(nodes)), dtype=net.vector, device=device) for _ in range(4)
+        )
+        self._solver = self._for = None
+
+    @classmethod
+    def of(cls, model, net, motion, scheme: str | None) -> "NetPredictor | None":
+        """As of `ChainPredictor`."""
+        midpoint = scheme == "implicit_midpoint"
+        needed = scheme and (net.host.followers or (midpoint and (net.edges or net.host.drag)))
+        return cls(model, net, motion, midpoint) if needed else None
+
+    def suit(self, step, s: float) -> bool:
+        """From now on find those of a `NetStep` that solves over s [s]; whether that is another one."""
+        if self._for != (s, self.model.version):
+            self._for = s, self.model.version
+            self._dt.fill_(2.0 * s if self._midpoint else s)
+            self._islands.turn.assign(np.resize(straight_turns(step.float32_errors(s)), len(self._islands)))
+        if self._solver is not None and self._solver.linear is step.newton.linear:
+            return False
+        self._solver = solver = copy.copy(step.newton)  # which turns what is its own
+        solver.q, solver.base, solver.target, solver.islands = self._q, self._base, self._target, self._islands
+        solver.direction = wp.zeros_like(solver.direction)
+        solver.turns = Turns(solver) if self._levels else None
+        self._mass = step.drag.moves if step.drag else solver.mass
+        return True
+
+    def find(self, before: NetState) -> None:
+        """As of `ChainPredictor`."""
+        net, solver, islands = self.net, self._solver, self._islands
+        islands.todo.zero_()
+        inputs = [before.q, before.v, solver.held, self._mass, self._dt, self._none, self._none, *islands.arrays]
+        outputs = [self._q, self._base, self._target]
+        arrays.sweep(self._begin, net.blocks, [*inputs, net.blocks], outputs, net.device, worlds=net.worlds)
+        if self.motion:
+            self.motion.place(islands, self._q)
+        if solver.turns:
+            solver.turns.predict(before.v, not self._midpoint)
+        self.state = replace(before, q=self._q)
+        if self.carries:
+            self.state = replace(self.state, frame=self.frame, lag=self._lag)
+            net.carry(before, self.state)
+
+    def pull(self, before: NetState, held: wp.array, start: NetState, by_rate: wp.array) -> None:
+        """From derivatives `by_q` to those by the state before the step; adds, and destroys `by_q`.
+
+        Args:
+            before: as of `find`, which has to be the last one found.
+            held: derivatives by where held dofs are; by_rate: those by the rate.
+        """
+        net, islands, worlds = self.net, self._islands, self.net.worlds
+        for array in (self._along, self._excess, self._added, self._by_base, self._by_step):
+            array.zero_()
+        inputs = [*self._rods, self._solver.held, islands.todo, net.blocks, self.by_q]
+        for rods, meets, starts, items in self._levels:
+            self._launch(self._unplace, (len(rods), worlds), [rods, *inputs], [self._excess, self._added])
+            read = [meets, starts, items, net.blocks, self._added]
+            self._launch(self._pass_on, (len(meets), worlds), read, [self.by_q, self._along])
+        held_mass = [self._solver.held, self._mass]
+        read = [self._nodes, self._ahead, self._q, before.q, before.v, *held_mass, islands.rate, islands.turn]
+        read += [islands.todo, net.blocks, self._excess]
+        self._launch(self._turn, (len(self._nodes), worlds), read, [self._by_base, self._by_step])
+        read = [self.by_q, self._along, self._placed, *self._meets, len(self._nodes), self._by_base, self._by_step]
+        read += [before.v, *held_mass, islands.todo, islands.rate, net.blocks]
+        self._launch(self._pull, len(self._q), read, [held, start.q, start.v, by_rate])
+
+    def _put(self, values: np.ndarray) -> wp.array:
+        return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=self.net.device)
+
+    def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim, inputs, outputs, device=self.net.device)

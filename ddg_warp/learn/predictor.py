@@ -1,0 +1,120 @@
+"""Where a step predicts rods to be, found again for the reverse of what its solve lags there, and the reverse of that.
+
+Loads that follow are those on the predicted configuration; so are, by the midpoint rule, frames and drag.
+"""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.compile.precision import straight_turns
+from ddg_warp.kernels import step
+from ddg_warp.kernels.adjoint import chain, turns
+from ddg_warp.kernels.islands import Islands
+
+
+class ChainPredictor:
+    """Of a group of rods, for whole steps that are solved at the first attempt.
+
+    Args:
+        motion: of the supports, None where they rest.
+
+    Attributes:
+        x: predicted nodes; frame: lagged frames, by the midpoint rule carried there.
+        by_x: derivatives by predicted nodes (block, n, R), scratch; by_frame: by carried frames.
+    """
+
+    def __init__(self, model, group, motion, midpoint: bool):
+        kind, real, device = group.kind, model.types.real, model.wp_device
+        self.model, self.group, self.motion, self._midpoint = model, group, motion, midpoint
+        self.carries = kind.twist and midpoint
+        nodes, vector = (group.nodes, group.columns), wp.types.vector(kind.dim, real)
+
+        def make(*rows, dtype=real, needed=True):
+            return arrays.allocate((*rows, *(nodes if needed else (1, 1))), dtype, device)
+
+        self.x, self._base, self._target = (make(dtype=vector) for _ in range(3))
+        self._theta, self._target_angle = (make(needed=kind.twist) for _ in range(2))
+        self.frame, self.by_frame = make(7, needed=kind.twist), make(7, needed=self.carries)
+        self._direction = self._predict = self._for = None
+        self.by_x, self._excess, self._added = (make(kind.block) for _ in range(3))
+        self._islands = Islands(group.columns, real, device)
+        self._islands.portion.fill_(1.0)
+        self._dt = wp.zeros(model.worlds, dtype=real, device=device)
+        self._none = wp.zeros(group.columns, dtype=real, device=device)
+        self._begin = step.begin_kernel(kind, real, midpoint)
+        self._carry = chain.frame_kernel(kind, real, unit=False) if self.carries else None
+        self._pull = turns.predict_kernel(kind, real, midpoint)
+
+    @classmethod
+    def of(cls, model, group, motion, scheme: str | None) -> "ChainPredictor | None":
+        """That of a group's steps by a scheme; None where their solves lag nothing at the predicted configuration."""
+        kind, midpoint = group.kind, scheme == "implicit_midpoint"
+        needed = scheme and (group.host.followers or (midpoint and (kind.twist or kind.drag)))
+        return cls(model, group, motion, midpoint) if needed else None
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture, once it suits."""
+        return [self._begin, self._predict, self._pull, *([self._carry] if self._carry else [])]
+
+    def suit(self, solved, s: float) -> bool:
+        """From now on find those of solves over s [s] by a `ChainStep`; whether that takes other kernels or arrays than before."""
+        linear = solved.newton.linear
+        if self._for != (s, self.model.version):
+            self._for = s, self.model.version
+            self._dt.fill_(2.0 * s if self._midpoint else s)
+            errors = self.group.float32_errors(s)
+            self._islands.turn.assign(np.resize(straight_turns(errors), len(self._islands)))
+        if self._direction is not None and self._direction.dtype is linear:
+            return False
+        kind, real = self.group.kind, self.model.types.real
+        self._direction = arrays.allocate((kind.block, *self.x.shape), linear, self.model.wp_device)
+        self._predict = step.predict_kernel(kind, real, linear, self._midpoint)
+        return True
+
+    def find(self, before) -> None:
+        """Those of a step from the state `before` of the group; launches alone."""
+        group, islands = self.group, self._islands
+        islands.bent.zero_()
+        wp.launch(
+            self._begin,
+            group.node_threads,
+            [before.x, before.v, before.theta, before.omega, before.frame, group.fixed, group.count, group.world]
+            + [self._dt, self._none, self._none, *islands.arrays],
+            [self.x, self._theta, self.frame, self._target, self._target_angle],
+            device=self.model.wp_device,
+        )
+        if self.motion:
+            self.motion.place(islands, self.x)
+        wp.launch(
+            self._predict,
+            group.columns,
+            [before.x, before.v, group.fixed, group.anchor, group.count, *islands.arrays],
+            [self._base, self._direction, self.x, self.frame],
+            device=self.model.wp_device,
+        )
+
+    def pull(self, before, gather, window: wp.array, held: wp.array, start, by_rate: wp.array) -> None:
+        """Add derivatives `by_x`, and those `by_frame` of carried frames, to those by the state before the step, `start`.
+
+        Args:
+            before: as of `find`, which has to be the last one found.
+            gather: kernel that adds what windows bring to nodes; window: scratch.
+            held: derivatives by where held dofs are, which are added to; by_rate: those by the rate, too.
+        """
+        group = self.group
+        if self.carries:
+            arrays.clear(window)
+            self._launch(self._carry, [self.x, before.frame, group.count, self.by_frame], [window, start.frame])
+            self._launch(gather, [window, group.count], [self.by_x])
+        wp.launch(
+            self._pull,
+            group.columns,
+            [self.x, before.x, before.v, group.fixed, group.anchor, group.count, *self._islands.arrays, self.by_x],
+            [self._excess, self._added, held, start.x, start.v, by_rate],
+            device=self.model.wp_device,
+        )
+
+    def _launch(self, kernel, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, (self.group.nodes, self.group.columns), inputs, outputs, device=self.model.wp_device)
