@@ -82,6 +82,7 @@ class ChainAdjoint:
         self.predictor = ChainPredictor.of(model, group, motion, scheme)
         terms = range(len(kind.terms))
         self._pull = [chain.pull_kernel(kind, i, real) for i in terms]
+        self._product = [chain.pull_kernel(kind, i, real, alone=True) for i in terms] if self.solve.guess else []
         self._strain = [chain.strain_kernel(kind, i, real) for i in terms] if kind.viscous else []
         self._frame = chain.frame_kernel(kind, real) if kind.twist else None
         self._nodes, self._edges = chain.gather_kernels(kind, real)
@@ -92,6 +93,7 @@ class ChainAdjoint:
         twisted, viscous = kind.twist, kind.viscous
         self._window, self._lag = self._rows(kind.window), self._rows(13)
         self._end, self._dof, self._right = (self._rows(kind.block) for _ in range(3))
+        self._rest, self._coefficient = self._rows(kind.block, bool(self.solve.guess)), wp.zeros_like(self._rate)
         self._by_frame = self._rows(7, twisted and viscous)
         self._start_state = GroupState(
             x=self._make(self.vector),
@@ -185,11 +187,21 @@ class ChainAdjoint:
         read = [*end, group.fixed, group.mass, group.rotary, group.count, self._rate]
         self._launch(self._solution, read, [self._dof, self._right])
         resisted = self.drag and (self.drag, before, tangents)
-        self.solve(kept, before.last, s, self._right, inputs.load, resisted)
-        arrays.clear(window)
         read = [kept.x, kept.theta, kept.frame, before.last, self._rate, *self._parameters, inputs.load]
+        written = [window, lag, inputs.parameters, start.last, inputs.rate]
+        right = self._right
+        if self.solve.guess and np.isfinite(s):
+            right, rate = self._rest, 1.0 / s
+            self._coefficient.fill_(rate * (rate + self.model.scene.mass_damping))
+            self._launch(self.solve.guess, [self._right, group.mass, self._coefficient], [inputs.load, right])
+            arrays.clear(window)
+            for kernel in self._product:
+                self._launch(kernel, read, written)
+            self._launch(self._nodes, [window, group.count], [right])
+        self.solve(kept, before.last, s, right, inputs.load, resisted)
+        arrays.clear(window)
         for kernel in self._pull:
-            self._launch(kernel, read, [window, lag, inputs.parameters, start.last, inputs.rate])
+            self._launch(kernel, read, written)
         self._launch(self._nodes, [window, group.count], [self._dof])
         if kind.twist:
             self._launch(self._edges, [lag, group.count], [lagged])
@@ -227,7 +239,7 @@ class ChainAdjoint:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [*self._pull, *self._strain, self._nodes, self._edges, self._solution, self._start]
+        own = [*self._pull, *self._product, *self._strain, self._nodes, self._edges, self._solution, self._start]
         own += [*([self._frame] if self._frame else []), *self.solve.kernels]
         parts = (self.supports, self.drag, self.followers, self.predictor)
         return own + [kernel for part in parts if part for kernel in part.kernels]

@@ -118,13 +118,14 @@ class ChainSolve:
     closed rods and of equilibria.
 
     Attributes:
+        guess: where solves are in another precision than the state, the kernel that w starts from; see `guess_kernels`.
         failed: not zero of rods whose H is not positive definite (columns,), so that w means nothing; None on the host.
     """
 
     def __init__(self, model, group):
         self.model, self.group = model, group
         self.host = HostSolve(ChainTangent(model, group, 0))
-        self.system = self.reduction = self.failed = None
+        self.system = self.reduction = self.failed = self.guess = self._cast = self._for = None
         if group.kind.closed:
             return
         self._built(model.types.linear)
@@ -133,7 +134,10 @@ class ChainSolve:
         """From now on solve by what suits steps of s [s], too, in the precision of the model's linear algebra where that leaves w right
         to `CLOSE`; whether that is another solver."""
         real = self.model.types.real
-        if self.system is None or self.system.linear is real or self.group.float32_errors(s).max() <= CLOSE:
+        if self.system is None or self.system.linear is real or self._for == (s, self.model.version):
+            return False
+        self._for = s, self.model.version
+        if not self.group.kind.drag and self.group.float32_errors(s).max() <= CLOSE:
             return False
         self._built(real)
         return True
@@ -141,7 +145,9 @@ class ChainSolve:
     def _built(self, linear) -> None:
         model, group, kind, device = self.model, self.group, self.group.kind, self.model.wp_device
         given = model, group, NewtonOptions(psd="none"), linear
-        self._cast = step.cast_kernels(model.types.real, linear) if linear is not model.types.real else None
+        self.guess = self._cast = None
+        if linear is not model.types.real:
+            self.guess, *self._cast = step.guess_kernels(kind, model.types.real, linear)
         if automatic(group) == "sweep":
             self.system = ChainNewton(*given)
             self._moved = self.system.x, self.system.theta  # what the sweep moves along w
@@ -159,13 +165,13 @@ class ChainSolve:
         """Kernels to load before a capture."""
         if self.system is None:
             return []
-        around = [(self.system._evaluate, 128), *(self._cast or ())]
+        around = [(self.system._evaluate, 128), *([self.guess, *self._cast] if self._cast else [])]
         if self.reduction is None:
             return [*around, (self.system._sweep, self.system._threads)]
         return [*around, self.system._assemble, *self.reduction.kernels]
 
     def __call__(self, solved, last: wp.array, s: float, right: wp.array, w: wp.array, resisted=None) -> None:
-        """Write w (block, n, R), zero at held dofs, for a right-hand side that is zero there.
+        """Write w (block, n, R), zero at held dofs, for a right-hand side that is zero there; with `guess`, add it to what w holds.
 
         Args:
             solved: the solution `x`, `theta` and its lagged `frame`.
@@ -194,7 +200,7 @@ class ChainSolve:
         system.evaluate(last)
         found = w
         if self._cast:
-            wp.launch(self._cast[0], right.shape, [right], [self._right], device=system.device)
+            wp.launch(self._cast[0], right.shape, [right, self.group.fixed], [self._right], device=system.device)
             right, found = self._right, self._found
         if self.reduction is None:
             islands.stale.zero_()  # frames are as they were in the step

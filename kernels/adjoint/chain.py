@@ -16,8 +16,8 @@ from ddg_warp.kernels.variation import carried_function, variation_functions
 
 
 @cache
-def pull_kernel(kind: ChainKind, index: int, real):
-    """pull(...): what the elements of a term bring, -w . dE/dq, by their inputs.
+def pull_kernel(kind: ChainKind, index: int, real, alone: bool = False):
+    """pull(...): what the elements of a term bring, -w . dE/dq, by their inputs; `alone` by the window, -H w.
 
     Adds those by the window, by the lagged data of its two edges and by the rate, and those by the rest measure and the parameters, in
     the rows that the term has in the table.
@@ -84,6 +84,8 @@ def pull_kernel(kind: ChainKind, index: int, real):
         f = spread(dq)
         for i in range(wp.static(kind.window)):
             window_out[i, k, r] = window_out[i, k, r] + f[i]
+        if wp.static(alone):
+            return
         if wp.static(frames):
             for i in range(13):
                 lag_out[i, k, r] = lag_out[i, k, r] + ds[i]

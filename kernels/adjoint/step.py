@@ -246,15 +246,45 @@ def smooth_kernel(real):
 
 
 @cache
-def cast_kernels(real, linear):
-    """down(values, out) and up(values, out): arrays of three dimensions from one precision to another."""
+def guess_kernels(kind: ChainKind, real, linear):
+    """guess(...), down(...) and up(...): the reverse's linear solve in another precision, for what inertia alone does not give.
 
-    def made(source, target):
-        @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-        def cast(values: wp.array3d(dtype=source), out: wp.array3d(dtype=target)):
-            i, k, r = wp.tid()
-            out[i, k, r] = target(values[i, k, r])
+    w is of the size of s times the derivatives by velocities, while what it says of positions is their difference, so that rounding of
+    w weighs 1 / s times as much. As steps solve for increments, this solves H (w - g) = right - H g, with g what inertia alone makes.
+    """
+    dim, block = kind.dim, kind.block
 
-        return cast
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def guess(
+        right: wp.array3d(dtype=real),
+        mass: wp.array2d(dtype=real),
+        coefficient: wp.array(dtype=real),
+        guess_out: wp.array3d(dtype=real),
+        rest_out: wp.array3d(dtype=real),
+    ):
+        """`rest_out` is what the right-hand side has beside inertia; `coefficient` is that of inertia [1/s^2]."""
+        k, r = wp.tid()
+        c = coefficient[r] * mass[k, r]
+        for d in range(wp.static(block)):
+            own = real(0.0)
+            rest = right[d, k, r]
+            if d < wp.static(dim) and c > real(0.0):
+                own = rest / c
+                rest = real(0.0)
+            guess_out[d, k, r] = own
+            rest_out[d, k, r] = rest
 
-    return made(real, linear), made(linear, real)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def down(values: wp.array3d(dtype=real), fixed: wp.array2d(dtype=wp.uint8), out: wp.array3d(dtype=linear)):
+        """Zero at held dofs."""
+        d, k, r = wp.tid()
+        free = ((int(fixed[k, r]) >> d) & 1) == 0
+        out[d, k, r] = wp.where(free, linear(values[d, k, r]), linear(0.0))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def up(values: wp.array3d(dtype=linear), out: wp.array3d(dtype=real)):
+        """Adds."""
+        d, k, r = wp.tid()
+        out[d, k, r] = out[d, k, r] + real(values[d, k, r])
+
+    return guess, down, up
