@@ -48,7 +48,8 @@ class RodParameters(torch.nn.Module):
             {name: torch.nn.Parameter(torch.zeros((batch or 1, 1), dtype=torch.float64)) for name in names}
         )
         self._owned = {name: found[name] for name in names}
-        for own in {each for owned in self._owned.values() for each in owned}:
+        # in one order, as DistributedDataParallel tells buffers of its processes apart by that
+        for own in dict.fromkeys(each for owned in self._owned.values() for each in owned):
             self.register_buffer(f"_{own.replace('.', '_')}", simulator.parameter(own)[:1].clone())
 
     def forward(self) -> dict[str, torch.Tensor]:
