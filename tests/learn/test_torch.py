@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 import pytest
+import warp as wp
 
 import ddg_warp as ddg
 from ddg_warp.errors import SceneError
@@ -320,6 +321,26 @@ def test_what_does_not_fit_is_refused(parameters, controls, message):
         own.step(own.initial_state(2), parameters, controls)
 
 
+def test_float32_solves_for_what_inertia_does_not_give():
+    """Of w itself float32 leaves 1e-4 of such gradients, as w is of the size of dt times those by velocities; of the rest 1e-7."""
+    scene, points = ddg.Scene(gravity=(0.0, 0.0, -9.81)), np.zeros((24, 3))
+    points[:, 0] = np.linspace(0.0, 1.0, len(points))
+    rubber = ddg.Material(young=1e7, poisson=0.5, density=1000.0)
+    scene.clamp(scene.add_rod(points, section=ddg.Circle(0.02), material=rubber))
+    gradients = []
+    for precision in ("float64", "mixed"):
+        own = Simulator(scene.build(device=differences.DEVICE, precision=precision), 0.005, rtol=1e-12)
+        rest = own.initial_state()
+        thrown = torch.zeros_like(rest.positions)
+        thrown[..., 2] = rest.positions[..., 0] ** 2
+        thrown.requires_grad_()
+        *_, state = own.rollout(own.initial_state(velocities=thrown), steps=20)
+        gradients.append(torch.autograd.grad(((state.positions - rest.positions) ** 2).sum(), thrown)[0].cpu().numpy())
+    assert own.engine(1).adjoint.chains[0].solve.system.linear is wp.float32
+    exact, found = gradients
+    assert np.linalg.norm(found - exact) < 1e-6 * np.linalg.norm(exact)
+
+
 @pytest.mark.parametrize("name", ["twisted", "joined", "planar", "sheet"])
 def test_mixed_precision_is_close_to_float64(name):
     """To 1e-4, as asked: by float32 solutions where these are good enough, else by float64."""
@@ -360,7 +381,9 @@ def _learn(rank: int, folder: str, out: str) -> None:
     torch.save(module.module.logarithms["bending"].grad, f"{out}{rank}")
     while not all(os.path.exists(f"{out}{other}") for other in range(2)):
         time.sleep(0.01)
-    os._exit(0)  # torch 2.13 can wait for ever where it takes a group apart: that holds the lock that a thread of gloo's asks for
+    os._exit(
+        0
+    )  # torch 2.13 can wait for ever where it takes a group apart: that holds the lock that a thread of gloo's asks for
 
 
 def test_two_processes_share_a_gradient(tmp_path, device):
