@@ -17,7 +17,7 @@ from ddg_warp.solve.choice import automatic
 from ddg_warp.solve.direct import SingularError, regular
 from ddg_warp.solve.reduction import CyclicReduction
 
-CLOSE = 1e-4  # relative error of float32 solutions up to which gradients take them
+CLOSE = 1e-5  # relative error of float32 solutions up to which gradients take them: from 3e-5 on roll-outs err by 1e-4
 SINGULAR = 1e-6  # part of a right-hand side that a solution may miss; a singular matrix, which has been made regular, misses more
 
 

@@ -322,7 +322,7 @@ def test_what_does_not_fit_is_refused(parameters, controls, message):
 
 
 def test_float32_solves_for_what_inertia_does_not_give():
-    """Of w itself float32 leaves 1e-4 of such gradients, as w is of the size of dt times those by velocities; of the rest 1e-7."""
+    """Within the error of one such solution; of w itself, dt times those by velocities, float32 leaves 1e-4 of these gradients."""
     scene, points = ddg.Scene(gravity=(0.0, 0.0, -9.81)), np.zeros((24, 3))
     points[:, 0] = np.linspace(0.0, 1.0, len(points))
     rubber = ddg.Material(young=1e7, poisson=0.5, density=1000.0)
@@ -338,7 +338,9 @@ def test_float32_solves_for_what_inertia_does_not_give():
         gradients.append(torch.autograd.grad(((state.positions - rest.positions) ** 2).sum(), thrown)[0].cpu().numpy())
     assert own.engine(1).adjoint.chains[0].solve.system.linear is wp.float32
     exact, found = gradients
-    assert np.linalg.norm(found - exact) < 1e-6 * np.linalg.norm(exact)
+    bound = own.model.groups[0].float32_errors(0.005).max()
+    assert bound < 1e-5
+    assert np.linalg.norm(found - exact) < bound * np.linalg.norm(exact)
 
 
 @pytest.mark.parametrize("name", ["twisted", "joined", "planar", "sheet"])
