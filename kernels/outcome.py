@@ -6,7 +6,9 @@ CONVERGED_TO_ROUNDING = 2
 MAX_ITERATIONS = 3
 LINE_SEARCH_FAILED = 4
 NON_FINITE = 5
-INDEFINITE = 6  # the exact Hessian has a negative pivot, and nothing was to be put in its place
+# the exact Hessian has a negative pivot, and nothing was to be put in its place; or, of a net, conjugate gradients have no direction,
+# as their preconditioner is not definite in this precision
+INDEFINITE = 6
 GIVEN_UP = 7  # an earlier step failed for good; the rod rests at its last good state
 LOST_IN_ROUNDING = (
     8  # counted instead of CONVERGED_TO_ROUNDING where rounding decides the motion, and the user allowed that

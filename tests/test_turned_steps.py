@@ -353,3 +353,30 @@ def test_a_net_stalls_by_what_a_whole_step_would_gain(device, length, decrease, 
         wp.launch(judge, 1, [*given, *islands.arrays, best, stalled, forcing, goal], device=device)
         status = int(islands.status.numpy()[0])
         assert status == (outcome.CONVERGED_TO_ROUNDING if stalls and k > STALLED else outcome.ACTIVE)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "decrease", "before", "iteration", "status"),
+    [
+        (2, 1.0, 1.0, 2, outcome.ACTIVE),
+        (3, 1.0, 1.0, 2, outcome.ACTIVE),
+        (3, 0.0, 1.0, 2, outcome.ACTIVE),
+        (3, 0.0, 0.0, 1, outcome.ACTIVE),
+        (3, 0.0, 0.0, 2, outcome.INDEFINITE),
+        (3, np.nan, 0.0, 2, outcome.NON_FINITE),
+    ],
+)
+def test_directions_that_are_not_solved_do_not_stall_a_net(device, wanted, decrease, before, iteration, status):
+    """What they would gain is not known; a world that has none twice in a row ends by name."""
+    real = wp.float64
+    take = search_kernels(real, real, True, False, False)[3]
+    islands, stalled = Islands(1, real, device), wp.full(1, STALLED, dtype=int, device=device)
+    islands.wanted.fill_(wanted)
+    islands.decrement.fill_(before)
+    islands.iteration.fill_(iteration)
+    given = [wp.full(1, v, dtype=real, device=device) for v in (decrease, 0.0)]
+    iterations, work = wp.zeros(1, dtype=int, device=device), wp.zeros(1, dtype=wp.int64, device=device)
+    wp.launch(take, 1, [*given, 1.0, iterations, *islands.arrays, stalled, work], device=device)
+    assert islands.status.numpy()[0] == status
+    if status != outcome.NON_FINITE:
+        assert stalled.numpy()[0] == (STALLED if wanted == 2 else 0)

@@ -69,8 +69,8 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool):
 
         How exactly the next direction is solved follows Eisenstat and Walker (1996). Where that leaves less than a fraction `spare`
         of the tolerance, this fraction is its `goal`. A world whose expected decrease of energy drowns in rounding, and whose
-        residual has not halved in `STALLED` iterations, has converged to rounding: on bad meshes rounding leaves more than the
-        estimate block by block.
+        residual has not halved in `STALLED` iterations whose directions were solved (see `take`), has converged to rounding: on bad
+        meshes rounding leaves more than the estimate block by block.
         """
         w = wp.tid()
         flags[WANTED, w] = 0
@@ -80,7 +80,7 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool):
             flags[STATUS, w] == 0
             and flags[UNBALANCED, w] == 0
             and flags[DROWNED, w] != 0
-            and real(forcing[w]) > real(wp.static(POLISH))
+            and forcing[w] > linear(wp.static(POLISH))  # as rounded as it is
         )
         if polish and flags[ITERATION, w] > 0:
             flags[UNBALANCED, w] = 1
@@ -176,15 +176,26 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool):
         iterations: wp.array(dtype=int),
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
+        stalled: wp.array(dtype=int),
         work: wp.array(dtype=wp.int64),
     ):
-        """Length of the step: whole, or so that nothing turns by more than the cap."""
+        """Length of the step: whole, or so that nothing turns by more than the cap.
+
+        A direction that conjugate gradients have not solved does not tell what a step would gain: no world stalls by it. Where there
+        is none at all, the iterate comes again, without compression in its matrix; if there is none again, the solve ends as
+        indefinite.
+        """
         w = wp.tid()
         if flags[WANTED, w] == 0:
             return
         if not wp.isfinite(decrease[w]):
             flags[STATUS, w] = wp.static(outcome.NON_FINITE)
             return
+        if flags[WANTED, w] == 3:
+            stalled[w] = 0
+            if decrease[w] == real(0.0) and scalars[DECREMENT, w] == real(0.0) and flags[ITERATION, w] > 1:
+                flags[STATUS, w] = wp.static(outcome.INDEFINITE)
+                return
         whole = real(1.0)
         if turn[w] > rotation_cap * rotation_cap:
             whole = rotation_cap / wp.sqrt(turn[w])

@@ -168,10 +168,11 @@ def solver_kernels(linear):
         rho_out[w] = total[w]
         first_out[w] = total[w]
         iterations_out[w] = 0
-        if total[w] > linear(0.0):
+        if total[w] > linear(0.0) and wp.isfinite(total[w]):
             busy_out[0] = 1
-        else:
+        else:  # in this precision the preconditioner is not definite: there is no direction
             wanted[w] = 3
+            negative_out[w] = 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def product(
@@ -257,18 +258,23 @@ def solver_kernels(linear):
         wanted: wp.array(dtype=int),
         busy_out: wp.array(dtype=int),
     ):
-        """Whether a world goes on, by the residual in the norm of the preconditioner; `negative` notes negative curvature."""
+        """Whether a world goes on, by the residual in the norm of the preconditioner.
+
+        `negative` notes negative curvature, and a preconditioner that is not definite: such a norm is negative, or no number.
+        """
         w = wp.tid()
         if wanted[w] != 1:
             return
         iterations[w] = iterations[w] + 1
-        if not curvature[w] > linear(0.0):
+        enough = forcing[w] * forcing[w] * first[w]
+        definite = total[w] >= -enough  # but for rounding
+        if not (curvature[w] > linear(0.0) and definite):
             negative[w] = 1
-        lost = ends(curvature[w], rho[w])
+        lost = ends(curvature[w], rho[w]) or not definite
         rho[w] = total[w]
         if lost or iterations[w] >= limit:
             wanted[w] = 3
-        elif total[w] > forcing[w] * forcing[w] * first[w]:
+        elif total[w] > enough:
             busy_out[0] = 1
         else:
             wanted[w] = 2

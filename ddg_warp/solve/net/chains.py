@@ -54,7 +54,11 @@ class Chains:
 
     @property
     def splits(self) -> bool:
-        """Whether tensions of edges may be unknowns, once the plan is bound: of chains alone, each walked along by a thread."""
+        """Whether tensions of edges may be unknowns, once the plan is bound: of chains alone, each walked along by a thread.
+
+        Between joints that move they were tried, too: as right as float64, 5 to 17 % slower than it on an H200 and 1.2 to 2 times on a
+        CPU core (gridshells of 8 edges, EA L^2 / EI = 1e8, and hair with twigs, where 1/60 s took 11 iterations instead of 7).
+        """
         longest, width = self.plan.chain.shape
         few = long_and_few(longest, self.net.worlds * width, wp.get_device(self.device))
         return self.split or (self.banded and self.plan.alone and not few)

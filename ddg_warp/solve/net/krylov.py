@@ -45,7 +45,7 @@ class ConjugateGradients:
         return [*own, *sums, *(self.levels.kernels if self.levels else [])]
 
     def solve(self) -> None:
-        """Directions; worlds whose curvature is negative on the way are noted, and end with what has been found so far."""
+        """Directions; worlds where H or its preconditioner is not definite are noted, and end with what has been found so far."""
         newton = self.newton
         table, blocks, wanted, anew = newton.system, newton.net.blocks, newton.islands.wanted, newton.anew.wanted
         self._launch(

@@ -297,7 +297,7 @@ class NetNewton:
 
     @property
     def indefinite(self) -> wp.array:
-        """Where conjugate gradients note negative curvature: the iterate comes again, or the next one leaves out compression."""
+        """Where conjugate gradients note what is not definite: the iterate comes again, or the next one leaves out compression."""
         return self.negative if self._repeat else self.islands.clamped
 
     def watch(self) -> None:
@@ -314,7 +314,7 @@ class NetNewton:
             self._take,
             self.worlds,
             [self.decrease, self.turn, self.options.rotation_cap, self.iterations],
-            [*self.islands.arrays, self.pcg_work],
+            [*self.islands.arrays, self.stalled, self.pcg_work],
             device=self.device,
         )
 
