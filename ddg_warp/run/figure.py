@@ -21,7 +21,7 @@ from ddg_warp.io.colors import SCALE
 DPI = 160
 FLAT = 1e-3  # thickness over size below which rods are drawn in their plane
 ELEVATION, AZIMUTH = 18.0, -58.0  # of the eye on solid scenes [degrees]
-WIDEST = 0.76  # that a box is seen, over its diagonal, before a panel beside others cuts it off
+WIDEST = 0.72  # that a box is seen, over its diagonal, before a panel beside others cuts it off
 MARGIN = 0.06  # of the size, around the rods
 FIELD_COLOR = "#c9bfd6"
 ARROWS = {2: 9, 3: 4}  # of a field along the longest side of a picture, by its dimension
