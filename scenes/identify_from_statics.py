@@ -65,6 +65,7 @@ def photograph(state) -> np.ndarray:
     return exact + np.random.default_rng(0).normal(scale=NOISE, size=exact.shape)
 
 
+@_learn.one_thread()
 def learn(seen: np.ndarray) -> dict:
     """EI and GJ from measured points (8, 3) [m].
 

@@ -77,6 +77,7 @@ def gaps(points):
 
 
 @cache
+@_learn.one_thread()
 def learn() -> tuple[np.ndarray, list[float]]:
     """Natural curvatures (6,) [1/m], and the gaps of a coarse finger after every step of the search, root mean square [m]."""
     import torch

@@ -187,11 +187,9 @@ def hinge_bending(surface, plate: Plate, kinds: EdgeKinds) -> list[ElementSet]:
     term, none = _term("shell_hinge", plate), np.zeros((len(edges), 0))
     law = _quadratic(term, lengths / (plate.area[sides].sum(1) / 3.0), plate, sides, plate.angle[edges, 0])
     hinges = ElementSet(term, nodes, none.astype(int), none, law)
-    supported = np.flatnonzero(kinds.kind >= CLAMPED)
     sets = [hinges]
-    pairs = [(edge, side) for edge in supported for side in range(2) if surface.edge_triangles[edge, side] >= 0]
-    if pairs:
-        edges, side = np.array(pairs).T
+    edges, side = _tilts(surface, kinds)
+    if len(edges):
         triangles = surface.edge_triangles[edges, side]
         ends = np.where(side[:, None] == 0, surface.edges[edges], surface.edges[edges, ::-1])
         nodes = np.concatenate([ends, surface.edge_opposite[edges, side][:, None]], axis=1)
@@ -246,6 +244,14 @@ def shell_elements(
     return [membrane(surface, plate), mid_edge_bending(surface, plate, kinds, bending != "midedge")]
 
 
+def triangles_beside(surface, kinds: EdgeKinds, bending: str) -> dict[str, np.ndarray]:
+    """Triangles whose mean stiffness the elements of bending at edges have, by term: two of hinges, one of tilts (., 2 or 1)."""
+    hinges = surface.edge_triangles[_hinges(surface, kinds)[0]]
+    if bending == "isometric":
+        return {"shell_isometric": hinges}
+    return {"shell_hinge": hinges, "shell_tilt": surface.edge_triangles[_tilts(surface, kinds)][:, None]}
+
+
 def turning(kinds: EdgeKinds, bending: str) -> np.ndarray:
     """Edges whose angle is a dof of a bending model (E,) bool."""
     return (kinds.kind == FREE) & (bending == "midedge_boundary") | (kinds.kind <= NEIGHBOUR) & (
@@ -257,6 +263,12 @@ def _hinges(surface, kinds: EdgeKinds) -> tuple[np.ndarray, np.ndarray]:
     """Interior edges without support, and the nodes of their hinges (., 4)."""
     edges = np.flatnonzero(kinds.kind == NEIGHBOUR)
     return edges, np.concatenate([surface.edges[edges], surface.edge_opposite[edges]], axis=1)
+
+
+def _tilts(surface, kinds: EdgeKinds) -> tuple[np.ndarray, np.ndarray]:
+    """Clamped edges and symmetry planes, once for each triangle that they bound, and its side (.,)."""
+    edges, side = np.nonzero((kinds.kind >= CLAMPED)[:, None] & (surface.edge_triangles >= 0))
+    return edges, side
 
 
 def _length_squared(surface, plate: Plate, edges: np.ndarray, triangles: np.ndarray) -> np.ndarray:

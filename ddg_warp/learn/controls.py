@@ -30,6 +30,7 @@ class StepControls:
                     place.copy_(value)
                 else:
                     place.zero_()
+        self.give_field(controls)
         if model.grips:
             place = view(engine.after.grips.pose)
             if "poses" in controls:
@@ -37,12 +38,29 @@ class StepControls:
             else:
                 place.copy_(view(engine.before.grips.pose))
 
+    def give_field(self, controls: dict) -> None:
+        """Hand the integrator the magnetic field of a step."""
+        if not self.model.magnetic:
+            return
+        place = view(self.engine.integrator.field)
+        if "field" in controls:
+            place.copy_(controls["field"].T)
+        else:
+            place.zero_()
+
     def pull(self, name: str, value: torch.Tensor, inputs: list, flags) -> torch.Tensor:
         """Derivatives by what a step is given (worlds, ...)."""
         if name == "poses":
             return self.engine.poses.by_end * self.layout.by_world(flags)[:, None, None]
         result = torch.zeros_like(value)
         model, worlds = self.model, self.model.worlds
+        if name == "field":
+            for part, data in zip(model.net.sets, inputs[-1].data, strict=True):
+                measure = part.term.measure
+                if measure.field:
+                    first = measure.data_size - measure.field
+                    result += view(data)[first : first + 3].reshape(3, worlds, -1).sum(2).T
+            return result * flags[-1][:, None]
         for i, group in enumerate(model.groups):
             found = inputs[i]
             if name == "gravity":

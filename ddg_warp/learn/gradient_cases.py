@@ -149,6 +149,8 @@ class Case:
             if self.model.grips:
                 yield self._control("poses", 0.1, self._normal(WORLDS, len(self.model.grips), 6), self.poses)
             yield self._control("gravity", 10.0, self._normal(WORLDS, 3) * self.down, gravity)
+            if self.model.magnetic:
+                yield self._control("field", 1e-2, self._normal(WORLDS, 3) * self.axes)
         if self.statics:
             for name in ("forces", "moments", "poses"):
                 yield self._shared(

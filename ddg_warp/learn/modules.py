@@ -50,15 +50,20 @@ class RodParameters(torch.nn.Module):
         self._owned = {name: found[name] for name in names}
         # in one order, as DistributedDataParallel tells buffers of its processes apart by that
         for own in dict.fromkeys(each for owned in self._owned.values() for each in owned):
-            self.register_buffer(f"_{own.replace('.', '_')}", simulator.parameter(own)[:1].clone())
+            self.register_buffer(parameter_key(own), simulator.parameter(own)[:1].clone())
 
     def forward(self) -> dict[str, torch.Tensor]:
         """Their values, as `Simulator.step` takes them."""
         return {
-            own: getattr(self, f"_{own.replace('.', '_')}") * self.logarithms[name].exp()
+            own: getattr(self, parameter_key(own)) * self.logarithms[name].exp()
             for name, owned in self._owned.items()
             for own in owned
         }
+
+
+def parameter_key(name: str) -> str:
+    """Of a parameter, as a buffer."""
+    return f"_{name.replace('.', '_')}"
 
 
 def _stiffnesses(model) -> dict[str, list[str]]:

@@ -14,10 +14,8 @@ from ddg_warp.learn.layout import tensors
 from ddg_warp.learn.rollout import Plan, bytes_of, plan, roll
 from ddg_warp.learn.step import Balance, Call, Step
 from ddg_warp.model import validate
-from ddg_warp.model.controls import Controls
+from ddg_warp.model.controls import Controls, require_field
 from ddg_warp.solve.dynamics import SCHEMES
-
-CONTROLS = {"forces": "points", "moments": "edges", "gravity": None, "poses": "grips"}
 
 
 @dataclass(frozen=True)
@@ -80,8 +78,8 @@ class Simulator(torch.nn.Module):
             failed, was made in parts or renewed its frames are not numbers, in these worlds alone.
 
     Parameters are dictionaries from "term.parameter" (see `Model.set_parameter`) to tensors (), (B, 1), (1, E) or (B, E), E the
-    elements that have it. Controls are dictionaries of "forces" (B, P, 3) or (P, 3), "moments" (B, edges), "gravity" (B, 3) or (3,) and
-    "poses" (B, grips, 6), see `Controls`.
+    elements that have it. Controls are dictionaries of "forces" (B, P, 3) or (P, 3), "moments" (B, edges), "gravity" and "field" (B, 3)
+    or (3,), and "poses" (B, grips, 6), see `Controls`.
 
     Raises:
         SceneError: the model has something that no gradient goes through, once one is asked for.
@@ -286,6 +284,7 @@ class Simulator(torch.nn.Module):
             "forces": (model.points_count, 3),
             "moments": (model.order.edges_count,),
             "gravity": (3,),
+            "field": (3,),
             "poses": (len(model.grips), 6),
         }
         result = {}
@@ -301,6 +300,8 @@ class Simulator(torch.nn.Module):
                 raise SceneError(
                     "controls: poses of no grip; hold something by Grip(...), as in scene.clamp(rod, motion=Grip())"
                 )
+            if name == "field":
+                require_field(model)
             if not isinstance(values, torch.Tensor):  # finite, and on what it can act on
                 Controls(**{name: own.cpu().numpy()}).checked(model)
             result[name] = own.to(device=str(wp.device_to_torch(model.wp_device)), dtype=real).expand(worlds, *shape)

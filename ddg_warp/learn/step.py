@@ -137,6 +137,7 @@ class Pull(torch.autograd.Function):
         flags = output[count:]
         with engine.stream():
             engine.tables.write(call.parameters, parameters)
+            engine.controls.give_field(controls)
             posed = "poses" in call.controls
             found, inputs = engine.backward(call.start, call.dt, state, output[:count], given, posed)
             flags = engine.solved(flags)

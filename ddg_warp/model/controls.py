@@ -23,12 +23,14 @@ class Controls:
             rods have, their sum; of a shell of revolution on the whole ring.
         moments: about the tangents of edges (edges,) or (worlds, edges) [N m], in the order of `State.angles`.
         gravity: (3,) or (worlds, 3) [m/s^2], instead of the scene's.
+        field: (3,) or (worlds, 3) [T], a uniform magnetic field on top of the scene's.
     """
 
     poses: Any = None
     forces: Any = None
     moments: Any = None
     gravity: Any = None
+    field: Any = None
 
     def checked(self, model) -> dict[str, np.ndarray]:
         """What is given, by name, each as an array with an axis of worlds (1 or worlds, ...).
@@ -41,6 +43,7 @@ class Controls:
             "forces": (model.points_count, 3),
             "moments": (model.order.edges_count,),
             "gravity": (3,),
+            "field": (3,),
         }
         given = {field.name: getattr(self, field.name) for field in fields(self)}
         found = {
@@ -59,7 +62,7 @@ def checked(controls: Controls | None, model) -> dict[str, np.ndarray]:
         return {}
     if not isinstance(controls, Controls):
         raise SceneError(
-            f"step: controls are {controls!r}; give Controls(poses=..., forces=..., moments=..., gravity=...)"
+            f"step: controls are {controls!r}; give Controls(poses=..., forces=..., moments=..., gravity=..., field=...)"
         )
     return controls.checked(model)
 
@@ -81,8 +84,23 @@ def _numbers(name: str, values, shape: tuple, worlds: int) -> np.ndarray:
     return values if values.ndim > len(shape) else values[None]
 
 
+def require_field(model) -> None:
+    """Refuse a magnetic field as a control where none acts.
+
+    Raises:
+        SceneError: nothing is magnetised, or the scene has no field that it adds to.
+    """
+    if not model.magnetic:
+        raise SceneError(
+            "Controls: a magnetic field acts on nothing; magnetise rods by scene.magnetize, and add scene.magnetic_field((0, 0, 0)) to "
+            "which it adds"
+        )
+
+
 def _refuse_missing(model, found: dict[str, np.ndarray]) -> None:
-    """Refuse poses without grips, and moments about edges without an angle."""
+    """Refuse poses without grips, a magnetic field of nothing, and moments about edges without an angle."""
+    if "field" in found:
+        require_field(model)
     if "poses" in found and not model.grips:
         raise SceneError(
             "Controls: poses of no grip; hold something by Grip(...), as in scene.clamp(rod, motion=Grip())"
@@ -117,6 +135,8 @@ def _refuse_out_of_plane(model, found: dict[str, np.ndarray]) -> None:
     if "forces" in found:
         for point in np.flatnonzero(flat & found["forces"][..., 1].any(0))[:1]:
             raise SceneError(f"Controls: forces: point {point} {text}; give 0 along y")
+    if "field" in found and planar and found["field"][:, 1].any():
+        raise SceneError(f"Controls: field {tuple(found['field'][0].tolist())}: the scene {text}; give 0 along y")
     if "gravity" in found and found["gravity"][:, along].any():
         what = (
             "shells of revolution are about z; give 0 along x and y"

@@ -96,6 +96,11 @@ class Model:
         return self.order.surfaces
 
     @property
+    def magnetic(self) -> bool:
+        """Whether rods of it are in a magnetic field."""
+        return self.net is not None and any(part.term.measure.field for part in self.net.sets)
+
+    @property
     def points_count(self) -> int:
         """Rows of `State.points` in one world."""
         return self.order.points_count

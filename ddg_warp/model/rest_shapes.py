@@ -34,6 +34,21 @@ def principal_form(points, triangles, first, second=0.0, direction=(1.0, 0.0, 0.
     Raises:
         ValueError: the direction is normal to a triangle.
     """
+    (u1, u2), (v1, v2) = np.moveaxis(edges_along(points, triangles, direction), 0, -1)
+    first, second = np.asarray(first, float), np.asarray(second, float)
+    return np.stack(
+        [first * u * v + second * p * q for u, v, p, q in ((u1, u1, v1, v1), (u1, u2, v1, v2), (u2, u2, v2, v2))], -1
+    )
+
+
+def edges_along(points, triangles, direction=(1.0, 0.0, 0.0)) -> np.ndarray:
+    """Components (T, 2, 2) [m] of the first two edges of triangles along a direction (first row) and across it; the columns are a1, a2.
+
+    Arguments as of `principal_form`.
+
+    Raises:
+        ValueError: the direction is normal to a triangle.
+    """
     corners = np.asarray(points, float)[np.asarray(triangles)]
     a1, a2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(a1, a2)
@@ -45,11 +60,7 @@ def principal_form(points, triangles, first, second=0.0, direction=(1.0, 0.0, 0.
         raise ValueError(f"triangle {t}: direction {direction[t]} is normal to it; give one along the surface")
     along /= length[:, None]
     across = np.cross(normal, along)
-    u1, u2, v1, v2 = (_dot(a, d) for d in (along, across) for a in (a1, a2))
-    first, second = np.asarray(first, float), np.asarray(second, float)
-    return np.stack(
-        [first * u * v + second * p * q for u, v, p, q in ((u1, u1, v1, v1), (u1, u2, v1, v2), (u2, u2, v2, v2))], -1
-    )
+    return np.stack([np.stack([_dot(a, d) for a in (a1, a2)], -1) for d in (along, across)], -2)
 
 
 def grown_metric(points, triangles, first, second=None, direction=(1.0, 0.0, 0.0)) -> np.ndarray:

@@ -21,6 +21,7 @@ from ddg_warp.io.colors import SCALE
 DPI = 160
 FLAT = 1e-3  # thickness over size below which rods are drawn in their plane
 ELEVATION, AZIMUTH = 18.0, -58.0  # of the eye on solid scenes [degrees]
+WIDEST = 0.72  # that a box is seen, over its diagonal, before a panel beside others cuts it off
 MARGIN = 0.06  # of the size, around the rods
 FIELD_COLOR = "#c9bfd6"
 ARROWS = {2: 9, 3: 4}  # of a field along the longest side of a picture, by its dimension
@@ -111,7 +112,7 @@ def rods_picture(
             plot.set_axis_off()
             if not len(flat):
                 sides = np.ptp([plot.get_xlim(), plot.get_ylim(), plot.get_zlim()], axis=1)
-                plot.set_box_aspect(sides, zoom=CLOSE * _to_fit(sides))
+                plot.set_box_aspect(sides, zoom=CLOSE * min(_to_fit(sides), WIDEST / _seen(sides)[0]))
             told = f"{label.partition(' [')[0]} {time:.3g} {label.partition('[')[2].rstrip(']')}"
             plot.set_title(told if names is None else names[number], fontsize=9, color=GREY)
     if not side_by_side:
@@ -355,14 +356,15 @@ def _solid_axes(figure: Figure, axes: list[int], low: np.ndarray, high: np.ndarr
 
 def _to_fit(sides: np.ndarray) -> float:
     """Zoom of a box that is seen higher than the cube that matplotlib makes room for; 1 of others."""
-    return min(1.0, _seen_height(np.ones(3)) / _seen_height(sides))
+    return min(1.0, _seen(np.ones(3))[1] / _seen(sides)[1])
 
 
-def _seen_height(sides: np.ndarray) -> float:
-    """Height at which a box is seen, over its diagonal, which is what matplotlib keeps."""
+def _seen(sides: np.ndarray) -> np.ndarray:
+    """Width and height at which a box is seen, over its diagonal, which is what matplotlib keeps."""
     elevation, azimuth = np.radians([ELEVATION, AZIMUTH])
-    seen = np.abs([np.cos(azimuth) * np.sin(elevation), np.sin(azimuth) * np.sin(elevation), np.cos(elevation)])
-    return float(seen @ sides / np.linalg.norm(sides))
+    wide = [np.sin(azimuth), np.cos(azimuth), 0.0]
+    high = [np.cos(azimuth) * np.sin(elevation), np.sin(azimuth) * np.sin(elevation), np.cos(elevation)]
+    return np.abs([wide, high]) @ sides / np.linalg.norm(sides)
 
 
 def _explain_times(figure: Figure, plot, times: np.ndarray, norm: Normalize, label: str, values, names) -> None:

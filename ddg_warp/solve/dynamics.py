@@ -100,6 +100,10 @@ class Integrator:
         validate.require_mass(model)
         validate.refuse_curved_membranes(model)
         self.given: Given | None = None  # loads that steps are given, once one is
+        # the uniform magnetic field that they are given, in every world
+        self.field = None
+        if model.magnetic:
+            self.field = wp.zeros((3, model.worlds), dtype=model.types.real, device=model.wp_device)
         self._chains = [ChainStep(self, model, group) for group in model.groups]
         self._net = NetStep(self, model) if model.net is not None else None
         self._worlds, self._first = Worlds(model), (None, None)
@@ -115,7 +119,7 @@ class Integrator:
 
         Args:
             state: where the step starts; dt: its length [s].
-            controls: poses of grips, loads and gravity of this step, world by world; see `Controls`.
+            controls: poses of grips, loads, gravity and magnetic field of this step, world by world; see `Controls`.
 
         Raises:
             SolverError: a rod could not be stepped within the retries, or float32 would lose its motion in rounding; the message
@@ -252,6 +256,9 @@ class Integrator:
             self._remake()
         if self.given is not None:
             self.given.upload(found)
+        if self.model.magnetic:
+            field = np.broadcast_to(found.get("field", 0.0), (self.model.worlds, 3))
+            self.field.assign(np.ascontiguousarray(field.T))
         if self.model.grips:
             now, then = (self._buffers[i].own.grips.pose for i in (source, 1 - source))
             if "poses" in found:

@@ -65,11 +65,13 @@ def normal_kernels(real, midpoint: bool):
 
 @cache
 def field_kernel(real):
-    """Field and gradient among the data of elements, from row `first` on, in worlds that `moved`; others keep theirs."""
+    """Field and gradient among the data of elements, from row `first` on, in worlds that `moved`, with a uniform field of their own
+    on top; others keep theirs."""
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def put(
         field: wp.array(dtype=real),
+        more: wp.array2d(dtype=real),
         first: int,
         elements: int,
         moved: wp.array(dtype=int),
@@ -79,6 +81,8 @@ def field_kernel(real):
         tid = wp.tid()
         for c in range(field.shape[0]):
             value = field[c]
+            if c < more.shape[0]:
+                value += more[c, tid / elements]
             if moved[tid / elements] == 0:
                 value = before[first + c, tid]
             data_out[first + c, tid] = value

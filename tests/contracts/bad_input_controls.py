@@ -28,6 +28,14 @@ def _gripped_dome():
     return scene.build("cpu", "float64")
 
 
+def _magnetic(dimension: int = 3):
+    scene = ddg.Scene(dimension=dimension)
+    rod = scene.add_rod(np.outer(np.arange(4.0), (1, 0, 0)), section=ddg.Circle(0.01), material=ddg.Material(1e6, density=1e3))
+    scene.magnetize(rod, 1e4)
+    scene.magnetic_field((0.0, 0.0, 0.0))
+    return built(scene)
+
+
 def _told(made, **controls):
     return ddg.Integrator(made).step(made.state(), 0.01, ddg.Controls(**controls))
 
@@ -54,7 +62,10 @@ def _step(controls):
 
 each("Controls", "controls", [3, {"gravity": (0, 0, 1)}, "up"], _step, "step: controls", "Controls(")
 each("Controls", "gravity", [1.0, (0.0, 1.0), "down", NAN, (0.0, 0.0, INF)], lambda v: _told(model(), gravity=v), "Controls: gravity")
+each("Controls", "field", [1.0, (0.0, 1.0), NAN], lambda v: _told(_magnetic(), field=v), "Controls: field")
 refuse("Controls", {
+    "a field of nothing": (lambda: _told(model(), field=(0.0, 0.0, 1.0)), "field acts on nothing", "scene.magnetize", "magnetic_field"),
+    "a field out of the plane": (lambda: _told(_magnetic(dimension=2), field=(0.0, 1.0, 0.0)), "Controls: field", "0 along y"),
     "poses without grips": (lambda: _told(model(), poses=np.zeros((0, 6))), "poses of no grip", "Grip"),
     "poses of one": (lambda: _told(_gripped(), poses=np.zeros((1, 6))), "poses have shape (1, 6)", "(2, 6)", "(2, 2, 6)"),
     "poses of three worlds": (lambda: _told(_gripped(), poses=np.zeros((3, 2, 6))), "poses have shape (3, 2, 6)", "(2, 2, 6)"),

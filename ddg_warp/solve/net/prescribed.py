@@ -51,12 +51,15 @@ class NetMotion(Motion):
 class NetField:
     """The magnetic field among the data of magnetised edges, at the time that the scheme balances forces at and at the end of a step.
 
+    Args:
+        given: the uniform field that a step is given on top of the scene's, in every world (3, worlds) [T]; None where none acts.
+
     Attributes:
         data: of those sets by index, with the field that a solve is about.
     """
 
-    def __init__(self, model, midpoint: bool):
-        self.model, self.net, self.midpoint = model, model.net, midpoint
+    def __init__(self, model, midpoint: bool, given: wp.array | None):
+        self.model, self.net, self.midpoint, self.given = model, model.net, midpoint, given
         self.data = model.net.field_data()
         self._kernel = field_kernel(model.types.real)
         self._now, self._end = (wp.zeros(FIELD, dtype=model.types.real, device=model.wp_device) for _ in range(2))
@@ -83,6 +86,6 @@ class NetField:
 
     def _launch(self, index: int, field: wp.array, moved: wp.array, before: wp.array, after: wp.array) -> None:
         part, first = self.net.sets[index], self.net.sets[index].term.measure.data_size - FIELD
-        inputs = [field, first, part.elements, moved, before]
+        inputs = [field, self.given, first, part.elements, moved, before]
         dim = part.elements * self.model.worlds
         wp.launch(self._kernel, dim, inputs, [after], device=self.model.wp_device)

@@ -63,7 +63,7 @@ class NetStep(PartStep):
             self.loads = ControlledLoads(model, self.net, self.midpoint, given, scale)
         elif host.timed or host.followers:
             self.loads = Loads(model, self.net, self.midpoint)
-        self.field = NetField(model, self.midpoint)
+        self.field = NetField(model, self.midpoint, integrator.field)
         self._data = (self.motion.data if self.motion else {}) | self.field.data
 
     def attempt(self, before, after) -> None:

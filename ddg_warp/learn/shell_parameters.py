@@ -1,0 +1,249 @@
+"""What shells are made of and how they are at rest, as a module that learns it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import warp as wp
+
+from ddg_warp import arguments
+from ddg_warp.compile.shells import triangles_beside
+from ddg_warp.errors import SceneError
+from ddg_warp.learn.modules import parameter_key
+from ddg_warp.model.rest_shapes import edges_along
+
+NUMBERS, FORMS = ("young", "thickness", "poisson"), ("metric", "curvature")  # of one component, and of three
+COMPONENTS = ("11", "12", "22")
+
+
+@dataclass(frozen=True)
+class _ShellTerm:
+    """A term of one shell whose parameters are learned: what each is, by "term.parameter", and whether it resists bending."""
+
+    parameters: dict[str, str]
+    bends: bool
+
+
+class ShellParameters(torch.nn.Module):
+    """What shells are made of, and their forms at rest, over what a simulator's were built with; called, it gives what
+    `Simulator.step` takes.
+
+    Learned are numbers c, zero at first, of whole shells, of triangles, or of what else `by` says:
+
+        young       E exp(c)
+        thickness   h exp(c), of the stiffness of membrane and bending; masses stay those of the model
+        poisson     -1/4 + 3/4 tanh(artanh((4 nu + 1) / 3) + c), between -1 and 1/2
+        metric      F^T exp(2 c) F, c a strain of logarithms
+        curvature   bbar + F^T c F / L, c / L a curvature [1/m]
+
+    where abar = F^T F is the metric that the shell was built with, the rows of F (2, 2) are components along `direction` and across
+    it, L is the root of the area of all triangles, and c of forms are the components 11, 12, 22 along these directions. See van
+    Rees, Vouga and Mahadevan, PNAS 114, 2017, 11597, for both forms as growth of two layers.
+
+    Args:
+        simulator: whose shells they are.
+        names: which are learned, among those above.
+        shells: which, all by default; in what follows their triangles are counted one shell after the other.
+        by: "shell", "element", or an array (T, K) that gives every triangle its share of K numbers, such as values of functions
+            at their centres.
+        batch: worlds that have numbers of their own; by default all share them.
+        direction: (3,) of forms, not normal to any triangle as drawn.
+
+    Attributes:
+        changes: c by name (batch or 1, K), of forms (batch or 1, K, 3).
+
+    Raises:
+        SceneError: there is no such shell, its bending has no such quantity, or its Poisson's ratio is 0.5 and learned.
+        ValueError: the direction is normal to a triangle.
+    """
+
+    def __init__(
+        self,
+        simulator,
+        names=("young",),
+        *,
+        shells=None,
+        by="shell",
+        batch: int | None = None,
+        direction=(1.0, 0.0, 0.0),
+    ):
+        super().__init__()
+        model = simulator.model
+        device = str(wp.device_to_torch(model.wp_device))
+        chosen = _shells(model, names, shells)
+        plates = [shell.plate for _, shell, _ in chosen]
+        counts = [len(plate.abar) for plate in plates]
+        self._names = tuple(names)
+        self._terms, values = _shell_terms(model, chosen, self._names)
+        for own in dict.fromkeys(own for term in self._terms for own in term.parameters):
+            usual = simulator.parameter(own)
+            values[parameter_key(own)] = usual[:1] if (usual == usual[:1]).all() else usual
+        shares = _shares(by, counts)
+        edges = [edges_along(shell.surface.points, shell.surface.triangles, direction) for _, shell, _ in chosen]
+        values |= {
+            "_shares": None if shares is None else torch.as_tensor(shares, dtype=torch.float64),
+            "_basis": torch.tensor(_basis(np.concatenate(edges), np.concatenate([p.abar for p in plates]))),
+            "_size": torch.tensor(np.sqrt(sum(plate.area.sum() for plate in plates))),
+        }
+        for name in ("young", "thickness", "poisson", "abar", "bbar", "bending_stiffness"):
+            values[f"_{name}"] = torch.tensor(np.concatenate([getattr(plate, name) for plate in plates]))
+        for name, value in values.items():
+            self.register_buffer(name, value if value is None else value.detach().to(device).clone())
+        count = sum(counts) if shares is None else shares.shape[1]
+        self.changes = torch.nn.ParameterDict(
+            {
+                name: torch.nn.Parameter(
+                    torch.zeros((batch or 1, count, 3)[: 2 + (name in FORMS)], dtype=torch.float64, device=device)
+                )
+                for name in self._names
+            }
+        )
+
+    def quantities(self) -> dict[str, torch.Tensor]:
+        """All of them as they are now: young [Pa], thickness [m] and poisson (B, T), metric [m^2] and curvature [m] (B, T, 3) as
+        `Scene.add_shell` takes them as `rest`.
+        """
+        c = {name: self._spread(value) for name, value in self.changes.items()}
+        found = {name: getattr(self, f"_{name}")[None] for name in NUMBERS}
+        found |= {"metric": self._abar[None], "curvature": self._bbar[None]}
+        for name in ("young", "thickness"):
+            if name in c:
+                found[name] = found[name] * c[name].exp()
+        if "poisson" in c:
+            found["poisson"] = 0.75 * torch.tanh(torch.atanh((4.0 * self._poisson + 1.0) / 3.0) + c["poisson"]) - 0.25
+        if "metric" in c:
+            stretch = torch.linalg.matrix_exp(2.0 * _matrices(c["metric"]))
+            found["metric"] = _form(self._basis.mT @ stretch @ self._basis)
+        if "curvature" in c:
+            change = self._basis.mT @ _matrices(c["curvature"] / self._size) @ self._basis
+            found["curvature"] = found["curvature"] + _form(change)
+        return found
+
+    def forward(self) -> dict[str, torch.Tensor]:
+        """Values by "term.parameter"."""
+        now, result = self.quantities(), {}
+        stiffer = now["young"] / self._young * now["thickness"] / self._thickness
+        stiffer = stiffer * (1.0 - self._poisson**2) / (1.0 - now["poisson"] ** 2)
+        plate = stiffer * (now["thickness"] / self._thickness) ** 2 * self._bending_stiffness
+        for i, term in enumerate(self._terms):
+            rows, triangles = getattr(self, f"_rows_{i}"), getattr(self, f"_triangles_{i}")
+            for own, what in term.parameters.items():
+                usual = getattr(self, parameter_key(own))
+                if what == "stiffness" and term.bends:
+                    mean = plate[:, triangles].mean(-1) / self._bending_stiffness[triangles].mean(-1)
+                    values = usual[:, rows] * mean
+                elif what == "stiffness":
+                    values = usual[:, rows] * stiffer[:, triangles[:, 0]]
+                else:
+                    values = _of_triangles(what, now)[:, triangles[:, 0]]
+                base = result.get(own, usual).to(values.dtype)
+                worlds = max(len(base), len(values))
+                base, values = base.expand(worlds, -1), values.expand(worlds, -1)
+                result[own] = base.index_copy(1, rows, values)
+        return result
+
+    def _spread(self, change: torch.Tensor) -> torch.Tensor:
+        """Of all triangles (B, T, ...)."""
+        return change if self._shares is None else torch.einsum("tk,bk...->bt...", self._shares, change)
+
+
+def _shells(model, names, shells) -> list[tuple]:
+    """Shells that are learned: their numbers, what the net has of them, and their bending.
+
+    Raises:
+        SceneError: there is no such shell, or it has no such quantity.
+    """
+    held = model.net.host.shells if model.net is not None else []
+    if not held:
+        raise SceneError("ShellParameters: the model has no shell of triangles; add one with Scene.add_shell")
+    for name in names:
+        if name not in NUMBERS + FORMS:
+            raise SceneError(f"ShellParameters: there is no {name!r}; there are {', '.join(NUMBERS + FORMS)}")
+    chosen = range(len(held)) if shells is None else np.atleast_1d(shells).tolist()
+    for shell in chosen:
+        if not 0 <= arguments.index("ShellParameters: shell", shell) < len(held):
+            raise SceneError(f"ShellParameters: shell {shell} does not exist; the model has {len(held)} shells")
+        bending = model.scene.shells[shell].bending
+        for name in names:
+            if name in FORMS and bending in ("hinge", "isometric"):
+                raise SceneError(
+                    f"ShellParameters: shell {shell} ('{model.scene.shells[shell].name}') with bending {bending!r} has no {name} of "
+                    "triangles that could be learned; take 'midedge_dof', or learn the parameters of its hinges"
+                )
+        if "poisson" in names and held[shell].plate.poisson.max() >= 0.5:
+            raise SceneError(
+                f"ShellParameters: shell {shell} ('{model.scene.shells[shell].name}') has a Poisson's ratio of 0.5, the end of its "
+                "range; start with less"
+            )
+    return [(shell, held[shell], model.scene.shells[shell].bending) for shell in chosen]
+
+
+def _shell_terms(model, chosen: list[tuple], names: tuple) -> tuple[list[_ShellTerm], dict]:
+    """Terms that depend on what is learned; the rows of their elements, and the triangles (., 1 or 2) of each, as buffers."""
+    terms, buffers, start = [], {}, 0
+    sets = {part.term.name: part.term for part in model.net.sets}
+    for _, shell, bending in chosen:
+        count = len(shell.surface.triangles)
+        beside = triangles_beside(shell.surface, shell.kinds, bending) if bending in ("hinge", "isometric") else {}
+        for name, first in shell.first.items():
+            bends = "stretch" not in name
+            what = {own: "stiffness" for own in sets[name].stiffness if set(names) & set(NUMBERS)}
+            if name not in beside:
+                what |= {"poisson": "poisson"} if "poisson" in names else {}
+                if "metric" in names:
+                    what |= {"measure": "measure"} | {f"metric_{k}": f"metric_{k}" for k in COMPONENTS}
+                    what |= {} if bends else {f"rest_{k}": f"half_{k}" for k in COMPONENTS}
+                if "curvature" in names and bends:
+                    what |= {f"rest_{k}": f"curvature_{k}" for k in COMPONENTS}
+            triangles = beside.get(name, np.arange(count)[:, None])
+            if what and len(triangles):
+                buffers[f"_rows_{len(terms)}"] = torch.as_tensor(first + np.arange(len(triangles)))
+                buffers[f"_triangles_{len(terms)}"] = torch.as_tensor(start + triangles)
+                terms.append(_ShellTerm({f"{name}.{own}": kind for own, kind in what.items()}, bends))
+        start += count
+    return terms, buffers
+
+
+def _of_triangles(what: str, now: dict[str, torch.Tensor]) -> torch.Tensor:
+    """A parameter of terms of triangles (B, T) from the quantities of shells."""
+    name, _, component = what.partition("_")
+    if name == "poisson":
+        return now["poisson"]
+    if name == "measure":
+        a11, a12, a22 = now["metric"].unbind(-1)
+        return 0.5 * torch.sqrt(a11 * a22 - a12**2)
+    found = 0.5 * now["metric"] if name == "half" else now[name]
+    return found[..., COMPONENTS.index(component)]
+
+
+def _shares(by, counts: list[int]) -> np.ndarray | None:
+    """What triangles have of every number (T, K); None for one each."""
+    if isinstance(by, str) and by in ("shell", "element"):
+        return np.repeat(np.eye(len(counts)), counts, axis=0) if by == "shell" else None
+    shares = arguments.floats(by)
+    if shares.ndim != 2 or len(shares) != sum(counts) or not np.isfinite(shares).all():
+        raise SceneError(
+            f"ShellParameters: by = {by!r}; it is 'shell', 'element' or finite numbers (T, K) of the {sum(counts)} triangles"
+        )
+    return shares
+
+
+def _basis(edges: np.ndarray, abar: np.ndarray) -> np.ndarray:
+    """F (T, 2, 2) with abar = F^T F: the edges as drawn, stretched without rotation to the metric at rest."""
+    inverse = np.linalg.inv(edges)
+    metric = abar[:, [[0, 1], [1, 2]]]
+    square = np.swapaxes(inverse, 1, 2) @ metric @ inverse
+    root = np.sqrt(np.linalg.det(square))[:, None, None]
+    trace = np.trace(square, axis1=1, axis2=2)[:, None, None]
+    return (square + root * np.eye(2)) / np.sqrt(trace + 2.0 * root) @ edges  # square root of a matrix of order 2
+
+
+def _matrices(components: torch.Tensor) -> torch.Tensor:
+    """Symmetric matrices (..., 2, 2) of components (..., 3)."""
+    c11, c12, c22 = components.unbind(-1)
+    return torch.stack([torch.stack([c11, c12], -1), torch.stack([c12, c22], -1)], -1)
+
+
+def _form(matrices: torch.Tensor) -> torch.Tensor:
+    """The components (..., 3) of symmetric matrices."""
+    return torch.stack([matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]], -1)

@@ -1,0 +1,167 @@
+"""Parameters of shells as a module: what it gives is what shells are built with, with gradients through steps and equilibria."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp.errors import SceneError
+from ddg_warp.geometry import meshes
+from ddg_warp.model.rest_shapes import grown_metric, principal_form
+from tests.learn.differences import TIGHT, built
+from tests.learn.test_adjoint import DT
+
+torch = pytest.importorskip("torch")
+from ddg_warp.torch import ShellParameters, Simulator  # noqa: E402
+from tests.learn.test_torch import check  # noqa: E402
+
+NUMBERS, FORMS = ("young", "thickness", "poisson"), ("metric", "curvature")
+BENDING = ("midedge_dof", "midedge_boundary", "midedge", "hinge", "isometric")
+
+
+def mesh(number: int) -> meshes.Mesh:
+    points, triangles = meshes.rectangle(3 - number, 2, (0.3, 0.2))
+    return np.array(points) + [0.0, 0.5 * number, 0.0], triangles
+
+
+def forms(number: int) -> tuple[np.ndarray, np.ndarray]:
+    """At rest: grown along an oblique direction, and curved."""
+    points, triangles = mesh(number)
+    along = (1.0, 0.4, 0.0)
+    return grown_metric(points, triangles, 1.1, 0.9, along), principal_form(points, triangles, 2.0, -1.0, along)
+
+
+def sheets(bending: str = "midedge_dof", values: dict | None = None) -> ddg.Scene:
+    """Two shells, held along one side, with these quantities (one number a triangle of both) or their own."""
+    scene, start = ddg.Scene(gravity=(0.5, 0.0, -9.81)), 0
+    for number in range(2):
+        points, triangles = mesh(number)
+        flat = bending in ("hinge", "isometric")
+        own = {"young": 1e7 * (1.0 + number), "thickness": 0.01, "poisson": 0.3 - 0.1 * number}
+        rest = "flat" if flat else forms(number)
+        if values is not None:
+            own = {name: values[name][0, start : start + len(triangles)] for name in NUMBERS}
+            rest = rest if flat else tuple(values[name][0, start : start + len(triangles)] for name in FORMS)
+        start += len(triangles)
+        thickness, poisson = own.pop("thickness"), own.pop("poisson")
+        material = ddg.Material(own["young"], poisson, density=1000.0, viscosity=0.01)
+        shell = scene.add_shell(points, triangles, thickness=thickness, material=material, bending=bending, rest=rest)
+        held = np.flatnonzero(points[:, 0] <= (0.16 if bending == "isometric" else 0.0))
+        scene.hold(shell, [*held, len(points) - 1])
+        if bending in ("midedge_dof", "hinge"):
+            scene.clamp_boundary(shell, held)
+    return scene
+
+
+def changed(module: ShellParameters, seed: int = 0) -> ShellParameters:
+    """With random changes."""
+    torch.manual_seed(seed)
+    with torch.no_grad():
+        for values in module.changes.values():
+            values.add_(0.2 * torch.randn(values.shape, dtype=values.dtype))
+    return module
+
+
+@pytest.mark.parametrize("bending", BENDING)
+@pytest.mark.parametrize("by", ["shell", "element"])
+def test_what_it_gives_is_what_shells_are_built_with(bending, by):
+    names = NUMBERS if bending in ("hinge", "isometric") else NUMBERS + FORMS
+    own = Simulator(built(sheets(bending)), DT)
+    module = ShellParameters(own, names, by=by)
+    for name, values in module().items():
+        torch.testing.assert_close(values, own.parameter(name), rtol=1e-13, atol=1e-18)
+    values = {name: found.detach().cpu().numpy() for name, found in changed(module).quantities().items()}
+    values = {name: np.broadcast_to(found, (1, 20, *found.shape[2:])) for name, found in values.items()}
+    again = Simulator(built(sheets(bending, values)), DT)
+    moved = module()
+    assert moved
+    for name, found in moved.items():
+        assert (found != own.parameter(name)).any(), name
+        torch.testing.assert_close(found, again.parameter(name), rtol=1e-12, atol=1e-18)
+
+
+def test_curvatures_and_metrics_are_those_along_the_direction():
+    scene = ddg.Scene()
+    points, triangles = mesh(0)
+    scene.add_shell(points, triangles, thickness=0.004, material=ddg.Material(1e6))
+    along = (1.0, 0.4, 0.0)
+    module = ShellParameters(Simulator(built(scene), DT), FORMS, direction=along)
+    size = np.sqrt(0.3 * 0.2)
+    with torch.no_grad():
+        module.changes["curvature"][:] = torch.tensor([3.0 * size, 0.0, -2.0 * size])
+        module.changes["metric"][:] = torch.tensor([np.log(1.2), 0.0, np.log(0.9)])
+    found = {name: values[0].detach().cpu().numpy() for name, values in module.quantities().items()}
+    np.testing.assert_allclose(found["curvature"], principal_form(points, triangles, 3.0, -2.0, along), atol=1e-15)
+    np.testing.assert_allclose(found["metric"], grown_metric(points, triangles, 1.2, 0.9, along), atol=1e-15)
+
+
+@pytest.mark.parametrize("bending", ["midedge_dof", "hinge"])
+@pytest.mark.parametrize("statics", [False, True])
+def test_gradients(bending, statics):
+    """By every quantity, in two worlds, through steps and equilibria, against differences."""
+    names = NUMBERS if bending == "hinge" else NUMBERS + FORMS
+    own = Simulator(built(sheets(bending)), DT, **TIGHT)
+    shares = np.column_stack([np.ones(20), np.linspace(-1.0, 1.0, 20)])
+    module = changed(ShellParameters(own, names, by=shares, batch=2))
+    first = own.equilibrium(module(), batch=2).detach() if statics else None
+    weight = torch.randn((own.model.points_count, 3), dtype=torch.float64)
+
+    def loss(**changes):
+        given = torch.func.functional_call(module, {f"changes.{name}": values for name, values in changes.items()})
+        state = own.equilibrium(given, state=first, start=1.0, rtol=1e-12) if statics else own.initial_state(2)
+        if not statics:
+            *_, state = own.rollout(state, given, steps=3)
+        return (weight * state.positions).sum()
+
+    check(loss, {name: values.detach() for name, values in module.changes.items()}, dict.fromkeys(names, 1e-3))
+
+
+def test_one_of_two_shells_is_learned():
+    own = Simulator(built(sheets()), DT)
+    module = changed(ShellParameters(own, NUMBERS + FORMS, shells=1, by="element"))
+    assert module.changes["metric"].shape == (1, 8, 3)
+    for name, values in module().items():
+        usual = own.parameter(name)
+        torch.testing.assert_close(values[:, :12], usual[:, :12], rtol=0.0, atol=0.0)
+        assert (values[:, 12:] != usual[:, 12:]).any(1).all()
+
+
+def test_copies_and_states():
+    own = Simulator(built(sheets()), DT)
+    module = changed(ShellParameters(own, FORMS))
+    again = ShellParameters(own, FORMS)
+    again.load_state_dict(module.state_dict())
+    for other in (copy.deepcopy(module), pickle.loads(pickle.dumps(module)), again):
+        for name, values in module().items():
+            torch.testing.assert_close(other()[name], values, rtol=0.0, atol=0.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"names": ("density",)}, "there is no 'density'; there are young, thickness, poisson, metric, curvature"),
+        ({"shells": 2}, "shell 2 does not exist; the model has 2 shells"),
+        ({"by": "vertex"}, "'shell', 'element' or finite numbers (T, K) of the 20 triangles"),
+        ({"by": np.ones((12, 2))}, "of the 20 triangles"),
+        ({"by": np.full((20, 1), np.nan)}, "finite numbers"),
+    ],
+)
+def test_what_there_is_not_is_refused(options, words):
+    with pytest.raises(SceneError) as error:
+        ShellParameters(Simulator(built(sheets()), DT), **options)
+    assert words in str(error.value)
+
+
+def test_shells_without_such_forms_are_refused():
+    with pytest.raises(SceneError, match=r"shell 0 .* with bending 'hinge' has no curvature of triangles"):
+        ShellParameters(Simulator(built(sheets("hinge")), DT), ("curvature",))
+    scene, (points, triangles) = ddg.Scene(), mesh(0)
+    scene.add_shell(points, triangles, thickness=0.004, material=ddg.Material(1e6, 0.5))
+    with pytest.raises(SceneError, match="the end of its range"):
+        ShellParameters(Simulator(built(scene), DT), ("poisson",))
+    scene = ddg.Scene()
+    scene.add_rod([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]], section=ddg.Circle(0.01), material=ddg.Material(1e6))
+    with pytest.raises(SceneError, match="the model has no shell of triangles"):
+        ShellParameters(Simulator(built(scene), DT))
