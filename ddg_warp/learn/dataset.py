@@ -202,7 +202,9 @@ class Recordings(torch.utils.data.Dataset):
         return values.reshape(len(values), source.worlds, -1)[:, world]
 
     def _tensor(self, values) -> torch.Tensor:
-        return torch.tensor(values, dtype=DTYPES[self._dtype])
+        return torch.tensor(
+            values, dtype=DTYPES[self._dtype], device="cpu"
+        )  # as loaders hand on, whatever the default is
 
 
 def _sources(path: Path, split: str | None, failed: bool) -> list[Source]:

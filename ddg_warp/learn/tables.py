@@ -137,17 +137,17 @@ class Tables:
         for name in names:
             for (_, rows, chain), (index, row) in zip(self.of(name)[1], self._rows(name), strict=True):
                 if chain:
-                    result.append(self._by(inputs[index].parameters)[row] * flags[index])
+                    result.append(self._by(index, inputs[index].parameters)[row] * flags[index])
                 else:
                     values = view(inputs[-1].parameters[index])[row]
                     result.append(values.reshape(worlds, len(rows)) * flags[-1][:, None])
         return result
 
-    def _by(self, array: wp.array) -> torch.Tensor:
-        """A tensor that looks at derivatives of rods, whose memory stays."""
-        if id(array) not in self._seen:
-            self._seen[id(array)] = array, view(array)
-        return self._seen[id(array)][1]
+    def _by(self, index: int, array: wp.array) -> torch.Tensor:
+        """A tensor that looks at derivatives of a group of rods, whose memory stays from step to step."""
+        if self._seen.get(index, (None,))[0] is not array:
+            self._seen[index] = array, view(array)
+        return self._seen[index][1]
 
     def _rows(self, name: str) -> list[tuple[int, int]]:
         """Of the parts that have a parameter, in the order of `of`: which it is, and the row that it has in their tables."""

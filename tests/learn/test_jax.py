@@ -97,7 +97,7 @@ def test_states_of_torch_pass_without_a_copy(jax):
     for tensor in (state.detach().positions, gradient):
         array = jax.dlpack.from_dlpack(tensor)
         assert array.unsafe_buffer_pointer() == tensor.data_ptr()
-        np.testing.assert_array_equal(array, tensor.numpy())
+        np.testing.assert_array_equal(array, tensor.cpu().numpy())
 
 
 @pytest.mark.parametrize("name", ["twisted", "sheet"])

@@ -12,7 +12,11 @@ torch = pytest.importorskip("torch")
 from ddg_warp.torch import Simulator  # noqa: E402
 from tests.learn.test_torch import check  # noqa: E402
 
-FIELDS = torch.tensor([[1e-2, 2e-2, -3e-2], [0.0, -1e-2, 2e-2]], dtype=torch.float64)  # of two worlds [T]
+
+@pytest.fixture
+def fields() -> torch.Tensor:
+    """Of two worlds [T], on the device under test."""
+    return torch.tensor([[1e-2, 2e-2, -3e-2], [0.0, -1e-2, 2e-2]], dtype=torch.float64)
 
 
 def magnet(scheme: str, field=(0.0, 0.0, 0.0), dimension: int = 3) -> Simulator:
@@ -29,82 +33,82 @@ def magnet(scheme: str, field=(0.0, 0.0, 0.0), dimension: int = 3) -> Simulator:
 
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
-def test_it_is_as_if_the_scene_had_it(scheme):
+def test_it_is_as_if_the_scene_had_it(scheme, fields):
     """Of two worlds each moves as in a scene with the sum of both fields, also one that changes with time."""
     own = magnet(scheme, lambda t: (0.0, 0.5 * t, 0.0))
-    moved = own.rollout(own.initial_state(2), None, {"field": FIELDS}, steps=4)[-1].positions
-    for world, field in enumerate(FIELDS.tolist()):
+    moved = own.rollout(own.initial_state(2), None, {"field": fields}, steps=4)[-1].positions
+    for world, field in enumerate(fields.tolist()):
         other = magnet(scheme, lambda t, field=field: np.add(field, (0.0, 0.5 * t, 0.0)))
         usual = other.rollout(other.initial_state(1), steps=4)[-1].positions[0]
         torch.testing.assert_close(moved[world], usual, rtol=1e-9, atol=1e-12)
     without = own.rollout(own.initial_state(2), steps=4)[-1].positions
     assert (moved - without).abs().max() > 1e-5
-    again = own.rollout(own.initial_state(2), None, {"field": FIELDS}, steps=4)[-1].positions
+    again = own.rollout(own.initial_state(2), None, {"field": fields}, steps=4)[-1].positions
     torch.testing.assert_close(again, moved, rtol=0.0, atol=0.0)
 
 
-def test_steps_of_an_integrator_take_it():
+def test_steps_of_an_integrator_take_it(fields):
     own = magnet("implicit_euler")
-    moved = own.rollout(own.initial_state(1), None, {"field": FIELDS[0]}, steps=3)[-1].positions[0]
+    moved = own.rollout(own.initial_state(1), None, {"field": fields[0]}, steps=3)[-1].positions[0]
     integrator, state = ddg.Integrator(own.model, **TIGHT), own.model.state()
     for _ in range(3):
-        state = integrator.step(state, DT, ddg.Controls(field=FIELDS[0].tolist()))
+        state = integrator.step(state, DT, ddg.Controls(field=fields[0].tolist()))
     np.testing.assert_array_equal(state.points(), moved.cpu().numpy())
     rest = integrator.step(state, DT).points()
     assert np.abs(rest - integrator.step(state, DT, ddg.Controls(field=(0.0, 0.0, 0.1))).points()).max() > 1e-6
 
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
-def test_gradients_of_every_step(scheme):
+def test_gradients_of_every_step(scheme, fields):
     """Each of three steps has a field of its own, also where the reverse comes after other steps."""
     own = magnet(scheme)
     torch.manual_seed(0)
     weight = torch.randn((own.model.points_count, 3), dtype=torch.float64)
 
-    def loss(fields):
+    def loss(given):
         state = own.initial_state(2)
-        for field in fields:
+        for field in given:
             state = own.step(state, None, {"field": field})
         found = (weight * state.positions).sum() + 0.1 * (weight * state.velocities).sum()
-        own.step(own.initial_state(2), None, {"field": 10.0 * FIELDS})
+        own.step(own.initial_state(2), None, {"field": 10.0 * fields})
         return found
 
-    check(loss, {"fields": torch.stack([FIELDS, -FIELDS, 2.0 * FIELDS])}, {"fields": 1e-3})
+    check(loss, {"given": torch.stack([fields, -fields, 2.0 * fields])}, {"given": 1e-3})
 
 
-def test_one_field_of_all_worlds_and_vmap():
+def test_one_field_of_all_worlds_and_vmap(fields):
     own = magnet("implicit_euler")
 
     def loss(field, worlds):
         state = own.step(own.initial_state(worlds), None, {"field": field})
         return (state.positions**2).sum()
 
-    (wide,) = torch.autograd.grad(loss(FIELDS.requires_grad_(), 2), FIELDS)
-    FIELDS.requires_grad_(False)
-    found = torch.func.vmap(torch.func.grad(lambda field: loss(field, 1)))(FIELDS)
+    (wide,) = torch.autograd.grad(loss(fields.requires_grad_(), 2), fields)
+    fields.requires_grad_(False)
+    found = torch.func.vmap(torch.func.grad(lambda field: loss(field, 1)))(fields)
     torch.testing.assert_close(found, wide, rtol=1e-9, atol=0.0)
-    one = FIELDS[0].clone().requires_grad_()
+    one = fields[0].clone().requires_grad_()
     (shared,) = torch.autograd.grad(loss(one, 2), one)
     torch.testing.assert_close(shared, 2.0 * wide[0], rtol=1e-9, atol=0.0)
 
 
-def test_planar_rods():
+def test_planar_rods(fields):
     own = magnet("implicit_euler", dimension=2)
 
     def loss(field):
         return (own.rollout(own.initial_state(), None, {"field": field}, steps=3)[-1].positions ** 2).sum()
 
-    check(loss, {"field": FIELDS[0] * torch.tensor([1.0, 0.0, 1.0])}, {"field": 1e-3})
+    check(loss, {"field": fields[0] * torch.tensor([1.0, 0.0, 1.0])}, {"field": 1e-3})
 
 
-def test_it_is_refused_where_nothing_is_magnetic():
+def test_it_is_refused_where_nothing_is_magnetic(fields):
     scene = ddg.Scene()
     rod = scene.add_rod(CURVE, section=ddg.Circle(0.004), material=SOFT)
     plain = Simulator(built(scene), DT)
     scene.magnetize(rod, 1e5)
     scene.add_dipoles()
     dipoles = Simulator(built(scene), DT)
-    for field in (FIELDS[0], (0.0, 0.0, 0.1)):
+    for field in (fields[0], (0.0, 0.0, 0.1)):
         for own in (plain, dipoles):
             with pytest.raises(
                 SceneError, match=r"a magnetic field acts on nothing; magnetise rods by scene\.magnetize"
@@ -112,4 +116,4 @@ def test_it_is_refused_where_nothing_is_magnetic():
                 own.step(own.initial_state(), None, {"field": field})
     own = magnet("implicit_euler")
     with pytest.raises(SceneError, match=r"field have shape \(2,\); they are \(3,\) or \(1, 3\)"):
-        own.step(own.initial_state(), None, {"field": FIELDS[0, :2]})
+        own.step(own.initial_state(), None, {"field": fields[0, :2]})

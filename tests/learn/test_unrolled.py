@@ -12,17 +12,21 @@ from ddg_warp.torch import Simulator  # noqa: E402
 DT, STEPS, ITERATIONS = 0.01, 3, 12
 YOUNG, DENSITY, RADIUS = 1e6, 1000.0, 0.004
 POINTS = np.array([[0.0, 0.0], [0.05, 0.0], [0.095, 0.02], [0.13, 0.055], [0.15, 0.1]])
-LENGTHS = torch.tensor(np.linalg.norm(np.diff(POINTS, axis=0), axis=1))
 FREE = 4  # entries of the first edge, which is held
+
+
+def rest_lengths():
+    """Of the edges [m], on the device under test."""
+    return torch.tensor(np.linalg.norm(np.diff(POINTS, axis=0), axis=1))
 
 
 def energy(x, bend, gravity):
     """Of a planar rod: sum EA/2 l0 (l/l0 - 1)^2 + sum EI/2 w (2 tan(phi/2) / w)^2 - sum m g . x, w the Voronoi lengths."""
-    area = np.pi * RADIUS**2
+    area, rest = np.pi * RADIUS**2, rest_lengths()
     edges = x[1:] - x[:-1]
     lengths = torch.sqrt((edges**2).sum(1))
-    stretch = 0.5 * YOUNG * area * (LENGTHS * (lengths / LENGTHS - 1.0) ** 2).sum()
-    e, f, w = edges[:-1], edges[1:], 0.5 * (LENGTHS[:-1] + LENGTHS[1:])
+    stretch = 0.5 * YOUNG * area * (rest * (lengths / rest - 1.0) ** 2).sum()
+    e, f, w = edges[:-1], edges[1:], 0.5 * (rest[:-1] + rest[1:])
     cross = e[:, 0] * f[:, 1] - e[:, 1] * f[:, 0]
     turn = 2.0 * cross / (lengths[:-1] * lengths[1:] + (e * f).sum(1))
     return stretch + (0.5 * bend * turn**2 / w).sum() - (masses() * (x @ gravity)).sum()
@@ -30,7 +34,7 @@ def energy(x, bend, gravity):
 
 def masses():
     """Of nodes, half of the mass of each of their edges."""
-    own = DENSITY * np.pi * RADIUS**2 * LENGTHS
+    own = DENSITY * np.pi * RADIUS**2 * rest_lengths()
     none = torch.zeros(1, dtype=own.dtype)
     return 0.5 * (torch.cat([own, none]) + torch.cat([none, own]))
 
@@ -83,9 +87,9 @@ def test_gradients_are_those_of_an_unrolled_tape():
     for steps in (unrolled, stepped):
         leaves = {name: value.clone().requires_grad_() for name, value in given.items()}
         x = steps(**leaves)
-        found.append((x.detach(), torch.autograd.grad((weight * x).sum(), list(leaves.values()))))
+        found.append((x.detach().cpu(), torch.autograd.grad((weight * x).sum(), list(leaves.values()))))
     (tape_x, tape), (x, gradients) = found
     assert x.numpy() == pytest.approx(tape_x.numpy(), abs=1e-12)
     for name, by_tape, ours in zip(given, tape, gradients, strict=True):
         free = slice(FREE // 2, None) if name == "velocities" else ...
-        assert ours[free].numpy() == pytest.approx(by_tape[free].numpy(), rel=1e-8, abs=1e-10), name
+        assert ours[free].cpu().numpy() == pytest.approx(by_tape[free].cpu().numpy(), rel=1e-8, abs=1e-10), name
