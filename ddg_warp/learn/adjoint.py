@@ -18,6 +18,7 @@ from ddg_warp.errors import SolverError
 from ddg_warp.learn.chains import ChainAdjoint, Kept
 from ddg_warp.learn.net import NetAdjoint, NetKept
 from ddg_warp.model import validate
+from ddg_warp.model.controls import Controls, checked
 from ddg_warp.model.state import State
 from ddg_warp.threads import launches
 
@@ -130,25 +131,36 @@ class EquilibriumAdjoint:
         self.chains = [ChainAdjoint(model, group, None) for group in model.groups]
         self.net = NetAdjoint(model, None) if model.net is not None else None
 
-    def pull(self, state: State, given: State) -> list:
+    @property
+    def parts(self) -> list:
+        """Of the groups of rods and of the net."""
+        return [*self.chains, *([self.net] if self.net else [])]
+
+    def pull(self, state: State, given: State, controls: Controls | None = None) -> list:
         """Derivatives by what the balance of the parts read: `ChainInputs` of every group, `NetInputs`.
 
         Args:
-            state: the equilibrium; its time is the load parameter.
+            state: the equilibrium; its time is the load parameter, which scales gravity, and by it derivatives by gravity and mass.
             given: derivatives by it; those by velocities have no effect.
+            controls: which it was found under.
 
         Raises:
             SolverError: the tangent of the equilibrium is singular (a limit point, a bifurcation).
         """
         validate.check_state("pull", self.model, state)
         validate.check_state("pull", self.model, given)
-        inputs = []
+        found, inputs = checked(controls, self.model, "pull"), []
+        for own in self.parts:
+            own.solve.tangent.give(found)
         for own, at, by in zip(self.chains, state.groups, given.groups, strict=True):
             kept = Kept(at, at.x, at.theta, at.frame, None, time=state.time)
             inputs += _copied(self.model.empty_state(), [own.pull(kept, at, by, np.inf)[1]])[1]
         if self.net:
             kept = NetKept(state.net, state.net, None, time=state.time)
             inputs.append(self.net.pull(kept, state.net, given.net, np.inf)[1])
+        for own in inputs:
+            for array in (own.gravity, own.mass):
+                wp.map(wp.mul, array, self.model.types.real(state.time), out=array)
         return inputs
 
 

@@ -49,7 +49,7 @@ class StepControls:
             place.zero_()
 
     def pull(self, name: str, value: torch.Tensor, inputs: list, flags) -> torch.Tensor:
-        """Derivatives by what a step is given (worlds, ...)."""
+        """Derivatives by what a step, or an equilibrium at full load, is given (worlds, ...)."""
         if name == "poses":
             return self.engine.poses.by_end * self.layout.by_world(flags)[:, None, None]
         result = torch.zeros_like(value)

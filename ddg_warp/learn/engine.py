@@ -20,6 +20,7 @@ from ddg_warp.learn.net_predictor import NetPredictor
 from ddg_warp.learn.poses import Poses
 from ddg_warp.learn.predictor import ChainPredictor
 from ddg_warp.learn.tables import Tables
+from ddg_warp.model.controls import Controls
 from ddg_warp.solve import statics
 from ddg_warp.solve.dynamics import Integrator
 from ddg_warp.solve.graphs import Graphs
@@ -185,26 +186,26 @@ class Engine:
 
     # equilibria
 
-    def balance(self, state, options: dict) -> list[torch.Tensor]:
+    def balance(self, state, controls: dict, options: dict) -> list[torch.Tensor]:
         """The equilibrium from the tensors of a state, and one of each part, as of `forward`."""
         start = self.model.empty_state()
         self.fill(tensors(start, self.fields), state)
-        found = statics.solve(self.model, start, **options)
+        found = statics.solve(self.model, start, controls=_on_host(controls), **options)
         ones = [
             torch.ones(len(part.islands), dtype=state[0].dtype, device=state[0].device)
             for part in self.integrator._parts
         ]
         return copies(tensors(found, self.fields)) + ones
 
-    def balance_backward(self, end: float, state, given) -> list:
-        """Derivatives by what an equilibrium at the load parameter `end` reads, part by part."""
+    def balance_backward(self, end: float, state, controls: dict, given) -> list:
+        """Derivatives by what an equilibrium at the load parameter `end`, under controls, reads, part by part."""
         if self._equilibria is None:
             self._equilibria = EquilibriumAdjoint(self.model)
         at, by = self.model.empty_state(), self.model.empty_state()
         self.fill(tensors(at, self.fields), state)
         self.fill(tensors(by, self.fields), given)
         at.time = end
-        return self._equilibria.pull(at, by)
+        return self._equilibria.pull(at, by, _on_host(controls))
 
     # what `ddg_warp.learn.step` asks
 
@@ -226,3 +227,8 @@ class Engine:
     def parts(self) -> int:
         """How many parts step on their own: groups of rods, and the net."""
         return len(self.integrator._parts)
+
+
+def _on_host(controls: dict) -> Controls:
+    """Controls as static solves take them, from tensors."""
+    return Controls(**{name: value.detach().cpu().numpy() for name, value in controls.items()})

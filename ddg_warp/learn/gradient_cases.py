@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
-import warp as wp
 
 from ddg_warp.errors import SceneError
 from ddg_warp.learn.gradient_objects import scene_of
@@ -113,7 +112,7 @@ class Case:
         """The last state, from the tensors of the first one."""
         state = WorldState(tuple(values or self.state.values), self.state.time, simulator.engine(WORLDS))
         if self.statics:
-            return simulator.equilibrium(parameters, state=state, start=1.0, **TIGHT)
+            return simulator.equilibrium(parameters, controls, state=state, start=1.0, **TIGHT)
         if self.model.grips:
             controls = {"poses": self.poses} | (controls or {})
         *_, state = simulator.rollout(state, parameters, controls, steps=STEPS)
@@ -142,22 +141,15 @@ class Case:
                 )
         for name in dict.fromkeys(self.engine.tables.names()):
             yield self._parameter(name)
+        yield self._control("forces", 1e-2, self._normal(WORLDS, points, 3) * self.axes)
+        if twisted:
+            yield self._control("moments", 1e-4, self._normal(WORLDS, edges))
+        if self.model.grips:
+            yield self._control("poses", 0.1, self._normal(WORLDS, len(self.model.grips), 6), self.poses)
+        yield self._control("gravity", 10.0, self._normal(WORLDS, 3) * self.down, gravity)
         if not self.statics:
-            yield self._control("forces", 1e-2, self._normal(WORLDS, points, 3) * self.axes)
-            if twisted:
-                yield self._control("moments", 1e-4, self._normal(WORLDS, edges))
-            if self.model.grips:
-                yield self._control("poses", 0.1, self._normal(WORLDS, len(self.model.grips), 6), self.poses)
-            yield self._control("gravity", 10.0, self._normal(WORLDS, 3) * self.down, gravity)
             if self.model.magnetic:
                 yield self._control("field", 1e-2, self._normal(WORLDS, 3) * self.axes)
-        if self.statics:
-            for name in ("forces", "moments", "poses"):
-                yield self._shared(
-                    name, 1.0, dict, "no gradient goes to controls of an equilibrium: it has those of its scene"
-                )
-            yield self._shared("gravity", 10.0, lambda x: {"gravity": (gravity + x * self.down).tolist()})
-        else:
             timed = self._without_step()
             yield self._shared("time step", DT, lambda x: {"dt": DT + float(x)}, timed)
             yield self._shared("mass damping", 1.0, lambda x: {"mass_damping": 0.7 + float(x)})
@@ -227,12 +219,8 @@ class Case:
         return sums
 
     def _of_equilibrium(self) -> dict[str, float]:
-        read = self.engine.balance_backward(1.0, self.state.values, self._by_end(self.state))
-        total = 0.0
-        for each, axes in zip(read, [group.host.axes for group in self.model.groups] + [(0, 1, 2)], strict=False):
-            values = wp.to_torch(each.gravity, requires_grad=False)
-            total += float((values.reshape(-1, values.shape[-1]).sum(0) * self.down[list(axes)]).sum())
-        return {"gravity": total, "density": self._by_density(read)}
+        read = self.engine.balance_backward(1.0, self.state.values, {}, self._by_end(self.state))
+        return {"density": self._by_density(read)}
 
     def _by_end(self, state: WorldState) -> list[torch.Tensor]:
         leaves = [value.detach().requires_grad_() for value in state.values]

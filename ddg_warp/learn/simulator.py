@@ -213,18 +213,25 @@ class Simulator(torch.nn.Module):
 
     @torch.compiler.disable
     def equilibrium(
-        self, parameters: dict | None = None, *, state: WorldState | None = None, batch: int | None = None, **options
+        self,
+        parameters: dict | None = None,
+        controls: dict | None = None,
+        *,
+        state: WorldState | None = None,
+        batch: int | None = None,
+        **options,
     ) -> WorldState:
-        """The equilibrium of every world, with gradients by parameters; controls it has none.
+        """The equilibrium of every world, with gradients by parameters and controls.
 
         Args:
             parameters: as of `step`.
+            controls: the same, without poses; loads that the load parameter scales as it does those of the scene.
             state: where the search begins; by default the first state of so many worlds (`batch`).
             options: as of `ddg_warp.statics.solve`.
 
         Raises:
             SolverError: there is none, in one of the worlds.
-            SceneError: the state has a history of gradients, which would end here.
+            SceneError: the state has a history of gradients, which would end here; a name or shape does not fit.
         """
         if state is not None and torch.is_grad_enabled() and any(value.requires_grad for value in state.values):
             raise SceneError(
@@ -233,9 +240,9 @@ class Simulator(torch.nn.Module):
             )
         state = state or self.initial_state(batch)
         engine, end = self._own(state), arguments.number("end", options.get("end", 1.0))
-        full = self._full(engine, parameters)
-        call = self._call(engine, end, full, {})
-        values = [value for _, own in full for value in own]
+        full, controls = self._full(engine, parameters), self._controls(engine, controls)
+        call = self._call(engine, end, full, controls)
+        values = [*(value for _, own in full for value in own), *controls.values()]
         found = Balance.apply(call, tuple(options.items()), *(value.detach() for value in state.values), *values)
         return WorldState(tuple(found[: len(engine.fields)]), end, engine)
 

@@ -119,12 +119,14 @@ class ChainSolve:
 
     Attributes:
         guess: where solves are in another precision than the state, the kernel that w starts from; see `guess_kernels`.
+        tangent: of solves on the host.
         failed: not zero of rods whose H is not positive definite (columns,), so that w means nothing; None on the host.
     """
 
     def __init__(self, model, group):
         self.model, self.group = model, group
         self.host = HostSolve(ChainTangent(model, group, 0))
+        self.tangent = self.host.tangent
         self.system = self.reduction = self.failed = self.guess = self._cast = self._for = None
         if group.kind.closed:
             return

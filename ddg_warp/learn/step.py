@@ -86,7 +86,7 @@ class Step(torch.autograd.Function):
 
 
 class Balance(torch.autograd.Function):
-    """balance(call, options, *tensors) -> the tensors of the equilibrium from a state, with gradients by parameters; see `Step`.
+    """balance(call, options, *tensors) -> the tensors of the equilibrium from a state, by parameters and controls; see `Step`.
 
     Where it starts from has no gradient: an equilibrium depends on that by where things are held alone, which `Simulator` refuses.
     """
@@ -94,10 +94,10 @@ class Balance(torch.autograd.Function):
     @staticmethod
     def forward(call: Call, options: tuple, *tensors):
         engine = call.engine
-        state, parameters, _ = call.split(tensors)
+        state, parameters, controls = call.split(tensors)
         with engine.stream():
             engine.tables.write(call.parameters, parameters)
-            return tuple(engine.balance(state, dict(options)))
+            return tuple(engine.balance(state, controls, dict(options)))
 
     @staticmethod
     def setup_context(ctx, inputs, output):
@@ -113,11 +113,15 @@ class Balance(torch.autograd.Function):
         call, saved = ctx.call, ctx.saved_tensors
         engine, count = call.engine, len(call.fields)
         tensors, output = saved[: -ctx.results], saved[-ctx.results :]
-        _, parameters, _ = call.split(tensors)
+        _, parameters, controls = call.split(tensors)
+        end, flags = call.start, output[count:]
         with engine.stream():
             engine.tables.write(call.parameters, parameters)
-            inputs = engine.balance_backward(call.start, output[:count], given[:count])
-            found = engine.tables.pull(call.parameters, inputs, output[count:])
+            inputs = engine.balance_backward(end, output[:count], controls, given[:count])
+            found = engine.tables.pull(call.parameters, inputs, flags)
+            for name, value in controls.items():
+                by_load = engine.controls.pull(name, value, inputs, flags)
+                found.append(by_load if name == "gravity" else end * by_load)  # which the load parameter scales
         return None, None, *([None] * count), *found
 
 

@@ -1,4 +1,4 @@
-"""Controls: what a time step is given beside its state, world by world."""
+"""Controls: what a time step, or a search for an equilibrium, is given beside its state, world by world."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -14,7 +14,9 @@ class Controls:
 
     Every field is one array for all worlds, or has an axis of worlds in front. What the scene has as functions of time, motions and
     loads, stays as it is, the same for all worlds; these loads add to it. They belong to the step alone: what is asked of a state
-    afterwards (reactions, equilibria, energy of gravity) knows the loads of the scene.
+    afterwards (reactions, spectra, energy of gravity) knows the loads of the scene.
+
+    `statics.solve(model, controls=...)` takes them, too: the load parameter scales loads and gravity as it does those of the scene.
 
     Attributes:
         poses: of every `Grip` at the end of the step (grips, 6) or (worlds, grips, 6): translation [m] and rotation vector [rad],
@@ -56,13 +58,13 @@ class Controls:
         return found
 
 
-def checked(controls: Controls | None, model) -> dict[str, np.ndarray]:
+def checked(controls: Controls | None, model, call: str = "step") -> dict[str, np.ndarray]:
     """What controls give, see `Controls.checked`; nothing without."""
     if controls is None:
         return {}
     if not isinstance(controls, Controls):
         raise SceneError(
-            f"step: controls are {controls!r}; give Controls(poses=..., forces=..., moments=..., gravity=..., field=...)"
+            f"{call}: controls are {controls!r}; give Controls(poses=..., forces=..., moments=..., gravity=..., field=...)"
         )
     return controls.checked(model)
 

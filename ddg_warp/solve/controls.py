@@ -62,7 +62,7 @@ class ControlledLoads(Loads):
         constant = put(host.constant_loads(), self._vector)
         self._shared = wp.clone(constant) if host.timed else constant
         self._sizes = wp.zeros((model.worlds, len(self.places)), dtype=real, device=device)
-        place, row = _rows(model, part)
+        place, row = loaded_rows(model, part)
         order = np.argsort(place, kind="stable")
         starts = np.searchsorted(place[order], np.arange(host.size + 1))
         self._inputs = [self._shared, constant, put(changing), put(mass), put(arm), nodes]
@@ -194,7 +194,7 @@ class NetScale(_Scale):
             self.launch(self._limit, limit.shape, [self.load, self.bodies, starts, body, weight], [limit])
 
 
-def _rows(model, part) -> tuple[np.ndarray, np.ndarray]:
+def loaded_rows(model, part) -> tuple[np.ndarray, np.ndarray]:
     """Places of a part, and the rows of the user's points that belong to nodes among them, or of his edges to angles."""
     order, host = model.order, part.host
     if part is model.net:

@@ -86,12 +86,6 @@ class Loads:
         """What follows nothing: constant loads, then each that changes."""
         self._values.assign((self._dead @ amplitudes).reshape(-1, 3))
 
-    def scale(self, dead: np.ndarray, at: float) -> None:
-        """Values of an equilibrium at load parameter `at`, with the loads on all places (P, 3) that follow nothing."""
-        self._values.assign(dead[self.places])
-        for _, load, _, values, _ in self._followers:
-            values.assign(load.at(at, at) * load.values)
-
     def apply(self, x: wp.array, force: wp.array, moment: wp.array) -> None:
         """Write the loads on nodes, which are at x, and on angles."""
         part = self.part
@@ -101,3 +95,17 @@ class Loads:
         for kernel, i, lists in self._spread:
             inputs = [*lists, self._force, part.world_columns, self.total]
             wp.launch(kernel, (len(lists[0]), part.worlds), inputs, [(force, moment)[i]], device=part.device)
+
+
+class StaticLoads(Loads):
+    """As `Loads`, of an equilibrium at a load parameter, in every world for itself."""
+
+    @property
+    def _copies(self) -> int:
+        return self.part.worlds
+
+    def scale(self, dead: np.ndarray, at: float) -> None:
+        """Values at load parameter `at`, with the loads on all places (worlds, P, 3) that follow nothing."""
+        self._values.assign(dead[:, self.places].reshape(-1, 3))
+        for _, load, _, values, _ in self._followers:
+            values.assign(load.at(at, at) * load.values)

@@ -4,6 +4,7 @@ import numpy as np
 from scipy import sparse
 
 from ddg_warp.compile.storage import gathered
+from ddg_warp.solve.controls import loaded_rows
 
 
 class Part:
@@ -13,13 +14,20 @@ class Part:
         host: its `Storage`.
         offset, size: of its dofs among all.
         mass: of every dof (size,) [kg, kg m^2].
-        gravity: on the dofs of a node, or of every block (1 or N, dofs of one) [m/s^2].
+        given: outer forces of controls on the dofs of every world, in space, at full load (worlds, n) [N, N m].
+
+    Args:
+        part: `Group` or `DeviceNet`.
     """
 
-    def __init__(self, model, host, offset: int, size: int, mass: np.ndarray, gravity: np.ndarray):
-        self.model, self.host, self.offset, self.size = model, host, offset, size
-        self.mass, self.gravity = mass, gravity
-        self.worlds = model.worlds
+    def __init__(self, model, part, offset: int, size: int, mass: np.ndarray):
+        self.model, self.part, self.host, self.offset, self.size = model, part, part.host, offset, size
+        self.mass, self.worlds = mass, model.worlds
+        self.given = np.zeros((self.worlds, size // self.worlds))
+
+    def accelerations(self, gravity: np.ndarray) -> np.ndarray:
+        """Those that gravity (3,) means on the dofs of a node, or of every block (1 or N, dofs of one) [m/s^2]."""
+        raise NotImplementedError
 
     def into(self, values: np.ndarray) -> np.ndarray:
         """Vectors in space (size,) as the dofs are."""
@@ -33,20 +41,33 @@ class Part:
         """A matrix of dofs in space as one of dofs as they are."""
         return values
 
-    def weight(self) -> np.ndarray:
-        """Gravity on the dofs of a world, in space [N]."""
-        own = self.mass[: self.size // self.worlds].reshape(-1, self.gravity.shape[1])
-        return (own * self.gravity).ravel()
+    def weight(self, gravity: np.ndarray | None = None) -> np.ndarray:
+        """Gravity, by default the scene's, on the dofs of a world, in space [N]."""
+        own = self.accelerations(np.asarray(self.model.scene.gravity if gravity is None else gravity, float))
+        return (self.mass[: self.size // self.worlds].reshape(-1, own.shape[1]) * own).ravel()
+
+    def give(self, found: dict[str, np.ndarray]) -> None:
+        """Take the loads among what `Controls.checked` found; none without."""
+        self.given[:] = 0.0
+        if "gravity" in found:
+            self.given[:] = [self.weight(own - self.model.scene.gravity) for own in found["gravity"]]
+        places, rows = loaded_rows(self.model, self.part)
+        for name, own in (("forces", places < self.host.nodes), ("moments", places >= self.host.nodes)):
+            if name in found:
+                dofs, values = self.host.dofs(places[own]), found[name][:, rows[own]]
+                values = values if name == "forces" else values[..., None] * [1.0, 0.0, 0.0]
+                for force, each in zip(self.given, np.broadcast_to(values, (self.worlds, *dofs.shape)), strict=True):
+                    _add(force, dofs, each)
 
     def dead_loads(self, factor: float) -> np.ndarray:
-        """Outer forces on the dofs of a world, in space, that do not follow it."""
+        """Outer forces on the dofs of every world, in space, that do not follow it (worlds, n)."""
         result = factor * self.weight()
         for load in (self.host.constant, *self.host.timed):
             _add(result, self.host.dofs(load.places), load.at(factor, factor) * load.force)
-        return result
+        return result + factor * self.given
 
     def loads(self, factor: float, q: np.ndarray) -> np.ndarray:
-        result = np.tile(self.dead_loads(factor), (self.worlds, 1))
+        result = self.dead_loads(factor)
         for load in self.host.followers:
             dofs, scale = self.host.dofs(load.places), load.at(factor, factor)
             for force, x in zip(result, self.back(q).reshape(self.worlds, -1), strict=True):

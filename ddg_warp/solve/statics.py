@@ -18,6 +18,7 @@ from ddg_warp import arguments
 from ddg_warp.compile.precision import lost_in_rounding
 from ddg_warp.errors import SceneError, SolverError, check_options
 from ddg_warp.model import validate
+from ddg_warp.model.controls import Controls, checked
 from ddg_warp.model.state import State
 from ddg_warp.scene import validate as scene_validate
 from ddg_warp.solve import mixed, stability
@@ -74,13 +75,21 @@ class StaticsOptions:
 
 
 def solve(
-    model, state: State | None = None, *, load_steps: int = 1, start: float = 0.0, end: float = 1.0, **options
+    model,
+    state: State | None = None,
+    *,
+    controls: Controls | None = None,
+    load_steps: int = 1,
+    start: float = 0.0,
+    end: float = 1.0,
+    **options,
 ) -> State:
     """The equilibrium at load parameter `end`, reached from `start` in `load_steps` increments or more.
 
     Args:
         model: what to equilibrate.
         state: where to begin; the rest state by default. It is not changed. What a `Grip` holds stays where it is.
+        controls: forces, moments and gravity, world by world, which the load parameter scales as it does those of the scene.
         load_steps: increments; one that fails is halved.
         start, end: load parameter, which scales gravity and loads and is the time of motions and amplitudes.
         options: see `StaticsOptions`.
@@ -92,7 +101,7 @@ def solve(
 
     Raises:
         SolverError: no equilibrium was found, or in mode "minimise" none that is stable; carries the last good state.
-        SceneError: nothing holds the rods.
+        SceneError: nothing holds the rods, or controls do not fit the model.
     """
     validate.check_model("statics", model)
     if state is not None:
@@ -100,11 +109,8 @@ def solve(
     for name, value in (("start", start), ("end", end)):
         arguments.number(f"statics: {name}", value)
     load_steps = arguments.count("load_steps", load_steps)
-    if "controls" in options:
-        raise SceneError(
-            "statics: equilibria take no controls, which are of a time step: grips are where the state has them, add loads to the scene"
-        )
-    return Equilibrium(model, StaticsOptions(**options)).load(state or model.state(), load_steps, start, end)
+    equilibrium = Equilibrium(model, StaticsOptions(**options))
+    return equilibrium.load(state or model.state(), load_steps, start, end, controls)
 
 
 @launches
@@ -148,8 +154,21 @@ class Equilibrium:
             return "direct" if self.options.mode == "follow" else static_solver(self.model)
         return solver
 
-    def load(self, state: State, load_steps: int, start: float = 0.0, end: float = 1.0) -> State:
+    def load(
+        self,
+        state: State,
+        load_steps: int,
+        start: float = 0.0,
+        end: float = 1.0,
+        controls: Controls | None = None,
+    ) -> State:
         """Load stepping; see `solve`."""
+        found = checked(controls, self.model, "statics")
+        if "field" in found:
+            raise SceneError("statics: equilibria take no field as a control yet; give it to the scene: scene.magnetic_field(...)")
+        if "poses" in found:
+            raise SceneError("statics: equilibria take no poses: grips are where the state has them")
+        self.tangent.give(found)
         if start == end:
             return self.solve(state, start, end)
         at, whole, cuts = start, (end - start) / load_steps, 0
@@ -175,7 +194,7 @@ class Equilibrium:
         return state
 
     def solve(self, state: State, before: float, at: float) -> State:
-        """The equilibrium at load parameter `at`, from a state that belongs to `before`.
+        """The equilibrium at load parameter `at`, from a state that belongs to `before`, under the controls of the last `load`.
 
         Mode "minimise" leaves a saddle along its lowest mode for the minimum that lies that way; `saddle` is the outcome where after
         some such descents there still is none. Conjugate gradients see no more than negative curvature on their way, and leave none.

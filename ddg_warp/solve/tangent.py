@@ -81,6 +81,11 @@ class Tangent:
         """Stresses (strains, elements) of every element set of the shells after a step, with strains e + J step."""
         return self.parts[0].linear_stress(state, step)
 
+    def give(self, found: dict[str, np.ndarray]) -> None:
+        """From now on have the loads among what `Controls.checked` found, times the factor, beside those of the scene."""
+        for part in self.parts:
+            part.give(found)
+
     def loads(self, factor: float, q: np.ndarray) -> np.ndarray:
         """Outer forces (size,) [N, N m] on dofs q: gravity and dead loads times `factor`, timed loads at their amplitude."""
         return np.concatenate([part.loads(factor, self.of(part, q)) for part in self.parts])

@@ -61,6 +61,7 @@ def _step(controls):
 
 
 each("Controls", "controls", [3, {"gravity": (0, 0, 1)}, "up"], _step, "step: controls", "Controls(")
+each("Controls", "of an equilibrium", [3, "up"], lambda v: statics.solve(model(), controls=v), "statics: controls", "Controls(")
 each("Controls", "gravity", [1.0, (0.0, 1.0), "down", NAN, (0.0, 0.0, INF)], lambda v: _told(model(), gravity=v), "Controls: gravity")
 each("Controls", "field", [1.0, (0.0, 1.0), NAN], lambda v: _told(_magnetic(), field=v), "Controls: field")
 refuse("Controls", {
@@ -81,7 +82,6 @@ refuse("Controls", {
     "moments without twist": (lambda: _told(_plain(), moments=np.ones(10)), "edge 0 of rod 1 ('odd')", "no twist", "twist=True"),
     "gravity out of the plane": (lambda: _told(_gripped(2), gravity=(0.0, 1.0, 0.0)), "gravity", "0 along y"),
     "gravity across the axis": (lambda: _told(_gripped_dome(), gravity=(1.0, 0.0, 0.0)), "gravity", "0 along x and y"),
-    "an equilibrium": (lambda: statics.solve(model(), controls=ddg.Controls()), "equilibria take no controls"),
 })
 each("Grip", "pivot", [1.0, (0.0, 1.0), "there", (NAN, 0.0, 0.0)], ddg.Grip, "Grip: pivot", "three finite")
 refuse("Grip", {

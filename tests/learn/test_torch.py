@@ -229,18 +229,65 @@ def test_what_is_not_given_is_as_the_model_has_it():
     torch.testing.assert_close(again, usual, rtol=0.0, atol=0.0)
 
 
-@pytest.mark.parametrize("name", ["twisted", "sheet"])
-def test_equilibria(name):
+def resting(name: str) -> Simulator:
     scene = SCENES[name]()
     if name == "twisted":
         scene.fix(1, [-1])
-    own, term = Simulator(built(scene), DT), STIFFNESS[name]
+    return Simulator(built(scene), DT)
+
+
+@pytest.mark.parametrize("name", ["twisted", "sheet"])
+def test_equilibria(name):
+    own, term = resting(name), STIFFNESS[name]
 
     def loss(stiffness):
         return (own.equilibrium({term: stiffness}, batch=2, rtol=1e-12).positions ** 2).sum()
 
     values = own.parameter(term, 2) * torch.tensor([[1.0], [2.0]])
     check(loss, {"stiffness": values}, {"stiffness": 1e-2 * float(values.max())})
+
+
+@pytest.mark.parametrize("end", [1.0, 0.7])
+@pytest.mark.parametrize("name", STIFFNESS)
+def test_equilibria_under_controls(name, end):
+    """Of two worlds under different loads, which the load parameter scales; along with a stiffness."""
+    own, term = resting(name), STIFFNESS[name]
+    points, edges = own.model.points_count, own.model.order.edges_count
+    flat = torch.tensor([1.0, 0.0, 1.0] if name == "planar" else [1.0, 1.0, 1.0])
+    torch.manual_seed(1)
+    weight = torch.randn((points, 3), dtype=torch.float64)
+    values = {
+        "forces": 1e-3 * torch.randn((2, points, 3), dtype=torch.float64) * flat,
+        "gravity": torch.tensor([[0.0, 0.0, -9.81], [1.0, 0.0, -5.0]], dtype=torch.float64),
+        "stiffness": own.parameter(term, 2),
+    }
+    sizes = {"forces": 1e-5, "gravity": 1e-2, "stiffness": 1e-2 * float(values["stiffness"].max())}
+    if name in ("twisted", "joined"):
+        values["moments"], sizes["moments"] = 1e-5 * torch.randn((2, edges), dtype=torch.float64), 1e-7
+
+    def loss(stiffness, **controls):
+        found = own.equilibrium({term: stiffness}, controls, batch=2, rtol=1e-13, end=end)
+        return (weight * found.positions).sum()
+
+    check(loss, values, sizes)
+
+
+def test_an_equilibrium_under_controls_repeats():
+    """Bit for bit, with its gradients; and is that of the model without them where they are zero."""
+    own = resting("joined")
+    forces = 1e-3 * torch.ones((2, own.model.points_count, 3), dtype=torch.float64)
+    forces.requires_grad_()
+
+    def once():
+        found = own.equilibrium(None, {"forces": forces}, batch=2).positions
+        return found, *torch.autograd.grad((found**2).sum(), forces)
+
+    for one, other in zip(once(), once(), strict=True):
+        torch.testing.assert_close(one, other, rtol=0.0, atol=0.0)
+    plain = own.equilibrium(batch=2).positions
+    still = own.equilibrium(None, {"forces": 0.0 * forces}, batch=2).positions
+    torch.testing.assert_close(still, plain, rtol=0.0, atol=0.0)
+    assert (once()[0] != plain).any()
 
 
 def test_copies_and_pickles():

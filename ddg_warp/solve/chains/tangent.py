@@ -25,8 +25,7 @@ class ChainTangent(Part):
     def __init__(self, model, group, offset: int):
         kind, real, device = group.kind, model.types.real, model.wp_device
         shape = (group.nodes, group.columns)
-        gravity = np.append(group.gravity_host, 0.0)[None, : kind.block]
-        super().__init__(model, group.host, offset, group.columns * group.nodes * kind.block, _mass(group), gravity)
+        super().__init__(model, group, offset, group.columns * group.nodes * kind.block, _mass(group))
         self.group, self.body_count = group, group.columns
         self.rate = group.still  # over what strain-rate damping counts: at rest not
         self.incidence = _incidence(group)
@@ -35,6 +34,9 @@ class ChainTangent(Part):
         self._windows = arrays.allocate((kind.window, *shape), real, device)
         self._energies = arrays.allocate(shape, real, device)
         self._hessian = arrays.allocate((kind.window**2, *shape), real, device)
+
+    def accelerations(self, gravity: np.ndarray) -> np.ndarray:
+        return np.append(gravity[list(self.host.axes)], 0.0)[None, : self.group.kind.block]
 
     def data(self, state):
         """This part of a state."""

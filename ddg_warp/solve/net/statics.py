@@ -19,7 +19,7 @@ from ddg_warp.model.state import State
 from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.choice import net_preconditioner
 from ddg_warp.solve.graphs import Graphs
-from ddg_warp.solve.loads import Loads
+from ddg_warp.solve.loads import StaticLoads
 from ddg_warp.solve.net.newton import NetNewton
 
 FORCING = 1e-4  # smallest reduction of the residual that a direction is solved to: Gauss-Newton errs by more
@@ -35,7 +35,7 @@ class StaticNewton(NetNewton):
         super().__init__(model, options, net_preconditioner(model.net), model.types.real)
         self._whole = False  # whether directions may go as far as they like
         self.gravity.zero_()  # a load like others: `begin` scales them all
-        self.loads = Loads(model, self.net, midpoint=False) if self.net.host.followers else None
+        self.loads = StaticLoads(model, self.net, midpoint=False) if self.net.host.followers else None
         self._there = wp.zeros_like(self.load)
         self._follow, self._less, self._far = newton.static_kernels(self.real, self.linear)
 
@@ -45,15 +45,15 @@ class StaticNewton(NetNewton):
         return [*super().kernels, self._follow, self._less, self._far, *(self.loads.kernels if self.loads else [])]
 
     def begin(self, q: np.ndarray, dead: np.ndarray, at: float, scale: np.ndarray) -> None:
-        """Set out from dofs `q` under dead loads (3 blocks,), those that follow at load parameter `at`; load scales of bodies."""
+        """Set out from dofs `q` under dead loads (worlds, 3 blocks), with those that follow at `at`; load scales of bodies."""
         for name in ("status", "iteration", "halvings", "unbalanced", "drowned", "clamped", "stale"):
             getattr(self.islands, name).zero_()
         for array in (self.q, self.base):
             array.assign(q.reshape(-1, 3))
         for load in (self.load, self._there):
-            load.assign(np.tile(dead.reshape(-1, 3), (self.worlds, 1)))
+            load.assign(dead.reshape(-1, 3))
         if self.loads:
-            self.loads.scale(dead.reshape(-1, 3), at)
+            self.loads.scale(dead.reshape(self.worlds, -1, 3), at)
         wp.copy(self.islands.load_scale, self.allowed.assign(scale.reshape(self.worlds, -1)))
         self.islands.active.fill_(1)
 

@@ -21,16 +21,19 @@ class NetTangent(Part):
 
     def __init__(self, model, offset: int):
         host, worlds = model.net.host, model.worlds
-        kind, gravity = np.zeros((host.blocks, 3), bool), np.zeros((host.blocks, 3))
-        kind[host.nodes :], gravity[: host.nodes] = True, model.scene.gravity
+        kind = np.zeros((host.blocks, 3), bool)
+        kind[host.nodes :] = True
         self.free, self.angle, mass = (np.tile(values.ravel(), worlds) for values in (~host.fixed, kind, host.mass))
-        super().__init__(model, host, offset, 3 * host.blocks * worlds, mass, gravity)
+        super().__init__(model, model.net, offset, 3 * host.blocks * worlds, mass)
         self.net, self.body_count = model.net, host.bodies.count * worlds
         self.rate = model.net.still  # over what strain-rate damping counts: at rest not
         self.planes = HostPlanes(host, worlds) if host.frames else None
         self._anchored = host.fixed[: host.nodes].copy()
         for shell in host.shells:
             self._anchored[shell.nodes] = True
+
+    def accelerations(self, gravity: np.ndarray) -> np.ndarray:
+        return np.where(np.arange(self.host.blocks)[:, None] < self.host.nodes, gravity, 0.0)
 
     @cached_property
     def _pattern(self) -> tuple[list, np.ndarray, np.ndarray]:

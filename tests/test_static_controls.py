@@ -1,0 +1,97 @@
+"""Equilibria under controls: as those of scenes that are built with the same loads, world by world."""
+
+import numpy as np
+import pytest
+from test_controls import GRAVITY, everything, joined, model_of, one_rod, sheet, some_rods
+
+import ddg_warp as ddg
+from ddg_warp import statics
+from ddg_warp.errors import SceneError
+from ddg_warp.solve.statics import Equilibrium, StaticsOptions
+
+TIGHT = {"rtol": 1e-12}
+FORCES = np.array([(0.0, 0.3, -0.2), (0.0, 0.0, 0.0), (0.1, -0.2, 0.4)])
+MOMENTS = np.array([0.01, 0.0, -0.02])
+NODE, EDGE = 6, 4
+
+
+def given(model, moments: bool = True) -> ddg.Controls:
+    """A force on a point, a moment on an edge and gravity of each world of a model."""
+    forces, twisting = np.zeros((3, model.points_count, 3)), np.zeros((3, model.order.edges_count))
+    forces[:, NODE] = FORCES
+    if moments:
+        twisting[:, EDGE] = MOMENTS
+    return ddg.Controls(forces=forces, moments=twisting, gravity=GRAVITY)
+
+
+def push(scene, world: int) -> None:
+    """The same loads in a scene of one world."""
+    if not scene.shells:
+        scene.add_force(0, NODE, FORCES[world])
+        scene.add_twisting_moment(0, EDGE, MOMENTS[world])
+    else:
+        scene.add_vertex_force(0, [NODE], FORCES[world])
+
+
+@pytest.mark.parametrize(
+    ("build", "solver"),
+    [
+        (one_rod, "direct"),
+        (some_rods, "direct"),
+        (joined, "direct"),
+        (joined, "pcg"),
+        (sheet, "direct"),
+        (sheet, "pcg"),
+    ],
+    ids=lambda value: getattr(value, "__name__", value),
+)
+def test_an_equilibrium_is_that_of_a_scene_with_these_loads(device, build, solver):
+    model = model_of(build, None, device, worlds=3)
+    options = TIGHT | {"solver": solver, "load_steps": 3}
+    found = statics.solve(model, controls=given(model, build is not sheet), **options)
+    for world in range(3):
+        alone = model_of(build, None, device, 1, GRAVITY[world], lambda scene, w=world: push(scene, w))
+        expected = statics.solve(alone, **options)
+        size = np.ptp(expected.points(), axis=0).max()
+        np.testing.assert_allclose(found.points()[world], expected.points(), rtol=0.0, atol=1e-9 * size)
+        if solver == "direct":
+            assert expected.stable == found.stable
+
+
+@pytest.mark.parametrize("solver", ["direct", "pcg"])
+def test_loads_that_follow_stay_beside_what_each_world_is_given(device, solver):
+    def load(scene):
+        scene.add_pressure(0, 20.0)
+
+    model = model_of(sheet, None, device, worlds=3, load=load)
+    options = TIGHT | {"solver": solver, "load_steps": 4}
+    found = statics.solve(model, controls=given(model, False), **options)
+    for world in range(3):
+        alone = model_of(sheet, None, device, 1, GRAVITY[world], lambda scene, w=world: (load(scene), push(scene, w)))
+        expected = statics.solve(alone, **options)
+        np.testing.assert_allclose(found.points()[world], expected.points(), rtol=0.0, atol=1e-9)
+
+
+def test_controls_are_of_one_search(device):
+    """A search with controls, then one without on the same solver: the bits of one that never had any, and the same twice."""
+    model = model_of(everything, None, device, worlds=3)
+    solver = Equilibrium(model, StaticsOptions(rtol=1e-10))
+    first = solver.load(model.state(), 1, controls=given(model)).snapshot()
+    plain = solver.load(model.state(), 1).snapshot()
+    again = solver.load(model.state(), 1, controls=given(model)).snapshot()
+    fresh = Equilibrium(model, StaticsOptions(rtol=1e-10)).load(model.state(), 1).snapshot()
+    for name, values in first.items():
+        np.testing.assert_array_equal(again[name], values, err_msg=name)
+        np.testing.assert_array_equal(plain[name], fresh[name], err_msg=name)
+    assert (first["0/x"] != plain["0/x"]).any()
+
+
+def test_what_does_not_fit_is_named(device):
+    model = model_of(one_rod, None, device, worlds=3)
+    for controls, words in (
+        (3, "statics: controls are 3; give Controls"),
+        (ddg.Controls(forces=np.zeros((2, 3))), r"forces have shape \(2, 3\)"),
+        (ddg.Controls(poses=np.zeros((0, 6))), "poses of no grip"),
+    ):
+        with pytest.raises(SceneError, match=words):
+            statics.solve(model, controls=controls)
