@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_controls import GRAVITY, everything, joined, model_of, one_rod, sheet, some_rods
+from test_controls import AXIS, GRAVITY, PIVOT, everything, joined, model_of, one_rod, sheet, some_rods
 
 import ddg_warp as ddg
 from ddg_warp import statics
@@ -70,6 +70,28 @@ def test_loads_that_follow_stay_beside_what_each_world_is_given(device, solver):
         alone = model_of(sheet, None, device, 1, GRAVITY[world], lambda scene, w=world: (load(scene), push(scene, w)))
         expected = statics.solve(alone, **options)
         np.testing.assert_allclose(found.points()[world], expected.points(), rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("build", "solver"),
+    [(some_rods, "direct"), (joined, "direct"), (joined, "pcg"), (sheet, "direct"), (sheet, "pcg")],
+    ids=lambda value: getattr(value, "__name__", value),
+)
+def test_grips_end_where_motions_would(device, build, solver):
+    """Poses world by world, against a scene in which functions of the load parameter lead to them; kept by a search without any."""
+    turns, shifts = np.array([0.3, -0.5, 0.0]), np.array([[0.02, 0.0, 0.01], [0.0, -0.01, 0.03], [0.0, 0.0, 0.0]])
+    model = model_of(build, ddg.Grip(PIVOT), device, worlds=3, gravity=(0.0, 0.0, -1.0))
+    poses = np.concatenate([shifts, turns[:, None] * AXIS], axis=1)[:, None]
+    options = TIGHT | {"solver": solver, "load_steps": 2}
+    found = statics.solve(model, controls=ddg.Controls(poses), **options)
+    np.testing.assert_array_equal(found.poses(), poses)
+    for world in range(3):
+        moved = ddg.Motion(lambda t, w=world: tuple(t * shifts[w]), lambda t, w=world: t * turns[w], tuple(AXIS), PIVOT)
+        expected = statics.solve(model_of(build, moved, device, gravity=(0.0, 0.0, -1.0)), **options)
+        np.testing.assert_allclose(found.points()[world], expected.points(), rtol=0.0, atol=1e-8)
+    kept = statics.solve(model, found, start=1.0, **TIGHT | {"solver": solver})
+    np.testing.assert_array_equal(kept.poses(), poses)
+    np.testing.assert_allclose(kept.points(), found.points(), rtol=0.0, atol=1e-8)
 
 
 def test_controls_are_of_one_search(device):

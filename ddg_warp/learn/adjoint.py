@@ -121,15 +121,16 @@ class EquilibriumAdjoint:
 
     Args:
         model: whose equilibria they are.
+        posed: whether they are given poses of grips, by which `Poses` of `ddg_warp.learn.poses` has derivatives then.
 
     Raises:
         SceneError: the model has something that no gradient goes through; names it.
     """
 
-    def __init__(self, model):
+    def __init__(self, model, posed: bool = False):
         self.model = model
-        self.chains = [ChainAdjoint(model, group, None) for group in model.groups]
-        self.net = NetAdjoint(model, None) if model.net is not None else None
+        self.chains = [ChainAdjoint(model, group, None, posed) for group in model.groups]
+        self.net = NetAdjoint(model, None, posed) if model.net is not None else None
 
     @property
     def parts(self) -> list:
@@ -152,12 +153,13 @@ class EquilibriumAdjoint:
         found, inputs = checked(controls, self.model, "pull"), []
         for own in self.parts:
             own.solve.tangent.give(found)
+            own.upload(state.time, state.time)
         for own, at, by in zip(self.chains, state.groups, given.groups, strict=True):
             kept = Kept(at, at.x, at.theta, at.frame, None, time=state.time)
-            inputs += _copied(self.model.empty_state(), [own.pull(kept, at, by, np.inf)[1]])[1]
+            inputs += _copied(self.model.empty_state(), [own.pull(kept, at, by, np.inf, (state, state))[1]])[1]
         if self.net:
             kept = NetKept(state.net, state.net, None, time=state.time)
-            inputs.append(self.net.pull(kept, state.net, given.net, np.inf)[1])
+            inputs.append(self.net.pull(kept, state.net, given.net, np.inf, (state, state))[1])
         for own in inputs:
             for array in (own.gravity, own.mass):
                 wp.map(wp.mul, array, self.model.types.real(state.time), out=array)

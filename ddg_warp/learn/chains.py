@@ -63,19 +63,20 @@ class ChainAdjoint:
 
     Args:
         scheme: of the steps, None for equilibria.
+        posed: whether equilibria are given poses of grips.
 
     Raises:
         SceneError: a motion has no gradient; see `Supports`.
     """
 
-    def __init__(self, model, group, scheme: str | None):
+    def __init__(self, model, group, scheme: str | None, posed: bool = False):
         self.group, self.model = group, model
         real, kind, device = model.types.real, group.kind, model.wp_device
         midpoint = self._midpoint = scheme == "implicit_midpoint"
         self.device, self.real = device, real
         self.vector = wp.types.vector(kind.dim, real)
         self.solve = ChainSolve(model, group)
-        self.supports = Supports(model, group, midpoint) if scheme and group.host.moves else None
+        self.supports = Supports(model, group, midpoint) if (scheme or posed) and group.host.moves else None
         motion = self.supports.motion if self.supports else None
         self.drag = ChainDragAdjoint(model, group, midpoint) if kind.drag and scheme else None
         self.followers = Followers(model, group, midpoint) if group.host.followers and scheme else None
@@ -203,6 +204,8 @@ class ChainAdjoint:
         for kernel in self._pull:
             self._launch(kernel, read, written)
         self._launch(self._nodes, [window, group.count], [self._dof])
+        if self.solve.held is not None:
+            arrays.assign(self._dof, arrays.download(self._dof) + self.solve.held)
         if kind.twist:
             self._launch(self._edges, [lag, group.count], [lagged])
         if self.supports and kind.twist:

@@ -51,7 +51,7 @@ class StepControls:
     def pull(self, name: str, value: torch.Tensor, inputs: list, flags) -> torch.Tensor:
         """Derivatives by what a step, or an equilibrium at full load, is given (worlds, ...)."""
         if name == "poses":
-            return self.engine.poses.by_end * self.layout.by_world(flags)[:, None, None]
+            return self.engine.by_poses * self.layout.by_world(flags)[:, None, None]
         result = torch.zeros_like(value)
         model, worlds = self.model, self.model.worlds
         if name == "field":

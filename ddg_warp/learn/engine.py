@@ -39,13 +39,15 @@ class Engine:
         tables, controls: what else steps read.
         before, after: the states at the ends of a step.
         adjoint, poses: what its reverse goes by, once that was asked for.
+        by_poses: derivatives by poses of grips of the last step or equilibrium that was pulled (worlds, grips, 6).
     """
 
     def __init__(self, model, scheme: str, options: dict):
         self.model, self.device = model, str(wp.device_to_torch(model.wp_device))
         self.midpoint = scheme == "implicit_midpoint"
         self.integrator = Integrator(model, scheme, failures="flag", check_every=FOREVER, energy_bound=None, **options)
-        self.adjoint = self.poses = self._equilibria = None
+        self.adjoint = self.poses = self.by_poses = None
+        self._equilibria = {}  # reverse of those that are given poses, and of others
         self.layout, self.tables = Layout(model), Tables(model)
         self.fields = self.layout.fields
         self.before, self.after = (buffer.own for buffer in self.integrator._buffers)
@@ -133,7 +135,8 @@ class Engine:
         found, inputs = self._found
         self._solved_by = [own.solve.failed for own in adjoint.chains]
         if self.poses:
-            self.poses.pull_step(found, inputs, self._given, posed)
+            self.poses.pull_step(found, inputs, (self.before, self.after), self._given, posed)
+            self.by_poses = self.poses.by_end
         if self._by_start is None or adjoint.net:  # memory of rods' derivatives stays
             self._by_start = tensors(found, self.fields)
         return self._by_start, inputs
@@ -151,7 +154,7 @@ class Engine:
                 for at, before in zip(solved, self.before.groups, strict=True)
             ]
             self.adjoint = adjoint
-            self.poses = Poses(self) if self.model.grips else None
+            self.poses = Poses(adjoint, self.midpoint) if self.model.grips else None
         return self.adjoint
 
     def _load(self) -> None:
@@ -199,13 +202,20 @@ class Engine:
 
     def balance_backward(self, end: float, state, controls: dict, given) -> list:
         """Derivatives by what an equilibrium at the load parameter `end`, under controls, reads, part by part."""
-        if self._equilibria is None:
-            self._equilibria = EquilibriumAdjoint(self.model)
+        posed = "poses" in controls
+        if posed not in self._equilibria:
+            adjoint = EquilibriumAdjoint(self.model, posed)
+            self._equilibria[posed] = adjoint, Poses(adjoint) if posed else None
+        adjoint, poses = self._equilibria[posed]
         at, by = self.model.empty_state(), self.model.empty_state()
         self.fill(tensors(at, self.fields), state)
         self.fill(tensors(by, self.fields), given)
         at.time = end
-        return self._equilibria.pull(at, by, _on_host(controls))
+        inputs = adjoint.pull(at, by, _on_host(controls))
+        if posed:
+            poses.pull_equilibrium(inputs, at, by)
+            self.by_poses = poses.by_end
+        return inputs
 
     # what `ddg_warp.learn.step` asks
 

@@ -65,8 +65,10 @@ class Case:
         points, edges = self.model.points_count, self.model.order.edges_count
         shape = (WORLDS, points, 3)
         self.weights = self._normal(*shape), 0.1 * self._normal(*shape), 0.1 * self._normal(WORLDS, edges)
-        self.state = self._first()
+        # of grips, which equilibria begin with: angles are measured from frames that are carried along to there
         self.poses = 1e-3 * self._normal(WORLDS, len(self.model.grips), 6)
+        self.posed = {"poses": self.poses} if self.model.grips else {}
+        self.state = self._first()
 
     def built(self, dt: float = DT, **changes) -> Simulator:
         """A simulator of the scene with changes; see `scene_of`."""
@@ -83,7 +85,7 @@ class Case:
         """An equilibrium, or a state on the way with random velocities and spins."""
         with torch.no_grad():
             if self.statics:
-                return self.simulator.equilibrium(batch=WORLDS, **TIGHT)
+                return self.simulator.equilibrium(None, self.posed, batch=WORLDS, **TIGHT)
             state = self.simulator.initial_state(WORLDS)
             for _ in range(3):
                 state = self.simulator.step(state)
@@ -111,10 +113,9 @@ class Case:
     def end(self, simulator: Simulator, values=None, parameters=None, controls=None) -> WorldState:
         """The last state, from the tensors of the first one."""
         state = WorldState(tuple(values or self.state.values), self.state.time, simulator.engine(WORLDS))
+        controls = self.posed | (controls or {})
         if self.statics:
             return simulator.equilibrium(parameters, controls, state=state, start=1.0, **TIGHT)
-        if self.model.grips:
-            controls = {"poses": self.poses} | (controls or {})
         *_, state = simulator.rollout(state, parameters, controls, steps=STEPS)
         return state
 
@@ -205,7 +206,7 @@ class Case:
             return self._of_equilibrium()
         states, sums = [self.state], {"time step": 0.0, "mass damping": 0.0, "density": 0.0}
         for _ in range(STEPS):
-            states.append(self.simulator.step(states[-1], None, {"poses": self.poses} if self.model.grips else None))
+            states.append(self.simulator.step(states[-1], None, self.posed))
         given = self._by_end(states[-1])
         for before, after in zip(states[-2::-1], states[:0:-1], strict=True):
             posed = bool(self.model.grips)

@@ -64,19 +64,19 @@ class NetAdjoint:
     """Reverse of the steps of a model's net, and of its equilibria.
 
     Args:
-        scheme: of the steps, None for equilibria.
+        scheme, posed: as of `ChainAdjoint`.
 
     Raises:
         SceneError: a motion has no gradient; see `Supports`.
     """
 
-    def __init__(self, model, scheme: str | None):
+    def __init__(self, model, scheme: str | None, posed: bool = False):
         net, real = model.net, model.types.real
         self.model, self.net, self.real, self.device = model, net, real, model.wp_device
         self.solve = HostSolve(NetTangent(model, 0))
         host = net.host
         midpoint = scheme == "implicit_midpoint"
-        self.supports = Supports(model, net, midpoint) if scheme and host.moves else None
+        self.supports = Supports(model, net, midpoint) if (scheme or posed) and host.moves else None
         motion = self.supports.motion if self.supports else None
         self._midpoint, drag = midpoint, bool(host.drag and scheme)
         self.followers = Followers(model, net, midpoint) if host.followers and scheme else None
@@ -183,6 +183,8 @@ class NetAdjoint:
             self._over(i, kernel, [at, w], [slots[i], lags[i], inputs.parameters[i], start.last[i], by_rate])
             inputs.elements_rate.append(by_rate)
         self._collect(slots, lags, by_q, carried, inputs.data)
+        if self.solve.held is not None:
+            wp.map(wp.add, by_q, self._upload(self.solve.tangent.back(self.solve.held)), out=by_q)
         own = [self._own(i, lag, more) for i, (lag, more) in enumerate(zip(lags, own, strict=True))]
         if self.supports:
             self.supports.follow(*states)

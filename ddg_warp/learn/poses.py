@@ -6,16 +6,17 @@ import warp as wp
 
 
 class Poses:
-    """Of an engine's model: a point X that a grip holds is at pivot + R (X - pivot) + translation, a director or a normal d at R d.
+    """Of the supports of an `Adjoint` or an `EquilibriumAdjoint`.
 
+    A point X that a grip holds is at pivot + R (X - pivot) + translation, a director or a normal d at R d.
     By the midpoint rule a point is at the mean of where it is at both ends of the step, and a vector is turned halfway.
 
     Attributes:
-        by_end: derivatives by poses at the end of the last step that was pulled (worlds, grips, 6).
+        by_end: derivatives by poses at the end of the last step or equilibrium that was pulled (worlds, grips, 6).
     """
 
-    def __init__(self, engine):
-        self.engine, self.model, self._midpoint = engine, engine.model, engine.midpoint
+    def __init__(self, adjoint, midpoint: bool = False):
+        self.model, self._midpoint = adjoint.model, midpoint
         model = self.model
         real = wp.dtype_to_torch(model.types.real)
         device = str(wp.device_to_torch(model.wp_device))
@@ -24,7 +25,7 @@ class Poses:
             return torch.as_tensor(np.ascontiguousarray(values), dtype=dtype, device=device)
 
         self._owned, count = [], len(model.grips)
-        for own in (*engine.adjoint.chains, *([engine.adjoint.net] if engine.adjoint.net else [])):
+        for own in adjoint.parts:
             if not own.supports:
                 continue
             motion, host = own.supports.motion, own.supports.part.host
@@ -38,33 +39,38 @@ class Poses:
             directors = host.frame[:3].reshape(3, -1)[:, host.turning[:, 0] - host.nodes].T
             self._owned.append((own, put(places, torch.long), put(of), put(arms), put(turned), put(directors)))
         self._normals = []  # of sets with normals that grips turn: index, their elements and rows of data, shares of grips, rest
-        moved = engine.integrator._net.motion if self.model.net is not None else None
-        for index, (where, rest) in moved.normals.items() if moved else ():
+        moved = adjoint.net.supports if adjoint.net else None
+        for index, (where, rest) in moved.motion.normals.items() if moved else ():
             element, row, pose = where.numpy().T
-            grips = np.append(moved._grips.numpy(), -1)[pose]
+            grips = np.append(moved.motion._grips.numpy(), -1)[pose]
             shares = np.stack([grips == g for g in range(count)], 0).astype(float)
             self._normals.append(
                 (index, put(element, torch.long), put(row, torch.long), put(shares), put(rest.numpy()))
             )
 
-    def pull_step(self, found, inputs: list, given, posed: bool) -> None:
-        """Put derivatives by poses at the start of the engine's step into those by the state there, `found`, and keep those at the end.
+    def pull_step(self, found, inputs: list, ends: tuple, given, posed: bool) -> None:
+        """Put derivatives by poses at the start of a step into those by the state there, `found`, and keep those at the end.
 
         Args:
             inputs: what the reverse of the parts has found.
-            given: derivatives by the state at the end.
+            ends: states at both ends; given: derivatives by that at the end.
             posed: whether the step was given poses; else they are those of the start.
         """
 
-        def looked(state) -> torch.Tensor:
-            return wp.to_torch(state.grips.pose, requires_grad=False)
-
-        states, worlds = (self.engine.before, self.engine.after, given), self.model.worlds
-        before, after, by_end = (looked(state).T.reshape(worlds, -1, 6) for state in states)
+        before, after, by_end = (self._of(state) for state in (*ends, given))
         by_start, own = self.pull(inputs, before, after)
         self.by_end = by_end + own
         by_start = by_start if posed else by_start + self.by_end
-        looked(found).copy_(by_start.reshape(-1, 6).T)
+        wp.to_torch(found.grips.pose, requires_grad=False).copy_(by_start.reshape(-1, 6).T)
+
+    def pull_equilibrium(self, inputs: list, state, given) -> None:
+        """Keep derivatives by the poses of an equilibrium, of which `given` are those by its state."""
+        poses = self._of(state)
+        self.by_end = self._of(given) + self.pull(inputs, poses, poses)[1]
+
+    def _of(self, state) -> torch.Tensor:
+        """Poses of a state (worlds, grips, 6)."""
+        return wp.to_torch(state.grips.pose, requires_grad=False).T.reshape(self.model.worlds, -1, 6)
 
     def pull(self, inputs: list, before: torch.Tensor, after: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Derivatives by the poses of the grips at the start and at the end of a step (worlds, grips, 6).

@@ -223,9 +223,12 @@ class Simulator(torch.nn.Module):
     ) -> WorldState:
         """The equilibrium of every world, with gradients by parameters and controls.
 
+        Angles are measured from frames that the search carries along, so that they depend on its way; their gradients are those of
+        a search that begins in the equilibrium. Positions do not.
+
         Args:
             parameters: as of `step`.
-            controls: the same, without poses; loads that the load parameter scales as it does those of the scene.
+            controls: the same; the load parameter scales loads as it does those of the scene, poses are those at the end.
             state: where the search begins; by default the first state of so many worlds (`batch`).
             options: as of `ddg_warp.statics.solve`.
 

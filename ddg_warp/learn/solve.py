@@ -22,10 +22,15 @@ SINGULAR = 1e-6  # part of a right-hand side that a solution may miss; a singula
 
 
 class HostSolve:
-    """(H + c M - dL/dq)^T w = g of a part of a model, by sparse factors on the host."""
+    """(H + c M - dL/dq)^T w = g of a part of a model, by sparse factors on the host.
+
+    Attributes:
+        held: of the last solution, what loads that follow held dofs add to derivatives by these (size,); None where none do.
+    """
 
     def __init__(self, tangent):
         self.tangent = tangent
+        self.held = None
 
     def __call__(
         self, state, rate: float, coefficient: float, factor: float | None, given: np.ndarray, more=None
@@ -64,6 +69,7 @@ class HostSolve:
             raise self._singular(free[int(np.argmax(missed))])
         w = np.zeros(tangent.size)
         w[free] = found
+        self.held = None if following is None else np.where(tangent.free, 0.0, -(following.T @ w))
         return w
 
     def _spun(self, state, factor: float) -> sparse.csc_matrix | None:
@@ -119,14 +125,14 @@ class ChainSolve:
 
     Attributes:
         guess: where solves are in another precision than the state, the kernel that w starts from; see `guess_kernels`.
-        tangent: of solves on the host.
+        tangent: of solves on the host; held: of the last of these, see `HostSolve`, as w is laid out.
         failed: not zero of rods whose H is not positive definite (columns,), so that w means nothing; None on the host.
     """
 
     def __init__(self, model, group):
         self.model, self.group = model, group
         self.host = HostSolve(ChainTangent(model, group, 0))
-        self.tangent = self.host.tangent
+        self.tangent, self.held = self.host.tangent, None
         self.system = self.reduction = self.failed = self.guess = self._cast = self._for = None
         if group.kind.closed:
             return
@@ -222,4 +228,6 @@ class ChainSolve:
         factor = None if rate else solved.time
         b = arrays.download(right).astype(float).transpose(2, 1, 0).ravel()
         found = self.host(SimpleNamespace(groups=groups), rate, coefficient, factor, b, more)
-        arrays.assign(w, self.host.tangent.blocks(found).transpose(2, 1, 0))
+        arrays.assign(w, self.tangent.blocks(found).transpose(2, 1, 0))
+        held = self.host.held
+        self.held = None if held is None else self.tangent.blocks(held).transpose(2, 1, 0)

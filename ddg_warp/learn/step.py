@@ -121,7 +121,7 @@ class Balance(torch.autograd.Function):
             found = engine.tables.pull(call.parameters, inputs, flags)
             for name, value in controls.items():
                 by_load = engine.controls.pull(name, value, inputs, flags)
-                found.append(by_load if name == "gravity" else end * by_load)  # which the load parameter scales
+                found.append(end * by_load if name in ("forces", "moments") else by_load)  # which `end` scales
         return None, None, *([None] * count), *found
 
 

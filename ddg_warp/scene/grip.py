@@ -15,7 +15,7 @@ class Grip:
     rotation vector (3,) [rad], both relative to rest: a point X of the rest state is at pivot + R (X - pivot) + translation. Over a
     step the translation runs straight and the rotation the shortest way from one orientation to the next, less than half a turn; turns
     add up from step to step, as those of a `Motion` do. A grip that a step is told nothing of rests where it was. Its poses are part
-    of a `State` (`State.poses`): equilibria and questions find it where the state has it.
+    of a `State` (`State.poses`): questions, and equilibria that are told nothing of it, find it where the state has it.
 
     Attributes:
         pivot: what it turns about at rest (3,) [m].

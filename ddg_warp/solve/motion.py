@@ -1,5 +1,7 @@
 """Motion of supports on a device."""
 
+from collections.abc import Callable
+
 import numpy as np
 import warp as wp
 
@@ -37,6 +39,25 @@ def jump_between(model, t0: float, t1: float) -> str:
                 "few steps"
             )
     return ""
+
+
+def poses_between(state: State, ends: np.ndarray, start: float, end: float) -> Callable:
+    """Poses of grips (worlds, grips, 6) by load parameter, from those of a state at `start` to `ends` at `end`: see `Grip`."""
+    from scipy.spatial.transform import Rotation
+
+    begin = state.poses().reshape(state.model.worlds, -1, 6)
+    ends = np.array(np.broadcast_to(ends, begin.shape))
+    first, last = (Rotation.from_rotvec(poses[..., 3:].reshape(-1, 3)) for poses in (begin, ends))
+    turn = (last * first.inv()).as_rotvec()
+
+    def poses(at: float) -> np.ndarray:
+        if at == end:
+            return ends
+        s = (at - start) / (end - start)
+        rotation = (Rotation.from_rotvec(s * turn) * first).as_rotvec().reshape(*begin.shape[:2], 3)
+        return np.concatenate([begin[..., :3] + s * (ends - begin)[..., :3], rotation], axis=-1)
+
+    return poses
 
 
 class Motion:

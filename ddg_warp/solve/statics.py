@@ -24,7 +24,7 @@ from ddg_warp.scene import validate as scene_validate
 from ddg_warp.solve import mixed, stability
 from ddg_warp.solve.choice import static_solver, why_not_pcg
 from ddg_warp.solve.direct import Factorisation, SingularError
-from ddg_warp.solve.motion import jump_between
+from ddg_warp.solve.motion import jump_between, poses_between
 from ddg_warp.solve.net.statics import NetEquilibrium
 from ddg_warp.solve.residuals import Residuals
 from ddg_warp.solve.supports import require_supports
@@ -88,8 +88,9 @@ def solve(
 
     Args:
         model: what to equilibrate.
-        state: where to begin; the rest state by default. It is not changed. What a `Grip` holds stays where it is.
-        controls: forces, moments and gravity, world by world, which the load parameter scales as it does those of the scene.
+        state: where to begin; the rest state by default. It is not changed. What a `Grip` holds stays where it is, without `poses`.
+        controls: forces, moments and gravity, world by world, which the load parameter scales as it does those of the scene; and poses
+            of grips at `end`, which move there straight from where the state has them.
         load_steps: increments; one that fails is halved.
         start, end: load parameter, which scales gravity and loads and is the time of motions and amplitudes.
         options: see `StaticsOptions`.
@@ -164,11 +165,12 @@ class Equilibrium:
     ) -> State:
         """Load stepping; see `solve`."""
         found = checked(controls, self.model, "statics")
-        if "poses" in found:
-            raise SceneError("statics: equilibria take no poses: grips are where the state has them")
         if "field" in found:
-            raise SceneError("statics: equilibria take no magnetic field yet: give it to the scene")
+            raise SceneError(
+                "statics: equilibria take no field as a control yet; give it to the scene: scene.magnetic_field(...)"
+            )
         self.tangent.give(found)
+        self.tangent.poses = poses_between(state, found["poses"], start, end) if "poses" in found else None
         if start == end:
             return self.solve(state, start, end)
         at, whole, cuts = start, (end - start) / load_steps, 0

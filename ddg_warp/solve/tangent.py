@@ -21,10 +21,11 @@ class Tangent:
         free: which dofs are free (size,) bool.
         angle: which dofs are angles (size,) bool.
         mass: lumped mass and rotary inertia of every dof (size,) [kg, kg m^2].
+        poses: of grips by load parameter, load -> (worlds, grips, 6); None where they are as the state has them.
     """
 
     def __init__(self, model):
-        self.model = model
+        self.model, self.poses = model, None
         self.parts, offset = [], 0
         for group in model.groups:
             self.parts.append(ChainTangent(model, group, offset))
@@ -116,6 +117,7 @@ class Tangent:
     def move_supports(self, state, before: float, at: float) -> None:
         """Put held dofs, and the magnetic field, where they are at load parameter `at`; the state belongs to `before`."""
         if self.model.motions or self.prescribes:
+            self._hold(state, at)
             for part in self.parts:
                 part.move_supports(state, before, at)
             self.model.carry_frames(state)
@@ -128,12 +130,19 @@ class Tangent:
         )
 
     def with_prescribed(self, state, at: float):
-        """The state with the normals that supports turn, and the magnetic field, of `at`; itself where there is neither."""
-        if not self.prescribes:
+        """The state with grips, the normals that supports turn, and the magnetic field, of `at`; itself where none changes."""
+        if not (self.prescribes or self.poses):
             return state
         state = state.copy()
-        self.parts[-1].prescribe(state, at)
+        self._hold(state, at)
+        if self.prescribes:
+            self.parts[-1].prescribe(state, at)
         return state
+
+    def _hold(self, state, at: float) -> None:
+        """Put the grips of a state where they are at load parameter `at`."""
+        if self.poses:
+            state.grips.pose.assign(np.ascontiguousarray(self.poses(at).reshape(-1, 6).T))
 
     def support_step(self, state, before: float, at: float) -> np.ndarray:
         """How far the supports of a state that belongs to `before` are from where they are at `at` (size,), zero at free dofs."""

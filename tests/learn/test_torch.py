@@ -11,6 +11,7 @@ import warp as wp
 
 import ddg_warp as ddg
 from ddg_warp.errors import SceneError
+from ddg_warp.geometry import meshes
 from tests.learn import differences
 from tests.learn.differences import TIGHT, built
 from tests.learn.test_adjoint import CLOSE, CURVE, DT, SCENES, SOFT, a_scene
@@ -268,6 +269,45 @@ def test_equilibria_under_controls(name, end):
     def loss(stiffness, **controls):
         found = own.equilibrium({term: stiffness}, controls, batch=2, rtol=1e-13, end=end)
         return (weight * found.positions).sum()
+
+    check(loss, values, sizes)
+
+
+def pressed_by_a_grip(scene):
+    """A sheet whose first vertices and normals a grip holds, under pressure, which follows them."""
+    points, triangles = meshes.rectangle(3, 2, (0.3, 0.2))
+    shell = scene.add_shell(points, triangles, thickness=0.004, material=SOFT)
+    scene.clamp_boundary(shell, np.flatnonzero(points[:, 0] <= 0.0), motion=ddg.Grip())
+    scene.add_pressure(shell, 5.0)
+
+
+def gripped_joint(scene):
+    """Two rods joined rigidly, of which a grip clamps the first."""
+    rods = [
+        scene.add_rod(CURVE + shift, section=ddg.Ellipse(0.004, 0.003), material=SOFT)
+        for shift in (0.0, CURVE[-1] - CURVE[0])
+    ]
+    scene.join([(rods[0], -1), (rods[1], 0)])
+    scene.clamp(rods[0], motion=ddg.Grip())
+
+
+@pytest.mark.parametrize("hold", [None, gripped_joint, pressed_by_a_grip], ids=["rod", "joined", "sheet"])
+def test_equilibria_by_poses(hold):
+    """Beside moments, which turn with the edges that a grip moves at one end, and loads that follow what it holds."""
+    own, scene = gripped(), a_scene()
+    if hold:
+        hold(scene)
+        own = Simulator(built(scene), DT)
+    torch.manual_seed(2)
+    weight = torch.randn((own.model.points_count, 3), dtype=torch.float64)
+    poses = torch.tensor([[[0.001, 0.002, -0.001, 0.02, 0.01, 0.03]], [[0.0, 0.001, 0.0, 0.05, -0.04, 0.01]]])
+    values, sizes = {"poses": poses.double()}, {"poses": 1e-5}
+    if hold is not pressed_by_a_grip:
+        moments = 1e-4 * torch.ones((2, own.model.order.edges_count), dtype=torch.float64)
+        values["moments"], sizes["moments"] = moments, 1e-7
+
+    def loss(**controls):
+        return (weight * own.equilibrium(None, controls, batch=2, rtol=1e-13, load_steps=2).positions).sum()
 
     check(loss, values, sizes)
 
