@@ -11,7 +11,7 @@ model). Time is the least of some runs, a step of ten in a row, after which alon
 gradients_DEVICE.csv and .json.
 
 Scaling is that of roll-outs of a world a rod, in the precision that a device has by default: seconds of all steps and of their reverse,
-and what torch holds of them at most [MB], the states between steps, with and without checkpoints. It writes
+the least of three runs, and what torch holds of them at most [MB], the states between steps, with and without checkpoints. It writes
 gradients_scaling_DEVICE.csv, .json and a plot of each study.
 """
 
@@ -125,7 +125,8 @@ def roll_out(worlds: int, nodes: int, steps: int, every: int | None, device: str
     for _ in range(2):  # in which graphs are captured
         run(2)
     clock.best.clear()
-    run(steps)
+    for _ in range(3):
+        run(steps)
     found = {"worlds": worlds, "nodes": nodes, "steps": steps, "checkpoint every": every or 0}
     found |= {f"{name} [s]": seconds for name, seconds in clock.best.items()}
     return found | {"memory [MB]": held / 1e6}

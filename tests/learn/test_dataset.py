@@ -105,6 +105,7 @@ def test_each_world_has_its_windows(worlds):
 
 @pytest.mark.parametrize("kind", ["fork", "spawn"])
 def test_workers_read_for_themselves(tmp_path, kind):
+    torch.set_default_device("cpu")  # workers that are forked have no CUDA
     filled(tmp_path, 6)
     data = Recordings(tmp_path, window=2)
     expected = [data[index] for index in range(len(data))]  # files of this process are open now
