@@ -207,7 +207,8 @@ LONG = (
         *((0.5, 16, 0.01, 2, ()), (1.0, 16, 0.01, 2, ())),
         *((0.5, 64, 0.01, 1, LONG), (1.0, 64, 0.01, 1, LONG)),
         *((0.5, 64, 1e-4, 2, ()), (1.0, 64, 1e-4, 2, ())),
-        pytest.param(0.5, 32, 0.01, 20, LONG, marks=slow),
+        # of such chaos rounding decides by which name a joined rod fails in its first step
+        pytest.param(0.5, 32, 0.01, 20, (*LONG, "line_search_failed"), marks=slow),
     ],
 )
 def test_random_start(device, amplitude, nodes, dt, steps, fails):
