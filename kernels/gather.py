@@ -36,3 +36,23 @@ def point_functions(dim: int, real):
             x[place / columns, column_of(place, w, columns)] = v
 
     return get, put
+
+
+@cache
+def row_functions(dim: int, real):
+    """take(a, k, r) and give(a, k, r, v): the first components of node k of rod r in an array (component, node, rod), as a vector."""
+    V = wp.types.vector(dim, real)
+
+    @wp.func
+    def take(a: wp.array3d(dtype=real), k: int, r: int):
+        v = V()
+        for d in range(wp.static(dim)):
+            v[d] = a[d, k, r]
+        return v
+
+    @wp.func
+    def give(a: wp.array3d(dtype=real), k: int, r: int, v: V):
+        for d in range(wp.static(dim)):
+            a[d, k, r] = v[d]
+
+    return take, give

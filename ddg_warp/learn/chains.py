@@ -242,7 +242,8 @@ class ChainAdjoint:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [*self._pull, *self._product, *self._strain, self._nodes, self._edges, self._solution, self._start]
+        own = [*self._pull, *self._strain, self._nodes, self._edges, self._solution, self._start]
+        own += self._product if self.solve.guess else []
         own += [*([self._frame] if self._frame else []), *self.solve.kernels]
         parts = (self.supports, self.drag, self.followers, self.predictor)
         return own + [kernel for part in parts if part for kernel in part.kernels]

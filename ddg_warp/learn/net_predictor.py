@@ -8,7 +8,7 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.compile.precision import straight_turns
-from ddg_warp.kernels.adjoint import turns
+from ddg_warp.kernels.adjoint import net_predictor
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.net import newton
 from ddg_warp.model.net import NetState
@@ -36,7 +36,7 @@ class NetPredictor:
         )
         self.frame, self._lag = net.lagged() if self.carries else (None, None)
         self._begin, _ = newton.step_kernels(real, midpoint, arrays.serial(device))
-        self._unplace, self._pass_on, self._turn, self._pull = turns.net_kernels(real, midpoint)
+        self._unplace, self._pass_on, self._turn, self._pull = net_predictor.net_kernels(real, midpoint)
         plan, loops = host.outwards, np.array([rod.piece.kind.closed for rod in host.rods], int)
         rod = np.repeat(np.arange(len(loops)), np.diff(plan.start))
         nodes, ahead = plan.nodes, plan.nodes[plan.ahead(loops)]

@@ -9,7 +9,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.compile.precision import straight_turns
 from ddg_warp.kernels import step
-from ddg_warp.kernels.adjoint import chain, turns
+from ddg_warp.kernels.adjoint import chain, chain_predictor
 from ddg_warp.kernels.islands import Islands
 
 
@@ -44,7 +44,7 @@ class ChainPredictor:
         self._none = wp.zeros(group.columns, dtype=real, device=device)
         self._begin = step.begin_kernel(kind, real, midpoint)
         self._carry = chain.frame_kernel(kind, real, unit=False) if self.carries else None
-        self._pull = turns.predict_kernel(kind, real, midpoint)
+        self._pull = chain_predictor.predict_kernel(kind, real, midpoint)
 
     @classmethod
     def of(cls, model, group, motion, scheme: str | None) -> "ChainPredictor | None":

@@ -10,6 +10,7 @@ import warp as wp
 from ddg_warp.kernels.balance import node_functions
 from ddg_warp.kernels.chain import ChainKind, gather_functions
 from ddg_warp.kernels.drag import ROTATIONAL, ROWS, block_inertia, edge_function
+from ddg_warp.kernels.gather import row_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
 
@@ -39,13 +40,7 @@ def chain_kernels(kind: ChainKind, real, midpoint: bool):
     half, resisted = edge_function(dim, real), resisted_function(dim, real)
     _, behind, *_ = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
-
-    @wp.func
-    def row(a: wp.array3d(dtype=real), k: int, r: int):
-        v = V()
-        for d in range(wp.static(dim)):
-            v[d] = a[d, k, r]
-        return v
+    row, _ = row_functions(dim, real)
 
     @wp.func
     def law(coefficients: wp.array3d(dtype=real), k: int, r: int):

@@ -10,6 +10,24 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 from ddg_warp.kernels.turns import edge_functions, onward_function, place_function
 
 
+def walk_functions(Rod):
+    """place_of(rod, j) and anchored(rod, j): where node j of a rod is among the places of all, and whether it is anchored there.
+
+    Args:
+        Rod: struct of a rod; its fields `first`, `count` and `anchored`, of all places. Nodes may be counted on past the last one.
+    """
+
+    @wp.func
+    def place_of(rod: Rod, j: int):
+        return rod.first + wp.where(j < rod.count, j, j - rod.count)
+
+    @wp.func
+    def anchored(rod: Rod, j: int):
+        return rod.anchored[place_of(rod, j)] != wp.uint8(0)
+
+    return place_of, anchored
+
+
 @cache
 def turn_kernels(real, linear):
     """What turns edges: bend(...) finds predictors that have to, aim(...) makes steps of them; turn(...) turns edges, a thread each,
@@ -37,9 +55,7 @@ def turn_kernels(real, linear):
         closed: int
         anchor: int
 
-    @wp.func
-    def place_of(rod: Rod, j: int):
-        return rod.first + wp.where(j < rod.count, j, j - rod.count)
+    place_of, anchored = walk_functions(Rod)
 
     @wp.func
     def move_of(direction: wp.array(dtype=H), block: int, amount: real):
@@ -49,10 +65,6 @@ def turn_kernels(real, linear):
     @wp.func
     def excess(rod: Rod, j: int):
         return rod.excess[rod.world, place_of(rod, j)]
-
-    @wp.func
-    def anchored(rod: Rod, j: int):
-        return rod.anchored[place_of(rod, j)] != wp.uint8(0)
 
     @wp.func
     def added(rod: Rod, j: int):

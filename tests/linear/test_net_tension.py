@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
+from test_tension import advance
 
 import ddg_warp as ddg
 from ddg_warp import arrays
@@ -106,16 +107,6 @@ def island(nodes: int, strands: int = 3, backwards: bool = False) -> ddg.Scene:
         scene.clamp(stub, edges=[0, 1])
         scene.join([(rod, -1 if backwards else 0), (stub, -1)], rigid=False)
     return scene
-
-
-def advance(scene: ddg.Scene, device, precision: str, dt: float, steps: int, **options):
-    """Points after some steps, and the statistics."""
-    model = scene.build(device, precision)
-    integrator, state = ddg.Integrator(model, **options), model.state()
-    for _ in range(steps):
-        state = integrator.step(state, dt)
-    integrator.check(state)
-    return state.points(), integrator.statistics()
 
 
 @pytest.mark.parametrize(
