@@ -87,7 +87,6 @@ class StepControls:
                 rows, blocks = self.layout.places(("points", "net"), lambda: model.order.net_rows)
                 result[:, rows] = w[:, blocks]
             else:
-                for rod in model.net.host.rods:
-                    first = int(model.order.edge_starts[rod.rod])
-                    result[:, first : first + len(rod.edges)] = w[:, torch.as_tensor(rod.edges), 0]
+                rows, blocks = self.layout.net_edges()
+                result[:, rows] = w[:, blocks, 0]
         return result

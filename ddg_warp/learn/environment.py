@@ -9,11 +9,13 @@ import warp as wp
 
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError
+from ddg_warp.kernels import outcome
+from ddg_warp.learn.layout import along
 from ddg_warp.learn.rotations import turned
 from ddg_warp.learn.simulator import Simulator, WorldState
 from ddg_warp.model.controls import Controls
 
-CONVERGED = "converged"
+CONVERGED = outcome.NAMES[outcome.CONVERGED]
 AXES = "xyz"
 
 
@@ -276,9 +278,7 @@ def _selected(mask: torch.Tensor, new: WorldState, old: WorldState) -> WorldStat
     """A state of worlds from one state where a mask (B,) is True, else from another, whose time it has."""
     values = []
     for field, a, b in zip(old.engine.fields, new.values, old.values, strict=True):
-        shape = [1] * b.ndim
-        shape[field.axis] = -1
-        values.append(torch.where(mask.repeat_interleave(b.shape[field.axis] // len(mask)).reshape(shape), a, b))
+        values.append(torch.where(along(mask, field, b), a, b))
     return WorldState(tuple(values), old.time, old.engine)
 
 

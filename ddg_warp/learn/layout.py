@@ -23,13 +23,12 @@ class Field:
 
 def fields(model) -> list[Field]:
     """Arrays of a model's states that hold something, in their order."""
-    result, nothing = [], {"net/frame"} if model.net is not None and not model.net.edges else set()
-    for part, values in model.empty_state().parts().items():
-        for name, array in values.arrays().items():
-            if array.size > 1 and f"{part}/{name}" not in nothing:
-                axis = array.ndim - 1
-                result.append(Field(f"{part}/{name}", axis, name.rstrip("_0123456789") in GRADIENTS))
-    return result
+    nothing = "net/frame" if model.net is not None and not model.net.edges else ""
+    return [
+        Field(name, array.ndim - 1, name.partition("/")[2].rstrip("_0123456789") in GRADIENTS)
+        for name, array in model.empty_state().arrays().items()
+        if array.size > 1 and name != nothing
+    ]
 
 
 def view(array: wp.array) -> torch.Tensor:
@@ -39,7 +38,7 @@ def view(array: wp.array) -> torch.Tensor:
 
 def tensors(state, names: list[Field]) -> list[torch.Tensor]:
     """Tensors that look at the arrays of a state."""
-    found = {f"{part}/{name}": array for part, data in state.parts().items() for name, array in data.arrays().items()}
+    found = state.arrays()
     return [view(found[field.name]) for field in names]
 
 
@@ -48,6 +47,14 @@ def copies(values: list[torch.Tensor]) -> list[torch.Tensor]:
     found = [torch.empty_like(value) for value in values]
     torch._foreach_copy_(found, values)
     return found
+
+
+def along(values: torch.Tensor, field: Field, like: torch.Tensor) -> torch.Tensor:
+    """Values of worlds, or of islands, as they lie along an array of a state, so that they multiply it."""
+    count = like.shape[field.axis]
+    if count != len(values):
+        values = values.repeat_interleave(count // len(values))
+    return values if like.ndim == field.axis + 1 else values[:, None]
 
 
 class Layout:
@@ -123,12 +130,10 @@ class Layout:
                 wide = torch.zeros_like(values[at]).reshape(group.nodes, worlds, group.rods)
                 wide = wide.index_put((k[:, None], of[None], column[:, None]), more[:, rows].T)
                 values[at] = values[at] + wide.reshape(values[at].shape)
-        for rod in model.net.host.rods if model.net is not None else ():
-            first, at = int(model.order.edge_starts[rod.rod]), self._of(f"net/{blocks}")
+        if model.net is not None:
+            at, (rows, owned) = self._of(f"net/{blocks}"), self.net_edges()
             wide = torch.zeros_like(values[at]).reshape(worlds, -1, 3)
-            rows = torch.as_tensor(rod.edges, device=wide.device)[None]
-            added = more[:, first : first + len(rod.edges)]
-            wide = wide.index_put((of[:, None], rows, torch.zeros_like(rows)), added)
+            wide = wide.index_put((of[:, None], owned[None], torch.zeros_like(owned)[None]), more[:, rows])
             values[at] = values[at] + wide.reshape(values[at].shape)
         return values
 
@@ -138,16 +143,17 @@ class Layout:
         return list(torch._foreach_mul([value for value, _ in found], [self._flag(*own, flags) for own in found]))
 
     def _flag(self, values: torch.Tensor, field: Field, flags) -> torch.Tensor:
-        """Flags of islands as they lie along such an array."""
+        """Flags of the islands of a part as they lie along such an array."""
         part = field.name.partition("/")[0]
-        flag = self.by_world(flags) if part == "grips" else flags[self._part(part)]
-        if values.shape[field.axis] != len(flag):  # entries of a net, world by world
-            flag = flag.repeat_interleave(values.shape[field.axis] // len(flag))
-        return flag if values.ndim == field.axis + 1 else flag[:, None]
+        return along(self.by_world(flags) if part == "grips" else flags[self._part(part)], field, values)
 
     def by_world(self, flags) -> torch.Tensor:
         """One for worlds in which all has gradients."""
         return torch.stack([flag.reshape(self.model.worlds, -1).sum(1) * 0.0 + 1.0 for flag in flags]).prod(0)
+
+    def net_edges(self) -> list[torch.Tensor]:
+        """Of the edges of a net's rods, where they are among all, and their blocks."""
+        return self.places(("edges", "net"), lambda: _net_edges(self.model))
 
     def places(self, key, find) -> list[torch.Tensor]:
         if key not in self._places:
@@ -185,10 +191,17 @@ class Layout:
         for at, group in zip(first, twisted, strict=False):
             k, column, own = model.order.edge_places(group)
             rows[:, own] = at + k * group.columns + world * group.rods + column
-        for rod in model.net.host.rods if model.net is not None else ():
-            own = model.order.edge_starts[rod.rod] + np.arange(len(rod.edges))
-            rows[:, own] = first[len(twisted)] + world * model.net.blocks + rod.edges
+        if model.net is not None:
+            own, blocks = _net_edges(model)
+            rows[:, own] = first[len(twisted)] + world * model.net.blocks + blocks
         return rows.ravel()
+
+
+def _net_edges(model) -> tuple[np.ndarray, np.ndarray]:
+    """Of the edges of a net's rods, where they are among all, and their blocks."""
+    rods, none = model.net.host.rods, np.zeros(0, np.int64)
+    rows = [model.order.edge_starts[rod.rod] + np.arange(len(rod.edges)) for rod in rods]
+    return np.concatenate([none, *rows]), np.concatenate([none, *(rod.edges for rod in rods)])
 
 
 def _last(rows: np.ndarray, blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,6 +4,9 @@ import numpy as np
 import torch
 import warp as wp
 
+from ddg_warp.learn.layout import view
+from ddg_warp.learn.rotations import halfway, matrix, quaternion
+
 
 class Poses:
     """Of the supports of an `Adjoint` or an `EquilibriumAdjoint`.
@@ -56,12 +59,11 @@ class Poses:
             ends: states at both ends; given: derivatives by that at the end.
             posed: whether the step was given poses; else they are those of the start.
         """
-
         before, after, by_end = (self._of(state) for state in (*ends, given))
         by_start, own = self.pull(inputs, before, after)
         self.by_end = by_end + own
         by_start = by_start if posed else by_start + self.by_end
-        wp.to_torch(found.grips.pose, requires_grad=False).copy_(by_start.reshape(-1, 6).T)
+        view(found.grips.pose).copy_(by_start.reshape(-1, 6).T)
 
     def pull_equilibrium(self, inputs: list, state, given) -> None:
         """Keep derivatives by the poses of an equilibrium, of which `given` are those by its state."""
@@ -70,7 +72,7 @@ class Poses:
 
     def _of(self, state) -> torch.Tensor:
         """Poses of a state (worlds, grips, 6)."""
-        return wp.to_torch(state.grips.pose, requires_grad=False).T.reshape(self.model.worlds, -1, 6)
+        return view(state.grips.pose).T.reshape(self.model.worlds, -1, 6)
 
     def pull(self, inputs: list, before: torch.Tensor, after: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Derivatives by the poses of the grips at the start and at the end of a step (worlds, grips, 6).
@@ -91,7 +93,7 @@ class Poses:
             by_shift = by_shift + shares.sum(2)
             by_turn = by_turn + torch.einsum("wgnc,gnd->wgcd", shares, arms)
             if len(directors):
-                found = wp.to_torch(own.supports.by_director, requires_grad=False)
+                found = view(own.supports.by_director)
                 by_turned = by_turned + torch.einsum("gi,iwc,id->wgcd", turned, found, directors)
         if self._normals:
             by_turned = by_turned + self._by_normals(inputs[-1].data, worlds)
@@ -99,8 +101,8 @@ class Poses:
         share = 0.5 if self._midpoint else 1.0
         ends = [poses[..., 3:].detach().requires_grad_() for poses in (before, after)]
         with torch.enable_grad():
-            start, end = (_rotation(_quaternion(rotation)) for rotation in ends)
-            solved = _rotation(_halfway(*map(_quaternion, ends))) if self._midpoint else end
+            start, end = (matrix(quaternion(rotation)) for rotation in ends)
+            solved = matrix(halfway(*map(quaternion, ends))) if self._midpoint else end
             total = (end * (share * by_turn + by_end)).sum() + (solved * by_turned).sum()
             if self._midpoint:
                 total = total + (start * (share * by_turn)).sum()
@@ -115,7 +117,7 @@ class Poses:
         """Derivatives by rotations (worlds, grips, 3, 3), from those by the data of element sets with normals that grips turn."""
         total = 0.0
         for index, element, row, shares, rest in self._normals:
-            found = wp.to_torch(data[index], requires_grad=False)
+            found = view(data[index])
             found = found.reshape(found.shape[0], worlds, -1)
             found = found[row[:, None] + torch.arange(3, device=row.device), :, element[:, None]]
             total = total + torch.einsum("gi,icw,id->wgcd", shares, found, rest)
@@ -123,7 +125,7 @@ class Poses:
 
     def _held(self, part, held: wp.array, places: torch.Tensor) -> torch.Tensor:
         """Derivatives by nodes at places, in space (worlds, nodes, 3)."""
-        values, worlds = wp.to_torch(held, requires_grad=False), self.model.worlds
+        values, worlds = view(held), self.model.worlds
         if part is self.model.net:
             return values.reshape(worlds, -1, 3)[:, places]
         columns, kind = part.rods, part.kind
@@ -132,27 +134,3 @@ class Poses:
         result = torch.zeros((worlds, len(places), 3), dtype=values.dtype, device=values.device)
         result[..., list(part.host.axes)] = own.permute(2, 0, 1)
         return result
-
-
-def _quaternion(rotation: torch.Tensor) -> torch.Tensor:
-    """Of rotation vectors (..., 3), its real part last (..., 4)."""
-    square = (rotation * rotation).sum(-1, keepdim=True)
-    small = square < 1e-12
-    angle = torch.where(small, torch.ones_like(square), square).sqrt()
-    sine = torch.where(small, 0.5 - square / 48.0, torch.sin(0.5 * angle) / angle)
-    return torch.cat([rotation * sine, torch.where(small, 1.0 - square / 8.0, torch.cos(0.5 * angle))], -1)
-
-
-def _halfway(start: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
-    """The quaternion halfway on the shorter way from one to another."""
-    near = torch.where((start * end).sum(-1, keepdim=True) < 0.0, -end, end)
-    return torch.nn.functional.normalize(start + near, dim=-1)
-
-
-def _rotation(quaternion: torch.Tensor) -> torch.Tensor:
-    """Its matrix (..., 3, 3)."""
-    x, y, z, w = quaternion.unbind(-1)
-    rows = [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)]
-    rows += [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)]
-    rows += [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)]
-    return torch.stack(rows, -1).reshape(*x.shape, 3, 3)

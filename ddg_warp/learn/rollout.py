@@ -44,7 +44,8 @@ def plan(held: int, steps: int, save: int, every: int | None, memory: float | No
 
     if every is None and (memory is None or steps * held <= memory):
         return Plan(None, steps * held)
-    best = Plan(every, in_blocks(every)) if every else min((Plan(k, in_blocks(k)) for k in _sizes(steps)), key=_of)
+    size = every or min(_sizes(steps), key=in_blocks)
+    best = Plan(size, in_blocks(size))
     if memory is not None and best.memory > memory:
         raise SceneError(
             f"rollout: {steps} steps hold {best.memory:,} bytes at least, {held:,} each, in blocks of {best.every} and with "
@@ -57,10 +58,6 @@ def _sizes(steps: int) -> range:
     """Of blocks, around the best one."""
     middle = max(1, round(math.sqrt(steps)))
     return range(max(1, middle - 1), middle + 2)
-
-
-def _of(plan: Plan) -> int:
-    return plan.memory
 
 
 def bytes_of(tensors) -> int:

@@ -14,7 +14,7 @@ from ddg_warp.learn.layout import tensors
 from ddg_warp.learn.rollout import Plan, bytes_of, plan, roll
 from ddg_warp.learn.step import Balance, Call, Step
 from ddg_warp.model import validate
-from ddg_warp.model.controls import Controls, require_field
+from ddg_warp.model.controls import Controls, require_acting, shapes
 from ddg_warp.solve.dynamics import SCHEMES
 
 
@@ -98,14 +98,13 @@ class Simulator(torch.nn.Module):
         if worlds not in self._engines:
             model = self.model
             if worlds != model.worlds:
-                options = {"device": model.device, "precision": model.precision, "allow_rounding": model.allow_rounding}
-                model = self.model.scene.build(worlds=worlds, **options)
+                model = _Recipe(model, worlds).build()
                 _copy_parameters(self.model, model)
             self._engines[worlds] = Engine(model, self.scheme, self.options)
         return self._engines[worlds]
 
     def __getstate__(self):
-        return self.__dict__ | {"_engines": {}, "model": _Recipe.of(self.model)}
+        return self.__dict__ | {"_engines": {}, "model": _Recipe(self.model, self.model.worlds)}
 
     def __setstate__(self, state):
         self.__dict__.update(state)
@@ -290,28 +289,16 @@ class Simulator(torch.nn.Module):
         model, worlds = engine.model, engine.model.worlds
         controls = _named("controls", "forces", controls)
         real = wp.dtype_to_torch(model.types.real)
-        shapes = {
-            "forces": (model.points_count, 3),
-            "moments": (model.order.edges_count,),
-            "gravity": (3,),
-            "field": (3,),
-            "poses": (len(model.grips), 6),
-        }
-        result = {}
+        result, known = {}, shapes(model)
         for name, values in controls.items():
-            if name not in shapes:
-                raise SceneError(f"controls: there is no {name!r}; there are {', '.join(shapes)}")
-            own, shape = self._tensor(f"controls: {name}", values), shapes[name]
+            if name not in known:
+                raise SceneError(f"controls: there is no {name!r}; there are {', '.join(known)}")
+            own, shape = self._tensor(f"controls: {name}", values), known[name]
             if tuple(own.shape) not in (shape, (worlds, *shape)):
                 raise SceneError(
                     f"controls: {name} have shape {tuple(own.shape)}; they are {shape} or {(worlds, *shape)}"
                 )
-            if name == "poses" and not model.grips:
-                raise SceneError(
-                    "controls: poses of no grip; hold something by Grip(...), as in scene.clamp(rod, motion=Grip())"
-                )
-            if name == "field":
-                require_field(model)
+            require_acting(model, (name,))
             if not isinstance(values, torch.Tensor):  # finite, and on what it can act on
                 Controls(**{name: own.cpu().numpy()}).checked(model)
             result[name] = own.to(device=str(wp.device_to_torch(model.wp_device)), dtype=real).expand(worlds, *shape)
@@ -345,18 +332,16 @@ def _named(what: str, example: str, values) -> dict:
 
 
 class _Recipe:
-    """A model that can be built again elsewhere."""
+    """A model of so many worlds that can be built again elsewhere."""
 
-    def __init__(self, model):
+    def __init__(self, model, worlds: int):
         self.scene = model.scene
         self.options = {
             "device": model.device,
             "precision": model.precision,
-            "worlds": model.worlds,
+            "worlds": worlds,
             "allow_rounding": model.allow_rounding,
         }
-
-    of = classmethod(lambda cls, model: cls(model))
 
     def build(self):
         """The model."""

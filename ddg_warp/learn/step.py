@@ -166,11 +166,8 @@ class Pull(torch.autograd.Function):
         return _folded(Pull, info.batch_size, in_dims, call, tensors, given, smooth + axes[len(call.fields) :])
 
 
-for own in (
-    Step,
-    Balance,
-    Pull,
-):  # which torch asks for in every call, and which takes as long as all that it does then
+# torch asks for signatures in every call, and looks for them longer than all else takes
+for own in (Step, Balance, Pull):
     own.forward.__signature__ = inspect.signature(own.forward)
 
 

@@ -41,16 +41,10 @@ class Controls:
         Raises:
             SceneError: a shape does not fit, a value is not finite, or the model has nothing that it could act on.
         """
-        shapes = {
-            "poses": (len(model.grips), 6),
-            "forces": (model.points_count, 3),
-            "moments": (model.order.edges_count,),
-            "gravity": (3,),
-            "field": (3,),
-        }
+        known = shapes(model)
         given = {field.name: getattr(self, field.name) for field in fields(self)}
         found = {
-            name: _numbers(name, values, shapes[name], model.worlds)
+            name: _numbers(name, values, known[name], model.worlds)
             for name, values in given.items()
             if values is not None
         }
@@ -87,27 +81,33 @@ def _numbers(name: str, values, shape: tuple, worlds: int) -> np.ndarray:
     return values if values.ndim > len(shape) else values[None]
 
 
-def require_field(model) -> None:
-    """Refuse a magnetic field as a control where none acts.
+def shapes(model) -> dict[str, tuple]:
+    """Of what a model's worlds are given each, by name."""
+    points, edges, grips = model.points_count, model.order.edges_count, len(model.grips)
+    return {"forces": (points, 3), "moments": (edges,), "gravity": (3,), "field": (3,), "poses": (grips, 6)}
+
+
+def require_acting(model, names) -> None:
+    """Refuse what would act on nothing.
 
     Raises:
-        SceneError: nothing is magnetised, or the scene has no field that it adds to.
+        SceneError: poses are among the names, and there is no grip; or a magnetic field, and nothing is magnetised or the scene has no
+            field that it adds to.
     """
-    if not model.magnetic:
+    if "field" in names and not model.magnetic:
         raise SceneError(
             "Controls: a magnetic field acts on nothing; magnetise rods by scene.magnetize, and add scene.magnetic_field((0, 0, 0)) to "
             "which it adds"
         )
-
-
-def _refuse_missing(model, found: dict[str, np.ndarray]) -> None:
-    """Refuse poses without grips, a magnetic field of nothing, and moments about edges without an angle."""
-    if "field" in found:
-        require_field(model)
-    if "poses" in found and not model.grips:
+    if "poses" in names and not model.grips:
         raise SceneError(
             "Controls: poses of no grip; hold something by Grip(...), as in scene.clamp(rod, motion=Grip())"
         )
+
+
+def _refuse_missing(model, found: dict[str, np.ndarray]) -> None:
+    """Refuse what would act on nothing, and moments about edges without an angle."""
+    require_acting(model, found)
     if "moments" in found:
         bad = np.flatnonzero(found["moments"].any(0) & ~model.order.twisted)
         if bad.size:
