@@ -16,6 +16,7 @@ STEPS = 40  # of the first estimate of a critical factor
 ROUGH = 0.02  # its relative error
 SOFTENED = 1e-10  # change of a stiffness, over itself, that counts as none
 GUARD = 3  # eigenpairs more than asked for, among which there is a gap to count at
+ROUNDED = 1e-9  # part of the shift that rounding leaves of an eigenvalue that is zero, with either sign
 GAP = 1e-6  # relative distance of two eigenvalues between which can be counted
 
 
@@ -107,7 +108,8 @@ class Lowest(Shifted):
         operator = LinearOperator((n, n), matvec=apply, dtype=np.float64)
         given = {"v0": across(_start(n, without)), "ncv": _vectors(n, count), "tol": 1e-12}
         inverse, vectors = eigsh(operator, count, which=which, **given)
-        return self.shift + 1.0 / inverse, vectors
+        values = self.shift + 1.0 / inverse
+        return np.where(np.abs(values) <= ROUNDED * abs(self.shift), 0.0, values), vectors
 
     def inertia(self, at: float) -> int | None:
         factor = Factorisation(self.matrix - at * sparse.diags(self.mass, format="csc"))
