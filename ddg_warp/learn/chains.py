@@ -65,6 +65,9 @@ class ChainAdjoint:
         scheme: of the steps, None for equilibria.
         posed: whether equilibria are given poses of grips.
 
+    Attributes:
+        unread: names of the arrays of the state that a step led to which its reverse does not read.
+
     Raises:
         SceneError: a motion has no gradient; see `Supports`.
     """
@@ -83,18 +86,18 @@ class ChainAdjoint:
         self.predictor = ChainPredictor.of(model, group, motion, scheme)
         terms = range(len(kind.terms))
         self._pull = [chain.pull_kernel(kind, i, real) for i in terms]
-        self._product = [chain.pull_kernel(kind, i, real, alone=True) for i in terms] if self.solve.guess else []
         self._strain = [chain.strain_kernel(kind, i, real) for i in terms] if kind.viscous else []
-        self._frame = chain.frame_kernel(kind, real) if kind.twist else None
-        self._nodes, self._edges = chain.gather_kernels(kind, real)
-        self._solution, self._start = step.step_kernels(kind, real, midpoint)
+        self._frame = chain.frame_kernel(kind, real, first=not kind.viscous) if kind.twist else None
+        self._ends, self._nodes, self._edges = chain.gather_kernels(kind, real)
+        self.unread = {"v", "omega"} if kind.viscous else {"v", "omega", "frame", "last"}
+        self._more_to_start = bool(self.drag or self.predictor)
+        self._solution, self._start = step.step_kernels(kind, real, midpoint, self._more_to_start)
         self._moved = arrays.upload(np.tile(_moved(group), (1, group.worlds)), wp.uint8, device)
         self._rate = wp.zeros(group.columns, dtype=real, device=device)
         self._damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
         twisted, viscous = kind.twist, kind.viscous
         self._window, self._lag = self._rows(kind.window), self._rows(13)
         self._end, self._dof, self._right = (self._rows(kind.block) for _ in range(3))
-        self._rest, self._coefficient = self._rows(kind.block, bool(self.solve.guess)), wp.zeros_like(self._rate)
         self._by_frame = self._rows(7, twisted and viscous)
         self._start_state = GroupState(
             x=self._make(self.vector),
@@ -156,7 +159,7 @@ class ChainAdjoint:
         """
         group, kind, before = self.group, self.group.kind, kept.before
         start, inputs, window, lag = self._start_state, self._inputs, self._window, self._lag
-        for array in (window, lag, self._end, inputs.parameters, inputs.rate, *vars(start).values()):
+        for array in (inputs.rate, *((start.x, start.v, start.theta) if self._more_to_start else ())):
             arrays.clear(array)
         self._rate.fill_(1.0 / s)
         by_frame, lagged = (
@@ -167,9 +170,7 @@ class ChainAdjoint:
         if predictor:
             kept = replace(kept, frame=self.lagged(before, states))
             arrays.clear(predictor.by_x)
-            if predictor.carries:
-                lagged = predictor.by_frame
-                arrays.clear(lagged)
+            lagged = predictor.by_frame if predictor.carries else lagged
             tangents = predictor.x if self._midpoint else tangents
         if kind.viscous:
             # strains of the end, which the next step is damped from
@@ -180,27 +181,17 @@ class ChainAdjoint:
                 by_frame = self._by_frame
                 arrays.copy(by_frame, given.frame)
                 self._launch(self._edges, [lag, group.count], [by_frame])
-                arrays.clear(lag)
         if kind.twist:
             self._launch(self._frame, [after.x, kept.frame, group.count, by_frame], [window, lagged])
-        self._launch(self._nodes, [window, group.count], [self._end])
+        if kind.twist or kind.viscous:
+            self._launch(self._ends, [window, group.count], [self._end])
         end = [given.x, given.v, given.theta, given.omega, self._end]
         read = [*end, group.fixed, group.mass, group.rotary, group.count, self._rate]
         self._launch(self._solution, read, [self._dof, self._right])
         resisted = self.drag and (self.drag, before, tangents)
         read = [kept.x, kept.theta, kept.frame, before.last, self._rate, *self._parameters, inputs.load]
         written = [window, lag, inputs.parameters, start.last, inputs.rate]
-        right = self._right
-        if self.solve.guess and np.isfinite(s):
-            right, rate = self._rest, 1.0 / s
-            self._coefficient.fill_(rate * (rate + self.model.scene.mass_damping))
-            self._launch(self.solve.guess, [self._right, group.mass, self._coefficient], [inputs.load, right])
-            arrays.clear(window)
-            for kernel in self._product:
-                self._launch(kernel, read, written)
-            self._launch(self._nodes, [window, group.count], [right])
-        self.solve(kept, before.last, s, right, inputs.load, resisted)
-        arrays.clear(window)
+        self.solve(kept, before.last, s, self._right, inputs.load, resisted)
         for kernel in self._pull:
             self._launch(kernel, read, written)
         self._launch(self._nodes, [window, group.count], [self._dof])
@@ -242,8 +233,7 @@ class ChainAdjoint:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [*self._pull, *self._strain, self._nodes, self._edges, self._solution, self._start]
-        own += self._product if self.solve.guess else []
+        own = [*self._pull, *self._strain, self._ends, self._nodes, self._edges, self._solution, self._start]
         own += [*([self._frame] if self._frame else []), *self.solve.kernels]
         parts = (self.supports, self.drag, self.followers, self.predictor)
         return own + [kernel for part in parts if part for kernel in part.kernels]

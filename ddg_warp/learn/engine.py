@@ -114,7 +114,7 @@ class Engine:
         """
         adjoint = self._adjoint()
         self.fill(self.source, before)
-        self.fill(self.target, after)
+        self.fill([self.target[i] for i in self._read], [after[i] for i in self._read])
         self.fill(self._by_state, given)
         if adjoint.upload(start, dt):
             self._graphs.clear()
@@ -146,6 +146,8 @@ class Engine:
             adjoint = Adjoint(self.integrator)
             self._given = self.model.empty_state()
             self._by_state = tensors(self._given, self.fields)
+            unread = {f"{i}/{name}" for i, own in enumerate(adjoint.chains) for name in own.unread}
+            self._read = [i for i, field in enumerate(self.fields) if field.name not in unread]
             self._graphs = Graphs(self.model, self._load)
             # laid out as states are, so that a graph can copy it
             solved = (self.model.empty_state() if self.midpoint else self.after).groups

@@ -105,7 +105,6 @@ class ChainPredictor:
         """
         group = self.group
         if self.carries:
-            arrays.clear(window)
             self._launch(self._carry, [self.x, before.frame, group.count, self.by_frame], [window, start.frame])
             self._launch(gather, [window, group.count], [self.by_x])
         wp.launch(

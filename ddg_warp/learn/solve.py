@@ -9,15 +9,16 @@ from scipy.sparse.linalg import splu
 
 from ddg_warp import arrays
 from ddg_warp.errors import SolverError
-from ddg_warp.kernels.adjoint import step
+from ddg_warp.kernels.adjoint import refine
 from ddg_warp.solve.chains.assembled import AssembledNewton
 from ddg_warp.solve.chains.newton import ChainNewton, NewtonOptions
 from ddg_warp.solve.chains.tangent import ChainTangent
 from ddg_warp.solve.choice import automatic
 from ddg_warp.solve.direct import SingularError, regular
-from ddg_warp.solve.reduction import CyclicReduction
+from ddg_warp.solve.reduction import CyclicReduction, Elimination
 
-CLOSE = 1e-5  # relative error of float32 solutions up to which gradients take them: from 3e-5 on roll-outs err by 1e-4
+CLOSE = 1e-5  # relative error of w up to which gradients take what float32 solutions, refined, leave; roll-outs amplify it ...
+PASSES = 2  # ... so that no more than these serve: with 3, an error of 1e-2 each, gradients erred by 1e-3
 SINGULAR = 1e-6  # part of a right-hand side that a solution may miss; a singular matrix, which has been made regular, misses more
 
 
@@ -120,66 +121,74 @@ def _transposed(matrix: sparse.csc_matrix):
 
 
 class ChainSolve:
-    """H w = g of a group of rods, in the precision of its state: by the sweep or cyclic reduction, as steps are made; on the host of
-    closed rods and of equilibria.
+    """H w = g of a group of rods, in the precision of its state: by the sweep, or by factors in that of the model's linear algebra,
+    node by node or by cyclic reduction, and refinement; on the host of closed rods and of equilibria.
 
     Attributes:
-        guess: where solves are in another precision than the state, the kernel that w starts from; see `guess_kernels`.
         tangent: of solves on the host; held: of the last of these, see `HostSolve`, as w is laid out.
         failed: not zero of rods whose H is not positive definite (columns,), so that w means nothing; None on the host.
+        passes: solutions by factors in another precision than the state's that are summed up; 0 where there are none.
     """
 
     def __init__(self, model, group):
         self.model, self.group = model, group
         self.host = HostSolve(ChainTangent(model, group, 0))
         self.tangent, self.held = self.host.tangent, None
-        self.system = self.reduction = self.failed = self.guess = self._cast = self._for = None
-        if group.kind.closed:
-            return
-        self._built(model.types.linear)
+        self.system = self.solver = self.failed = self._for = None
+        self.passes = 0
+        if not group.kind.closed:
+            self._build()
 
     def suit(self, s: float) -> bool:
-        """From now on solve by what suits steps of s [s], too, in the precision of the model's linear algebra where that leaves w right
-        to `CLOSE`; whether that is another solver."""
-        real = self.model.types.real
-        if self.system is None or self.system.linear is real or self._for == (s, self.model.version):
+        """From now on solve by what suits steps of s [s]: by as many passes in the precision of the model's linear algebra as leave w
+        right to `CLOSE`, or without any; whether that is anything else than before."""
+        model, kind = self.model, self.group.kind
+        if self.system is None or model.types.linear is model.types.real or self._for == (s, model.version):
             return False
-        self._for = s, self.model.version
-        if not self.group.kind.drag and self.group.float32_errors(s).max() <= CLOSE:
+        self._for = s, model.version
+        error = 1.0 if kind.drag else float(self.group.float32_errors(s).max())
+        passes = next((n for n in range(1, PASSES + 1) if error**n <= CLOSE), 0)
+        if passes == self.passes:
             return False
-        self._built(real)
+        if bool(passes) != bool(self.passes):
+            self._build(model.types.linear if passes else None)
+        self.passes = passes
         return True
 
-    def _built(self, linear) -> None:
-        model, group, kind, device = self.model, self.group, self.group.kind, self.model.wp_device
-        given = model, group, NewtonOptions(psd="none"), linear
-        self.guess = self._cast = None
-        if linear is not model.types.real:
-            self.guess, *self._cast = step.guess_kernels(kind, model.types.real, linear)
-        if automatic(group) == "sweep":
-            self.system = ChainNewton(*given)
+    def _build(self, linear=None) -> None:
+        """What solves, by factors in the precision `linear` if one is given."""
+        group, kind, device, real = self.group, self.group.kind, self.model.wp_device, self.model.types.real
+        given, size = (self.model, group, NewtonOptions(psd="none"), real), (group.nodes, group.columns)
+        few = automatic(group) == "partitioned"
+        if not few and linear is None:
+            self.solver, self.system = None, ChainNewton(*given)
             self._moved = self.system.x, self.system.theta  # what the sweep moves along w
             self.failed = self.system.islands.status
-        else:
-            self.system = AssembledNewton(*given)
-            self.reduction = CyclicReduction(kind.block, group.nodes, group.columns, linear, device)
-            self._wanted = wp.full(group.columns, 1, dtype=int, device=device)
-            self.failed = self.system.islands.bad
-
-        self._right, self._found = self.system.right, self.system.direction
+            return
+        self.system = AssembledNewton(*given, stored=linear)
+        own = linear or real
+        self.solver = CyclicReduction(kind.block, *size, own, device) if few else Elimination(kind, *size, own, device)
+        self._wanted = wp.full(group.columns, 1, dtype=int, device=device)
+        self.failed = self.system.islands.bad
+        if linear is not None:
+            self._product = refine.product_kernel(kind, real)
+            self._guess, self._rest, self._add = refine.refine_kernels(kind, real, linear)
+            self._elements = arrays.allocate((kind.window, *size), real, device)
+            self._right, self._found = self.system.vectors(), self.system.vectors()
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         if self.system is None:
             return []
-        around = [(self.system._evaluate, 128), *([self.guess, *self._cast] if self._cast else [])]
-        if self.reduction is None:
+        around = [(self.system._evaluate, 128)]
+        if self.solver is None:
             return [*around, (self.system._sweep, self.system._threads)]
-        return [*around, self.system._assemble, *self.reduction.kernels]
+        refined = [self._product, self._guess, self._rest, self._add] if self.passes else []
+        return [*around, self.system._assemble, *self.solver.kernels, *refined]
 
     def __call__(self, solved, last: wp.array, s: float, right: wp.array, w: wp.array, resisted=None) -> None:
-        """Write w (block, n, R), zero at held dofs, for a right-hand side that is zero there; with `guess`, add it to what w holds.
+        """Write w (block, n, R), zero at held dofs, for a right-hand side that is zero there.
 
         Args:
             solved: the solution `x`, `theta` and its lagged `frame`.
@@ -206,21 +215,32 @@ class ChainSolve:
         if resisted:
             resisted[0].resist(*resisted[1:], system, islands)
         system.evaluate(last)
-        found = w
-        if self._cast:
-            wp.launch(self._cast[0], right.shape, [right, self.group.fixed], [self._right], device=system.device)
-            right, found = self._right, self._found
-        if self.reduction is None:
+        if self.solver is None:
             islands.stale.zero_()  # frames are as they were in the step
-            (system.x, system.theta), system.right, system.direction = self._moved, right, found
+            (system.x, system.theta), system.right, system.direction = self._moved, right, w
             arrays.copy(system.x, solved.x)
             arrays.copy(system.theta, solved.theta)
             system.eliminate()
-        else:
-            system.assemble_blocks()
-            self.reduction.solve(system.blocks, right, self.group.count, self._wanted, found, islands.bad)
-        if self._cast:
-            wp.launch(self._cast[1], w.shape, [found], [w], device=system.device)
+            return
+        system.assemble_blocks()
+        if not self.passes:
+            self._solve(right, w)
+            return
+        nodes, count = w.shape[1:], self.group.count
+        self._launch(self._guess, nodes, [right, system.mass, islands.coefficient], [w])
+        for done in range(self.passes):
+            self._launch(self._product, nodes, [system.factor, system.geometric, w, count], [self._elements])
+            read = [right, w, self._elements, system.mass, system.rotary, islands.coefficient, self.group.fixed, count]
+            self._launch(self._rest, nodes, read, [self._right])
+            self._solve(self._right, self._found, again=done > 0)
+            self._launch(self._add, w.shape, [self._found], [w])
+
+    def _solve(self, right: wp.array, found: wp.array, again: bool = False) -> None:
+        system = self.system
+        self.solver.solve(system.blocks, right, self.group.count, self._wanted, found, system.islands.bad, again)
+
+    def _launch(self, kernel, shape: tuple, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, shape, inputs, outputs, device=self.system.device)
 
     def _on_host(self, solved, last, rate: float, coefficient: float, right: wp.array, w: wp.array, more) -> None:
         data = SimpleNamespace(x=solved.x, theta=solved.theta, frame=solved.frame, last=last)

@@ -1,9 +1,12 @@
-"""Block cyclic reduction on a device: few, long chains solved by many threads each."""
+"""Block-pentadiagonal systems of chains on a device: few, long chains by many threads each, or many by one each."""
 
 import warp as wp
 
 from ddg_warp import arrays
+from ddg_warp.kernels.matrix import block_band
 from ddg_warp.kernels.solve import cyclic_reduction, paired
+
+THREADS = 32  # of a block of threads that walk: few chains reach more multiprocessors
 
 
 class CyclicReduction:
@@ -70,6 +73,34 @@ class CyclicReduction:
                 [solution],
                 device=self.device,
             )
+
+
+class Elimination:
+    """Node by node, with a thread each, of the same chains by the same calls: for many of them.
+
+    Args:
+        kind: `ChainKind` of the chains; columns: how many there are.
+    """
+
+    def __init__(self, kind, nodes: int, columns: int, linear, device):
+        self.columns, self.device = columns, device
+        self._factors = arrays.allocate((3 * kind.block**2 + kind.block, nodes, columns), linear, device)
+        self._first = wp.zeros(columns, dtype=int, device=device)  # iteration
+        self._factor, self._direct = block_band.factor_kernel(kind, linear), block_band.direct_kernel(kind, linear)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [(self._factor, THREADS), (self._direct, THREADS)]
+
+    def solve(self, matrix, right, count, wanted, solution: wp.array, bad: wp.array, again: bool = False) -> None:
+        """As `CyclicReduction.solve`."""
+        if not again:
+            self._launch(self._factor, [matrix, count, wanted, self._first, 0], [self._factors, bad])
+        self._launch(self._direct, [self._factors, right, count, wanted], [solution])
+
+    def _launch(self, kernel, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, self.columns, inputs, outputs, device=self.device, block_dim=THREADS)
 
 
 class TensionReduction:

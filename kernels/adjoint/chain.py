@@ -1,7 +1,8 @@
 """Reverse of a step on chains; see `kernels.variation`.
 
 Every element writes its own shares, which nodes then gather, so that sums come in one order, without atomics. Cotangents of dofs lie
-as right-hand sides do, [component of a node][node][rod].
+as right-hand sides do, [component of a node][node][rod]. The first of the terms writes the windows, others add to them; one term alone
+has lagged data.
 """
 
 from functools import cache
@@ -16,29 +17,14 @@ from ddg_warp.kernels.variation import carried_function, variation_functions
 
 
 @cache
-def pull_kernel(kind: ChainKind, index: int, real, alone: bool = False):
-    """pull(...): what the elements of a term bring, -w . dE/dq, by their inputs; `alone` by the window, -H w.
-
-    Adds those by the window, by the lagged data of its two edges and by the rate, and those by the rest measure and the parameters, in
-    the rows that the term has in the table.
-    Writes those by the strains of the last step.
-    """
-    term = kind.terms[index]
-    measure, density = term.measure, term.density
-    n, size = len(measure.strains), density.parameter_size(len(measure.strains))
-    V, W = wp.types.vector(kind.dim, real), wp.types.vector(kind.window, real)
-    E = wp.types.vector(n, real)
-    along_node, window, lagged, _ = gather_functions(kind, real)
-    load, local, short, spread = term_functions(kind, index, real)
-    along, _ = variation_functions(term, real)
-    row, _, _, strain_row = kind.places()[index]
-    static_size, missing = len(term.parameter_names) - 1, 0 if kind.closed else measure.span
+def displaced_function(kind: ChainKind, real):
+    """displaced(v, k, count, whole, r): the window of a displacement, which lies as right-hand sides do."""
+    W = wp.types.vector(kind.window, real)
+    along_node, *_ = gather_functions(kind, real)
     dim, span, twist = kind.dim, kind.span, kind.twist
-    frames, lagged_density = measure.lag_size > 0, density.lagged
 
     @wp.func
     def displaced(v: wp.array3d(dtype=real), k: int, count: int, whole: bool, r: int):
-        """The window of a displacement."""
         q = W()
         b = along_node(k + 1, count)
         for d in range(wp.static(dim)):
@@ -53,6 +39,45 @@ def pull_kernel(kind: ChainKind, index: int, real, alone: bool = False):
                 if wp.static(twist):
                     q[wp.static(dim * span + 1)] = v[wp.static(dim), b, r]
         return q
+
+    return displaced
+
+
+@cache
+def put_function(kind: ChainKind, real, first: bool):
+    """put(out, k, r, f): what an element brings to its window; the `first` that does writes it."""
+    W = wp.types.vector(kind.window, real)
+
+    @wp.func
+    def put(out: wp.array3d(dtype=real), k: int, r: int, f: W):
+        for i in range(wp.static(kind.window)):
+            if wp.static(first):
+                out[i, k, r] = f[i]
+            else:
+                out[i, k, r] = out[i, k, r] + f[i]
+
+    return put
+
+
+@cache
+def pull_kernel(kind: ChainKind, index: int, real):
+    """pull(...): what the elements of a term bring, -w . dE/dq, by their inputs.
+
+    Those by the window; by the lagged data of its two edges; by the rest measure and the parameters, in the rows that the term has in
+    the table, of viscous rods beside those of `strain_kernel`; by the strains of the last step; adds those by the rate.
+    """
+    term = kind.terms[index]
+    measure, density = term.measure, term.density
+    n, size = len(measure.strains), density.parameter_size(len(measure.strains))
+    V, W = wp.types.vector(kind.dim, real), wp.types.vector(kind.window, real)
+    E = wp.types.vector(n, real)
+    _, window, lagged, _ = gather_functions(kind, real)
+    displaced, put = displaced_function(kind, real), put_function(kind, real, index == 0)
+    load, local, short, spread = term_functions(kind, index, real)
+    along, _ = variation_functions(term, real)
+    row, _, _, strain_row = kind.places()[index]
+    static_size, missing = len(term.parameter_names) - 1, 0 if kind.closed else measure.span
+    frames, lagged_density = measure.lag_size > 0, density.lagged
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pull(
@@ -74,6 +99,7 @@ def pull_kernel(kind: ChainKind, index: int, real, alone: bool = False):
         k, r = wp.tid()
         nodes = count[r]
         if k >= nodes - wp.static(missing):
+            put(window_out, k, r, W())
             return
         whole = wp.static(measure.span) == 2
         measured, p = load(buffer, table, last, rate[r], k, r)
@@ -81,15 +107,13 @@ def pull_kernel(kind: ChainKind, index: int, real, alone: bool = False):
         s = short(lagged(frame, k, nodes, whole, r))
         v = -local(displaced(w, k, nodes, whole, r))
         dq, ds, dmeasure, dp, _dv, _de = wp.grad(along)(q, s, measured, p, v, E())
-        f = spread(dq)
-        for i in range(wp.static(kind.window)):
-            window_out[i, k, r] = window_out[i, k, r] + f[i]
-        if wp.static(alone):
-            return
+        put(window_out, k, r, spread(dq))
         if wp.static(frames):
             for i in range(13):
-                lag_out[i, k, r] = lag_out[i, k, r] + ds[i]
-        parameter_out[wp.static(row), k, r] = parameter_out[wp.static(row), k, r] + dmeasure
+                lag_out[i, k, r] = ds[i]
+        if wp.static(kind.viscous):
+            dmeasure += parameter_out[wp.static(row), k, r]
+        parameter_out[wp.static(row), k, r] = dmeasure
         for i in range(wp.static(static_size)):
             parameter_out[wp.static(row + 1) + i, k, r] = dp[i]
         if wp.static(lagged_density):
@@ -102,11 +126,12 @@ def pull_kernel(kind: ChainKind, index: int, real, alone: bool = False):
 
 @cache
 def strain_kernel(kind: ChainKind, index: int, real):
-    """pull(...): from the derivative by a term's strains at a state to those by window, lagged data and rest measure. Adds."""
+    """pull(...): from the derivative by a term's strains at a state to those by window, lagged data and rest measure."""
     term = kind.terms[index]
     measure = term.measure
     n = len(measure.strains)
     V, E = wp.types.vector(kind.dim, real), wp.types.vector(n, real)
+    W, put = wp.types.vector(kind.window, real), put_function(kind, real, index == 0)
     _, window, lagged, _ = gather_functions(kind, real)
     load, local, short, spread = term_functions(kind, index, real)
     _, strained = variation_functions(term, real)
@@ -131,6 +156,7 @@ def strain_kernel(kind: ChainKind, index: int, real):
         k, r = wp.tid()
         nodes = count[r]
         if k >= nodes - wp.static(missing):
+            put(window_out, k, r, W())
             return
         whole = wp.static(measure.span) == 2
         measured, _p = load(buffer, table, last, rate[r], k, r)
@@ -140,21 +166,19 @@ def strain_kernel(kind: ChainKind, index: int, real):
         for i in range(wp.static(n)):
             f[i] = given[wp.static(strain_row) + i, k, r]
         dq, ds, dmeasure, _df = wp.grad(strained)(q, s, measured, f)
-        g = spread(dq)
-        for i in range(wp.static(kind.window)):
-            window_out[i, k, r] = window_out[i, k, r] + g[i]
+        put(window_out, k, r, spread(dq))
         if wp.static(frames):
             for i in range(13):
-                lag_out[i, k, r] = lag_out[i, k, r] + ds[i]
-        parameter_out[wp.static(row), k, r] = parameter_out[wp.static(row), k, r] + dmeasure
+                lag_out[i, k, r] = ds[i]
+        parameter_out[wp.static(row), k, r] = dmeasure
 
     return pull
 
 
 @cache
-def frame_kernel(kind: ChainKind, real, unit: bool = True):
-    """pull(...): the reverse of `step.finish_frames_kernel`, or, not `unit`, of `search.relag`. Adds to the window, of which only its
-    first edge counts.
+def frame_kernel(kind: ChainKind, real, unit: bool = True, first: bool = True):
+    """pull(...): the reverse of `step.finish_frames_kernel`, or, not `unit`, of `search.relag`. Writes derivatives by frames; those by
+    windows, of which the first edge alone counts, where it is the `first` to do so, else adds.
 
     The reference twist is found anew at every state; the lagged one only says which turn it is of.
     """
@@ -162,6 +186,7 @@ def frame_kernel(kind: ChainKind, real, unit: bool = True):
     along_node, *_ = gather_functions(kind, real)
     carried = carried_function(real, unit)
     closed = kind.closed
+    W, put = wp.types.vector(kind.window, real), put_function(kind, real, first)
 
     @wp.func
     def three(a: wp.array3d(dtype=real), row: int, k: int, r: int):
@@ -184,19 +209,63 @@ def frame_kernel(kind: ChainKind, real, unit: bool = True):
         de, du, dt, _u, _t = wp.grad(carried)(
             e, three(frame, 0, k, r), three(frame, 3, k, r), three(given, 0, k, r), three(given, 3, k, r)
         )
+        f = W()
         for d in range(3):
-            window_out[d, k, r] = window_out[d, k, r] + de[d]
-            frame_out[d, k, r] = frame_out[d, k, r] + du[d]
-            frame_out[3 + d, k, r] = frame_out[3 + d, k, r] + dt[d]
+            f[d] = de[d]
+            frame_out[d, k, r] = du[d]
+            frame_out[3 + d, k, r] = dt[d]
+        put(window_out, k, r, f)
 
     return pull
 
 
 @cache
-def gather_kernels(kind: ChainKind, real):
-    """nodes(...) adds what windows bring to the dofs of a node; edges(...) what lagged data of vertices bring to frames of edges."""
+def gathered_function(kind: ChainKind, real):
+    """gathered(windows, k, n, r): what windows bring to the dofs of node k of a rod of n nodes."""
     dim, twist, closed, window = kind.dim, kind.twist, kind.closed, kind.window
+    B = wp.types.vector(kind.block, real)
     _, behind, _, edge_force = node_functions(kind, real)
+
+    @wp.func
+    def gathered(windows: wp.array3d(dtype=real), k: int, n: int, r: int):
+        q = B()
+        b = behind(k, n)
+        ahead = wp.static(closed) or k < n - 1
+        if ahead:
+            f = edge_force(windows, k, n, r)
+            for d in range(wp.static(dim)):
+                q[d] = -f[d]
+            if wp.static(twist):
+                q[wp.static(dim)] = windows[wp.static(window - 2), k, r]
+        if b >= 0:
+            f = edge_force(windows, b, n, r)
+            for d in range(wp.static(dim)):
+                q[d] = q[d] + f[d]
+            if wp.static(twist):
+                if ahead:
+                    q[wp.static(dim)] = q[wp.static(dim)] + windows[wp.static(window - 1), b, r]
+        return q
+
+    return gathered
+
+
+@cache
+def gather_kernels(kind: ChainKind, real):
+    """end(...) writes what windows bring to the dofs of a node, nodes(...) adds it; edges(...) adds what lagged data of vertices bring
+    to frames of edges.
+    """
+    block, closed, gathered = kind.block, kind.closed, gathered_function(kind, real)
+    _, behind, *_ = node_functions(kind, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def end(window_in: wp.array3d(dtype=real), count: wp.array(dtype=int), dof_out: wp.array3d(dtype=real)):
+        k, r = wp.tid()
+        n = count[r]
+        if k >= n:
+            return
+        q = gathered(window_in, k, n, r)
+        for d in range(wp.static(block)):
+            dof_out[d, k, r] = q[d]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def nodes(window_in: wp.array3d(dtype=real), count: wp.array(dtype=int), dof_out: wp.array3d(dtype=real)):
@@ -204,22 +273,9 @@ def gather_kernels(kind: ChainKind, real):
         n = count[r]
         if k >= n:
             return
-        b = behind(k, n)
-        if wp.static(closed) or k < n - 1:
-            f = edge_force(window_in, k, n, r)
-            for d in range(wp.static(dim)):
-                dof_out[d, k, r] = dof_out[d, k, r] - f[d]
-            if wp.static(twist):
-                dof_out[wp.static(dim), k, r] = dof_out[wp.static(dim), k, r] + window_in[wp.static(window - 2), k, r]
-        if b >= 0:
-            f = edge_force(window_in, b, n, r)
-            for d in range(wp.static(dim)):
-                dof_out[d, k, r] = dof_out[d, k, r] + f[d]
-            if wp.static(twist):
-                if wp.static(closed) or k < n - 1:
-                    dof_out[wp.static(dim), k, r] = (
-                        dof_out[wp.static(dim), k, r] + window_in[wp.static(window - 1), b, r]
-                    )
+        q = gathered(window_in, k, n, r)
+        for d in range(wp.static(block)):
+            dof_out[d, k, r] = dof_out[d, k, r] + q[d]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def edges(lag_in: wp.array3d(dtype=real), count: wp.array(dtype=int), frame_out: wp.array3d(dtype=real)):
@@ -234,4 +290,4 @@ def gather_kernels(kind: ChainKind, real):
                 total += lag_in[6 + c, b, r]
             frame_out[c, k, r] = frame_out[c, k, r] + total
 
-    return nodes, edges
+    return end, nodes, edges

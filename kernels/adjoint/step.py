@@ -19,11 +19,12 @@ from ddg_warp.kernels.variation import angle_function
 
 
 @cache
-def step_kernels(kind: ChainKind, real, midpoint: bool):
+def step_kernels(kind: ChainKind, real, midpoint: bool, more_to_start: bool):
     """solution(...): derivatives by the dofs that a solve has found, from those by the end of the step; start(...): by the start of the
     step, masses and what all nodes share, from those and from w.
 
-    `more` is what came to the dofs of the end through its frames and strains. `start` adds.
+    `more` is what came to the dofs of the end through its frames and strains. `more_to_start`: whether other kernels have written
+    derivatives by positions, velocities and angles of the start, to which is added.
     """
     dim, twist = kind.dim, kind.twist
     settles = kind.drag and midpoint  # rates of what has no inertia are means over the step; see `drag.chain_kernels`
@@ -103,8 +104,7 @@ def step_kernels(kind: ChainKind, real, midpoint: bool):
         damping_out: wp.array2d(dtype=real),
         gravity_out: wp.array2d(dtype=V),
     ):
-        """`moved` are dofs that a motion puts in place; other held ones stay where the step starts. Adds to derivatives by positions,
-        velocities, angles and the rate."""
+        """`moved` are dofs that a motion puts in place; other held ones stay where the step starts. Adds to derivatives by the rate."""
         k, r = wp.tid()
         if k >= count[r]:
             return
@@ -132,8 +132,13 @@ def step_kernels(kind: ChainKind, real, midpoint: bool):
             if m <= real(0.0):
                 turned = real(1.0)
                 before_kept = real(0.0)
-        x_out[k, r] = x_out[k, r] + own * (c * m) + stays - by_end * kept - ended * (rho * turned)
-        v_out[k, r] = v_out[k, r] + own * (rho * m) - ended * before_kept
+        by_x = own * (c * m) + stays - by_end * kept - ended * (rho * turned)
+        by_v = own * (rho * m) - ended * before_kept
+        if wp.static(more_to_start):
+            by_x += x_out[k, r]
+            by_v += v_out[k, r]
+        x_out[k, r] = by_x
+        v_out[k, r] = by_v
         mass_out[k, r] = wp.dot(own, gravity[0] - step * c + before * rho)
         gravity_out[k, r] = own * m
         by_rate = turned * wp.dot(ended, step) - m * wp.dot(own, step * (real(2.0) * rho + alpha) - before)
@@ -156,7 +161,10 @@ def step_kernels(kind: ChainKind, real, midpoint: bool):
                     turned = real(1.0)
                     before_kept = real(0.0)
             by_turn = theta[k, r] + more[wp.static(dim), k, r]
-            theta_out[k, r] = theta_out[k, r] + free * c * j + rests - by_turn * kept - spun * (rho * turned)
+            by_angle = free * c * j + rests - by_turn * kept - spun * (rho * turned)
+            if wp.static(more_to_start):
+                by_angle += theta_out[k, r]
+            theta_out[k, r] = by_angle
             omega_out[k, r] = free * rho * j - spun * before_kept
             rotary_out[k, r] = free * (spin * rho - turn * c)
             by_rate += turned * spun * turn - j * free * (turn * (real(2.0) * rho + alpha) - spin)
@@ -243,48 +251,3 @@ def smooth_kernel(real):
         smooth_out[r] = wp.where(same, real(1.0), real(wp.nan))
 
     return smooth
-
-
-@cache
-def guess_kernels(kind: ChainKind, real, linear):
-    """guess(...), down(...) and up(...): the reverse's linear solve in another precision, for what inertia alone does not give.
-
-    w is of the size of s times the derivatives by velocities, while what it says of positions is their difference, so that rounding of
-    w weighs 1 / s times as much. As steps solve for increments, this solves H (w - g) = right - H g, with g what inertia alone makes.
-    """
-    dim, block = kind.dim, kind.block
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def guess(
-        right: wp.array3d(dtype=real),
-        mass: wp.array2d(dtype=real),
-        coefficient: wp.array(dtype=real),
-        guess_out: wp.array3d(dtype=real),
-        rest_out: wp.array3d(dtype=real),
-    ):
-        """`rest_out` is what the right-hand side has beside inertia; `coefficient` is that of inertia [1/s^2]."""
-        k, r = wp.tid()
-        c = coefficient[r] * mass[k, r]
-        for d in range(wp.static(block)):
-            own = real(0.0)
-            rest = right[d, k, r]
-            if d < wp.static(dim) and c > real(0.0):
-                own = rest / c
-                rest = real(0.0)
-            guess_out[d, k, r] = own
-            rest_out[d, k, r] = rest
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def down(values: wp.array3d(dtype=real), fixed: wp.array2d(dtype=wp.uint8), out: wp.array3d(dtype=linear)):
-        """Zero at held dofs."""
-        d, k, r = wp.tid()
-        free = ((int(fixed[k, r]) >> d) & 1) == 0
-        out[d, k, r] = wp.where(free, linear(values[d, k, r]), linear(0.0))
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def up(values: wp.array3d(dtype=linear), out: wp.array3d(dtype=real)):
-        """Adds."""
-        d, k, r = wp.tid()
-        out[d, k, r] = out[d, k, r] + real(values[d, k, r])
-
-    return guess, down, up

@@ -16,6 +16,8 @@ from ddg_warp.kernels.matrix import geometric
 from ddg_warp.kernels.solve import pivot
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
+TILE = wp.constant(32)
+
 
 @cache
 def block_functions(nb: int, linear):
@@ -52,17 +54,19 @@ def block_functions(nb: int, linear):
 
 
 @cache
-def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None):
+def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None, stored=None):
     """Blocks of H of every rod that is not in balance.
 
-    From iteration `exact_from` on, H has the geometric stiffness of rods that are not `clamped`.
+    From iteration `exact_from` on, H has the geometric stiffness of rods that are not `clamped`. Blocks are `stored` in another
+    precision than they are made in, if one is given. Launched over (tiles of `TILE` rods, nodes, rods of a tile): what three nodes read
+    is still in the cache then.
     """
     dim, nb, nb2, twist, span, closed = kind.dim, kind.block, kind.block**2, kind.twist, kind.span, kind.closed
     window, vertex_rows, edge_rows, tensions = kind.window, kind.vertex_strains, kind.edge_strains, kind.tensions
     H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     drag, Inertia = kind.drag, inertia_type(kind, real)
     edge_row, tension_row = vertex_rows * window, vertex_rows * window + edge_rows * dim
-    _, store, _, _ = block_functions(nb, linear)
+    stored = stored or linear
     _, behind, *_ = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
     curved, begin = exact_from is not None, exact_from or 0
@@ -102,6 +106,12 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
         return m
 
     @wp.func
+    def store(A: wp.array3d(dtype=stored), row: int, k: int, r: int, m: M):
+        for i in range(wp.static(nb)):
+            for j in range(wp.static(nb)):
+                A[row + i * wp.static(nb) + j, k, r] = stored(m[i, j])
+
+    @wp.func
     def free_of(fixed: wp.array2d(dtype=wp.uint8), k: int, r: int):
         free = H()
         for d in range(wp.static(nb)):
@@ -119,9 +129,12 @@ def assemble_kernel(kind: ChainKind, real, linear, exact_from: int | None = None
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         reuse: int,
-        blocks_out: wp.array3d(dtype=linear),
+        blocks_out: wp.array3d(dtype=stored),
     ):
-        k, r = wp.tid()
+        tile, k, lane = wp.tid()
+        r = tile * TILE + lane
+        if r >= count.shape[0]:
+            return
         n = count[r]
         if flags[STATUS, r] != 0 or k >= n:
             return
