@@ -460,29 +460,32 @@ def test_compiled_functions_go_on_around_steps():
     torch.testing.assert_close(found, wanted)
 
 
-def _learn(rank: int, folder: str, out: str) -> None:
-    """One of two processes that share a parameter and have a world each: half a step of descent."""
+def _learn(rank: int, folder: str, out: str, cuda: bool) -> None:
+    """One of two processes that share a parameter and have a world each, on a GPU each: half a step of descent."""
     import torch.distributed as dist
 
-    dist.init_process_group("gloo", init_method=f"file://{folder}/meet", rank=rank, world_size=2)
+    if cuda:
+        differences.DEVICE = f"cuda:{rank}"
+        torch.cuda.set_device(rank)
+    dist.init_process_group("nccl" if cuda else "gloo", init_method=f"file://{folder}/meet", rank=rank, world_size=2)
     own = simulator("twisted")
     module = torch.nn.parallel.DistributedDataParallel(RodParameters(own, names=("bending",)))
     speed = torch.full((1, own.model.points_count, 3), 0.1 * (rank + 1.0), dtype=torch.float64)
     state = own.step(own.initial_state(velocities=speed), module())
     (state.positions**2).sum().backward()
-    torch.save(module.module.logarithms["bending"].grad, f"{out}{rank}")
+    torch.save(module.module.logarithms["bending"].grad.cpu(), f"{out}{rank}")
     while not all(os.path.exists(f"{out}{other}") for other in range(2)):
         time.sleep(0.01)
-    os._exit(
-        0
-    )  # torch 2.13 can wait for ever where it takes a group apart: that holds the lock that a thread of gloo's asks for
+    # torch 2.13 can wait for ever where it takes a group apart: that holds the lock that a thread of gloo's asks for
+    os._exit(0)
 
 
 def test_two_processes_share_a_gradient(tmp_path, device):
     """DistributedDataParallel takes the mean of what both have found."""
-    if device != "cpu":
-        pytest.skip("gloo is for the CPU")
-    torch.multiprocessing.spawn(_learn, (str(tmp_path), str(tmp_path / "gradient")), nprocs=2)
+    cuda = device != "cpu"
+    if cuda and torch.cuda.device_count() < 2:
+        pytest.skip("needs two GPUs")
+    torch.multiprocessing.spawn(_learn, (str(tmp_path), str(tmp_path / "gradient"), cuda), nprocs=2)
     found = [torch.load(tmp_path / f"gradient{rank}") for rank in range(2)]
     torch.testing.assert_close(found[0], found[1], rtol=0.0, atol=0.0)
     own, factors = simulator("twisted"), None
@@ -492,7 +495,7 @@ def test_two_processes_share_a_gradient(tmp_path, device):
         speed = torch.full((1, own.model.points_count, 3), 0.1 * (rank + 1.0), dtype=torch.float64)
         state = own.step(own.initial_state(velocities=speed), factors())
         (state.positions**2).sum().backward()
-        total = total + 0.5 * factors.logarithms["bending"].grad
+        total = total + 0.5 * factors.logarithms["bending"].grad.cpu()
     torch.testing.assert_close(found[0], total, rtol=1e-10, atol=0.0)
 
 
