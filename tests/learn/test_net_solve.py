@@ -1,0 +1,215 @@
+"""Linear systems of the reverse of nets: conjugate gradients on the device against sparse factors, and gradients by both."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+import ddg_warp as ddg
+from ddg_warp.geometry import meshes
+from ddg_warp.learn import net_solve
+from ddg_warp.learn.adjoint import Adjoint
+from ddg_warp.learn.net_solve import NetSolve
+from ddg_warp.learn.solve import HostSolve
+from ddg_warp.solve.net.exact import ExactSystem, suits
+from ddg_warp.solve.net.tangent import NetTangent
+from ddg_warp.torch import Simulator
+from tests.learn import differences
+from tests.learn.differences import TIGHT, built, cotangent, directions, entries, lively
+from tests.learn.test_adjoint import DT, SCENES, SOFT
+from tests.learn.test_torch import STIFFNESS
+
+RATE = 1.0 / DT
+
+
+def oblique():
+    """A sheet with an edge on a plane that is across no axis."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, -9.81), mass_damping=0.7)
+    vertices, triangles = meshes.rectangle(3, 2, (0.3, 0.2))
+    angle = 0.5
+    turn = np.array([[np.cos(angle), 0.0, -np.sin(angle)], [0.0, 1.0, 0.0], [np.sin(angle), 0.0, np.cos(angle)]])
+    shell = scene.add_shell(np.asarray(vertices) @ turn.T, triangles, thickness=0.004, material=SOFT)
+    left, right = (np.flatnonzero(vertices[:, 0] == x) for x in (vertices[:, 0].min(), vertices[:, 0].max()))
+    scene.symmetry(shell, left, turn[:, 0])
+    scene.hold(shell, right[:1])
+    return scene
+
+
+def strut(density=1000.0):
+    """A straight rod with a twig of its own, between two supports."""
+    scene, t = ddg.Scene(gravity=(0.0, 0.0, 0.0)), np.linspace(0.0, 1.0, 9)
+    material = ddg.Material(young=1e6, density=density)
+    rods = [
+        scene.add_rod(np.outer(t, axis) + start, section=ddg.Circle(0.01), material=material)
+        for axis, start in (((1.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ((0.0, 0.0, 0.2), (0.5, 0.0, 0.0)))
+    ]
+    scene.fix(rods[0], [0, -1])
+    scene.join([(rods[0], 4), (rods[1], 0)])
+    return scene
+
+
+def squeezed(name: str):
+    """A model, and a state in which it is shorter than at rest by a third: its Hessian is indefinite."""
+    model = built({"strut": strut, "sheet": SCENES["sheet"]}[name]())
+    state, net = model.state(), model.net
+    q = net.rest().q.numpy()
+    q[: net.host.nodes, 0] *= 0.67
+    state.net.q.assign(q)
+    return model, state
+
+
+def by_both(model, state, rate: float, **attributes):
+    """The system after it has solved for one right-hand side, its solution, that of factors, and their tangent."""
+    net = model.net
+    right = np.random.default_rng(1).normal(size=(model.worlds * net.blocks, 3))
+    angles = (np.arange(net.blocks) >= net.host.nodes) & (np.arange(net.blocks) < net.blocks - net.host.spins)
+    right[np.tile(angles, model.worlds), 1:] = 0.0
+    found = wp.zeros(len(right), dtype=net.vector, device=net.device)
+    coefficient, system = rate * (rate + model.scene.mass_damping), ExactSystem(model)
+    for name, value in attributes.items():
+        setattr(system.krylov, name, value)
+    rates = wp.full(model.worlds, rate, dtype=net.real, device=net.device)
+    system.solve(state.net, coefficient, rates, wp.array(right, dtype=net.vector, device=net.device), found)
+    tangent = NetTangent(model, 0)
+    solve = HostSolve(tangent)
+    wanted = solve(SimpleNamespace(net=state.net), rate, coefficient, None, tangent.into(right.ravel()))
+    return system, found.numpy(), tangent.back(wanted).reshape(-1, 3), tangent
+
+
+def off(found: np.ndarray, wanted: np.ndarray) -> float:
+    return float(np.abs(found - wanted).max() / np.abs(wanted).max())
+
+
+NETS = {name: SCENES[name] for name in ("joined", "hinged", "sheet", "hinges", "midedge", "stiffened", "turned_joined")}
+
+
+@pytest.mark.parametrize("name", [*NETS, "oblique"])
+def test_conjugate_gradients_find_what_factors_do(name):
+    model = (NETS | {"oblique": oblique})[name]().build(device=differences.DEVICE, precision="float64", worlds=2)
+    system, found, wanted, tangent = by_both(model, lively(model), RATE)
+    assert not system.failed.numpy().any()
+    assert off(found, wanted) < 1e-9
+    if name != "oblique":
+        assert np.all(found.ravel()[~tangent.free] == 0.0)
+
+
+def test_rods_that_branch_are_eliminated():
+    """One iteration: what chains leave is nothing; so that the CPU, too, does without factors on the host."""
+    model = built(SCENES["joined"]())
+    system, *_ = by_both(model, lively(model), RATE)
+    assert system.iterations.numpy()[0] == 1
+    assert suits(model.net)
+    assert suits(built(SCENES["sheet"]()).net) == (differences.DEVICE != "cpu")
+
+
+@pytest.mark.parametrize("name", ["strut", "sheet"])
+def test_an_indefinite_matrix(name):
+    model, state = squeezed(name)
+    system, found, wanted, tangent = by_both(model, state, 1.0)
+    matrix = tangent.hessian(SimpleNamespace(net=state.net)).toarray() + np.diag(tangent.mass)
+    spectrum = np.linalg.eigvalsh(matrix[tangent.free][:, tangent.free])
+    assert (spectrum < 0.0).sum() > 2
+    assert not system.failed.numpy().any()
+    assert off(found, wanted) < 1e-7
+
+
+def test_a_world_without_a_right_hand_side():
+    model = SCENES["sheet"]().build(device=differences.DEVICE, precision="float64", worlds=2)
+    state, net, system = lively(model), model.net, ExactSystem(model)
+    right = np.zeros((2 * net.blocks, 3))
+    right[net.blocks + 5] = 1.0
+    found = wp.full(len(right), net.vector(1.0, 1.0, 1.0), dtype=net.vector, device=net.device)
+    rates = wp.full(2, RATE, dtype=net.real, device=net.device)
+    system.solve(state.net, RATE**2, rates, wp.array(right, dtype=net.vector, device=net.device), found)
+    assert np.all(found.numpy()[: net.blocks] == 0.0)
+    assert np.abs(found.numpy()[net.blocks :]).max() > 0.0
+    assert not system.failed.numpy().any()
+
+
+def pulled(model, state, scheme: str, given: dict):
+    """Derivatives by the state before a step, and what solved for them."""
+    adjoint = Adjoint(ddg.Integrator(model, scheme=scheme, **TIGHT))
+    _, tape = adjoint.step(state, DT)
+    gradient, inputs = adjoint.pull(tape, cotangent(model, given))
+    values = {name: array.numpy() for name, array in entries(gradient).items()}
+    values |= {f"parameters {i}": rows.numpy() for i, rows in enumerate(inputs[-1].parameters)}
+    return values, adjoint.net.solve
+
+
+@pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
+@pytest.mark.parametrize("name", ["sheet", "stiffened", "turned_joined", "sand, joined", "pressure"])
+def test_gradients_are_those_of_factors(name, scheme, monkeypatch):
+    """The whole reverse of a step, by either; and bit by bit once more."""
+    model = built(SCENES[name]())
+    state = lively(model, scheme=scheme)
+    given = directions(model, state, 5)
+    found = {}
+    for device in (True, False, True):
+        monkeypatch.setattr(net_solve, "suits", lambda _, device=device: device)
+        values, solve = pulled(model, state, scheme, given)
+        assert (solve.system is not None) == device
+        if device in found:
+            for key, value in values.items():
+                np.testing.assert_array_equal(value, found[device][key], err_msg=key)
+        found[device] = values
+    for key, value in found[False].items():
+        if np.abs(value).max() > 1e-9:
+            assert off(found[True][key], value) < 1e-9, key
+
+
+def test_what_does_not_converge_takes_factors(monkeypatch):
+    model = built(SCENES["sheet"]())
+    state = lively(model)
+    given = directions(model, state, 5)
+    wanted, _ = pulled(model, state, "implicit_euler", given)
+    monkeypatch.setattr(net_solve, "suits", lambda _: True)
+    once = NetSolve.__init__
+
+    def cut(self, *arguments):
+        once(self, *arguments)
+        self.system.krylov._limit = 1
+
+    monkeypatch.setattr(NetSolve, "__init__", cut)
+    found, solve = pulled(model, state, "implicit_euler", given)
+    assert solve.failed.numpy().all()
+    for key, value in wanted.items():
+        if np.abs(value).max() > 1e-9:
+            assert off(found[key], value) < 1e-9, key
+    # steps of torch are not held up by the host: their worlds say so
+    own = Simulator(SCENES["sheet"]().build(device=differences.DEVICE, precision="float64", worlds=1), DT)
+    velocities = torch.zeros((1, own.model.points_count, 3), dtype=torch.float64, requires_grad=True)
+    after = own.step(own.initial_state(velocities=velocities))
+    assert torch.isnan(torch.autograd.grad((after.positions**2).sum(), velocities)[0]).any()
+
+
+@pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
+@pytest.mark.parametrize("name", ["joined", "sheet"])
+def test_reverses_of_nets_are_replayed(name, scheme, monkeypatch):
+    """One captured graph for all steps of a length, by the time step and the parameters that they have."""
+    gradients = {}
+    for device in (True, False):
+        monkeypatch.setattr(net_solve, "suits", lambda _, device=device: device)
+        own = Simulator(built(SCENES[name]()), DT, scheme=scheme, rtol=1e-12)
+        parameter = STIFFNESS[name]
+        stiffness = own.parameter(parameter).requires_grad_()
+        *_, state = own.rollout(own.initial_state(), {parameter: 1.1 * stiffness}, steps=4)
+        gradients[device] = torch.autograd.grad((state.positions**2).sum(), stiffness)[0]
+        if device:
+            assert len(own.engine(1)._graphs._graphs) == 1
+    assert off(gradients[True].cpu().numpy(), gradients[False].cpu().numpy()) < 1e-9
+
+
+@pytest.mark.parametrize("name", ["joined", "sheet"])
+def test_mixed_precision_on_the_device(name, monkeypatch):
+    """Within 1e-4 of float64's, as asked: solved in float64."""
+    monkeypatch.setattr(net_solve, "suits", lambda _: True)
+    gradients = []
+    for precision in ("float64", "mixed"):
+        own = Simulator(SCENES[name]().build(device=differences.DEVICE, precision=precision), DT, rtol=1e-9)
+        speed = torch.zeros((1, own.model.points_count, 3), dtype=own.initial_state().velocities.dtype)
+        speed.requires_grad_()
+        *_, state = own.rollout(own.initial_state(velocities=speed), steps=5)
+        gradients.append(torch.autograd.grad((state.positions**2).sum(), speed)[0].cpu().numpy())
+    assert off(gradients[1], gradients[0]) < 1e-4
