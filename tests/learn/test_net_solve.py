@@ -112,6 +112,21 @@ def test_an_indefinite_matrix(name):
     assert off(found, wanted) < 1e-7
 
 
+def test_what_rounding_leaves_is_no_failure():
+    """Rods as thin as hair, in long steps: stretching is 1e13 times as stiff as inertia."""
+    scene, t = ddg.Scene(gravity=(0.0, 0.0, -9.81)), np.linspace(0.0, 0.2, 65)
+    hair = ddg.Material(young=4e9, density=1300.0)
+    points = np.stack([t, 0.3 * t * t, 0.02 * np.sin(20.0 * t)], 1)
+    twig = points[32] + np.outer(t[:32], (0.3, 0.3, 0.2))
+    rods = [scene.add_rod(of, section=ddg.Circle(4e-5), material=hair) for of in (points, twig)]
+    scene.clamp(rods[0])
+    scene.join([(rods[0], 32), (rods[1], 0)])
+    model = built(scene)
+    system, found, wanted, _ = by_both(model, model.state(), 60.0)
+    assert not system.failed.numpy().any()
+    assert off(found, wanted) < 1e-6
+
+
 def test_a_world_without_a_right_hand_side():
     model = SCENES["sheet"]().build(device=differences.DEVICE, precision="float64", worlds=2)
     state, net, system = lively(model), model.net, ExactSystem(model)
