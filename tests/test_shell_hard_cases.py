@@ -262,4 +262,4 @@ def test_curved_membrane_is_for_statics(device):
     model = scene.build(device, "float64")
     assert Equilibrium(model).load(model.state(), 2).points()[:, 2].min() < -0.01
     with pytest.raises(ddg.SceneError, match=r"shell 0 \('flag'\): membrane 'curved'.*membrane='flat'"):
-        ddg.Integrator(model)
+        ddg.Integrator(model).step(model.state(), 0.01)

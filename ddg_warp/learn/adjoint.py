@@ -87,8 +87,11 @@ class Adjoint:
         ends = tape.before, tape.after
         for own, kept, part in zip(self.parts, tape.parts, self.integrator._parts, strict=True):
             _require_one_solve(own, kept, ends, part)
-        s = self.integrator._solved(tape.dt)
-        found = _copied(*self.pull_parts(tape.before, tape.after, tape.parts, given, s))
+        read = tape.before, tape.after, tape.parts, given, self.integrator._solved(tape.dt)
+        found = self.pull_parts(*read)
+        if self.net and self.net.solve.failed is not None and self.net.solve.failed.numpy().any():
+            found = self.pull_parts(*read, factors=True)
+        found = _copied(*found)
         for own, part in zip(self.chains, self.integrator._chains, strict=True):
             _require_minimum(own, part)
         return found
@@ -101,8 +104,13 @@ class Adjoint:
             own.upload(start, start + dt)
         return changed
 
-    def pull_parts(self, before: State, after: State, parts: list, given: State, s: float) -> tuple[State, list]:
-        """The same without a check, for solves over s [s]; what it returns is written anew by the next call."""
+    def pull_parts(
+        self, before: State, after: State, parts: list, given: State, s: float, factors: bool = False
+    ) -> tuple[State, list]:
+        """The same without a check, for solves over s [s]; what it returns is written anew by the next call.
+
+        With `factors` nets are solved on the host, which is right where conjugate gradients have failed.
+        """
         groups, inputs = [], []
         for own, kept, end, by in zip(self.chains, parts, after.groups, given.groups, strict=False):
             start, read = own.pull(kept, end, by, s, (before, after))
@@ -110,7 +118,7 @@ class Adjoint:
             inputs.append(read)
         net = None
         if self.net:
-            net, read = self.net.pull(parts[-1], after.net, given.net, s, (before, after))
+            net, read = self.net.pull(parts[-1], after.net, given.net, s, (before, after), factors)
             inputs.append(read)
         return State(self.model, groups, net, before.time, self._grips), inputs
 
@@ -159,7 +167,8 @@ class EquilibriumAdjoint:
             inputs += _copied(self.model.empty_state(), [own.pull(kept, at, by, np.inf, (state, state))[1]])[1]
         if self.net:
             kept = NetKept(state.net, state.net, None, time=state.time)
-            inputs.append(self.net.pull(kept, state.net, given.net, np.inf, (state, state))[1])
+            read = self.net.pull(kept, state.net, given.net, np.inf, (state, state))[1]
+            inputs += _copied(self.model.empty_state(), [read])[1]
         for own in inputs:
             for array in (own.gravity, own.mass):
                 wp.map(wp.mul, array, self.model.types.real(state.time), out=array)

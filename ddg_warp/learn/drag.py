@@ -103,6 +103,11 @@ class NetDragAdjoint:
         self.inertia = wp.zeros((net.worlds, net.blocks), dtype=block_inertia(real), device=device)
         self._islands = Islands(net.worlds, real, device)
 
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [self._edges, self._nodes, *self.drag.kernels]
+
     def resist(self, before, tangents: wp.array, rate: float) -> None:
         """Write `inertia` of a solve from the state `before`, with the tangents that it took."""
         self._islands.rate.fill_(rate)

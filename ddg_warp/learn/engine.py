@@ -128,16 +128,16 @@ class Engine:
         def launch():
             self._found = adjoint.pull_parts(self.before, self.after, parts, self._given, s)
 
-        if all(own.solve.system for own in adjoint.chains) and not adjoint.net:
+        if all(own.solve.system for own in adjoint.parts):
             self._graphs.replay(dt, launch)
         else:
             launch()
         found, inputs = self._found
-        self._solved_by = [own.solve.failed for own in adjoint.chains]
+        self._solved_by = [own.solve.failed for own in adjoint.parts]
         if self.poses:
             self.poses.pull_step(found, inputs, (self.before, self.after), self._given, posed)
             self.by_poses = self.poses.by_end
-        if self._by_start is None or adjoint.net:  # memory of rods' derivatives stays
+        if self._by_start is None:  # whose memory stays
             self._by_start = tensors(found, self.fields)
         return self._by_start, inputs
 
@@ -155,39 +155,47 @@ class Engine:
                 Kept(before, at.x, at.theta, before.frame, None)
                 for at, before in zip(solved, self.before.groups, strict=True)
             ]
+            if adjoint.net:
+                before, data = self.before.net, self.after.net.data
+                if self.midpoint:
+                    data = {index: wp.clone(values) for index, values in data.items()}
+                self._net = NetKept(before, replace(before, q=wp.clone(before.q), data=data), None)
+                self._turned = wp.clone(before.q)  # scratch
             self.adjoint = adjoint
             self.poses = Poses(adjoint, self.midpoint) if self.model.grips else None
         return self.adjoint
 
     def _load(self) -> None:
-        kernels = [kernel for own in self.adjoint.chains for kernel in own.kernels]
+        kernels = [kernel for own in self.adjoint.parts for kernel in own.kernels]
         arrays.load_kernels(kernels, self.model.wp_device)
 
     def _net_kept(self, start: float, dt: float) -> NetKept:
         """Of the net: joints' rotations are those at the rates of the step, as their dofs begin it at zero."""
-        net, before, after = self.model.net, self.before.net, self.after.net
-        solved, data = wp.clone(after.q), after.data
-        q = view(solved)
+        net, before, after, kept = self.model.net, self.before.net, self.after.net, self._net
+        q = view(kept.solved.q)
+        q.copy_(view(after.q))
         if self.midpoint:
             q.add_(view(before.q)).mul_(0.5)
-            data = self._data_between(start, dt, solved)
+            self._data_between(start, dt)
         spins = net.host.spins
         if spins:
             rates = view(after.v)
             if self.midpoint:  # the mean of those at both ends, over half of the step
                 rates = 0.25 * (rates + view(before.v))
             q.view(net.worlds, -1, 3)[:, -spins:] = rates.reshape(net.worlds, -1, 3)[:, -spins:] * dt
-        return NetKept(before, replace(before, q=solved, data=data), None)
+        return kept
 
-    def _data_between(self, start: float, dt: float, q: wp.array) -> dict:
+    def _data_between(self, start: float, dt: float) -> None:
         """Normals that supports turn, and the magnetic field, in the middle of a step, as its solve had them."""
         step = self.integrator._net
         step.prescribe(start, start + dt)
         if step.motion:
             step.motion.follow(self.before, self.after)
             # normals alone: angles are known
-            step.motion.direct(self.adjoint.net.supports.islands, wp.clone(q), self.before.net.frame)
-        return step._data
+            wp.copy(self._turned, self._net.solved.q)
+            step.motion.direct(self.adjoint.net.supports.islands, self._turned, self.before.net.frame)
+        for index, data in self._net.solved.data.items():
+            wp.copy(data, step._data[index])
 
     # equilibria
 
@@ -231,8 +239,9 @@ class Engine:
         return wp.ScopedStream(self._streams[own])
 
     def solved(self, flags) -> list[torch.Tensor]:
-        """Flags of a step, not numbers where its reverse has failed, too: of rods that are at no minimum."""
-        found = zip(flags, [*self._solved_by, None], strict=False)
+        """Flags of a step, not numbers where its reverse has failed, too: of rods that are at no minimum, and of nets that conjugate
+        gradients have not solved."""
+        found = zip(flags, self._solved_by, strict=True)
         return [flag if bad is None else torch.where(view(bad) == 0, flag, float("nan")) for flag, bad in found]
 
     @property

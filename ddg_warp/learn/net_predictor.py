@@ -65,6 +65,13 @@ class NetPredictor:
         needed = scheme and (net.host.followers or (midpoint and (net.edges or net.host.drag)))
         return cls(model, net, motion, midpoint) if needed else None
 
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture, once a solver was suited."""
+        own = [self._begin, self._unplace, self._pass_on, self._turn, self._pull, *self.net.carries]
+        parts = (self.motion, self._solver.turns)
+        return own + [kernel for part in parts if part for kernel in part.kernels]
+
     def suit(self, step, s: float) -> bool:
         """From now on find those of a `NetStep` that solves over s [s]; whether that is another one."""
         if self._for != (s, self.model.version):

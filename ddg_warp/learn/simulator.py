@@ -142,7 +142,7 @@ class Simulator(torch.nn.Module):
         """The state after a step of dt.
 
         Raises:
-            SceneError: a name or shape does not fit.
+            SceneError: a name or shape does not fit, or a shell has a curved membrane, which is for equilibria alone.
         """
         engine = self._own(state)
         return self._step(state, self._full(engine, parameters), self._controls(engine, controls))

@@ -98,7 +98,6 @@ class Integrator:
         self.energy_bound = energy.bound(energy_bound, scheme)
         self.check_every = check_every or (32 if model.wp_device.is_cuda else 1)
         validate.require_mass(model)
-        validate.refuse_curved_membranes(model)
         self.given: Given | None = None  # loads that steps are given, once one is
         # the uniform magnetic field that they are given, in every world
         self.field = None
@@ -124,7 +123,7 @@ class Integrator:
         Raises:
             SolverError: a rod could not be stepped within the retries, or float32 would lose its motion in rounding; the message
                 names rod and outcome.
-            SceneError: controls do not fit the model.
+            SceneError: controls do not fit the model, or a shell has a curved membrane.
         """
         dt = arguments.number("dt", dt, "a time step that is positive and finite [s]", lambda v: v > 0.0)
         validate.check_state("step", self.model, state)
@@ -147,6 +146,7 @@ class Integrator:
         """Solve by what suits steps of dt from now on."""
         changed = dt != self._dt_host or self.model.version != self._version
         if changed:
+            validate.refuse_curved_membranes(self.model)
             self._dt.fill_(dt)
             self._dt_host = dt
         self._weigh(dt, state)

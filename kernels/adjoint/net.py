@@ -1,7 +1,6 @@
 """Reverse of a step on nets; see `kernels.variation`, and `kernels.net.elements` for how elements and worlds lie.
 
-Every slot of an element writes its own shares; blocks and edges gather what is theirs by lists, so that sums come in one order, without
-atomics.
+Every slot of an element writes its own shares, which `kernels.adjoint.net_shares` gathers.
 """
 
 from functools import cache
@@ -13,7 +12,7 @@ from ddg_warp.kernels.net import elements
 from ddg_warp.kernels.net.elements import FRAME, elements_type, place_function
 from ddg_warp.kernels.terms import Term
 from ddg_warp.kernels.threads import CPU_OPTIONS
-from ddg_warp.kernels.variation import carried_function, variation_functions
+from ddg_warp.kernels.variation import variation_functions
 
 
 @cache
@@ -135,90 +134,11 @@ def lag_kernel(term: Term, real):
 
 
 @cache
-def frame_kernel(real):
-    """pull(...): the reverse of `net.frames.edge_kernel`: by the edge vector, and, added, by the frame of before."""
-    V = wp.types.vector(3, real)
-    carried = carried_function(real)
-
-    @wp.func
-    def three(a: wp.array2d(dtype=real), row: int, f: int):
-        return V(a[row, f], a[row + 1, f], a[row + 2, f])
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def pull(
-        q: wp.array(dtype=V),
-        ends: wp.array2d(dtype=int),
-        blocks: int,
-        frame: wp.array2d(dtype=real),
-        by: wp.array2d(dtype=real),
-        edge_out: wp.array2d(dtype=V),
-        frame_out: wp.array2d(dtype=real),
-    ):
-        f = wp.tid()
-        world = f / ends.shape[0]
-        i = f - world * ends.shape[0]
-        e = q[ends[i, 1] + world * blocks] - q[ends[i, 0] + world * blocks]
-        de, du, dt, _u, _t = wp.grad(carried)(
-            e, three(frame, 0, f), three(frame, 3, f), three(by, 0, f), three(by, 3, f)
-        )
-        edge_out[0, f] = -de
-        edge_out[1, f] = de
-        for d in range(3):
-            frame_out[d, f] = frame_out[d, f] + du[d]
-            frame_out[3 + d, f] = frame_out[3 + d, f] + dt[d]
-
-    return pull
-
-
-@cache
-def gather_kernels(real):
-    """slots(...) adds what slots of elements bring to blocks; frames(...) what their lagged data bring to the frames of edges.
-
-    Item i of a list is slot i / `count` of element i % `count`, of which there are `count` in each world.
-    """
-    V = wp.types.vector(3, real)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def slots(
-        starts: wp.array(dtype=int),
-        items: wp.array(dtype=int),
-        count: int,
-        blocks: int,
-        slot_in: wp.array2d(dtype=V),
-        out: wp.array(dtype=V),
-    ):
-        tid = wp.tid()
-        world = tid / blocks
-        k = tid - world * blocks
-        total = out[tid]
-        for at in range(starts[k], starts[k + 1]):
-            total += slot_in[items[at] / count, items[at] % count + world * count]
-        out[tid] = total
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def frames(
-        starts: wp.array(dtype=int),
-        items: wp.array(dtype=int),
-        count: int,
-        edges: int,
-        lag_in: wp.array2d(dtype=real),
-        out: wp.array2d(dtype=real),
-    ):
-        tid = wp.tid()
-        world = tid / edges
-        k = tid - world * edges
-        for at in range(starts[k], starts[k + 1]):
-            row = items[at] / count * wp.static(FRAME)
-            e = items[at] % count + world * count
-            for c in range(wp.static(FRAME)):
-                out[c, tid] = out[c, tid] + lag_in[row + c, e]
-
-    return slots, frames
-
-
-@cache
 def step_kernels(real, midpoint: bool, drag: bool):
-    """solution(...) and start(...) as of `kernels.adjoint.step`, of the blocks of a net. Joints' rotations begin every step at zero."""
+    """solution(...) and start(...) as of `kernels.adjoint.step`, of the blocks of a net; ended(...): blocks at the end of a step.
+
+    Joints' rotations begin every step at zero.
+    """
     V = wp.types.vector(3, real)
     share = real(2.0 if midpoint else 1.0)
     kept = real(1.0 if midpoint else 0.0)
@@ -304,4 +224,9 @@ def step_kernels(real, midpoint: bool, drag: bool):
         )
         damping_out[i] = -rate * wp.dot(wp.cw_mul(m, own), step)
 
-    return solution, start
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def ended(solved: wp.array(dtype=V), q0: wp.array(dtype=V), out: wp.array(dtype=V)):
+        i = wp.tid()
+        out[i] = solved[i] + (solved[i] - q0[i])
+
+    return solution, start, ended

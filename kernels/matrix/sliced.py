@@ -133,6 +133,30 @@ def sum_function(term: Term, linear, exact: bool, local: bool):
     return add
 
 
+@cache
+def inertia_function(real, linear, drag: bool):
+    """inertia_of(mass, coefficient, world, block): what inertia and drag bring to H."""
+    M, Mass = wp.types.matrix((3, 3), linear), mass_type(real, drag)
+
+    @wp.func
+    def inertia_of(mass: Mass, coefficient: real, w: int, block: int):
+        m = M()
+        if wp.static(drag):
+            inertia = mass[w, block].mass * coefficient
+        else:
+            inertia = mass[block] * coefficient
+        for d in range(3):
+            m[d, d] = linear(inertia[d])
+        if wp.static(drag):
+            resistance = mass[w, block].resistance
+            for i in range(3):
+                for j in range(3):
+                    m[i, j] = m[i, j] + linear(resistance[i, j])
+        return m
+
+    return inertia_of
+
+
 SETS = 6  # sets that one launch sums
 
 
@@ -158,6 +182,7 @@ def assemble_kernel(
         for term, first, own in zip(terms, exact_from, local, strict=True)
     )
     begin = next((first for first in exact_from if first is not None), 0)
+    inertia_of = inertia_function(real, linear, drag)
     count = len(terms)
     last = count - 1
     Own0, Own1, Own2, Own3, Own4, Own5 = (contributions(linear, local[min(i, last)]) for i in range(SETS))
@@ -192,17 +217,7 @@ def assemble_kernel(
             m = M()
             if wp.static(begins):
                 if row == columns[at]:
-                    if wp.static(drag):
-                        inertia = mass[w, row].mass * scalars[COEFFICIENT, w]
-                    else:
-                        inertia = mass[row] * scalars[COEFFICIENT, w]
-                    for d in range(3):
-                        m[d, d] = linear(inertia[d])
-                    if wp.static(drag):
-                        resistance = mass[w, row].resistance
-                        for i in range(3):
-                            for j in range(3):
-                                m[i, j] = m[i, j] + linear(resistance[i, j])
+                    m = inertia_of(mass, scalars[COEFFICIENT, w], w, row)
             else:
                 for i in range(3):
                     for j in range(3):

@@ -86,8 +86,12 @@ def inverse_function(linear):
 
 
 @cache
-def solver_kernels(linear):
-    """Kernels of a solve, in the order of their use; see the module's text."""
+def solver_kernels(linear, indefinite: bool = False):
+    """Kernels of a solve, in the order of their use; see the module's text.
+
+    If `indefinite`, H may be, with a preconditioner that is not: iterates then are the points of conjugate gradients of Paige and
+    Saunders (SIAM J. Numer. Anal. 12, 1975, 617), each of which there is unless a curvature is zero.
+    """
     H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
     times, free = product_functions(linear)
     inverse_of = inverse_function(linear)
@@ -96,7 +100,10 @@ def solver_kernels(linear):
     @wp.func
     def ends(curvature: linear, rho: linear):
         """Curvature that is negative, or lost to rounding: the solve ends with what it has, or a step of steepest descent."""
-        return not curvature > eps * rho * linear(1.0e-6)
+        if wp.static(indefinite):
+            return not wp.abs(curvature) > eps * rho * linear(1.0e-6)
+        else:
+            return not curvature > eps * rho * linear(1.0e-6)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def invert(

@@ -10,17 +10,19 @@ from ddg_warp.solve.net.system import Sums
 
 
 class ConjugateGradients:
-    """Directions of a `NetNewton`: H d = r in the worlds that want one, as exactly as its `forcing` and `goal` say.
+    """H d = r in the worlds that want it, to a residual as small as `forcing` says, in the norm of the preconditioner.
 
     Args:
-        newton: whose matrix, residual, direction and chains these are.
+        newton: a `NetNewton`, or what has its names, whose matrix, residual, direction and chains these are.
         multilevel: whether levels precondition what chains leave, or all; see `kernels.solve.levels`.
+        indefinite: whether H may be.
 
     Attributes:
         rest: the residual; z: preconditioned; p: the search direction; product: H p; inverse: of the diagonal blocks.
+        rho_first, total: squares of the norm of the first and of the last residual; sum: of values of blocks, world by world.
     """
 
-    def __init__(self, newton, multilevel: bool):
+    def __init__(self, newton, multilevel: bool, indefinite: bool = False):
         self.newton, net, linear, device = newton, newton.net, newton.linear, newton.device
         H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
         self.rest, self.z, self.p, self.product = (wp.zeros(newton.all, dtype=H, device=device) for _ in range(4))
@@ -30,19 +32,17 @@ class ConjugateGradients:
         )
         self.busy = wp.zeros(1, dtype=int, device=device)
         self._unread = [wp.zeros(newton.worlds, dtype=int, device=device) for _ in range(2)]
-        self._sum = Sums(newton.worlds, net.blocks, linear, device)
-        self._worst = Sums(newton.worlds, newton.allowed.ratio.shape[1], newton.real, device, largest=True)
-        self._invert, self._start, self._begin, *self._cycle = krylov.solver_kernels(linear)
-        self._compare, self._confirm = krylov.confirm_kernels(newton.real, linear)
+        self.sum = Sums(newton.worlds, net.blocks, linear, device)
+        self._invert, self._start, self._begin, *self._cycle = krylov.solver_kernels(linear, indefinite)
         self.levels = Multilevel(net, newton.system, linear) if multilevel else None
         self._limit = max(200, 100 * math.isqrt(net.blocks))
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [self._invert, self._start, self._begin, *self._cycle, self._compare, self._confirm]
-        sums = [(kernel, krylov.THREADS) for part in (self._sum, self._worst) for kernel in part.kernels]
-        return [*own, *sums, *(self.levels.kernels if self.levels else [])]
+        sums = [(kernel, krylov.THREADS) for kernel in self.sum.kernels]
+        levels = self.levels.kernels if self.levels else []
+        return [self._invert, self._start, self._begin, *self._cycle, *sums, *levels]
 
     def solve(self) -> None:
         """Directions; worlds where H or its preconditioner is not definite are noted, and end with what has been found so far."""
@@ -63,7 +63,7 @@ class ConjugateGradients:
         if self.levels:
             self.levels.prepare(newton.matrix, newton.fixed, anew)
         self.precondition(self.p)
-        self._sum(newton.krylov_dots, self.total)
+        self.sum(newton.krylov_dots, self.total)
         self.busy.zero_()
         wp.launch(
             self._begin,
@@ -72,23 +72,11 @@ class ConjugateGradients:
             [wanted, self.rho, self.rho_first, newton.iterations, newton.indefinite, self.busy],
             device=newton.device,
         )
-        wp.capture_while(self.busy, self.reduce)
+        self.iterate()
 
-    def reduce(self) -> None:
-        """Iterate until the residual is small in the norm of the preconditioner, and go on where the tolerance says that it is not."""
-        newton = self.newton
-        allowed, wanted, rtol = newton.allowed, newton.islands.wanted, newton.options.rtol
+    def iterate(self) -> None:
+        """Iterate until the residual is small in the norm of the preconditioner."""
         wp.capture_while(self.busy, self.cycle)
-        self._launch(self._compare, [self.rest, allowed.blocks, wanted, newton.net.blocks], [allowed.ratio])
-        allowed.sum_up(self.rest, rtol, newton.islands, *self._unread)
-        self._worst(allowed.ratio, newton.worst)
-        wp.launch(
-            self._confirm,
-            newton.worlds,
-            [newton.worst, newton.goal, newton.options.linear_rtol],
-            [newton.forcing, wanted, self.busy],
-            device=newton.device,
-        )
 
     def precondition(self, z: wp.array) -> None:
         """What chains and levels make of z, which holds the residual times the inverses of the diagonal blocks."""
@@ -109,14 +97,14 @@ class ConjugateGradients:
             newton.chains.product(newton.matrix, self.p, newton.fixed, wanted, self.product, dots)
         else:
             self.multiply(self.p)
-        self._sum(dots, self.curvature)
+        self.sum(dots, self.curvature)
         self._launch(
             advance,
             [self.p, self.product, self.inverse, self.rho, self.curvature, newton.iterations, wanted, blocks],
             [newton.direction, self.rest, self.z, dots],
         )
         self.precondition(self.z)
-        self._sum(dots, self.total)
+        self.sum(dots, self.total)
         self._launch(turn, [self.z, self.total, self.rho, wanted, blocks], [self.p])
         wp.launch(
             test,
@@ -125,7 +113,6 @@ class ConjugateGradients:
             [self.rho, newton.iterations, newton.indefinite, wanted, self.busy],
             device=newton.device,
         )
-        newton.watch()
 
     def multiply(self, p: wp.array) -> None:
         """H p on free dofs where none of H lies in bands, and p . H p block by block."""
@@ -140,3 +127,44 @@ class ConjugateGradients:
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
         """One thread for each block of every world."""
         wp.launch(kernel, self.newton.all, inputs, outputs, device=self.newton.device)
+
+
+class Directions(ConjugateGradients):
+    """Those of a `NetNewton`, as exactly as its `forcing` and `goal` say."""
+
+    def __init__(self, newton, multilevel: bool):
+        super().__init__(newton, multilevel)
+        real = newton.real
+        self._worst = Sums(newton.worlds, newton.allowed.ratio.shape[1], real, newton.device, largest=True)
+        self._compare, self._confirm = krylov.confirm_kernels(real, newton.linear)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        sums = [(kernel, krylov.THREADS) for kernel in self._worst.kernels]
+        return [*super().kernels, self._compare, self._confirm, *sums]
+
+    def iterate(self) -> None:
+        """The same, and on where the tolerance says that the residual is not small."""
+        wp.capture_while(self.busy, self.reduce)
+
+    def reduce(self) -> None:
+        """Until one of the two says so."""
+        newton = self.newton
+        allowed, wanted, rtol = newton.allowed, newton.islands.wanted, newton.options.rtol
+        super().iterate()
+        self._launch(self._compare, [self.rest, allowed.blocks, wanted, newton.net.blocks], [allowed.ratio])
+        allowed.sum_up(self.rest, rtol, newton.islands, *self._unread)
+        self._worst(allowed.ratio, newton.worst)
+        wp.launch(
+            self._confirm,
+            newton.worlds,
+            [newton.worst, newton.goal, newton.options.linear_rtol],
+            [newton.forcing, wanted, self.busy],
+            device=newton.device,
+        )
+
+    def cycle(self) -> None:
+        """One iteration."""
+        super().cycle()
+        self.newton.watch()

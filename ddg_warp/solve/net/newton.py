@@ -18,7 +18,7 @@ from ddg_warp.solve.chains.newton import EARLY, FROZEN, FROZEN_ONLY, NewtonOptio
 from ddg_warp.solve.net.balance import Balance
 from ddg_warp.solve.net.chains import Chains
 from ddg_warp.solve.net.frozen import Frozen
-from ddg_warp.solve.net.krylov import ConjugateGradients
+from ddg_warp.solve.net.krylov import Directions
 from ddg_warp.solve.net.planes import DevicePlanes
 from ddg_warp.solve.net.system import Assembly, NetSystem, Sums
 from ddg_warp.solve.net.tolerance import Allowed
@@ -286,9 +286,9 @@ class NetNewton:
             wp.launch(self._repeat, self.worlds, [1, *self.islands.arrays, self.negative], device=self.device)
 
     @cached_property
-    def krylov(self) -> ConjugateGradients:
+    def krylov(self) -> Directions:
         """What finds directions where elimination is not exact."""
-        return ConjugateGradients(self, self._multilevel)
+        return Directions(self, self._multilevel)
 
     @property
     def anew(self) -> Islands | Frozen:

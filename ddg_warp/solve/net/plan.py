@@ -192,19 +192,16 @@ class ChainPlan:
 
     def _take(self, rows, columns, near, kept) -> None:
         """What bands take over (`taken`), and whether that is all (`complete`)."""
-        self.taken, self.complete = np.zeros(0, int), False
-        if kept is None:
-            return
         k, c = np.divmod(self.where, self.chain.shape[1])
         a, b = (np.where(rows >= 0, of, 0) for of in (rows, columns))
-        both = kept[a] & kept[b] & (rows >= 0)
+        inside, free = self.where >= 0, ~self._held
+        both = inside[a] & inside[b] & (rows >= 0) & free[a] & free[b]
         same = both & near & (c[a] == c[b]) & (np.abs(k[a] - k[b]) <= self.span)
         same &= self.chain[k[a], c[a]] == self.chain[k[b], c[b]]
-        self.taken = np.flatnonzero(same)
+        self.taken = np.zeros(0, int) if kept is None else np.flatnonzero(same)
         joint = np.where(self.joint_row >= 0, self.joint_row // 2, -1)
-        free = ~self._held
-        between = (joint[a] != joint[b]) & (rows >= 0) & free[a] & free[b] & ~(kept[a] | kept[b])
-        self.complete = not (both & ~same).any() and not (free & ~kept & (joint < 0)).any() and not between.any()
+        between = (joint[a] != joint[b]) & (rows >= 0) & free[a] & free[b] & ~(inside[a] | inside[b])
+        self.complete = not (both & ~same).any() and not (free & ~inside & (joint < 0)).any() and not between.any()
 
     def _couple(self, host, rows, columns) -> None:
         """Couplings of chains and joints, of what is not held."""

@@ -1,0 +1,71 @@
+"""Around the linear solve of a reverse on a net: vectors of blocks in its precision and frames, and what became of it."""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.matrix.sliced import product_functions
+from ddg_warp.kernels.threads import CPU_OPTIONS
+
+
+@cache
+def block_kernels(real, linear):
+    """into(blocks, blocks in `linear`) and back(...); keep(...): zeroes dofs whose bits are set, in every world."""
+    V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
+    _, free = product_functions(linear)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def into(values: wp.array(dtype=V), out: wp.array(dtype=H)):
+        i = wp.tid()
+        v = values[i]
+        out[i] = H(linear(v[0]), linear(v[1]), linear(v[2]))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def back(values: wp.array(dtype=H), out: wp.array(dtype=V)):
+        i = wp.tid()
+        v = values[i]
+        out[i] = V(real(v[0]), real(v[1]), real(v[2]))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def keep(bits: wp.array(dtype=wp.uint8), blocks: int, values: wp.array(dtype=H)):
+        i = wp.tid()
+        values[i] = wp.cw_mul(values[i], free(bits[i % blocks]))
+
+    return into, back, keep
+
+
+@cache
+def check_kernels(linear):
+    """rest(...): the residual that a solution leaves, preconditioned by the diagonal blocks; check(...): whether that is little."""
+    H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def rest(
+        right: wp.array(dtype=H),
+        product: wp.array(dtype=H),
+        inverse: wp.array(dtype=M),
+        blocks: int,
+        residual_out: wp.array(dtype=H),
+        z_out: wp.array(dtype=H),
+        dots_out: wp.array2d(dtype=linear),
+    ):
+        i = wp.tid()
+        r = right[i] - product[i]
+        z = inverse[i] * r
+        residual_out[i] = r
+        z_out[i] = z
+        dots_out[i / blocks, i % blocks] = wp.dot(r, z)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def check(
+        total: wp.array(dtype=linear),
+        first: wp.array(dtype=linear),
+        missed: linear,
+        failed_out: wp.array(dtype=int),
+    ):
+        """Marks worlds whose residual is more than a part `missed` of the right-hand side, or no number; zero is solved by zero."""
+        w = wp.tid()
+        little = wp.abs(total[w]) <= missed * missed * first[w]
+        failed_out[w] = wp.where(little or first[w] == linear(0.0), 0, 1)
+
+    return rest, check

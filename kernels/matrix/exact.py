@@ -1,0 +1,97 @@
+"""The exact Hessian of a net by index, from those of its elements in their local dofs; it lies as `sliced` says."""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.drag import mass_type
+from ddg_warp.kernels.islands import COEFFICIENT, WANTED
+from ddg_warp.kernels.matrix.sliced import inertia_function
+from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
+
+FIRST, SIGN, COUNT = range(
+    3
+)  # what a slot sees of local dofs: the first, with which sign, and how many (three, or one of an angle)
+
+
+@cache
+def exact_kernels(real, linear, drag: bool, serial: bool):
+    """begin(...): what inertia, and drag, bring to H; add(...): adds what the elements of one set bring."""
+    M, Mass, until = wp.types.matrix((3, 3), linear), mass_type(real, drag), until_function(serial)
+    inertia_of = inertia_function(real, linear, drag)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def begin(
+        mass: Mass,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        rows: wp.array(dtype=int),
+        columns: wp.array(dtype=int),
+        positions: int,
+        matrix: wp.array2d(dtype=linear),
+    ):
+        start = wp.tid()
+        for p in range(start, until(start, matrix.shape[1])):
+            w = p / positions
+            at = p - w * positions
+            row = rows[at]
+            if flags[WANTED, w] == 0 or row < 0:
+                continue  # padding stays zero
+            m = M()
+            if row == columns[at]:
+                m = inertia_of(mass, scalars[COEFFICIENT, w], w, row)
+            for i in range(3):
+                for j in range(3):
+                    matrix[3 * i + j, p] = m[i, j]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def add(
+        hessian: wp.array3d(dtype=real),
+        starts: wp.array(dtype=int),
+        items: wp.array(dtype=int),
+        ends: wp.array2d(dtype=int),
+        slots: int,
+        flags: wp.array2d(dtype=int),
+        positions: int,
+        matrix: wp.array2d(dtype=linear),
+    ):
+        """`hessian` is [element][row][column], rounding apart symmetric; items as of `sliced.sum_function`.
+
+        `ends` (slots * n, 3) are `FIRST`, `SIGN` and `COUNT` of the n dofs that each slot sees at most; a sign of zero ends them early.
+        """
+        start = wp.tid()
+        n = ends.shape[0] / slots
+        for p in range(start, until(start, matrix.shape[1])):
+            w = p / positions
+            at = p - w * positions
+            if flags[WANTED, w] == 0 or starts[at] == starts[at + 1]:
+                continue
+            elements = hessian.shape[0] / flags.shape[1]
+            m = M()
+            for index in range(starts[at], starts[at + 1]):
+                item = items[index]
+                pair = item / slots
+                b = item - pair * slots
+                e = pair / slots
+                a = pair - e * slots
+                e += w * elements
+                for i in range(n):
+                    up = ends[a * n + i, wp.static(SIGN)]
+                    if up == 0:
+                        break
+                    row = ends[a * n + i, wp.static(FIRST)]
+                    for j in range(n):
+                        sign = up * ends[b * n + j, wp.static(SIGN)]
+                        if sign == 0:
+                            break
+                        column = ends[b * n + j, wp.static(FIRST)]
+                        for x in range(3):
+                            for y in range(3):
+                                if x < ends[a * n + i, wp.static(COUNT)] and y < ends[b * n + j, wp.static(COUNT)]:
+                                    both = hessian[e, row + x, column + y] + hessian[e, column + y, row + x]
+                                    m[x, y] = m[x, y] + linear(real(0.5) * real(sign) * both)
+            for i in range(3):
+                for j in range(3):
+                    matrix[3 * i + j, p] = matrix[3 * i + j, p] + m[i, j]
+
+    return begin, add

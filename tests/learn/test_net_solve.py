@@ -1,0 +1,228 @@
+"""Linear systems of the reverse of nets: conjugate gradients on the device against sparse factors, and gradients by both."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+import ddg_warp as ddg
+from ddg_warp.geometry import meshes
+from ddg_warp.learn.adjoint import Adjoint
+from ddg_warp.learn.solve import HostSolve
+from ddg_warp.solve.net.exact import ExactSystem
+from ddg_warp.solve.net.krylov import ConjugateGradients
+from ddg_warp.solve.net.tangent import NetTangent
+from ddg_warp.torch import Simulator
+from tests.learn import differences
+from tests.learn.differences import TIGHT, built, cotangent, directions, entries, lively
+from tests.learn.test_adjoint import DT, SCENES, SOFT
+from tests.learn.test_torch import STIFFNESS
+
+RATE = 1.0 / DT
+
+
+def oblique():
+    """A sheet with an edge on a plane that is across no axis."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, -9.81), mass_damping=0.7)
+    vertices, triangles = meshes.rectangle(3, 2, (0.3, 0.2))
+    angle = 0.5
+    turn = np.array([[np.cos(angle), 0.0, -np.sin(angle)], [0.0, 1.0, 0.0], [np.sin(angle), 0.0, np.cos(angle)]])
+    shell = scene.add_shell(np.asarray(vertices) @ turn.T, triangles, thickness=0.004, material=SOFT)
+    left, right = (np.flatnonzero(vertices[:, 0] == x) for x in (vertices[:, 0].min(), vertices[:, 0].max()))
+    scene.symmetry(shell, left, turn[:, 0])
+    scene.hold(shell, right[:1])
+    return scene
+
+
+def strut(density=1000.0):
+    """A straight rod with a twig of its own, between two supports."""
+    scene, t = ddg.Scene(gravity=(0.0, 0.0, 0.0)), np.linspace(0.0, 1.0, 9)
+    material = ddg.Material(young=1e6, density=density)
+    rods = [
+        scene.add_rod(np.outer(t, axis) + start, section=ddg.Circle(0.01), material=material)
+        for axis, start in (((1.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ((0.0, 0.0, 0.2), (0.5, 0.0, 0.0)))
+    ]
+    scene.fix(rods[0], [0, -1])
+    scene.join([(rods[0], 4), (rods[1], 0)])
+    return scene
+
+
+def squeezed(name: str):
+    """A model, and a state in which it is shorter than at rest by a third: its Hessian is indefinite."""
+    model = built({"strut": strut, "sheet": SCENES["sheet"]}[name]())
+    state, net = model.state(), model.net
+    q = net.rest().q.numpy()
+    q[: net.host.nodes, 0] *= 0.67
+    state.net.q.assign(q)
+    return model, state
+
+
+def by_both(model, state, rate: float, **attributes):
+    """The system after it has solved for one right-hand side, its solution, that of factors, and their tangent."""
+    net = model.net
+    right = np.random.default_rng(1).normal(size=(model.worlds * net.blocks, 3))
+    angles = (np.arange(net.blocks) >= net.host.nodes) & (np.arange(net.blocks) < net.blocks - net.host.spins)
+    right[np.tile(angles, model.worlds), 1:] = 0.0
+    found = wp.zeros(len(right), dtype=net.vector, device=net.device)
+    coefficient, system = rate * (rate + model.scene.mass_damping), ExactSystem(model)
+    for name, value in attributes.items():
+        setattr(system.krylov, name, value)
+    rates = wp.full(model.worlds, rate, dtype=net.real, device=net.device)
+    system.solve(state.net, coefficient, rates, wp.array(right, dtype=net.vector, device=net.device), found)
+    tangent = NetTangent(model, 0)
+    solve = HostSolve(tangent)
+    wanted = solve(SimpleNamespace(net=state.net), rate, coefficient, None, tangent.into(right.ravel()))
+    return system, found.numpy(), tangent.back(wanted).reshape(-1, 3), tangent
+
+
+def off(found: np.ndarray, wanted: np.ndarray) -> float:
+    return float(np.abs(found - wanted).max() / np.abs(wanted).max())
+
+
+NETS = {name: SCENES[name] for name in ("joined", "hinged", "sheet", "hinges", "midedge", "stiffened", "turned_joined")}
+
+
+@pytest.mark.parametrize("name", [*NETS, "oblique"])
+def test_conjugate_gradients_find_what_factors_do(name):
+    model = (NETS | {"oblique": oblique})[name]().build(device=differences.DEVICE, precision="float64", worlds=2)
+    system, found, wanted, tangent = by_both(model, lively(model), RATE)
+    assert not system.failed.numpy().any()
+    assert off(found, wanted) < 1e-9
+    if name != "oblique":
+        assert np.all(found.ravel()[~tangent.free] == 0.0)
+
+
+def test_rods_that_branch_are_eliminated():
+    """One iteration: chains leave nothing."""
+    model = built(SCENES["joined"]())
+    system, *_ = by_both(model, lively(model), RATE)
+    assert system.iterations.numpy()[0] == 1
+
+
+@pytest.mark.parametrize("name", ["strut", "sheet"])
+def test_an_indefinite_matrix(name):
+    model, state = squeezed(name)
+    system, found, wanted, tangent = by_both(model, state, 1.0)
+    matrix = tangent.hessian(SimpleNamespace(net=state.net)).toarray() + np.diag(tangent.mass)
+    spectrum = np.linalg.eigvalsh(matrix[tangent.free][:, tangent.free])
+    assert (spectrum < 0.0).sum() > 2
+    assert not system.failed.numpy().any()
+    assert off(found, wanted) < 1e-7
+
+
+def test_what_rounding_leaves_is_no_failure():
+    """Rods as thin as hair, in long steps: stretching is 1e13 times as stiff as inertia."""
+    scene, t = ddg.Scene(gravity=(0.0, 0.0, -9.81)), np.linspace(0.0, 0.2, 65)
+    hair = ddg.Material(young=4e9, density=1300.0)
+    points = np.stack([t, 0.3 * t * t, 0.02 * np.sin(20.0 * t)], 1)
+    twig = points[32] + np.outer(t[:32], (0.3, 0.3, 0.2))
+    rods = [scene.add_rod(of, section=ddg.Circle(4e-5), material=hair) for of in (points, twig)]
+    scene.clamp(rods[0])
+    scene.join([(rods[0], 32), (rods[1], 0)])
+    model = built(scene)
+    system, found, wanted, _ = by_both(model, model.state(), 60.0)
+    assert not system.failed.numpy().any()
+    assert off(found, wanted) < 1e-6
+
+
+def test_a_world_without_a_right_hand_side():
+    model = SCENES["sheet"]().build(device=differences.DEVICE, precision="float64", worlds=2)
+    state, net, system = lively(model), model.net, ExactSystem(model)
+    right = np.zeros((2 * net.blocks, 3))
+    right[net.blocks + 5] = 1.0
+    found = wp.full(len(right), net.vector(1.0, 1.0, 1.0), dtype=net.vector, device=net.device)
+    rates = wp.full(2, RATE, dtype=net.real, device=net.device)
+    system.solve(state.net, RATE**2, rates, wp.array(right, dtype=net.vector, device=net.device), found)
+    assert np.all(found.numpy()[: net.blocks] == 0.0)
+    assert np.abs(found.numpy()[net.blocks :]).max() > 0.0
+    assert not system.failed.numpy().any()
+
+
+def pulled(model, state, scheme: str, given: dict, **how):
+    """Derivatives by the state before a step and by parameters, and the reverse that found them."""
+    adjoint = Adjoint(ddg.Integrator(model, scheme=scheme, **TIGHT))
+    _, tape = adjoint.step(state, DT)
+    s = DT / 2.0 if scheme == "implicit_midpoint" else DT
+    given = cotangent(model, given)
+    adjoint.pull(tape, given)
+    gradient, inputs = adjoint.pull_parts(tape.before, tape.after, tape.parts, given, s, **how)
+    values = {name: array.numpy() for name, array in entries(gradient).items()}
+    return values | {f"parameters {i}": rows.numpy() for i, rows in enumerate(inputs[-1].parameters)}
+
+
+@pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
+@pytest.mark.parametrize("name", ["sheet", "stiffened", "turned_joined", "sand, joined", "pressure"])
+def test_gradients_are_those_of_factors(name, scheme):
+    """The whole reverse of a step, by either; and bit by bit once more."""
+    model = built(SCENES[name]())
+    state = lively(model, scheme=scheme)
+    given = directions(model, state, 5)
+    found, wanted, again = (pulled(model, state, scheme, given, factors=how) for how in (False, True, False))
+    for key, value in wanted.items():
+        np.testing.assert_array_equal(found[key], again[key], err_msg=key)
+        if np.abs(value).max() > 1e-9:
+            assert off(found[key], value) < 1e-9, key
+
+
+@pytest.fixture
+def hasty(monkeypatch):
+    """Conjugate gradients that end with their first iteration."""
+    once = ConjugateGradients.__init__
+
+    def cut(self, newton, multilevel, indefinite=False):
+        once(self, newton, multilevel, indefinite)
+        self._limit = 1 if indefinite else self._limit
+
+    monkeypatch.setattr(ConjugateGradients, "__init__", cut)
+
+
+def test_what_does_not_converge_takes_factors(hasty):
+    model = built(SCENES["sheet"]())
+    state = lively(model)
+    given = directions(model, state, 5)
+    adjoint = Adjoint(ddg.Integrator(model, **TIGHT))
+    _, tape = adjoint.step(state, DT)
+    gradient, _ = adjoint.pull(tape, cotangent(model, given))
+    wanted = pulled(model, state, "implicit_euler", given, factors=True)
+    for key, array in entries(gradient).items():
+        np.testing.assert_array_equal(array.numpy(), wanted[key], err_msg=key)
+
+
+def test_worlds_of_torch_that_do_not_converge_say_so(hasty):
+    """The host does not look at a step of torch: what has no gradient is no number."""
+    own = Simulator(built(SCENES["sheet"]()), DT)
+    velocities = torch.zeros((1, own.model.points_count, 3), dtype=torch.float64, requires_grad=True)
+    after = own.step(own.initial_state(velocities=velocities))
+    assert torch.isnan(torch.autograd.grad((after.positions**2).sum(), velocities)[0]).any()
+
+
+@pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
+@pytest.mark.parametrize("name", ["joined", "sheet"])
+def test_reverses_of_nets_are_replayed(name, scheme):
+    """One captured graph serves all steps of a length, and finds what launches one by one do."""
+    gradients = []
+    for replayed in (True, False):
+        own = Simulator(built(SCENES[name]()), DT, scheme=scheme, rtol=1e-12)
+        graphs = own.engine(1)._adjoint() and own.engine(1)._graphs
+        if not replayed:
+            graphs.replay = lambda name, launch: launch()
+        stiffness = own.parameter(STIFFNESS[name]).requires_grad_()
+        *_, state = own.rollout(own.initial_state(), {STIFFNESS[name]: 1.1 * stiffness}, steps=4)
+        gradients.append(torch.autograd.grad((state.positions**2).sum(), stiffness)[0].cpu().numpy())
+        assert len(graphs._graphs) == replayed
+    np.testing.assert_array_equal(*gradients)
+
+
+@pytest.mark.parametrize("name", ["joined", "sheet"])
+def test_mixed_precision(name):
+    """Within 1e-4 of float64's, as asked: solved in float64."""
+    gradients = []
+    for precision in ("float64", "mixed"):
+        own = Simulator(SCENES[name]().build(device=differences.DEVICE, precision=precision), DT, rtol=1e-9)
+        speed = torch.zeros((1, own.model.points_count, 3), dtype=own.initial_state().velocities.dtype)
+        speed.requires_grad_()
+        *_, state = own.rollout(own.initial_state(velocities=speed), steps=5)
+        gradients.append(torch.autograd.grad((state.positions**2).sum(), speed)[0].cpu().numpy())
+    assert off(gradients[1], gradients[0]) < 1e-4
