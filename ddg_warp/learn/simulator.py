@@ -11,6 +11,7 @@ from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 from ddg_warp.learn.engine import Engine
 from ddg_warp.learn.layout import tensors
+from ddg_warp.learn.recipe import Recipe
 from ddg_warp.learn.rollout import Plan, bytes_of, plan, roll
 from ddg_warp.learn.step import Balance, Call, Step
 from ddg_warp.model import validate
@@ -98,13 +99,12 @@ class Simulator(torch.nn.Module):
         if worlds not in self._engines:
             model = self.model
             if worlds != model.worlds:
-                model = _Recipe(model, worlds).build()
-                _copy_parameters(self.model, model)
+                model = Recipe(model, worlds).build()
             self._engines[worlds] = Engine(model, self.scheme, self.options)
         return self._engines[worlds]
 
     def __getstate__(self):
-        return self.__dict__ | {"_engines": {}, "model": _Recipe(self.model, self.model.worlds)}
+        return self.__dict__ | {"_engines": {}, "model": Recipe(self.model, self.model.worlds)}
 
     def __setstate__(self, state):
         self.__dict__.update(state)
@@ -329,32 +329,3 @@ def _named(what: str, example: str, values) -> dict:
     if not (values is None or isinstance(values, Mapping)):
         raise SceneError(f"{what} are {values!r}; give a dictionary such as {{{example!r}: ...}}")
     return dict(values or {})
-
-
-class _Recipe:
-    """A model of so many worlds that can be built again elsewhere."""
-
-    def __init__(self, model, worlds: int):
-        self.scene = model.scene
-        self.options = {
-            "device": model.device,
-            "precision": model.precision,
-            "worlds": worlds,
-            "allow_rounding": model.allow_rounding,
-        }
-
-    def build(self):
-        """The model."""
-        return self.scene.build(**self.options)
-
-
-def _copy_parameters(source, target) -> None:
-    """Give a model of other worlds the parameters of another one, which has one world or the same in all."""
-    pairs = [(a.parameters, b.parameters) for a, b in zip(source.groups, target.groups, strict=True)]
-    nets = (source.net, target.net) if source.net is not None else ()
-    if nets:
-        pairs += [(a.parameters, b.parameters) for a, b in zip(nets[0].sets, nets[1].sets, strict=True)]
-    for own, other in pairs:
-        for name, values in own.values.items():
-            if values.shape == other[name].shape:
-                other.set(**{name: values.copy()})
