@@ -96,6 +96,25 @@ class Order:
             result[self.edge_starts[rod.rod] + np.arange(len(rod.edges))] = True
         return result
 
+    def elements(self, name: str) -> tuple[int, list[tuple[Group, np.ndarray, np.ndarray]]]:
+        """Elements of rods on their own that have a parameter "term.parameter", counted rod by rod, those of clamped ends included.
+
+        Returns:
+            How many there are in one world; and of every group that has some: itself, where its rods have them (n, R) bool, and
+            their numbers there, 0 elsewhere (n, R).
+        """
+        counts, found = np.zeros(self.model.scene.rod_count, np.int64), []
+        for group in self.model.groups:
+            if name in group.parameters.values:
+                term = next(term for term in group.kind.terms if name.startswith(f"{term.name}."))
+                missing = 0 if group.kind.closed else term.measure.span
+                inside = np.arange(group.nodes)[:, None] < group.host.count - missing
+                counts[group.host.rods] = inside.sum(0)
+                found.append((group, inside))
+        first = np.cumsum(counts) - counts
+        places = [first[group.host.rods] + np.arange(group.nodes)[:, None] for group, _ in found]
+        return int(counts.sum()), [(*each, np.where(each[1], own, 0)) for each, own in zip(found, places, strict=True)]
+
     @property
     def meridian_rows(self) -> slice:
         """Rows of `State.points` that are nodes of meridians."""
