@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
-from ddg_warp.ask.sag_free import rest_strains
+from ddg_warp.ask.sag_free import least_stiffness, rest_strains
 from ddg_warp.geometry import meshes
 from ddg_warp.model.rest_shapes import set_rest_strains
+from ddg_warp.solve.stability import spectrum
 from ddg_warp.solve.statics import solve
 
 LENGTH, EDGES = 0.5, 20
@@ -161,6 +162,38 @@ def test_a_long_rod():
 
 
 ROUND = ddg.Material(1e7, density=1000.0)
+
+
+@pytest.mark.parametrize("n", [40, 200])
+def test_a_column_may_be_as_soft_as_greenhill_found(n):
+    """Upright under its weight: stable where w L^3 < 7.8373 EI (Greenhill 1881), whatever its stretch was made to be."""
+    points = np.linspace((0.0, 0.0, 0.0), (0.0, 0.0, LENGTH), n + 1)
+    section = ddg.Stiffness(EA=1e5, EI1=0.03, EI2=0.05, GJ=0.02, mass_per_length=SECTION.mass_per_length)
+    scene = one(points=points, hold="clamp_end", section=section, director=(1.0, 0.0, 0.0))
+    scene.clamp_end(scene.add_rod(-points, section=section))  # hangs
+    model = scene.build("cpu")
+    given(model, rest_strains(model))
+    ((standing, hanging),) = least_stiffness(model, model.state())
+    assert standing == pytest.approx(WEIGHT * LENGTH**3 / (7.8373 * section.EI1), rel=2.0 / n**2 + 1e-4)
+    assert hanging < 1e-12
+
+
+def test_least_stiffness_is_where_stability_is_lost():
+    """Curled rods of any kind: stable as they are a per cent above it, and not a per cent below; it says so of both alike."""
+    model = scene_of_all().build("cpu", "float64")
+    given(model, rest_strains(model))
+    (least,) = least_stiffness(model, model.state())
+    assert (least > 0.0).all() and (least < 1.0).all()
+    worst = least.max()
+    for factor, stable in ((1.01 * worst, True), (0.99 * worst, False)):
+        softer = scene_of_all().build("cpu", "float64")
+        for group in softer.groups:
+            group.parameters.set(**{n: factor * v for n, v in group.parameters.values.items() if "stiffness" in n})
+        given(softer, rest_strains(softer))
+        assert spectrum(softer, softer.state(), 1, "unit", load=1.0).stable is stable
+        np.testing.assert_allclose(least_stiffness(softer, softer.state())[0] * factor, least, rtol=1e-6)
+
+
 REFUSED = {
     "closed": (
         lambda s: s.clamp(s.add_rod(curve(12), section=SECTION, closed=True, name="ring")),
@@ -212,6 +245,13 @@ def test_mistakes_are_named():
     ):
         with pytest.raises(ddg.SceneError, match=f"rest_strains: {said}"):
             rest_strains(*arguments)
+    free = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    free.fix(free.add_rod(LEVEL, section=SECTION), [0, -1])
+    unclamped = free.build("cpu")
+    with pytest.raises(ddg.SceneError, match=r"least_stiffness: supports leave a rigid motion of .* rod 0"):
+        least_stiffness(unclamped, unclamped.state())
+    with pytest.raises(ddg.SceneError, match="least_stiffness: the state is of another model"):
+        least_stiffness(model, unclamped.state())
     with pytest.raises(ddg.SceneError, match="float32"):
         rest_strains(one().build("cpu", "float32"))
     found, before = rest_strains(model), model.parameters()
