@@ -48,6 +48,7 @@ SMALL = {
     "ribbon_helix": {"n": 50},
     "right_angle_frame": {},
     "roll_up": {"n": 100},
+    "sag_free_groom": {"count": 8},
     "sedimenting_rod": {},
     "slit_annulus": {},
     "soft_gripper": {"fingers": 1},
