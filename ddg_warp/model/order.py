@@ -157,19 +157,19 @@ class Order:
             raise ValueError(f"{what}: node {int(np.argwhere(~np.isfinite(values))[0][-2])} is not finite")
         return values
 
-    def put_edges(self, group: Group, values, out: np.ndarray) -> None:
-        values, _ = self.spins(values)
+    def put_edges(self, group: Group, values, out: np.ndarray, what: str = "spins") -> None:
+        values, _ = self.of_edges(values, what)
         k, column, index = self.edge_places(group)
         for world in range(self.model.worlds):
             out[k, column + world * group.rods] = (values if values.ndim == 1 else values[world])[index]
 
-    def spins(self, values) -> tuple[np.ndarray, np.ndarray]:
-        """Spins in the user's order, checked, and where the edges of each rod begin."""
-        values, count = _numbers("spins", values), self.edges_count
+    def of_edges(self, values, what: str) -> tuple[np.ndarray, np.ndarray]:
+        """Spins or angles in the user's order, checked, and where the edges of each rod begin."""
+        values, count = _numbers(what, values), self.edges_count
         if values.shape not in ((count,), (self.model.worlds, count)):
-            raise ValueError(f"spins have shape {values.shape}; they are ({count},), or one such array a world")
+            raise ValueError(f"{what} have shape {values.shape}; they are ({count},), or one such array a world")
         if not np.isfinite(values).all():
-            raise ValueError(f"spins: edge {int(np.argwhere(~np.isfinite(values))[0][-1])} is not finite")
+            raise ValueError(f"{what}: edge {int(np.argwhere(~np.isfinite(values))[0][-1])} is not finite")
         return values, self.edge_starts
 
     def nodes(self, values: list[np.ndarray], blocks: wp.array | None = None) -> np.ndarray:

@@ -548,3 +548,27 @@ def test_calls_that_do_not_fit_are_refused():
     ):
         with pytest.raises(SceneError, match=message):
             call()
+
+
+@pytest.mark.parametrize("name", ["twisted", "joined"])
+def test_states_of_the_model_step_as_its_own(name):
+    """Elsewhere, turned and moving, of damped rods, in two worlds: step by step what the integrator makes of it."""
+    model = SCENES[name]().build(device=differences.DEVICE, precision="float64", worlds=2)
+    own = Simulator(model, DT, **TIGHT)
+    random = np.random.default_rng(5)
+    points = model.state().points()
+    state = model.state(
+        points + 1e-3 * random.normal(size=points.shape),
+        0.1 * random.normal(size=points.shape),
+        angles=0.2 * random.normal(size=(2, model.order.edges_count)),
+    )
+    world, integrator = own.world_state(state), ddg.Integrator(model, **TIGHT)
+    torch.testing.assert_close(world.angles, torch.tensor(state.angles()), rtol=0.0, atol=0.0)
+    for _ in range(3):
+        state, world = integrator.step(state, DT), own.step(world)
+    torch.testing.assert_close(world.positions, torch.tensor(state.points()), rtol=0.0, atol=1e-12)
+    torch.testing.assert_close(world.angles, torch.tensor(state.angles()), rtol=0.0, atol=1e-10)
+    with pytest.raises(SceneError, match="world_state"):
+        own.world_state(world)
+    with pytest.raises(ValueError, match="angles have shape"):
+        model.state(angles=np.zeros(1))
