@@ -3,11 +3,13 @@
 import numpy as np
 
 import ddg_warp as ddg
+from ddg_warp.geometry import meshes
 
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # rad
 HAIR = np.array([0.36, 0.21, 0.11])  # RGB
 PANELS = 3  # of the picture
 GRAVITY = 9.81  # m/s^2
+HEAD = 0.97  # radius of the head that is drawn over that of the roots
 
 
 def placed(motion: ddg.Motion, rest: np.ndarray, t: float) -> np.ndarray:
@@ -18,6 +20,15 @@ def placed(motion: ddg.Motion, rest: np.ndarray, t: float) -> np.ndarray:
 def edge_lengths(points: np.ndarray) -> np.ndarray:
     """Lengths (..., nodes - 1) of the edges between points (..., nodes, 3)."""
     return np.linalg.norm(np.diff(points, axis=-2), axis=-1)
+
+
+def moments(points: np.ndarray, weight: float) -> np.ndarray:
+    """Moments (rods, nodes - 2) [N m] of what is beyond, about the inner nodes of rods (rods, nodes, 3) of a weight [N/m]."""
+    half = 0.5 * weight * np.linalg.norm(np.diff(points, axis=1), axis=2)
+    load = np.pad(half, ((0, 0), (1, 0))) + np.pad(half, ((0, 0), (0, 1)))
+    arms = points[:, None, :, :2] - points[:, 1:-1, None, :2]  # weights act along z: level arms alone count
+    beyond = np.arange(points.shape[1]) > np.arange(1, points.shape[1] - 1)[:, None]
+    return np.linalg.norm((arms * (load[:, None] * beyond)[..., None]).sum(2), axis=2)
 
 
 def observe(model, state) -> dict[str, float]:
@@ -78,6 +89,15 @@ def fastest_root(result) -> float:
 def shown(frames) -> dict:
     """A few of the frames (time -> points), from the first on."""
     return {t: frames[t] for t in list(frames)[:: max(1, (len(frames) - 1) // (PANELS - 1))]}
+
+
+def head(roots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) and triangles (t, 3) of the ball that roots (count, 3) stand on, in least squares a little below them."""
+    # The sphere through the roots: |x|^2 = 2 c . x + (r^2 - |c|^2).
+    found, *_ = np.linalg.lstsq(np.column_stack([2.0 * roots, np.ones(len(roots))]), (roots**2).sum(1), rcond=None)
+    radius = np.sqrt(found[3] + found[:3] @ found[:3])
+    ball, triangles = meshes.sphere(4)
+    return found[:3] + HEAD * radius * ball, triangles
 
 
 def colors(count: int) -> np.ndarray:

@@ -15,7 +15,7 @@ from functools import cache
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.scenes import _learn
+from ddg_warp.scenes import _learn, _strands
 
 LENGTH = 0.3  # m, of a strand from root to tip, and of the shelf along itself
 CURL = 0.015  # m, radius at the tip
@@ -97,15 +97,6 @@ def size(result) -> tuple[int, int]:
     return len(strands.points), shelf.points.shape[1]
 
 
-def moments(points: np.ndarray, weight: float) -> np.ndarray:
-    """Moments (rods, nodes - 2) [N m] of what is beyond, about the inner nodes of rods (rods, nodes, 3) of a weight [N/m]."""
-    half = 0.5 * weight * np.linalg.norm(np.diff(points, axis=1), axis=2)
-    load = np.pad(half, ((0, 0), (1, 0))) + np.pad(half, ((0, 0), (0, 1)))
-    arms = points[:, None, :, :2] - points[:, 1:-1, None, :2]  # weights act along z: level arms alone count
-    beyond = np.arange(points.shape[1]) > np.arange(1, points.shape[1] - 1)[:, None]
-    return np.linalg.norm((arms * (load[:, None] * beyond)[..., None]).sum(2), axis=2)
-
-
 def check(result) -> list[ddg.Check]:
     """Everything where it was drawn, but for its stretch; the natural shape against statics."""
     from ddg_warp.ask import inquiry
@@ -119,7 +110,7 @@ def check(result) -> list[ddg.Check]:
 
     stresses = inquiry.stresses(result.model, result.state)["rod_bend_twist"]
     found = np.stack([np.linalg.norm(own, axis=-1) for own in stresses[:strands]])
-    known = moments(drawn[:-1], weights[0])
+    known = _strands.moments(drawn[:-1], weights[0])
 
     along = LENGTH * np.arange(1, nodes - 1) / (nodes - 1)
     shelf = weights[1] * (LENGTH - along) ** 2 / (2.0 * sections[1].EI1)

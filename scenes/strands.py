@@ -11,14 +11,12 @@ from pathlib import Path
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.geometry import meshes
 from ddg_warp.scenes import _strands
 
 GROOM = Path(__file__).resolve().parent / "data" / "strands.usdc"
 PERIOD = 1.0  # s, of the head's motion
 REST = 2.0  # s; the head has come to rest by then
 TURN = 0.9  # rad
-HEAD = 0.97  # radius of the head that is drawn over that of the roots
 
 observe = _strands.observe
 
@@ -116,12 +114,8 @@ def benchmark() -> ddg.bench.Study:
 def picture(result, frames) -> dict:
     """A few times side by side, in the colors of hair, with the head that the roots stand on."""
     batch, motion = result.model.scene.batches[0], result.model.scene.supports[0].motion
-    roots = batch.points[:, 0]
-    # The sphere through the roots: |x|^2 = 2 c . x + (r^2 - |c|^2), in least squares.
-    found, *_ = np.linalg.lstsq(np.column_stack([2.0 * roots, np.ones(len(roots))]), (roots**2).sum(1), rcond=None)
-    radius = np.sqrt(found[3] + found[:3] @ found[:3])
-    ball, triangles = meshes.sphere(4)
+    ball, triangles = _strands.head(batch.points[:, 0])
     shown = _strands.shown(frames)
-    heads = {t: (_strands.placed(motion, found[:3] + HEAD * radius * ball, t), triangles) for t in shown}
-    colors = _strands.colors(len(roots))
+    heads = {t: (_strands.placed(motion, ball, t), triangles) for t in shown}
+    colors = _strands.colors(batch.rods)
     return {"points_by_time": shown, "bodies": heads, "colors": colors, "side_by_side": True}

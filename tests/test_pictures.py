@@ -113,7 +113,7 @@ def test_hair_is_shown_with_its_head_side_by_side(drawn):
     head, _ = options["bodies"][0.0]
     roots = scene.batches[0].points[:, 0]
     centre = 0.5 * (head.min(axis=0) + head.max(axis=0))
-    radius = 0.5 * np.ptp(head, axis=0).max() / module.HEAD
+    radius = 0.5 * np.ptp(head, axis=0).max() / module._strands.HEAD
     np.testing.assert_allclose(np.linalg.norm(roots - centre, axis=1), radius, rtol=0.05)
     figure.rods_picture(result.model, path="unused.png", **options)
     assert len(drawn[0].axes) == 3

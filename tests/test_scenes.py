@@ -24,6 +24,7 @@ SMALL = {
     "helical_flagellum": {"n": 24},
     "helical_spring": {"n": 200},
     "hinged_roof": {"n": 6, "steps": 16},
+    "identify_from_recording": {},
     "identify_from_statics": {},
     "identify_stiffness": {},
     "inverse_rest_shape": {"strands": 2},
@@ -48,6 +49,7 @@ SMALL = {
     "ribbon_helix": {"n": 50},
     "right_angle_frame": {},
     "roll_up": {"n": 100},
+    "sag_free_groom": {"count": 8},
     "sedimenting_rod": {},
     "slit_annulus": {},
     "soft_gripper": {"fingers": 1},
@@ -78,6 +80,7 @@ LONG = (
     "residual_network",
 )
 LEARNED = (
+    "identify_from_recording",
     "identify_from_statics",
     "identify_stiffness",
     "inverse_rest_shape",

@@ -117,9 +117,36 @@ class Recording:
         if not self.complete:
             frame, marker = np.argwhere(~np.isfinite(self.markers).all(axis=2))[0]
             raise DataError(
-                f"{self.name}: frame {frame}: marker {marker} is lost; resample frames where all are seen (`between`)"
+                f"{self.name}: frame {frame}: marker {marker} is lost; fill short gaps (`filled`), or resample frames where all are "
+                "seen (`between`)"
             )
         return replace(self, times=times, markers=make_interp_spline(self.times, self.markers, k=degree)(times))
+
+    def filled(self, longest: float) -> Recording:
+        """The recording with markers that were lost for a while put where straight lines between the frames around have them.
+
+        Args:
+            longest: Between frames where a marker is seen [s]; what is lost for longer, or at either end, stays lost.
+
+        Raises:
+            SceneError: `longest` is not positive.
+        """
+        arguments.positive("filled: longest", longest, "s")
+        markers = self.markers.copy()
+        for place in np.ndindex(markers.shape[1:]):
+            seen = np.flatnonzero(np.isfinite(self.markers[(slice(None), *place)]))
+            if not len(seen):
+                continue
+            before, after = (
+                np.searchsorted(seen, np.arange(len(markers)), "right") - 1,
+                np.searchsorted(seen, np.arange(len(markers))),
+            )
+            inside = (before >= 0) & (after < len(seen))
+            before, after = seen[np.maximum(before, 0)], seen[np.minimum(after, len(seen) - 1)]
+            inside &= self.times[after] - self.times[before] <= longest * (1.0 + 1e-9)
+            own = np.interp(self.times, self.times[seen], self.markers[(seen, *place)])
+            markers[(inside, *place)] = own[inside]
+        return replace(self, markers=markers)
 
     def between(self, first: int, last: int) -> Recording:
         """The frames from `first` up to, but without, `last`; times go on from 0."""

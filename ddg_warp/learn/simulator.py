@@ -10,7 +10,8 @@ import warp as wp
 from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 from ddg_warp.learn.engine import Engine
-from ddg_warp.learn.layout import tensors
+from ddg_warp.learn.layout import copies, tensors
+from ddg_warp.learn.recipe import Recipe
 from ddg_warp.learn.rollout import Plan, bytes_of, plan, roll
 from ddg_warp.learn.step import Balance, Call, Step
 from ddg_warp.model import validate
@@ -98,13 +99,12 @@ class Simulator(torch.nn.Module):
         if worlds not in self._engines:
             model = self.model
             if worlds != model.worlds:
-                model = _Recipe(model, worlds).build()
-                _copy_parameters(self.model, model)
+                model = Recipe(model, worlds).build()
             self._engines[worlds] = Engine(model, self.scheme, self.options)
         return self._engines[worlds]
 
     def __getstate__(self):
-        return self.__dict__ | {"_engines": {}, "model": _Recipe(self.model, self.model.worlds)}
+        return self.__dict__ | {"_engines": {}, "model": Recipe(self.model, self.model.worlds)}
 
     def __setstate__(self, state):
         self.__dict__.update(state)
@@ -120,7 +120,8 @@ class Simulator(torch.nn.Module):
         Args:
             batch: worlds; by default those of positions or velocities, else of the model.
             positions, velocities: (P, 3) or (B, P, 3); gradients go through both. Frames stay those of the rest state and are carried
-                along by the first step: no edge may be further than 90 degrees from there.
+                along by the first step: no edge may be further than 90 degrees from there. Strain-rate damping resists what led there
+                from rest, within that step; states without that come from `world_state`.
 
         Raises:
             SceneError: shapes do not fit.
@@ -136,6 +137,18 @@ class Simulator(torch.nn.Module):
             if name in moved:
                 values = engine.layout.put_points(values, *arrays, moved[name])
         return WorldState(tuple(values), 0.0, engine)
+
+    def world_state(self, state) -> WorldState:
+        """A `State` as one that steps start from, such as `model.state(points, velocities)` or a checkpoint; gradients begin there.
+
+        Unlike by `initial_state`, frames are those of the state, and dampers have its strains behind them, not those at rest.
+
+        Raises:
+            SceneError: it is no state of this simulator's model, which has as many worlds.
+        """
+        validate.check_state("world_state", self.model, state)
+        engine = self.engine(self.model.worlds)
+        return WorldState(tuple(copies(tensors(state, engine.fields))), state.time, engine)
 
     @torch.compiler.disable  # what is compiled goes on behind it: launches of Warp are nothing that a compiler sees
     def step(self, state: WorldState, parameters: dict | None = None, controls: dict | None = None) -> WorldState:
@@ -329,32 +342,3 @@ def _named(what: str, example: str, values) -> dict:
     if not (values is None or isinstance(values, Mapping)):
         raise SceneError(f"{what} are {values!r}; give a dictionary such as {{{example!r}: ...}}")
     return dict(values or {})
-
-
-class _Recipe:
-    """A model of so many worlds that can be built again elsewhere."""
-
-    def __init__(self, model, worlds: int):
-        self.scene = model.scene
-        self.options = {
-            "device": model.device,
-            "precision": model.precision,
-            "worlds": worlds,
-            "allow_rounding": model.allow_rounding,
-        }
-
-    def build(self):
-        """The model."""
-        return self.scene.build(**self.options)
-
-
-def _copy_parameters(source, target) -> None:
-    """Give a model of other worlds the parameters of another one, which has one world or the same in all."""
-    pairs = [(a.parameters, b.parameters) for a, b in zip(source.groups, target.groups, strict=True)]
-    nets = (source.net, target.net) if source.net is not None else ()
-    if nets:
-        pairs += [(a.parameters, b.parameters) for a, b in zip(nets[0].sets, nets[1].sets, strict=True)]
-    for own, other in pairs:
-        for name, values in own.values.items():
-            if values.shape == other[name].shape:
-                other.set(**{name: values.copy()})

@@ -25,16 +25,9 @@ class Tables:
             SceneError: nothing has it.
         """
         if name not in self._found:
-            found, model, own = [], self.model, name.rpartition(".")
-            counts = np.zeros(model.scene.rod_count, np.int64)  # elements of every rod on its own
-            groups = [(group, self._inside(group, name)) for group in model.groups if name in group.parameters.values]
-            for group, inside in groups:
-                counts[group.host.rods] = inside.sum(0)
-            first = np.cumsum(counts) - counts
-            for group, inside in groups:
-                rows = first[group.host.rods] + np.arange(group.nodes)[:, None]
-                found.append((group.parameters, np.where(inside, rows, 0), True))
-            start = int(counts.sum())
+            model, own = self.model, name.rpartition(".")
+            start, groups = model.order.elements(name)
+            found = [(group.parameters, rows, True) for group, _, rows in groups]
             for part in model.net.sets if model.net is not None else ():
                 if part.term.name == own[0] and own[2] in part.parameters.values:
                     found.append((part.parameters, start + np.arange(part.elements), False))
@@ -96,8 +89,8 @@ class Tables:
             values = np.broadcast_to(table[name if chain else own], self._shape(rows, chain))
             wide = torch.tensor(values, dtype=result.dtype, device=result.device)
             if chain:
-                group = next(group for group in self.model.groups if group.parameters is table)
-                inside = torch.as_tensor(self._inside(group, name))
+                _, groups = self.model.order.elements(name)
+                inside = torch.as_tensor(next(inside for group, inside, _ in groups if group.parameters is table))
                 wide = wide.reshape(rows.shape[0], worlds, -1).permute(1, 0, 2)
                 result[:, rows[inside]] = wide[:, inside]
             else:
@@ -159,13 +152,6 @@ class Tables:
                 found.append((index, list(table.values).index(name if chain else own)))
             self._row_of[name] = found
         return self._row_of[name]
-
-    @staticmethod
-    def _inside(group, name: str) -> np.ndarray:
-        """Where rods of a group have elements of the term that a parameter belongs to (n, R)."""
-        term = next(term for term in group.kind.terms if name.startswith(f"{term.name}."))
-        missing = 0 if group.kind.closed else term.measure.span
-        return np.arange(group.nodes)[:, None] < group.host.count - missing
 
     def _shape(self, rows: torch.Tensor, chain: bool) -> tuple[int, int]:
         worlds = self.model.worlds

@@ -230,7 +230,7 @@ class Model:
                 result |= {f"{place}/{name}": values for name, values in part.parameters.values.items()}
         return result
 
-    def state(self, points=None, velocities=None, spins=None) -> State:
+    def state(self, points=None, velocities=None, spins=None, angles=None) -> State:
         """A first state: the rest state at rest, or with other positions and velocities.
 
         Args:
@@ -259,17 +259,24 @@ class Model:
                     omega = np.zeros((group.nodes, group.columns))
                     self.order.put_edges(group, spins, omega)
                     arrays.assign(data.omega, omega)
+                if angles is not None:
+                    theta = np.zeros((group.nodes, group.columns))
+                    self.order.put_edges(group, angles, theta, "angles")
+                    arrays.assign(data.theta, theta)
         if self.net is not None:
             state.net = self.net.rest()
             for values, array, what in ((points, state.net.q, "points"), (velocities, state.net.v, "velocities")):
                 if values is not None:
                     array.assign(self.order.put_blocks(values, array.numpy(), what))
-            if spins is not None:
-                values, start = self.order.spins(spins)
-                rates = state.net.v.numpy().reshape(self.worlds, -1, 3)
-                for rod in self.net.host.rods:
-                    rates[:, rod.edges, 0] = values[..., start[rod.rod] + np.arange(len(rod.edges))]
-                state.net.v.assign(rates.reshape(-1, 3))
+            if angles is not None and self.scene.attachments:
+                raise ValueError("angles: edges that are glued to a shell turn with it; leave angles out")
+            for given, array, what in ((spins, state.net.v, "spins"), (angles, state.net.q, "angles")):
+                if given is not None:
+                    values, start = self.order.of_edges(given, what)
+                    blocks = array.numpy().reshape(self.worlds, -1, 3)
+                    for rod in self.net.host.rods:
+                        blocks[:, rod.edges, 0] = values[..., start[rod.rod] + np.arange(len(rod.edges))]
+                    array.assign(blocks.reshape(-1, 3))
         if points is not None:
             self.carry_frames(state)
         if self.net is not None:

@@ -96,6 +96,25 @@ class Order:
             result[self.edge_starts[rod.rod] + np.arange(len(rod.edges))] = True
         return result
 
+    def elements(self, name: str) -> tuple[int, list[tuple[Group, np.ndarray, np.ndarray]]]:
+        """Elements of rods on their own that have a parameter "term.parameter", counted rod by rod, those of clamped ends included.
+
+        Returns:
+            How many there are in one world; and of every group that has some: itself, where its rods have them (n, R) bool, and
+            their numbers there, 0 elsewhere (n, R).
+        """
+        counts, found = np.zeros(self.model.scene.rod_count, np.int64), []
+        for group in self.model.groups:
+            if name in group.parameters.values:
+                term = next(term for term in group.kind.terms if name.startswith(f"{term.name}."))
+                missing = 0 if group.kind.closed else term.measure.span
+                inside = np.arange(group.nodes)[:, None] < group.host.count - missing
+                counts[group.host.rods] = inside.sum(0)
+                found.append((group, inside))
+        first = np.cumsum(counts) - counts
+        places = [first[group.host.rods] + np.arange(group.nodes)[:, None] for group, _ in found]
+        return int(counts.sum()), [(*each, np.where(each[1], own, 0)) for each, own in zip(found, places, strict=True)]
+
     @property
     def meridian_rows(self) -> slice:
         """Rows of `State.points` that are nodes of meridians."""
@@ -138,19 +157,19 @@ class Order:
             raise ValueError(f"{what}: node {int(np.argwhere(~np.isfinite(values))[0][-2])} is not finite")
         return values
 
-    def put_edges(self, group: Group, values, out: np.ndarray) -> None:
-        values, _ = self.spins(values)
+    def put_edges(self, group: Group, values, out: np.ndarray, what: str = "spins") -> None:
+        values, _ = self.of_edges(values, what)
         k, column, index = self.edge_places(group)
         for world in range(self.model.worlds):
             out[k, column + world * group.rods] = (values if values.ndim == 1 else values[world])[index]
 
-    def spins(self, values) -> tuple[np.ndarray, np.ndarray]:
-        """Spins in the user's order, checked, and where the edges of each rod begin."""
-        values, count = _numbers("spins", values), self.edges_count
+    def of_edges(self, values, what: str) -> tuple[np.ndarray, np.ndarray]:
+        """Spins or angles in the user's order, checked, and where the edges of each rod begin."""
+        values, count = _numbers(what, values), self.edges_count
         if values.shape not in ((count,), (self.model.worlds, count)):
-            raise ValueError(f"spins have shape {values.shape}; they are ({count},), or one such array a world")
+            raise ValueError(f"{what} have shape {values.shape}; they are ({count},), or one such array a world")
         if not np.isfinite(values).all():
-            raise ValueError(f"spins: edge {int(np.argwhere(~np.isfinite(values))[0][-1])} is not finite")
+            raise ValueError(f"{what}: edge {int(np.argwhere(~np.isfinite(values))[0][-1])} is not finite")
         return values, self.edge_starts
 
     def nodes(self, values: list[np.ndarray], blocks: wp.array | None = None) -> np.ndarray:

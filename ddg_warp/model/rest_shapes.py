@@ -1,4 +1,4 @@
-"""Rest shapes of shells: growth, swelling, bilayers, creases and pre-stress as fundamental forms at rest.
+"""Rest shapes: growth, swelling, bilayers, creases and pre-stress of shells as fundamental forms at rest; rest strains of rods.
 
 A shell at rest has a metric abar and a second fundamental form bbar on every triangle, written (11, 12, 22) in the basis of its
 first two edges, a1 = x1 - x0 and a2 = x2 - x0. They need not be those of any surface: then the shell is strained whatever its shape
@@ -129,6 +129,38 @@ def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, ang
     held.plate = plate  # from here on nothing can fail
     for part, first, parameters in places:
         part.set_rest(first, parameters)
+    model.version += 1
+
+
+def set_rest_strains(model, strains: dict) -> None:
+    """Change the rest stretches, natural curvatures and natural twists of rods on their own, element by element.
+
+    Args:
+        model: a built scene.
+        strains: values (elements,) or (worlds, elements) by name, such as "rod_stretch.rest" [1] or "rod_bend_twist.rest_1" [1/m], of
+            the elements of all rods, rod by rod, those of clamped ends included; `ddg_warp.ask.sag_free.rest_strains` finds some.
+
+    Raises:
+        ValueError: no rod on its own has such a rest strain, or rods of the net have it too; values do not fit or are not finite.
+            Nothing is changed then.
+    """
+    own = {f"{term.name}.{name}" for group in model.groups for term in group.kind.terms for name in term.rest}
+    shared = {part.term.name for part in model.net.sets} if model.net is not None else set()
+    known, found = sorted(name for name in own if name.partition(".")[0] not in shared), []
+    for name, values in strains.items():
+        if name not in known:
+            why = "rods that are joined, glued or magnetised have it too" if name in own else f"there is {known}"
+            raise ValueError(f"set_rest_strains: {name!r} is no rest strain of rods that are all on their own; {why}")
+        count, groups = model.order.elements(name)
+        values = model.valid_values(*name.rsplit(".", 1), values)
+        if values.shape not in ((count,), (model.worlds, count)):
+            raise ValueError(
+                f"set_rest_strains: {name} has shape {values.shape}; give ({count},) or ({model.worlds}, {count})"
+            )
+        values = np.broadcast_to(values, (model.worlds, count))
+        found += [(group, name, np.concatenate(values[:, numbers], axis=1)) for group, _, numbers in groups]
+    for group, name, values in found:
+        group.parameters.set(**{name: values})
     model.version += 1
 
 

@@ -1,13 +1,16 @@
-"""Sparse direct solution of symmetric systems with their inertia (SuperLU), for problems of moderate size."""
+"""Sparse direct solution of symmetric systems with their inertia (SuperLU), and of equations that leave a choice; of moderate size."""
 
 from functools import cached_property
 
 import numpy as np
 from scipy.linalg import qr
-from scipy.sparse import csc_matrix, diags
-from scipy.sparse.linalg import splu
+from scipy.sparse import bmat, csc_matrix, csr_matrix, diags, identity
+from scipy.sparse.linalg import norm, splu
 
 SHIFTS = (1e-13, 1e-11, 1e-9)  # of a singular matrix, over its largest eigenvalue as its diagonal shows it
+
+REPEATED = 1e-15  # of equations, over their size: so little keeps regular those that say the same twice
+CORRECTIONS = 20  # at most, of what rounding and that leave
 
 
 class SingularError(RuntimeError):
@@ -86,3 +89,23 @@ def regular(matrix: csc_matrix, mass: np.ndarray) -> tuple[Factorisation, float]
         except SingularError:
             continue
     raise SingularError("the tangent is singular whatever is added to it: it is not finite")
+
+
+def shortest(matrix: csr_matrix, right: np.ndarray) -> np.ndarray:
+    """The shortest y with A y = b, by the augmented system [1, A^T; A, 0] (Bjorck, Numerical methods for least squares problems, 1996).
+
+    Equations may say the same twice; of those that contradict each other something is left, for the caller to see.
+    """
+    size = norm(matrix, axis=1)
+    scaling = diags(1.0 / np.where(size > 0.0, size, 1.0))
+    matrix, right = scaling @ matrix, scaling @ right
+    rows, columns = matrix.shape
+    factors = splu(bmat([[identity(columns), matrix.T], [matrix, -REPEATED * identity(rows)]], format="csc"))
+    found, left = np.zeros(columns), right
+    for _ in range(CORRECTIONS):
+        tried = found + factors.solve(np.concatenate([np.zeros(columns), left]))[:columns]
+        now = right - matrix @ tried
+        if not np.linalg.norm(now) < 0.5 * np.linalg.norm(left):
+            break
+        found, left = tried, now
+    return found

@@ -283,11 +283,15 @@ def buckling(model, free, loaded, count: int = 1) -> np.ndarray:
         raise ValueError("the first state is no minimum: its tangent is singular") from None
     if factors.negative:
         raise ValueError(f"the first state is no minimum: its tangent has {factors.negative} negative eigenvalues")
-    if len(dofs) <= DENSE:
-        values = linalg.eigh(softening.toarray(), start.toarray(), eigvals_only=True)
-        factor = 1.0 / np.sort(values[values > 0.0])[::-1][:count]
-    else:
-        factor = LowestFactors(start, softening, factors)(count)
+    factor = lowest_factors(start, softening, factors, count)
     if not len(factor):
         raise ValueError("no load along this direction makes the tangent singular")
     return factor
+
+
+def lowest_factors(matrix, softening, factors: Factorisation, count: int) -> np.ndarray:
+    """The `count` lowest positive f with det(K - f S) = 0 for a definite K, whose `factors` these are; fewer if there are no more."""
+    if matrix.shape[0] > DENSE:
+        return LowestFactors(matrix, softening, factors)(count)
+    values = linalg.eigh(softening.toarray(), matrix.toarray(), eigvals_only=True)
+    return 1.0 / np.sort(values[values > 0.0])[::-1][:count]

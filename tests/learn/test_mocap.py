@@ -116,6 +116,21 @@ def test_lost_markers_are_kept_and_named(tmp_path):
     assert len(recording.between(8, 20).grips()) == 2
 
 
+def test_short_gaps_are_filled():
+    """By straight lines, exact for steady motion; long gaps and both ends stay lost, and what was seen stays as it was."""
+    steady = np.linspace(0.0, 1.0, 20)[:, None, None] * np.arange(1.0, 10.0).reshape(3, 3)
+    markers = steady.copy()
+    markers[3:6, 0], markers[8:14, 1], markers[:2, 2], markers[-1, 2] = np.nan, np.nan, np.nan, np.nan
+    recording = Recording("a", 0.01 * np.arange(20), markers, ())
+    found = recording.filled(0.05).markers
+    np.testing.assert_allclose(found[:, 0], steady[:, 0], rtol=1e-14)
+    np.testing.assert_array_equal(found[:, 1:], markers[:, 1:])
+    np.testing.assert_allclose(recording.filled(0.07).markers[:, 1], steady[:, 1], rtol=1e-14)
+    assert np.isnan(recording.markers[4, 0]).all()  # it is not changed
+    with pytest.raises(SceneError, match="longest"):
+        recording.filled(0.0)
+
+
 def test_where_recordings_are_must_be_said(tmp_path, monkeypatch):
     monkeypatch.delenv(VARIABLE, raising=False)
     with pytest.raises(DataError, match=VARIABLE):

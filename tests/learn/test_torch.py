@@ -346,6 +346,21 @@ def test_copies_and_pickles():
     torch.testing.assert_close(again()["rod_bend_twist.stiffness_1"], factors()["rod_bend_twist.stiffness_1"])
 
 
+@pytest.mark.parametrize("name", ["lone", "joined"])
+def test_parameters_of_the_model_go_into_other_worlds(name):
+    """One number an element, set before the simulator was made, is that of all worlds and of what is pickled; never the scene's."""
+    own, stiffness = gripped() if name == "lone" else simulator(name), "rod_bend_twist.stiffness_2"
+    values = np.linspace(1.0, 2.0, own.parameter(stiffness).shape[1]) * float(own.parameter(stiffness)[0, 0])
+    own.model.set_parameter(*stiffness.split("."), values)
+    wanted = torch.tensor(values).expand(3, -1)
+    for each in (own, pickle.loads(pickle.dumps(own)), copy.deepcopy(own)):
+        torch.testing.assert_close(each.parameter(stiffness, 3), wanted, rtol=0.0, atol=0.0)
+    two = own.model.scene.build(device=differences.DEVICE, precision="float64", worlds=2)
+    two.set_parameter(*stiffness.split("."), values[:2])
+    with pytest.raises(SceneError, match="stiffness_2 differs between the 2 worlds"):
+        Simulator(two, DT).parameter(stiffness, 3)
+
+
 def test_a_stiffness_is_found_again():
     """Three stiffnesses of a rod from its motion, by gradients of their logarithms."""
     own = simulator("twisted")
@@ -533,3 +548,27 @@ def test_calls_that_do_not_fit_are_refused():
     ):
         with pytest.raises(SceneError, match=message):
             call()
+
+
+@pytest.mark.parametrize("name", ["twisted", "joined"])
+def test_states_of_the_model_step_as_its_own(name):
+    """Elsewhere, turned and moving, of damped rods, in two worlds: step by step what the integrator makes of it."""
+    model = SCENES[name]().build(device=differences.DEVICE, precision="float64", worlds=2)
+    own = Simulator(model, DT, **TIGHT)
+    random = np.random.default_rng(5)
+    points = model.state().points()
+    state = model.state(
+        points + 1e-3 * random.normal(size=points.shape),
+        0.1 * random.normal(size=points.shape),
+        angles=0.2 * random.normal(size=(2, model.order.edges_count)),
+    )
+    world, integrator = own.world_state(state), ddg.Integrator(model, **TIGHT)
+    torch.testing.assert_close(world.angles, torch.tensor(state.angles()), rtol=0.0, atol=0.0)
+    for _ in range(3):
+        state, world = integrator.step(state, DT), own.step(world)
+    torch.testing.assert_close(world.positions, torch.tensor(state.points()), rtol=0.0, atol=1e-12)
+    torch.testing.assert_close(world.angles, torch.tensor(state.angles()), rtol=0.0, atol=1e-10)
+    with pytest.raises(SceneError, match="world_state"):
+        own.world_state(world)
+    with pytest.raises(ValueError, match="angles have shape"):
+        model.state(angles=np.zeros(1))

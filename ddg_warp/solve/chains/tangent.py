@@ -14,6 +14,7 @@ from ddg_warp import arrays
 from ddg_warp.compile.tolerance import support_forces
 from ddg_warp.geometry.turning import turned
 from ddg_warp.kernels import element
+from ddg_warp.model.parameters import ParameterTable
 from ddg_warp.solve.motion import Motion
 from ddg_warp.solve.part import Part
 from ddg_warp.solve.rigid import Body
@@ -69,6 +70,28 @@ class ChainTangent(Part):
         elements = len(values)
         diagonal = sparse.bsr_matrix((values, np.arange(elements), np.arange(elements + 1)))
         return self.incidence.T @ (diagonal @ self.incidence)
+
+    def unit_forces(self, state, strains: np.ndarray) -> sparse.csr_matrix:
+        """Derivatives of the strains by the dofs, times the measures: forces of unit stresses (size, columns n strains).
+
+        Args:
+            strains: of all terms at this state, whose laws are quadratic (strains, n, columns).
+        """
+        group, values = self.group, self.group.parameters.values
+        blocks = np.zeros((group.columns, group.nodes, group.kind.window, len(strains)))
+        for index, (term, place) in enumerate(zip(group.kind.terms, group.kind.places(), strict=True)):
+            names = [[f"{term.name}.{name}" for name in own] for own in (term.stiffness, term.rest)]
+            first = place[3]
+            for unit in range(len(term.rest)):
+                own = {name: np.full((1, 1), float(m == unit)) for m, name in enumerate(names[0])}
+                own |= {name: strains[first + m] - 1.0 for m, name in enumerate(names[1])}
+                table = ParameterTable(values | own, 0, self.model.types.real, self.model.wp_device)
+                self._windows.zero_()
+                self._launch(state, index, 1, self._windows, table)
+                blocks[..., first + unit] = arrays.download(self._windows).transpose(2, 1, 0)
+        blocks = blocks.reshape(-1, *blocks.shape[2:])
+        elements = np.arange(len(blocks) + 1)
+        return sparse.csr_matrix(self.incidence.T @ sparse.bsr_matrix((blocks, elements[:-1], elements)))
 
     def blocks(self, q: np.ndarray) -> np.ndarray:
         """Dofs (size,) as (column, node, dofs of a node)."""
@@ -174,14 +197,22 @@ class ChainTangent(Part):
             out[column, :n, : kind.dim] += turned(x[column, :n], dx[column, :n], held[column, :n], still, kind.closed)
         return moved
 
-    def _launch(self, state, index: int, which: int, out: wp.array) -> None:
+    def _launch(self, state, index: int, which: int, out: wp.array, parameters: ParameterTable | None = None) -> None:
         group, data = self.group, self.data(state)
         kernel = element.term_kernels(group.kind, index, self.model.types.real)[which]
         grid = (group.elements, group.columns) + ((group.kind.window,) if which == 2 else ())
         wp.launch(
             kernel,
             grid,
-            [data.x, data.theta, data.frame, data.last, self.rate, *group.parameters.arrays, group.count],
+            [
+                data.x,
+                data.theta,
+                data.frame,
+                data.last,
+                self.rate,
+                *(parameters or group.parameters).arrays,
+                group.count,
+            ],
             [out],
             device=self.model.wp_device,
         )

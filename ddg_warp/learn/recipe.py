@@ -1,0 +1,52 @@
+"""Models built again with the parameters that they have: with other worlds, or in another process."""
+
+import numpy as np
+
+from ddg_warp.errors import SceneError
+
+
+class Recipe:
+    """A model of so many worlds that can be built again elsewhere, with the parameters that it has.
+
+    Raises:
+        SceneError: a parameter differs between its worlds, and there are to be others.
+    """
+
+    def __init__(self, model, worlds: int):
+        self.scene = model.scene
+        self.options = {
+            "device": model.device,
+            "precision": model.precision,
+            "worlds": worlds,
+            "allow_rounding": model.allow_rounding,
+        }
+        self.parameters = [
+            {name: _in_worlds(name, values, axis, model.worlds, worlds) for name, values in table.values.items()}
+            for table, axis in _tables(model)
+        ]
+
+    def build(self):
+        """The model."""
+        model = self.scene.build(**self.options)
+        for (table, _), values in zip(_tables(model), self.parameters, strict=True):
+            table.set(**values)
+        return model
+
+
+def _tables(model) -> list:
+    """Parameters of all groups and of the net, and the axis along which worlds lie."""
+    sets = model.net.sets if model.net is not None else ()
+    return [(group.parameters, 1) for group in model.groups] + [(part.parameters, 0) for part in sets]
+
+
+def _in_worlds(name: str, values: np.ndarray, axis: int, worlds: int, wanted: int) -> np.ndarray:
+    """A parameter of so many worlds as one of others."""
+    if worlds == wanted or values.shape[axis] == 1:
+        return values
+    own = np.stack(np.split(values, worlds, axis))
+    if (own != own[0]).any():
+        raise SceneError(
+            f"the parameter {name} differs between the {worlds} worlds of the model, so that those of {wanted} worlds are not known; "
+            "give it as a tensor, or build the model with as many worlds"
+        )
+    return np.concatenate([own[0]] * wanted, axis)
