@@ -141,9 +141,7 @@ class Pull(torch.autograd.Function):
         flags = output[count:]
         with engine.stream():
             engine.tables.write(call.parameters, parameters)
-            engine.controls.give_field(controls)
-            posed = "poses" in call.controls
-            found, inputs = engine.backward(call.start, call.dt, state, output[:count], given, posed)
+            found, inputs = engine.backward(call.start, call.dt, state, output[:count], given, controls)
             flags = engine.solved(flags)
             by_state = engine.layout.flagged(found, flags)
             by_parameters = engine.tables.pull(call.parameters, inputs, flags)

@@ -23,8 +23,8 @@ class NetTangent(Part):
         host, worlds = model.net.host, model.worlds
         kind = np.zeros((host.blocks, 3), bool)
         kind[host.nodes :] = True
-        self.free, self.angle, mass = (np.tile(values.ravel(), worlds) for values in (~host.fixed, kind, host.mass))
-        super().__init__(model, model.net, offset, 3 * host.blocks * worlds, mass)
+        self.free, self.angle = (np.tile(values.ravel(), worlds) for values in (~host.fixed, kind))
+        super().__init__(model, model.net, offset, 3 * host.blocks * worlds)
         self.net, self.body_count = model.net, host.bodies.count * worlds
         self.rate = model.net.still  # over what strain-rate damping counts: at rest not
         self.planes = HostPlanes(host, worlds) if host.frames else None
