@@ -96,11 +96,15 @@ class Adjoint:
             _require_minimum(own, part)
         return found
 
-    def upload(self, start: float, dt: float) -> bool:
-        """What is prescribed in the step whose reverse follows, and what suits it; whether that is anything else than before."""
+    def upload(self, start: float, dt: float, given: bool = False) -> bool:
+        """What is prescribed in the step whose reverse follows, and what suits it; whether that is anything else than before.
+
+        Args:
+            given: whether parameters may be others than those of the model.
+        """
         s, changed = self.integrator._solved(dt), False
         for own, part in zip(self.parts, self.integrator._parts, strict=True):
-            changed = own.suit(part, s) or changed
+            changed = own.suit(part, s, given) or changed
             own.upload(start, start + dt)
         return changed
 

@@ -126,10 +126,14 @@ class ChainAdjoint:
             drag=self.drag.by_coefficients if self.drag else None,
         )
 
-    def suit(self, step, s: float) -> bool:
-        """From now on reverse solves of a `ChainStep` over s [s] by what suits them; whether that is anything else than before."""
+    def suit(self, step, s: float, given: bool = False) -> bool:
+        """From now on reverse solves of a `ChainStep` over s [s] by what suits them; whether that is anything else than before.
+
+        Args:
+            given: whether parameters may be others than those of the model.
+        """
         changed = self.predictor is not None and self.predictor.suit(step, s)
-        return self.solve.suit(s) or changed
+        return self.solve.suit(s, given) or changed
 
     def upload(self, t0: float, t1: float) -> None:
         """What supports, loads that follow and the fluid do between t0 and t1, the step whose reverse follows."""

@@ -51,10 +51,14 @@ class _Part:
     heavy: object = None
 
 
+def elements(model, name: str) -> np.ndarray:
+    """Rows of `State.points`, or of `State.angles`, that have such a parameter, in their order (E,)."""
+    return np.unique(np.concatenate([np.zeros(0, int), *(part.rows for part in _parts(model, name))]))
+
+
 def array_places(model, name: str) -> tuple[int, list[ArrayPlace]]:
     """How many elements have such a parameter, and where these are; none where the model has nothing of the kind."""
-    parts = [part for part in _parts(model, name) if len(part.places)]
-    rows = np.unique(np.concatenate([np.zeros(0, int), *(part.rows for part in parts)]))
+    rows = elements(model, name)
     made = [
         ArrayPlace(
             model,
@@ -70,7 +74,8 @@ def array_places(model, name: str) -> tuple[int, list[ArrayPlace]]:
             part.found,
             part.heavy,
         )
-        for part in parts
+        for part in _parts(model, name)
+        if len(part.places)
     ]
     return len(rows), made
 

@@ -120,7 +120,7 @@ class Engine:
         self.fill(self.source, before)
         self.fill([self.target[i] for i in self._read], [after[i] for i in self._read])
         self.fill(self._by_state, given)
-        if adjoint.upload(start, dt):
+        if adjoint.upload(start, dt, self.tables.given):
             self._graphs.clear()
         s, parts = self.integrator._solved(dt), list(self._parts)
         for kept, end in zip(parts if self.midpoint else (), self.after.groups, strict=False):

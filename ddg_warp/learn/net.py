@@ -124,7 +124,7 @@ class NetAdjoint:
         parts = (self._shares, self.solve, self.supports, self.drag, self.followers, self.predictor)
         return own + [kernel for part in parts if part for kernel in part.kernels]
 
-    def suit(self, step, s: float) -> bool:
+    def suit(self, step, s: float, given: bool = False) -> bool:
         """As of `ChainAdjoint`, of a `NetStep`."""
         return self.predictor is not None and self.predictor.suit(step, s)
 

@@ -88,6 +88,15 @@ class TermPlace:
         return self._view
 
 
+def meeting(places: np.ndarray, elements: np.ndarray, size: int, count: int) -> np.ndarray:
+    """The elements at every place (size, most), filled up by `count`; they are at `places` (n,)."""
+    order = np.argsort(places, kind="stable")
+    at = np.arange(len(order)) - np.searchsorted(places[order], places[order])
+    rows = np.full((size, at.max(initial=0) + 1), count)
+    rows[places[order], at] = elements[order]
+    return rows
+
+
 class ArrayPlace:
     """A parameter in an array that has numbers of its own for every world, each the sum of those of the elements that meet there.
 
@@ -107,10 +116,7 @@ class ArrayPlace:
         self._found, self._heavy, self._view, self._rests = found, heavy, look(), {}
         self.weighs = heavy is not None
         self.memory, self.usual = self, usual
-        order = np.argsort(places, kind="stable")
-        at = np.arange(len(order)) - np.searchsorted(places[order], places[order])
-        rows = np.full((usual.size, at.max(initial=0) + 1), count)
-        rows[places[order], at] = elements[order]
+        rows = meeting(places, elements, usual.size, count)
         self._elements, self._brought = elements, brought
         self._sum = np.zeros(usual.size)
         np.add.at(self._sum, places, brought)

@@ -116,6 +116,11 @@ class Tables:
                 self._written[key] = kept
 
     @property
+    def given(self) -> bool:
+        """Whether anything is another than that of the model."""
+        return bool(self._written)
+
+    @property
     def weighs(self) -> bool:
         """Whether masses are other ones than those of the model."""
         return any(place.weighs for (place, *_), *_ in self._written.values())
