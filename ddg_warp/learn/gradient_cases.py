@@ -149,9 +149,9 @@ class Case:
         if self.model.grips:
             yield self._control("poses", 0.1, self._normal(WORLDS, len(self.model.grips), 6), self.poses)
         yield self._control("gravity", 10.0, self._normal(WORLDS, 3) * self.down, gravity)
+        if self.model.magnetic:
+            yield self._control("field", 1e-2, self._normal(WORLDS, 3) * self.axes)
         if not self.statics:
-            if self.model.magnetic:
-                yield self._control("field", 1e-2, self._normal(WORLDS, 3) * self.axes)
             timed = self._without_step()
             yield self._shared("time step", DT, lambda x: {"dt": DT + float(x)}, timed)
             yield self._shared("mass damping", 1.0, lambda x: {"mass_damping": 0.7 + float(x)})

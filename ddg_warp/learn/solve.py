@@ -203,13 +203,13 @@ class DirectSolve:
 
 
 class ChainSolve:
-    """H w = g of a group of rods, in the precision of its state: directly, by factors in the precision of the model's linear algebra where
-    these serve; on the host of closed rods and of equilibria.
+    """H w = g of a group of rods, in the precision of its state: directly, by factors in the precision of the model's linear algebra
+    where these serve; on the host of closed rods and of equilibria.
 
     Attributes:
         tangent: of solves on the host; held: of the last of these, see `HostSolve`, as w is laid out.
-        system: the `DirectSolve`, None of closed rods; exact: one in the precision of the state, which is taken instead where parameters
-            that the device holds ask for it; None where they are the model's, or `system` is that.
+        system: the `DirectSolve`, None of closed rods; exact: one in the precision of the state, which is taken instead where
+            parameters that the device holds ask for it; None where they are the model's, or `system` is that.
         failed: of the last direct solve, see `DirectSolve`; None without.
     """
 

@@ -121,7 +121,8 @@ class Balance(torch.autograd.Function):
             found = engine.tables.pull(call.parameters, inputs, flags)
             for name, value in controls.items():
                 by_load = engine.controls.pull(name, value, inputs, flags)
-                found.append(end * by_load if name in ("forces", "moments") else by_load)  # which `end` scales
+                scaled = name in ("forces", "moments", "field")  # by `end`; gravity has been already
+                found.append(end * by_load if scaled else by_load)
         return None, None, *([None] * count), *found
 
 
