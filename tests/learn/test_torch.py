@@ -369,7 +369,8 @@ def test_rest_shapes_of_the_model_go_along():
     other = pickle.loads(pickle.dumps(pickle.loads(pickle.dumps(own))))
     with torch.no_grad():
         plain, moved, again, wide = (
-            each.step(each.initial_state(worlds)).positions for each, worlds in ((usual, 1), (own, 1), (other, 1), (own, 3))
+            each.step(each.initial_state(worlds)).positions
+            for each, worlds in ((usual, 1), (own, 1), (other, 1), (own, 3))
         )
         metrics = [ShellParameters(each, ("metric",)).quantities()["metric"] for each in (own, other)]
     assert float((moved - plain).abs().max()) > 1e-6
