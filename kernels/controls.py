@@ -20,7 +20,8 @@ def load_kernel(real):
         shared: wp.array(dtype=V),
         constant: wp.array(dtype=V),
         changing: wp.array(dtype=real),
-        mass: wp.array(dtype=real),
+        mass: wp.array2d(dtype=real),
+        columns: int,
         arm: wp.array(dtype=real),
         nodes: int,
         starts: wp.array(dtype=int),
@@ -34,15 +35,16 @@ def load_kernel(real):
     ):
         """`shared` are the scene's loads now, `constant` those that do not change, `changing` sizes of the others at full amplitude.
 
-        `items` are rows of the forces that belong to a node, of the moments that belong to an angle; `usual` is the scene's gravity,
-        `gravity` what is added to it.
+        `mass` is [node][column] of all worlds, each of which has so many `columns`; `items` are rows of the forces that belong to a
+        node, of the moments that belong to an angle; `usual` is the scene's gravity, `gravity` what is added to it.
         """
         w, k = wp.tid()
         given = V()
         weight = V()
         if k < nodes:
-            weight = usual[0] * mass[k]
-            given = gravity[w] * mass[k]
+            m = mass[k / columns, k % columns + w * columns]
+            weight = usual[0] * m
+            given = gravity[w] * m
             for at in range(starts[k], starts[k + 1]):
                 given += forces[w, items[at]]
         else:

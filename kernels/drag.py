@@ -186,8 +186,8 @@ def block_inertia(real):
 
 @cache
 def mass_type(real, drag: bool):
-    """Masses of the dofs of blocks, of all worlds; with drag, inertia and drag (worlds, blocks)."""
-    return wp.array2d(dtype=block_inertia(real)) if drag else wp.array(dtype=wp.types.vector(3, real))
+    """Masses of the dofs of blocks (worlds, blocks); with drag, inertia and drag."""
+    return wp.array2d(dtype=block_inertia(real) if drag else wp.types.vector(3, real))
 
 
 @cache
@@ -203,7 +203,7 @@ def net_kernels(real):
         v0: wp.array(dtype=V),
         tangents: wp.array(dtype=V),
         q: wp.array(dtype=V),
-        mass: wp.array(dtype=V),
+        mass: wp.array2d(dtype=V),
         ends: wp.array2d(dtype=int),
         coefficients: wp.array2d(dtype=real),
         starts: wp.array(dtype=int),
@@ -216,7 +216,10 @@ def net_kernels(real):
         nodes: int,
         inertia_out: wp.array2d(dtype=Inertia),
     ):
-        """Items of a block are edges that meet there, or the one whose angle it is. Where loads give no scale, drag does."""
+        """Items of a block are edges that meet there, or the one whose angle it is. Where loads give no scale, drag does.
+
+        Coefficients (rows, worlds edges) are of one world after the other.
+        """
         i = wp.tid()
         w = i / blocks
         if scalars[PROGRESS, w] >= real(1.0):
@@ -234,13 +237,13 @@ def net_kernels(real):
             if k < nodes:
                 p = P()
                 for c in range(wp.static(ROWS)):
-                    p[c] = coefficients[c, edge]
+                    p[c] = coefficients[c, edge + w * ends.shape[0]]
                 D += half(e, (v0[a] + v0[b]) * real(0.5) - u, p)
             else:
-                D[0, 0] = coefficients[wp.static(ROTATIONAL), edge] * wp.length(e)
+                D[0, 0] = coefficients[wp.static(ROTATIONAL), edge + w * ends.shape[0]] * wp.length(e)
         rate = scalars[RATE, w]
         block = Inertia()
-        block.mass = mass[k]
+        block.mass = mass[w, k]
         block.resistance = D * rate
         block.carried = q0[i] + u / rate
         inertia_out[w, k] = block

@@ -37,7 +37,7 @@ def energies(model, state) -> dict:
     for part in tangent.parts:
         q, v = (values.reshape(model.worlds, -1) for values in (part.back(part.dofs(state)), part.rates(state)))
         kinetic += 0.5 * (part.mass.reshape(v.shape) * v * v).sum(1)
-        potential -= q @ part.weight()
+        potential -= (q * part.weight()).sum(1)
     every = result | {"kinetic": kinetic, "gravity": potential}
     return {name: values if model.worlds > 1 else float(values[0]) for name, values in every.items()}
 

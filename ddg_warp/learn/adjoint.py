@@ -96,11 +96,15 @@ class Adjoint:
             _require_minimum(own, part)
         return found
 
-    def upload(self, start: float, dt: float) -> bool:
-        """What is prescribed in the step whose reverse follows, and what suits it; whether that is anything else than before."""
+    def upload(self, start: float, dt: float, given: bool = False) -> bool:
+        """What is prescribed in the step whose reverse follows, and what suits it; whether that is anything else than before.
+
+        Args:
+            given: whether parameters may be others than those of the model.
+        """
         s, changed = self.integrator._solved(dt), False
         for own, part in zip(self.parts, self.integrator._parts, strict=True):
-            changed = own.suit(part, s) or changed
+            changed = own.suit(part, s, given) or changed
             own.upload(start, start + dt)
         return changed
 
@@ -161,6 +165,8 @@ class EquilibriumAdjoint:
         found, inputs = checked(controls, self.model, "pull"), []
         for own in self.parts:
             own.solve.tangent.give(found)
+            gravity = np.broadcast_to(found.get("gravity", self.model.scene.gravity), (self.model.worlds, 3))
+            own.gravity.assign(np.ascontiguousarray(gravity[:, list(own.axes)], float))
             own.upload(state.time, state.time)
         for own, at, by in zip(self.chains, state.groups, given.groups, strict=True):
             kept = Kept(at, at.x, at.theta, at.frame, None, time=state.time)
@@ -181,7 +187,9 @@ def _copied(state: State, inputs: list) -> tuple[State, list]:
 
 
 def _cloned(value):
-    return [wp.clone(array) for array in value] if isinstance(value, list) else wp.clone(value)
+    if isinstance(value, list):
+        return [wp.clone(array) for array in value]
+    return None if value is None else wp.clone(value)
 
 
 def _require_minimum(own: ChainAdjoint, part) -> None:

@@ -44,6 +44,7 @@ class ChainInputs:
         parameters: (rows of the parameter table, n, R); mass, rotary: of nodes and edges (n, R).
         load: by the forces on nodes and the moments on angles (block, n, R); zero at held dofs.
         held: by where held dofs are at the solution (block, n, R).
+        drag: by coefficients of drag (rows, n, R); None without any.
         rate, damping, gravity: by what all nodes share, the share of each (n, R); by the rate without what motions, loads and
             fields do as functions of time.
     """
@@ -56,10 +57,15 @@ class ChainInputs:
     rate: wp.array
     damping: wp.array
     gravity: wp.array
+    drag: wp.array | None = None
 
 
 class ChainAdjoint:
     """Reverse of the steps of a group of rods, and of their equilibria.
+
+    Attributes:
+        gravity: of every world in what is pulled (worlds,), by which derivatives by masses go; the scene's at first.
+        axes: components of space that it has.
 
     Args:
         scheme: of the steps, None for equilibria.
@@ -73,7 +79,7 @@ class ChainAdjoint:
     """
 
     def __init__(self, model, group, scheme: str | None, posed: bool = False):
-        self.group, self.model = group, model
+        self.group, self.model, self.axes = group, model, group.host.axes
         real, kind, device = model.types.real, group.kind, model.wp_device
         midpoint = self._midpoint = scheme == "implicit_midpoint"
         self.device, self.real = device, real
@@ -95,6 +101,7 @@ class ChainAdjoint:
         self._moved = arrays.upload(np.tile(_moved(group), (1, group.worlds)), wp.uint8, device)
         self._rate = wp.zeros(group.columns, dtype=real, device=device)
         self._damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
+        self.gravity = wp.array(np.tile(group.gravity_host, (group.worlds, 1)), dtype=self.vector, device=device)
         twisted, viscous = kind.twist, kind.viscous
         self._window, self._lag = self._rows(kind.window), self._rows(13)
         self._end, self._dof, self._right = (self._rows(kind.block) for _ in range(3))
@@ -116,12 +123,17 @@ class ChainAdjoint:
             rate=self._make(),
             damping=self._make(),
             gravity=self._make(self.vector),
+            drag=self.drag.by_coefficients if self.drag else None,
         )
 
-    def suit(self, step, s: float) -> bool:
-        """From now on reverse solves of a `ChainStep` over s [s] by what suits them; whether that is anything else than before."""
+    def suit(self, step, s: float, given: bool = False) -> bool:
+        """From now on reverse solves of a `ChainStep` over s [s] by what suits them; whether that is anything else than before.
+
+        Args:
+            given: whether parameters may be others than those of the model.
+        """
         changed = self.predictor is not None and self.predictor.suit(step, s)
-        return self.solve.suit(s) or changed
+        return self.solve.suit(s, given) or changed
 
     def upload(self, t0: float, t1: float) -> None:
         """What supports, loads that follow and the fluid do between t0 and t1, the step whose reverse follows."""
@@ -223,7 +235,8 @@ class ChainAdjoint:
                 group.count,
                 self._rate,
                 self._damping,
-                group.gravity,
+                self.gravity,
+                group.world,
             ],
             [start.x, start.v, start.theta, start.omega, inputs.mass, inputs.rotary, inputs.rate, inputs.damping]
             + [inputs.gravity],

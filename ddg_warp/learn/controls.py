@@ -2,6 +2,7 @@
 
 import numpy as np
 import torch
+import warp as wp
 
 from ddg_warp.learn.layout import view
 from ddg_warp.solve.controls import LOADS
@@ -12,22 +13,23 @@ class StepControls:
 
     def __init__(self, engine):
         self.engine, self.model, self.layout = engine, engine.model, engine.layout
+        real = wp.dtype_to_torch(self.model.types.real)
+        self._usual = torch.tensor(np.array(self.model.scene.gravity, float), dtype=real, device=engine.device)
 
     def give(self, controls: dict) -> None:
-        """Hand the integrator loads and poses."""
+        """Hand the integrator loads and poses; masses that parameters give are loads, too, which residuals are compared with."""
         engine, integrator, model = self.engine, self.engine.integrator, self.model
-        if integrator.given is None and any(name in controls for name in LOADS):
+        loaded = engine.tables.weighs or any(name in controls for name in LOADS)
+        if integrator.given is None and loaded:
             integrator._control({"gravity": np.array(model.scene.gravity, float)[None]}, 0)
         if integrator.given is not None:
             given = integrator.given
-            given.any = any(name in controls for name in LOADS)
+            given.any = loaded
             for name in LOADS:
                 place = view(getattr(given, name))
                 if name in controls:
                     value = controls[name]
-                    if name == "gravity":
-                        value = value - torch.as_tensor(given._usual, dtype=value.dtype, device=value.device)
-                    place.copy_(value)
+                    place.copy_(value - self._usual if name == "gravity" else value)
                 else:
                     place.zero_()
         self.give_field(controls)
@@ -47,6 +49,12 @@ class StepControls:
             place.copy_(controls["field"].T)
         else:
             place.zero_()
+
+    def give_gravity(self, controls: dict, adjoint) -> None:
+        """Hand the reverse the gravity of a step."""
+        own = controls.get("gravity", self._usual)
+        for part in adjoint.parts:
+            view(part.gravity).copy_(own[..., list(part.axes)])
 
     def pull(self, name: str, value: torch.Tensor, inputs: list, flags) -> torch.Tensor:
         """Derivatives by what a step, or an equilibrium at full load, is given (worlds, ...)."""

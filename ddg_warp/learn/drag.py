@@ -124,7 +124,7 @@ class NetDragAdjoint:
     ):
         """As of `ChainDragAdjoint`, of a solve with the solution q; derivatives by tangents are added to `by_tangents`."""
         net, drag = self.net, self.drag
-        read = [tangents, before.q, before.v, q, self._ends, self._angles, drag.coefficients, drag.flow, w, rate]
+        read = [tangents, before.q, before.v, q, self._ends, self._angles, net.drag, drag.flow, w, rate]
         outputs = [self._by_tangent, self._by_velocity, self.by_coefficients]
         self._launch(self._edges, self.by_coefficients.shape[1], [*read, net.blocks], outputs)
         for slots, by in ((self._by_tangent, by_tangents), (self._by_velocity, start.v)):

@@ -104,19 +104,23 @@ class Engine:
 
     # gradients
 
-    def backward(self, start: float, dt: float, before, after, given, posed: bool) -> tuple[list[torch.Tensor], list]:
+    def backward(
+        self, start: float, dt: float, before, after, given, controls: dict
+    ) -> tuple[list[torch.Tensor], list]:
         """Derivatives by the state before a step, and by what else it read, part by part.
 
         Args:
             start, dt: time and length of the step.
             before, after, given: tensors of the states at its ends, and of the derivatives by the latter.
-            posed: whether it was given poses of grips.
+            controls: which it was given.
         """
         adjoint = self._adjoint()
+        self.controls.give_field(controls)
+        self.controls.give_gravity(controls, adjoint)
         self.fill(self.source, before)
         self.fill([self.target[i] for i in self._read], [after[i] for i in self._read])
         self.fill(self._by_state, given)
-        if adjoint.upload(start, dt):
+        if adjoint.upload(start, dt, self.tables.given):
             self._graphs.clear()
         s, parts = self.integrator._solved(dt), list(self._parts)
         for kept, end in zip(parts if self.midpoint else (), self.after.groups, strict=False):
@@ -135,7 +139,8 @@ class Engine:
         found, inputs = self._found
         self._solved_by = [own.solve.failed for own in adjoint.parts]
         if self.poses:
-            self.poses.pull_step(found, inputs, (self.before, self.after), self._given, posed)
+            ends = self.before, self.after
+            self.poses.pull_step(found, inputs, ends, self._given, "poses" in controls)
             self.by_poses = self.poses.by_end
         if self._by_start is None:  # whose memory stays
             self._by_start = tensors(found, self.fields)

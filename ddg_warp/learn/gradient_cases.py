@@ -1,11 +1,12 @@
 """An object under an analysis, its inputs, and how a loss depends on them; see `ddg_warp.learn.gradients`."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
 from ddg_warp.errors import SceneError
+from ddg_warp.learn.constants import MASSES, of_sections
 from ddg_warp.learn.gradient_objects import scene_of
 from ddg_warp.learn.simulator import Simulator, WorldState
 from ddg_warp.scene.grip import Grip
@@ -140,7 +141,7 @@ class Case:
                 yield self._state(
                     "spins", 10.0, lambda x: self.engine.layout.turn_edges(self.state.values, "omega", "v", x * spin)
                 )
-        for name in dict.fromkeys(self.engine.tables.names()):
+        for name in self.engine.tables.names():
             yield self._parameter(name)
         yield self._control("forces", 1e-2, self._normal(WORLDS, points, 3) * self.axes)
         if twisted:
@@ -148,13 +149,13 @@ class Case:
         if self.model.grips:
             yield self._control("poses", 0.1, self._normal(WORLDS, len(self.model.grips), 6), self.poses)
         yield self._control("gravity", 10.0, self._normal(WORLDS, 3) * self.down, gravity)
+        if self.model.magnetic:
+            yield self._control("field", 1e-2, self._normal(WORLDS, 3) * self.axes)
         if not self.statics:
-            if self.model.magnetic:
-                yield self._control("field", 1e-2, self._normal(WORLDS, 3) * self.axes)
             timed = self._without_step()
             yield self._shared("time step", DT, lambda x: {"dt": DT + float(x)}, timed)
             yield self._shared("mass damping", 1.0, lambda x: {"mass_damping": 0.7 + float(x)})
-        yield self._shared("density", 1.0, lambda x: {"density": 1.0 + float(x)})
+        yield self._density()
 
     def _moved(self, own: str, blocks: str, by: torch.Tensor) -> list:
         at = self.engine.layout.points(self.state.values, own, blocks)
@@ -173,11 +174,24 @@ class Case:
     def _size_of_family(self, name: str) -> float:
         """Of the largest of a family, such as the components of a metric; one where all are zero."""
         family = name.rstrip("0123456789")
-        alike = [own for own in dict.fromkeys(self.engine.tables.names()) if own.rstrip("0123456789") == family]
+        alike = [own for own in self.engine.tables.names() if own.rstrip("0123456789") == family]
         return max(float(self.engine.tables.value(own).abs().max()) for own in alike) or 1.0
 
     def _control(self, name: str, size: float, direction: torch.Tensor, usual=0.0) -> Input:
         return Input(name, size, lambda x: self.loss(self.end(self.simulator, controls={name: usual + x * direction})))
+
+    def _density(self) -> Input:
+        """A factor of masses and inertia, as parameters; differences build the scene anew."""
+        known = set(self.engine.tables.names())
+
+        def scaled(x: torch.Tensor) -> dict[str, torch.Tensor]:
+            masses = {name: self._tensor(of_sections(self.model, name)) for name in known.intersection(MASSES)}
+            more = {name: self.engine.tables.value(name) + x * own for name, own in masses.items()}
+            inertia = {name: self.engine.tables.value(name) * (1.0 + x) for name in known.intersection(["rod.inertia"])}
+            return more | inertia
+
+        own = Input("density", 1.0, lambda x: self.loss(self.end(self.simulator, None, scaled(x))))
+        return replace(own, loss=lambda x: self.loss(self.end(self.built(density=1.0 + float(x)))), gradient=own.found)
 
     def _without_step(self) -> str:
         """Why lengths of steps have no derivative; empty where they have one."""
@@ -202,41 +216,21 @@ class Case:
     def reverse(self) -> dict[str, float]:
         """Derivatives by what is no tensor, from the reverse of every step."""
         self.engine.tables.write((), [])  # parameters are those of the model
-        if self.statics:
-            return self._of_equilibrium()
-        states, sums = [self.state], {"time step": 0.0, "mass damping": 0.0, "density": 0.0}
+        states, sums = [self.state], {"time step": 0.0, "mass damping": 0.0}
         for _ in range(STEPS):
             states.append(self.simulator.step(states[-1], None, self.posed))
         given = self._by_end(states[-1])
         for before, after in zip(states[-2::-1], states[:0:-1], strict=True):
-            posed = bool(self.model.grips)
-            given, read = self.engine.backward(before.time, DT, before.values, after.values, given, posed)
+            given, read = self.engine.backward(before.time, DT, before.values, after.values, given, self.posed)
             for each in read:
                 by_rate = sum(own.numpy().sum() for own in (each.rate, *getattr(each, "elements_rate", ())))
                 # an implicit step is over dt, the midpoint rule's over half of it
                 sums["time step"] -= by_rate / DT**2 * (2.0 if self.analysis == "implicit_midpoint" else 1.0)
                 sums["mass damping"] += each.damping.numpy().sum()
-            sums["density"] += self._by_density(read)
         return sums
-
-    def _of_equilibrium(self) -> dict[str, float]:
-        read = self.engine.balance_backward(1.0, self.state.values, {}, self._by_end(self.state))
-        return {"density": self._by_density(read)}
 
     def _by_end(self, state: WorldState) -> list[torch.Tensor]:
         leaves = [value.detach().requires_grad_() for value in state.values]
         loss = self.loss(WorldState(tuple(leaves), state.time, self.engine))
         found = torch.autograd.grad(loss, leaves, allow_unused=True)
         return [torch.zeros_like(own) if by is None else by for own, by in zip(leaves, found, strict=True)]
-
-    def _by_density(self, read: list) -> float:
-        """By a factor of all masses and rotary inertia."""
-        total = 0.0
-        for group, each in zip(self.model.groups, read, strict=False):
-            total += float((each.mass.numpy() * group.mass.numpy()).sum())
-            if group.kind.twist:
-                total += float((each.rotary.numpy() * group.rotary.numpy()).sum())
-        if self.model.net is not None:
-            mass = self.model.net.host.mass
-            total += float((read[-1].mass.numpy().reshape(WORLDS, *mass.shape) * mass).sum())
-        return total

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ddg_warp.geometry import meshes
+from ddg_warp.scene.drag import Granular
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.material import Circle, Ellipse, Material, Ribbon
 from ddg_warp.scene.motion import Motion
@@ -33,8 +34,8 @@ def _rod(points=CURVE, section=None, hold: Callable | None = None, more: Callabl
     return add
 
 
-def _joined(rigid: bool = True, flat: bool = False) -> Callable:
-    """Three rods that meet in a point; hinged ones are held at their far ends, too."""
+def _joined(rigid: bool = True, flat: bool = False, more: Callable | None = None) -> Callable:
+    """Three rods that meet in a point; hinged ones are held at their far ends, too; with `more(scene, rods)`."""
 
     def add(scene: Scene, material: Material) -> None:
         keep, last = np.array([1.0, not flat, 1.0]), len(CURVE) - 1
@@ -47,6 +48,8 @@ def _joined(rigid: bool = True, flat: bool = False) -> Callable:
         scene.join([(rods[0], last), (rods[1], 0), (rods[2], 0)], rigid=rigid)
         if not rigid:
             scene.clamp(rods[1:], edges=[-1])
+        if more:
+            more(scene, rods)
 
     return add
 
@@ -107,6 +110,21 @@ def _magnetised(magnetisation, field, dipoles: bool = False) -> Callable:
     return magnetise
 
 
+def _drag(scene: Scene, rods) -> None:
+    scene.drag(rods, tangential=0.1, normal=0.2, rotational=1e-6)
+
+
+def _sand(scene: Scene, rods) -> None:
+    scene.drag(rods, Granular(lateral=0.3, friction=0.1, leading=0.05, speed=0.05))
+
+
+def _some_drag(scene: Scene, rods) -> None:
+    """Of two rods, each of another kind, and a mass."""
+    _drag(scene, rods[0])
+    _sand(scene, rods[1])
+    scene.add_mass(rods[2], -1, 0.002)
+
+
 def _timed(t: float) -> tuple:
     return (0.0, 2e-2 * t, 1e-2)
 
@@ -154,7 +172,9 @@ OBJECTS: dict[str, tuple[int, Callable]] = {
         ),
     ),
     "rod of dipoles": (3, _rod(more=_magnetised(2e5, (0.0, 1e-2, 1e-2), dipoles=True))),
-    "rod with drag": (3, _rod(more=lambda s, r: s.drag(r, tangential=0.1, normal=0.2))),
+    "rod with drag": (3, _rod(more=_drag)),
+    "rod in sand": (3, _rod(more=_sand)),
+    "joined rods with drag": (3, _joined(more=_some_drag)),
     "rod in a motion": (3, _rod(hold=lambda s, r: s.clamp(r, motion=SWING))),
     "gripped rod": (3, _rod(hold=lambda s, r: s.clamp(r, motion=Grip(pivot=(0.1, 0.0, 0.0))))),
     "gripped shell": (3, _sheet("midedge_dof", lambda s, k, first: s.hold(k, first, motion=Grip()))),

@@ -42,6 +42,7 @@ class NetInputs:
             (rows, W E).
         mass: by the masses of the dofs of blocks (W N,); load: by the forces on them, zero at held dofs.
         held: by where held dofs are at the solution (W N,).
+        drag: by coefficients of drag (rows, W edges that feel it); None without any.
         rate, damping, gravity: by what all blocks share, the share of each (W N,); elements_rate: by the rate, of every set (W E,).
     """
 
@@ -54,11 +55,12 @@ class NetInputs:
     rate: wp.array
     damping: wp.array
     gravity: wp.array
+    drag: wp.array | None
     elements_rate: list[wp.array]
 
 
 class NetAdjoint:
-    """Reverse of the steps of a model's net, and of its equilibria.
+    """Reverse of the steps of a model's net, and of its equilibria; `gravity` and `axes` as of `ChainAdjoint`.
 
     Args:
         scheme, posed: as of `ChainAdjoint`.
@@ -71,6 +73,7 @@ class NetAdjoint:
         net, real = model.net, model.types.real
         self.model, self.net, self.real, self.device = model, net, real, model.wp_device
         host, count = net.host, net.worlds * net.blocks
+        self.axes = host.axes
         midpoint = scheme == "implicit_midpoint"
         self.supports = Supports(model, net, midpoint) if (scheme or posed) and host.moves else None
         motion = self.supports.motion if self.supports else None
@@ -80,8 +83,7 @@ class NetAdjoint:
         self._shares = Shares(model)
         self.drag = NetDragAdjoint(model, net, midpoint, self._shares.gather) if drag else None
         self.solve = NetSolve(model, self.drag, scheme is not None)
-        self._mass = wp.array(host.mass, dtype=net.vector, device=self.device)
-        self._gravity = wp.array(np.array(model.scene.gravity, float)[None], dtype=net.vector, device=self.device)
+        self.gravity = wp.array(np.tile(model.scene.gravity, (net.worlds, 1)), dtype=net.vector, device=self.device)
         self._damping = wp.array([model.scene.mass_damping], dtype=real, device=self.device)
         self._pull = [reverse.pull_kernel(part.term, real) for part in net.sets]
         self._strains = [reverse.strain_kernel(p.term, real) if p.term.density.lagged else None for p in net.sets]
@@ -111,6 +113,7 @@ class NetAdjoint:
             rate=make(real),
             damping=make(real),
             gravity=make(),
+            drag=self.drag.by_coefficients if drag else None,
             elements_rate=[wp.zeros(part.elements * net.worlds, dtype=real, device=self.device) for part in net.sets],
         )
 
@@ -121,7 +124,7 @@ class NetAdjoint:
         parts = (self._shares, self.solve, self.supports, self.drag, self.followers, self.predictor)
         return own + [kernel for part in parts if part for kernel in part.kernels]
 
-    def suit(self, step, s: float) -> bool:
+    def suit(self, step, s: float, given: bool = False) -> bool:
         """As of `ChainAdjoint`, of a `NetStep`."""
         return self.predictor is not None and self.predictor.suit(step, s)
 
@@ -222,8 +225,8 @@ class NetAdjoint:
         self._launch(
             self._start,
             len(by_q),
-            [given.q, given.v, by_end, solved.q, before.q, before.v, w, self._stays, self._inertia, self._mass]
-            + [self._gravity, net.host.nodes, last, net.blocks, rate, self._damping],
+            [given.q, given.v, by_end, solved.q, before.q, before.v, w, self._stays, self._inertia, net.mass]
+            + [self.gravity, net.host.nodes, last, net.blocks, rate, self._damping],
             [start.q, start.v, inputs.mass, inputs.rate, inputs.damping, inputs.gravity],
         )
         return start, inputs

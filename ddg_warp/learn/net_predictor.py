@@ -84,14 +84,13 @@ class NetPredictor:
         solver.q, solver.base, solver.target, solver.islands = self._q, self._base, self._target, self._islands
         solver.direction = wp.zeros_like(solver.direction)
         solver.turns = Turns(solver) if self._levels else None
-        self._mass = step.drag.moves if step.drag else solver.mass
         return True
 
     def find(self, before: NetState) -> None:
         """As of `ChainPredictor`."""
         net, solver, islands = self.net, self._solver, self._islands
         islands.todo.zero_()
-        inputs = [before.q, before.v, solver.held, self._mass, self._dt, self._none, self._none, *islands.arrays]
+        inputs = [before.q, before.v, solver.held, net.moves, self._dt, self._none, self._none, *islands.arrays]
         outputs = [self._q, self._base, self._target]
         arrays.sweep(self._begin, net.blocks, [*inputs, net.blocks], outputs, net.device, worlds=net.worlds)
         if self.motion:
@@ -118,7 +117,7 @@ class NetPredictor:
             self._launch(self._unplace, (len(rods), worlds), [rods, *inputs], [self._excess, self._added])
             read = [meets, starts, items, net.blocks, self._added]
             self._launch(self._pass_on, (len(meets), worlds), read, [self.by_q, self._along])
-        held_mass = [self._solver.held, self._mass]
+        held_mass = [self._solver.held, self.net.moves]
         read = [self._nodes, self._ahead, self._q, before.q, before.v, *held_mass, islands.rate, islands.turn]
         read += [islands.todo, net.blocks, self._excess]
         self._launch(self._turn, (len(self._nodes), worlds), read, [self._by_base, self._by_step])

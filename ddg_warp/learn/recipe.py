@@ -1,4 +1,4 @@
-"""Models built again with the parameters that they have: with other worlds, or in another process."""
+"""Models built again with the parameters and rest shapes that they have: with other worlds, or in another process."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from ddg_warp.errors import SceneError
 
 
 class Recipe:
-    """A model of so many worlds that can be built again elsewhere, with the parameters that it has.
+    """A model of so many worlds that can be built again elsewhere, with the parameters and rest shapes that it has.
 
     Raises:
         SceneError: a parameter differs between its worlds, and there are to be others.
@@ -24,12 +24,15 @@ class Recipe:
             {name: _in_worlds(name, values, axis, model.worlds, worlds) for name, values in table.values.items()}
             for table, axis in _tables(model)
         ]
+        self.plates = [shell.plate for shell in _shells(model)]
 
     def build(self):
         """The model."""
         model = self.scene.build(**self.options)
         for (table, _), values in zip(_tables(model), self.parameters, strict=True):
             table.set(**values)
+        for shell, plate in zip(_shells(model), self.plates, strict=True):
+            shell.plate = plate
         return model
 
 
@@ -37,6 +40,10 @@ def _tables(model) -> list:
     """Parameters of all groups and of the net, and the axis along which worlds lie."""
     sets = model.net.sets if model.net is not None else ()
     return [(group.parameters, 1) for group in model.groups] + [(part.parameters, 0) for part in sets]
+
+
+def _shells(model) -> list:
+    return model.net.host.shells if model.net is not None else []
 
 
 def _in_worlds(name: str, values: np.ndarray, axis: int, worlds: int, wanted: int) -> np.ndarray:

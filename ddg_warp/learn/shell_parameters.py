@@ -9,10 +9,12 @@ import warp as wp
 from ddg_warp import arguments
 from ddg_warp.compile.shells import triangles_beside
 from ddg_warp.errors import SceneError
-from ddg_warp.learn.modules import parameter_key
+from ddg_warp.learn.modules import parameter_key, usual_values
+from ddg_warp.learn.places import meeting
 from ddg_warp.model.rest_shapes import edges_along
 
-NUMBERS, FORMS = ("young", "thickness", "poisson"), ("metric", "curvature")  # of one component, and of three
+STIFF, HEAVY = ("young", "thickness", "poisson"), ("density", "thickness")  # what stiffnesses and masses depend on
+NUMBERS, FORMS = (*STIFF, "density"), ("metric", "curvature")  # of one component, and of three
 COMPONENTS = ("11", "12", "22")
 
 
@@ -31,7 +33,8 @@ class ShellParameters(torch.nn.Module):
     Learned are numbers c, zero at first, of whole shells, of triangles, or of what else `by` says:
 
         young       E exp(c)
-        thickness   h exp(c), of the stiffness of membrane and bending; masses stay those of the model
+        thickness   h exp(c), of the stiffness of membrane and bending, and of masses
+        density     rho exp(c), of masses, which a metric at rest does not change
         poisson     -1/4 + 3/4 tanh(artanh((4 nu + 1) / 3) + c), between -1 and 1/2
         metric      F^T exp(2 c) F, c a strain of logarithms
         curvature   bbar + F^T c F / L, c / L a curvature [1/m]
@@ -76,8 +79,7 @@ class ShellParameters(torch.nn.Module):
         self._names = tuple(names)
         self._terms, values = _shell_terms(model, chosen, self._names)
         for own in dict.fromkeys(own for term in self._terms for own in term.parameters):
-            usual = simulator.parameter(own)
-            values[parameter_key(own)] = usual[:1] if (usual == usual[:1]).all() else usual
+            values[parameter_key(own)] = usual_values(simulator, own)
         shares = _shares(by, counts)
         edges = [edges_along(shell.surface.points, shell.surface.triangles, direction) for _, shell, _ in chosen]
         values |= {
@@ -87,6 +89,12 @@ class ShellParameters(torch.nn.Module):
         }
         for name in ("young", "thickness", "poisson", "abar", "bbar", "bending_stiffness"):
             values[f"_{name}"] = torch.tensor(np.concatenate([getattr(plate, name) for plate in plates]))
+        densities = [model.scene.shells[i].material.density for i, *_ in chosen]
+        values["_density"] = torch.tensor(np.concatenate([np.full(*of) for of in zip(counts, densities, strict=True)]))
+        self._weighs = bool(set(HEAVY) & set(names) and (values["_density"] > 0.0).any())
+        if self._weighs:
+            values["_mass"] = usual_values(simulator, "shell.mass")
+            values |= _vertices(model, [i for i, *_ in chosen])
         for name, value in values.items():
             self.register_buffer(name, value if value is None else value.detach().to(device).clone())
         count = sum(counts) if shares is None else shares.shape[1]
@@ -100,13 +108,13 @@ class ShellParameters(torch.nn.Module):
         )
 
     def quantities(self) -> dict[str, torch.Tensor]:
-        """All of them as they are now: young [Pa], thickness [m] and poisson (B, T), metric [m^2] and curvature [m] (B, T, 3) as
-        `Scene.add_shell` takes them as `rest`.
+        """All of them as they are now: young [Pa], thickness [m], poisson and density [kg/m^3] (B, T), metric [m^2] and curvature [m]
+        (B, T, 3) as `Scene.add_shell` takes them as `rest`.
         """
         c = {name: self._spread(value) for name, value in self.changes.items()}
         found = {name: getattr(self, f"_{name}")[None] for name in NUMBERS}
         found |= {"metric": self._abar[None], "curvature": self._bbar[None]}
-        for name in ("young", "thickness"):
+        for name in ("young", "thickness", "density"):
             if name in c:
                 found[name] = found[name] * c[name].exp()
         if "poisson" in c:
@@ -140,6 +148,10 @@ class ShellParameters(torch.nn.Module):
                 worlds = max(len(base), len(values))
                 base, values = base.expand(worlds, -1), values.expand(worlds, -1)
                 result[own] = base.index_copy(1, rows, values)
+        if self._weighs:
+            more = torch.expm1(sum(self._spread(self.changes[name]) for name in HEAVY if name in self.changes))
+            more = torch.nn.functional.pad(more * self._corner_mass, (0, 1))[:, self._corners]
+            result["shell.mass"] = self._mass + more.sum(-1)
         return result
 
     def _spread(self, change: torch.Tensor) -> torch.Tensor:
@@ -175,6 +187,11 @@ def _shells(model, names, shells) -> list[tuple]:
                 f"ShellParameters: shell {shell} ('{model.scene.shells[shell].name}') has a Poisson's ratio of 0.5, the end of its "
                 "range; start with less"
             )
+        if "density" in names and not np.any(held[shell].corner_mass):
+            raise SceneError(
+                f"ShellParameters: shell {shell} ('{model.scene.shells[shell].name}') has no density that a factor could change; "
+                "give its material one"
+            )
     return [(shell, held[shell], model.scene.shells[shell].bending) for shell in chosen]
 
 
@@ -187,7 +204,7 @@ def _shell_terms(model, chosen: list[tuple], names: tuple) -> tuple[list[_ShellT
         beside = triangles_beside(shell.surface, shell.kinds, bending) if bending in ("hinge", "isometric") else {}
         for name, first in shell.first.items():
             bends = "stretch" not in name
-            what = {own: "stiffness" for own in sets[name].stiffness if set(names) & set(NUMBERS)}
+            what = {own: "stiffness" for own in sets[name].stiffness if set(names) & set(STIFF)}
             if name not in beside:
                 what |= {"poisson": "poisson"} if "poisson" in names else {}
                 if "metric" in names:
@@ -202,6 +219,23 @@ def _shell_terms(model, chosen: list[tuple], names: tuple) -> tuple[list[_ShellT
                 terms.append(_ShellTerm({f"{name}.{own}": kind for own, kind in what.items()}, bends))
         start += count
     return terms, buffers
+
+
+def _vertices(model, chosen: list[int]) -> dict[str, torch.Tensor]:
+    """Of every vertex of a model's shells the corners that meet there, by their triangles among those of the chosen shells, the number
+    of these where there are fewer; and the mass of a corner of each [kg]."""
+    held, at = model.net.host.shells, 0
+    total = sum(len(held[i].surface.triangles) for i in chosen)
+    vertex, triangle = [], []
+    starts = np.cumsum([0, *(len(shell.nodes) for shell in held)])
+    for i in chosen:
+        corners = held[i].surface.triangles
+        vertex.append(starts[i] + corners.ravel())
+        triangle.append(at + np.repeat(np.arange(len(corners)), 3))
+        at += len(corners)
+    found = meeting(np.concatenate(vertex), np.concatenate(triangle), int(starts[-1]), total)
+    mass = np.concatenate([held[i].corner_mass for i in chosen])
+    return {"_corners": torch.as_tensor(found), "_corner_mass": torch.as_tensor(mass)}
 
 
 def _of_triangles(what: str, now: dict[str, torch.Tensor]) -> torch.Tensor:

@@ -78,9 +78,9 @@ class Simulator(torch.nn.Module):
         scheme, options: as of `Integrator`. Worlds in which a step fails rest, see `outcomes`; gradients that go through a step that
             failed, was made in parts or renewed its frames are not numbers, in these worlds alone.
 
-    Parameters are dictionaries from "term.parameter" (see `Model.set_parameter`) to tensors (), (B, 1), (1, E) or (B, E), E the
-    elements that have it. Controls are dictionaries of "forces" (B, P, 3) or (P, 3), "moments" (B, edges), "gravity" and "field" (B, 3)
-    or (3,), and "poses" (B, grips, 6), see `Controls`.
+    Parameters are dictionaries from "term.parameter" (see `Model.set_parameter`), or names of masses and of coefficients of drag (see
+    `ddg_warp.learn.constants`), to tensors (), (B, 1), (1, E) or (B, E), E the elements that have it. Controls are dictionaries of
+    "forces" (B, P, 3) or (P, 3), "moments" (B, edges), "gravity" and "field" (B, 3) or (3,), and "poses" (B, grips, 6), see `Controls`.
 
     Raises:
         SceneError: the model has something that no gradient goes through, once one is asked for.
@@ -266,7 +266,7 @@ class Simulator(torch.nn.Module):
         return self.engine(worlds or self.model.worlds).integrator.outcomes()
 
     def parameter(self, name: str, batch: int | None = None) -> torch.Tensor:
-        """The values that the model has of a parameter "term.parameter" (B, E)."""
+        """The values that the model has of a parameter (B, E)."""
         return self.engine(batch or self.model.worlds).tables.value(name)
 
     def _full(self, engine: Engine, parameters: dict | None) -> list:
@@ -276,7 +276,7 @@ class Simulator(torch.nn.Module):
             engine.tables.of(name)  # which refuses what there is not
             if not isinstance(values, torch.Tensor):
                 try:
-                    values = self._tensor(name, self.model.valid_values(*name.rsplit(".", 1), values))
+                    values = self._tensor(name, engine.tables.valid(name, values))
                 except ValueError as error:
                     raise SceneError(f"parameters: {error}") from None
             result.append((name, engine.tables.full(name, values)))

@@ -9,7 +9,7 @@ from scipy.sparse.linalg import splu
 
 from ddg_warp import arrays
 from ddg_warp.errors import SolverError
-from ddg_warp.kernels.adjoint import refine
+from ddg_warp.kernels.adjoint import precision, refine
 from ddg_warp.solve.chains.assembled import AssembledNewton
 from ddg_warp.solve.chains.newton import ChainNewton, NewtonOptions
 from ddg_warp.solve.chains.tangent import ChainTangent
@@ -120,45 +120,22 @@ def _transposed(matrix: sparse.csc_matrix):
     return lambda given: factors.solve(given, trans="T")
 
 
-class ChainSolve:
-    """H w = g of a group of rods, in the precision of its state: by the sweep, or by factors in that of the model's linear algebra,
-    node by node or by cyclic reduction, and refinement; on the host of closed rods and of equilibria.
+class DirectSolve:
+    """H w = g of a group of open rods: by the sweep, or by factors in another precision than the state's, node by node or by cyclic
+    reduction, and refinement.
+
+    Args:
+        linear: precision of the factors; that of the state by default.
 
     Attributes:
-        tangent: of solves on the host; held: of the last of these, see `HostSolve`, as w is laid out.
-        failed: not zero of rods whose H is not positive definite (columns,), so that w means nothing; None on the host.
+        failed: not zero of rods whose H is not positive definite (columns,), so that w means nothing.
         passes: solutions by factors in another precision than the state's that are summed up; 0 where there are none.
     """
 
-    def __init__(self, model, group):
-        self.model, self.group = model, group
-        self.host = HostSolve(ChainTangent(model, group, 0))
-        self.tangent, self.held = self.host.tangent, None
-        self.system = self.solver = self.failed = self._for = None
-        self.passes = 0
-        if not group.kind.closed:
-            self._build()
-
-    def suit(self, s: float) -> bool:
-        """From now on solve by what suits steps of s [s]: by as many passes in the precision of the model's linear algebra as leave w
-        right to `CLOSE`, or without any; whether that is anything else than before."""
-        model, kind = self.model, self.group.kind
-        if self.system is None or model.types.linear is model.types.real or self._for == (s, model.version):
-            return False
-        self._for = s, model.version
-        error = 1.0 if kind.drag else float(self.group.float32_errors(s).max())
-        passes = next((n for n in range(1, PASSES + 1) if error**n <= CLOSE), 0)
-        if passes == self.passes:
-            return False
-        if bool(passes) != bool(self.passes):
-            self._build(model.types.linear if passes else None)
-        self.passes = passes
-        return True
-
-    def _build(self, linear=None) -> None:
-        """What solves, by factors in the precision `linear` if one is given."""
-        group, kind, device, real = self.group, self.group.kind, self.model.wp_device, self.model.types.real
-        given, size = (self.model, group, NewtonOptions(psd="none"), real), (group.nodes, group.columns)
+    def __init__(self, model, group, linear=None):
+        self.group, self.passes = group, 0
+        kind, device, real = group.kind, model.wp_device, model.types.real
+        given, size = (model, group, NewtonOptions(psd="none"), real), (group.nodes, group.columns)
         few = automatic(group) == "partitioned"
         if not few and linear is None:
             self.solver, self.system = None, ChainNewton(*given)
@@ -179,32 +156,14 @@ class ChainSolve:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        if self.system is None:
-            return []
         around = [(self.system._evaluate, 128)]
         if self.solver is None:
             return [*around, (self.system._sweep, self.system._threads)]
         refined = [self._product, self._guess, self._rest, self._add] if self.passes else []
         return [*around, self.system._assemble, *self.solver.kernels, *refined]
 
-    def __call__(self, solved, last: wp.array, s: float, right: wp.array, w: wp.array, resisted=None) -> None:
-        """Write w (block, n, R), zero at held dofs, for a right-hand side that is zero there.
-
-        Args:
-            solved: the solution `x`, `theta` and its lagged `frame`.
-            last: strains of the last step.
-            s: length of the implicit Euler step [s]; infinite for an equilibrium, of which `solved.time` is the load parameter.
-            resisted: with drag, its `ChainDragAdjoint`, the state before the step, and the nodes that tangents were taken from.
-
-        Raises:
-            SolverError: H is singular; on the host alone, see `failed`.
-        """
-        rate = 1.0 / s
-        coefficient = rate * (rate + self.model.scene.mass_damping)
-        if self.system is None or not rate:
-            more = resisted[0].matrix(*resisted[1:], rate) if resisted else None
-            self._on_host(solved, last, rate, coefficient, right, w, more)
-            return
+    def __call__(self, solved, last: wp.array, rate: float, coefficient: float, right: wp.array, w: wp.array, resisted):
+        """Write w; launches alone. Arguments as of `ChainSolve`, `coefficient` that of inertia [1/s^2]."""
         system = self.system
         system.x, system.theta, system.frame = solved.x, solved.theta, solved.frame
         islands = system.islands
@@ -241,6 +200,103 @@ class ChainSolve:
 
     def _launch(self, kernel, shape: tuple, inputs: list, outputs: list) -> None:
         wp.launch(kernel, shape, inputs, outputs, device=self.system.device)
+
+
+class ChainSolve:
+    """H w = g of a group of rods, in the precision of its state: directly, by factors in the precision of the model's linear algebra
+    where these serve; on the host of closed rods and of equilibria.
+
+    Attributes:
+        tangent: of solves on the host; held: of the last of these, see `HostSolve`, as w is laid out.
+        system: the `DirectSolve`, None of closed rods; exact: one in the precision of the state, which is taken instead where
+            parameters that the device holds ask for it; None where they are the model's, or `system` is that.
+        failed: of the last direct solve, see `DirectSolve`; None without.
+    """
+
+    def __init__(self, model, group):
+        self.model, self.group = model, group
+        self.host = HostSolve(ChainTangent(model, group, 0))
+        self.tangent, self.held = self.host.tangent, None
+        self.system = self.exact = self.failed = self._for = None
+        if not group.kind.closed:
+            self.system = DirectSolve(model, group)
+            self.failed = self.system.failed
+
+    def suit(self, s: float, given: bool = False) -> bool:
+        """From now on solve by what suits steps of s [s]: by as many passes in the precision of the model's linear algebra as leave w
+        right to `CLOSE`, or without any; whether that is anything else than before.
+
+        Args:
+            given: whether parameters may be others than the model's; which these are the device finds out.
+        """
+        model, kind = self.model, self.group.kind
+        if self.system is None or model.types.linear is model.types.real:
+            return False
+        changed = False
+        if self._for != (s, model.version):
+            self._for = s, model.version
+            error = 1.0 if kind.drag else float(self.group.float32_errors(s).max())
+            passes = next((n for n in range(1, PASSES + 1) if error**n <= CLOSE), 0)
+            changed = passes != self.system.passes
+            if bool(passes) != bool(self.system.passes):
+                self.system, self.exact = DirectSolve(model, self.group, model.types.linear if passes else None), None
+                self.failed = self.system.failed
+            self.system.passes = passes
+        if given and self.exact is None and self.system.passes:
+            self._watch()
+            changed = True
+        return changed
+
+    def _watch(self) -> None:
+        group, real, device = self.group, self.model.types.real, self.model.wp_device
+        self.exact = DirectSolve(self.model, group)
+        self.failed = wp.zeros_like(self.system.failed)
+        self._measure, self._judge = precision.stiffness_kernels(group.kind, real)
+        self._poor = wp.zeros(1, dtype=int, device=device)
+        self._rate = wp.zeros(group.columns, dtype=real, device=device)
+        parts = -(-group.nodes // precision.PART)
+        self._found = wp.zeros((precision.ROWS, parts, group.columns), dtype=real, device=device)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        watch = [*self.exact.kernels, self._measure, self._judge] if self.exact else []
+        return [*self.system.kernels, *watch] if self.system else []
+
+    def __call__(self, solved, last: wp.array, s: float, right: wp.array, w: wp.array, resisted=None) -> None:
+        """Write w (block, n, R), zero at held dofs, for a right-hand side that is zero there.
+
+        Args:
+            solved: the solution `x`, `theta` and its lagged `frame`.
+            last: strains of the last step.
+            s: length of the implicit Euler step [s]; infinite for an equilibrium, of which `solved.time` is the load parameter.
+            resisted: with drag, its `ChainDragAdjoint`, the state before the step, and the nodes that tangents were taken from.
+
+        Raises:
+            SolverError: H is singular; on the host alone, see `failed`.
+        """
+        rate = 1.0 / s
+        coefficient = rate * (rate + self.model.scene.mass_damping)
+        if self.system is None or not rate:
+            more = resisted[0].matrix(*resisted[1:], rate) if resisted else None
+            self._on_host(solved, last, rate, coefficient, right, w, more)
+            return
+        given = solved, last, rate, coefficient, right, w, resisted
+        if self.exact is None:
+            self.system(*given)
+            return
+        group, device = self.group, self.model.wp_device
+        self._poor.zero_()
+        self._rate.fill_(rate)
+        read = [*group.parameters.arrays, group.mass, group.count]
+        wp.launch(self._measure, self._found.shape[1:], read, [self._found], device=device)
+        read = [self._found, group.length, group.count, self._rate, CLOSE ** (1.0 / self.system.passes)]
+        wp.launch(self._judge, group.columns, read, [self._poor], device=device)
+        wp.capture_if(self._poor, lambda: self._by(self.exact, given), lambda: self._by(self.system, given))
+
+    def _by(self, direct: DirectSolve, given: tuple) -> None:
+        direct(*given)
+        wp.copy(self.failed, direct.failed)
 
     def _on_host(self, solved, last, rate: float, coefficient: float, right: wp.array, w: wp.array, more) -> None:
         data = SimpleNamespace(x=solved.x, theta=solved.theta, frame=solved.frame, last=last)

@@ -121,7 +121,8 @@ class Balance(torch.autograd.Function):
             found = engine.tables.pull(call.parameters, inputs, flags)
             for name, value in controls.items():
                 by_load = engine.controls.pull(name, value, inputs, flags)
-                found.append(end * by_load if name in ("forces", "moments") else by_load)  # which `end` scales
+                scaled = name in ("forces", "moments", "field")  # by `end`; gravity has been already
+                found.append(end * by_load if scaled else by_load)
         return None, None, *([None] * count), *found
 
 
@@ -141,9 +142,7 @@ class Pull(torch.autograd.Function):
         flags = output[count:]
         with engine.stream():
             engine.tables.write(call.parameters, parameters)
-            engine.controls.give_field(controls)
-            posed = "poses" in call.controls
-            found, inputs = engine.backward(call.start, call.dt, state, output[:count], given, posed)
+            found, inputs = engine.backward(call.start, call.dt, state, output[:count], given, controls)
             flags = engine.solved(flags)
             by_state = engine.layout.flagged(found, flags)
             by_parameters = engine.tables.pull(call.parameters, inputs, flags)

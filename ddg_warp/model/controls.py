@@ -16,8 +16,8 @@ class Controls:
     loads, stays as it is, the same for all worlds; these loads add to it. They belong to the step alone: what is asked of a state
     afterwards (reactions, spectra, energy of gravity) knows the loads of the scene.
 
-    `statics.solve(model, controls=...)` takes them, too: the load parameter scales loads and gravity as it does those of the scene,
-    and poses are those at its end. A field it refuses.
+    `statics.solve(model, controls=...)` takes them, too: the load parameter scales loads, gravity and the field as it does those of
+    the scene, and poses are those at its end.
 
     Attributes:
         poses: of every `Grip` at the end of the step (grips, 6) or (worlds, grips, 6): translation [m] and rotation vector [rad],

@@ -15,7 +15,8 @@ from ddg_warp.scene import drag
 class Group:
     """Constant device arrays of one group of rods, all worlds side by side (columns world * R + rod).
 
-    `parameters` are "term.parameter" of all terms, broadcastable to (node, column).
+    `parameters` are "term.parameter" of all terms, broadcastable to (node, column); `weighed` is whether `mass` and `rotary` may be
+    others than those of `host`.
     """
 
     def __init__(self, host: ChainGroup, scene, worlds: int, device, real):
@@ -40,6 +41,7 @@ class Group:
         self.still = wp.zeros(self.columns, dtype=real, device=device)
         self.mass = put(host.mass, real)
         self.rotary = put(host.rotary, real)
+        self.weighed = False
         self.drag = put(host.drag, real) if kind.drag else None
         self.fixed = put(host.fixed, wp.uint8)
         self.anchor = put(_last_anchor(host), int)
@@ -74,6 +76,19 @@ class Group:
             along = np.pad(along, ((0, 0), (0, elements - along.shape[1])), mode="edge")
             new = np.repeat(np.broadcast_to(along, (self.worlds, elements)), self.rods, axis=0).T
         self.parameters.set(**{name: new})
+
+    @property
+    def node_mass(self) -> wp.array:
+        """As of `DeviceNet`, [node][column]."""
+        return self.mass
+
+    def dof_masses(self) -> np.ndarray:
+        """Masses of all dofs, rod by rod (columns n block,)."""
+        if self.weighed:
+            mass, rotary = (arrays.download(array).astype(float) for array in (self.mass, self.rotary))
+        else:
+            mass, rotary = (np.tile(values, (1, self.worlds)) for values in (self.host.mass, self.host.rotary))
+        return np.stack([mass] * self.dim + [rotary] * self.kind.twist, axis=-1).transpose(1, 0, 2).ravel()
 
     def stiffnesses(self, s: float) -> tuple[np.ndarray, ...]:
         """Stiffnesses of every rod (columns,) over a step of s [s]; see `precision.stiffnesses`."""

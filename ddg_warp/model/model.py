@@ -13,6 +13,7 @@ from ddg_warp.kernels import element, step
 from ddg_warp.model import glue, validate
 from ddg_warp.model.group import Group
 from ddg_warp.model.order import Order
+from ddg_warp.model.parameters import valid_numbers
 from ddg_warp.model.state import GripState, GroupState, State
 from ddg_warp.scene.grip import Grip
 from ddg_warp.threads import launches
@@ -173,15 +174,7 @@ class Model:
         Raises:
             ValueError: they are no numbers, not finite, or none that the parameter may have.
         """
-        name, (rule, holds) = f"{term}.{parameter}", self._terms()[term][parameter].valid
-        try:
-            values = np.array(values, float)
-        except (TypeError, ValueError):
-            raise ValueError(f"{name} = {values!r}; give numbers") from None
-        bad = np.flatnonzero(~(np.isfinite(values) & holds(values)))
-        if bad.size:
-            raise ValueError(f"{name}: value {bad[0]} is {values.ravel()[bad[0]]:g}; it is finite and {rule}")
-        return values
+        return valid_numbers(f"{term}.{parameter}", values, *self._terms()[term][parameter].valid)
 
     def _terms(self) -> dict[str, dict]:
         """Parameters of all terms: term -> name -> `Parameter`."""

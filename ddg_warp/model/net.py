@@ -94,7 +94,13 @@ class DeviceSet:
 
 
 class DeviceNet:
-    """A `Net` with all its worlds on a device; `motions` are those that turn the supports of shells and rings, -1 where none does."""
+    """A `Net` with all its worlds on a device; `motions` are those that turn the supports of shells and rings, -1 where none does.
+
+    Attributes:
+        mass: of the dofs of blocks (worlds, N) [kg, kg m^2]; weighed: whether it may be another one than that of `host`.
+        moves: what inertia or drag give a rate, as masses of the dofs of blocks (N,) that are positive there.
+        drag: coefficients of the edges that feel some, world by world (rows, W E), as of `kernels.drag`; None without.
+    """
 
     def __init__(self, host: Net, worlds: int, device, real, motions: np.ndarray):
         self.host, self.worlds, self.device, self.real = host, worlds, device, real
@@ -103,6 +109,14 @@ class DeviceNet:
         self.dim, self.world_columns, self.columns = 3, 1, worlds
         self.edges = host.rod_edges
         self.sets = [DeviceSet(s, worlds, device, real, motions) for s in host.sets]
+        self.mass = wp.array(np.tile(host.mass, (worlds, 1, 1)), dtype=self.vector, device=device)
+        self.weighed, self.drag, felt = False, None, np.zeros((host.blocks, 3))
+        if host.drag:
+            ends, angles, coefficients = host.drag
+            self.drag = wp.array(np.tile(coefficients, (1, worlds)), dtype=real, device=device)
+            felt[ends] = 1.0
+            felt[angles[angles >= 0], 0] = 1.0
+        self.moves = wp.array(host.mass + felt, dtype=self.vector, device=device)
         self.ends = wp.array(np.ascontiguousarray(host.ends, np.int32).reshape(-1, 2), dtype=int, device=device)
         self.still = wp.zeros(worlds, dtype=real, device=device)
         self.every = wp.full(worlds, 1, dtype=int, device=device)
@@ -127,6 +141,17 @@ class DeviceNet:
             state.last.append(self._zeros(strains, count if strains else 1))
         state.data = self.turning_data() | self.field_data()
         return state
+
+    @property
+    def node_mass(self) -> wp.array:
+        """Masses of nodes as [block][world]."""
+        return self.angles(self.mass.flatten())
+
+    def dof_masses(self) -> np.ndarray:
+        """Masses of all dofs, world by world (W N 3,)."""
+        if self.weighed:
+            return self.mass.numpy().astype(float).ravel()
+        return np.tile(self.host.mass.ravel(), self.worlds)
 
     def points(self, blocks: wp.array) -> wp.array:
         """Blocks (W N,) as the points of a storage, [block][world]."""

@@ -42,3 +42,19 @@ class ParameterTable:
         flat = np.concatenate([np.ravel(values) for values in self.values.values()])
         self.buffer = wp.array(flat, dtype=self._real, device=self._device)
         self.table = wp.array(np.array(table, np.int32), dtype=int, device=self._device)
+
+
+def valid_numbers(name: str, values, rule: str, holds) -> np.ndarray:
+    """Values of a parameter as an array of numbers that fulfil a rule.
+
+    Raises:
+        ValueError: they are no numbers, not finite, or do not.
+    """
+    try:
+        values = np.array(values, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} = {values!r}; give numbers") from None
+    bad = np.flatnonzero(~(np.isfinite(values) & holds(values)))
+    if bad.size:
+        raise ValueError(f"{name}: value {bad[0]} is {values.ravel()[bad[0]]:g}; it is finite and {rule}")
+    return values

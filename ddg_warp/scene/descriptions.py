@@ -117,6 +117,7 @@ class RodBatch:
     first: int  # index of its first rod
     laws: Mapping[str, Law] = field(default_factory=dict)  # by term
     curvature: str = "tangent"  # or "angle"
+    sized: bool = True  # whether all stiffnesses and masses follow from the size of its section
 
     @property
     def by_angle(self) -> bool:

@@ -175,6 +175,7 @@ class Scene(Structures):
             self.rod_count,
             laws_of(f"rods '{name}'", section, material, laws),
             curvature,
+            not (isinstance(section, Stiffness) or laws),
         )
         self.batches.append(batch)
         return range(batch.first, batch.first + batch.rods)

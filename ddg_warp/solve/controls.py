@@ -58,14 +58,14 @@ class ControlledLoads(Loads):
         def put(values, dtype=real):
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
-        mass, arm, changing = scale.places(host)
+        arm, changing = scale.places(host)
         constant = put(host.constant_loads(), self._vector)
         self._shared = wp.clone(constant) if host.timed else constant
         self._sizes = wp.zeros((model.worlds, len(self.places)), dtype=real, device=device)
         place, row = loaded_rows(model, part)
         order = np.argsort(place, kind="stable")
         starts = np.searchsorted(place[order], np.arange(host.size + 1))
-        self._inputs = [self._shared, constant, put(changing), put(mass), put(arm), nodes]
+        self._inputs = [self._shared, constant, put(changing), part.node_mass, part.world_columns, put(arm), nodes]
         self._inputs += [put(starts.astype(np.int32), int), put(row[order].astype(np.int32), int)]
         self._inputs += [given.forces, given.moments, given.gravity]
         self._inputs += [put([np.asarray(model.scene.gravity, float)], self._vector)]
@@ -141,14 +141,13 @@ class ChainScale(_Scale):
         self.keep(self.load)
 
     @staticmethod
-    def places(host) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mass, what moments are divided by, and sizes of loads that change, of all places."""
+    def places(host) -> tuple[np.ndarray, np.ndarray]:
+        """What moments are divided by, and sizes of loads that change, of all places."""
         turns = host.size > host.nodes
-        mass = np.concatenate([host.mass.ravel(), np.zeros(host.size - host.nodes)])
         arm = np.ones(host.size)
         if turns:
             arm[host.nodes :] = np.tile(host.length, host.shape[0])
-        return mass, arm, group.changing_forces(host)
+        return arm, group.changing_forces(host)
 
 
 class NetScale(_Scale):
@@ -182,10 +181,9 @@ class NetScale(_Scale):
         return self.indices(starts), self.indices(body), weight, limit
 
     @staticmethod
-    def places(host) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def places(host) -> tuple[np.ndarray, np.ndarray]:
         """As of `ChainScale`."""
-        mass = np.where(np.arange(host.blocks) < host.nodes, host.mass[:, 0], 0.0)
-        return mass, host.bodies.arm, tolerance.changing_forces(host) / host.bodies.arm
+        return host.bodies.arm, tolerance.changing_forces(host) / host.bodies.arm
 
     def share(self) -> None:
         """Limits of blocks and parts, from the loads of bodies and the mean of what they are connected with."""

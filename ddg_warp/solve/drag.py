@@ -86,29 +86,18 @@ class ChainDrag(Drag):
 
 
 class NetDrag(Drag):
-    """Drag on the rods of a net, against a fluid that flows.
-
-    Attributes:
-        moves: what inertia or drag give a rate, as masses of the dofs of blocks that are positive there.
-    """
+    """Drag on the rods of a net, against a fluid that flows."""
 
     def __init__(self, model, midpoint: bool = False):
-        net, host, device, real = model.net, model.net.host, model.wp_device, model.types.real
-        super().__init__(model, net, drag.net_kernels(real), midpoint)
-        ends, angles, coefficients = host.drag
+        net, host, device = model.net, model.net.host, model.wp_device
+        super().__init__(model, net, drag.net_kernels(model.types.real), midpoint)
+        ends, angles, _ = host.drag
         places = np.stack([*ends, np.where(angles < 0, host.blocks, angles)], -1).ravel()
         starts, items = lists(places, host.blocks + 1)
 
-        def put(values, dtype=int):
-            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
-
-        self.ends, self.starts, self.items = (put(v.astype(np.int32)) for v in (ends.T, starts, items // 3))
-        self.coefficients = put(coefficients, real)
-        self.mass = put(host.mass, net.vector)
-        felt = np.zeros((host.blocks, 3))
-        felt[ends] = 1.0
-        felt[angles[angles >= 0], 0] = 1.0
-        self.moves = put(host.mass + felt, net.vector)
+        self.ends, self.starts, self.items = (
+            wp.array(np.ascontiguousarray(v, np.int32), dtype=int, device=device) for v in (ends.T, starts, items // 3)
+        )
 
     def resist(self, before, solver, islands) -> None:
         """Write inertia and drag of a solve from the state `before`, once its iterate is predicted."""
@@ -116,8 +105,8 @@ class NetDrag(Drag):
         self._launch(
             self._resist,
             net.worlds * net.blocks,
-            [before.q, before.v, solver.q if self.midpoint else before.q, solver.q, self.mass, self.ends]
-            + [self.coefficients, self.starts, self.items, self.flow, solver.outer, *islands.arrays]
+            [before.q, before.v, solver.q if self.midpoint else before.q, solver.q, net.mass, self.ends]
+            + [net.drag, self.starts, self.items, self.flow, solver.outer, *islands.arrays]
             + [net.blocks, net.host.nodes],
             [solver.mass],
         )

@@ -1,5 +1,7 @@
 """What the parts of a tangent have in common, groups of rods and the net: outer forces on their dofs, and the derivatives of these."""
 
+from functools import cached_property
+
 import numpy as np
 from scipy import sparse
 
@@ -13,17 +15,25 @@ class Part:
     Attributes:
         host: its `Storage`.
         offset, size: of its dofs among all.
-        mass: of every dof (size,) [kg, kg m^2].
         given: outer forces of controls on the dofs of every world, in space, at full load (worlds, n) [N, N m].
 
     Args:
         part: `Group` or `DeviceNet`.
     """
 
-    def __init__(self, model, part, offset: int, size: int, mass: np.ndarray):
+    def __init__(self, model, part, offset: int, size: int):
         self.model, self.part, self.host, self.offset, self.size = model, part, part.host, offset, size
-        self.mass, self.worlds = mass, model.worlds
+        self.worlds = model.worlds
         self.given = np.zeros((self.worlds, size // self.worlds))
+
+    @property
+    def mass(self) -> np.ndarray:
+        """Of every dof (size,) [kg, kg m^2]."""
+        return self.part.dof_masses() if self.part.weighed else self._usual_mass
+
+    @cached_property
+    def _usual_mass(self) -> np.ndarray:
+        return self.part.dof_masses()
 
     def accelerations(self, gravity: np.ndarray) -> np.ndarray:
         """Those that gravity (3,) means on the dofs of a node, or of every block (1 or N, dofs of one) [m/s^2]."""
@@ -42,15 +52,18 @@ class Part:
         return values
 
     def weight(self, gravity: np.ndarray | None = None) -> np.ndarray:
-        """Gravity, by default the scene's, on the dofs of a world, in space [N]."""
-        own = self.accelerations(np.asarray(self.model.scene.gravity if gravity is None else gravity, float))
-        return (self.mass[: self.size // self.worlds].reshape(-1, own.shape[1]) * own).ravel()
+        """Gravity (3,) or (worlds, 3), by default the scene's, on the dofs of every world, in space (worlds, n) [N]."""
+        gravity = np.asarray(self.model.scene.gravity if gravity is None else gravity, float)
+        given = np.broadcast_to(gravity, (self.worlds, 3))
+        masses = self.mass.reshape(self.worlds, -1)
+        own = (self.accelerations(g) for g in given)
+        return np.array([(m.reshape(-1, a.shape[1]) * a).ravel() for m, a in zip(masses, own, strict=True)])
 
     def give(self, found: dict[str, np.ndarray]) -> None:
         """Take the loads among what `Controls.checked` found; none without."""
         self.given[:] = 0.0
         if "gravity" in found:
-            self.given[:] = [self.weight(own - self.model.scene.gravity) for own in found["gravity"]]
+            self.given[:] = self.weight(found["gravity"] - self.model.scene.gravity)
         places, rows = loaded_rows(self.model, self.part)
         for name, own in (("forces", places < self.host.nodes), ("moments", places >= self.host.nodes)):
             if name in found:
@@ -61,10 +74,10 @@ class Part:
 
     def dead_loads(self, factor: float) -> np.ndarray:
         """Outer forces on the dofs of every world, in space, that do not follow it (worlds, n)."""
-        result = factor * self.weight()
+        result = np.zeros(self.size // self.worlds)
         for load in (self.host.constant, *self.host.timed):
             _add(result, self.host.dofs(load.places), load.at(factor, factor) * load.force)
-        return result + factor * self.given
+        return result + factor * (self.weight() + self.given)
 
     def loads(self, factor: float, q: np.ndarray) -> np.ndarray:
         result = self.dead_loads(factor)

@@ -89,8 +89,8 @@ def solve(
     Args:
         model: what to equilibrate.
         state: where to begin; the rest state by default. It is not changed. What a `Grip` holds stays where it is, without `poses`.
-        controls: forces, moments and gravity, world by world, which the load parameter scales as it does those of the scene; and poses
-            of grips at `end`, which move there straight from where the state has them.
+        controls: forces, moments, gravity and magnetic field, world by world, which the load parameter scales as it does those of the
+            scene; and poses of grips at `end`, which move there straight from where the state has them.
         load_steps: increments; one that fails is halved.
         start, end: load parameter, which scales gravity and loads and is the time of motions and amplitudes.
         options: see `StaticsOptions`.
@@ -165,10 +165,6 @@ class Equilibrium:
     ) -> State:
         """Load stepping; see `solve`."""
         found = checked(controls, self.model, "statics")
-        if "field" in found:
-            raise SceneError(
-                "statics: equilibria take no field as a control yet; give it to the scene: scene.magnetic_field(...)"
-            )
         self.tangent.give(found)
         self.tangent.poses = poses_between(state, found["poses"], start, end) if "poses" in found else None
         if start == end:

@@ -20,7 +20,6 @@ class Tangent:
         size: number of dofs, held and padding ones included.
         free: which dofs are free (size,) bool.
         angle: which dofs are angles (size,) bool.
-        mass: lumped mass and rotary inertia of every dof (size,) [kg, kg m^2].
         poses: of grips by load parameter, load -> (worlds, grips, 6); None where they are as the state has them.
     """
 
@@ -36,9 +35,14 @@ class Tangent:
             self.parts.append(NetTangent(model, offset))
             offset += self.parts[-1].size
         self.size = offset
-        self.free, self.angle, self.mass = (
-            np.concatenate([getattr(part, name) for part in self.parts]) for name in ("free", "angle", "mass")
+        self.free, self.angle = (
+            np.concatenate([getattr(part, name) for part in self.parts]) for name in ("free", "angle")
         )
+
+    @property
+    def mass(self) -> np.ndarray:
+        """Lumped mass and rotary inertia of every dof (size,) [kg, kg m^2]."""
+        return np.concatenate([part.mass for part in self.parts])
 
     def energy(self, state) -> dict[str, np.ndarray]:
         """Elastic energy of every term (worlds,) [J]."""

@@ -196,7 +196,7 @@ def net_kernels(real, midpoint: bool):
         b = ends[edge, 1] + world * blocks
         p = P()
         for i in range(wp.static(ROWS)):
-            p[i] = coefficients[i, edge]
+            p[i] = coefficients[i, tid]
         u = flow[0]
         turn = real(0.0)
         if angles[edge] >= 0:

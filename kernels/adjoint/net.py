@@ -185,7 +185,7 @@ def step_kernels(real, midpoint: bool, drag: bool):
         w: wp.array(dtype=V),
         held: wp.array(dtype=V),
         inertia: wp.array2d(dtype=Inertia),
-        mass: wp.array(dtype=V),
+        mass: wp.array2d(dtype=V),
         gravity: wp.array(dtype=V),
         nodes: int,
         last: int,
@@ -199,13 +199,15 @@ def step_kernels(real, midpoint: bool, drag: bool):
         damping_out: wp.array(dtype=real),
         gravity_out: wp.array(dtype=V),
     ):
-        """`held` is what is left at held dofs that no motion moves. Adds to derivatives by the start and by the rate."""
+        """`held` is what is left at held dofs that no motion moves; `gravity` is of worlds. Adds to derivatives by the start and by
+        the rate."""
         i = wp.tid()
-        k = i % blocks
+        world = i / blocks
+        k = i - world * blocks
         if k >= last:
             return
         c = rate * (rate + damping[0])
-        m = mass[k]
+        m = mass[world, k]
         own = w[i]
         step = solved[i] - q0[i]
         before = v0[i]
@@ -214,7 +216,7 @@ def step_kernels(real, midpoint: bool, drag: bool):
         v_out[i] = v_out[i] + wp.cw_mul(m, own) * rate - (ended - v[i]) * kept
         outer = before * rate - step * c
         if k < nodes:
-            outer += gravity[0]
+            outer += gravity[world]
             gravity_out[i] = wp.cw_mul(m, own)
         mass_out[i] = wp.cw_mul(own, outer)
         rate_out[i] = (

@@ -93,6 +93,7 @@ def step_kernels(kind: ChainKind, real, midpoint: bool, more_to_start: bool):
         rate: wp.array(dtype=real),
         damping: wp.array(dtype=real),
         gravity: wp.array(dtype=V),
+        world: wp.array(dtype=int),
         # derivatives by the start; by masses; by the rate, the damping and gravity, of every node
         x_out: wp.array2d(dtype=V),
         v_out: wp.array2d(dtype=V),
@@ -104,7 +105,8 @@ def step_kernels(kind: ChainKind, real, midpoint: bool, more_to_start: bool):
         damping_out: wp.array2d(dtype=real),
         gravity_out: wp.array2d(dtype=V),
     ):
-        """`moved` are dofs that a motion puts in place; other held ones stay where the step starts. Adds to derivatives by the rate."""
+        """`moved` are dofs that a motion puts in place; other held ones stay where the step starts. `gravity` is of worlds, `world`
+        that of a column. Adds to derivatives by the rate."""
         k, r = wp.tid()
         if k >= count[r]:
             return
@@ -139,7 +141,7 @@ def step_kernels(kind: ChainKind, real, midpoint: bool, more_to_start: bool):
             by_v += v_out[k, r]
         x_out[k, r] = by_x
         v_out[k, r] = by_v
-        mass_out[k, r] = wp.dot(own, gravity[0] - step * c + before * rho)
+        mass_out[k, r] = wp.dot(own, gravity[world[r]] - step * c + before * rho)
         gravity_out[k, r] = own * m
         by_rate = turned * wp.dot(ended, step) - m * wp.dot(own, step * (real(2.0) * rho + alpha) - before)
         by_damping = -m * rho * wp.dot(own, step)

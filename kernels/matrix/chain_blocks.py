@@ -206,7 +206,7 @@ def blocks_function(
                                 if wp.static(drag):
                                     inertia = mass[w, at].mass[d] * scalars[COEFFICIENT, w]
                                 else:
-                                    inertia = mass[at][d] * scalars[COEFFICIENT, w]
+                                    inertia = mass[w, at][d] * scalars[COEFFICIENT, w]
                                 D[3 * part + d, 3 * part + d] = D[3 * part + d, 3 * part + d] + linear(inertia)
                         if wp.static(drag):
                             resistance = mass[w, at].resistance

@@ -144,7 +144,7 @@ def inertia_function(real, linear, drag: bool):
         if wp.static(drag):
             inertia = mass[w, block].mass * coefficient
         else:
-            inertia = mass[block] * coefficient
+            inertia = mass[w, block] * coefficient
         for d in range(3):
             m[d, d] = linear(inertia[d])
         if wp.static(drag):

@@ -138,7 +138,7 @@ def residual_functions(real, linear, drag: bool, angle: bool = False):
         if wp.static(drag):
             m = own(given.mass[w, k].mass)
         else:
-            m = own(given.mass[k])
+            m = own(given.mass[w, k])
         if wp.static(not angle):
             if k < given.nodes:
                 force += wp.cw_mul(m, given.gravity[0])

@@ -83,7 +83,7 @@ def block_kernel(real, drag: bool = False):
         if wp.static(drag):
             m = mass[w, k].mass
         else:
-            m = mass[k]
+            m = mass[w, k]
         rows_out[wp.static(HELD) * worlds + w, k] = real(0.5) * wp.dot(wp.cw_mul(m, v), v)
         damped = real(2.0) * damping[0] * scalars[RATE, w] * wp.dot(wp.cw_mul(m, moved), moved)
         if wp.static(drag):

@@ -117,3 +117,30 @@ def test_it_is_refused_where_nothing_is_magnetic(fields):
     own = magnet("implicit_euler")
     with pytest.raises(SceneError, match=r"field have shape \(2,\); they are \(3,\) or \(1, 3\)"):
         own.step(own.initial_state(), None, {"field": fields[0, :2]})
+
+
+@pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])  # with twist and without
+def test_equilibria_take_it(scheme, fields):
+    """Each world is where a scene with the sum of both fields rests; half of the load parameter means half of the field."""
+    own = magnet(scheme, (1e-2, 0.0, 0.0))
+    found = own.equilibrium(None, {"field": fields}, batch=2, rtol=1e-11).positions
+    half = own.equilibrium(None, {"field": fields}, batch=2, end=0.5, rtol=1e-11).positions
+    for world, field in enumerate(fields.tolist()):
+        other = magnet(scheme, np.add(field, (1e-2, 0.0, 0.0)))
+        usual = other.equilibrium(rtol=1e-11).positions[0]
+        torch.testing.assert_close(found[world], usual, rtol=1e-8, atol=1e-11)
+        usual = other.equilibrium(end=0.5, rtol=1e-11).positions[0]
+        torch.testing.assert_close(half[world], usual, rtol=1e-8, atol=1e-11)
+    rest = own.equilibrium(batch=2, rtol=1e-11).positions
+    assert (found - rest).abs().max() > 1e-5
+    torch.testing.assert_close(rest[1], rest[0], rtol=1e-12, atol=1e-14)  # and nothing is left of the field
+
+
+def test_gradients_of_equilibria(fields):
+    own = magnet("implicit_euler", (1e-2, 0.0, 0.0))
+    weight = torch.randn((own.model.points_count, 3), dtype=torch.float64)
+
+    def loss(field):
+        return (weight * own.equilibrium(None, {"field": field}, batch=2, end=0.7, **TIGHT).positions).sum()
+
+    check(loss, {"field": fields}, {"field": 1e-5})

@@ -17,7 +17,7 @@ torch = pytest.importorskip("torch")
 from ddg_warp.torch import ShellParameters, Simulator  # noqa: E402
 from tests.learn.test_torch import check  # noqa: E402
 
-NUMBERS, FORMS = ("young", "thickness", "poisson"), ("metric", "curvature")
+NUMBERS, FORMS, MASS = ("young", "thickness", "poisson"), ("metric", "curvature"), ("density",)
 BENDING = ("midedge_dof", "midedge_boundary", "midedge", "hinge", "isometric")
 
 
@@ -33,20 +33,27 @@ def forms(number: int) -> tuple[np.ndarray, np.ndarray]:
     return grown_metric(points, triangles, 1.1, 0.9, along), principal_form(points, triangles, 2.0, -1.0, along)
 
 
+def areas(metric: np.ndarray) -> np.ndarray:
+    """Of triangles (T,), twice."""
+    return np.sqrt(metric[:, 0] * metric[:, 2] - metric[:, 1] ** 2)
+
+
 def sheets(bending: str = "midedge_dof", values: dict | None = None) -> ddg.Scene:
     """Two shells, held along one side, with these quantities (one number a triangle of both) or their own."""
     scene, start = ddg.Scene(gravity=(0.5, 0.0, -9.81)), 0
     for number in range(2):
         points, triangles = mesh(number)
         flat = bending in ("hinge", "isometric")
-        own = {"young": 1e7 * (1.0 + number), "thickness": 0.01, "poisson": 0.3 - 0.1 * number}
+        own = {"young": 1e7 * (1.0 + number), "thickness": 0.01, "poisson": 0.3 - 0.1 * number, "density": 1000.0}
         rest = "flat" if flat else forms(number)
         if values is not None:
-            own = {name: values[name][0, start : start + len(triangles)] for name in NUMBERS}
-            rest = rest if flat else tuple(values[name][0, start : start + len(triangles)] for name in FORMS)
+            own = {name: values[name][0, start : start + len(triangles)] for name in NUMBERS + MASS}
+            if not flat:  # masses are those of the first metric
+                first, rest = rest, tuple(values[name][0, start : start + len(triangles)] for name in FORMS)
+                own["density"] = own["density"] * areas(first[0]) / areas(rest[0])
         start += len(triangles)
         thickness, poisson = own.pop("thickness"), own.pop("poisson")
-        material = ddg.Material(own["young"], poisson, density=1000.0, viscosity=0.01)
+        material = ddg.Material(own["young"], poisson, density=own["density"], viscosity=0.01)
         shell = scene.add_shell(points, triangles, thickness=thickness, material=material, bending=bending, rest=rest)
         held = np.flatnonzero(points[:, 0] <= (0.16 if bending == "isometric" else 0.0))
         scene.hold(shell, [*held, len(points) - 1])
@@ -67,7 +74,7 @@ def changed(module: ShellParameters, seed: int = 0) -> ShellParameters:
 @pytest.mark.parametrize("bending", BENDING)
 @pytest.mark.parametrize("by", ["shell", "element"])
 def test_what_it_gives_is_what_shells_are_built_with(bending, by):
-    names = NUMBERS if bending in ("hinge", "isometric") else NUMBERS + FORMS
+    names = (NUMBERS if bending in ("hinge", "isometric") else NUMBERS + FORMS) + MASS
     own = Simulator(built(sheets(bending)), DT)
     module = ShellParameters(own, names, by=by)
     for name, values in module().items():
@@ -101,10 +108,10 @@ def test_curvatures_and_metrics_are_those_along_the_direction():
 @pytest.mark.parametrize("statics", [False, True])
 def test_gradients(bending, statics):
     """By every quantity, in two worlds, through steps and equilibria, against differences."""
-    names = NUMBERS if bending == "hinge" else NUMBERS + FORMS
+    names = (NUMBERS if bending == "hinge" else NUMBERS + FORMS) + MASS
     own = Simulator(built(sheets(bending)), DT, **TIGHT)
     shares = np.column_stack([np.ones(20), np.linspace(-1.0, 1.0, 20)])
-    module = changed(ShellParameters(own, names, by=shares, batch=2))
+    module = changed(ShellParameters(own, names, by=shares, batch=2), seed=5)
     first = own.equilibrium(module(), batch=2).detach() if statics else None
     weight = torch.randn((own.model.points_count, 3), dtype=torch.float64)
 
@@ -141,7 +148,7 @@ def test_copies_and_states():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"names": ("density",)}, "there is no 'density'; there are young, thickness, poisson, metric, curvature"),
+        ({"names": ("mass",)}, "there is no 'mass'; there are young, thickness, poisson, density, metric, curvature"),
         ({"shells": 2}, "shell 2 does not exist; the model has 2 shells"),
         ({"by": "vertex"}, "'shell', 'element' or finite numbers (T, K) of the 20 triangles"),
         ({"by": np.ones((12, 2))}, "of the 20 triangles"),

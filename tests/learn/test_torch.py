@@ -17,7 +17,7 @@ from tests.learn.differences import TIGHT, built
 from tests.learn.test_adjoint import CLOSE, CURVE, DT, SCENES, SOFT, a_scene
 
 torch = pytest.importorskip("torch")
-from ddg_warp.torch import RodParameters, Simulator  # noqa: E402
+from ddg_warp.torch import RodParameters, ShellParameters, Simulator  # noqa: E402
 
 STIFFNESS = {
     "twisted": "rod_bend_twist.stiffness_1",
@@ -361,6 +361,24 @@ def test_parameters_of_the_model_go_into_other_worlds(name):
         Simulator(two, DT).parameter(stiffness, 3)
 
 
+def test_rest_shapes_of_the_model_go_along():
+    """Into a pickle, one of that, and other worlds; what is learned of shells begins with them."""
+    model = SCENES["sheet"]().build(device=differences.DEVICE, precision="float64")
+    model.set_rest(0, points=model.state().points() * [1.2, 1.1, 0.5])
+    own, usual = Simulator(model, DT, **TIGHT), simulator("sheet")
+    other = pickle.loads(pickle.dumps(pickle.loads(pickle.dumps(own))))
+    with torch.no_grad():
+        plain, moved, again, wide = (
+            each.step(each.initial_state(worlds)).positions
+            for each, worlds in ((usual, 1), (own, 1), (other, 1), (own, 3))
+        )
+        metrics = [ShellParameters(each, ("metric",)).quantities()["metric"] for each in (own, other)]
+    assert float((moved - plain).abs().max()) > 1e-6
+    torch.testing.assert_close(again, moved, rtol=0.0, atol=0.0)
+    torch.testing.assert_close(wide, moved.expand(3, -1, -1), rtol=0.0, atol=0.0)
+    torch.testing.assert_close(metrics[1], metrics[0], rtol=0.0, atol=0.0)
+
+
 def test_a_stiffness_is_found_again():
     """Three stiffnesses of a rod from its motion, by gradients of their logarithms."""
     own = simulator("twisted")
@@ -441,7 +459,7 @@ def test_float32_solves_for_what_inertia_does_not_give(monkeypatch, young, radiu
         thrown.requires_grad_()
         *_, state = own.rollout(own.initial_state(velocities=thrown), steps=20)
         gradients.append(torch.autograd.grad(((state.positions - rest.positions) ** 2).sum(), thrown)[0].cpu().numpy())
-    assert own.engine(1).adjoint.chains[0].solve.passes == passes
+    assert own.engine(1).adjoint.chains[0].solve.system.passes == passes
     exact, found = gradients
     bound = own.model.groups[0].float32_errors(0.005).max() ** passes
     assert bound < 1e-5 or not passes

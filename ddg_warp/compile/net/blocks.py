@@ -150,7 +150,8 @@ class _Builder:
                 )
             except SceneError as error:
                 raise SceneError(f"shell '{shell.name}': {error}") from None
-            shells.append(NetShell(surface, merged[numbers], angle, kinds, supports, plate))
+            third = plate.area * plate.thickness * material.density / 3.0
+            shells.append(NetShell(surface, merged[numbers], angle, kinds, supports, plate, third))
         angles = self.rod_edges + mesh_edges
         spins = sum(joint.rigid for joint in scene.joints)
         rods = sorted(self.rods.values(), key=lambda rod: rod.rod)

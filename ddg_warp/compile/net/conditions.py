@@ -14,9 +14,8 @@ from ddg_warp.geometry.shell_forms import FREE as FREE_EDGE
 def add_masses(scene, net: Net) -> None:
     """Lump masses and rotary inertia at the dofs."""
     lumps = [(rod.all_nodes, rod.piece.mass[rod.row]) for rod in net.rods]
-    for shell, description in zip(net.shells, scene.shells, strict=True):
-        weight = shell.plate.area * shell.plate.thickness * description.material.density / 3.0
-        lumps.append((shell.nodes[shell.surface.triangles].ravel(), np.repeat(weight, 3)))
+    for shell in net.shells:
+        lumps.append((shell.nodes[shell.surface.triangles].ravel(), np.repeat(shell.corner_mass, 3)))
     for shell in net.meridians:
         axisymmetric.check_gravity(scene.gravity)
         lumps.append((shell.nodes, shell.mass))

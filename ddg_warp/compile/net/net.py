@@ -52,6 +52,7 @@ class NetShell:
     kinds: shell_forms.EdgeKinds
     supports: np.ndarray  # place among the scene's of the support that gives the normal at each mesh edge, -1 without
     plate: shell_terms.Plate
+    corner_mass: np.ndarray  # a third of the mass of each triangle [kg]
     first: dict[str, int] = field(default_factory=dict)  # its first element in the set of each of its terms
 
 

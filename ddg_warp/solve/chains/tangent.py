@@ -26,7 +26,7 @@ class ChainTangent(Part):
     def __init__(self, model, group, offset: int):
         kind, real, device = group.kind, model.types.real, model.wp_device
         shape = (group.nodes, group.columns)
-        super().__init__(model, group, offset, group.columns * group.nodes * kind.block, _mass(group))
+        super().__init__(model, group, offset, group.columns * group.nodes * kind.block)
         self.group, self.body_count = group, group.columns
         self.rate = group.still  # over what strain-rate damping counts: at rest not
         self.incidence = _incidence(group)
@@ -251,11 +251,6 @@ def _free(group) -> np.ndarray:
     bits = (host.fixed[..., None] >> np.arange(group.kind.block)) & 1
     inside = np.arange(group.nodes)[:, None] < host.count
     return _every_world(group, (bits == 0) & inside[..., None])
-
-
-def _mass(group) -> np.ndarray:
-    kind = group.kind
-    return _every_world(group, np.stack([group.host.mass] * kind.dim + [group.host.rotary] * kind.twist, axis=-1))
 
 
 def _every_world(group, values: np.ndarray) -> np.ndarray:

@@ -53,7 +53,7 @@ class ExactSystem:
         self.system = NetSystem(net)
         self.planes = DevicePlanes(net, self.system, real, self.linear) if host.frames else None
         self.fixed = self.bits(host.fixed)
-        self.mass = wp.array(host.mass, dtype=net.vector, device=device) if inertia is None else inertia
+        self.mass = net.mass if inertia is None else inertia
         self.right, self.direction = (make(self.all, H) for _ in range(2))
         self.matrix = make((9, worlds * self.system.positions), self.linear)
         self.krylov_dots = make((worlds, net.blocks), self.linear)

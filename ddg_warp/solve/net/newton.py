@@ -77,9 +77,7 @@ class NetNewton:
         self._weights, self._weight = make((3, worlds, blocks), self.real), make((3, worlds), self.real)
         self.change, self.noise, self.square = (self._weights[i] for i in range(3))
         self.dots = make((worlds, arrays.takers(blocks, device)), self.real)
-        self.mass = (
-            make((worlds, blocks), block_inertia(self.real)) if drag else wp.array(host.mass, dtype=V, device=device)
-        )
+        self.mass = make((worlds, blocks), block_inertia(self.real)) if drag else net.mass
         bits = (host.fixed * [1, 2, 4]).sum(1).astype(np.uint8)
         self.fixed = wp.array(bits, dtype=wp.uint8, device=device)
         self.held = self.fixed  # components in space, for predictors: rates along oblique planes stay in them

@@ -72,7 +72,7 @@ class NetStep(PartStep):
         blocks = net.blocks
         self._sweep(
             self._begin,
-            [before.q, before.v, solver.held, self.drag.moves if self.drag else solver.mass]
+            [before.q, before.v, solver.held, net.moves]
             + [self.integrator._dt, self.damping, solver.outer, *islands.arrays, blocks],
             [solver.q, solver.base, solver.target],
         )

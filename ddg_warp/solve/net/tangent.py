@@ -23,10 +23,11 @@ class NetTangent(Part):
         host, worlds = model.net.host, model.worlds
         kind = np.zeros((host.blocks, 3), bool)
         kind[host.nodes :] = True
-        self.free, self.angle, mass = (np.tile(values.ravel(), worlds) for values in (~host.fixed, kind, host.mass))
-        super().__init__(model, model.net, offset, 3 * host.blocks * worlds, mass)
+        self.free, self.angle = (np.tile(values.ravel(), worlds) for values in (~host.fixed, kind))
+        super().__init__(model, model.net, offset, 3 * host.blocks * worlds)
         self.net, self.body_count = model.net, host.bodies.count * worlds
         self.rate = model.net.still  # over what strain-rate damping counts: at rest not
+        self.given_field = np.zeros((worlds, 3))  # of controls, over that of the scene [T]
         self.planes = HostPlanes(host, worlds) if host.frames else None
         self._anchored = host.fixed[: host.nodes].copy()
         for shell in host.shells:
@@ -157,6 +158,10 @@ class NetTangent(Part):
             self._motion.put(state, before, at, state.net.q, state.net.frame)
         self.prescribe(state, at)
 
+    def give(self, found: dict[str, np.ndarray]) -> None:
+        super().give(found)
+        self.given_field[:] = found.get("field", 0.0)
+
     def prescribe(self, state, at: float) -> None:
         """Put the normals that supports turn, and the magnetic field, where they are at load parameter `at`."""
         for index, data in state.net.data.items():
@@ -175,7 +180,9 @@ class NetTangent(Part):
                 for d in range(3):
                     values[row + d, element + columns] = turned[..., d]
             if part.term.measure.field:
-                values[-part.term.measure.field :] = self.model.scene.applied_field.at(at, at)[:, None]
+                first = part.term.measure.data_size - part.term.measure.field
+                values[first:] = self.model.scene.applied_field.at(at, at)[:, None]
+                values[first : first + 3] += np.repeat(at * self.given_field, part.elements, axis=0).T
             data.assign(values)
 
     def edges(self, q: np.ndarray) -> np.ndarray:

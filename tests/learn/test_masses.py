@@ -1,0 +1,248 @@
+"""Masses, rotary inertia and drag as parameters of steps and equilibria: against scenes built with them, and against differences."""
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp.errors import SceneError
+from tests.learn.differences import TIGHT, built
+from tests.learn.test_adjoint import CURVE, DT, SCENES, SOFT, T, a_scene
+
+torch = pytest.importorskip("torch")
+from ddg_warp.learn import gradient_objects  # noqa: E402
+from ddg_warp.torch import RodParameters, ShellParameters, Simulator  # noqa: E402
+from tests.learn.test_torch import check  # noqa: E402
+
+SECTIONS = {
+    "circle": lambda c: ddg.Circle(0.004 * c),
+    "ellipse": lambda c: ddg.Ellipse(0.004 * c, 0.003 * c),
+    "rectangle": lambda c: ddg.Rectangle(0.004 * c, 0.006 * c),
+    "ribbon": lambda c: ddg.Ribbon(0.01 * c, 0.002 * c),
+}
+OBJECTS = (
+    *SECTIONS,
+    "circle in a fluid",
+    "planar circle",
+    "joined circle",
+    "joined circle in a fluid",
+    "planar joined circle",
+)
+DENSITY, RADIUS = 1.7, 1.2
+
+
+def scene_of(name: str, radius: float = 1.0, density: float = 1.0) -> ddg.Scene:
+    """Rods with such a section, times a radius and a density; joined, in the plane, in a fluid."""
+    flat, fluid = "planar" in name, "fluid" in name
+    scene = ddg.Scene(gravity=(0.3, 0.0, -9.81), mass_damping=0.7, dimension=2 if flat else 3)
+    material = ddg.Material(1e6, density=1000.0 * density, viscosity=0.01)
+    section = next(make for own, make in SECTIONS.items() if own in name)(radius)
+
+    def rod(points):
+        return scene.add_rod(points * ([1.0, 0.0, 1.0] if flat else 1.0), section=section, material=material)
+
+    rods = [rod(CURVE)]
+    scene.clamp(rods[0])
+    scene.add_mass(rods[0], 2, 0.003)
+    if "joined" in name:
+        rods += [rod(CURVE[-1] + np.stack([0.1 * T, y * T, z * T], axis=1)) for y, z in ((0.2, 0.1), (-0.2, 0.05))]
+        scene.join([(rods[0], 5), (rods[1], 0), (rods[2], 0)])
+        scene.fix(rods[1], [5], components="xz")
+        scene.add_mass(rods[2], 0, 0.002)  # on the joint
+    if fluid:
+        scene.drag(rods[:1], ddg.Viscous(3.0))
+        for other in rods[1:]:
+            scene.drag(other, tangential=0.1, normal=0.2)
+    return scene
+
+
+def end(own: Simulator, parameters=None, statics: bool = False, worlds: int = 1) -> torch.Tensor:
+    """Positions and velocities after five steps, or positions at rest."""
+    if statics:
+        return own.equilibrium(parameters, batch=worlds, **TIGHT).positions
+    *_, state = own.rollout(own.initial_state(worlds), parameters, steps=5)
+    return torch.cat([state.positions, state.velocities], -1)
+
+
+def simulator(scene: ddg.Scene, scheme: str = "implicit_midpoint") -> Simulator:
+    return Simulator(built(scene), DT, scheme=scheme, **TIGHT)
+
+
+@pytest.mark.parametrize("statics", [False, True])
+@pytest.mark.parametrize("name", OBJECTS)
+def test_density_and_radius_are_those_that_rods_are_built_with(name, statics):
+    own = simulator(scene_of(name))
+    factors = RodParameters(own, names=("density", "radius"))
+    with torch.no_grad():
+        factors.logarithms["density"].fill_(np.log(DENSITY))
+        factors.logarithms["radius"].fill_(np.log(RADIUS))
+        found, other = end(own, factors(), statics), simulator(scene_of(name, RADIUS, DENSITY))
+        torch.testing.assert_close(found, end(other, None, statics), rtol=1e-9, atol=1e-11)
+        assert float((found - end(own, None, statics)).abs().max()) > 1e-3
+    for parameter, values in factors().items():
+        torch.testing.assert_close(values.detach(), other.parameter(parameter), rtol=1e-12, atol=1e-18)
+
+
+def test_every_world_has_its_own():
+    """Twice all masses, inertia, stiffnesses and drag move alike; half the mass alone does not."""
+    for name in ("circle in a fluid", "joined circle in a fluid"):
+        own = simulator(scene_of(name))
+        parameters = [n for n in own.engine(3).tables.names() if n.startswith(("rod.", "drag.")) or "stiffness" in n]
+        factor = torch.tensor([[1.0], [2.0], [1.0]], dtype=torch.float64)
+        given = {n: own.parameter(n, 3) * factor for n in parameters}
+        given["rod.mass"][2] *= 0.5
+        for statics in (False, True):
+            found = end(own, given, statics, 3)
+            torch.testing.assert_close(found[1], found[0], rtol=1e-8, atol=1e-11)
+            torch.testing.assert_close(found[0], end(own, None, statics, 3)[0], rtol=1e-8, atol=1e-11)
+            assert float((found[2] - found[0]).abs().max()) > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("name", "analysis"),
+    [(n, s) for n in ("twisted", "closed", "joined", "sheet") for s in ("implicit_euler", "implicit_midpoint")]
+    + [(n, "statics") for n in ("clamped_end", "joined", "sheet")]
+    + [
+        ("planar", "implicit_euler"),
+        ("planar", "statics"),
+        ("stiffened", "implicit_midpoint"),
+        ("stiffened", "statics"),
+    ],
+)
+def test_masses_under_gravity_that_is_given(name, analysis):
+    """Gradients by masses go by the gravity of their world, and every kind of mass is there."""
+    statics = analysis == "statics"
+    own = Simulator(built(SCENES[name]()), DT, scheme="implicit_euler" if statics else analysis, **TIGHT)
+    masses = [n for n in own.engine(2).tables.names() if n.endswith((".mass", ".inertia"))]
+    assert masses
+    torch.manual_seed(2)
+    weight = torch.randn((2, own.model.points_count, 3), dtype=torch.float64)
+    gravity = torch.tensor([[2.0, 0.0, -12.0], [-1.0, 0.0, -3.0]], dtype=torch.float64)
+
+    def loss(gravity, **given):
+        given = {key.replace("__", "."): values for key, values in given.items()}
+        if statics:
+            return (weight * own.equilibrium(given, {"gravity": gravity}, batch=2, **TIGHT).positions).sum()
+        state = own.initial_state(2)
+        *_, state = own.rollout(state, given, {"gravity": gravity}, steps=3)
+        return (weight * state.positions).sum() + 0.1 * (weight * state.velocities).sum()
+
+    values = {n.replace(".", "__"): own.parameter(n, 2) for n in masses if not (statics and n == "rod.inertia")}
+    sizes = {key: (0.01 if "inertia" in key else 1e-3) * float(found.max()) for key, found in values.items()}
+    check(loss, {"gravity": gravity} | values, {"gravity": 2e-3} | sizes)
+
+
+def test_it_repeats_and_leaves_nothing():
+    for name in ("circle in a fluid", "joined circle"):
+        own = simulator(scene_of(name))
+        plain = end(own)
+        mass = 2.0 * own.parameter("rod.mass")
+
+        def once(own=own, mass=mass):
+            given = mass.clone().requires_grad_()
+            found = end(own, {"rod.mass": given})
+            return found.detach(), *torch.autograd.grad((found**2).sum(), given)
+
+        for one, other in zip(once(), once(), strict=True):
+            torch.testing.assert_close(one, other, rtol=0.0, atol=0.0)
+        torch.testing.assert_close(end(own), plain, rtol=0.0, atol=0.0)
+        rest = end(own, None, statics=True)
+        assert (end(own, {"rod.mass": mass}, statics=True) != rest).any()
+        torch.testing.assert_close(end(own, None, statics=True), rest, rtol=0.0, atol=0.0)
+
+
+def test_worlds_of_a_map_are_those_of_a_batch():
+    own = simulator(scene_of("circle"))
+    masses = own.parameter("rod.mass") * torch.tensor([[1.0], [1.5]], dtype=torch.float64)
+
+    def loss(mass):
+        return (end(own, {"rod.mass": mass}) ** 2).sum()
+
+    found = torch.func.vmap(torch.func.grad(loss))(masses[:, None])
+    for one, mass in zip(found, masses, strict=True):
+        torch.testing.assert_close(one, torch.func.grad(loss)(mass[None]), rtol=1e-9, atol=1e-12)
+
+
+def test_a_rod_and_its_shell_have_masses_of_their_own():
+    """Which add up where they share a node."""
+
+    def stiffened(density: float = 1.0) -> ddg.Scene:
+        scene = a_scene()
+        gradient_objects.OBJECTS["rod on a shell"][1](scene, gradient_objects.soft(density))
+        return scene
+
+    own = simulator(stiffened())
+    assert own.parameter("rod.mass").shape[1] + own.parameter("shell.mass").shape[1] == own.model.points_count
+    rod, shell = RodParameters(own, names=("density",)), ShellParameters(own, ("density",))
+    with torch.no_grad():
+        rod.logarithms["density"].fill_(np.log(2.0))
+        shell.changes["density"].fill_(np.log(2.0))
+        both = end(own, rod() | shell())
+        torch.testing.assert_close(both, end(simulator(stiffened(2.0))), rtol=1e-8, atol=1e-10)
+        assert float((both - end(own, shell())).abs().max()) > 1e-6
+        assert float((both - end(own, rod())).abs().max()) > 1e-6
+
+
+def _magnetise(scene: ddg.Scene) -> None:
+    scene.magnetize(0, 1e3)
+    scene.magnetic_field((0.0, 0.0, 1e-3))
+
+
+@pytest.mark.parametrize(
+    ("change", "names", "match"),
+    [
+        (lambda s: s.add_rod(CURVE + 1.0, section=ddg.Stiffness(1.0, 1e-4, GJ=1e-4)), ("radius",), "of a Stiffness"),
+        (_magnetise, ("radius",), "'rod' are magnetised"),
+        (lambda s: None, ("mass",), "no rod has 'mass'; there is stretching, bending, twisting, density, radius"),
+    ],
+)
+def test_what_no_rod_has_is_refused(change, names, match):
+    scene = ddg.Scene()
+    scene.add_rod(CURVE, section=ddg.Circle(0.004), material=SOFT)
+    change(scene)
+    with pytest.raises(SceneError, match=match):
+        RodParameters(Simulator(built(scene), DT), names=names)
+
+
+def test_densities_that_are_none_are_refused():
+    scene = ddg.Scene()
+    scene.add_rod(CURVE, section=ddg.Circle(0.004), material=ddg.Material(1e6, density=0.0))
+    with pytest.raises(SceneError, match="no rod has 'density'"):
+        RodParameters(Simulator(built(scene), DT), names=("density",))
+
+
+@pytest.mark.parametrize(
+    ("given", "match"),
+    [
+        ({"rod.mass": 0.0}, "rod.mass: value 0 is 0; it is finite and positive"),
+        ({"rod.mass": [[np.nan]]}, "rod.mass: value 0 is nan; it is finite and positive"),
+        ({"rod.inertia": -1.0}, "rod.inertia: value 0 is -1; it is finite and not negative"),
+        ({"rod.mass": torch.ones(4)}, r"rod.mass has shape \(4,\); give \(\), \(1, 1\) for each world, \(1, 6\)"),
+        ({"shell.mass": 1.0}, "nothing has 'shell.mass'; this model has .*rod.mass, rod.inertia, drag.tangential"),
+        ({"drag.speed": 1.0}, "nothing has 'drag.speed'"),
+        ({"drag.normal": "thick"}, "drag.normal = 'thick'; give numbers"),
+    ],
+)
+def test_what_does_not_fit_is_refused(given, match):
+    own = simulator(scene_of("circle in a fluid"))
+    with pytest.raises(SceneError, match=match):
+        own.step(own.initial_state(), given)
+
+
+@pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
+@pytest.mark.parametrize("factor", [1.0, 1e3, 1e6])
+def test_mixed_precision_knows_what_is_given(scheme, factor):
+    """Of rods that a tensor makes stiffer by far than the model's, which float32 serves; by 1e6 they are taken in float64."""
+    names = [f"rod_bend_twist.stiffness_{k}" for k in (1, 2, 3)] + ["rod_stretch.stiffness"]
+
+    def gradient(precision):
+        along = np.linspace(0.0, 1.0, 24)
+        curve = np.stack([0.3 * along, 0.05 * np.sin(3.0 * along), 0.04 * np.cos(5.0 * along)], axis=1)
+        scene = ddg.Scene(gravity=(0.3, 0.2, -9.81))
+        scene.clamp(scene.add_rod(curve, section=ddg.Circle(0.004), material=ddg.Material(1e4, density=1000.0)))
+        own = Simulator(scene.build("cpu", precision), DT, scheme=scheme, **TIGHT)
+        given = {name: (factor * own.parameter(name)).requires_grad_() for name in names}
+        *_, state = own.rollout(own.initial_state(), given, steps=5)
+        return torch.cat(torch.autograd.grad(state.positions[0, -1, 2], list(given.values())), 1)
+
+    exact, mixed = gradient("float64"), gradient("mixed")
+    assert float((mixed - exact).norm()) < 1e-6 * float(exact.norm())
