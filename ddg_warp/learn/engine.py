@@ -10,7 +10,7 @@ import torch
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.adjoint.step import smooth_kernel
+from ddg_warp.kernels.adjoint.step import smooth_kernel, solved_kernel
 from ddg_warp.learn.adjoint import Adjoint, EquilibriumAdjoint
 from ddg_warp.learn.chains import Kept
 from ddg_warp.learn.controls import StepControls
@@ -53,7 +53,8 @@ class Engine:
         self.before, self.after = (buffer.own for buffer in self.integrator._buffers)
         self.source, self.target = (tensors(state, self.fields) for state in (self.before, self.after))
         self.controls = StepControls(self)
-        self._flagged, self._streams = {}, {}
+        self._flagged, self._told, self._streams = {}, {}, {}
+        self._solves = solved_kernel(model.types.real)
         self._graphs = self._by_start = None
 
     # steps
@@ -129,15 +130,20 @@ class Engine:
         if adjoint.net:
             parts.append(self._net_kept(start, dt))
 
+        told = [self._told_by(own.solve.failed) for own in adjoint.parts]
+        self._solved_by = [place[-1] for place in told]
+
         def launch():
             self._found = adjoint.pull_parts(self.before, self.after, parts, self._given, s)
+            for failed, place, _ in told:
+                if failed is not None:
+                    wp.launch(self._solves, failed.shape, [failed], [place], device=failed.device)
 
         if all(own.solve.system for own in adjoint.parts):
             self._graphs.replay(dt, launch)
         else:
             launch()
         found, inputs = self._found
-        self._solved_by = [own.solve.failed for own in adjoint.parts]
         if self.poses:
             ends = self.before, self.after
             self.poses.pull_step(found, inputs, ends, self._given, "poses" in controls)
@@ -172,7 +178,7 @@ class Engine:
 
     def _load(self) -> None:
         kernels = [kernel for own in self.adjoint.parts for kernel in own.kernels]
-        arrays.load_kernels(kernels, self.model.wp_device)
+        arrays.load_kernels([*kernels, self._solves], self.model.wp_device)
 
     def _net_kept(self, start: float, dt: float) -> NetKept:
         """Of the net: joints' rotations are those at the rates of the step, as their dofs begin it at zero."""
@@ -247,7 +253,17 @@ class Engine:
         """Flags of a step, not numbers where its reverse has failed, too: of rods that are at no minimum, and of nets that conjugate
         gradients have not solved."""
         found = zip(flags, self._solved_by, strict=True)
-        return [flag if bad is None else torch.where(view(bad) == 0, flag, float("nan")) for flag, bad in found]
+        return [flag if solved is None else flag * solved for flag, solved in found]
+
+    def _told_by(self, failed: wp.array | None) -> tuple:
+        """What tells which islands a reverse has failed in, where a step leaves one or not a number for them, and as a tensor; None
+        where nothing tells."""
+        if id(failed) not in self._told:
+            place = None
+            if failed is not None:
+                place = wp.ones(failed.shape, dtype=self.model.types.real, device=failed.device)
+            self._told[id(failed)] = failed, place, None if place is None else view(place)
+        return self._told[id(failed)]
 
     @property
     def parts(self) -> int:

@@ -4,6 +4,7 @@ from math import pi
 
 import numpy as np
 import torch
+import warp as wp
 
 from ddg_warp.errors import SceneError
 from ddg_warp.learn import constants
@@ -46,18 +47,19 @@ class RodParameters(torch.nn.Module):
                 raise SceneError(f"RodParameters: no rod has {name!r}; there is {', '.join(known) or 'no rod'}")
         if "radius" in names:
             _require_sizes(model.scene)
+        made = {"dtype": torch.float64, "device": str(wp.device_to_torch(model.wp_device))}
         self.logarithms = torch.nn.ParameterDict(
-            {name: torch.nn.Parameter(torch.zeros((batch or 1, 1), dtype=torch.float64)) for name in names}
+            {name: torch.nn.Parameter(torch.zeros((batch or 1, 1), **made)) for name in names}
         )
         # in one order, as DistributedDataParallel tells buffers of its processes apart by that
         self._powers = {own: power for own, power in powers.items() if not power.keys().isdisjoint(names)}
         for own in self._powers:
             self.register_buffer(parameter_key(own), usual_values(simulator, own))
         if "rod.mass" in self._powers:
-            self.register_buffer("_sections", torch.tensor(constants.of_sections(model, "rod.mass")))
+            self.register_buffer("_sections", torch.tensor(constants.of_sections(model, "rod.mass"), **made))
         for own in ("drag.tangential", "drag.normal", "drag.rotational"):
             if own in self._powers:
-                self.register_buffer(f"{parameter_key(own)}_share", torch.tensor(_share(model, own)))
+                self.register_buffer(f"{parameter_key(own)}_share", torch.tensor(_share(model, own), **made))
 
     def forward(self) -> dict[str, torch.Tensor]:
         """Their values, as `Simulator.step` takes them."""

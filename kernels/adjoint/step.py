@@ -253,3 +253,15 @@ def smooth_kernel(real):
         smooth_out[r] = wp.where(same, real(1.0), real(wp.nan))
 
     return smooth
+
+
+@cache
+def solved_kernel(real):
+    """solved(...): one for islands whose linear system has not `failed`, else not a number."""
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def solved(failed: wp.array(dtype=int), solved_out: wp.array(dtype=real)):
+        r = wp.tid()
+        solved_out[r] = wp.where(failed[r] == 0, real(1.0), real(wp.nan))
+
+    return solved
