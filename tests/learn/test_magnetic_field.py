@@ -10,7 +10,7 @@ from tests.learn.test_adjoint import CURVE, DT, SOFT
 
 torch = pytest.importorskip("torch")
 from ddg_warp.torch import Simulator  # noqa: E402
-from tests.learn.test_torch import check  # noqa: E402
+from tests.learn.test_torch import check, normal  # noqa: E402
 
 
 @pytest.fixture
@@ -63,7 +63,7 @@ def test_gradients_of_every_step(scheme, fields):
     """Each of three steps has a field of its own, also where the reverse comes after other steps."""
     own = magnet(scheme)
     torch.manual_seed(0)
-    weight = torch.randn((own.model.points_count, 3), dtype=torch.float64)
+    weight = normal(own.model.points_count, 3)
 
     def loss(given):
         state = own.initial_state(2)
@@ -138,7 +138,7 @@ def test_equilibria_take_it(scheme, fields):
 
 def test_gradients_of_equilibria(fields):
     own = magnet("implicit_euler", (1e-2, 0.0, 0.0))
-    weight = torch.randn((own.model.points_count, 3), dtype=torch.float64)
+    weight = normal(own.model.points_count, 3)
 
     def loss(field):
         return (weight * own.equilibrium(None, {"field": field}, batch=2, end=0.7, **TIGHT).positions).sum()

@@ -5,13 +5,14 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.errors import SceneError
+from tests.learn import differences
 from tests.learn.differences import TIGHT, built
 from tests.learn.test_adjoint import CURVE, DT, SCENES, SOFT, T, a_scene
 
 torch = pytest.importorskip("torch")
 from ddg_warp.learn import gradient_objects  # noqa: E402
 from ddg_warp.torch import RodParameters, ShellParameters, Simulator  # noqa: E402
-from tests.learn.test_torch import check  # noqa: E402
+from tests.learn.test_torch import check, normal  # noqa: E402
 
 SECTIONS = {
     "circle": lambda c: ddg.Circle(0.004 * c),
@@ -115,7 +116,7 @@ def test_masses_under_gravity_that_is_given(name, analysis):
     masses = [n for n in own.engine(2).tables.names() if n.endswith((".mass", ".inertia"))]
     assert masses
     torch.manual_seed(2)
-    weight = torch.randn((2, own.model.points_count, 3), dtype=torch.float64)
+    weight = normal(2, own.model.points_count, 3)
     gravity = torch.tensor([[2.0, 0.0, -12.0], [-1.0, 0.0, -3.0]], dtype=torch.float64)
 
     def loss(gravity, **given):
@@ -124,10 +125,12 @@ def test_masses_under_gravity_that_is_given(name, analysis):
             return (weight * own.equilibrium(given, {"gravity": gravity}, batch=2, **TIGHT).positions).sum()
         state = own.initial_state(2)
         *_, state = own.rollout(state, given, {"gravity": gravity}, steps=3)
-        return (weight * state.positions).sum() + 0.1 * (weight * state.velocities).sum()
+        moved = (weight * state.positions).sum() + 0.1 * (weight * state.velocities).sum()
+        return moved + state.angles.square().sum()
 
     values = {n.replace(".", "__"): own.parameter(n, 2) for n in masses if not (statics and n == "rod.inertia")}
-    sizes = {key: (0.01 if "inertia" in key else 1e-3) * float(found.max()) for key, found in values.items()}
+    turned = 0.05 if name == "stiffened" else 0.01  # where little depends on it, what rounding leaves counts
+    sizes = {key: (turned if "inertia" in key else 1e-3) * float(found.max()) for key, found in values.items()}
     check(loss, {"gravity": gravity} | values, {"gravity": 2e-3} | sizes)
 
 
@@ -239,7 +242,7 @@ def test_mixed_precision_knows_what_is_given(scheme, factor):
         curve = np.stack([0.3 * along, 0.05 * np.sin(3.0 * along), 0.04 * np.cos(5.0 * along)], axis=1)
         scene = ddg.Scene(gravity=(0.3, 0.2, -9.81))
         scene.clamp(scene.add_rod(curve, section=ddg.Circle(0.004), material=ddg.Material(1e4, density=1000.0)))
-        own = Simulator(scene.build("cpu", precision), DT, scheme=scheme, **TIGHT)
+        own = Simulator(scene.build(differences.DEVICE, precision), DT, scheme=scheme, **TIGHT)
         given = {name: (factor * own.parameter(name)).requires_grad_() for name in names}
         *_, state = own.rollout(own.initial_state(), given, steps=5)
         return torch.cat(torch.autograd.grad(state.positions[0, -1, 2], list(given.values())), 1)

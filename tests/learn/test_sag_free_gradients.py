@@ -9,6 +9,7 @@ from tests.test_sag_free import scene_of_all
 
 torch = pytest.importorskip("torch")
 from ddg_warp.torch import Simulator  # noqa: E402
+from tests.learn.test_torch import normal  # noqa: E402
 
 ALONE = 66  # nodes of the first two rods, which bear their weight alone
 
@@ -26,7 +27,7 @@ def test_more_weight_and_the_rest_strains_for_it_move_nothing():
     assert (found - points).abs().max() < 1e-10
 
     torch.manual_seed(0)
-    weight = torch.randn((ALONE, 3), dtype=points.dtype)
+    weight = normal(ALONE, 3)
     *by_rest, by_gravity = torch.autograd.grad((weight * found[:ALONE]).sum(), [*parameters.values(), gravity])
     change = [torch.tensor(whole[name] - none[name]) for name in whole]
     by_strains = sum((one * other).sum() for one, other in zip(by_rest, change, strict=True)).item()

@@ -15,7 +15,7 @@ from tests.learn.test_adjoint import DT
 
 torch = pytest.importorskip("torch")
 from ddg_warp.torch import ShellParameters, Simulator  # noqa: E402
-from tests.learn.test_torch import check  # noqa: E402
+from tests.learn.test_torch import check, normal  # noqa: E402
 
 NUMBERS, FORMS, MASS = ("young", "thickness", "poisson"), ("metric", "curvature"), ("density",)
 BENDING = ("midedge_dof", "midedge_boundary", "midedge", "hinge", "isometric")
@@ -62,12 +62,12 @@ def sheets(bending: str = "midedge_dof", values: dict | None = None) -> ddg.Scen
     return scene
 
 
-def changed(module: ShellParameters, seed: int = 0) -> ShellParameters:
+def changed(module: ShellParameters, seed: int = 0, size: float = 0.2) -> ShellParameters:
     """With random changes."""
     torch.manual_seed(seed)
     with torch.no_grad():
         for values in module.changes.values():
-            values.add_(0.2 * torch.randn(values.shape, dtype=values.dtype))
+            values.add_(size * normal(*values.shape))
     return module
 
 
@@ -111,9 +111,10 @@ def test_gradients(bending, statics):
     names = (NUMBERS if bending == "hinge" else NUMBERS + FORMS) + MASS
     own = Simulator(built(sheets(bending)), DT, **TIGHT)
     shares = np.column_stack([np.ones(20), np.linspace(-1.0, 1.0, 20)])
-    module = changed(ShellParameters(own, names, by=shares, batch=2), seed=5)
+    # sheets that grow by a fifth are thrown about: differences then meet other solutions
+    module = changed(ShellParameters(own, names, by=shares, batch=2), seed=5, size=0.05)
     first = own.equilibrium(module(), batch=2).detach() if statics else None
-    weight = torch.randn((own.model.points_count, 3), dtype=torch.float64)
+    weight = normal(own.model.points_count, 3)
 
     def loss(**changes):
         given = torch.func.functional_call(module, {f"changes.{name}": values for name, values in changes.items()})
@@ -122,7 +123,11 @@ def test_gradients(bending, statics):
             *_, state = own.rollout(state, given, steps=3)
         return (weight * state.positions).sum()
 
-    check(loss, {name: values.detach() for name, values in module.changes.items()}, dict.fromkeys(names, 1e-3))
+    check(
+        loss,
+        {name: values.detach() for name, values in module.changes.items()},
+        dict.fromkeys(names, 1e-3) | dict.fromkeys(set(FORMS) & set(names), 1e-4),
+    )
 
 
 def test_one_of_two_shells_is_learned():

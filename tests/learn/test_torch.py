@@ -40,13 +40,18 @@ def gripped(scheme: str = "implicit_euler") -> Simulator:
     return Simulator(built(scene), DT, scheme=scheme, **TIGHT)
 
 
+def normal(*shape: int):
+    """Normal numbers, the same on every device."""
+    return torch.randn(shape, dtype=torch.float64, device="cpu").to(differences.DEVICE)
+
+
 def check(loss, values: dict, sizes: dict) -> None:
     """The gradient of loss(**values) along random directions against central differences of fourth order."""
     values = {name: value.clone().requires_grad_() for name, value in values.items()}
     gradients = torch.autograd.grad(loss(**values), values.values())
     torch.manual_seed(3)
     for (name, value), gradient in zip(values.items(), gradients, strict=True):
-        direction = torch.rand(value.shape, dtype=value.dtype)
+        direction = torch.rand(value.shape, dtype=value.dtype, device="cpu").to(value.device)
         direction = direction * torch.where(gradient < 0.0, -1.0, 1.0) * (gradient != 0.0)
         found, step = float((gradient * direction).sum()), sizes[name]
         with torch.no_grad():
@@ -61,8 +66,8 @@ def test_everything_that_goes_in_has_a_gradient(name):
     first = torch.tensor(own.model.state().points())
     flat = torch.tensor([1.0, 0.0, 1.0] if name == "planar" else [1.0, 1.0, 1.0])
     torch.manual_seed(1)
-    force = 1e-3 * torch.randn((2, len(first), 3), dtype=torch.float64) * flat
-    weight = torch.randn((len(first), 3), dtype=torch.float64)
+    force = 1e-3 * normal(2, len(first), 3) * flat
+    weight = normal(len(first), 3)
 
     def loss(positions, velocities, stiffness, forces, gravity):
         state = own.initial_state(positions=positions, velocities=velocities)
@@ -199,7 +204,7 @@ def test_a_world_without_a_gradient_says_so_alone():
     points = own.model.points_count
     speed = torch.zeros((2, points, 3), dtype=torch.float64)
     torch.manual_seed(0)
-    speed[1, 2:] = torch.randn((points - 2, 3), dtype=torch.float64)
+    speed[1, 2:] = normal(points - 2, 3)
     speed.requires_grad_()
     state = own.step(own.initial_state(velocities=speed))
     (gradient,) = torch.autograd.grad((state.positions**2).sum(), speed)
@@ -256,15 +261,15 @@ def test_equilibria_under_controls(name, end):
     points, edges = own.model.points_count, own.model.order.edges_count
     flat = torch.tensor([1.0, 0.0, 1.0] if name == "planar" else [1.0, 1.0, 1.0])
     torch.manual_seed(1)
-    weight = torch.randn((points, 3), dtype=torch.float64)
+    weight = normal(points, 3)
     values = {
-        "forces": 1e-3 * torch.randn((2, points, 3), dtype=torch.float64) * flat,
+        "forces": 1e-3 * normal(2, points, 3) * flat,
         "gravity": torch.tensor([[0.0, 0.0, -9.81], [1.0, 0.0, -5.0]], dtype=torch.float64),
         "stiffness": own.parameter(term, 2),
     }
     sizes = {"forces": 1e-5, "gravity": 1e-2, "stiffness": 1e-2 * float(values["stiffness"].max())}
     if name in ("twisted", "joined"):
-        values["moments"], sizes["moments"] = 1e-5 * torch.randn((2, edges), dtype=torch.float64), 1e-7
+        values["moments"], sizes["moments"] = 1e-5 * normal(2, edges), 1e-7
 
     def loss(stiffness, **controls):
         found = own.equilibrium({term: stiffness}, controls, batch=2, rtol=1e-13, end=end)
@@ -299,7 +304,7 @@ def test_equilibria_by_poses(hold):
         hold(scene)
         own = Simulator(built(scene), DT)
     torch.manual_seed(2)
-    weight = torch.randn((own.model.points_count, 3), dtype=torch.float64)
+    weight = normal(own.model.points_count, 3)
     poses = torch.tensor([[[0.001, 0.002, -0.001, 0.02, 0.01, 0.03]], [[0.0, 0.001, 0.0, 0.05, -0.04, 0.01]]])
     values, sizes = {"poses": poses.double()}, {"poses": 1e-5}
     if hold is not pressed_by_a_grip:
