@@ -15,6 +15,7 @@ class StepControls:
         self.engine, self.model, self.layout = engine, engine.model, engine.layout
         real = wp.dtype_to_torch(self.model.types.real)
         self._usual = torch.tensor(np.array(self.model.scene.gravity, float), dtype=real, device=engine.device)
+        self._pulled_by = False  # gravity that was given
 
     def give(self, controls: dict) -> None:
         """Hand the integrator loads and poses; masses that parameters give are loads, too, which residuals are compared with."""
@@ -51,10 +52,17 @@ class StepControls:
             place.zero_()
 
     def give_gravity(self, controls: dict, adjoint) -> None:
-        """Hand the reverse the gravity of a step."""
-        own = controls.get("gravity", self._usual)
-        for part in adjoint.parts:
-            view(part.gravity).copy_(own[..., list(part.axes)])
+        """Hand the reverse the gravity of a step; it has the scene's at first."""
+        given = "gravity" in controls
+        if given or self._pulled_by:
+            own = controls.get("gravity", self._usual)
+            for i, part in enumerate(adjoint.parts):
+                view(part.gravity).copy_(own.index_select(-1, self._axes(i, part.axes)))
+        self._pulled_by = given
+
+    def _axes(self, part: int, axes) -> torch.Tensor:
+        """Components of space that a part of the model has."""
+        return self.layout.places(("axes", part), lambda: [list(axes)])[0]
 
     def pull(self, name: str, value: torch.Tensor, inputs: list, flags) -> torch.Tensor:
         """Derivatives by what a step, or an equilibrium at full load, is given (worlds, ...)."""
@@ -74,12 +82,12 @@ class StepControls:
             if name == "gravity":
                 own = view(found.gravity) * flags[i][:, None]
                 own = own.reshape(group.nodes, worlds, group.rods, -1).sum((0, 2))
-                result[:, list(group.host.axes)] += own
+                result.index_add_(1, self._axes(i, group.host.axes), own)
                 continue
             w = (view(found.load) * flags[i]).reshape(-1, group.nodes, worlds, group.rods)
             if name == "forces":
                 k, column, rows = self.layout.places(("points", i), lambda group=group: model.order.places(group))
-                result[:, rows[:, None], torch.tensor(group.host.axes)] = w[: group.kind.dim, k, :, column].permute(
+                result[:, rows[:, None], self._axes(i, group.host.axes)] = w[: group.kind.dim, k, :, column].permute(
                     2, 0, 1
                 )
             elif group.kind.twist:

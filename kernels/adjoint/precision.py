@@ -12,7 +12,7 @@ import warp as wp
 from ddg_warp.kernels.chain import ChainKind, gather_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
-PART = 32  # nodes that a thread goes over
+PART = 8  # nodes that a thread goes over
 STIFFEST, SOFTEST, MASS = range(
     3
 )  # rows: largest of an edge or node, least of bending over lengths, sum [N/m, N m^3, kg]
