@@ -67,8 +67,22 @@ def test_a_law_of_ones_own(device, analysis, monkeypatch):
     assert {"rod_bend_twist.modulus", "rod_bend_twist.limit"} <= {r["input"] for r in rows if r["result"] == "right"}
 
 
-def test_the_command_prints_it(tmp_path, capsys):
-    assert main(["gradients", "planar rod", "--analysis", "implicit_euler", "--out", str(tmp_path / "table")]) == 0
+def test_the_command_prints_it(tmp_path, capsys, device):
+    assert (
+        main(
+            [
+                "gradients",
+                "planar rod",
+                "--analysis",
+                "implicit_euler",
+                "--device",
+                device,
+                "--out",
+                str(tmp_path / "table"),
+            ]
+        )
+        == 0
+    )
     printed = capsys.readouterr().out
     assert "planar_bend.stiffness" in printed
     assert "0 wrong" in printed
@@ -77,12 +91,12 @@ def test_the_command_prints_it(tmp_path, capsys):
     assert "there is no 'balloon'; there are rod" in capsys.readouterr().err
 
 
-def test_what_is_wrong_fails(monkeypatch, capsys):
+def test_what_is_wrong_fails(monkeypatch, capsys, device):
     """A gradient that is lost, and one that is off."""
     usual = gradients.Input.found
     spoilt = {"velocities": 0.0, "gravity": 1.01}
     monkeypatch.setattr(gradients.Input, "found", lambda own: usual(own) * spoilt.get(own.name, 1.0))
-    assert main(["gradients", "planar rod", "--analysis", "implicit_euler"]) == 1
+    assert main(["gradients", "planar rod", "--analysis", "implicit_euler", "--device", device]) == 1
     printed = capsys.readouterr().out
     assert "SILENT ZERO" in printed
     assert "WRONG" in printed
