@@ -257,25 +257,21 @@ def gather_kernels(kind: ChainKind, real):
     block, closed, gathered = kind.block, kind.closed, gathered_function(kind, real)
     _, behind, *_ = node_functions(kind, real)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def end(window_in: wp.array3d(dtype=real), count: wp.array(dtype=int), dof_out: wp.array3d(dtype=real)):
-        k, r = wp.tid()
-        n = count[r]
-        if k >= n:
-            return
-        q = gathered(window_in, k, n, r)
-        for d in range(wp.static(block)):
-            dof_out[d, k, r] = q[d]
+    def gather_kernel(adds: bool):
+        @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+        def gather(window_in: wp.array3d(dtype=real), count: wp.array(dtype=int), dof_out: wp.array3d(dtype=real)):
+            k, r = wp.tid()
+            n = count[r]
+            if k >= n:
+                return
+            q = gathered(window_in, k, n, r)
+            for d in range(wp.static(block)):
+                if wp.static(adds):
+                    dof_out[d, k, r] = dof_out[d, k, r] + q[d]
+                else:
+                    dof_out[d, k, r] = q[d]
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def nodes(window_in: wp.array3d(dtype=real), count: wp.array(dtype=int), dof_out: wp.array3d(dtype=real)):
-        k, r = wp.tid()
-        n = count[r]
-        if k >= n:
-            return
-        q = gathered(window_in, k, n, r)
-        for d in range(wp.static(block)):
-            dof_out[d, k, r] = dof_out[d, k, r] + q[d]
+        return gather
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def edges(lag_in: wp.array3d(dtype=real), count: wp.array(dtype=int), frame_out: wp.array3d(dtype=real)):
@@ -290,4 +286,4 @@ def gather_kernels(kind: ChainKind, real):
                 total += lag_in[6 + c, b, r]
             frame_out[c, k, r] = frame_out[c, k, r] + total
 
-    return end, nodes, edges
+    return gather_kernel(False), gather_kernel(True), edges
