@@ -22,7 +22,7 @@ class BroadPhase:
     All that is within thickness + `reach` is among the candidates as long as no node has moved by more than half of `margin` since they
     were found. `update`, `bound`, `hold`, `impact` and `crossings` read nothing back and can be captured, `update` and `search` in
     conditional parts of graphs, too. `rebuild` can be captured, on CUDA outside of those alone; there every step should begin with it.
-    `fit` and `check` read, between launches of graphs.
+    `fit` and `check` read, between launches of graphs; what is not finite touches nothing, until they name it.
 
     Args:
         shapes: what may touch in one world.
@@ -55,8 +55,6 @@ class BroadPhase:
         self.device, real = x.device, x.dtype._wp_scalar_type_
         self.real = real
         things = {size: Things(shapes, size, worlds, real, self.device) for size in shapes.sizes}
-        if max(part.all for part in things.values()) >= 2**31:
-            raise SceneError("a contact search has 2^31 edges or more in all worlds; use fewer worlds")
         self._things = list(things.values())
         self._seen, self._still = (wp.zeros(len(x), dtype=x.dtype, device=self.device) for _ in range(2))
         self.overflow, self.searches, self._stale, self._lost, self.held = (

@@ -3,6 +3,7 @@
 import numpy as np
 import warp as wp
 
+from ddg_warp.errors import SceneError
 from ddg_warp.kernels.contact.boxes import box_kernel
 from ddg_warp.kernels.contact.surfaces import surface_struct
 
@@ -17,6 +18,10 @@ class Things:
     def __init__(self, shapes, size: int, worlds: int, real, device):
         nodes, radius, owner, span = shapes.things(size)
         self.count, self.all, self.size = len(nodes), worlds * len(nodes), size
+        if self.all >= 2**31:
+            raise SceneError(
+                f"{worlds} worlds of {self.count} edges, points or triangles each are 2^31 or more; use fewer worlds"
+            )
         self.surface = surface_struct(real)()
         self.surface.nodes = wp.array(np.ascontiguousarray(nodes), dtype=int, device=device)
         self.surface.radius = wp.array(radius, dtype=real, device=device)
