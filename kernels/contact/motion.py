@@ -2,9 +2,8 @@
 
 Node i may move by b_i = min(q min_pairs (d - keep thickness) / 2, (margin + reach) / 2 - moved_i), with 0 < q < 1 and the distance d of
 the pairs among the candidates that it belongs to: of a pair both sides take half, and every point of an edge or triangle moves no
-farther than one of its nodes; pairs that are no candidates were farther apart than thickness + margin + reach at the search. Wu, Wang
-and Wang (Computer Graphics Forum 2020) and Lan et al., "Penetration-free projective dynamics on the GPU" (ACM ToG 41(4), 2022), bound
-vertices alike.
+farther than one of its nodes; pairs that are no candidates were farther apart than thickness + margin + reach at the search. Bounds
+of this kind are those of Chen et al., "Offset geometric contact", ACM ToG 44(4), 2025.
 """
 
 from functools import cache
