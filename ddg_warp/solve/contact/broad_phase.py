@@ -1,0 +1,236 @@
+"""Candidates of contact on a device, how long they hold, and how far nodes may move; see `kernels.contact`."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.kernels.contact.impact import impact_kernel
+from ddg_warp.kernels.contact.motion import motion_kernels
+from ddg_warp.kernels.contact.surfaces import EDGES, POINT_TRIANGLE
+from ddg_warp.solve.contact.pairs import PairList
+from ddg_warp.solve.contact.shapes import Shapes
+from ddg_warp.solve.contact.tree import Things
+
+SLACK = 1e-3  # of the margin, by which a search goes beyond it, for rounding
+NONE = np.iinfo(np.int64).max
+
+
+class BroadPhase:
+    """Pairs of `shapes` that are near, in each of some worlds.
+
+    All that is within thickness + `reach` is among the candidates as long as no node has moved by more than half of `margin` since they
+    were found. `update`, `bound`, `hold`, `impact` and `crossings` read nothing back and can be captured, `update` and `search` in
+    conditional parts of graphs, too. `rebuild` can be captured, on CUDA outside of those alone; there every step should begin with it.
+    `fit` and `check` read, between launches of graphs; what is not finite touches nothing, until they name it.
+
+    Args:
+        shapes: what may touch in one world.
+        x: positions (worlds times nodes,), vectors of 3 [m], one world after the other.
+        reach: gap [m] within which surfaces matter, positive.
+        margin: by how much farther candidates may be apart when they are found [m], positive: large ones are more pairs, small ones
+            more searches.
+
+    Attributes:
+        lists: a `PairList` for each kind of pairs that there can be.
+        overflow: (1,), not zero once pairs did not fit: `fit` has to follow, and whatever came of the pairs is to be done again.
+        searches: (1,) how many there were; held: (1,) how many displacements were shortened.
+        bounds: (worlds times nodes,) [m]; gap [m], time and crossed, of each world: see `bound`, `impact` and `crossings`.
+        version: grows whenever arrays were replaced by larger ones, and graphs that hold them have to be captured anew.
+
+    Raises:
+        SceneError: if x, reach or margin are not as they should be.
+    """
+
+    def __init__(self, shapes: Shapes, x: wp.array, worlds: int = 1, *, reach: float, margin: float):
+        for name, value in (("reach", reach), ("margin", margin)):
+            if not 0.0 < value < np.inf:
+                raise SceneError(f"{name} = {value!r} of a contact search; it is positive and finite [m]")
+        nodes = len(shapes.points)
+        if x.ndim != 1 or len(x) != worlds * nodes or x.dtype not in (wp.vec3f, wp.vec3d):
+            raise SceneError(
+                f"positions of {worlds} world(s) of {nodes} nodes are {worlds * nodes} vectors of 3, not {x.shape} of {x.dtype}"
+            )
+        self.shapes, self.worlds, self.reach, self.margin = shapes, worlds, float(reach), float(margin)
+        self.device, real = x.device, x.dtype._wp_scalar_type_
+        self.real = real
+        things = {size: Things(shapes, size, worlds, real, self.device) for size in shapes.sizes}
+        self._things = list(things.values())
+        self._seen, self._still = (wp.zeros(len(x), dtype=x.dtype, device=self.device) for _ in range(2))
+        self.overflow, self.searches, self._stale, self._lost, self.held = (
+            wp.zeros(1, dtype=int, device=self.device) for _ in range(5)
+        )
+        self._trees = [things[size] for size in things if size > 1]
+        self.rebuild(x)
+        grouped = worlds > 1
+        sides = [(EDGES, 2, 2)] + [(POINT_TRIANGLE, 1, 3)] * (3 in things)
+        self.lists = [
+            PairList(kind, things[first], things[second], shapes, grouped, real, self.overflow)
+            for kind, first, second in sides
+        ]
+        self._motion = motion_kernels(real, arrays.serial(self.device))
+        self._impacts, self._passes = (
+            [impact_kernel(pairs.kind, grouped, passing, real) for pairs in self.lists] for passing in (False, True)
+        )
+        # what kernels of impacts have no use for
+        self._unused = [wp.zeros(worlds, dtype=dtype, device=self.device) for dtype in (real, int, wp.int64)]
+        self.bounds = wp.zeros(len(x), dtype=real, device=self.device)
+        self.gap = wp.zeros(worlds, dtype=real, device=self.device)
+        self.time = wp.zeros(worlds, dtype=real, device=self.device)
+        self.crossed = wp.zeros(worlds, dtype=int, device=self.device)
+        self._firsts = [wp.zeros(1, dtype=wp.int64, device=self.device) for _ in self.lists]
+        self.version = 0
+        self.search(x)
+        self.fit(x)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        lists = [kernel for pairs in self.lists for kernel in pairs.kernels]
+        return [*lists, *(part.kernel for part in self._things), *self._motion, *self._impacts, *self._passes]
+
+    def rebuild(self, x: wp.array) -> None:
+        """Build the trees anew; lists stay as they are. On CUDA searches use them until the next time, on the CPU they build their own.
+
+        Where everything has changed places since, a search takes tens of times as long.
+        """
+        self._enclose(x, self._still, 1.0, self._within)
+        for part in self._trees:
+            part.build()
+
+    def update(self, x: wp.array) -> None:
+        """Search again if some node has moved by more than half of the margin since the last search."""
+        watch, *_ = self._motion
+        self._sweep(watch, x, [x, self._seen, 0.5 * self.margin], [self._stale])
+        wp.capture_if(self._stale, lambda: self.search(x))
+
+    def search(self, x: wp.array) -> None:
+        """Find all candidates at x."""
+        _, mark, *_ = self._motion
+        self._enclose(x, self._still, 1.0, self._within)
+        for part in self._trees:
+            part.renew()
+        for pairs in self.lists:
+            pairs.search(x, 2.0 * self._within)
+        self._sweep(mark, x, [x, self.overflow], [self._seen, self._stale, self.searches])
+
+    def fit(self, x: wp.array) -> bool:
+        """Make room for pairs that did not fit, and search again until they do; whether there were any. Reads from the device.
+
+        Raises:
+            SolverError: names a node whose position is not finite; or if there are more pairs than can be counted.
+        """
+        self.check()
+        grown = False
+        while self.overflow.numpy()[0]:
+            self.overflow.zero_()
+            for pairs in self.lists:
+                needed = int(pairs.needed.numpy()[0])
+                if needed > pairs.capacity:
+                    if needed >= 2**31 - 1:
+                        raise SolverError(
+                            "more than 2^31 pairs are near; use a smaller margin or reach", outcome="too_many_pairs"
+                        )
+                    pairs.reserve(min(needed + needed // 2, 2**31 - 1))
+            self.version += 1
+            grown = True
+            self.search(x)
+        return grown
+
+    def check(self) -> None:
+        """Refuse positions that were not finite when boxes were made of them. Reads from the device.
+
+        Raises:
+            SolverError: names the node and its world.
+        """
+        node = int(self._lost.numpy()[0]) - 1
+        if node >= 0:
+            self._lost.zero_()
+            world, node = divmod(node, len(self.shapes.points))
+            raise SolverError(
+                f"node {node} of world {world} has a position or displacement that is not finite; go back to the last good state",
+                outcome="not_finite",
+            )
+
+    def bound(self, x: wp.array, share: float = 0.9, keep: float = 1.0) -> None:
+        """How far each node may move from x, in `bounds` [m]; the smallest gap of each world in `gap` [m], at most `reach`.
+
+        Nodes that move no farther leave (1 - share) of all distances beyond `keep` of the thickness. Candidates have to be up to date;
+        while pairs do not fit, nothing may move.
+
+        Raises:
+            SceneError: if not 0 < share < 1 or not 0 <= keep <= 1.
+        """
+        if not 0.0 < share < 1.0:
+            raise SceneError(f"share = {share!r} of gaps that motion may use up; it is between 0 and 1")
+        _checked_keep(keep)
+        *_, start, _ = self._motion
+        self._sweep(start, x, [x, self._seen, 0.5 * (self.margin + self.reach), self.overflow], [self.bounds])
+        self.gap.fill_(self.reach)
+        for pairs in self.lists:
+            pairs.bound(x, share, keep, self.bounds, self.gap)
+
+    def hold(self, move: wp.array) -> None:
+        """Shorten displacements to `bounds`, node by node, and add to `held` how many were."""
+        self._sweep(self._motion[-1], move, [self.bounds], [move, self.held])
+
+    def impact(self, x: wp.array, move: wp.array, keep: float = 1.0) -> None:
+        """When in the motion from x by `move` two come as near as `keep` of their thickness, in `time` of each world; never late.
+
+        1 where that does not happen; 0 where some overlap at x. All pairs are asked for, not only candidates.
+
+        Raises:
+            SceneError: if not 0 <= keep <= 1.
+        """
+        _checked_keep(keep)
+        self.time.fill_(1.0)
+        self._passing(self._impacts, x, move, keep, self._unused[1], [self._unused[2]] * len(self.lists))
+
+    def crossings(self, x: wp.array, move: wp.array) -> None:
+        """How many pairs pass through each other, without thickness, in the straight motion from x by `move`, in `crossed` by world."""
+        self.crossed.zero_()
+        for first in self._firsts:
+            first.fill_(NONE)
+        self._passing(self._passes, x, move, 0.0, self.crossed, self._firsts)
+
+    def first_crossing(self) -> str:
+        """The first of the pairs that passed through each other, by name, or nothing. Reads from the device."""
+        for pairs, first in zip(self.lists, self._firsts, strict=True):
+            key = int(first.numpy()[0])
+            if key != NONE:
+                return self.describe(pairs, *divmod(key, pairs.second.all))
+        return ""
+
+    def describe(self, pairs: PairList, i: int, j: int) -> str:
+        """A pair as a message has it."""
+        world, k = divmod(i, pairs.first.count)
+        one, other = (
+            self.shapes.describe(pairs.first.size, k),
+            self.shapes.describe(pairs.second.size, j % pairs.second.count),
+        )
+        return f"{one} and {other}" + (f" in world {world}" if self.worlds > 1 else "")
+
+    @property
+    def _within(self) -> float:
+        """Half of the gap up to which pairs are found."""
+        return 0.5 * (self.reach + (1.0 + SLACK) * self.margin)
+
+    def _passing(self, kernels, x, move, keep: float, number, firsts) -> None:
+        self._enclose(x, move, keep, 0.0)
+        for part in self._trees:
+            part.tree.refit()
+        for kernel, pairs, least in zip(kernels, self.lists, firsts, strict=True):
+            outputs = [self.time, number, least]
+            wp.launch(kernel, pairs.first.all, [pairs.sides, x, move, keep], outputs, device=self.device)
+
+    def _enclose(self, x, move, share: float, more: float) -> None:
+        for part in self._things:
+            part.enclose(x, move, share, more, self._lost)
+
+    def _sweep(self, kernel, x, inputs: list, outputs: list) -> None:
+        arrays.sweep(kernel, len(x), inputs, outputs, self.device)
+
+
+def _checked_keep(keep: float) -> None:
+    if not 0.0 <= keep <= 1.0:
+        raise SceneError(f"keep = {keep!r} of the thickness; it is from 0 to 1")

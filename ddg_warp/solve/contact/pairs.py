@@ -1,0 +1,99 @@
+"""Lists of pairs on a device, of fixed capacity; see `kernels.contact.candidates`."""
+
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.kernels.contact import sums
+from ddg_warp.kernels.contact.candidates import candidate_kernels
+from ddg_warp.kernels.contact.motion import bound_kernel
+from ddg_warp.kernels.contact.surfaces import Kind, sides_struct
+from ddg_warp.solve.contact.shapes import Shapes
+from ddg_warp.solve.contact.tree import Things
+
+
+class RunningSums:
+    """The sum of those before it for each of some integers, in `starts`."""
+
+    def __init__(self, values: wp.array):
+        self._levels = [values]
+        while len(self._levels[-1]) > sums.PIECE:
+            pieces = -(-len(self._levels[-1]) // sums.PIECE)
+            self._levels.append(wp.zeros(pieces, dtype=int, device=values.device))
+        self._starts = [wp.zeros_like(level) for level in self._levels]
+        self._first = wp.zeros(1, dtype=int, device=values.device)
+        self.starts = self._starts[0]
+
+    def __call__(self) -> None:
+        for values, pieces in zip(self._levels, self._levels[1:], strict=False):
+            wp.launch(sums.add_pieces, len(pieces), [values], [pieces], device=values.device)
+        before = self._first
+        for values, starts in zip(reversed(self._levels), reversed(self._starts), strict=True):
+            wp.launch(sums.run, len(before), [values, before], [starts], device=values.device)
+            before = starts
+
+
+class PairList:
+    """Pairs of one kind whose distance is at most both radii and a reach.
+
+    Attributes:
+        pairs: things (i, j) of both sides, counted over all worlds, sorted; the first `count` hold.
+        count: of pairs, zero where they do not fit; needed: the most pairs of any search since the capacity was set.
+        sides: see `kernels.contact.surfaces`; overflow: shared with other lists; not zero once pairs did not fit.
+    """
+
+    def __init__(
+        self, kind: Kind, first: Things, second: Things, shapes: Shapes, grouped: bool, real, overflow: wp.array
+    ):
+        self.kind, self.first, self.second = kind, first, second
+        self.overflow, self.device = overflow, first.device
+        self.sides = sides_struct(real)()
+        self.sides.first, self.sides.second = first.surface, second.surface
+        self.sides.lower, self.sides.upper, self.sides.tree = first.lower, first.upper, second.tree.id
+        self.sides.counts, self.sides.objects = wp.vec2i(first.count, second.count), len(shapes.names)
+        self.sides.ignored = wp.array(shapes.ignored, dtype=wp.int64, device=self.device)
+        self._last, self._partners = (wp.zeros(first.all, dtype=int, device=self.device) for _ in range(2))
+        self._sums = RunningSums(self._partners)
+        self._find, self._fill = candidate_kernels(kind, grouped, real)
+        self._bounds = bound_kernel(kind, real, arrays.serial(self.device))
+        self.found, self.count, self.needed = (wp.zeros(1, dtype=int, device=self.device) for _ in range(3))
+        self.kernels = [self._find, self._fill, self._bounds, sums.add_pieces, sums.run]
+        self.reserve(max(1024, 4 * first.all))
+
+    @property
+    def capacity(self) -> int:
+        return len(self.pairs)
+
+    def reserve(self, capacity: int) -> None:
+        """Make room for so many pairs; what was captured with the list is to be captured anew."""
+        self._partner, self._before = (wp.zeros(capacity, dtype=int, device=self.device) for _ in range(2))
+        self.pairs = wp.zeros(capacity, dtype=wp.vec2i, device=self.device)
+        self.needed.zero_()
+
+    def search(self, x, reach: float) -> None:
+        """Find and list the pairs; boxes have to be up to date."""
+        self.found.zero_()
+        wp.launch(
+            self._find,
+            self.first.all,
+            [self.sides, x, reach],
+            [self.found, self._partner, self._before, self._last, self._partners],
+            device=self.device,
+        )
+        self._sums()
+        wp.launch(
+            self._fill,
+            self.first.all,
+            [self.found, self._partner, self._before, self._last, self._sums.starts],
+            [self.pairs, self.count, self.overflow, self.needed],
+            device=self.device,
+        )
+
+    def bound(self, x, share: float, keep: float, bound, gap) -> None:
+        """Lower the bounds of nodes of pairs, and the smallest gaps; see `kernels.contact.motion`."""
+        arrays.sweep(
+            self._bounds,
+            self.capacity,
+            [self.pairs, self.count, self.sides, x, share, keep],
+            [bound, gap],
+            self.device,
+        )

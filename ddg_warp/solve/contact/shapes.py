@@ -1,0 +1,150 @@
+"""What may touch in one world: edges of rods as capsules, triangles of shells with a thickness, and what is no pair."""
+
+import numpy as np
+
+from ddg_warp.errors import SceneError
+
+FLAT = 1e-12  # area of a triangle over the square of its longest edge, below which it has none
+
+
+class Shapes:
+    """Rods and shells over the nodes of one world, numbered as they are added.
+
+    Args:
+        points: positions (n, 3) at which nothing may be without length or area [m].
+
+    Attributes:
+        edges, triangles, nodes: `Things`, the last with the nodes of all objects where there are triangles.
+    """
+
+    def __init__(self, points: np.ndarray):
+        self.points = np.asarray(points, float)
+        if self.points.ndim != 2 or self.points.shape[1] != 3 or not np.isfinite(self.points).all():
+            raise SceneError("points of a contact search have to be finite, of shape (n, 3)")
+        self.names: list[str] = []
+        self._parts: dict[int, list] = {1: [], 2: [], 3: []}
+        self._ignored: set[tuple[int, int]] = set()
+
+    def rod(
+        self, nodes, radius: float, *, closed: bool = False, apart: float | None = None, name: str | None = None
+    ) -> int:
+        """Add a rod along nodes (m,), a row of capsules; returns the number of the object.
+
+        Args:
+            radius: of the capsules [m].
+            closed: whether an edge leads from the last node to the first.
+            apart: edges with less than this between them along the rod [m] are no pair, nor are neighbours; by default pi radius, the
+                arc between opposite sides of the tightest bend that a rod so thick can have.
+
+        Raises:
+            SceneError: names the rod, the edge or node, and the remedy.
+        """
+        name = f"rod '{name}'" if name else f"rod {len(self.names)}"
+        nodes = self._checked(nodes, 1, name)
+        if len(nodes) < 2 + closed:
+            raise SceneError(f"{name} has {len(nodes)} nodes; it needs at least {2 + closed}")
+        self._positive(radius, "radius", name)
+        apart = np.pi * radius if apart is None else apart
+        if not 0.0 <= apart < np.inf:
+            raise SceneError(f"{name}: apart = {apart!r}; it is an arc length, zero or more [m]")
+        edges = np.column_stack([nodes, np.roll(nodes, -1)])[: None if closed else -1]
+        lengths = np.linalg.norm(self.points[edges[:, 1]] - self.points[edges[:, 0]], axis=1)
+        self._refuse(lengths <= 0.0, "edge", "has zero length", name)
+        ends = np.concatenate([[0.0], np.cumsum(lengths)])
+        loop = np.full(len(edges), ends[-1] if closed else 0.0)
+        span = np.column_stack([ends[:-1], ends[1:], loop, np.full(len(edges), float(apart))])
+        return self._add(name, radius, {1: nodes[:, None], 2: edges}, span)
+
+    def shell(self, triangles, thickness: float, *, name: str | None = None) -> int:
+        """Add a shell of triangles (m, 3) with a thickness [m], half of it on either side; returns the number of the object.
+
+        Triangles, edges and points that share a node are no pairs.
+
+        Raises:
+            SceneError: names the shell, the triangle, and the remedy.
+        """
+        name = f"shell '{name}'" if name else f"shell {len(self.names)}"
+        triangles = self._checked(triangles, 2, name)
+        self._positive(thickness, "thickness", name)
+        if triangles.shape[1:] != (3,) or not len(triangles):
+            raise SceneError(f"{name} has triangles of shape {triangles.shape}; it is (m, 3), with at least one")
+        a, b, c = np.moveaxis(self.points[triangles], 1, 0)
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        longest = np.max([np.square(b - a).sum(1), np.square(c - b).sum(1), np.square(a - c).sum(1)], axis=0)
+        self._refuse(area <= FLAT * longest, "triangle", "has no area", name)
+        sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        edges = np.unique(sides, axis=0)
+        span = np.broadcast_to([0.0, 0.0, 0.0, -1.0], (len(edges), 4))
+        parts = {1: np.unique(triangles)[:, None], 2: edges, 3: triangles}
+        return self._add(name, 0.5 * thickness, parts, span)
+
+    def ignore(self, first: int, second: int) -> None:
+        """Two objects pass through each other; an object and itself: it has no contact with itself.
+
+        Raises:
+            SceneError: if there is no such object.
+        """
+        for number in (first, second):
+            if not 0 <= number < len(self.names):
+                raise SceneError(
+                    f"there is no object {number}; objects are 0 to {len(self.names) - 1}, in the order added"
+                )
+        self._ignored.add((min(first, second), max(first, second)))
+
+    @property
+    def ignored(self) -> np.ndarray:
+        """Keys of pairs of objects (smaller number times all objects + larger), sorted."""
+        return np.array(sorted(a * len(self.names) + b for a, b in self._ignored), np.int64)
+
+    @property
+    def sizes(self) -> list[int]:
+        """Numbers of nodes of the things that pairs need: edges, and points and triangles where there are triangles."""
+        return [1, 2, 3] if self._parts[3] else [2]
+
+    def things(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Points, edges or triangles by their number of nodes: nodes (n, size), radius, object (n,) and span (n, 4) of edges.
+
+        Raises:
+            SceneError: if nothing was added.
+        """
+        if not self.names:
+            raise SceneError("a contact search has no objects; add rods or shells")
+        parts = self._parts[size]
+        number = np.repeat([part[2] for part in parts], [len(part[0]) for part in parts])
+        radius = np.repeat([part[1] for part in parts], [len(part[0]) for part in parts])
+        return np.concatenate([part[0] for part in parts]), radius, number, np.concatenate([part[3] for part in parts])
+
+    def describe(self, size: int, index: int) -> str:
+        """A thing of a world as a message has it."""
+        for nodes, _, number, _ in self._parts[size]:
+            if index < len(nodes):
+                kind = ("point", "edge", "triangle")[size - 1]
+                return f"{kind} {index} of {self.names[number]} (nodes {', '.join(map(str, nodes[index]))})"
+            index -= len(nodes)
+        raise IndexError(index)
+
+    def _add(self, name: str, radius: float, parts: dict, span: np.ndarray) -> int:
+        number = len(self.names)
+        self.names.append(name)
+        for size, nodes in parts.items():
+            self._parts[size].append((nodes, radius, number, span if size == 2 else np.zeros((0, 4))))
+        return number
+
+    def _checked(self, nodes, axes: int, name: str) -> np.ndarray:
+        nodes = np.asarray(nodes)
+        if nodes.ndim != axes or nodes.dtype.kind not in "iu":
+            raise SceneError(
+                f"{name}: nodes are whole numbers in {axes} dimension(s), not {nodes.dtype} of shape {nodes.shape}"
+            )
+        wrong = (nodes < 0) | (nodes >= len(self.points))
+        if wrong.any():
+            raise SceneError(f"{name} has node {nodes[wrong][0]}; nodes are 0 to {len(self.points) - 1}")
+        return nodes
+
+    def _positive(self, value: float, what: str, name: str) -> None:
+        if not 0.0 < value < np.inf:
+            raise SceneError(f"{name}: {what} = {value!r}; it is positive and finite [m]")
+
+    def _refuse(self, wrong: np.ndarray, what: str, fault: str, name: str) -> None:
+        if wrong.any():
+            raise SceneError(f"{what} {np.flatnonzero(wrong)[0]} of {name} {fault}; merge its nodes or leave it out")

@@ -1,0 +1,61 @@
+"""Things of all worlds on a device, with a tree of their boxes."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels.contact.boxes import box_kernel
+from ddg_warp.kernels.contact.surfaces import surface_struct
+
+
+class Things:
+    """Points, edges or triangles of `shapes` by their number of nodes, with boxes; `tree` is there where things are searched for.
+
+    Attributes:
+        count: in one world; all: in all; surface: see `surface_struct`; lower, upper: of boxes (all,).
+    """
+
+    def __init__(self, shapes, size: int, worlds: int, real, device):
+        nodes, radius, owner, span = shapes.things(size)
+        self.count, self.all, self.size = len(nodes), worlds * len(nodes), size
+        if self.all >= 2**31:
+            raise SceneError(
+                f"{worlds} worlds of {self.count} edges, points or triangles each are 2^31 or more; use fewer worlds"
+            )
+        self.surface = surface_struct(real)()
+        self.surface.nodes = wp.array(np.ascontiguousarray(nodes), dtype=int, device=device)
+        self.surface.radius = wp.array(radius, dtype=real, device=device)
+        self.surface.object = wp.array(owner, dtype=int, device=device)
+        self.surface.span = wp.array(np.ascontiguousarray(span), dtype=wp.types.vector(4, real), device=device)
+        self.surface.nodes_a_world = len(shapes.points)
+        self.lower, self.upper = (wp.zeros(self.all, dtype=wp.vec3, device=device) for _ in range(2))
+        self.tree, self.device = None, device
+        self.kernel = box_kernel(size, real)
+        self._worlds = worlds
+
+    def enclose(self, x, move, share: float, more: float, lost) -> None:
+        """Boxes around x and x + move, inflated by a share of the radius and more [m]."""
+        wp.launch(
+            self.kernel,
+            self.all,
+            [self.surface, self.count, x, move, share, more],
+            [self.lower, self.upper, lost],
+            device=self.device,
+        )
+
+    def build(self) -> None:
+        """The tree anew for boxes as they are; on CUDA not in conditional parts of graphs, which must not allocate."""
+        if self.tree is None:
+            groups = None
+            if self._worlds > 1:
+                groups = wp.array(np.repeat(np.arange(self._worlds), self.count), dtype=int, device=self.device)
+            self.tree = wp.Bvh(self.lower, self.upper, groups=groups)
+        else:
+            self.tree.rebuild()
+
+    def renew(self) -> None:
+        """A tree for boxes that may have moved far: anew on the CPU, as it was built on CUDA; that can be slower by far."""
+        if self.device.is_cpu:
+            self.build()
+        else:
+            self.tree.refit()

@@ -1,0 +1,67 @@
+"""Boxes around what may touch, in float32 and rounded outwards: nothing that reaches into a box in exact numbers is outside of it."""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.contact.surfaces import surface_struct
+from ddg_warp.kernels.threads import CPU_OPTIONS
+
+ROUNDING = 3e-7  # more than two roundings of float32, relative: that of a sum and that of the conversion
+LEAST = 1e-30  # so that zero is rounded outwards, too [m]
+
+
+@cache
+def box_kernel(size: int, real):
+    """Boxes of things with `size` nodes, inflated by `share` of their radius and `more`, around both x and x + move.
+
+    Nodes that are no numbers are noted in `lost` as node + 1; a box around them is empty, at the origin.
+    """
+    Surface, X = surface_struct(real), wp.types.vector(3, real)
+
+    @wp.func
+    def outward(value: real, sign: float):
+        v = wp.float32(value)
+        return v + sign * (wp.abs(v) * wp.static(wp.float32(ROUNDING)) + wp.static(wp.float32(LEAST)))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def boxes(
+        surface: Surface,
+        count: int,
+        x: wp.array(dtype=X),
+        move: wp.array(dtype=X),
+        share: real,
+        more: real,
+        lower: wp.array(dtype=wp.vec3),
+        upper: wp.array(dtype=wp.vec3),
+        lost: wp.array(dtype=int),
+    ):
+        """A thread has a thing of a world."""
+        i = wp.tid()
+        w = i / count
+        k = i - w * count
+        low, high, sound = X(), X(), int(1)
+        for l in range(wp.static(size)):
+            node = surface.nodes[k, l] + w * surface.nodes_a_world
+            a = x[node]
+            b = a + move[node]
+            if not (wp.isfinite(a) and wp.isfinite(b)):
+                sound = 0
+                wp.atomic_max(lost, 0, node + 1)
+            if l == 0:
+                low, high = wp.min(a, b), wp.max(a, b)
+            else:
+                low, high = wp.min(low, wp.min(a, b)), wp.max(high, wp.max(a, b))
+        if sound == 0:
+            lower[i] = wp.vec3()
+            upper[i] = wp.vec3()
+            return
+        reach = surface.radius[k] * share + more
+        down, up = wp.vec3(), wp.vec3()
+        for d in range(3):
+            down[d] = outward(low[d] - reach, wp.float32(-1.0))
+            up[d] = outward(high[d] + reach, wp.float32(1.0))
+        lower[i] = down
+        upper[i] = up
+
+    return boxes

@@ -1,0 +1,106 @@
+"""Pairs that are near: found through a tree of boxes, judged by their distance, listed in the order of their indices.
+
+Each thing notes its partners in a linked list, whose entries come from one counter; running sums then say where its part of the list
+of pairs starts. So two runs give the same list to the bit, whatever order threads run in, and a list that does not fit is left out
+whole: `overflow` says so, and `found` how long it would be.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
+from ddg_warp.kernels.threads import CPU_OPTIONS
+
+MOST = 2**31 - 1  # pairs that can be counted; more are told as so many
+
+
+@cache
+def query_function(grouped: bool, real):
+    """begin(sides, i) -> query, w, k: second things of world w whose boxes meet that of first thing i, the k-th of w."""
+    Sides = sides_struct(real)
+
+    @wp.func
+    def begin(sides: Sides, i: int):
+        w = i / sides.counts[0]
+        root = int(-1)
+        if wp.static(grouped):
+            root = wp.bvh_get_group_root(sides.tree, w)
+        return wp.bvh_query_aabb(sides.tree, sides.lower[i], sides.upper[i], root), w, i - w * sides.counts[0]
+
+    return begin
+
+
+@cache
+def candidate_kernels(kind: Kind, grouped: bool, real):
+    """find(...) partners and fill(...) the list of pairs."""
+    Sides, X = sides_struct(real), wp.types.vector(3, real)
+    slots, may_touch, thickness, closest = pair_functions(kind, real)
+    begin = query_function(grouped, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def find(
+        sides: Sides,
+        x: wp.array(dtype=X),
+        reach: real,
+        found: wp.array(dtype=int),
+        partner: wp.array(dtype=int),
+        before: wp.array(dtype=int),
+        last: wp.array(dtype=int),
+        partners: wp.array(dtype=int),
+    ):
+        """Partners of a thing with a distance of at most both radii and `reach`."""
+        i = wp.tid()
+        query, w, k = begin(sides, i)
+        number, at, j = int(0), int(-1), int(0)
+        while wp.bvh_query_next(query, j):
+            l = j - w * sides.counts[1]
+            if may_touch(sides, k, l):
+                r, _ = closest(x, slots(sides, k, l, w))
+                allowed = thickness(sides, k, l) + reach
+                if wp.dot(r, r) <= allowed * allowed:
+                    slot = wp.atomic_add(found, 0, 1)
+                    number += 1
+                    if slot < partner.shape[0]:
+                        partner[slot] = j
+                        before[slot] = at
+                        at = slot
+        last[i] = at
+        partners[i] = number
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def fill(
+        found: wp.array(dtype=int),
+        partner: wp.array(dtype=int),
+        before: wp.array(dtype=int),
+        last: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
+        pairs: wp.array(dtype=wp.vec2i),
+        count: wp.array(dtype=int),
+        overflow: wp.array(dtype=int),
+        largest: wp.array(dtype=int),
+    ):
+        """The pairs of a thing, sorted by insertion; lists are short."""
+        i = wp.tid()
+        total = found[0]
+        fits = total >= 0 and total <= pairs.shape[0]
+        if i == 0:
+            count[0] = wp.where(fits, total, 0)
+            largest[0] = wp.max(largest[0], wp.where(total < 0, wp.static(MOST), total))
+            if not fits:
+                overflow[0] = 1
+        if fits:
+            start = starts[i]
+            end = start
+            at = last[i]
+            while at >= 0:
+                j = partner[at]
+                k = end
+                while k > start and pairs[wp.max(k - 1, 0)][1] > j:
+                    pairs[k] = pairs[k - 1]
+                    k -= 1
+                pairs[k] = wp.vec2i(i, j)
+                end += 1
+                at = before[at]
+
+    return find, fill

@@ -1,0 +1,136 @@
+"""When things that move straight come as near as their thickness, and which have passed through each other.
+
+Additive continuous collision detection after Li, Kaufman and Jiang, "Codimensional incremental potential contact", ACM ToG 40(4),
+2021, algorithm 1: the distance of a pair falls at most as fast as its fastest nodes of both sides approach, less what all move in
+common. Time goes on by the part of the gap that is safe at that speed, until the gap is `REST` of what it was: the time found is
+never late.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.contact.candidates import query_function
+from ddg_warp.kernels.contact.distance import distance_functions
+from ddg_warp.kernels.contact.surfaces import EDGES, Kind, pair_functions, sides_struct
+from ddg_warp.kernels.threads import CPU_OPTIONS
+
+REST, SAFE = 0.1, 0.9  # of the gap: what is left at the time found; what a part of the motion may use up
+PARTS = 1000  # in which a motion is followed; where that does not do, the time reached so far is safe, too
+PATIENCE = 100_000  # the same for what is to be told apart from passing
+TOUCHING = 1e-9  # distance of two that pass, over the size of the pair
+
+
+@cache
+def impact_functions(kind: Kind, real):
+    """impact(x, p, thickness) -> time; meet(x, p) -> whether two without thickness do. x, p: positions, displacements of the nodes."""
+    Y, first = wp.types.matrix((4, 3), real), kind.first
+    _, segments, point_triangle = distance_functions(real)
+    measure = segments if kind == EDGES else point_triangle
+    # of eight digits or sixteen, those that a distance keeps
+    touching = TOUCHING if real is wp.float64 else 1e3 * TOUCHING
+
+    @wp.func
+    def relative(p: Y):
+        """Displacements less their mean, and how fast the sides may approach."""
+        mean = real(0.25) * (p[0] + p[1] + p[2] + p[3])
+        q = wp.matrix_from_rows(p[0] - mean, p[1] - mean, p[2] - mean, p[3] - mean)
+        one, other = real(0.0), real(0.0)
+        for k in range(4):
+            if k < wp.static(first):
+                one = wp.max(one, wp.length(q[k]))
+            else:
+                other = wp.max(other, wp.length(q[k]))
+        return q, one + other
+
+    @wp.func
+    def distance(x: Y, q: Y, t: real):
+        y = x + t * q
+        r, _ = measure(y[0], y[1], y[2], y[3])
+        return wp.length(r)
+
+    @wp.func
+    def impact(x: Y, p: Y, thickness: real):
+        """In [0, 1], or 2 where there is none; zero where the pair overlaps at the start."""
+        q, speed = relative(p)
+        gap = distance(x, q, real(0.0)) - thickness
+        if gap <= real(0.0):
+            return real(0.0)
+        if speed == real(0.0):
+            return real(2.0)
+        least, t = real(REST) * gap, real(0.0)
+        step = (gap - least) / speed
+        for _ in range(wp.static(PARTS)):
+            if t + step > real(1.0):
+                return real(2.0)
+            gap = distance(x, q, t + step) - thickness
+            if gap < least:
+                return t
+            t += step
+            step = real(SAFE) * gap / speed
+        return t
+
+    @wp.func
+    def meet(x: Y, p: Y):
+        """Whether two come together on their way, or can not be told to stay apart."""
+        q, speed = relative(p)
+        size = speed + wp.length(x[1] - x[0]) + wp.length(x[2] - x[1]) + wp.length(x[3] - x[2])
+        least, t = real(touching) * size, real(0.0)
+        for _ in range(wp.static(PATIENCE)):
+            apart = distance(x, q, t)
+            if apart <= least:
+                return True
+            t += apart / speed
+            if t > real(1.0):
+                return False
+        return True
+
+    return impact, meet
+
+
+@cache
+def impact_kernel(kind: Kind, grouped: bool, passing: bool, real):
+    """The earliest time of impact of each world or, if `passing`, how many pairs pass through each other and the first of them.
+
+    Pairs are numbered i times the second things of all worlds + j. They are found through a tree of boxes around the motion.
+    """
+    Sides, X = sides_struct(real), wp.types.vector(3, real)
+    slots, may_touch, thickness, _ = pair_functions(kind, real)
+    begin, (impact, meet) = query_function(grouped, real), impact_functions(kind, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def impacts(
+        sides: Sides,
+        x: wp.array(dtype=X),
+        move: wp.array(dtype=X),
+        keep: real,
+        time: wp.array(dtype=real),
+        number: wp.array(dtype=int),
+        least: wp.array(dtype=wp.int64),
+    ):
+        """A thread has a first thing of a world."""
+        i = wp.tid()
+        query, w, k = begin(sides, i)
+        j, soonest, met = int(0), real(1.0), int(0)
+        while wp.bvh_query_next(query, j):
+            l = j - w * sides.counts[1]
+            if not may_touch(sides, k, l):
+                continue
+            n = slots(sides, k, l, w)
+            y = wp.matrix_from_rows(x[n[0]], x[n[1]], x[n[2]], x[n[3]])
+            p = wp.matrix_from_rows(move[n[0]], move[n[1]], move[n[2]], move[n[3]])
+            if wp.static(passing):
+                if meet(y, p):
+                    met += 1
+                    key = wp.int64(i) * wp.int64(sides.counts[1] * number.shape[0]) + wp.int64(j)
+                    wp.atomic_min(least, 0, key)
+            else:
+                soonest = wp.min(soonest, impact(y, p, keep * thickness(sides, k, l)))
+        if wp.static(passing):
+            if met > 0:
+                wp.atomic_add(number, w, met)
+        else:
+            if soonest < real(1.0):
+                wp.atomic_min(time, w, soonest)
+
+    return impacts

@@ -1,0 +1,130 @@
+"""What may touch: points, edges and triangles with a radius, and the two kinds of pairs that suffice.
+
+Two surfaces that are piecewise straight and flat meet for the first time where an edge meets an edge or a point meets a triangle. So
+edges are paired with edges and points with triangles; the edges of rods are among the edges beside those of triangles, the nodes of
+rods among the points. Indices of things and nodes count all worlds, one world after the other, each alike.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.contact.distance import distance_functions
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of pairs: nodes of the first and of the second thing. Of equal things each pair is taken once, the smaller index first."""
+
+    first: int
+    second: int
+
+    @property
+    def alike(self) -> bool:
+        return self.first == self.second
+
+
+EDGES, POINT_TRIANGLE = Kind(2, 2), Kind(1, 3)
+
+
+@cache
+def surface_struct(real):
+    """Points, edges or triangles of one world.
+
+    nodes (count, 1 to 3); radius [m]; object: who they belong to; span (start, end, loop, apart) of edges of rods: arc lengths of the
+    ends, of the whole rod where it is closed (else 0), and that within which edges of a rod are no pair (-1: of no rod) [m].
+    """
+    span_type = wp.types.vector(4, real)
+
+    @wp.struct
+    class Surface:
+        nodes: wp.array2d(dtype=int)
+        radius: wp.array(dtype=real)
+        object: wp.array(dtype=int)
+        span: wp.array(dtype=span_type)
+        nodes_a_world: int
+
+    return Surface
+
+
+@cache
+def sides_struct(real):
+    """Two surfaces whose pairs are asked for.
+
+    first, second: see `surface_struct`; lower, upper: boxes of the first, in all worlds; tree: of the boxes of the second; counts: of
+    both in one world; ignored: keys of pairs of objects that pass through each other, sorted (smaller number times `objects` + larger).
+    """
+    surface = surface_struct(real)
+
+    @wp.struct
+    class Sides:
+        first: surface
+        second: surface
+        lower: wp.array(dtype=wp.vec3)
+        upper: wp.array(dtype=wp.vec3)
+        tree: wp.uint64
+        counts: wp.vec2i
+        ignored: wp.array(dtype=wp.int64)
+        objects: int
+
+    return Sides
+
+
+@cache
+def pair_functions(kind: Kind, real):
+    """slots(sides, i, j, w) -> the four nodes; may_touch(sides, i, j); thickness(sides, i, j); closest(x, nodes) -> r, w.
+
+    Here i and j count the things of one world, w.
+    """
+    Sides, N = sides_struct(real), wp.types.vector(4, int)
+    X, S, count = wp.types.vector(3, real), wp.types.vector(4, real), kind.first
+    _, segments, point_triangle = distance_functions(real)
+    measure = segments if kind == EDGES else point_triangle
+
+    @wp.func
+    def slots(sides: Sides, i: int, j: int, w: int):
+        nodes, offset = N(), w * sides.first.nodes_a_world
+        for k in range(wp.static(kind.first)):
+            nodes[k] = sides.first.nodes[i, k] + offset
+        for k in range(wp.static(kind.second)):
+            nodes[wp.static(count) + k] = sides.second.nodes[j, k] + offset
+        return nodes
+
+    @wp.func
+    def within(a: S, b: S):
+        """Whether edges of a rod are as close along it as to be no pair."""
+        gap = wp.max(a[0], b[0]) - wp.min(a[1], b[1])
+        if a[2] > real(0.0):
+            gap = wp.min(gap, a[2] - (wp.max(a[1], b[1]) - wp.min(a[0], b[0])))
+        return gap < a[3]
+
+    @wp.func
+    def may_touch(sides: Sides, i: int, j: int):
+        if wp.static(kind.alike):
+            if j <= i:
+                return False
+        for k in range(wp.static(kind.first)):
+            for l in range(wp.static(kind.second)):
+                if sides.first.nodes[i, k] == sides.second.nodes[j, l]:
+                    return False
+        a, b = sides.first.object[i], sides.second.object[j]
+        if wp.static(kind.alike):
+            if a == b and within(sides.first.span[i], sides.second.span[j]):
+                return False
+        if sides.ignored.shape[0] > 0:
+            key = wp.int64(wp.min(a, b)) * wp.int64(sides.objects) + wp.int64(wp.max(a, b))
+            at = wp.lower_bound(sides.ignored, key)
+            if at < sides.ignored.shape[0] and sides.ignored[at] == key:
+                return False
+        return True
+
+    @wp.func
+    def thickness(sides: Sides, i: int, j: int):
+        return sides.first.radius[i] + sides.second.radius[j]
+
+    @wp.func
+    def closest(x: wp.array(dtype=X), nodes: N):
+        return measure(x[nodes[0]], x[nodes[1]], x[nodes[2]], x[nodes[3]])
+
+    return slots, may_touch, thickness, closest

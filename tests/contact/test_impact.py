@@ -1,0 +1,223 @@
+"""Bounds of motion, times of impact and crossings against dense sampling in time and closed forms."""
+
+import brute_force
+import numpy as np
+import pytest
+import warp as wp
+
+from ddg_warp.solve.contact.broad_phase import BroadPhase
+from ddg_warp.solve.contact.shapes import Shapes
+
+REACH, MARGIN = 0.004, 0.01
+FRAMES = 2001
+SIDES = {"edges": (2, 2), "point and triangle": (1, 3)}
+
+
+def upload(x, device: str) -> wp.array:
+    return wp.array(np.ascontiguousarray(x), dtype=wp.vec3d, device=device)
+
+
+def pairs_apart(name: str, seed: int, count: int) -> tuple[Shapes, np.ndarray, np.ndarray]:
+    """A pair in each of `count` worlds, random in place and motion; a point is the end of an edge that meets nothing itself."""
+    rng = np.random.default_rng(seed)
+    nodes = 4 if name == "edges" else 5
+    x, move = rng.normal(size=(2, count, nodes, 3))
+    shapes = Shapes(np.random.default_rng(0).normal(size=(nodes, 3)))
+    shapes.rod([0, 1], 0.05)
+    if name == "edges":
+        shapes.rod([2, 3], 0.1)
+    else:
+        x[:, 1] = x[:, 0] + 100.0
+        move[:, 1] = move[:, 0]
+        shapes.shell([[2, 3, 4]], 0.2)
+    return shapes, x, move
+
+
+def gaps(shapes: Shapes, name: str, x: np.ndarray) -> np.ndarray:
+    """Gaps (pairs, worlds) of all pairs that there are at x (worlds, nodes, 3)."""
+    found = []
+    for side in [SIDES["edges"]] + [SIDES["point and triangle"]] * (name != "edges"):
+        for i, j in zip(*brute_force.allowed(shapes, *side), strict=True):
+            nodes_a, radius_a, *_ = shapes.things(side[0])
+            nodes_b, radius_b, *_ = shapes.things(side[1])
+            corners = [*np.moveaxis(x[:, nodes_a[i]], 1, 0), *np.moveaxis(x[:, nodes_b[j]], 1, 0)]
+            d = (brute_force.edge_edge if side[0] == 2 else brute_force.point_triangle)(*corners)
+            found.append(d - radius_a[i] - radius_b[j])
+    return np.array(found)
+
+
+@pytest.mark.parametrize("name", SIDES)
+def test_time_of_impact_is_never_late_and_not_much_too_early(device, name):
+    shapes, x, move = pairs_apart(name, 1, 500)
+    search = BroadPhase(shapes, upload(x.reshape(-1, 3), device), len(x), reach=REACH, margin=MARGIN)
+    search.impact(upload(x.reshape(-1, 3), device), upload(move.reshape(-1, 3), device))
+    time = search.time.numpy()
+    gap = np.array([gaps(shapes, name, x + t * move) for t in np.linspace(0.0, 1.0, FRAMES)])
+    overlap = (gap[0] <= 0.0).any(0)
+    assert (time[overlap] == 0.0).all() and (time[~overlap] > 0.0).all()
+    closed = (gap <= 0.0).any(1)
+    hit = closed.any(0) & ~overlap
+    first = closed.argmax(0) / (FRAMES - 1)
+    assert hit.sum() > 50 and (time[hit] <= first[hit]).all()
+    assert np.median((first - time)[hit] / first[hit]) < 0.25
+    assert (gaps(shapes, name, x + time[:, None, None] * move)[:, ~overlap] > 0.0).all()
+    # a motion is not stopped unless a pair is to come as near as a tenth of its gap, and is wherever a pair would pass
+    stopped = np.flatnonzero((time < 1.0) & ~overlap)
+    left = [(gap[int(time[k] * (FRAMES - 1)) :, :, k].min(0) / gap[0, :, k]).min() for k in stopped]
+    assert max(left) <= 0.101
+    assert (time[hit] < 1.0).all()
+
+
+def test_head_on_impact_by_its_closed_form(device):
+    """Crossed edges at distance 1 with radii 0.1 that approach by 2: they touch at 0.4; a tenth of the gap of 0.8 is left at 0.36."""
+    points = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 1.0], [0.0, 1.0, 1.0]])
+    move = np.array([[0.0, 0.0, 1.0]] * 2 + [[0.0, 0.0, -1.0]] * 2)
+    shapes = Shapes(points)
+    shapes.rod([0, 1], 0.1)
+    shapes.rod([2, 3], 0.1)
+    x = upload(points, device)
+    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    search.impact(x, upload(move, device))
+    assert search.time.numpy()[0] == pytest.approx(0.36, rel=1e-12)
+    search.impact(x, upload(move, device), keep=0.0)
+    assert search.time.numpy()[0] == pytest.approx(0.45, rel=1e-12)
+    search.impact(x, upload(0.35 * move, device))
+    assert search.time.numpy()[0] == 1.0
+    # a motion that all share is none
+    search.impact(x, upload(np.broadcast_to([300.0, 5.0, -7.0], (4, 3)), device))
+    assert search.time.numpy()[0] == 1.0
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e3])
+def test_crossings_are_counted_exactly(device, offset):
+    """A grid of 8 x 8 rods that fall through 8 x 8 others across them: all 64 pairs cross as soon as they have met, none before."""
+    ends, at = np.array([-1.0, 1.0]), np.linspace(-0.8, 0.8, 8)
+    one = np.stack(np.broadcast_arrays(ends, at[:, None], 0.0), axis=-1).reshape(-1, 3)
+    other = np.stack(np.broadcast_arrays(at[:, None], ends, 0.3), axis=-1).reshape(-1, 3)
+    points = np.concatenate([one, other]) + offset
+    shapes = Shapes(points)
+    for k in range(16):
+        shapes.rod([2 * k, 2 * k + 1], 0.01)
+    x = upload(points, device)
+    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    for fall, crossed in ((0.2999, 0), (0.3001, 64), (0.6, 64), (5.0, 64)):
+        move = np.zeros_like(points)
+        move[16:, 2] = -fall
+        move[:, 0] += 17.0
+        search.crossings(x, upload(move, device))
+        assert search.crossed.numpy()[0] == crossed
+        assert search.first_crossing() == (
+            "edge 0 of rod 0 (nodes 0, 1) and edge 0 of rod 8 (nodes 16, 17)" if crossed else ""
+        )
+    # rods in a plane that pass within it, where the volume of four nodes is zero all the time
+    move = np.zeros_like(points)
+    move[0:2, 1] = 0.8 * 2 / 7 + 0.01
+    search.crossings(x, upload(move, device))
+    assert search.crossed.numpy()[0] == 1
+
+
+@pytest.mark.parametrize("distance", [1e-4, 0.0])
+def test_what_slides_past_close_by_has_not_crossed(device, distance):
+    """A rod that slides by ten thousand times its distance from another, across or along it; without any, they meet."""
+    points = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [-0.5, -1.0, distance], [-0.5, 1.0, distance]])
+    shapes = Shapes(points)
+    shapes.rod([0, 1], 1e-5)
+    shapes.rod([2, 3], 1e-5)
+    x = upload(points, device)
+    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    for direction in ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.0]):
+        search.crossings(x, upload(np.outer([0, 0, 1, 1], direction), device))
+        assert search.crossed.numpy()[0] == (distance == 0.0)
+
+
+def test_crossings_of_random_motion_are_those_of_signed_volumes(device):
+    """Pairs pass where the volume of their nodes changes its sign while the closest points lie inside: roots of a cubic."""
+    rng = np.random.default_rng(3)
+    n = 2000
+    x, move = rng.normal(size=(2, n, 4, 3))
+    shapes = Shapes(x[0])
+    shapes.rod([0, 1], 0.01)
+    shapes.rod([2, 3], 0.01)
+    search = BroadPhase(shapes, upload(x.reshape(-1, 3), device), n, reach=REACH, margin=MARGIN)
+    search.crossings(upload(x.reshape(-1, 3), device), upload(move.reshape(-1, 3), device))
+    times = np.linspace(0.0, 1.0, 4)
+
+    def volume(y):
+        return np.linalg.det(y[..., 1:, :] - y[..., :1, :])
+
+    cubics = np.linalg.solve(np.vander(times, 4), np.array([volume(x + t * move) for t in times]))
+    wanted = []
+    for k in range(n):
+        roots = np.roots(cubics[:, k])
+        roots = roots[np.abs(roots.imag) < 1e-9].real
+        meets = False
+        for t in roots[(roots >= 0.0) & (roots <= 1.0)]:
+            y = x[k] + t * move[k]
+            meets |= bool(brute_force.edge_edge(*y[:, None])[0] < 1e-7)
+        wanted.append(int(meets))
+    assert 50 < sum(wanted) < n
+    assert search.crossed.numpy().tolist() == wanted
+
+
+def overlapping_free(seed: int, spread: float) -> tuple[Shapes, np.ndarray]:
+    """A scene in which nothing overlaps: objects that do are told to ignore each other."""
+    shapes, points = brute_force.scene(seed, spread, rods=30, triangles=60)
+    for first, second in SIDES.values():
+        i, j = np.array(sorted(brute_force.near(shapes, points, first, second, 0.0)), int).reshape(-1, 2).T
+        owners = shapes.things(first)[2][i], shapes.things(second)[2][j]
+        for a, b in set(zip(*map(np.ndarray.tolist, owners), strict=True)):
+            shapes.ignore(a, b)
+    return shapes, points
+
+
+def test_bounds_keep_all_gaps_open_whatever_the_direction(device):
+    """Nodes that move as far as they may, ten times over, anywhere: no gap closes, and none shrinks by more than was allowed."""
+    shapes, points = overlapping_free(5, 1.0)
+    x = upload(points, device)
+    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    rng = np.random.default_rng(6)
+    for _ in range(10):
+        search.update(x)
+        search.fit(x)
+        search.bound(x, share=0.9)
+        before = x.numpy()
+        wish = rng.normal(size=points.shape)
+        move = upload(wish, device)
+        search.held.zero_()
+        search.hold(move)
+        length, bound = np.linalg.norm(move.numpy(), axis=1), search.bounds.numpy()
+        used = np.unique(np.concatenate([shapes.things(size)[0].ravel() for size in (1, 2, 3)]))
+        assert length == pytest.approx(np.minimum(bound, np.linalg.norm(wish, axis=1)), rel=1e-12)
+        assert search.held.numpy()[0] == len(points)
+        assert bound.max() <= 0.5 * (MARGIN + REACH) and bound[used].min() > 0.0
+        search.crossings(x, move)
+        assert search.crossed.numpy()[0] == 0
+        after = before + move.numpy()
+        for side in SIDES.values():
+            i, j = np.array(sorted(brute_force.near(shapes, before, *side, 2 * MARGIN)), int).reshape(-1, 2).T
+            d, thickness = brute_force.distances(shapes, before, *side, i, j)
+            d_after, _ = brute_force.distances(shapes, after, *side, i, j)
+            nearest = d - thickness <= REACH
+            assert ((d_after - thickness)[nearest] >= (0.0999 * (d - thickness))[nearest]).all()
+            assert ((d_after - thickness) > 0.0).all()
+        x.assign(after)
+
+
+def test_smallest_gaps_and_one_tight_pair_that_holds_nobody_else(device):
+    """Of three parallel pairs the tight one alone is held back; bounds are 0.9 / 2 of a gap, or half of reach and margin."""
+    gap = np.array([1e-6, 1e-3, 1.0])
+    points = []
+    for k, g in enumerate(gap):
+        points += [[0, 10 * k, 0], [1, 10 * k, 0], [0, 10 * k, 0.02 + g], [1, 10 * k, 0.02 + g]]
+    shapes = Shapes(np.array(points, float))
+    for k in range(6):
+        shapes.rod([2 * k, 2 * k + 1], 0.01)
+    x = upload(shapes.points, device)
+    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    search.bound(x, share=0.9)
+    assert search.gap.numpy()[0] == pytest.approx(gap[0], rel=1e-9)
+    expected = np.repeat([0.45 * gap[0], 0.45 * gap[1], 0.5 * (MARGIN + REACH)], 4)
+    assert search.bounds.numpy() == pytest.approx(expected, rel=1e-9)
+    search.bound(x, share=0.9, keep=0.0)
+    expected = np.repeat([0.45 * (0.02 + gap[0]), 0.45 * (0.02 + gap[1]), 0.5 * (MARGIN + REACH)], 4)
+    assert search.bounds.numpy() == pytest.approx(np.minimum(expected, 0.5 * (MARGIN + REACH)), rel=1e-9)
