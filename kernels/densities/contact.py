@@ -1,14 +1,15 @@
 """Laws of contact: the energy of two surfaces by their gap g, the distance of what lies in their middle less the thickness between.
 
-Smooth penalty (the implicit contact model: Tong, Choi, Joo and Jawed, Extreme Mech. Lett. 58, 2023, 101924), with K = 15 / delta:
+Smooth penalty (the implicit contact model: Tong, Choi, Joo and Jawed, Extreme Mech. Lett. 58, 2023, 101924), with K = 15 / delta
+and the range delta:
 
     psi = k (ln(1 + exp(-K g)) / K)^2   for g < delta,   0 beyond.
 
 As published it is k g^2 from -delta inwards, where it jumps by 4.1e-8 of its value there, and its slope by 2.9e-7; here it has the
 same form all the way in, so that nothing jumps and it differs from the published one by no more than these. At delta it ends with
-4.2e-16 k delta^2 and a slope of 8.3e-16 k delta.
+4.2e-16 k delta^2 and a slope of 1.2e-14 k delta.
 
-Log barrier (incremental potential contact: Li et al., ACM Trans. Graph. 39, 2020, 49), for g^ the gap at which it begins:
+Log barrier (incremental potential contact: Li et al., ACM Trans. Graph. 39, 2020, 49), with the range g^:
 
     psi = -k (g - g^)^2 ln(g / g^)   for 0 < g < g^,   0 beyond;   infinite for g <= 0.
 

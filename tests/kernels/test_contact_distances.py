@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+import warp as wp
 from contact_cases import COUNT, RIGHT, Pairs, closest_by_features, pairs, positions, worst
 
+from ddg_warp.kernels.net.elements import elements_type, term_kernels
 from ddg_warp.kernels.terms import ALL, CONTACT, FRICTION
 
 STENCILS = ("edge_edge", "point_edge", "point_triangle")
@@ -156,6 +158,30 @@ def test_obstacles_are_what_they_are_called(device):
     np.testing.assert_allclose(sample.strains()[0][0, :n], distance, rtol=1e-14)
     direction = sample.gradient()[:, :n] / (2.0 * (distance - 20.0))  # of gap^2
     np.testing.assert_allclose(direction.T, [case[4] for case in cases], atol=1e-14)
+
+
+@pytest.mark.parametrize("term", ["penalty_obstacle", "friction_obstacle"])
+def test_poses_of_obstacles_have_gradients(device, term):
+    """Reverse mode by what places the obstacle, and by its half lengths, = differences, as an adjoint needs it."""
+    sample = Pairs(ALL[term], None, "float64", device)
+    given, seeds = sample._elements(wp.float64), wp.ones(COUNT, dtype=wp.float64, device=device)
+    wp.launch(
+        term_kernels(sample.term, wp.float64, reverse=True)[0],
+        COUNT,
+        [given],
+        [wp.zeros_like(seeds, requires_grad=True)],
+        adjoint=True,
+        adj_inputs=[elements_type(wp.float64)()],
+        adj_outputs=[seeds],
+        device=device,
+    )
+    found = given.data.grad.numpy()[1:]
+    rows = range(1, len(found) + 1)
+    reference = np.array([sample.difference(sample.energy, "constants", (row,)) for row in rows])
+    lengths = sample.data["constants"][13:] > 0.0  # one that is zero may not be less
+    compared = np.concatenate([np.ones((12, COUNT), bool), lengths])
+    np.testing.assert_allclose(found[compared], reference[compared], atol=1e-6 * np.abs(reference).max())
+    assert np.abs(found[:12]).max(1).min() > 0.0
 
 
 @pytest.mark.parametrize("term", [name for name in CONTACT if name.startswith("penalty")])
