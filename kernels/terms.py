@@ -6,14 +6,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ddg_warp.kernels.densities import POSITIVE, Density, Parameter
+from ddg_warp.kernels.densities.contact import log_barrier, mollified_barrier, mollified_penalty, smooth_penalty
 from ddg_warp.kernels.densities.damping import damped
 from ddg_warp.kernels.densities.dipole import dipole_dipole, dipole_in_field
+from ddg_warp.kernels.densities.friction import logistic_friction, polynomial_friction
 from ddg_warp.kernels.densities.quadratic import quadratic
 from ddg_warp.kernels.densities.st_venant_kirchhoff import st_venant_kirchhoff
 from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.measures.axisymmetric_curvature import axisymmetric_curvature, axisymmetric_rim
 from ddg_warp.kernels.measures.axisymmetric_metric import axisymmetric_metric
 from ddg_warp.kernels.measures.curvature_binormal import curvature_binormal
+from ddg_warp.kernels.measures.edge_edge_distance import edge_edge_distance
 from ddg_warp.kernels.measures.edge_stretch import edge_stretch, edge_stretch_2d
 from ddg_warp.kernels.measures.edge_tilt import edge_tilt
 from ddg_warp.kernels.measures.hinge_angle import hinge_angle
@@ -27,9 +30,12 @@ from ddg_warp.kernels.measures.magnetised_edge import (
 )
 from ddg_warp.kernels.measures.midedge_curvature import midedge_curvature, midedge_curvature_dof
 from ddg_warp.kernels.measures.midedge_metric import midedge_metric
+from ddg_warp.kernels.measures.obstacle_distance import obstacle_distance
 from ddg_warp.kernels.measures.planar_curvature import planar_curvature
+from ddg_warp.kernels.measures.point_distance import point_edge_distance, point_triangle_distance
 from ddg_warp.kernels.measures.rod_curvature_twist import rod_curvature_twist
 from ddg_warp.kernels.measures.rod_surface_angle import rod_surface_angle
+from ddg_warp.kernels.measures.slip import edge_edge_slip, obstacle_slip, point_edge_slip, point_triangle_slip
 from ddg_warp.kernels.measures.triangle_metric import triangle_metric
 from ddg_warp.kernels.measures.turning_angle import (
     curvature_binormal_angle,
@@ -53,7 +59,7 @@ class Term:
     @property
     def key(self) -> str:
         """Name in the registries, which hold each term with and without strain-rate damping."""
-        return term_key(self.name, self.measure.by_angle) + ("_damped" if self.density.lagged else "")
+        return term_key(self.name, self.measure.by_angle) + ("_damped" if self.density.undamped else "")
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -167,4 +173,32 @@ MAGNETS = {
     )
 }
 
-ALL = {**REGISTRY, **SHELLS, **AXISYMMETRIC, **JOINTS, GLUE.name: GLUE, **MAGNETS}
+CONTACT = {
+    term.name: term
+    for term in (
+        Term("penalty_edge_edge", edge_edge_distance, mollified_penalty, "smooth penalty between edges, mollified"),
+        Term("penalty_point_edge", point_edge_distance, smooth_penalty, "smooth penalty between a point and an edge"),
+        Term("penalty_point_triangle", point_triangle_distance, smooth_penalty, "smooth penalty of a triangle"),
+        Term("penalty_obstacle", obstacle_distance, smooth_penalty, "smooth penalty of a half-space or a box"),
+        Term("barrier_edge_edge", edge_edge_distance, mollified_barrier, "log barrier between edges, mollified"),
+        Term("barrier_point_edge", point_edge_distance, log_barrier, "log barrier between a point and an edge"),
+        Term("barrier_point_triangle", point_triangle_distance, log_barrier, "log barrier of a triangle"),
+        Term("barrier_obstacle", obstacle_distance, log_barrier, "log barrier of a half-space or a box"),
+    )
+}
+_SLIPS = {
+    "edge_edge": (edge_edge_slip, "between edges"),
+    "point_edge": (point_edge_slip, "between a point and an edge"),
+    "point_triangle": (point_triangle_slip, "between a point and a triangle"),
+    "obstacle": (obstacle_slip, "on an obstacle"),
+}
+FRICTION = {
+    f"friction_{name}{suffix}": Term(f"friction_{name}{suffix}", measure, density, f"Coulomb friction {text}, {kind}")
+    for suffix, density, kind in (
+        ("", logistic_friction, "logistic"),
+        ("_polynomial", polynomial_friction, "polynomial"),
+    )
+    for name, (measure, text) in _SLIPS.items()
+}
+
+ALL = {**REGISTRY, **SHELLS, **AXISYMMETRIC, **JOINTS, GLUE.name: GLUE, **MAGNETS, **CONTACT, **FRICTION}

@@ -10,7 +10,7 @@ from test_readme import BLOCKS
 
 import ddg_warp as ddg
 from ddg_warp.kernels.densities.quadratic import quadratic
-from ddg_warp.kernels.terms import ALL, MAGNETS, REGISTRY
+from ddg_warp.kernels.terms import ALL, CONTACT, FRICTION, MAGNETS, REGISTRY
 from ddg_warp.run import derivatives
 from ddg_warp.run.catalog import load_file
 from ddg_warp.run.cli import main
@@ -136,8 +136,8 @@ def test_every_law_says_its_parameters():
         names = term.parameter_names
         assert len(set(names)) == len(names) and names[0] == "measure"
         assert all(known.unit and known.valid[0] for known in term.parameters)
-        assert len(term.rest) == (0 if term.name in MAGNETS else len(term.measure.strains))
-        assert ("viscosity" in names) == term.density.lagged
+        assert len(term.rest) == (0 if term.name in {*MAGNETS, *CONTACT, *FRICTION} else len(term.measure.strains))
+        assert ("viscosity" in names) == (term.density.undamped is not None)
 
 
 WRONG = {

@@ -100,6 +100,8 @@ def _gauss_newton(sample: Sample) -> np.ndarray:
     strain, stress = sample.strains()
     inverse = np.linalg.pinv(J, 1e-9)
     curvature = J @ inverse @ S @ inverse  # of the strains that the dofs reach
+    if kept := sample.term.density.kept:
+        curvature = curvature * np.outer(np.arange(len(strain)) < kept, np.arange(len(strain)) < kept)
     if measure.field:  # of a direction n in a field -s what is positive of the curvature along the sphere, -n . s
         curvature = -(strain[:3] * stress[:3]).sum(0)[:, None, None] * np.diag(np.arange(6) < 3)
     matrix = w * np.moveaxis(J.swapaxes(-2, -1) @ _positive(curvature) @ J, (-2, -1), (0, 1))

@@ -27,6 +27,7 @@ class Sample:
     """
 
     chain = "net"
+    STEP = 1e-4  # of differences
 
     def __init__(self, term: Term, kind, precision: str, device: str, data: dict | None = None):
         self.term, self.measure, self.kind, self.precision, self.device = term, term.measure, kind, precision, device
@@ -76,7 +77,7 @@ class Sample:
 
     def difference(self, function, name: str, where, direction=1.0) -> np.ndarray:
         """Central difference of fourth order of function(**data) along data[name][where]."""
-        h, ends = 1e-4, []
+        h, ends = self.STEP, []
         for step in (h, -h, 2.0 * h, -2.0 * h):
             values = self.data[name].copy()
             values[where] += step * direction
@@ -147,6 +148,10 @@ def random_parameters(term: Term, random: np.random.Generator, shape: tuple) -> 
             value = 0.2 * value  # beside the diagonal of a positive definite tensor
         if parameter.unit == "1/m":
             value = 8.0 * value  # strains that mean something to a law are as large as those of the sample
+        if parameter.family == "thickness":
+            value = 0.1 * value  # points do not lie inside of what they touch,
+        if parameter.family in ("range", "velocity"):
+            value = 3.0 * value  # nor beyond its reach, nor do they slide so fast that friction is constant
         rows.append(random_strains(term, random, shape) if parameter.family == "rest" else value)
     return np.array(rows)
 

@@ -53,6 +53,8 @@ class Density:
         lagged: whether p ends with the strains of the last step (n) and the reciprocal of the time step (1).
         coupled: whether psi'' is a full matrix.
         quadratic: whether psi'' depends on no strain.
+        kept: of a coupled law, how many strains the root is of: the first ones, or all (0). What else there is of psi'' is left to the
+            exact Hessian.
         own_root: (real, n) -> root(e, p, shift) as in `functions`, where it has a closed form; else it is found.
     """
 
@@ -63,6 +65,7 @@ class Density:
     lagged: bool = False
     coupled: bool = False
     quadratic: bool = False
+    kept: int = 0
     own_root: Callable | None = None
     undamped: "Density | None" = None  # the law that this is with strain-rate damping
 

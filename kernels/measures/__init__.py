@@ -81,7 +81,7 @@ class Measure:
     @property
     def nodes(self) -> int:
         """Nodes of the stencil."""
-        return 1 + max(max(pair) for pair in self.edges)
+        return max((1 + max(pair) for pair in self.edges), default=self.points)
 
     @property
     def slots(self) -> int:
@@ -99,12 +99,13 @@ class Measure:
     def ends(self) -> tuple[list[int], list[int]]:
         """Of each slot, the first local dof that it sees with weight 1, and with -1, -1 for none.
 
-        A node sees the edge that ends in it and that which starts in it, of which there is one each at most, angles and rotations
-        see themselves.
+        A node sees the edge that ends in it and that which starts in it, of which there is one each at most, or itself as a position
+        where no edge ends; angles and rotations see themselves.
         """
         angles, spins, points = self.starts
         own = [*range(angles, spins), *range(spins, points, 3)]
         minus, plus = ({edge[end]: 3 * i for i, edge in enumerate(self.edges)} for end in (0, 1))
+        plus = {n: points + 3 * n for n in range(self.points)} | plus
         nodes = range(self.nodes)
         return [*(plus.get(n, -1) for n in nodes), *own], [*(minus.get(n, -1) for n in nodes), *([-1] * len(own))]
 

@@ -17,7 +17,10 @@ DAILY = {
     *("rod_stretch_damped", "rod_bend_twist", "planar_bend"),
     *("shell_stretch_damped", "shell_stretch_curved", "shell_hinge_damped", "shell_tilt", "shell_isometric"),
     *("axisymmetric_stretch", "axisymmetric_bend", "axisymmetric_rim", "rigid_joint", "glued_edge"),
+    *("penalty_edge_edge", "penalty_point_edge", "penalty_obstacle", "barrier_edge_edge", "barrier_point_triangle"),
+    *("friction_edge_edge", "friction_point_edge_polynomial", "friction_point_triangle", "friction_obstacle"),
 }
+CONTACTS = ("penalty_", "barrier_", "friction_")
 SAMPLES = {
     (precision, name, sample.chain): sample
     for precision in ("float64", "float32")
@@ -123,16 +126,16 @@ def test_a_term_of_ones_own_passes(device, own, precision):
 
 
 def test_every_term_has_every_check():
-    """Terms of nets but `rigid`, of which `invariance` is the whole, and `exact` where second derivatives are left out; dipoles have no
-    rest shape."""
+    """Terms of nets but `rigid`, of which `invariance` is the whole, and `exact` where second derivatives are left out; dipoles and
+    contacts have no rest shape."""
     for (precision, name, chain), sample in SAMPLES.items():
         left_out = {
             "open": set(),
             "closed": set(),
-            "net": {"rigid"} | (set() if name.startswith("rigid_joint") else {"exact"}),
+            "net": {"rigid"} | (set() if name.startswith(("rigid_joint", *CONTACTS)) else {"exact"}),
         }[chain]
         left_out = left_out | ({"downcast"} if precision == "float32" else set())
-        left_out = left_out | ({"rest"} if name.startswith(("magnetic", "dipoles")) else set())
+        left_out = left_out | ({"rest"} if name.startswith(("magnetic", "dipoles", *CONTACTS)) else set())
         assert set(derivatives.CHECKS) - set(derivatives.checks_of(sample)) == left_out
 
 

@@ -1,0 +1,141 @@
+"""Regularised Coulomb friction: the dissipation potential of a step of length h, by the slip u = e - e^n since its start,
+
+    psi = mu N nu h G(|u| / (nu h)),   force -mu N G'(x) u / |u|,   x = |u| / (nu h) the speed over the velocity nu [m/s],
+
+with the coefficient mu and the normal force N, which is lagged, so that this is a potential in the step. It is zero without slip and
+convex, and so takes energy, no more than the mu N |u| of Coulomb's law.
+
+    logistic     G' = 2 / (1 + exp(-15 x)) - 1 = tanh(7.5 x)     (Tong, Choi, Joo and Jawed, Extreme Mech. Lett. 58, 2023, 101924)
+    polynomial   G' = x (2 - x) for x < 1, 1 beyond              (Li et al., ACM Trans. Graph. 39, 2020, 49: f_1)
+
+What sticks creeps: at the share f of mu N the speed is nu atanh(f) / 7.5, or nu (1 - sqrt(1 - f)). Without a rate, in statics, 1/h = 0
+and there is no friction.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.densities import NOT_NEGATIVE, POSITIVE, Density, Parameter
+
+STEEPNESS = 7.5
+
+
+@cache
+def _logistic(real):
+    """Device functions of x: G / x^2, G' / x and G''."""
+    a = wp.constant(real(STEEPNESS))
+
+    @wp.func
+    def potential(x: real):
+        """ln cosh z / z^2 by its series near zero, where the difference would lose all digits."""
+        z = a * x
+        y = z * z
+        if z < real(0.1):
+            tail = real(31.0 / 14175.0) - y * real(691.0 / 935550.0)
+            tail = real(1.0 / 45.0) - y * (real(17.0 / 2520.0) - y * tail)
+            return a * (real(0.5) - y * (real(1.0 / 12.0) - y * tail))
+        return a * (z - wp.log(real(2.0)) + wp.log(real(1.0) + wp.exp(real(-2.0) * z))) / y
+
+    @wp.func
+    def force(x: real):
+        z = a * x
+        if z < real(1.0e-4):
+            return a * (real(1.0) - z * z / real(3.0))
+        return a * wp.tanh(z) / z
+
+    @wp.func
+    def slope(x: real):
+        t = wp.tanh(a * x)
+        return a * (real(1.0) - t * t)
+
+    return potential, force, slope
+
+
+@cache
+def _polynomial(real):
+    """The same."""
+
+    @wp.func
+    def potential(x: real):
+        if x < real(1.0):
+            return real(1.0) - x / real(3.0)
+        return (x - real(1.0) / real(3.0)) / (x * x)
+
+    @wp.func
+    def force(x: real):
+        if x < real(1.0):
+            return real(2.0) - x
+        return real(1.0) / x
+
+    @wp.func
+    def slope(x: real):
+        return real(2.0) * wp.max(real(1.0) - x, real(0.0))
+
+    return potential, force, slope
+
+
+def _functions(profile, real):
+    """(energy, slope, curvature, root) of a profile G."""
+    potential, force, slope_of = profile(real)
+    E, P = wp.types.vector(2, real), wp.types.vector(6, real)
+    tiny = wp.constant(real(1.0e-30))
+
+    @wp.func
+    def slid(e: E, p: P):
+        """Slip, its length over nu h, and mu N / (nu h)."""
+        u = e - E(p[3], p[4])
+        inverse = p[5] / p[2]
+        return u, wp.length(u) * inverse, p[0] * p[1] * inverse
+
+    @wp.func
+    def energy(e: E, p: P):
+        u, x, scale = slid(e, p)
+        return scale * potential(x) * wp.dot(u, u)
+
+    @wp.func
+    def slope(e: E, p: P):
+        u, x, scale = slid(e, p)
+        return u * (scale * force(x))
+
+    @wp.func
+    def between(u: E, across: real, along: real):
+        """The matrix that is `along` in the direction of the slip, `across` at right angles to it."""
+        unit = u / wp.max(wp.length(u), tiny)
+        return wp.diag(E(across, across)) + wp.outer(unit, unit) * (along - across)
+
+    @wp.func
+    def curvature(e: E, p: P):
+        u, x, scale = slid(e, p)
+        return between(u, scale * force(x), scale * slope_of(x))
+
+    @wp.func
+    def root(e: E, p: P, shift: E):
+        u, x, scale = slid(e, p)
+        return between(u, wp.sqrt(scale * force(x)), wp.sqrt(scale * slope_of(x)))
+
+    return energy, slope, curvature, root
+
+
+def _friction(name: str, profile) -> Density:
+    @cache
+    def functions(real):
+        return _functions(profile, real)
+
+    return Density(
+        name,
+        lambda n: (
+            Parameter("friction", "1", NOT_NEGATIVE),
+            Parameter("normal", "N per rest measure", NOT_NEGATIVE),
+            Parameter("velocity", "m/s", POSITIVE),
+        ),
+        lambda real, n: functions(real)[:3],
+        strains=2,
+        lagged=True,
+        coupled=True,
+        own_root=lambda real, n: functions(real)[3],
+    )
+
+
+logistic_friction = _friction("logistic_friction", _logistic)
+polynomial_friction = _friction("polynomial_friction", _polynomial)
