@@ -43,7 +43,7 @@ class AssembledNewton(ChainNewton):
         group = self.group
         wp.launch(
             self._assemble,
-            (-(-group.columns // block_band.TILE), group.nodes, block_band.TILE),
+            (-(-group.columns // block_band.TILE), group.nodes, min(block_band.TILE, group.columns)),
             [self.factor, self.geometric, group.count, self.mass, self.rotary, group.fixed, *self.islands.arrays]
             + [int(self.reuse)],
             [self.blocks],
