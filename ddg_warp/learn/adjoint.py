@@ -194,7 +194,7 @@ def _cloned(value):
 
 def _require_minimum(own: ChainAdjoint, part) -> None:
     """Refuse the reverse of a step to a saddle, which a solve may end at: the Hessian has negative pivots there."""
-    bad = np.flatnonzero(own.solve.failed.numpy()) if own.solve.failed is not None else []
+    bad = np.flatnonzero(own.solve.failed.numpy())
     if len(bad):
         raise SolverError(
             f"{part.who(int(bad[0]))} ended the step at no minimum of its energy: no gradient goes through it; take a smaller dt",

@@ -158,7 +158,7 @@ class ChainAdjoint:
 
     def pull(self, kept: Kept, after: GroupState, given: GroupState, s: float, states=None) -> tuple:
         """Derivatives by the start of a step, and by what else it read; both are written anew by the next call. Launches alone, but for
-        closed rods and equilibria.
+        equilibria.
 
         Args:
             after: the state that it led to.

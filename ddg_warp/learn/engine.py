@@ -136,13 +136,9 @@ class Engine:
         def launch():
             self._found = adjoint.pull_parts(self.before, self.after, parts, self._given, s)
             for failed, place, _ in told:
-                if failed is not None:
-                    wp.launch(self._solves, failed.shape, [failed], [place], device=failed.device)
+                wp.launch(self._solves, failed.shape, [failed], [place], device=failed.device)
 
-        if all(own.solve.system for own in adjoint.parts):
-            self._graphs.replay(dt, launch)
-        else:
-            launch()
+        self._graphs.replay(dt, launch)
         found, inputs = self._found
         if self.poses:
             ends = self.before, self.after
@@ -252,17 +248,13 @@ class Engine:
     def solved(self, flags) -> list[torch.Tensor]:
         """Flags of a step, not numbers where its reverse has failed, too: of rods that are at no minimum, and of nets that conjugate
         gradients have not solved."""
-        found = zip(flags, self._solved_by, strict=True)
-        return [flag if solved is None else flag * solved for flag, solved in found]
+        return [flag * solved for flag, solved in zip(flags, self._solved_by, strict=True)]
 
-    def _told_by(self, failed: wp.array | None) -> tuple:
-        """What tells which islands a reverse has failed in, where a step leaves one or not a number for them, and as a tensor; None
-        where nothing tells."""
+    def _told_by(self, failed: wp.array) -> tuple:
+        """What tells which islands a reverse has failed in, where a step leaves one or not a number for them, and that as a tensor."""
         if id(failed) not in self._told:
-            place = None
-            if failed is not None:
-                place = wp.ones(failed.shape, dtype=self.model.types.real, device=failed.device)
-            self._told[id(failed)] = failed, place, None if place is None else view(place)
+            place = wp.ones(failed.shape, dtype=self.model.types.real, device=failed.device)
+            self._told[id(failed)] = failed, place, view(place)
         return self._told[id(failed)]
 
     @property

@@ -10,8 +10,10 @@ from scipy.sparse.linalg import splu
 from ddg_warp import arrays
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.adjoint import precision, refine
+from ddg_warp.kernels.adjoint.solve import check_kernels
 from ddg_warp.solve.chains.assembled import AssembledNewton
 from ddg_warp.solve.chains.newton import ChainNewton, NewtonOptions
+from ddg_warp.solve.chains.pcg import PcgNewton
 from ddg_warp.solve.chains.tangent import ChainTangent
 from ddg_warp.solve.choice import automatic
 from ddg_warp.solve.direct import SingularError, regular
@@ -19,6 +21,8 @@ from ddg_warp.solve.reduction import CyclicReduction, Elimination
 
 CLOSE = 1e-5  # relative error of w up to which gradients take what float32 solutions, refined, leave; roll-outs amplify it ...
 PASSES = 2  # ... so that no more than these serve: with 3, an error of 1e-2 each, gradients erred by 1e-3
+LINEAR_RTOL = 1e-13  # of conjugate gradients of closed rods, in the norm of their preconditioner
+MISSED = 1e-6  # what they may have left in truth, for rounding
 SINGULAR = 1e-6  # part of a right-hand side that a solution may miss; a singular matrix, which has been made regular, misses more
 
 
@@ -120,9 +124,33 @@ def _transposed(matrix: sparse.csc_matrix):
     return lambda given: factors.solve(given, trans="T")
 
 
+class ClosedChains:
+    """Closed rods by conjugate gradients, which their open parts precondition; by the calls of `CyclicReduction`."""
+
+    def __init__(self, system: PcgNewton):
+        self.system = system
+        _, self._check = check_kernels(system.linear)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        system = self.system
+        return [system._factor, system._start, system._product, system._advance, self._check]
+
+    def solve(self, matrix, right, count, wanted, solution: wp.array, bad: wp.array, again: bool = False) -> None:
+        """As `CyclicReduction.solve`; `bad` are those of which a residual is left."""
+        system = self.system
+        wp.copy(system.islands.wanted, wanted)
+        system.factorise()
+        system.right, system.direction = right, solution
+        system.direct()
+        read = [system.rho, system.rho_first, MISSED]
+        wp.launch(self._check, system.group.columns, read, [bad], device=system.device)
+
+
 class DirectSolve:
-    """H w = g of a group of open rods: by the sweep, or by factors in another precision than the state's, node by node or by cyclic
-    reduction, and refinement.
+    """H w = g of a group of rods, on the device: by the sweep, or by factors in another precision than the state's, node by node or by
+    cyclic reduction, and refinement; of closed rods by conjugate gradients.
 
     Args:
         linear: precision of the factors; that of the state by default.
@@ -136,6 +164,12 @@ class DirectSolve:
         self.group, self.passes = group, 0
         kind, device, real = group.kind, model.wp_device, model.types.real
         given, size = (model, group, NewtonOptions(psd="none"), real), (group.nodes, group.columns)
+        self._wanted = wp.full(group.columns, 1, dtype=int, device=device)
+        if kind.closed:
+            options = NewtonOptions(psd="none", linear_rtol=LINEAR_RTOL)
+            self.system = PcgNewton(model, group, options, linear=real)
+            self.solver, self.failed = ClosedChains(self.system), self.system.islands.bad
+            return
         few = automatic(group) == "partitioned"
         if not few and linear is None:
             self.solver, self.system = None, ChainNewton(*given)
@@ -145,7 +179,6 @@ class DirectSolve:
         self.system = AssembledNewton(*given, stored=linear)
         own = linear or real
         self.solver = CyclicReduction(kind.block, *size, own, device) if few else Elimination(kind, *size, own, device)
-        self._wanted = wp.full(group.columns, 1, dtype=int, device=device)
         self.failed = self.system.islands.bad
         if linear is not None:
             self._product = refine.product_kernel(kind, real)
@@ -204,23 +237,21 @@ class DirectSolve:
 
 class ChainSolve:
     """H w = g of a group of rods, in the precision of its state: directly, by factors in the precision of the model's linear algebra
-    where these serve; on the host of closed rods and of equilibria.
+    where these serve; on the host of equilibria.
 
     Attributes:
         tangent: of solves on the host; held: of the last of these, see `HostSolve`, as w is laid out.
-        system: the `DirectSolve`, None of closed rods; exact: one in the precision of the state, which is taken instead where
+        system: the `DirectSolve`; exact: one in the precision of the state, which is taken instead where
             parameters that the device holds ask for it; None where they are the model's, or `system` is that.
-        failed: of the last direct solve, see `DirectSolve`; None without.
+        failed: of the last direct solve, see `DirectSolve`.
     """
 
     def __init__(self, model, group):
         self.model, self.group = model, group
         self.host = HostSolve(ChainTangent(model, group, 0))
         self.tangent, self.held = self.host.tangent, None
-        self.system = self.exact = self.failed = self._for = None
-        if not group.kind.closed:
-            self.system = DirectSolve(model, group)
-            self.failed = self.system.failed
+        self.system, self.exact, self._for = DirectSolve(model, group), None, None
+        self.failed = self.system.failed
 
     def suit(self, s: float, given: bool = False) -> bool:
         """From now on solve by what suits steps of s [s]: by as many passes in the precision of the model's linear algebra as leave w
@@ -230,12 +261,12 @@ class ChainSolve:
             given: whether parameters may be others than the model's; which these are the device finds out.
         """
         model, kind = self.model, self.group.kind
-        if self.system is None or model.types.linear is model.types.real:
+        if model.types.linear is model.types.real:
             return False
         changed = False
         if self._for != (s, model.version):
             self._for = s, model.version
-            error = 1.0 if kind.drag else float(self.group.float32_errors(s).max())
+            error = 1.0 if kind.drag or kind.closed else float(self.group.float32_errors(s).max())
             passes = next((n for n in range(1, PASSES + 1) if error**n <= CLOSE), 0)
             changed = passes != self.system.passes
             if bool(passes) != bool(self.system.passes):
@@ -261,7 +292,7 @@ class ChainSolve:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         watch = [*self.exact.kernels, self._measure, self._judge] if self.exact else []
-        return [*self.system.kernels, *watch] if self.system else []
+        return [*self.system.kernels, *watch]
 
     def __call__(self, solved, last: wp.array, s: float, right: wp.array, w: wp.array, resisted=None) -> None:
         """Write w (block, n, R), zero at held dofs, for a right-hand side that is zero there.
@@ -277,7 +308,7 @@ class ChainSolve:
         """
         rate = 1.0 / s
         coefficient = rate * (rate + self.model.scene.mass_damping)
-        if self.system is None or not rate:
+        if not rate:
             more = resisted[0].matrix(*resisted[1:], rate) if resisted else None
             self._on_host(solved, last, rate, coefficient, right, w, more)
             return

@@ -171,11 +171,11 @@ def solver_kernels(kind: ChainKind, linear, preconditioner: str):
             put(residual, 0, k, r, vector(residual, 0, k, r) - alpha * vector(q, 0, k, r))
         total = apply(blocks, factors, residual, z, n, r)
         iterations[r] = iterations[r] + 1
+        beta = total / rho[r]
+        rho[r] = total
         if not total > rtol * rtol * rho_first[r] or iterations[r] >= limit:
             wanted[r] = 2
             return
-        beta = total / rho[r]
-        rho[r] = total
         for k in range(n):
             put(p, 0, k, r, vector(z, 0, k, r) + beta * vector(p, 0, k, r))
         busy[0] = 1

@@ -104,13 +104,18 @@ class PcgNewton(AssembledNewton):
             device=device,
         )
         if self._factor:
-            wp.launch(
-                self._factor,
-                group.columns,
-                [self.blocks, group.count, self.islands.wanted, self.islands.iteration, int(self.reuse)],
-                [self.factors, self.negative if self._repeat else self.islands.lost],
-                device=device,
-            )
+            self.factorise()
+
+    def factorise(self) -> None:
+        """Factors of the open parts of rods that want a direction."""
+        group, islands = self.group, self.islands
+        wp.launch(
+            self._factor,
+            group.columns,
+            [self.blocks, group.count, islands.wanted, islands.iteration, int(self.reuse)],
+            [self.factors, self.negative if self._repeat else islands.lost],
+            device=self.device,
+        )
 
     def direct(self) -> None:
         """Directions by conjugate gradients."""
