@@ -119,3 +119,20 @@ def test_rods_end_to_end_push_each_other(device, law):
     result, _ = terms(shapes, points, device, law)
     one = LAWS[law][1]["stiffness"] * float(psi(law, np.array(GAP)))
     assert result.energy.numpy()[0] == pytest.approx(one, rel=1e-9)
+
+
+@each_law
+@pytest.mark.parametrize("first", [0, 1, 7])
+def test_closed_rods_may_begin_at_any_node(device, law, first):
+    """Rings of 240 edges, 1.5 degrees apart, one above the other."""
+    n = 240
+    angle = 2.0 * np.pi * np.arange(n) / n
+    ring = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], 1)
+    points = np.concatenate([ring, ring + [0.0, 0.0, height(law)]])
+    shapes = Shapes(points)
+    shapes.rod(np.roll(np.arange(n), first), RADIUS, closed=True)
+    shapes.rod(n + np.arange(n), RADIUS, closed=True)
+    result, _ = terms(shapes, points, device, law)
+    forces = result.forces.numpy()
+    assert np.abs(forces[n:] - forces[n]).max(0)[2] < 1e-10 * forces[n, 2]
+    assert np.abs(forces[:n, 2] + forces[n, 2]).max() < 1e-10 * forces[n, 2]

@@ -253,6 +253,23 @@ def test_overlaps_and_what_is_not_finite_show_in_the_energy(device):
     assert np.isnan(result.energy.numpy()).all()
 
 
+@each_case
+def test_all_in_single_precision(device, case):
+    """Positions err by 1e-8 of 0.3 m, a gap of 1e-3 m by 1e-5 of it."""
+    shapes, x = CASES[case]()
+    at = upload(x, device, wp.vec3f)
+    search = BroadPhase(shapes, at, reach=REACH, margin=MARGIN)
+    result = PairTerms(search, smooth_penalty, **LAWS["penalty"][1])
+    result.evaluate(at)
+    assert result.energy.numpy()[0] == pytest.approx(
+        brute(shapes, x.astype(np.float32).astype(float), "penalty"), rel=1e-4
+    )
+    v = np.random.default_rng(7).normal(size=x.shape)
+    whole, there = terms(shapes, x, device)
+    for positions, exact in ((None, times(whole, v)), (at, times(whole, v, there))):
+        assert np.abs(times(result, v, positions) - exact).max() < 1e-3 * np.abs(exact).max()
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
