@@ -33,6 +33,7 @@ import warp as wp
 from ddg_warp.kernels.densities import NOT_NEGATIVE, POSITIVE, Density, Parameter
 
 SHARPNESS = 15.0  # K times the range of the smooth penalty
+SHARE = 1.0e-3  # of |e|^2 |f|^2 of edges at rest, which is the threshold of their mollifier
 THICKNESS = Parameter("thickness", "m", NOT_NEGATIVE, default=0.0)
 RANGE = Parameter("range", "m", POSITIVE)
 STIFFNESS = Parameter("stiffness", "N/m per rest measure", NOT_NEGATIVE)
@@ -144,7 +145,24 @@ def mollified(density: Density) -> Density:
     )
 
 
+@cache
+def mollifier_function(real):
+    """mollify(x, threshold) -> m and its derivatives m', m'' by x."""
+
+    @wp.func
+    def mollify(x: real, threshold: real):
+        one, two = real(1.0), real(2.0)
+        inverse = one / threshold
+        y = x * inverse
+        if y >= one:
+            return one, real(0.0), real(0.0)
+        return y * (two - y), two * (one - y) * inverse, -two * inverse * inverse
+
+    return mollify
+
+
 def _mollified_laws(density: Density, real):
+    mollify = mollifier_function(real)
     energy_of, slope_of, curvature_of = density.laws(real, 1)
     size = len(density.parameters(1))
     G, O = wp.types.vector(1, real), wp.types.vector(size, real)
@@ -156,12 +174,8 @@ def _mollified_laws(density: Density, real):
         own = O()
         for i in range(wp.static(size)):
             own[i] = p[i]
-        one, two = real(1.0), real(2.0)
-        inverse = one / p[wp.static(size)]
-        y = e[1] * inverse
-        if y >= one:
-            return G(e[0]), own, one, real(0.0), real(0.0)
-        return G(e[0]), own, y * (two - y), two * (one - y) * inverse, -two * inverse * inverse
+        m, first, second = mollify(e[1], p[wp.static(size)])
+        return G(e[0]), own, m, first, second
 
     @wp.func
     def energy(e: E, p: P):

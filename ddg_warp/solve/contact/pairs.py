@@ -37,6 +37,7 @@ class PairList:
 
     Attributes:
         pairs: things (i, j) of both sides, counted over all worlds, sorted; the first `count` hold.
+        starts, partners: of each first thing (first.all,), where its pairs start and how many they are, where all pairs fit.
         count: of pairs, zero where they do not fit; needed: the most pairs of any search since the capacity was set.
         sides: see `kernels.contact.surfaces`; overflow: shared with other lists; not zero once pairs did not fit.
     """
@@ -51,8 +52,9 @@ class PairList:
         self.sides.lower, self.sides.upper, self.sides.tree = first.lower, first.upper, second.tree.id
         self.sides.counts, self.sides.objects = wp.vec2i(first.count, second.count), len(shapes.names)
         self.sides.ignored = wp.array(shapes.ignored, dtype=wp.int64, device=self.device)
-        self._last, self._partners = (wp.zeros(first.all, dtype=int, device=self.device) for _ in range(2))
-        self._sums = RunningSums(self._partners)
+        self._last, self.partners = (wp.zeros(first.all, dtype=int, device=self.device) for _ in range(2))
+        self._sums = RunningSums(self.partners)
+        self.starts = self._sums.starts
         self._find, self._fill = candidate_kernels(kind, grouped, real)
         self._bounds = bound_kernel(kind, real, arrays.serial(self.device))
         self.found, self.count, self.needed = (wp.zeros(1, dtype=int, device=self.device) for _ in range(3))
@@ -76,14 +78,14 @@ class PairList:
             self._find,
             self.first.all,
             [self.sides, x, reach],
-            [self.found, self._partner, self._before, self._last, self._partners],
+            [self.found, self._partner, self._before, self._last, self.partners],
             device=self.device,
         )
         self._sums()
         wp.launch(
             self._fill,
             self.first.all,
-            [self.found, self._partner, self._before, self._last, self._sums.starts],
+            [self.found, self._partner, self._before, self._last, self.starts],
             [self.pairs, self.count, self.overflow, self.needed],
             device=self.device,
         )

@@ -1,0 +1,188 @@
+"""Contact on the candidates of a search: energies, forces, and products with the Hessian; see `kernels.contact.pair_energy`."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.kernels.contact import gather
+from ddg_warp.kernels.contact.pair_terms import law_struct
+from ddg_warp.kernels.densities import Density
+from ddg_warp.solve.contact.broad_phase import BroadPhase
+from ddg_warp.solve.contact.list_terms import ListTerms
+from ddg_warp.solve.contact.shapes import Shapes
+
+ROUNDING = 1e-6  # by which a range may exceed the reach, less than what searches go beyond it
+
+
+class PairTerms:
+    """Contact of all pairs of a `BroadPhase`, in one law with parameters by pairs of groups of objects.
+
+    `evaluate`, `product` and `blocks` read nothing back and can be captured, on the CPU too; graphs that hold them have to be captured
+    anew whenever `version` of the search grows, after `fit` of the search and of this. While pairs do not fit energies are infinite.
+
+    Args:
+        search: candidates; to be updated before each `evaluate`.
+        law: `densities.contact.smooth_penalty` or `log_barrier`.
+        stiffness: [N/m], not negative; range: gap below which surfaces push each other [m], positive, at most the reach of the search;
+            thickness: distance at which the gap is zero [m], by default the sum of both radii. Numbers, or symmetric (groups, groups).
+        groups: of each object (objects,), from 0; by default all are in one.
+        linear: type of factors and of vectors of products, by default that of positions.
+        atomic: whether sums are added atomically, in an order that on CUDA differs from run to run.
+
+    Attributes:
+        energy: (worlds,) [J]; forces: (worlds times nodes,) [N].
+        diagonal: (worlds times nodes,) blocks of the Gauss-Newton matrix at nodes, 3 x 3 [N/m]; between: (worlds times edges,) those
+            between the first and the second node of edges, in the order of `shapes.things(2)`. Each pair's own part of rods, 6 x 6 for
+            an edge, is in both, positive semi-definite together. See `blocks`.
+        law: `law_struct`, on the device.
+
+    Raises:
+        SceneError: names the parameter, the pair of objects where there is one, and the remedy.
+    """
+
+    def __init__(
+        self,
+        search: BroadPhase,
+        law: Density,
+        *,
+        stiffness,
+        range,
+        thickness=None,
+        groups=None,
+        linear=None,
+        atomic: bool = False,
+    ):
+        self.search, self.device, self.real = search, search.device, search.real
+        self.linear = linear or self.real
+        self.law = law_struct(self.real)()
+        self._set(stiffness, range, thickness, groups)
+        nodes = len(search.shapes.points) * search.worlds
+        square, inner = _edges(search.shapes)
+        self.law.square = wp.array(square, dtype=self.real, device=self.device)
+        self.law.inner = wp.array(inner, dtype=wp.types.vector(2, self.real), device=self.device)
+        self.energy = wp.zeros(search.worlds, dtype=self.real, device=self.device)
+        self.forces = wp.zeros(nodes, dtype=wp.types.vector(3, self.real), device=self.device)
+        block = wp.types.matrix((3, 3), self.linear)
+        self.diagonal = wp.zeros(nodes, dtype=block, device=self.device)
+        self.between = wp.zeros(search.worlds * len(square), dtype=block, device=self.device)
+        self._listed = wp.full(1, -1, dtype=int, device=self.device)
+        self._stale = wp.zeros(1, dtype=int, device=self.device)
+        self.lists = [
+            ListTerms(pairs, law, nodes, search.worlds, self.real, self.linear, atomic) for pairs in search.lists
+        ]
+        self._version = search.version
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [gather.compare_searches, *(kernel for part in self.lists for kernel in part.kernels)]
+
+    def fit(self) -> bool:
+        """Make as much room as the lists of the search have; whether there was less. Not in a capture."""
+        if self._version == self.search.version:
+            return False
+        for part in self.lists:
+            part.reserve()
+        self._listed.fill_(-1)
+        self._version = self.search.version
+        return True
+
+    def evaluate(self, x: wp.array) -> None:
+        """Energies, forces and factors at positions x.
+
+        Raises:
+            SolverError: if the lists of the search have grown since `fit`.
+        """
+        if self._version != self.search.version:
+            raise SolverError("the lists of pairs have grown; call fit() of these terms, and capture graphs anew")
+        wp.launch(gather.compare_searches, 1, [self.search.searches, self._listed], [self._stale], device=self.device)
+        wp.capture_if(self._stale, self._list)
+        self.energy.zero_()
+        self.forces.zero_()
+        for part in self.lists:
+            part.evaluate(x, self.law, self.forces, self.energy, self.search.overflow)
+
+    def product(self, v: wp.array, out: wp.array, x: wp.array | None = None) -> None:
+        """out += H v of the last `evaluate`, vectors of 3 (worlds times nodes,).
+
+        H is the Gauss-Newton matrix, positive semi-definite by form; with the positions x of that `evaluate`, the exact Hessian.
+        """
+        for part in self.lists:
+            part.product(v, out, x, self.law)
+
+    def blocks(self) -> None:
+        """Write `diagonal` and `between` of the last `evaluate`."""
+        self.diagonal.zero_()
+        self.between.zero_()
+        for part in self.lists:
+            part.blocks(self.diagonal, self.between)
+
+    def _list(self) -> None:
+        for part in self.lists:
+            part.list()
+
+    def _set(self, stiffness, range, thickness, groups) -> None:
+        """Check the parameters and upload them."""
+        objects = len(self.search.shapes.names)
+        groups = np.zeros(objects, int) if groups is None else np.asarray(groups)
+        if groups.shape != (objects,) or groups.dtype.kind not in "iu" or groups.min() < 0:
+            raise SceneError(f"groups = {groups!r} of contact; they are {objects} whole numbers from 0, one an object")
+        number = int(groups.max()) + 1
+        values = {
+            "stiffness": _table("stiffness", stiffness, number, False),
+            "range": _table("range", range, number, True),
+            "thickness": np.full((number, number), -1.0)
+            if thickness is None
+            else _table("thickness", thickness, number, False),
+        }
+        self._within_reach(values["range"], values["thickness"], groups)
+        self.law.group = wp.array(groups, dtype=int, device=self.device)
+        for name, value in values.items():
+            setattr(self.law, name, wp.array(value, dtype=self.real, device=self.device))
+
+    def _within_reach(self, within: np.ndarray, thickness: np.ndarray, groups: np.ndarray) -> None:
+        """Refuse ranges in which the search does not find all pairs."""
+        shapes = self.search.shapes
+        _, radius, owner, _ = shapes.things(2)
+        radii = np.zeros(len(groups))
+        radii[owner] = radius
+        thinnest = {int(g): np.flatnonzero(groups == g)[radii[groups == g].argmin()] for g in np.unique(groups)}
+        for g, one in thinnest.items():
+            for h, other in thinnest.items():
+                both = radii[one] + radii[other]
+                excess = within[g, h] + (thickness[g, h] - both if thickness[g, h] >= 0.0 else 0.0)
+                if excess > self.search.reach * (1.0 + ROUNDING):
+                    raise SceneError(
+                        f"{shapes.names[one]} and {shapes.names[other]} push each other up to {both + excess:.6g} m apart, but are"
+                        f" searched for within {both + self.search.reach:.6g}; give the search a reach of {excess:.6g} m"
+                    )
+
+
+def _edges(shapes: Shapes) -> tuple[np.ndarray, np.ndarray]:
+    """Squared lengths of edges at rest (n,), and of both nodes (n, 2) 1/2 inside of a rod, 0 at its ends, -1 of shells."""
+    nodes, _, owner, span = shapes.things(2)
+    ends = shapes.points[nodes]
+    keys = owner[:, None] * len(shapes.points) + nodes
+    _, which, times = np.unique(keys, return_inverse=True, return_counts=True)
+    inner = np.where(times[which.reshape(keys.shape)] > 1, 0.5, 0.0)
+    inner[span[:, 3] < 0.0] = -1.0
+    return np.square(ends[:, 1] - ends[:, 0]).sum(1), inner
+
+
+def _table(name: str, value, number: int, positive: bool) -> np.ndarray:
+    """A parameter by pairs of groups (number, number)."""
+    table = np.asarray(value, float)
+    if table.shape not in ((), (number, number)):
+        raise SceneError(
+            f"{name} of contact has shape {table.shape}; it is a number, or one a pair of {number} group(s)"
+        )
+    table = np.array(np.broadcast_to(table, (number, number)))
+    wrong = ~(np.isfinite(table) & ((table > 0.0) if positive else (table >= 0.0)))
+    for fault, where in (
+        ("is not finite and " + ("positive" if positive else "not negative"), wrong),
+        ("is not symmetric", table != table.T),
+    ):
+        if where.any():
+            g, h = np.argwhere(where)[0]
+            raise SceneError(f"{name} = {float(table[g, h])!r} of contact between groups {g} and {h} {fault}")
+    return table

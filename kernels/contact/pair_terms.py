@@ -1,0 +1,214 @@
+"""Contact on lists of pairs: energies, gradients and factors a pair, and products with a vector; see `pair_energy`."""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.contact.gather import SLOTS, factor_struct
+from ddg_warp.kernels.contact.pair_energy import distance_function, pair_energy_functions, rows_of, shape_types
+from ddg_warp.kernels.contact.surfaces import EDGES, Kind, pair_functions, sides_struct
+from ddg_warp.kernels.densities import Density
+from ddg_warp.kernels.densities.contact import SHARE
+from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
+
+
+@cache
+def law_struct(real):
+    """Parameters of pairs by the groups of both objects: stiffness [N/m], range and thickness [m], below zero for the sum of radii.
+
+    group (objects,); square (edges,): squared lengths of edges at rest [m^2]; inner (edges,): of both nodes, see `pair_energy`.
+    """
+    U = wp.types.vector(2, real)
+
+    @wp.struct
+    class Law:
+        group: wp.array(dtype=int)
+        stiffness: wp.array2d(dtype=real)
+        range: wp.array2d(dtype=real)
+        thickness: wp.array2d(dtype=real)
+        square: wp.array(dtype=real)
+        inner: wp.array(dtype=U)
+
+    return Law
+
+
+@cache
+def read_functions(kind: Kind, real):
+    """given(law, sides, pair) -> p, threshold, inner of things (i, j) of all worlds; corners(x, nodes) -> (4, 3)."""
+    Law, Sides = law_struct(real), sides_struct(real)
+    _, W, P = shape_types(real)
+    V = wp.types.vector(3, real)
+    _, _, thickness, _ = pair_functions(kind, real)
+
+    @wp.func
+    def given(law: Law, sides: Sides, pair: wp.vec2i):
+        w = pair[0] / sides.counts[0]
+        i, j = pair[0] - w * sides.counts[0], pair[1] - w * sides.counts[1]
+        a, b = law.group[sides.first.object[i]], law.group[sides.second.object[j]]
+        both = law.thickness[a, b]
+        if both < real(0.0):
+            both = thickness(sides, i, j)
+        threshold = real(1.0)
+        inner = W()
+        if wp.static(kind == EDGES):
+            threshold = real(wp.static(SHARE)) * law.square[i] * law.square[j]
+            one, other = law.inner[i], law.inner[j]
+            inner = W(one[0], one[1], other[0], other[1])
+        return P(law.stiffness[a, b], law.range[a, b], both), threshold, inner
+
+    @wp.func
+    def corners(x: wp.array(dtype=V), nodes: wp.vec4i):
+        return wp.matrix_from_rows(x[nodes[0]], x[nodes[1]], x[nodes[2]], x[nodes[3]])
+
+    return given, corners
+
+
+@cache
+def evaluate_kernel(kind: Kind, density: Density, real, linear, serial: bool):
+    """Energy, gradient by slot and factor of each pair."""
+    Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
+    V, W4 = wp.types.vector(3, real), wp.types.vector(4, linear)
+    L = wp.types.vector(3, linear)
+    near = distance_function(kind, real)
+    evaluate_pair, row_of, _ = pair_energy_functions(kind, density, real)
+    given, corners = read_functions(kind, real)
+    until, rows = until_function(serial), rows_of(kind)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def evaluate(
+        pairs: wp.array(dtype=wp.vec2i),
+        count: wp.array(dtype=int),
+        sides: Sides,
+        law: Law,
+        x: wp.array(dtype=V),
+        factor: Factor,
+        energy: wp.array(dtype=real),
+        gradient: wp.array2d(dtype=V),
+    ):
+        tid = wp.tid()
+        if tid >= count[0]:
+            return
+        for pair in range(tid, until(tid, count[0])):
+            p, threshold, inner = given(law, sides, pairs[pair])
+            at = corners(x, factor.nodes[pair])
+            _w, d, _n = near(at)
+            factor.used[pair] = 0
+            energy[pair] = real(0.0)
+            # ends of edges are no nearer; what is no number shows in the energy
+            if p[0] > real(0.0) and not (d >= p[1] + p[2]):
+                e, g = evaluate_pair(at, p, threshold, inner)
+                energy[pair] = e
+                for slot in range(wp.static(SLOTS)):
+                    gradient[slot, pair] = g[slot]
+                used = int(1)
+                for k in range(wp.static(rows)):
+                    weight, v = row_of(at, p, threshold, inner, k)
+                    if wp.dot(v, v) > real(0.0):
+                        used |= 2 << k
+                        factor.direction[k, pair] = L(linear(v[0]), linear(v[1]), linear(v[2]))
+                        factor.weight[k, pair] = W4(
+                            linear(weight[0]), linear(weight[1]), linear(weight[2]), linear(weight[3])
+                        )
+                factor.used[pair] = used
+
+    return evaluate
+
+
+@cache
+def product_kernel(rows: int, linear, serial: bool):
+    """F^T F v of each pair, by slot."""
+    Factor, V, until = factor_struct(linear), wp.types.vector(3, linear), until_function(serial)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def product(count: wp.array(dtype=int), factor: Factor, v: wp.array(dtype=V), parts: wp.array2d(dtype=V)):
+        tid = wp.tid()
+        if tid >= count[0]:
+            return
+        for p in range(tid, until(tid, count[0])):
+            used = factor.used[p]
+            if used != 0:
+                n = factor.nodes[p]
+                v0, v1, v2, v3 = v[n[0]], v[n[1]], v[n[2]], v[n[3]]
+                y0, y1, y2, y3 = V(), V(), V(), V()
+                for k in range(wp.static(rows)):
+                    if (used >> (k + 1)) & 1 != 0:
+                        w = factor.weight[k, p]
+                        along = factor.direction[k, p]
+                        force = along * wp.dot(along, v0 * w[0] + v1 * w[1] + v2 * w[2] + v3 * w[3])
+                        y0 += force * w[0]
+                        y1 += force * w[1]
+                        y2 += force * w[2]
+                        y3 += force * w[3]
+                parts[0, p] = y0
+                parts[1, p] = y1
+                parts[2, p] = y2
+                parts[3, p] = y3
+
+    return product
+
+
+@cache
+def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: bool):
+    """Product of the exact Hessian of each pair with v, by slot: the reverse of the derivative along v."""
+    Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
+    X, *_ = shape_types(real)
+    V, L, until = wp.types.vector(3, real), wp.types.vector(3, linear), until_function(serial)
+    _, _, along = pair_energy_functions(kind, density, real)
+    given, corners = read_functions(kind, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def product(
+        pairs: wp.array(dtype=wp.vec2i),
+        count: wp.array(dtype=int),
+        sides: Sides,
+        law: Law,
+        x: wp.array(dtype=V),
+        factor: Factor,
+        v: wp.array(dtype=L),
+        parts: wp.array2d(dtype=L),
+    ):
+        tid = wp.tid()
+        if tid >= count[0]:
+            return
+        for pair in range(tid, until(tid, count[0])):
+            if factor.used[pair] != 0:
+                p, threshold, inner = given(law, sides, pairs[pair])
+                nodes = factor.nodes[pair]
+                move = X()
+                for slot in range(wp.static(SLOTS)):
+                    for d in range(3):
+                        move[slot, d] = real(v[nodes[slot]][d])
+                dx, _dv, _dp, _dt, _ds = wp.grad(along)(corners(x, nodes), move, p, threshold, inner)
+                for slot in range(wp.static(SLOTS)):
+                    parts[slot, pair] = L(linear(dx[slot, 0]), linear(dx[slot, 1]), linear(dx[slot, 2]))
+
+    return product
+
+
+@cache
+def energy_kernels(real):
+    """things(...) adds energies of pairs of each first thing, total(...) adds those of a list to worlds."""
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def things(
+        count: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
+        partners: wp.array(dtype=int),
+        energy: wp.array(dtype=real),
+        sums: wp.array2d(dtype=real),
+    ):
+        w, k = wp.tid()
+        i = w * sums.shape[1] + k
+        total = real(0.0)
+        if count[0] > 0:
+            for p in range(starts[i], starts[i] + partners[i]):
+                total += energy[p]
+        sums[w, k] = total
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def total(own: wp.array(dtype=real), overflow: wp.array(dtype=int), energy: wp.array(dtype=real)):
+        """Infinite while pairs do not fit."""
+        w = wp.tid()
+        energy[w] = wp.where(overflow[0] == 0, energy[w] + own[w], real(wp.inf))
+
+    return things, total

@@ -1,0 +1,135 @@
+"""Scenes for contact on pairs, and its energy by all pairs in NumPy."""
+
+import numpy as np
+import warp as wp
+from brute_force import allowed, edge_edge, point_edge, point_triangle, scene
+
+from ddg_warp.kernels.densities.contact import log_barrier, smooth_penalty
+from ddg_warp.solve.contact.broad_phase import BroadPhase
+from ddg_warp.solve.contact.pair_terms import PairTerms
+from ddg_warp.solve.contact.shapes import Shapes
+
+REACH, MARGIN = 0.004, 0.004
+LAWS = {
+    "penalty": (smooth_penalty, {"stiffness": 100.0, "range": 0.004}),
+    "barrier": (log_barrier, {"stiffness": 100.0, "range": 0.008, "thickness": 0.0}),
+}
+
+
+def upload(x: np.ndarray, device, dtype=wp.vec3d) -> wp.array:
+    return wp.array(np.ascontiguousarray(x), dtype=dtype, device=device)
+
+
+def bundle(rods: int = 3, edges: int = 4, jitter: float = 2e-5, seed: int = 1) -> tuple[Shapes, np.ndarray]:
+    """Rods side by side over a strip of triangles, parallel but for 1 part in 500: mollifiers are between 0 and 1."""
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(np.linspace(0.0, 0.2, edges + 1), np.arange(rods) * 0.0062)
+    sides = np.stack([x + 0.011 * np.arange(rods)[:, None], y, 0.0 * x], 2).reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(4), np.arange(3), indexing="ij")
+    strip = np.stack([0.02 + 0.05 * i, -0.005 + 0.01 * j, np.full(i.shape, -0.0056)], 2).reshape(-1, 3)
+    rest = np.concatenate([sides, strip])
+    shapes = Shapes(rest)
+    for r in range(rods):
+        shapes.rod(r * (edges + 1) + np.arange(edges + 1), 0.003)
+    first = len(sides) + (3 * i + j)[:-1, :-1].ravel()
+    triangles = np.concatenate(
+        [np.stack([first, first + 3, first + 1], 1), np.stack([first + 3, first + 4, first + 1], 1)]
+    )
+    shapes.shell(triangles, 0.004)
+    return shapes, rest + rng.normal(size=rest.shape) * jitter
+
+
+CASES = {
+    "crossing": lambda: scene(1, 0.3, rods=10, triangles=40),
+    "parallel": bundle,
+}
+
+
+def terms(
+    shapes: Shapes, x: np.ndarray, device, law: str = "penalty", worlds: int = 1, **options
+) -> tuple[PairTerms, wp.array]:
+    """Terms, evaluated at x, which is returned on the device."""
+    density, parameters = LAWS[law]
+    at = upload(x, device)
+    search = BroadPhase(shapes, at, worlds, reach=REACH, margin=MARGIN)
+    result = PairTerms(search, density, **{**parameters, **options})
+    result.evaluate(at)
+    return result, at
+
+
+def move(result: PairTerms, at: wp.array, x: np.ndarray) -> None:
+    """Evaluate at other positions."""
+    at.assign(x)
+    result.search.update(at)
+    result.search.fit(at)
+    result.fit()
+    result.evaluate(at)
+
+
+def psi(law: str, gap: np.ndarray, order: int = 0) -> np.ndarray:
+    """Energies by the gap, or their second derivatives, in the forms of the papers, for one newton a metre."""
+    within = LAWS[law][1]["range"]
+    if law == "penalty":
+        K = 15.0 / within
+        s, share = np.logaddexp(0.0, -K * gap) / K, 1.0 / (1.0 + np.exp(np.minimum(K * gap, 100.0)))
+        value = s**2 if order == 0 else 2.0 * share * (share + K * s * (1.0 - share))
+    else:
+        g = np.minimum(gap, 0.999 * within)
+        log, rest = np.log(g / within), g - within
+        value = -(rest**2) * log if order == 0 else -2.0 * log - 4.0 * rest / g + rest**2 / g**2
+    return np.where(gap < within, value, 0.0)
+
+
+def ends(shapes: Shapes, rest: np.ndarray, x: np.ndarray, i, j):
+    """Of edges i the ends, against edges j: distances from these and from their two nodes (2, 3, n), and weights (2, 3, n)."""
+    nodes, _, owner, span = shapes.things(2)
+    key = owner[:, None] * len(rest) + nodes
+    inside = (key[:, :, None] == np.concatenate([key[:, 0], key[:, 1]])).sum(2) > 1
+    p, a, b = x[nodes[i]].swapaxes(0, 1), x[nodes[j, 0]], x[nodes[j, 1]]
+    d = np.stack([point_edge(p, a, b), np.linalg.norm(p - a, axis=-1), np.linalg.norm(p - b, axis=-1)], 1)
+    weights = np.stack([np.ones(len(j)), -0.5 * inside[j, 0], -0.5 * inside[j, 1]])
+    return d, np.stack([0.5 * weights * (span[j, 3] >= 0.0)] * 2)
+
+
+def brute(shapes: Shapes, x: np.ndarray, law: str, v: np.ndarray | None = None) -> float:
+    """Energy [J] of all pairs; with v, v . H v of the Gauss-Newton matrix: psi'' times the square of how distances change along v."""
+    rest, k = shapes.points, LAWS[law][1]["stiffness"]
+    i, j = allowed(shapes, 2, 2)
+    nodes, radius, *_ = shapes.things(2)
+    order = 0 if v is None else 2
+
+    def corners(x):
+        return [x[nodes[of, end]] for of in (i, j) for end in (0, 1)]
+
+    def value(d, both):
+        return psi(law, d - (both if law == "penalty" else 0.0), order)
+
+    def change(function):
+        """Squares of changes along v of what function(x) gives."""
+        return 1.0 if v is None else central(lambda s: function(x + s * v), 1e-7) ** 2
+
+    a, b, c, e = corners(x)
+    length = ((rest[nodes[:, 1]] - rest[nodes[:, 0]]) ** 2).sum(1)
+    y = np.minimum((np.cross(b - a, e - c) ** 2).sum(1) / (1e-3 * length[i] * length[j]), 1.0)
+    m, both = y * (2.0 - y), radius[i] + radius[j]
+    total = (m * value(edge_edge(a, b, c, e), both) * change(lambda x: edge_edge(*corners(x)))).sum()
+    for one, other in ((i, j), (j, i)):
+        d, weights = ends(shapes, rest, x, one, other)
+        counted = (weights * value(d, both)).sum(1)
+        if v is not None:
+            counted = np.maximum(counted, 0.0)
+        total += ((1.0 - m) * counted * change(lambda x, o=one, p=other: ends(shapes, rest, x, o, p)[0][:, 0])).sum()
+    if 3 in shapes.sizes:
+        i, j = allowed(shapes, 1, 3)
+        (point, thin, *_), (sides, thick, *_) = shapes.things(1), shapes.things(3)
+
+        def apart(x):
+            return point_triangle(x[point[i, 0]], *(x[sides[j, k]] for k in range(3)))
+
+        total += (value(apart(x), thin[i] + thick[j]) * change(apart)).sum()
+    return float(k * total)
+
+
+def central(function, h: float):
+    """Derivative at 0 by central differences of fourth order."""
+    return (8.0 * (function(h) - function(-h)) - (function(2.0 * h) - function(-2.0 * h))) / (12.0 * h)

@@ -1,0 +1,296 @@
+"""Contact on pairs: energies and forces of all pairs, products with the Hessian, momentum, and what may not change them."""
+
+import numpy as np
+import pytest
+import warp as wp
+from pair_cases import (
+    CASES,
+    LAWS,
+    MARGIN,
+    REACH,
+    brute,
+    bundle,
+    central,
+    move,
+    terms,
+    upload,
+)
+
+from ddg_warp import arrays
+from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.kernels.densities.contact import smooth_penalty
+from ddg_warp.solve.contact.broad_phase import BroadPhase
+from ddg_warp.solve.contact.pair_terms import PairTerms
+from ddg_warp.solve.contact.shapes import Shapes
+
+each_case = pytest.mark.parametrize("case", CASES)
+each_law = pytest.mark.parametrize("law", LAWS)
+
+
+def state(result: PairTerms) -> list[np.ndarray]:
+    """Copies of energies, forces and blocks."""
+    result.blocks()
+    return [of.numpy().copy() for of in (result.energy, result.forces, result.diagonal, result.between)]
+
+
+def times(result: PairTerms, v: np.ndarray, at=None) -> np.ndarray:
+    """H v, of the exact Hessian where positions are given."""
+    given = upload(v, result.device, wp.types.vector(3, result.linear))
+    out = wp.zeros_like(given)
+    result.product(given, out, at)
+    return out.numpy().copy()
+
+
+def assembled(result: PairTerms, n: int, at=None) -> np.ndarray:
+    """H (n, 3, n, 3), a column a product."""
+    unit = np.eye(3 * n).reshape(3 * n, n, 3)
+    return np.stack([times(result, v, at) for v in unit], -1).reshape(n, 3, n, 3)
+
+
+@each_case
+@each_law
+def test_energy_is_that_of_all_pairs(device, case, law):
+    shapes, x = CASES[case]()
+    result, _ = terms(shapes, x, device, law)
+    assert result.energy.numpy()[0] == pytest.approx(brute(shapes, x, law), rel=1e-11)
+    assert all((part.factor.used.numpy() != 0).sum() > 5 for part in result.lists)
+    if case == "parallel":  # both parts of the energy of edges are there
+        assert ((result.lists[0].factor.used.numpy() & 0b10) != 0).sum() > 5
+        assert ((result.lists[0].factor.used.numpy() & 0b111100) != 0).sum() > 5
+
+
+@each_case
+@each_law
+def test_forces_and_exact_products_are_differences(device, case, law):
+    shapes, x = CASES[case]()
+    result, at = terms(shapes, x, device, law)
+    forces = result.forces.numpy().copy()
+    step = 2e-8  # regions of closest points, where second derivatives jump, are as near as 1e-7
+    random = np.random.default_rng(1)
+    for _ in range(5):
+        v = random.normal(size=x.shape)
+        product = times(result, v, at)
+
+        def quantities(s, v=v):
+            move(result, at, x + s * v)
+            return np.append(result.energy.numpy()[0], result.forces.numpy().ravel())
+
+        slopes = central(quantities, step)
+        move(result, at, x)
+        assert slopes[0] == pytest.approx(-(forces * v).sum(), rel=1e-6)
+        assert np.abs(product.ravel() + slopes[1:]).max() < 1e-6 * np.abs(product).max()
+
+
+@each_case
+@each_law
+def test_gauss_newton_matrix(device, case, law):
+    """Symmetric, positive semi-definite, and what psi'' makes of the derivatives of distances."""
+    shapes, x = CASES[case]()
+    result, _ = terms(shapes, x, device, law)
+    v = np.random.default_rng(2).normal(size=x.shape)
+    assert (times(result, v) * v).sum() == pytest.approx(brute(shapes, x, law, v), rel=1e-6)
+    n = len(x)
+    matrix = assembled(result, n)
+    flat = matrix.reshape(3 * n, 3 * n)
+    largest = np.abs(flat).max()
+    assert np.abs(flat - flat.T).max() < 1e-14 * largest
+    assert np.linalg.eigvalsh(flat).min() > -1e-13 * largest
+    assert np.abs((flat @ v.ravel()).reshape(n, 3) - times(result, v)).max() < 1e-13 * largest * np.abs(v).max()
+
+
+@each_law
+def test_blocks_are_those_of_the_matrix(device, law):
+    shapes, x = bundle()
+    for other in range(4):
+        shapes.ignore(3, other)  # no triangles: between nodes of an edge there is what the pairs of the edge add
+    result, _ = terms(shapes, x, device, law)
+    n = len(x)
+    matrix = assembled(result, n).transpose(0, 2, 1, 3)
+    _, _, diagonal, between = state(result)
+    nodes = shapes.things(2)[0]
+    largest = np.abs(matrix).max()
+    assert np.abs(diagonal - matrix[np.arange(n), np.arange(n)]).max() < 1e-13 * largest
+    assert np.abs(between - matrix[nodes[:, 0], nodes[:, 1]]).max() < 1e-13 * largest
+    assert np.abs(between).max() > 1e-3 * largest
+
+
+@each_case
+@each_law
+def test_forces_have_no_resultant_and_no_moment(device, case, law):
+    shapes, x = CASES[case]()
+    result, _ = terms(shapes, x, device, law)
+    forces = result.forces.numpy()
+    largest = np.abs(forces).sum()
+    assert np.abs(forces.sum(0)).max() < 1e-14 * largest
+    assert np.abs(np.cross(x, forces).sum(0)).max() < 1e-14 * largest * np.abs(x).max()
+
+
+@each_case
+def test_two_runs_agree_to_the_bit_and_atomic_sums_to_rounding(device, case):
+    shapes, x = CASES[case]()
+    v = np.random.default_rng(3).normal(size=x.shape)
+    runs = []
+    for atomic in (False, False, True):
+        result, _ = terms(shapes, x, device, atomic=atomic)
+        runs.append([*state(result), times(result, v)])
+    for first, again, other in zip(*runs, strict=True):
+        assert (first == again).all()
+        assert np.abs(first - other).max() <= 1e-13 * np.abs(first).max()
+
+
+def test_worlds_are_alone(device):
+    shapes, x = CASES["crossing"]()
+    random = np.random.default_rng(4)
+    worlds = [x + 1e-3 * random.normal(size=x.shape) for _ in range(3)]
+    together = state(terms(shapes, np.concatenate(worlds), device, worlds=3)[0])
+    alone = [state(terms(shapes, each, device)[0]) for each in worlds]
+    for whole, parts in zip(together, zip(*alone, strict=True), strict=True):
+        assert (whole == np.concatenate(parts)).all()
+    assert len(set(together[0])) == 3
+
+
+def test_lists_grow_and_nothing_is_dropped(device):
+    shapes, x = CASES["crossing"]()
+    result, at = terms(shapes, x, device)
+    before = state(result)
+    for pairs in result.search.lists:
+        pairs.reserve(10)
+    result.search.search(at)
+    result.evaluate(at)
+    assert np.isinf(result.energy.numpy()).all()
+    assert not result.forces.numpy().any()
+    assert result.search.fit(at)
+    with pytest.raises(SolverError, match=r"have grown; call fit\(\)"):
+        result.evaluate(at)
+    assert result.fit()
+    assert not result.fit()
+    result.evaluate(at)
+    assert all((a == b).all() for a, b in zip(state(result), before, strict=True))
+
+
+def test_the_order_of_objects_does_not_matter(device):
+    """Objects and their nodes the other way round, and rods from their other end."""
+    shapes, x = bundle()
+    rods, edges = 3, 4
+    n = len(x)
+    turned = Shapes(shapes.points[::-1])
+    triangles = n - 1 - shapes.things(3)[0]
+    turned.shell(triangles[::-1, [1, 2, 0]], 0.004)
+    for r in reversed(range(rods)):
+        turned.rod(n - 1 - (r * (edges + 1) + np.arange(edges + 1)), 0.003)
+    first, _ = terms(shapes, x, device)
+    second, _ = terms(turned, x[::-1], device)
+    assert second.energy.numpy()[0] == pytest.approx(first.energy.numpy()[0], rel=1e-12)
+    forces = first.forces.numpy()
+    assert np.abs(second.forces.numpy()[::-1] - forces).max() < 1e-11 * np.abs(forces).max()
+
+
+def test_a_captured_evaluation_follows_motion(device):
+    shapes, x = CASES["crossing"]()
+    result, at = terms(shapes, x, device)
+    v = np.random.default_rng(5).normal(size=x.shape)
+    given, out = upload(v, device), upload(0.0 * v, device)
+    arrays.load_kernels([*result.search.kernels, *result.kernels], device)
+    with wp.ScopedCapture(device=device) as capture:
+        result.search.update(at)
+        result.evaluate(at)
+        out.zero_()
+        result.product(given, out)
+        result.blocks()
+    velocity = 0.3 * MARGIN * v / np.linalg.norm(v, axis=1, keepdims=True)
+    searches = result.search.searches.numpy()[0]
+    for step in range(1, 5):
+        at.assign(x + step * velocity)
+        wp.capture_launch(capture.graph)
+        assert result.energy.numpy()[0] == pytest.approx(brute(shapes, x + step * velocity, "penalty"), rel=1e-11)
+        assert (out.numpy() * v).sum() == pytest.approx(brute(shapes, x + step * velocity, "penalty", v), rel=1e-6)
+    assert result.search.searches.numpy()[0] == searches + 2
+
+
+def test_parameters_are_those_of_groups(device):
+    """What each pair of groups has with its parameters for all, where other pairs ignore each other; together the whole."""
+    groups = np.array([0, 0, 1, 1])
+    parameters = {
+        "stiffness": np.array([[1.0, 2.0], [2.0, 5.0]]),
+        "range": np.array([[2.2e-3, 3e-3], [3e-3, 3.5e-3]]),
+        "thickness": np.array([[5.8e-3, 5e-3], [5e-3, 4.5e-3]]),
+    }
+    total = 0.0
+    for g, h in ((0, 0), (0, 1), (1, 1)):
+        shapes, x = bundle()
+        for a in range(4):
+            for b in range(a, 4):
+                if sorted((groups[a], groups[b])) != [g, h]:
+                    shapes.ignore(a, b)
+        alone, _ = terms(shapes, x, device, **{name: table[g, h] for name, table in parameters.items()})
+        assert alone.energy.numpy()[0] > 0.0
+        total += alone.energy.numpy()[0]
+    whole, _ = terms(*bundle(), device, groups=groups, **parameters)
+    assert whole.energy.numpy()[0] == pytest.approx(total, rel=1e-12)
+
+
+def test_factors_in_single_precision(device):
+    shapes, x = CASES["parallel"]()
+    whole, _ = terms(shapes, x, device)
+    single, at = terms(shapes, x, device, linear=wp.float32)
+    v = np.random.default_rng(6).normal(size=x.shape)
+    assert (single.forces.numpy() == whole.forces.numpy()).all()
+    for positions in (None, at):
+        exact = times(whole, v, positions)
+        assert np.abs(times(single, v, positions) - exact).max() < 1e-5 * np.abs(exact).max()
+
+
+def test_overlaps_and_what_is_not_finite_show_in_the_energy(device):
+    shapes, x = bundle()
+    result, at = terms(shapes, x, device, "barrier", thickness=0.006, range=0.002)
+    assert np.isinf(result.energy.numpy()).all()
+    without, _ = terms(shapes, x, device, "barrier", thickness=0.006, range=0.002, stiffness=0.0)
+    assert not without.energy.numpy().any()
+    result, at = terms(shapes, x, device)
+    x[7] = np.nan
+    at.assign(x)
+    result.evaluate(at)
+    assert np.isnan(result.energy.numpy()).all()
+
+
+@each_case
+def test_all_in_single_precision(device, case):
+    """Positions err by 1e-8 of 0.3 m, a gap of 1e-3 m by 1e-5 of it."""
+    shapes, x = CASES[case]()
+    at = upload(x, device, wp.vec3f)
+    search = BroadPhase(shapes, at, reach=REACH, margin=MARGIN)
+    result = PairTerms(search, smooth_penalty, **LAWS["penalty"][1])
+    result.evaluate(at)
+    assert result.energy.numpy()[0] == pytest.approx(
+        brute(shapes, x.astype(np.float32).astype(float), "penalty"), rel=1e-4
+    )
+    v = np.random.default_rng(7).normal(size=x.shape)
+    whole, there = terms(shapes, x, device)
+    for positions, exact in ((None, times(whole, v)), (at, times(whole, v, there))):
+        assert np.abs(times(result, v, positions) - exact).max() < 1e-3 * np.abs(exact).max()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"stiffness": -1.0}, r"stiffness = -1.0 of contact between groups 0 and 0 is not finite and not negative"),
+        ({"range": 0.0}, r"range = 0.0 of contact between groups 0 and 0 is not finite and positive"),
+        ({"range": np.ones(3)}, r"range of contact has shape \(3,\); it is a number, or one a pair of 1 group"),
+        ({"thickness": np.nan}, r"thickness = nan .* is not finite and not negative"),
+        ({"groups": [0, 1]}, r"groups = .* of contact; they are 4 whole numbers from 0, one an object"),
+        (
+            {"groups": [0, 0, 0, 1], "stiffness": [[1.0, 2.0], [3.0, 4.0]]},
+            r"stiffness = 2.0 of contact between groups 0 and 1 is not symmetric",
+        ),
+        (
+            {"range": 0.005},
+            r"shell 3 and shell 3 push each other up to 0.009 m apart, but .* within 0.008; .* reach of 0.005 m",
+        ),
+        ({"thickness": 0.0065, "groups": [0, 0, 0, 1]}, r"rod 0 and rod 0 push .* a reach of 0.0045 m"),
+    ],
+)
+def test_wrong_parameters_are_named(device, options, message):
+    shapes, x = bundle()
+    search = BroadPhase(shapes, upload(x, device), reach=REACH, margin=MARGIN)
+    with pytest.raises(SceneError, match=message):
+        PairTerms(search, smooth_penalty, **{"stiffness": 1.0, "range": REACH, **options})
