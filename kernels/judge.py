@@ -13,6 +13,7 @@ from ddg_warp.kernels.chain import ChainKind
 from ddg_warp.kernels.islands import (
     ACTIVE,
     DECREMENT,
+    DRIVEN,
     DROWNED,
     HALVINGS,
     ITERATION,
@@ -33,8 +34,11 @@ STOP, DIRECT = 0, 3  # beside PLACE and RELAG: nothing more to do, and a directi
 
 
 @cache
-def judge_functions(twist: bool, real):
-    """balanced(...): whether a rod has stopped; decide(...): what an active rod does next (STOP, PLACE, RELAG or DIRECT)."""
+def judge_functions(twist: bool, real, driven: bool = False):
+    """balanced(...): whether a rod has stopped; decide(...): what an active rod does next (STOP, PLACE, RELAG or DIRECT).
+
+    `driven`: whether supports may have moved in the last step, whose work the search does not know.
+    """
     shorter = shorter_function(real)
 
     @wp.func
@@ -89,6 +93,8 @@ def judge_functions(twist: bool, real):
                 accept = total <= real(-1.0e-4) * expected + rounding
             else:
                 accept = square <= real(4.0) * scalars[MERIT, r] or taken == real(0.0)
+            if wp.static(driven):
+                accept = accept or flags[DRIVEN, r] != 0
         if not accept:
             flags[HALVINGS, r] = flags[HALVINGS, r] + 1
             if flags[HALVINGS, r] > max_halvings:

@@ -14,6 +14,7 @@ LOST_IN_ROUNDING = (
     8  # counted instead of CONVERGED_TO_ROUNDING where rounding decides the motion, and the user allowed that
 )
 ENERGY_DRIFT = 9  # the midpoint rule would have made or lost more energy than it may; see `kernels.energy`
+CROSSED = 10  # things would have passed through each other
 
 NAMES = {
     CONVERGED: "converged",
@@ -25,4 +26,5 @@ NAMES = {
     GIVEN_UP: "given_up",
     LOST_IN_ROUNDING: "lost_in_rounding",
     ENERGY_DRIFT: "energy_drift",
+    CROSSED: "crossed",
 }

@@ -44,8 +44,9 @@ def energies(model, state) -> dict:
 
 @launches
 def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
-    """Force and moment of every support of the scene: those of rods in the order they were added, then of shells, then of rings.
+    """Force and moment of every support of the scene: those of rods in the order they were added, then of shells, of rings, of obstacles.
 
+    What holds an obstacle takes what is pushed against it, without friction.
     They balance the internal forces and the loads on held dofs, and hold the normals of clamped mesh edges and of planes of
     symmetry; the inertia of a held node itself is left out, and drag on it, which a moving support would have to add. Of a ring, x
     is the radial force summed around it, and moments do not hold the direction of the meridian. A dof that several supports hold
@@ -61,7 +62,7 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     q = tangent.back(q)
     scene = model.scene
     first, shells = len(scene.supports), len(scene.shell_supports)
-    turns = np.zeros((model.worlds, first + shells + len(scene.ring_supports), 3))
+    turns = np.zeros((model.worlds, first + shells + len(scene.ring_supports) + len(scene.obstacles), 3))
     if shells:
         turns[:, first : first + shells] = _normal_moments(tangent.parts[-1], state)
     result = []

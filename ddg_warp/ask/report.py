@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ddg_warp.kernels.solve import cyclic_reduction
-from ddg_warp.kernels.terms import ALL
+from ddg_warp.kernels.terms import ALL, CONTACT, FRICTION
 from ddg_warp.scene.scene import Dynamics
 from ddg_warp.solve.chains.step import DIRECT
 from ddg_warp.solve.choice import automatic, net_preconditioner
@@ -44,6 +44,9 @@ def report(model) -> str:
     if model.net is not None:
         lines += net_lines(model)
         present |= {part.term.name for part in model.net.sets}
+        if touching := model.net.host.touching:
+            lines += contact_lines(touching)
+            present |= contact_terms(touching)
     absent = sorted({term.name for term in ALL.values()} - present)
     lines.append("not in this scene: " + ", ".join(absent))
     if not any(group.kind.twist for group in model.groups) and (model.net is None or not model.net.edges):
@@ -67,6 +70,27 @@ def step_lines(model, errors_of: Callable) -> list[str]:
     return [f"  over steps of {analysis.dt:g} s: {', '.join(taken)}"] if taken else []
 
 
+def contact_lines(touching) -> list[str]:
+    """What may touch, and by which numbers."""
+    law, still = touching.law, sum(body.still for body in touching.bodies)
+    numbers = ((touching.range, "range", "m"), (touching.stiffness, "stiffness", "N/m"), (touching.friction, "friction", ""))
+    said = (f"{name} {_between(values)}{unit and ' ' + unit}" for values, name, unit in numbers)
+    return [f"contact: {law.law} between {len(touching.bodies) - still} bodies and {still} obstacles, {', '.join(said)}"]
+
+
+def contact_terms(touching) -> set[str]:
+    """Names of the terms that are its."""
+    law, rubs = touching.law, touching.friction.any()
+    polynomial = law.friction_law == "polynomial"
+    names = {name for name in CONTACT if name.startswith(law.law)}
+    return names | {name for name in FRICTION if rubs and name.endswith("_polynomial") == polynomial}
+
+
+def _between(values: np.ndarray) -> str:
+    low, high = values.min(), values.max()
+    return f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
+
+
 def net_lines(model) -> list[str]:
     """What the net holds: dofs, terms, the matrix."""
     host, net = model.net.host, model.net
@@ -86,7 +110,7 @@ def net_lines(model) -> list[str]:
     reals, solver, bands, split = 9 * table.positions, f"PCG ({name})", "", False
     if chains and chains.banded:
         chains.plan.bind(host, table.rows.numpy(), table.columns.numpy(), chains.kept)
-        solver = "elimination along rods, exact" if chains.plan.complete else solver
+        solver = "elimination along rods, exact" if chains.plan.complete and not host.touching else solver
         split = chains.splits
         places, block = int(chains.plan.count.sum()), chains.plan.block
         reals += 3 * block**2 * chains.plan.chain.size

@@ -13,7 +13,7 @@ _NONE = np.zeros(0, int)
 
 def scene_motions(scene) -> list:
     """The different motions of a scene's supports, in order of appearance."""
-    supports = [*scene.supports, *scene.shell_supports, *scene.ring_supports]
+    supports = [*scene.supports, *scene.shell_supports, *scene.ring_supports, *scene.obstacles]
     return list({id(s.motion): s.motion for s in supports if s.motion is not None}.values())
 
 

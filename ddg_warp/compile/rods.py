@@ -11,6 +11,7 @@ from ddg_warp.geometry import polyline
 from ddg_warp.kernels.chain import ChainKind
 from ddg_warp.kernels.terms import REGISTRY, Term, term_key
 from ddg_warp.scene import drag
+from ddg_warp.scene.contact import touching_names
 from ddg_warp.scene.descriptions import RodBatch
 from ddg_warp.scene.scene import Scene
 from ddg_warp.scene.validate import check_batch
@@ -62,13 +63,17 @@ class Piece:
 
 
 def net_rods(scene: Scene) -> np.ndarray:
-    """Which rods belong to the scene's net: those that are joined or attached to something, or magnetised (R,) bool."""
+    """Which rods belong to the scene's net: those that are joined or attached to something, magnetised, or touch (R,) bool."""
     members = [rod for joint in scene.joints for rod, _ in joint.members]
     members += [attachment.rod for attachment in scene.attachments]
     chosen = np.zeros(scene.rod_count, bool)
     chosen[np.array(members, int)] = True
     for magnet in scene.magnets:
         chosen[magnet.rods] = True
+    names = touching_names(scene)
+    for batch in scene.batches:
+        if batch.name in names:
+            chosen[batch.first : batch.first + batch.rods] = True
     return chosen
 
 

@@ -10,6 +10,7 @@ import torch
 import warp as wp
 
 from ddg_warp import arrays
+from ddg_warp.errors import SceneError
 from ddg_warp.kernels.adjoint.step import smooth_kernel, solved_kernel
 from ddg_warp.learn.adjoint import Adjoint, EquilibriumAdjoint
 from ddg_warp.learn.chains import Kept
@@ -43,6 +44,8 @@ class Engine:
     """
 
     def __init__(self, model, scheme: str, options: dict):
+        if model.net is not None and model.net.host.touching:
+            raise SceneError("contact: steps with contact have no gradients yet; step the model by an Integrator")
         self.model, self.device = model, str(wp.device_to_torch(model.wp_device))
         self.midpoint = scheme == "implicit_midpoint"
         self.integrator = Integrator(model, scheme, failures="flag", check_every=FOREVER, energy_bound=None, **options)

@@ -1,5 +1,7 @@
 """Model: a scene frozen for a device. Constant arrays, terms, dof map, and what can be asked of a state."""
 
+from functools import cached_property
+
 import numpy as np
 import warp as wp
 
@@ -96,6 +98,15 @@ class Model:
         """Shells as triangles among the rows of `State.points`; None without."""
         return self.order.surfaces
 
+    @cached_property
+    def touch(self):
+        """What may touch, and what does at states that it is asked about (`Touch`); None without contact."""
+        from ddg_warp.solve.contact.touch import Touch
+
+        if self.net is None or self.net.host.touching is None:
+            return None
+        return Touch(self.net, self.types.real, self.net.rest().q)
+
     @property
     def magnetic(self) -> bool:
         """Whether rods of it are in a magnetic field."""
@@ -132,6 +143,13 @@ class Model:
 
         validate.check_state("drag", self, state)
         return drag(self, state)
+
+    def contacts(self, state: State):
+        """What touches what at a state, `ask.contacts.Contacts`; see there."""
+        from ddg_warp.ask.contacts import contacts
+
+        validate.check_state("contacts", self, state)
+        return contacts(self, state)
 
     def stresses(self, state: State) -> dict:
         """Axial forces and moments along the rods; see `ddg_warp.ask.inquiry.stresses`."""
@@ -373,4 +391,5 @@ def _device(name):
 
 def needs_net(scene) -> bool:
     """Whether a scene has anything but rods on their own."""
-    return bool(scene.shells or scene.joints or scene.attachments or scene.magnets or scene.axisymmetric_shells)
+    parts = scene.shells, scene.joints, scene.attachments, scene.magnets, scene.axisymmetric_shells, scene.touching
+    return any(map(bool, parts))

@@ -55,6 +55,7 @@ class Scene(Structures):
     def __repr__(self) -> str:
         joined = f", {len(self.joints)} joints, {len(self.attachments)} attachments" if self.joints else ""
         held = len(self.supports) + len(self.shell_supports) + len(self.ring_supports)
+        obstacles = f", {len(self.obstacles)} obstacles" if self.obstacles else ""
         loads = sum(
             map(
                 len,
@@ -66,7 +67,7 @@ class Scene(Structures):
         return (
             f"<Scene of dimension {self.dimension}, gravity {tuple(self.gravity)} m/s^2, {type(self.analysis).__name__}: "
             f"{self.rod_count} rods of {nodes} nodes, {len(self.shells)} shells of {triangles} triangles, "
-            f"{len(self.axisymmetric_shells)} shells of revolution{joined}, {held} supports, {loads} loads>"
+            f"{len(self.axisymmetric_shells)} shells of revolution{joined}{obstacles}, {held} supports, {loads} loads>"
         )
 
     @property

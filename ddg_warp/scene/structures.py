@@ -12,6 +12,7 @@ from ddg_warp.errors import SceneError, SceneWarning
 from ddg_warp.geometry.shell_forms import MEMBRANES, MODELS, TURNING
 from ddg_warp.geometry.surface import Surface
 from ddg_warp.scene import validate
+from ddg_warp.scene.contact import Contacts
 from ddg_warp.scene.descriptions import (
     Attachment,
     EdgeCouple,
@@ -31,7 +32,7 @@ COINCIDE = 1e-6  # how far points that are meant to be one, or in one plane, may
 
 
 @dataclass(kw_only=True, repr=False, eq=False)
-class Structures(Meridians, Magnets):
+class Structures(Meridians, Magnets, Contacts):
     """The part of a scene that is a net: whatever is not a rod of its own."""
 
     shells: list[Shell] = field(default_factory=list, init=False)

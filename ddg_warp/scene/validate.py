@@ -8,6 +8,7 @@ from ddg_warp import arguments
 from ddg_warp.errors import SceneError, SceneWarning
 from ddg_warp.geometry import polyline
 from ddg_warp.scene import drag
+from ddg_warp.scene.contact import check_contact
 from ddg_warp.scene.descriptions import Dynamics, Statics, Trace
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.motion import Motion
@@ -54,7 +55,8 @@ def check_scene(scene) -> None:
         )
     drag.check_flow(scene)
     _check_magnets(scene)
-    every = (*scene.supports, *scene.shell_supports, *scene.ring_supports)
+    check_contact(scene)
+    every = (*scene.supports, *scene.shell_supports, *scene.ring_supports, *scene.obstacles)
     supports = [s for s in every if isinstance(s.motion, Motion)]  # a grip starts at rest
     if not supports or scene.initial is not None or not isinstance(scene.analysis, Dynamics):
         return  # a state may start elsewhere, and equilibria have no time before the first

@@ -50,6 +50,8 @@ def why_not_pcg(model) -> str:
     """What keeps equilibria of a model from being found by conjugate gradients; empty where nothing does."""
     if model.net is None or model.groups:
         return "it is for shells and joined rods alone, and the model has rods on their own"
+    if model.net.host.touching:
+        return "it does not serve contact"
     return ""
 
 

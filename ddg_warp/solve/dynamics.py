@@ -164,7 +164,13 @@ class Integrator:
                 self.forget()
             self._launch(source)
 
-        self._graphs.replay((source, anew, self.given is not None and self.given.any), launch)
+        def replay():
+            self._graphs.replay((source, anew, self.given is not None and self.given.any), launch)
+
+        replay()
+        while self._net is not None and self._net.outgrown(self._buffers[source].own.net):
+            self._graphs.clear()
+            replay()
 
     def check(self, state: State) -> None:
         """Read the outcomes of all steps since the last reading.
@@ -235,7 +241,8 @@ class Integrator:
         """Counts since the integrator was made: Newton iterations of a solve, retries, lost pivots, outcomes.
 
         Under "energy", where it is watched, what the midpoint rule has made and what damping took [J] over all rods and worlds since
-        the state that the integrator was given, and of them the largest fraction made; see `energy_bound`.
+        the state that the integrator was given, and of them the largest fraction made; see `energy_bound`. Under "contact", where
+        there is any, see `NetContact.statistics`.
         """
         tally = sum(part.tally.numpy() for part in self._parts)
         work = np.array([part.work.numpy() for part in self._parts])
@@ -247,7 +254,15 @@ class Integrator:
             "lost_pivots": int(work[:, 4].sum()),
             "linear": [str(part.means) for part in self._parts],
             "outcomes": {name: int(tally[code]) for code, name in outcome.NAMES.items() if tally[code]},
-        } | ({} if self.energy_bound is None else {"energy": energy.summary([part.energy for part in self._parts])})
+        } | self._more_statistics()
+
+    def _more_statistics(self) -> dict:
+        result = {}
+        if self.energy_bound is not None:
+            result["energy"] = energy.summary([part.energy for part in self._parts])
+        if self._net is not None and self._net.newton.contact:
+            result["contact"] = self._net.newton.contact.statistics()
+        return result
 
     def _control(self, found: dict[str, np.ndarray], source: int) -> None:
         """Hand the device what a step from a buffer is given; parts that carry no such loads yet are made anew, to do so."""
@@ -314,6 +329,8 @@ class Integrator:
         self._vacate(0)
         self._buffers[0].state.assign(state)
         self.forget()
+        if self._net is not None and self._net.newton.contact:
+            self._net.newton.contact.check(self._buffers[0].own.net.q)
         return 0
 
     def forget(self) -> None:

@@ -39,7 +39,7 @@ def meeting_type(real, linear):
 def given_type(real, drag: bool):
     """What the balance of blocks reads beside the elements.
 
-    `allowed` is what the residual of a block may be at rtol = 1, over `load_scale`; see `ddg_warp.compile.tolerance`. Moments are
+    In contact nodes have forces `push`, and bounds `pressed` on the stiffness of what pushes them. `allowed` is what the residual of a block may be at rtol = 1, over `load_scale`; see `ddg_warp.compile.tolerance`. Moments are
     compared over the length `arm`. What rounding leaves of an edge vector follows from the coordinates of both its ends, `longest`
     apart at most.
     """
@@ -61,6 +61,8 @@ def given_type(real, drag: bool):
         longest: real
         rtol: real
         floor: real
+        push: wp.array(dtype=V)
+        pressed: wp.array(dtype=real)
 
     return Given
 
@@ -103,8 +105,8 @@ def largest_function(real, size: int = 3):
 
 
 @cache
-def residual_functions(real, linear, drag: bool, angle: bool = False):
-    """outer(...): loads, gravity, inertia and drag of a block; settle(...): its residual, and whether that balances.
+def residual_functions(real, linear, drag: bool, contact: bool, angle: bool = False):
+    """outer(...): loads, gravity, inertia, drag and contact of a block; settle(...): its residual, and whether that balances.
 
     Of an `angle` of a rod, known as such, vectors have its one dof.
     """
@@ -132,7 +134,7 @@ def residual_functions(real, linear, drag: bool, angle: bool = False):
 
     @wp.func
     def outer(given: Given, i: int, k: int, w: int, c: real):
-        """Force; its size and stiffness, the work along the step."""
+        """Force; its size and stiffness, the work along the step, without that of contact, which has an energy."""
         x = own(given.q[i])
         force = own(given.load[i])
         if wp.static(drag):
@@ -152,6 +154,9 @@ def residual_functions(real, linear, drag: bool, angle: bool = False):
             inertia += held_back
             change += wp.dot(u, held_back - resistance * u * real(0.5))
             stiff += wp.max(wp.get_diag(resistance))
+        if wp.static(contact and not angle):
+            force += given.push[i]
+            stiff += given.pressed[i]
         return force - inertia, largest(force), stiff, change
 
     @wp.func
@@ -210,12 +215,12 @@ ITEM = 16  # in an item, an element of a set counts as much, and its slots one e
 
 
 @cache
-def balance_kernel(real, linear, drag: bool, serial: bool):
+def balance_kernel(real, linear, drag: bool, contact: bool, serial: bool):
     """balance(...) of the blocks `some`, or, where these are none, of all."""
     V, Meeting = wp.types.vector(3, real), meeting_type(real, linear)
     Given, Found, F = given_type(real, drag), found_type(real, linear), wp.types.matrix((3, 3), real)
     until = until_function(serial)
-    outer, settle = residual_functions(real, linear, drag)
+    outer, settle = residual_functions(real, linear, drag, contact)
     largest = largest_function(real)
 
     @wp.func

@@ -10,6 +10,7 @@ from ddg_warp.kernels.islands import (
     ACTIVE,
     CAUTIOUS,
     DECREMENT,
+    DRIVEN,
     DROWNED,
     ITERATION,
     LOAD_SCALE,
@@ -30,19 +31,21 @@ from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
 from ddg_warp.kernels.search import PLACE, STRAIGHT
 from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
 
+ON_THE_WAY, THERE = 2, 1  # what supports have done in the last step, if they moved: not arrived, arrived
 POLISH = 1e-3  # reduction to which a direction must have been solved before rounding excuses what it leaves
 STALLED = 8  # iterations without progress, where energies drown in rounding, that a world is given
 
 
 @cache
-def search_kernels(real, linear, serial: bool, turns: bool, renews: bool):
+def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contact: bool = False):
     """judge(...) of an iterate, measure(...) and take(...) of a direction, move(...) of the blocks.
 
     Args:
         turns: whether there are rods, whose edges turn; renews: whether there are frames, which may have to be renewed.
+        contact: whether supports may be on their way; see `kernels.net.contact`.
     """
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
-    balanced, decide = judge_functions(renews, real)
+    balanced, decide = judge_functions(renews, real, contact)
     share, until = share_function(serial), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -84,6 +87,9 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool):
         )
         if polish and flags[ITERATION, w] > 0:
             flags[UNBALANCED, w] = 1
+        if wp.static(contact):
+            if flags[DRIVEN, w] == wp.static(ON_THE_WAY):
+                flags[UNBALANCED, w] = 1
         if balanced(flags, scalars, w):
             return
         before = scalars[MERIT, w]

@@ -121,12 +121,12 @@ def force_function(terms: tuple[Term, ...], real, linear):
 
 
 @cache
-def place_kernel(terms: tuple[Term, ...], twist: bool, real, linear, drag: bool, serial: bool):
+def place_kernel(terms: tuple[Term, ...], twist: bool, real, linear, drag: bool, contact: bool, serial: bool):
     """balance(...) of the nodes and angles of places, but for those `elsewhere`; see `kernels.matrix.sliced`."""
     Along, Given, Found = along_type(real, linear), given_type(real, drag), found_type(real, linear)
     M, until = wp.types.vector(1, real), until_function(serial)
-    outer, settle = residual_functions(real, linear, drag)
-    outer_of_angle, settle_angle = residual_functions(real, linear, drag, True)
+    outer, settle = residual_functions(real, linear, drag, contact)
+    outer_of_angle, settle_angle = residual_functions(real, linear, drag, contact, True)
     collect = force_function(terms, real, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

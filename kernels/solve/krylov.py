@@ -113,9 +113,10 @@ def solver_kernels(linear, indefinite: bool = False):
         wanted: wp.array(dtype=int),
         blocks: int,
         positions: int,
+        more: wp.array(dtype=M),
         inverse_out: wp.array(dtype=M),
     ):
-        """Inverse of the diagonal blocks of H on free dofs; `diagonal` holds their positions."""
+        """Inverse of the diagonal blocks of H on free dofs; `diagonal` holds their positions, `more` what is not there, if anything."""
         i = wp.tid()
         w = i / blocks
         if wanted[w] == 0:
@@ -130,6 +131,8 @@ def solver_kernels(linear, indefinite: bool = False):
         for r in range(3):
             for c in range(3):
                 m[r, c] = matrix[3 * r + c, p]
+        if more.shape[0] > 0:
+            m += more[i]
         inverse, definite = inverse_of(wp.cw_mul(m, wp.outer(f, f)), f)
         if not definite:
             for d in range(3):

@@ -13,6 +13,7 @@ from ddg_warp.compile.ghosts import Ghosts
 from ddg_warp.compile.net import conditions
 from ddg_warp.compile.net import elements as net_elements
 from ddg_warp.compile.net.net import Net, NetRod, NetShell
+from ddg_warp.compile.net.touching import touching
 from ddg_warp.compile.rods import Piece, alike, net_rods, piece_of
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import shell_forms
@@ -47,6 +48,8 @@ def compile_net(scene, along: bool = False) -> Net | None:
         builder.add_shell(shell)
     for shell in scene.axisymmetric_shells:
         builder.add_meridian(shell)
+    for obstacle in scene.obstacles:
+        builder.add_obstacle(obstacle)
     return builder.finish()
 
 
@@ -74,6 +77,7 @@ class _Builder:
         self.rods: dict[int, NetRod] = {}
         self.shells: list[tuple] = []
         self.meridians: list[np.ndarray] = []
+        self.obstacles: list[np.ndarray] = []
         self.numbers: list[tuple[np.ndarray, np.ndarray]] = []  # of the nodes and of the angles of some rods
         self.rod_edges = 0
         self.frames: list[np.ndarray] = []
@@ -113,6 +117,10 @@ class _Builder:
         """Number the nodes of a shell of revolution."""
         radius, height = shell.points.T
         self.meridians.append(self._number(np.column_stack([radius, 0.0 * radius, height])))
+
+    def add_obstacle(self, obstacle) -> None:
+        """Number the points of an obstacle."""
+        self.obstacles.append(self._number(obstacle.shape.points))
 
     def _number(self, points: np.ndarray) -> np.ndarray:
         self.points.append(points)
@@ -173,12 +181,14 @@ class _Builder:
                 axisymmetric.meridian(shell, i, scene.ring_supports, merged[numbers])
                 for i, (shell, numbers) in enumerate(zip(scene.axisymmetric_shells, self.meridians, strict=True))
             ],
+            obstacles=[merged[numbers] for numbers in self.obstacles],
         )
         net.fixed[nodes : nodes + angles, 1:] = True
         net.sets = net_elements.element_sets(scene, net, self.along)
         conditions.add_masses(scene, net)
         conditions.hold(scene, net)
         conditions.load(scene, net)
+        net.touching = touching(scene, net)
         if scene.dimension == 2:
             net.fixed[:nodes, 1] = True
             net.fixed[nodes : nodes + angles] = True

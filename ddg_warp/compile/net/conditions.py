@@ -42,6 +42,9 @@ def hold(scene, net: Net) -> None:
         nodes = net.meridians[support.shell].nodes[support.nodes]
         each = np.arange(len(nodes))
         claims.take(support, nodes, each, each)
+    for obstacle, nodes in zip(scene.obstacles, net.obstacles, strict=True):
+        each = np.arange(len(nodes))
+        claims.take(obstacle, nodes, each, each)
     claims.finish()
     frames_of_planes(net, normals)
 

@@ -47,7 +47,7 @@ class BroadPhase:
             if not 0.0 < value < np.inf:
                 raise SceneError(f"{name} = {value!r} of a contact search; it is positive and finite [m]")
         nodes = len(shapes.points)
-        if x.ndim != 1 or len(x) != worlds * nodes or x.dtype not in (wp.vec3f, wp.vec3d):
+        if x.ndim != 1 or len(x) != worlds * nodes or getattr(x.dtype, "_shape_", ()) != (3,):
             raise SceneError(
                 f"positions of {worlds} world(s) of {nodes} nodes are {worlds * nodes} vectors of 3, not {x.shape} of {x.dtype}"
             )

@@ -24,6 +24,8 @@ class Balance:
         given.rtol, given.floor = newton.options.rtol, newton.options.floor_factor * newton.eps
         for name in ("right", "square", "change", "noise"):
             setattr(found, name, getattr(newton, name))
+        if newton.contact:
+            given.push, given.pressed = newton.contact.forces, newton.contact.stiffness
         found.least, found.ratio = newton.allowed.least, newton.allowed.ratio
         self.given, self.found = given, found
         self._meetings = list(self._meeting_of_sets())  # an array of structures keeps nothing alive
@@ -36,7 +38,7 @@ class Balance:
         else:
             types = int, wp.types.matrix((3, 3), real)
             self._frames = [wp.zeros(0, dtype=dtype, device=net.device) for dtype in types]
-        self.kernels = [balance.balance_kernel(real, linear, drag, arrays.serial(net.device))]
+        self.kernels = [balance.balance_kernel(real, linear, drag, newton.contact is not None, arrays.serial(net.device))]
 
     def _meeting_of_sets(self):
         """What the elements of each set bring to the blocks."""

@@ -44,6 +44,7 @@ class Chains:
         self.along = [i for i, part in enumerate(net.sets) if part.host.along]
         self.banded = banded and len(self.along) <= SETS
         self.kept = self.plan.where >= 0 if self.banded else None
+        self._contact = net.host.touching is not None
 
     @classmethod
     def of(cls, net, preconditioner: str, banded: bool = True, split: bool = False) -> "Chains | None":
@@ -61,18 +62,19 @@ class Chains:
         """
         longest, width = self.plan.chain.shape
         few = long_and_few(longest, self.net.worlds * width, wp.get_device(self.device))
-        return self.split or (self.banded and self.plan.alone and not few)
+        return self.split or (self.banded and self.plan.alone and not (few or self._contact))
 
     def bind(
         self, table, written: list[dict], real, linear, exact_from: tuple, drag: bool, reuse: bool = False
     ) -> None:
         """Take the `NetSystem` of the net, without what bands keep, and what the elements of all sets write; see `Assembly`.
 
-        With `reuse` one matrix serves several directions.
+        With `reuse` one matrix serves several directions. In contact there is more to H than is here, which goes into `eliminated`
+        before `prepare`.
         """
         self.table, net, plan = table, self.net, self.plan
         plan.bind(net.host, table.rows.numpy(), table.columns.numpy(), self.kept)
-        self.exact = self.banded and plan.complete
+        self.exact = self.banded and plan.complete and not self._contact
         worlds, device, serial = net.worlds, net.device, arrays.serial(net.device)
         H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
 
@@ -96,6 +98,9 @@ class Chains:
             self.bands = self.factors
         else:
             self.bands = arrays.allocate((3 * block**2, self.longest, self.columns), linear, device)
+        self.eliminated = self.bands  # what is factored
+        if self._contact and self.banded:
+            self.eliminated = arrays.allocate((3 * block**2, self.longest, self.columns), linear, device)
         self.values = arrays.allocate((block, self.longest, self.columns), linear, device)
         self.responses = arrays.allocate((block, self.longest, plan.solves * self.columns), linear, device)
         self.coupled = len(plan.of_places[1]) > 0
@@ -115,14 +120,14 @@ class Chains:
         self._assemble, self._clear, self._product = band_kernels(
             terms, plan.twist, plan.span, real, linear, late, drag, serial, self.split
         )
-        self._layout = layout_type()()
+        self.layout = layout_type()()
         for name in ("places", "chain", "count", "held"):
-            setattr(self._layout, name, getattr(self, name))
-        self._layout.diagonal, self._layout.positions = table.diagonal, table.positions
+            setattr(self.layout, name, getattr(self, name))
+        self.layout.diagonal, self.layout.positions = table.diagonal, table.positions
         own = [self._elements(i, written[i], real, linear) for i in sets] or [along_type(real, linear)()]
         self._own = own + own[-1:] * (SETS - len(own))
         if self.banded:
-            self._balance = place_kernel(terms, plan.twist, real, linear, drag, serial)
+            self._balance = place_kernel(terms, plan.twist, real, linear, drag, self._contact, serial)
             apart = np.zeros(net.blocks, np.uint8)
             apart[self.elsewhere] = 1
             self._apart = wp.array(apart, dtype=wp.uint8, device=device)
@@ -177,7 +182,7 @@ class Chains:
         self._launch(
             self._assemble,
             (arrays.takers(self.longest, self.device), self.columns),
-            [matrix, mass, *islands.arrays, self._layout, *self._own],
+            [matrix, mass, *islands.arrays, self.layout, *self._own],
             [self.bands],
         )
         if self._clears:
@@ -205,13 +210,13 @@ class Chains:
             self.prepare(matrix, fixed, anew.wanted, lost)
             self.apply(matrix, right, islands.wanted, z, dots)
             if self.split:
-                inputs = [*islands.arrays, self._layout, *self._own, self.values]
+                inputs = [*islands.arrays, self.layout, *self._own, self.values]
                 self._launch(self._lengthen, (self.longest, self.columns), inputs, [self.longer])
             return
         self._launch(
             self._walk,
             self.columns,
-            [matrix, mass, *islands.arrays, self._layout, *self._own, right, self.net.blocks],
+            [matrix, mass, *islands.arrays, self.layout, *self._own, right, self.net.blocks],
             [self.factors, self.values, lost, z],
         )
         if self.joints:
@@ -222,7 +227,7 @@ class Chains:
         """Factors of chains and joints of the worlds that want a direction; raises `lost` where one of them is indefinite."""
         self._lost, self._reduced = lost, False
         if not self.reduction:
-            self._launch(self._factorise, self.columns, [self.bands, self.count, wanted], [self.factors, lost], SERIAL)
+            self._launch(self._factorise, self.columns, [self.eliminated, self.count, wanted], [self.factors, lost], SERIAL)
         if self.joints:
             self._prepare_joints(matrix, fixed, wanted, lost)
 
@@ -299,7 +304,7 @@ class Chains:
         self._launch(spread, self.columns, [wanted, self.width], [self._wanted])
         for first in range(0, values.shape[2], self.columns):
             part = values[:, :, first : first + self.columns]
-            given = self.bands, part, self._all, self._wanted, part, self._bad
+            given = self.eliminated, part, self._all, self._wanted, part, self._bad
             self.reduction.solve(*given, again=self._reduced)
             if not self._reduced:
                 self._launch(note, self.columns, [self.width], [self._bad, self._lost])

@@ -35,6 +35,7 @@ class ExactSystem:
         failed: not zero of worlds where it is more, so that w means nothing (worlds,).
     """
 
+    contact = None
     tolerance = 1e-12
     missed = 1e-6
 

@@ -34,6 +34,7 @@ class ConjugateGradients:
         self._unread = [wp.zeros(newton.worlds, dtype=int, device=device) for _ in range(2)]
         self.sum = Sums(newton.worlds, net.blocks, linear, device)
         self._invert, self._start, self._begin, *self._cycle = krylov.solver_kernels(linear, indefinite)
+        self._more = newton.contact.diagonal if newton.contact else wp.zeros(0, dtype=M, device=device)
         self.levels = Multilevel(net, newton.system, linear) if multilevel else None
         self._limit = max(200, 100 * math.isqrt(net.blocks))
 
@@ -50,7 +51,7 @@ class ConjugateGradients:
         table, blocks, wanted, anew = newton.system, newton.net.blocks, newton.islands.wanted, newton.anew.wanted
         self._launch(
             self._invert,
-            [newton.matrix, table.diagonal, newton.fixed, anew, blocks, table.positions],
+            [newton.matrix, table.diagonal, newton.fixed, anew, blocks, table.positions, self._more],
             [self.inverse],
         )
         self._launch(
@@ -97,6 +98,7 @@ class ConjugateGradients:
             newton.chains.product(newton.matrix, self.p, newton.fixed, wanted, self.product, dots)
         else:
             self.multiply(self.p)
+        self.couple(self.p)
         self.sum(dots, self.curvature)
         self._launch(
             advance,
@@ -113,6 +115,9 @@ class ConjugateGradients:
             [self.rho, newton.iterations, newton.indefinite, wanted, self.busy],
             device=newton.device,
         )
+
+    def couple(self, p: wp.array) -> None:
+        """Add to H p, and to p . H p, what is in no matrix."""
 
     def multiply(self, p: wp.array) -> None:
         """H p on free dofs where none of H lies in bands, and p . H p block by block."""
@@ -163,6 +168,11 @@ class Directions(ConjugateGradients):
             [newton.forcing, wanted, self.busy],
             device=newton.device,
         )
+
+    def couple(self, p: wp.array) -> None:
+        """Contact's part."""
+        if self.newton.contact:
+            self.newton.contact.multiply(p, self.product)
 
     def cycle(self) -> None:
         """One iteration."""

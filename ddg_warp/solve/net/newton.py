@@ -17,6 +17,7 @@ from ddg_warp.kernels.solve import krylov, pcg
 from ddg_warp.solve.chains.newton import EARLY, FROZEN, FROZEN_ONLY, NewtonOptions
 from ddg_warp.solve.net.balance import Balance
 from ddg_warp.solve.net.chains import Chains
+from ddg_warp.solve.net.contact import NetContact
 from ddg_warp.solve.net.frozen import Frozen
 from ddg_warp.solve.net.krylov import Directions
 from ddg_warp.solve.net.planes import DevicePlanes
@@ -97,6 +98,7 @@ class NetNewton:
         self.forcing = make(worlds, self.linear)
         self.pcg_work = make(1, wp.int64)
         self.frozen = Frozen(self.islands) if reuse else None
+        self.contact = NetContact(self) if host.touching else None
         self.psd = self.automatic_psd() if options.psd == "auto" else options.psd
         if self.psd == "none":
             self._require_exact()
@@ -127,6 +129,8 @@ class NetNewton:
         ]
         if self.chains:
             self.chains.bind(self.system, self.parts, self.real, self.linear, self.exact_from, drag, reuse)
+            if self.contact:
+                self.contact.bind(self.chains)
         self._direct = self.chains is not None and self.chains.exact
         fails = self.psd == "none"
         repeats = not reuse and (fails or any(exact) or self._direct)
@@ -137,7 +141,7 @@ class NetNewton:
         )
         self.turns = Turns(self) if host.rods else None
         self._judge, self._measure, self._rotate, self._take, self._move = newton.search_kernels(
-            self.real, self.linear, serial, bool(host.rods), bool(net.edges)
+            self.real, self.linear, serial, bool(host.rods), bool(net.edges), self.contact is not None
         )
         self.allowed = Allowed(net, self.real, self.linear)
         outer = outer_forces(host, gravity)
@@ -185,7 +189,7 @@ class NetNewton:
         """Kernels to load before a capture."""
         own = [*self._balance.kernels, self._judge, self._measure, self._rotate, self._take]
         own += [*self.allowed.kernels, *([self._repeat] if self._repeat else [])]
-        used = (self.chains, None if self._direct else self.krylov, self.planes, self.turns)
+        used = (self.chains, None if self._direct else self.krylov, self.planes, self.turns, self.contact)
         parts = [self._move, *self.net.carries, *(k for part in used if part for k in part.kernels)]
         evaluate = [(kernel, 128) for kernel in self._evaluate]
         sums = (self._sum, self._sum_weights, self._largest, self._worst)
@@ -215,6 +219,8 @@ class NetNewton:
         self.move()
         if self.turns:
             wp.capture_if(self.islands.turning, lambda: self.turns.turn(state))
+        if self.contact:
+            self.contact.hold()
 
     def evaluate(self, state) -> None:
         """Energies, gradients and factors of all elements at the iterate."""
@@ -228,6 +234,8 @@ class NetNewton:
                 128,
                 self.worlds,
             )
+        if self.contact:
+            self.contact.evaluate()
 
     def balance(self) -> None:
         """Residuals, the change of the energy, and the worlds that are out of equilibrium."""
@@ -241,6 +249,8 @@ class NetNewton:
         options = self.options
         self._sum_weights(self._weights.reshape((3 * self.worlds, -1)), self._weight.flatten())
         self._worst(self.allowed.ratio, self.worst)
+        if self.contact:
+            self.contact.account(self._weight[0], self._weight[1])
         wp.launch(
             self._judge,
             self.worlds,
@@ -261,6 +271,8 @@ class NetNewton:
             self.planes.matrix(self.matrix, anew.wanted)
         if self.chains and not self._direct:
             self.chains.assemble(self.matrix, self.mass, anew)
+        if self.contact:
+            self.contact.assemble()
 
     def direct(self) -> None:
         """Directions: by elimination where that is exact, else by conjugate gradients."""
@@ -278,6 +290,8 @@ class NetNewton:
                 self.direction,
                 self.krylov_dots,
             )
+        elif self.contact:
+            self.contact.direct()
         else:
             self.krylov.solve()
         if self._repeat:  # what was indefinite comes again, without second derivatives and compression

@@ -53,7 +53,13 @@ class NetStep(PartStep):
         super().__init__(integrator, model, solver, means, counts_of)
         if counts_of is not None:
             self.newton.pcg_work = counts_of.newton.pcg_work
+            if solver.contact:
+                solver.contact.go_on(counts_of.newton.contact)
+        self._counts = [*self.islands.arrays, self.tally, self.work, self.newton.pcg_work]
+        self._kept = [wp.zeros_like(array) for array in self._counts] if solver.contact else []
         self._begin, self._finish = newton.step_kernels(real, self.midpoint, arrays.serial(model.wp_device))
+        if solver.contact and self.midpoint:
+            raise SceneError("contact: by the midpoint rule steps end beyond where forces balance, in overlaps; use 'implicit_euler'")
         self._lagged = model.net.lagged() if model.net.edges else None
         self.drag = NetDrag(model, self.midpoint) if host.drag else None
         self.energy = NetEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
@@ -65,6 +71,25 @@ class NetStep(PartStep):
             self.loads = Loads(model, self.net, self.midpoint)
         self.field = NetField(model, self.midpoint, integrator.field)
         self._data = (self.motion.data if self.motion else {}) | self.field.data
+
+    def step(self, before, after) -> None:
+        """Launch a whole step from one state to another."""
+        if self.newton.contact:
+            for kept, array in zip(self._kept, self._counts, strict=True):
+                wp.copy(kept, array)
+            self.newton.contact.begin(before.q)
+        super().step(before, after)
+
+    def outgrown(self, before) -> bool:
+        """Whether the last step, from a state `before`, had more pairs in contact than there was room for, and is to be done again.
+
+        Then there is room, and all is as it was before that step. Reads from the device where there is contact.
+        """
+        if self.newton.contact is None or not self.newton.contact.outgrown(before.q):
+            return False
+        for kept, array in zip(self._kept, self._counts, strict=True):
+            wp.copy(array, kept)
+        return True
 
     def attempt(self, before, after) -> None:
         """One solve of every world that has not finished the step, from state `before` to `after`."""
@@ -87,7 +112,12 @@ class NetStep(PartStep):
             self.loads.apply(net.points(solver.q), net.points(solver.load), net.angles(solver.load))
         if self.drag:
             self.drag.resist(before, solver, islands)
+        if solver.contact:
+            solver.contact.start(before.q)
+            solver.contact.place()
         solver.solve(start)
+        if solver.contact:
+            solver.contact.finish(before.q)
         if self.energy:
             self.energy.judge(before, start)
         inputs = [solver.q, before.q, before.v, *islands.arrays, blocks]
@@ -169,4 +199,11 @@ class NetStep(PartStep):
         """What to do about a world that was given up: edges of its last good state that no step can start from, or advice."""
         x = state.net.q.numpy().reshape(self.model.worlds, -1, 3)[world]
         found = (self.dead_end(x[r.all_nodes], r.first, r.piece.kind, f" of rod {r.rod}") for r in self.net.host.rods)
-        return next(filter(None, found), "") or self.advice(state)
+        return next(filter(None, found), "") or self._tightest(state) + self.advice(state)
+
+    def _tightest(self, state) -> str:
+        """The pair that is the closest in the last good state, where that may be why."""
+        if not self.newton.contact:
+            return ""
+        gap, pair = self.newton.contact.touch.closest(state.net.q)
+        return f"the smallest gap, {gap:.3g} m, is between {pair}; " if gap < self.newton.contact.search.reach else ""

@@ -7,6 +7,7 @@ import warp as wp
 from scipy import sparse
 
 from ddg_warp.compile.tolerance import largest_excess
+from ddg_warp.errors import SceneError
 from ddg_warp.geometry.turning import turned
 from ddg_warp.kernels.net import elements
 from ddg_warp.scene.grip import Grip
@@ -57,6 +58,9 @@ class NetTangent(Part):
             self._launch(state, i, 0, out, ())
             values = out.numpy().astype(np.float64)
             yield part.term.name, values.reshape(self.net.worlds, -1)
+        if self.model.touch:
+            self.model.touch.at(state.net.q)
+            yield "contact", self.model.touch.terms.energy.numpy().astype(np.float64)[:, None]
 
     def gradient(self, state) -> np.ndarray:
         result = np.zeros((self.size // 3, 3))
@@ -65,6 +69,9 @@ class NetTangent(Part):
             index = _tiled(slots, self.host.blocks, self.net.worlds).ravel()
             for d in range(3):
                 result[:, d] += np.bincount(index, forces[..., d].ravel(), len(result))
+        if self.model.touch:
+            self.model.touch.at(state.net.q)
+            result -= self.model.touch.terms.forces.numpy()
         return self.into(result.ravel())
 
     def into(self, values: np.ndarray) -> np.ndarray:
@@ -86,6 +93,10 @@ class NetTangent(Part):
         return out.numpy().astype(np.float64)
 
     def hessian(self, state, stress: list | None = None) -> sparse.csc_matrix:
+        if self.model.touch:
+            raise SceneError(
+                "contact: equilibria, stability and paths have no matrix of what touches yet; step the scene in time, damped"
+            )
         scatter, rows, starts = self._pattern
         total = np.zeros(len(rows))
         for i, part in enumerate(self.net.sets):

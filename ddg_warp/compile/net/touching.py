@@ -1,0 +1,121 @@
+"""What of a net may touch what, and by which numbers."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ddg_warp.compile.net.net import Net
+from ddg_warp.scene.contact import Contact, touching_names
+from ddg_warp.scene.obstacles import BALL, CAPSULE, MESH
+
+ROD = "rod"
+HALF = 0.5  # of the smallest radius, the range of contact by default
+GRAVITY = 9.81  # by which nodes are taken to weigh at least [m/s^2]
+WEIGHTS = 10.0  # of a node that close the gap by some part of the range
+BENDING = 0.01  # of EI / r^2 that does: bending to ten radii
+
+
+@dataclass
+class Body:
+    """A rod, shell or obstacle: nodes, kind, radius [m], name of its group, how messages call it, cells of nodes."""
+
+    nodes: np.ndarray
+    kind: str
+    radius: float
+    name: str
+    label: str
+    cells: np.ndarray | None = None
+    closed: bool = False
+    still: bool = False
+
+
+@dataclass
+class Touching:
+    """Contact of a net.
+
+    Attributes:
+        law: what the scene says; bodies: what may touch, obstacles at last.
+        names: of the groups that numbers are of, one a name; group (bodies,): number of that of each.
+        friction, stiffness [N/m], range [m]: of two groups (groups, groups).
+        ignored: pairs of groups that pass through each other.
+    """
+
+    law: Contact
+    bodies: list[Body]
+    names: list[str]
+    group: np.ndarray
+    friction: np.ndarray
+    stiffness: np.ndarray
+    range: np.ndarray
+    ignored: list[tuple[int, int]] = field(default_factory=list)
+
+    @property
+    def reach(self) -> float:
+        """Largest range [m]."""
+        return float(self.range.max())
+
+    @property
+    def size(self) -> float:
+        """Typical radius of what is not an obstacle [m]."""
+        return float(np.median([body.radius for body in self.bodies if not body.still]))
+
+
+def touching(scene, net: Net) -> Touching | None:
+    """Contact of a scene's net, None without."""
+    law = scene.touching
+    if law is None:
+        return None
+    names, bodies, forces = touching_names(scene), [], []
+    for rod in net.rods:
+        batch = rod.piece.batch
+        if batch.name in names:
+            row = rod.rod - batch.first
+            radius = law.radius.get(batch.name, float(np.max(_of_rod(batch, "radius", row))))
+            bodies.append(Body(rod.nodes, ROD, radius, batch.name, f"rod {rod.rod}", closed=batch.closed))
+            bending = max(float(np.max(_of_rod(batch, name, row))) for name in ("EI1", "EI2"))
+            forces.append((net.mass[rod.nodes, 0].max(), bending / radius**2))
+    for index, shell in enumerate(net.shells):
+        if (name := shell.surface.name) in names:
+            plate = shell.plate
+            half = law.radius.get(name, 0.5 * float(plate.thickness.max()))
+            bodies.append(Body(shell.nodes, MESH, half, name, f"shell {index}", shell.nodes[shell.surface.triangles]))
+            bending = float((plate.young * plate.thickness**3 / 12.0 / (1.0 - plate.poisson**2)).max())
+            forces.append((net.mass[shell.nodes, 0].max(), bending / half))
+    weight = max(GRAVITY, float(np.linalg.norm(scene.gravity)))
+    scale = [max(WEIGHTS * mass * weight, BENDING * bending) for mass, bending in forces]
+    for index, (obstacle, nodes) in enumerate(zip(scene.obstacles, net.obstacles, strict=True)):
+        shape = obstacle.shape
+        label = f"obstacle {index} ('{obstacle.name}')"
+        bodies.append(Body(nodes, shape.kind, shape.radius, obstacle.name, label, nodes[shape.cells], still=True))
+    return _numbers(scene, law, bodies, np.array([*scale, *np.full(len(scene.obstacles), np.nan)]))
+
+
+def _of_rod(batch, name: str, row: int) -> np.ndarray:
+    """Values of the section of one rod of a batch."""
+    values = np.asarray(getattr(batch.section, name), float)
+    return values[row] if values.ndim == 2 and len(values) > 1 else values
+
+
+def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray) -> Touching:
+    """Numbers by pairs of groups; `scale` is the force [N] of every body that closes the gap by some part of the range."""
+    names, group = np.unique([body.name for body in bodies], return_inverse=True)
+    count, moving = len(names), np.array([not body.still for body in bodies])
+    radius = min(body.radius for body in bodies if not body.still)
+    within = np.full((count, count), HALF * radius if law.range is None else law.range)
+    friction = np.full((count, count), law.friction)
+    own = np.full(count, np.nan)  # of obstacles that of what they touch counts
+    for g in np.unique(group[moving]):
+        own[g] = scale[moving & (group == g)].max()
+    own = np.where(np.isnan(own)[:, None], own[None], own[:, None])
+    force = np.sqrt(np.where(np.isnan(own), 1.0, own) * np.where(np.isnan(own.T), 1.0, own.T))
+    stiffness = np.full((count, count), np.nan if law.stiffness is None else law.stiffness)
+    ignored, place = [], {name: i for i, name in enumerate(names.tolist())}
+    for between in scene.betweens:
+        g, h = (place[name] for name in between.names)
+        for table, value in ((friction, between.friction), (stiffness, between.stiffness), (within, between.range)):
+            if value is not None:
+                table[g, h] = table[h, g] = value
+        if between.ignore:
+            ignored.append((g, h))
+    stiffness = np.where(np.isnan(stiffness), force / within, stiffness)
+    return Touching(law, bodies, names.tolist(), group, friction, stiffness, within, ignored)

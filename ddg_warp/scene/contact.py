@@ -1,0 +1,214 @@
+"""What a scene says about contact: what may touch, by which law, and obstacles."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+
+from ddg_warp import arguments
+from ddg_warp.errors import SceneError
+from ddg_warp.scene.grip import Grip
+from ddg_warp.scene.motion import Motion
+from ddg_warp.scene.obstacles import Capsule, Mesh, Obstacle, Plane, Sphere
+
+LAWS = ("barrier", "penalty")
+FRICTION_LAWS = ("logistic", "polynomial")
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Contact of a scene; attributes as the arguments of `Scene.contact`."""
+
+    law: str = "barrier"
+    range: float | None = None
+    stiffness: float | None = None
+    friction: float = 0.0
+    friction_law: str = "logistic"
+    velocity: float = 1e-3
+    lags: int = 1
+    apart: float | None = None
+    radius: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    objects: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Between:
+    """What is different between objects of two names; None where it is not."""
+
+    names: tuple[str, str]
+    ignore: bool
+    friction: float | None
+    stiffness: float | None
+    range: float | None
+
+
+@dataclass(kw_only=True, repr=False, eq=False)
+class Contacts:
+    """The part of a scene that is about contact."""
+
+    touching: Contact | None = field(default=None, init=False)
+    betweens: list[Between] = field(default_factory=list, init=False)
+    obstacles: list[Obstacle] = field(default_factory=list, init=False)
+
+    def contact(
+        self,
+        *,
+        law: str = "barrier",
+        range: float | None = None,
+        stiffness: float | None = None,
+        friction: float = 0.0,
+        friction_law: str = "logistic",
+        velocity: float = 1e-3,
+        lags: int = 1,
+        apart: float | None = None,
+        radius: Mapping[str, float] | None = None,
+        objects=None,
+    ) -> None:
+        """Let rods, shells and obstacles touch: nothing passes through anything.
+
+        Rods are rows of capsules, shells and meshes have a thickness. Two surfaces push each other where the gap between them is
+        below `range`. By "barrier" the force grows without bound as the gap closes, and nothing overlaps; by "penalty" it grows with
+        the overlap, and the lines and surfaces in the middle never cross. See `kernels.densities.contact` and `friction`.
+
+        Args:
+            law: "barrier" or "penalty".
+            range: gap below which surfaces push each other [m]; by default half of the smallest radius of a rod or half thickness of
+                a shell.
+            stiffness: of the law [N/m]; by default of every object what lets a node's weight, or bending as tight as ten radii, close
+                the gap by some part of the range, and between two the geometric mean.
+            friction: Coulomb's coefficient.
+            friction_law: "logistic" or "polynomial": how friction grows with the speed.
+            velocity: the speed nu from which on all of the friction acts, nearly [m/s]: what sticks creeps by less.
+            lags: how often in a step friction takes the normal forces and directions anew.
+            apart: edges of a rod with less than this between them along it are no pair [m]; by default pi times its radius.
+            radius: by name of objects, instead of those of their sections, or half thicknesses [m].
+            objects: names of the rods and shells that touch; by default all. Obstacles always do.
+
+        Raises:
+            SceneError: an argument that is none of these, or contact was described before.
+        """
+        if self.touching is not None:
+            raise SceneError("contact: this scene has contact already; use contact_between for what differs")
+        call = "contact: "
+        for name, value in (("range", range), ("stiffness", stiffness)):
+            if value is not None:
+                arguments.positive(call + name, value, "m" if name == "range" else "N/m")
+        if apart is not None:
+            arguments.number(f"{call}apart", apart, "an arc length, zero or more [m]", lambda v: v >= 0.0)
+        if radius is not None and not isinstance(radius, Mapping):
+            raise SceneError(f"{call}radius is {radius!r}; give a dictionary from names of objects to radii [m]")
+        for name, value in (radius or {}).items():
+            arguments.positive(f"{call}radius of {name!r}", value, "m")
+        self.touching = Contact(
+            arguments.choice(f"{call}law", law, LAWS),
+            range,
+            stiffness,
+            _friction(f"{call}friction", friction),
+            arguments.choice(f"{call}friction_law", friction_law, FRICTION_LAWS),
+            arguments.positive(f"{call}velocity", velocity, "m/s"),
+            arguments.count(f"{call}lags", lags),
+            apart,
+            MappingProxyType(dict(radius or {})),
+            None if objects is None else tuple(dict.fromkeys([objects] if isinstance(objects, str) else objects)),
+        )
+
+    def contact_between(
+        self,
+        one: str,
+        other: str,
+        *,
+        ignore: bool = False,
+        friction: float | None = None,
+        stiffness: float | None = None,
+        range: float | None = None,
+    ) -> None:
+        """What is different between objects of two names, or among those of one; the last call counts.
+
+        Args:
+            one, other: names as given to `add_rods`, `add_shell` and `add_obstacle`.
+            ignore: whether they pass through each other.
+            friction, stiffness, range: as of `contact`.
+
+        Raises:
+            SceneError: an argument that is none of these.
+        """
+        call = f"contact_between {one!r} and {other!r}: "
+        for name, value in (("stiffness", stiffness), ("range", range)):
+            if value is not None:
+                arguments.positive(call + name, value)
+        friction = None if friction is None else _friction(f"{call}friction", friction)
+        ignore = arguments.flag(f"{call}ignore", ignore)
+        self.betweens.append(Between((one, other), ignore, friction, stiffness, range))
+
+    def add_obstacle(
+        self, shape: Plane | Sphere | Capsule | Mesh, *, motion: Motion | Grip | None = None, name: str = "obstacle"
+    ) -> int:
+        """Add a body that rods and shells of a scene with `contact` touch, and that nothing bends.
+
+        Args:
+            shape: `Plane`, `Sphere`, `Capsule`, `Box` or `Mesh`, where it is at the start.
+            motion: moves it as a whole; of a mesh it may give every vertex a displacement of its own. It stays still without.
+            name: by which `contact_between` and output know it.
+
+        Returns:
+            Index of the obstacle.
+
+        Raises:
+            SceneError: no such shape, or a motion that does not fit.
+        """
+        if not isinstance(shape, Plane | Sphere | Capsule | Mesh):
+            raise SceneError(f"add_obstacle '{name}': shape is {shape!r}; give Plane, Sphere, Capsule, Box or Mesh")
+        if motion is not None and not isinstance(motion, Motion | Grip):
+            raise SceneError(
+                f"add_obstacle '{name}': motion is {motion!r}; give Motion(translation=..., angle=...) or Grip(pivot=...)"
+            )
+        count = getattr(motion, "count", None)
+        if count is not None and (not isinstance(shape, Mesh) or count != len(shape.points)):
+            raise SceneError(
+                f"add_obstacle '{name}': the motion has {count} displacements, the shape {len(shape.points)} points; "
+                "of a Mesh give one for each vertex, of other shapes one for all"
+            )
+        self.obstacles.append(Obstacle(shape, motion, name))
+        return len(self.obstacles) - 1
+
+
+def check_contact(scene) -> None:
+    """Refuse contact that is about nothing, or of names that nothing has.
+
+    Raises:
+        SceneError: the first thing found wrong.
+    """
+    if scene.touching is None:
+        if scene.obstacles:
+            raise SceneError(f"obstacle 0 ('{scene.obstacles[0].name}') touches nothing; add scene.contact()")
+        if scene.betweens:
+            raise SceneError("contact_between: this scene has no contact; add scene.contact()")
+        return
+    if scene.dimension == 2:
+        raise SceneError("contact: a scene with contact has dimension 3; leave dimension=2 to scenes without")
+    if scene.axisymmetric_shells:
+        raise SceneError(f"contact: shell of revolution 0 ('{scene.axisymmetric_shells[0].name}') can not touch anything")
+    bodies = {batch.name for batch in scene.batches} | {shell.name for shell in scene.shells}
+    names = touching_names(scene) | {obstacle.name for obstacle in scene.obstacles}
+    asked = [("objects", name, bodies) for name in scene.touching.objects or ()]
+    asked += [("radius", name, bodies) for name in scene.touching.radius]
+    asked += [("contact_between", name, names) for between in scene.betweens for name in between.names]
+    for what, name, known in asked:
+        if name not in known:
+            raise SceneError(
+                f"contact: {what} names {name!r}; this scene has {', '.join(map(repr, sorted(known)))}"
+            )
+
+
+def touching_names(scene) -> set[str]:
+    """Names of the rods and shells that touch."""
+    if scene.touching is None:
+        return set()
+    if scene.touching.objects is not None:
+        return set(scene.touching.objects)
+    return {batch.name for batch in scene.batches} | {shell.name for shell in scene.shells}
+
+
+def _friction(what: str, value: float) -> float:
+    return arguments.number(what, value, "a coefficient, zero or more", lambda v: v >= 0.0 and np.isfinite(v))

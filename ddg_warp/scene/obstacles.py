@@ -1,0 +1,136 @@
+"""Obstacles: bodies that rods and shells touch and that nothing bends, still or moved."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ddg_warp import arguments
+from ddg_warp.errors import SceneError
+from ddg_warp.scene.grip import Grip
+from ddg_warp.scene.motion import Motion
+
+PLANE, BALL, CAPSULE, MESH = "plane", "ball", "capsule", "mesh"
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A half-space: everything behind the plane through `point` whose `normal` points outwards."""
+
+    point: tuple = (0.0, 0.0, 0.0)
+    normal: tuple = (0.0, 0.0, 1.0)
+    points: np.ndarray = field(init=False, repr=False, compare=False)
+
+    kind, radius, cells = PLANE, 0.0, np.array([[0, 1, 2]])
+
+    def __post_init__(self):
+        point = np.array(arguments.vector("Plane: point", self.point))
+        normal = np.array(arguments.vector("Plane: normal", self.normal))
+        if not normal.any():
+            raise SceneError("Plane: the normal is zero; give the direction out of the half-space")
+        normal /= np.linalg.norm(normal)
+        first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+        first /= np.linalg.norm(first)
+        # a motion moves the plane by three points of it
+        object.__setattr__(self, "points", np.stack([point, point + first, point + np.cross(normal, first)]))
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A ball of a `radius` [m] about its `center` [m]."""
+
+    center: tuple
+    radius: float
+
+    kind, cells = BALL, np.array([[0]])
+
+    def __post_init__(self):
+        arguments.vector("Sphere: center", self.center)
+        arguments.positive("Sphere: radius", self.radius, "m")
+
+    @property
+    def points(self) -> np.ndarray:
+        """Its center (1, 3)."""
+        return np.array([self.center], float)
+
+
+@dataclass(frozen=True)
+class Capsule:
+    """All that is within a `radius` [m] of the line from `start` to `end` [m]."""
+
+    start: tuple
+    end: tuple
+    radius: float
+
+    kind, cells = CAPSULE, np.array([[0, 1]])
+
+    def __post_init__(self):
+        for name in ("start", "end"):
+            arguments.vector(f"Capsule: {name}", getattr(self, name))
+        arguments.positive("Capsule: radius", self.radius, "m")
+        if np.array_equal(self.start, self.end):
+            raise SceneError("Capsule: start and end are one point; use Sphere(center, radius)")
+
+    @property
+    def points(self) -> np.ndarray:
+        """Both ends of its line (2, 3)."""
+        return np.array([self.start, self.end], float)
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A surface of triangles that nothing passes, from either side; open or closed.
+
+    Attributes:
+        points: vertices (P, 3) [m]; cells: corners of the triangles (T, 3), as `io.read_mesh` gives both.
+        radius: half the thickness of the surface [m].
+    """
+
+    points: np.ndarray
+    cells: np.ndarray
+    radius: float = 0.0
+
+    kind = MESH
+
+    def __post_init__(self):
+        try:
+            points, cells = np.array(self.points, float), np.array(self.cells)
+        except (TypeError, ValueError):
+            raise SceneError("Mesh: points or triangles are no arrays of numbers") from None
+        if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+            raise SceneError(f"Mesh: points have shape {points.shape}; they are finite, (points, 3) [m]")
+        if cells.ndim != 2 or cells.shape[1] != 3 or cells.dtype.kind not in "iu" or not len(cells):
+            raise SceneError(f"Mesh: triangles have shape {cells.shape} of {cells.dtype}; they are whole numbers (T, 3)")
+        for triangle in np.flatnonzero(((cells < 0) | (cells >= len(points))).any(1))[:1]:
+            raise SceneError(
+                f"Mesh: triangle {triangle} has corners {cells[triangle]}; vertices are 0 to {len(points) - 1}"
+            )
+        arguments.number("Mesh: radius", self.radius, "a length, zero or more [m]", lambda v: v >= 0.0)
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "cells", cells)
+
+
+CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+
+
+def Box(center, half, rotation=None, radius: float = 0.0) -> Mesh:  # noqa: N802, a shape like the others
+    """A box about its `center` [m] with half lengths `half` (3,) [m], turned by a `rotation` (3, 3); edges are round with a `radius`."""
+    center, half = (np.array(arguments.vector(f"Box: {n}", v)) for n, v in (("center", center), ("half", half)))
+    if not (half > 0.0).all():
+        raise SceneError(f"Box: half = {half}; half lengths are positive [m]")
+    turn = np.eye(3) if rotation is None else np.array(rotation, float)
+    if turn.shape != (3, 3) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-9):
+        raise SceneError("Box: rotation is no rotation matrix (3, 3)")
+    cells = np.concatenate([SIDES[:, [0, 1, 2]], SIDES[:, [0, 2, 3]]])
+    return Mesh(center + (CORNERS * half) @ turn.T, cells, radius)
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A shape of a scene, and what moves it: see `Scene.add_obstacle`."""
+
+    shape: Plane | Sphere | Capsule | Mesh
+    motion: Motion | Grip | None
+    name: str
+
+    call, components = "add_obstacle", "xyz"  # as of supports, which hold its points

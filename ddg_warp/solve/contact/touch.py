@@ -1,0 +1,116 @@
+"""Contact of a net: what may touch, the search for what is near, and its energy."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.kernels.contact.look import look_kernel
+from ddg_warp.kernels.densities.contact import log_barrier, smooth_penalty
+from ddg_warp.scene.obstacles import BALL, CAPSULE, MESH, PLANE
+from ddg_warp.solve.contact.broad_phase import BroadPhase
+from ddg_warp.solve.contact.pair_terms import PairTerms
+from ddg_warp.solve.contact.shapes import Shapes
+
+LAWS = {"barrier": log_barrier, "penalty": smooth_penalty}
+KEEP = {"barrier": 1.0, "penalty": 0.0}  # of the thickness, what motion never goes into
+MARGIN = 1.0  # of a typical radius, by which searches go beyond the reach
+
+
+class Touch:
+    """Contact of a `DeviceNet` with blocks x (W N,), where it is searched for at first.
+
+    Attributes:
+        shapes, search, terms: what may touch, candidates, and the energy of those that are near.
+        keep: part of the thickness that motion never goes into.
+    """
+
+    def __init__(self, net, linear, x: wp.array):
+        self.net, given = net, net.host.touching
+        self.law, self.keep = given.law, KEEP[given.law.law]
+        self.shapes = shapes_of(net.host)
+        margin = MARGIN * max(given.size, given.reach)
+        self.search = BroadPhase(self.shapes, x, net.worlds, reach=given.reach, margin=margin)
+        self.terms = PairTerms(
+            self.search,
+            LAWS[self.law.law],
+            stiffness=given.stiffness,
+            range=given.range,
+            groups=given.group,
+            friction=given.friction,
+            friction_law=self.law.friction_law,
+            velocity=self.law.velocity,
+            linear=linear,
+        )
+
+    def at(self, x: wp.array) -> None:
+        """Energies and forces at blocks x, with room for all pairs. Not in a capture.
+
+        Raises:
+            SolverError: names a node whose position is not finite.
+        """
+        self.search.rebuild(x)
+        self.search.search(x)
+        self.search.fit(x)
+        self.terms.fit()
+        self.terms.evaluate(x)
+
+    def pairs(self, x: wp.array) -> dict[str, np.ndarray]:
+        """Candidates at blocks x, after `at`.
+
+        Returns:
+            world: (n,); sizes, things: numbers of nodes of both, 1 to 3, and what number they have in a world (n, 2).
+            gap: (n,) [m]; point: between the closest points (n, 3) [m]; force: on the first of both (n, 3) [N].
+        """
+        found = [self._pairs(*each, x) for each in zip(self.search.lists, self.terms.lists, strict=True)]
+        return {name: np.concatenate([own[name] for own in found]) for name in found[0]}
+
+    def _pairs(self, pairs, terms, x: wp.array) -> dict[str, np.ndarray]:
+        count = int(pairs.count.numpy()[0])
+        gap = wp.zeros(count, dtype=self.net.real, device=x.device)
+        point, force = (wp.zeros(count, dtype=x.dtype, device=x.device) for _ in range(2))
+        if count:
+            inputs = [pairs.pairs, pairs.sides, x, terms.factor.used, terms.gradient]
+            kernel = look_kernel(pairs.kind, self.net.real)
+            wp.launch(kernel, count, inputs, [gap, point, force], device=x.device)
+        i, j = pairs.pairs.numpy()[:count].reshape(-1, 2).T
+        return {
+            "world": i // pairs.first.count,
+            "sizes": np.broadcast_to([pairs.kind.first, pairs.kind.second], (count, 2)),
+            "things": np.column_stack([i % pairs.first.count, j % pairs.second.count]),
+            "gap": gap.numpy(),
+            "point": point.numpy().reshape(-1, 3),
+            "force": force.numpy().reshape(-1, 3),
+        }
+
+    def closest(self, x: wp.array) -> tuple[float, str]:
+        """Smallest gap of all candidates [m], and which pair has it; infinite where nothing is near."""
+        self.at(x)
+        found = self.pairs(x)
+        if not len(found["gap"]):
+            return np.inf, ""
+        k = int(np.argmin(np.where(np.isfinite(found["gap"]), found["gap"], np.inf)))
+        one, other = (self.shapes.describe(*map(int, of)) for of in zip(found["sizes"][k], found["things"][k], strict=True))
+        world = f" in world {found['world'][k]}" if self.net.worlds > 1 else ""
+        return float(found["gap"][k]), f"{one} and {other}{world}"
+
+
+def shapes_of(host) -> Shapes:
+    """What may touch among the blocks of a net."""
+    given, shapes = host.touching, Shapes(host.rest)
+    for body in given.bodies:
+        options = {"name": body.label, "still": body.still}
+        if body.kind == CAPSULE:
+            shapes.rod(body.nodes, body.radius, apart=0.0, **options)
+        elif body.kind == MESH:
+            shapes.shell(body.cells, 2.0 * body.radius, **options)
+        elif body.kind == BALL:
+            shapes.ball(int(body.nodes[0]), body.radius, **options)
+        elif body.kind == PLANE:
+            shapes.plane(body.nodes, **options)
+        else:
+            shapes.rod(body.nodes, body.radius, closed=body.closed, apart=given.law.apart, **options)
+    for g, h in given.ignored:
+        for one in np.flatnonzero(given.group == g):
+            for other in np.flatnonzero(given.group == h):
+                shapes.ignore(int(one), int(other))
+    return shapes

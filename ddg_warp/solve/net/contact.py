@@ -1,0 +1,264 @@
+"""Contact within Newton's method on a net; see `kernels.net.contact`, and `solve.contact` for the search and the pairs.
+
+What is proposed, a predictor or a step, is cut rod by rod before anything passes through anything. Supports and obstacles that move
+are part of what is proposed: what contact holds up comes along with the next directions, which know how far it has yet to go.
+"""
+
+import math
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels.net import contact
+from ddg_warp.solve.contact.touch import Touch
+from ddg_warp.solve.net.system import Sums
+
+ROUNDING = 16.0  # units in the last place within which supports have arrived
+
+
+class NetContact:
+    """Contact of a `NetNewton`.
+
+    Attributes:
+        search, terms: candidates, and the energy of those that are near.
+        forces (W N,) [N], stiffness (W N,) [N/m]: what pushes nodes, and a bound on how stiff that is.
+        diagonal: (W N,) blocks of its matrix at nodes.
+        crossed: (1,) pairs that would have passed through each other in all steps so far; least: (1,) the smallest gap [m].
+    """
+
+    def __init__(self, newton):
+        self.newton, self.net = newton, newton.net
+        net, host, real, linear, device = newton.net, newton.net.host, newton.real, newton.linear, newton.device
+        if host.frames:
+            raise SceneError("contact: a support on an oblique plane of symmetry does not go with it; use an axis of space")
+        if newton.frozen:
+            raise SceneError("contact: solver 'projective' keeps the matrix of a step, which contact changes; use 'newton'")
+        newton.q.assign(np.tile(host.rest, (net.worlds, 1)))
+        self.touch = Touch(net, linear, newton.q)
+        self.shapes, self.search, self.terms = self.touch.shapes, self.touch.search, self.touch.terms
+        self._edges = len(self.shapes.things(2)[0])
+        self.rubs = bool(host.touching.friction.any())
+        worlds = net.worlds
+        self.forces, self.stiffness, self.diagonal = self.terms.forces, self.terms.stiffness, self.terms.diagonal
+
+        def make(shape, dtype):
+            return wp.zeros(shape, dtype=dtype, device=device)
+
+        self._modes, self._whole = make(worlds, int), make(worlds, int)
+        self._kept, self._gain = make((2, worlds), real), make(worlds, real)
+        self._move = make(newton.all, net.vector)
+        self._pushed = make(newton.all, wp.types.vector(3, linear))
+        self.crossed, self.least = make(1, wp.int64), wp.full(1, math.inf, dtype=real, device=device)
+        self._counts = self.crossed, self.least, self.search.searches
+        self._unit, self._units = self._number_units(host)
+        places = np.concatenate([host.moving[:, 0], host.turning[:, 0]])
+        self._nodes = wp.array(places.astype(np.int32), dtype=int, device=device)
+        self._aims = make((max(1, len(places)), worlds), net.vector)
+        made = contact.world_kernels(real)
+        self._account, self._find_modes, self._find_predicted, self._depart, self._expect, self._refuse = made
+        made = contact.block_kernels(real, linear, arrays.serial(device))
+        self._differ_gain, self._differ, self._settle, self._lessen, self._aim, self._push, self._arrive = made
+        self._sum = Sums(worlds, newton.dots.shape[1], real, device)
+        self._stiffen = None
+
+    def bind(self, chains) -> None:
+        """Have a part in what chains eliminate, once their plan is made."""
+        self._stiffen = contact.stiffen_kernel(chains.plan.twist, self.newton.linear)
+        self._ahead = arrays.upload(self._edges_ahead(chains.plan), int, self.newton.device)
+
+    def _number_units(self, host) -> tuple[wp.array, int]:
+        """Unit of every block: what is cut together, a rod, a shell or an obstacle; and how many there are."""
+        unit = np.full(host.blocks, -1, np.int32)
+        count = 0
+        for rod in host.rods:
+            unit[rod.all_nodes], unit[rod.all_edges] = count, count
+            count += 1
+        for shell in host.shells:
+            unit[shell.nodes], unit[shell.edges[shell.edges >= 0]] = count, count
+            count += 1
+        for nodes in host.obstacles:
+            unit[nodes] = count
+            count += 1
+        unit = _joined(unit, host)
+        return wp.array(unit, dtype=int, device=self.newton.device), count
+
+    def _edges_ahead(self, plan) -> np.ndarray:
+        """The contact edge from the node of each place of the chains to that of the next, -1 for none."""
+        ends, *_ = self.shapes.things(2)
+        blocks = self.net.blocks
+        node = plan.places[0]
+        after = np.full_like(node, -1)
+        after[:-1] = np.where(plan.chain[1:] == plan.chain[:-1], node[1:], -1)
+        keys = ends[:, 0].astype(np.int64) * blocks + ends[:, 1]
+        order = np.argsort(keys)
+        wanted = node.astype(np.int64) * blocks + after
+        at = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
+        found = (node >= 0) & (after >= 0) & (keys[order][at] == wanted)
+        return np.where(found, order[at], -1).astype(np.int32)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        own = [self._account, self._find_modes, self._find_predicted, self._depart, self._expect, self._refuse]
+        own += [self._differ_gain, self._differ, self._settle, self._lessen, self._aim, self._push, self._arrive]
+        own += [self._stiffen] if self._stiffen else []
+        return [*own, *self._sum.kernels, *self.search.kernels, *self.terms.kernels]
+
+    def begin(self, before: wp.array) -> None:
+        """Start a step from positions: the trees of the search anew."""
+        self.search.rebuild(before)
+
+    def start(self, before: wp.array) -> None:
+        """Start an attempt: candidates at positions `before`, and what friction takes from there."""
+        self.search.update(before)
+        if self.rubs:
+            self.terms.lag(before)
+
+    def place(self) -> None:
+        """Cut the predictor, once supports are placed, where they have to be."""
+        newton = self.newton
+        if len(self._nodes):
+            inputs = [self._nodes, self.net.blocks, newton.q]
+            self._launch(self._aim, (len(self._nodes), self.net.worlds), inputs, [self._aims])
+        self._launch(self._find_predicted, self.net.worlds, [newton.islands.arrays[0]], [self._modes])
+        self._hold()
+
+    def evaluate(self) -> None:
+        """Energies, forces and factors at the iterate."""
+        self.search.update(self.newton.q)
+        self.terms.evaluate(self.newton.q, self.newton.islands.rate if self.rubs else None)
+
+    def account(self, change: wp.array, noise: wp.array) -> None:
+        """Add to the change of the energy of worlds, and to its rounding."""
+        inputs = [self.terms.energy, self.newton.islands.arrays[0], self._kept, change, noise]
+        self._launch(self._account, self.net.worlds, inputs, [])
+
+    def assemble(self) -> None:
+        """Its own part in the preconditioner."""
+        newton = self.newton
+        self.terms.blocks()
+        if chains := newton.chains:
+            inputs = [chains.bands, chains.layout, self._ahead, self._edges, newton.islands.arrays[0]]
+            inputs += [self.net.blocks, self.diagonal, self.terms.between]
+            self._launch(self._stiffen, (chains.longest, chains.columns), inputs, [chains.eliminated])
+
+    def direct(self) -> None:
+        """Directions by conjugate gradients, along with what supports have yet to go."""
+        newton, count = self.newton, len(self._nodes)
+        if not count:
+            newton.krylov.solve()
+            return
+        newton.direction.zero_()
+        self._go()
+        self._pushed.zero_()
+        self.terms.product(newton.direction, self._pushed)
+        self._sweep(self._lessen, [self._pushed, newton.fixed, newton.islands.wanted, self.net.blocks], [newton.right])
+        newton.krylov.solve()
+        self._go()
+
+    def _go(self) -> None:
+        newton = self.newton
+        inputs = [self._nodes, self._aims, newton.q, newton.fixed, newton.islands.wanted, self.net.blocks]
+        self._launch(self._push, (len(self._nodes), self.net.worlds), inputs, [newton.direction])
+
+    def multiply(self, p: wp.array, product: wp.array) -> None:
+        """Add H p, and write p . H p block by block."""
+        newton = self.newton
+        self.terms.product(p, product)
+        inputs = [p, newton.fixed, newton.islands.wanted, self.net.blocks]
+        self._sweep(self._settle, inputs, [product, newton.krylov_dots])
+
+    def hold(self) -> None:
+        """Cut what was moved, and say what that is expected to gain."""
+        newton = self.newton
+        self._launch(self._find_modes, self.net.worlds, [newton.islands.arrays[0]], [self._modes])
+        self._launch(self._depart, self.net.worlds, [self._modes], [newton.islands.arrays[0]])
+        self._hold()
+        inputs = [newton.right, newton.q, newton.base, self._modes, self.net.blocks]
+        self._sweep(self._differ_gain, inputs, [newton.dots])
+        self._sum(newton.dots, self._gain)
+        inputs = [self._modes, self.search.time, self._gain]
+        self._launch(self._expect, self.net.worlds, inputs, [newton.islands.arrays[1]])
+
+    def _hold(self) -> None:
+        newton = self.newton
+        self.search.filter(newton.base, newton.q, self._unit, self._units, self._modes, keep=self.touch.keep)
+        if len(self._nodes):
+            eps = ROUNDING * newton.eps
+            inputs = [self._nodes, self._aims, newton.fixed, self._modes, eps, self.net.blocks, newton.q]
+            self._launch(self._arrive, (len(self._nodes), self.net.worlds), inputs, [newton.islands.arrays[0]])
+
+    def finish(self, before: wp.array) -> None:
+        """Take no part of a step in which things passed through each other."""
+        newton = self.newton
+        arrays.sweep(self._differ, newton.all, [newton.q, before], [self._move], newton.device)
+        self.search.crossings(before, self._move)
+        self.search.measure(newton.q)
+        inputs = [self.search.crossed, self.search.gap, newton.islands.arrays[0]]
+        self._launch(self._refuse, self.net.worlds, inputs, [self.crossed, self.least])
+
+    def statistics(self) -> dict:
+        """Over all steps so far: searches, pairs that would have passed through each other, the smallest gap [m], infinite without any.
+
+        And how many candidates there are now.
+        """
+        return {
+            "searches": int(self.search.searches.numpy()[0]),
+            "refused_crossings": int(self.crossed.numpy()[0]),
+            "smallest_gap": float(self.least.numpy()[0]),
+            "candidates": sum(int(pairs.count.numpy()[0]) for pairs in self.search.lists),
+        }
+
+    def go_on(self, other: "NetContact") -> None:
+        """Count on from another one."""
+        for own, found in zip(self._counts, other._counts, strict=True):
+            wp.copy(own, found)
+
+    def check(self, x: wp.array) -> None:
+        """Refuse to start from positions in which surfaces overlap. Reads from the device.
+
+        Raises:
+            SceneError: names the pair and by how much.
+        """
+        gap, pair = self.touch.closest(x)
+        least = 0.0 if self.touch.keep else -self.touch.search.reach
+        if gap <= least:
+            raise SceneError(
+                f"contact: {pair} overlap by {-gap:.3g} m at the start; move them apart, give them a smaller radius, or let them "
+                "pass by contact_between(..., ignore=True)"
+            )
+
+    def outgrown(self, x: wp.array) -> bool:
+        """Whether pairs did not fit, for which there is room then. Reads from the device."""
+        grown = self.search.fit(x)
+        return self.terms.fit() or grown
+
+    def _sweep(self, kernel, inputs: list, outputs: list) -> None:
+        arrays.sweep(kernel, self.net.blocks, inputs, outputs, self.newton.device, worlds=self.net.worlds)
+
+    def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim, inputs, outputs, device=self.newton.device)
+
+
+def _joined(unit: np.ndarray, host) -> np.ndarray:
+    """The same with one unit for what shares nodes, so that joints stay whole."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    pairs = [(unit[rod.all_nodes], np.full(len(rod.all_nodes), i)) for i, rod in enumerate(host.rods)]
+    first = len(host.rods)
+    pairs += [(unit[shell.nodes], np.full(len(shell.nodes), first + i)) for i, shell in enumerate(host.shells)]
+    if not pairs:
+        return unit
+    one, other = (np.concatenate(values) for values in zip(*pairs, strict=True))
+    size = int(unit.max()) + 1
+    graph = coo_array((np.ones(len(one)), (one, other)), shape=(size, size))
+    number = connected_components(graph, directed=False)[1]
+    joined = np.where(unit >= 0, number[unit], -1).astype(np.int32)
+    for part in host.sets:  # rotations of joints move with what they join
+        rows = np.flatnonzero((unit[part.slots] < 0).any(0))
+        own = part.slots[:, rows]
+        joined[np.where(unit[own] < 0, own, own[:1])] = joined[own[:1]]
+    return joined

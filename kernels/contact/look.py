@@ -1,0 +1,43 @@
+"""What pairs in contact look like: gaps, places and forces, for whoever asks."""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
+from ddg_warp.kernels.threads import CPU_OPTIONS
+
+
+@cache
+def look_kernel(kind: Kind, real):
+    """Gap [m], the place between the closest points [m], and the force on the first thing [N] of each pair."""
+    Sides, X = sides_struct(real), wp.types.vector(3, real)
+    slots, _, thickness, closest = pair_functions(kind, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def look(
+        pairs: wp.array(dtype=wp.vec2i),
+        sides: Sides,
+        x: wp.array(dtype=X),
+        used: wp.array(dtype=int),
+        gradient: wp.array2d(dtype=X),
+        gap_out: wp.array(dtype=real),
+        point_out: wp.array(dtype=X),
+        force_out: wp.array(dtype=X),
+    ):
+        p = wp.tid()
+        w = pairs[p][0] / sides.counts[0]
+        i, j = pairs[p][0] - w * sides.counts[0], pairs[p][1] - w * sides.counts[1]
+        nodes = slots(sides, i, j, w)
+        r, weights = closest(x, nodes)
+        gap_out[p] = wp.length(r) - thickness(sides, i, j)
+        point = real(-0.5) * r
+        force = X()
+        for k in range(wp.static(kind.first)):
+            point += x[nodes[k]] * weights[k]
+            if used[p] != 0:
+                force -= gradient[k, p]
+        point_out[p] = point
+        force_out[p] = force
+
+    return look

@@ -1,0 +1,265 @@
+"""Contact within Newton's method on a net: its energy in the search, its own part in the preconditioner, and what supports push."""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels import outcome
+from ddg_warp.kernels.islands import DECREMENT, DRIVEN, HALVINGS, MOVED, SLOT, STATUS, STEP_LENGTH, TODO, WANTED
+from ddg_warp.kernels.matrix.block_band import block_functions
+from ddg_warp.kernels.matrix.chain_blocks import layout_type
+from ddg_warp.kernels.matrix.chain_places import place_dofs, place_functions
+from ddg_warp.kernels.matrix.sliced import product_functions
+from ddg_warp.kernels.net.newton import ON_THE_WAY, THERE
+from ddg_warp.kernels.search import PLACE, STRAIGHT
+from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
+
+WHOLE, UNITS, NONE = 1, 0, -1  # how a world moves: with one share, unit by unit, not at all
+
+
+@cache
+def world_kernels(real):
+    """A thread a world: account(...) for the energy; modes(...) of motions, and of what is predicted(...); depart(...) on them;
+    expect(...) of steps that were cut; refuse(...) what crossed."""
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def account(
+        energy: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        kept: wp.array2d(dtype=real),
+        change: wp.array(dtype=real),
+        noise: wp.array(dtype=real),
+    ):
+        """Adds what contact has to the change of the energy since the accepted iterate, and to its rounding."""
+        w = wp.tid()
+        if flags[STATUS, w] == 0:
+            accepted = flags[SLOT, w]
+            kept[1 - accepted, w] = energy[w]
+            change[w] = change[w] + energy[w] - kept[accepted, w]
+            noise[w] = noise[w] + wp.abs(energy[w])
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def modes(flags: wp.array2d(dtype=int), modes_out: wp.array(dtype=int)):
+        """A step that was shortened by the search moves all with one share: it descends, if short enough."""
+        w = wp.tid()
+        modes_out[w] = wp.static(NONE)
+        if flags[TODO, w] == wp.static(PLACE) or flags[TODO, w] == wp.static(STRAIGHT):
+            modes_out[w] = wp.where(flags[HALVINGS, w] > 0, int(wp.static(WHOLE)), int(wp.static(UNITS)))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def predicted(flags: wp.array2d(dtype=int), modes_out: wp.array(dtype=int)):
+        """The same of predictors, which the worlds have that are on their way."""
+        w = wp.tid()
+        modes_out[w] = wp.where(flags[MOVED, w] != 0, int(wp.static(UNITS)), int(wp.static(NONE)))
+        flags[DRIVEN, w] = 0
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def depart(modes: wp.array(dtype=int), flags: wp.array2d(dtype=int)):
+        w = wp.tid()
+        if modes[w] != wp.static(NONE):
+            flags[DRIVEN, w] = wp.where(flags[DRIVEN, w] == wp.static(ON_THE_WAY), int(wp.static(THERE)), int(0))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def expect(
+        modes: wp.array(dtype=int),
+        time: wp.array(dtype=real),
+        decrease: wp.array(dtype=real),
+        scalars: wp.array2d(dtype=real),
+    ):
+        """What a step that was cut is expected to gain, over its length."""
+        w = wp.tid()
+        length = scalars[STEP_LENGTH, w]
+        if modes[w] != wp.static(NONE) and time[w] < real(1.0) and length > real(0.0):
+            scalars[DECREMENT, w] = wp.max(decrease[w], real(0.0)) / length
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def refuse(
+        crossed: wp.array(dtype=int),
+        gap: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        total: wp.array(dtype=wp.int64),
+        least: wp.array(dtype=real),
+    ):
+        """A part of a step in which things passed through each other is not taken; of others the smallest gap is kept."""
+        w = wp.tid()
+        if flags[MOVED, w] != 0 and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING):
+            if crossed[w] > 0:
+                flags[STATUS, w] = wp.static(outcome.CROSSED)
+                wp.atomic_add(total, 0, wp.int64(crossed[w]))
+            else:
+                wp.atomic_min(least, 0, gap[w])
+
+    return account, modes, predicted, depart, expect, refuse
+
+
+@cache
+def block_kernels(real, linear, serial: bool):
+    """gain(...) by a motion, differ(...) of positions; settle(...) a product, lessen(...) the residual by it; aim(...), push(...) and
+    arrive(...) of supports."""
+    V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
+    _, free = product_functions(linear)
+    share, until = share_function(serial), until_function(serial)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def gain(
+        right: wp.array(dtype=H),
+        q: wp.array(dtype=V),
+        base: wp.array(dtype=V),
+        modes: wp.array(dtype=int),
+        blocks: int,
+        dots_out: wp.array2d(dtype=real),
+    ):
+        """r . (q - base) of the blocks that a thread takes."""
+        w, start = share(wp.tid(), blocks)
+        if modes[w] == wp.static(NONE):
+            return
+        total = real(0.0)
+        for k in range(start, until(start, blocks)):
+            i = k + w * blocks
+            r = right[i]
+            total += wp.dot(V(real(r[0]), real(r[1]), real(r[2])), q[i] - base[i])
+        dots_out[w, start] = total
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def differ(q: wp.array(dtype=V), base: wp.array(dtype=V), move_out: wp.array(dtype=V)):
+        tid = wp.tid()
+        for i in range(tid, until(tid, q.shape[0])):
+            move_out[i] = q[i] - base[i]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def settle(
+        p: wp.array(dtype=H),
+        fixed: wp.array(dtype=wp.uint8),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        product: wp.array(dtype=H),
+        dots_out: wp.array2d(dtype=linear),
+    ):
+        """A product on free dofs, and p . product block by block."""
+        w, start = share(wp.tid(), blocks)
+        if wanted[w] != 1:
+            return
+        for k in range(start, until(start, blocks)):
+            i = k + w * blocks
+            y = wp.cw_mul(product[i], free(fixed[k]))
+            product[i] = y
+            dots_out[w, k] = wp.dot(p[i], y)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def lessen(
+        product: wp.array(dtype=H),
+        fixed: wp.array(dtype=wp.uint8),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        right: wp.array(dtype=H),
+    ):
+        """Takes a product from the residual on free dofs."""
+        w, start = share(wp.tid(), blocks)
+        if wanted[w] == 0:
+            return
+        for k in range(start, until(start, blocks)):
+            i = k + w * blocks
+            right[i] = right[i] - wp.cw_mul(product[i], free(fixed[k]))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def aim(nodes: wp.array(dtype=int), blocks: int, q: wp.array(dtype=V), aims_out: wp.array2d(dtype=V)):
+        i, w = wp.tid()
+        aims_out[i, w] = q[nodes[i] + w * blocks]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def push(
+        nodes: wp.array(dtype=int),
+        aims: wp.array2d(dtype=V),
+        q: wp.array(dtype=V),
+        fixed: wp.array(dtype=wp.uint8),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        direction: wp.array(dtype=H),
+    ):
+        """The way that supports have yet to go, among the directions, which are zero there."""
+        i, w = wp.tid()
+        if wanted[w] == 0:
+            return
+        k = nodes[i]
+        d = aims[i, w] - q[k + w * blocks]
+        for c in range(3):
+            if ((int(fixed[k]) >> c) & 1) != 0:
+                direction[k + w * blocks][c] = linear(d[c])
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def arrive(
+        nodes: wp.array(dtype=int),
+        aims: wp.array2d(dtype=V),
+        fixed: wp.array(dtype=wp.uint8),
+        modes: wp.array(dtype=int),
+        eps: real,
+        blocks: int,
+        q: wp.array(dtype=V),
+        flags: wp.array2d(dtype=int),
+    ):
+        """Supports that are where they have to be, up to rounding, are put there."""
+        i, w = wp.tid()
+        if modes[w] == wp.static(NONE):
+            return
+        k = nodes[i]
+        x = q[k + w * blocks]
+        for c in range(3):
+            if ((int(fixed[k]) >> c) & 1) != 0:
+                goal = aims[i, w][c]
+                if wp.abs(goal - x[c]) <= eps * (wp.abs(goal) + wp.abs(x[c])):
+                    x[c] = goal
+                else:
+                    flags[DRIVEN, w] = wp.static(ON_THE_WAY)
+        q[k + w * blocks] = x
+
+    return gain, differ, settle, lessen, aim, push, arrive
+
+
+@cache
+def stiffen_kernel(twist: bool, linear):
+    """stiffen(...): the bands of chains with contact's blocks of nodes, and of the edges ahead of them."""
+    nb = place_dofs(twist)
+    K, M, Layout = wp.types.matrix((3, 3), linear), wp.types.matrix((nb, nb), linear), layout_type()
+    load, store, _, _ = block_functions(nb, linear)
+    free_of, _ = place_functions(twist, linear)
+
+    @wp.func
+    def wide(own: K):
+        m = M()
+        for i in range(3):
+            for j in range(3):
+                m[i, j] = own[i, j]
+        return m
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def stiffen(
+        bands: wp.array3d(dtype=linear),
+        layout: Layout,
+        ahead: wp.array2d(dtype=int),
+        edges: int,
+        flags: wp.array2d(dtype=int),
+        blocks: int,
+        diagonal: wp.array(dtype=K),
+        between: wp.array(dtype=K),
+        stiffer: wp.array3d(dtype=linear),
+    ):
+        k, r = wp.tid()
+        w = r / layout.count.shape[0]
+        c = r - w * layout.count.shape[0]
+        if flags[WANTED, w] == 0 or k >= layout.count[c]:
+            return
+        f = free_of(layout.held[k, c])
+        D = load(bands, 0, k, r)
+        node = layout.places[0, k, c]
+        if node >= 0:
+            D += wp.cw_mul(wide(diagonal[node + w * blocks]), wp.outer(f, f))
+        store(stiffer, 0, k, r, D)
+        E = load(bands, wp.static(nb**2), k, r)
+        e = ahead[k, c]
+        if e >= 0:
+            E += wp.cw_mul(wide(between[e + w * edges]), wp.outer(f, free_of(layout.held[k + 1, c])))
+        store(stiffer, wp.static(nb**2), k, r, E)
+        for row in range(wp.static(2 * nb**2), bands.shape[0]):
+            stiffer[row, k, r] = bands[row, k, r]
+
+    return stiffen
