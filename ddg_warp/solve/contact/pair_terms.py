@@ -8,7 +8,7 @@ from ddg_warp.kernels.contact import gather
 from ddg_warp.kernels.contact.pair_terms import law_struct
 from ddg_warp.kernels.densities import Density
 from ddg_warp.solve.contact.broad_phase import BroadPhase
-from ddg_warp.solve.contact.list_terms import ListTerms
+from ddg_warp.solve.contact.contact_elements import ContactElements
 from ddg_warp.solve.contact.shapes import Shapes
 
 ROUNDING = 1e-6  # by which a range may exceed the reach, less than what searches go beyond it
@@ -34,6 +34,7 @@ class PairTerms:
         diagonal: (worlds times nodes,) blocks of the Gauss-Newton matrix at nodes, 3 x 3 [N/m]; between: (worlds times edges,) those
             between the first and the second node of edges, in the order of `shapes.things(2)`. Each pair's own part of rods, 6 x 6 for
             an edge, is in both, positive semi-definite together. See `blocks`.
+        stiffness: (worlds times nodes,) [N/m], traces of `diagonal`.
         law: `law_struct`, on the device.
 
     Raises:
@@ -62,20 +63,22 @@ class PairTerms:
         self.law.inner = wp.array(inner, dtype=wp.types.vector(2, self.real), device=self.device)
         self.energy = wp.zeros(search.worlds, dtype=self.real, device=self.device)
         self.forces = wp.zeros(nodes, dtype=wp.types.vector(3, self.real), device=self.device)
+        self.stiffness = wp.zeros(nodes, dtype=self.real, device=self.device)
         block = wp.types.matrix((3, 3), self.linear)
         self.diagonal = wp.zeros(nodes, dtype=block, device=self.device)
         self.between = wp.zeros(search.worlds * len(square), dtype=block, device=self.device)
         self._listed = wp.full(1, -1, dtype=int, device=self.device)
         self._stale = wp.zeros(1, dtype=int, device=self.device)
         self.lists = [
-            ListTerms(pairs, law, nodes, search.worlds, self.real, self.linear, atomic) for pairs in search.lists
+            ContactElements(pairs, law, nodes, search.worlds, self.real, self.linear, atomic) for pairs in search.lists
         ]
+        self._trace = gather.trace_kernel(self.real, self.linear)
         self._version = search.version
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [gather.compare_searches, *(kernel for part in self.lists for kernel in part.kernels)]
+        return [gather.compare_searches, self._trace, *(kernel for part in self.lists for kernel in part.kernels)]
 
     def fit(self) -> bool:
         """Make as much room as the lists of the search have; whether there was less. Not in a capture."""
@@ -108,14 +111,18 @@ class PairTerms:
         H is the Gauss-Newton matrix, positive semi-definite by form; with the positions x of that `evaluate`, the exact Hessian.
         """
         for part in self.lists:
-            part.product(v, out, x, self.law)
+            if x is None:
+                part.product(v, out)
+            else:
+                part.exact_product(v, out, x, self.law)
 
     def blocks(self) -> None:
-        """Write `diagonal` and `between` of the last `evaluate`."""
+        """Write `diagonal`, `between` and `stiffness` of the last `evaluate`."""
         self.diagonal.zero_()
         self.between.zero_()
         for part in self.lists:
             part.blocks(self.diagonal, self.between)
+        wp.launch(self._trace, len(self.stiffness), [self.diagonal], [self.stiffness], device=self.device)
 
     def _list(self) -> None:
         for part in self.lists:
