@@ -86,6 +86,13 @@ def assembled(result: PairTerms, n: int, at=None) -> np.ndarray:
     return np.stack([times(result, v, at) for v in unit], -1).reshape(n, 3, n, 3)
 
 
+def repeats(run) -> None:
+    """Whether two times run(atomic) agree to the bit, and one with atomic sums to rounding."""
+    for first, again, other in zip(*(run(atomic) for atomic in (False, False, True)), strict=True):
+        assert (first == again).all()
+        assert np.abs(first - other).max() <= 1e-13 * np.abs(first).max()
+
+
 def psi(law: str, gap: np.ndarray, order: int = 0) -> np.ndarray:
     """Energies by the gap, or their second derivatives, in the forms of the papers, for one newton a metre."""
     within = LAWS[law][1]["range"]

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 import warp as wp
-from pair_cases import state, terms, times
+from pair_cases import move, state, terms, times
 
 from ddg_warp import arrays
 from ddg_warp.kernels.contact import gather
 from ddg_warp.kernels.contact.surfaces import EDGES, POINT_TRIANGLE, Kind
 from ddg_warp.solve.contact.shapes import Shapes
 
-SIDE = 50
+MU, RATE, SIDE = 0.4, 100.0, 50
 
 
 def star() -> tuple[Shapes, np.ndarray]:
@@ -28,19 +28,25 @@ def star() -> tuple[Shapes, np.ndarray]:
 
 @pytest.mark.parametrize("atomic", [False, True])
 def test_a_node_in_thousands_of_pairs(device, monkeypatch, atomic):
-    """A thread a pair, and one for all: energies, forces, products and blocks."""
+    """A thread a pair, and one for all: energies, forces, products and blocks, of contact and friction."""
     shapes, x = star()
     v = np.random.default_rng(1).normal(size=x.shape)
+    slip = 3e-6 * np.random.default_rng(2).normal(size=x.shape)
 
     def run():
-        result, at = terms(shapes, x, device, atomic=atomic)
+        result, at = terms(shapes, x, device, friction=MU, atomic=atomic)
+        result.lag(at)
+        move(result, at, x + slip)
+        result.evaluate(at, wp.full(1, RATE, dtype=wp.float64, device=device))
+        result.work()
         _, points = result.lists
         assert points.numbers.numpy()[:3].tolist() == [2 * SIDE**2] * 3
-        for node in (0, 1, 2, 3):
-            start, number = (of.numpy()[node] for of in (points.places, points.numbers))
-            items = points.items.numpy()[start : start + number]
-            assert (np.diff(items) > 0).all() and (points.factor.nodes.numpy().ravel()[items] == node).all()
-        return [*state(result), times(result, v), times(result, v, at), result.stiffness.numpy()]
+        for part in (points, result.frictions[1]):
+            for node in (0, 1, 2, 3):
+                start, number = (of.numpy()[node] for of in (part.places, part.numbers))
+                items = part.items.numpy()[start : start + number]
+                assert (np.diff(items) > 0).all() and (part.factor.nodes.numpy().ravel()[items] == node).all()
+        return [*state(result), times(result, v), times(result, v, at), result.dissipated.numpy()]
 
     one = run()
     monkeypatch.setattr(arrays, "serial", lambda device: False)
