@@ -1,14 +1,14 @@
 """What pairs bring to nodes, gathered in one order: which pairs each node is in, and sums over them.
 
-An item is 4 pair + slot. Threads list items in any order; each list is then sorted by insertion, so that sums of two runs agree to the
-bit. As lists of pairs are sorted, one thread alone lists them in order.
+An item is 4 pair + slot. One thread alone lists items in order. Many threads list them in any order, and then put each one where as
+many of its list as are smaller come before it, so that sums of two runs agree to the bit.
 """
 
 from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
+from ddg_warp.kernels.contact.surfaces import EDGES, Kind, pair_functions, sides_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 SLOTS = 4  # nodes of a pair
@@ -18,7 +18,7 @@ SLOTS = 4  # nodes of a pair
 def factor_struct(linear):
     """Rows of the factors of pairs: where bit k + 1 of used[p] is set, row k of p has weight[k, p][i] direction[k, p] for its node i.
 
-    nodes (capacity,): of each pair, in all worlds; used (capacity,): zero of pairs out of range, else bit 0 is set.
+    nodes (capacity,): of each pair, in all worlds; used (capacity,): zero of pairs that add nothing, else bit 0 is set.
     """
     V, W = wp.types.vector(3, linear), wp.types.vector(SLOTS, linear)
 
@@ -41,8 +41,8 @@ def compare_searches(searches: wp.array(dtype=int), listed: wp.array(dtype=int),
 
 @cache
 def list_kernels(kind: Kind, real, serial: bool):
-    """number(...) and fill(...) the items of nodes, sort(...) each list."""
-    Sides, until = sides_struct(real), until_function(serial)
+    """number(...) and fill(...) the items of nodes, sort(...) each list into `ordered`."""
+    Sides, until, size = sides_struct(real), until_function(serial), kind.first + kind.second
     slots, *_ = pair_functions(kind, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -60,7 +60,7 @@ def list_kernels(kind: Kind, real, serial: bool):
             w = pairs[p][0] / sides.counts[0]
             nodes = slots(sides, pairs[p][0] - w * sides.counts[0], pairs[p][1] - w * sides.counts[1], w)
             nodes_out[p] = wp.vec4i(nodes[0], nodes[1], nodes[2], nodes[3])
-            for slot in range(wp.static(SLOTS)):
+            for slot in range(wp.static(size)):
                 wp.atomic_add(numbers, nodes[slot], 1)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -75,28 +75,37 @@ def list_kernels(kind: Kind, real, serial: bool):
         if tid >= count[0]:
             return
         for p in range(tid, until(tid, count[0])):
-            for slot in range(wp.static(SLOTS)):
+            for slot in range(wp.static(size)):
                 node = nodes[p][slot]
                 items[starts[node] + wp.atomic_add(filled, node, 1)] = wp.static(SLOTS) * p + slot
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def sort(starts: wp.array(dtype=int), numbers: wp.array(dtype=int), items: wp.array(dtype=int)):
+    def sort(
+        count: wp.array(dtype=int),
+        nodes: wp.array(dtype=wp.vec4i),
+        starts: wp.array(dtype=int),
+        numbers: wp.array(dtype=int),
+        items: wp.array(dtype=int),
+        ordered: wp.array(dtype=int),
+    ):
+        """A thread a pair, as a thread a node would take thousands of steps where a node is in thousands of pairs."""
         tid = wp.tid()
-        for node in range(tid, until(tid, numbers.shape[0])):
-            start = starts[node]
-            for k in range(start + 1, start + numbers[node]):
-                item = items[k]
-                at = int(k)
-                while at > start and items[wp.max(at - 1, 0)] > item:
-                    items[at] = items[at - 1]
-                    at -= 1
-                items[at] = item
+        if tid >= count[0]:
+            return
+        for p in range(tid, until(tid, count[0])):
+            for slot in range(wp.static(size)):
+                start = starts[nodes[p][slot]]
+                item = wp.static(SLOTS) * p + slot
+                smaller = int(0)
+                for k in range(start, start + numbers[nodes[p][slot]]):
+                    smaller += wp.where(items[k] < item, 1, 0)
+                ordered[start + smaller] = item
 
     return number, fill, sort
 
 
 @cache
-def sum_kernels(real, serial: bool):
+def sum_kernels(size: int, real, serial: bool):
     """gather(...) to nodes what pairs have written a slot, or scatter(...) it by atomic additions, in any order."""
     V, until = wp.types.vector(3, real), until_function(serial)
 
@@ -134,7 +143,7 @@ def sum_kernels(real, serial: bool):
             return
         for p in range(tid, until(tid, count[0])):
             if used[p] != 0:
-                for slot in range(wp.static(SLOTS)):
+                for slot in range(wp.static(size)):
                     wp.atomic_add(out, nodes[p][slot], parts[slot, p] * scale)
 
     return gather, scatter
@@ -159,8 +168,11 @@ def block_function(rows: int, linear):
 
 
 @cache
-def block_kernels(rows: int, real, linear, serial: bool):
-    """nodes(...) adds the blocks of H on its diagonal, edges(...) those between the first and the second node of edges."""
+def block_kernels(kind: Kind, rows: int, real, linear, serial: bool):
+    """nodes(...) adds the blocks of H on its diagonal, edges(...) those between the first and the second node of edges.
+
+    The latter is for kinds whose first things are edges.
+    """
     M, Factor, Sides = wp.types.matrix((3, 3), linear), factor_struct(linear), sides_struct(real)
     block, until = block_function(rows, linear), until_function(serial)
 
@@ -201,9 +213,22 @@ def block_kernels(rows: int, real, linear, serial: bool):
             for k in range(starts[node], starts[node] + numbers[node]):
                 p = items[k] / wp.static(SLOTS)
                 slot = items[k] - wp.static(SLOTS) * p
-                if factor.used[p] != 0 and (slot == 0 or slot == 2):
+                if factor.used[p] != 0 and (slot == 0 or (wp.static(kind == EDGES) and slot == 2)):
                     if pairs[p][slot / 2] == i:
                         total += block(factor, p, slot, slot + 1)
             out[i] = out[i] + total
 
     return nodes, edges
+
+
+@cache
+def trace_kernel(real, linear):
+    """Traces of blocks."""
+    M = wp.types.matrix((3, 3), linear)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def trace(blocks: wp.array(dtype=M), out: wp.array(dtype=real)):
+        i = wp.tid()
+        out[i] = real(wp.trace(blocks[i]))
+
+    return trace

@@ -33,18 +33,31 @@ def law_struct(real):
 
 
 @cache
+def groups_function(real):
+    """groups(law, sides, pair) -> i, j of a pair of all worlds in its own one, and the groups of both."""
+    Law, Sides = law_struct(real), sides_struct(real)
+
+    @wp.func
+    def groups(law: Law, sides: Sides, pair: wp.vec2i):
+        w = pair[0] / sides.counts[0]
+        i, j = pair[0] - w * sides.counts[0], pair[1] - w * sides.counts[1]
+        return i, j, law.group[sides.first.object[i]], law.group[sides.second.object[j]]
+
+    return groups
+
+
+@cache
 def read_functions(kind: Kind, real):
     """given(law, sides, pair) -> p, threshold, inner of things (i, j) of all worlds; corners(x, nodes) -> (4, 3)."""
     Law, Sides = law_struct(real), sides_struct(real)
     _, W, P = shape_types(real)
     V = wp.types.vector(3, real)
     _, _, thickness, _ = pair_functions(kind, real)
+    groups = groups_function(real)
 
     @wp.func
     def given(law: Law, sides: Sides, pair: wp.vec2i):
-        w = pair[0] / sides.counts[0]
-        i, j = pair[0] - w * sides.counts[0], pair[1] - w * sides.counts[1]
-        a, b = law.group[sides.first.object[i]], law.group[sides.second.object[j]]
+        i, j, a, b = groups(law, sides, pair)
         both = law.thickness[a, b]
         if both < real(0.0):
             both = thickness(sides, i, j)
@@ -187,7 +200,7 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: boo
 
 @cache
 def energy_kernels(real):
-    """things(...) adds energies of pairs of each first thing, total(...) adds those of a list to worlds."""
+    """things(...) adds energies of pairs of each first thing, total(...) adds their sums to worlds."""
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def things(

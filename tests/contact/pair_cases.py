@@ -66,6 +66,33 @@ def move(result: PairTerms, at: wp.array, x: np.ndarray) -> None:
     result.evaluate(at)
 
 
+def state(result: PairTerms) -> list[np.ndarray]:
+    """Copies of energies, forces and blocks."""
+    result.blocks()
+    return [of.numpy().copy() for of in (result.energy, result.forces, result.diagonal, result.between)]
+
+
+def times(result: PairTerms, v: np.ndarray, at=None) -> np.ndarray:
+    """H v, of the exact Hessian where positions are given."""
+    given = upload(v, result.device, wp.types.vector(3, result.linear))
+    out = wp.zeros_like(given)
+    result.product(given, out, at)
+    return out.numpy().copy()
+
+
+def assembled(result: PairTerms, n: int, at=None) -> np.ndarray:
+    """H (n, 3, n, 3), a column a product."""
+    unit = np.eye(3 * n).reshape(3 * n, n, 3)
+    return np.stack([times(result, v, at) for v in unit], -1).reshape(n, 3, n, 3)
+
+
+def repeats(run) -> None:
+    """Whether two times run(atomic) agree to the bit, and one with atomic sums to rounding."""
+    for first, again, other in zip(*(run(atomic) for atomic in (False, False, True)), strict=True):
+        assert (first == again).all()
+        assert np.abs(first - other).max() <= 1e-13 * np.abs(first).max()
+
+
 def psi(law: str, gap: np.ndarray, order: int = 0) -> np.ndarray:
     """Energies by the gap, or their second derivatives, in the forms of the papers, for one newton a metre."""
     within = LAWS[law][1]["range"]

@@ -1,4 +1,7 @@
-"""Contact on the candidates of a search: energies, forces, and products with the Hessian; see `kernels.contact.pair_energy`."""
+"""Contact and friction on the candidates of a search: energies, forces, and products with the Hessian.
+
+See `kernels.contact.pair_energy` and `kernels.contact.pair_friction`.
+"""
 
 import numpy as np
 import warp as wp
@@ -7,18 +10,25 @@ from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels.contact import gather
 from ddg_warp.kernels.contact.pair_terms import law_struct
 from ddg_warp.kernels.densities import Density
+from ddg_warp.kernels.densities.friction import logistic_friction, polynomial_friction
 from ddg_warp.solve.contact.broad_phase import BroadPhase
-from ddg_warp.solve.contact.list_terms import ListTerms
+from ddg_warp.solve.contact.contact_elements import ContactElements
+from ddg_warp.solve.contact.friction_elements import FrictionElements
 from ddg_warp.solve.contact.shapes import Shapes
 
+FRICTION = {"logistic": logistic_friction, "polynomial": polynomial_friction}
 ROUNDING = 1e-6  # by which a range may exceed the reach, less than what searches go beyond it
 
 
 class PairTerms:
-    """Contact of all pairs of a `BroadPhase`, in one law with parameters by pairs of groups of objects.
+    """Contact of all pairs of a `BroadPhase`, in one law with parameters by pairs of groups of objects, and their friction.
 
-    `evaluate`, `product` and `blocks` read nothing back and can be captured, on the CPU too; graphs that hold them have to be captured
-    anew whenever `version` of the search grows, after `fit` of the search and of this. While pairs do not fit energies are infinite.
+    Friction is that of the pairs that push each other when `lag` is called, at the start of a step, and of its normal forces; searches
+    within the step leave it alone.
+
+    `lag`, `evaluate`, `product`, `blocks` and `work` read nothing back and can be captured, on the CPU too; graphs that hold them have
+    to be captured anew whenever `version` of the search grows, after `fit` of the search and of this, beginning with `lag`. While pairs
+    do not fit energies are infinite.
 
     Args:
         search: candidates; to be updated before each `evaluate`.
@@ -26,14 +36,19 @@ class PairTerms:
         stiffness: [N/m], not negative; range: gap below which surfaces push each other [m], positive, at most the reach of the search;
             thickness: distance at which the gap is zero [m], by default the sum of both radii. Numbers, or symmetric (groups, groups).
         groups: of each object (objects,), from 0; by default all are in one.
+        friction: coefficient mu, a number or symmetric (groups, groups), not negative; None or 0: no friction is built.
+        friction_law: "logistic" or "polynomial", see `densities.friction`.
+        velocity: nu [m/s], positive: what sticks creeps with a share of it.
         linear: type of factors and of vectors of products, by default that of positions.
         atomic: whether sums are added atomically, in an order that on CUDA differs from run to run.
 
     Attributes:
-        energy: (worlds,) [J]; forces: (worlds times nodes,) [N].
+        energy: (worlds,) [J], that of contact and the potential of friction; forces: (worlds times nodes,) [N].
+        dissipated: (worlds,) [J], see `work`.
         diagonal: (worlds times nodes,) blocks of the Gauss-Newton matrix at nodes, 3 x 3 [N/m]; between: (worlds times edges,) those
             between the first and the second node of edges, in the order of `shapes.things(2)`. Each pair's own part of rods, 6 x 6 for
             an edge, is in both, positive semi-definite together. See `blocks`.
+        stiffness: (worlds times nodes,) [N/m], traces of `diagonal`.
         law: `law_struct`, on the device.
 
     Raises:
@@ -49,80 +64,158 @@ class PairTerms:
         range,
         thickness=None,
         groups=None,
+        friction=None,
+        friction_law: str = "logistic",
+        velocity: float = 1e-3,
         linear=None,
         atomic: bool = False,
     ):
         self.search, self.device, self.real = search, search.device, search.real
         self.linear = linear or self.real
         self.law = law_struct(self.real)()
-        self._set(stiffness, range, thickness, groups)
+        number = self._set(stiffness, range, thickness, groups)
         nodes = len(search.shapes.points) * search.worlds
         square, inner = _edges(search.shapes)
         self.law.square = wp.array(square, dtype=self.real, device=self.device)
         self.law.inner = wp.array(inner, dtype=wp.types.vector(2, self.real), device=self.device)
         self.energy = wp.zeros(search.worlds, dtype=self.real, device=self.device)
+        self.dissipated, self._no_rate = wp.zeros_like(self.energy), wp.zeros_like(self.energy)
         self.forces = wp.zeros(nodes, dtype=wp.types.vector(3, self.real), device=self.device)
+        self.stiffness = wp.zeros(nodes, dtype=self.real, device=self.device)
         block = wp.types.matrix((3, 3), self.linear)
         self.diagonal = wp.zeros(nodes, dtype=block, device=self.device)
         self.between = wp.zeros(search.worlds * len(square), dtype=block, device=self.device)
         self._listed = wp.full(1, -1, dtype=int, device=self.device)
         self._stale = wp.zeros(1, dtype=int, device=self.device)
         self.lists = [
-            ListTerms(pairs, law, nodes, search.worlds, self.real, self.linear, atomic) for pairs in search.lists
+            ContactElements(pairs, law, nodes, search.worlds, self.real, self.linear, atomic) for pairs in search.lists
         ]
-        self._version = search.version
+        self._trace = gather.trace_kernel(self.real, self.linear)
+        self._version, self._lagged = search.version, -1
+        self.frictions = self._with_friction(friction, friction_law, velocity, number, atomic)
+        self._start = wp.zeros_like(self.forces)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [gather.compare_searches, *(kernel for part in self.lists for kernel in part.kernels)]
+        parts = [kernel for part in self._parts for kernel in part.kernels]
+        return [gather.compare_searches, self._trace, *parts]
+
+    @property
+    def _parts(self) -> list:
+        return [*self.lists, *self.frictions]
 
     def fit(self) -> bool:
-        """Make as much room as the lists of the search have; whether there was less. Not in a capture."""
+        """Make as much room as the lists of the search have; whether there was less. Not in a capture.
+
+        If so, the step is to be done again from its `lag` on.
+        """
         if self._version == self.search.version:
             return False
-        for part in self.lists:
+        for part in self._parts:
             part.reserve()
         self._listed.fill_(-1)
         self._version = self.search.version
         return True
 
-    def evaluate(self, x: wp.array) -> None:
-        """Energies, forces and factors at positions x.
+    def lag(self, x: wp.array) -> None:
+        """Evaluate contact at x, and take pairs, normal forces and tangents of friction from it, and x as where slip starts.
+
+        Does nothing where there is no friction.
 
         Raises:
             SolverError: if the lists of the search have grown since `fit`.
         """
+        if not self.frictions:
+            return
+        self.evaluate(x)
+        for part in self.frictions:
+            part.lag(self.law)
+        wp.copy(self._start, x)
+        self._lagged = self._version
+
+    def evaluate(self, x: wp.array, rate: wp.array | None = None, start: wp.array | None = None) -> None:
+        """Energies, forces and factors at positions x; with rates, those of friction too.
+
+        Args:
+            rate: 1/h of each world (worlds,) [1/s]; no friction where it is 0.
+            start: positions that slip starts from, by default those of `lag`.
+
+        Raises:
+            SolverError: if the lists of the search have grown since `fit`, or friction was not lagged since then, or rates do not fit.
+        """
         if self._version != self.search.version:
             raise SolverError("the lists of pairs have grown; call fit() of these terms, and capture graphs anew")
+        if rate is not None:
+            self._check(rate)
         wp.launch(gather.compare_searches, 1, [self.search.searches, self._listed], [self._stale], device=self.device)
         wp.capture_if(self._stale, self._list)
         self.energy.zero_()
         self.forces.zero_()
         for part in self.lists:
             part.evaluate(x, self.law, self.forces, self.energy, self.search.overflow)
+        start = self._start if start is None else start
+        rate = self._no_rate if rate is None else rate
+        for part in self.frictions:
+            part.evaluate(x, start, rate, self.forces, self.energy, self.search.overflow)
+
+    def work(self) -> None:
+        """Write `dissipated`: what friction takes from its start to the last `evaluate`, the sum of its forces times slip [J]."""
+        self.dissipated.zero_()
+        for part in self.frictions:
+            part.work(self.search.overflow, self.dissipated)
 
     def product(self, v: wp.array, out: wp.array, x: wp.array | None = None) -> None:
         """out += H v of the last `evaluate`, vectors of 3 (worlds times nodes,).
 
-        H is the Gauss-Newton matrix, positive semi-definite by form; with the positions x of that `evaluate`, the exact Hessian.
+        H is the Gauss-Newton matrix, positive semi-definite by form; with the positions x of that `evaluate`, the exact Hessian. Of
+        friction both are the same.
         """
         for part in self.lists:
-            part.product(v, out, x, self.law)
+            if x is None:
+                part.product(v, out)
+            else:
+                part.exact_product(v, out, x, self.law)
+        for part in self.frictions:
+            part.product(v, out)
 
     def blocks(self) -> None:
-        """Write `diagonal` and `between` of the last `evaluate`."""
+        """Write `diagonal`, `between` and `stiffness` of the last `evaluate`."""
         self.diagonal.zero_()
         self.between.zero_()
-        for part in self.lists:
+        for part in self._parts:
             part.blocks(self.diagonal, self.between)
+        wp.launch(self._trace, len(self.stiffness), [self.diagonal], [self.stiffness], device=self.device)
+
+    def _check(self, rate: wp.array) -> None:
+        """Refuse rates that do not fit, and friction that was not lagged."""
+        if rate.shape != (self.search.worlds,) or rate.dtype is not self.real:
+            raise SolverError(
+                f"rates of contact are {self.search.worlds} of {self.real.__name__}, one a world,"
+                f" not {rate.shape} of {rate.dtype.__name__}"
+            )
+        if self.frictions and self._lagged != self._version:
+            raise SolverError("friction has no pairs of the step's start; call lag() there, anew after fit()")
+
+    def _with_friction(self, friction, law: str, velocity: float, number: int, atomic: bool) -> list[FrictionElements]:
+        """Friction of each list, where there is any."""
+        if law not in FRICTION:
+            raise SceneError(f"friction_law = {law!r} of contact; it is one of {', '.join(FRICTION)}")
+        if not 0.0 < velocity < np.inf:
+            raise SceneError(f"velocity = {velocity!r} of friction; it is positive and finite [m/s]")
+        table = _table("friction", 0.0 if friction is None else friction, number, False)
+        if not table.any():
+            return []
+        table = wp.array(table, dtype=self.real, device=self.device)
+        sizes = (len(self.forces), self.search.worlds, self.real, self.linear, atomic)
+        return [FrictionElements(part, FRICTION[law], table, float(velocity), *sizes) for part in self.lists]
 
     def _list(self) -> None:
         for part in self.lists:
             part.list()
 
-    def _set(self, stiffness, range, thickness, groups) -> None:
-        """Check the parameters and upload them."""
+    def _set(self, stiffness, range, thickness, groups) -> int:
+        """Check the parameters of contact and upload them; the number of groups."""
         objects = len(self.search.shapes.names)
         groups = np.zeros(objects, int) if groups is None else np.asarray(groups)
         if groups.shape != (objects,) or groups.dtype.kind not in "iu" or groups.min() < 0:
@@ -139,6 +232,7 @@ class PairTerms:
         self.law.group = wp.array(groups, dtype=int, device=self.device)
         for name, value in values.items():
             setattr(self.law, name, wp.array(value, dtype=self.real, device=self.device))
+        return number
 
     def _within_reach(self, within: np.ndarray, thickness: np.ndarray, groups: np.ndarray) -> None:
         """Refuse ranges in which the search does not find all pairs."""

@@ -1,0 +1,74 @@
+"""Friction on the pairs that contact had at the start of a step: memory and launches of `kernels.contact.pair_friction`."""
+
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.kernels.contact.pair_friction import ROWS, friction_kernel, lag_kernel, lagged_struct
+from ddg_warp.kernels.densities import Density
+from ddg_warp.solve.contact.contact_elements import ContactElements
+from ddg_warp.solve.contact.pair_elements import PairElements
+
+
+class FrictionElements(PairElements):
+    """Friction of the pairs of one list, with lists of their own, which later searches leave alone; see `PairTerms`.
+
+    Args:
+        contact: of the same pairs.
+        friction: coefficients by groups of both objects (groups, groups).
+        velocity: below which surfaces stick [m/s].
+    """
+
+    def __init__(
+        self,
+        contact: ContactElements,
+        density: Density,
+        friction: wp.array,
+        velocity: float,
+        nodes: int,
+        worlds: int,
+        real,
+        linear,
+        atomic: bool,
+    ):
+        super().__init__(contact.found, ROWS, nodes, worlds, real, linear, atomic)
+        serial = arrays.serial(self.device)
+        self._contact, self._friction, self._velocity = contact, friction, velocity
+        self._lag = lag_kernel(self.found.kind, real, linear, serial)
+        self._evaluate = friction_kernel(density, real, linear, serial)
+        self.kernels += [self._lag, self._evaluate]
+        self._kept = ("count", "starts", "partners", "numbers", "places")
+        for name in self._kept:
+            setattr(self, name, wp.zeros_like(getattr(contact, name)))
+        self.lagged = lagged_struct(real)()
+        self.reserve()
+
+    def reserve(self) -> None:
+        """As it is of `PairElements`; what was lagged is lost."""
+        super().reserve()
+        for name in self._kept:
+            getattr(self, name).zero_()
+        capacity = self.found.capacity
+        self.pairs = wp.zeros(capacity, dtype=wp.vec2i, device=self.device)
+        self._work, self.lagged.bound = (wp.zeros(capacity, dtype=self._real, device=self.device) for _ in range(2))
+        self.lagged.weight = wp.zeros(capacity, dtype=wp.types.vector(4, self._real), device=self.device)
+        self.lagged.tangent = arrays.allocate((ROWS, capacity), wp.types.vector(3, self._real), self.device)
+
+    def lag(self, law) -> None:
+        """Take the pairs of contact as it was evaluated last."""
+        of = self._contact
+        inputs = [of.pairs, of.count, self.found.sides, law, self._friction, of.factor, of.gradient, of.items]
+        self._sweep(self._lag, self.found.capacity, inputs, [self.pairs, self.factor, self.lagged, self.items])
+        for name in self._kept:
+            wp.copy(getattr(self, name), getattr(of, name))
+
+    def evaluate(self, x, start, rate: wp.array, forces: wp.array, energy: wp.array, overflow: wp.array) -> None:
+        """Write factors at x by the slip since `start`; add to the forces on nodes and to the energies of worlds."""
+        inputs = [self.pairs, self.count, self.found.first.count, self.lagged, self._velocity, rate, x, start]
+        outputs = [self.factor, self._energy, self._work, self.gradient]
+        self._sweep(self._evaluate, self.found.capacity, inputs, outputs)
+        self._add_up(self.gradient, -1.0, forces)
+        self._add_energies(self._energy, overflow, energy)
+
+    def work(self, overflow: wp.array, dissipated: wp.array) -> None:
+        """Add what friction takes by the slip of the last `evaluate` to that of worlds."""
+        self._add_energies(self._work, overflow, dissipated)

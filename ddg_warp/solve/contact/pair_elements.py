@@ -1,0 +1,98 @@
+"""Elements on pairs: memory of their factors, and what nodes and worlds get of them; see `kernels.contact.gather`."""
+
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.errors import SolverError
+from ddg_warp.kernels.contact import gather
+from ddg_warp.kernels.contact.pair_terms import energy_kernels, product_kernel
+from ddg_warp.solve.contact.pairs import PairList
+from ddg_warp.solve.net.system import Sums
+
+MOST = 2**31 // gather.SLOTS  # pairs whose slots can be counted
+
+
+class PairElements:
+    """Elements on pairs, a factor of `rows` rows each. A subclass says which pairs those are, and writes what they are.
+
+    Args:
+        found: list of a search, whose kind of pairs and capacity these have.
+        nodes: of all worlds; worlds: how many.
+        linear: type of factors; atomic: whether sums are added atomically.
+
+    Attributes:
+        factor: see `gather.factor_struct`.
+        pairs, count, starts, partners: as those of a `PairList`; of the subclass.
+        numbers, places: of each node, how many items it has and where they start in `items`; of the subclass, but for `items`.
+    """
+
+    def __init__(self, found: PairList, rows: int, nodes: int, worlds: int, real, linear, atomic: bool):
+        self.found, self.device, self._rows, self._real, self._linear = found, found.device, rows, real, linear
+        self._atomic, serial, kind = atomic, arrays.serial(self.device), found.kind
+        self.size = kind.first + kind.second
+        self._product = product_kernel(rows, linear, serial)
+        self._add = {dtype: gather.sum_kernels(self.size, dtype, serial)[int(atomic)] for dtype in (real, linear)}
+        self._blocks = gather.block_kernels(kind, rows, real, linear, serial)
+        self._energies = energy_kernels(real)
+        self._of_things = wp.zeros((worlds, found.first.count), dtype=real, device=self.device)
+        self._sum = Sums(worlds, found.first.count, real, self.device)
+        self._of_worlds = wp.zeros(worlds, dtype=real, device=self.device)
+        self.factor = gather.factor_struct(linear)()
+        self.kernels = [*self._add.values(), *self._blocks, *self._energies, *self._sum.kernels, self._product]
+
+    def reserve(self) -> None:
+        """Make room for as many pairs as the list of the search has.
+
+        Raises:
+            SolverError: if there are more than can be counted.
+        """
+        capacity, linear = self.found.capacity, self._linear
+        if capacity > MOST:
+            raise SolverError(
+                f"contact has room for {MOST} pairs, not {capacity}; use a smaller margin or reach",
+                outcome="too_many_pairs",
+            )
+        vector = wp.types.vector(3, linear)
+        self.factor.nodes = wp.zeros(capacity, dtype=wp.vec4i, device=self.device)
+        self.factor.used = wp.zeros(capacity, dtype=int, device=self.device)
+        self.factor.direction = arrays.allocate((self._rows, capacity), vector, self.device)
+        self.factor.weight = arrays.allocate((self._rows, capacity), wp.types.vector(4, linear), self.device)
+        self.items = wp.zeros(self.size * capacity, dtype=int, device=self.device)
+        self._energy = wp.zeros(capacity, dtype=self._real, device=self.device)
+        shape = (gather.SLOTS, capacity)
+        self._parts = arrays.allocate(shape, vector, self.device)
+        self.gradient = self._parts
+        if linear is not self._real:
+            self.gradient = arrays.allocate(shape, wp.types.vector(3, self._real), self.device)
+
+    def product(self, v: wp.array, out: wp.array) -> None:
+        """Add the product of the Gauss-Newton matrix with v."""
+        self._sweep(self._product, self.found.capacity, [self.count, self.factor, v], [self._parts])
+        self._add_up(self._parts, 1.0, out)
+
+    def blocks(self, diagonal: wp.array, between: wp.array) -> None:
+        """Add the blocks of nodes, and those between the nodes of edges."""
+        lists, (nodes, edges) = [self.places, self.numbers, self.items], self._blocks
+        self._sweep(nodes, len(diagonal), [self.factor, *lists], [diagonal])
+        if self.found.kind.first == 2:
+            self._sweep(edges, len(between), [self.factor, self.pairs, self.found.sides, *lists], [between])
+
+    def _add_energies(self, energies: wp.array, overflow: wp.array, out: wp.array) -> None:
+        """Add what pairs have written to that of worlds."""
+        things, total = self._energies
+        inputs = [self.count, self.starts, self.partners, energies]
+        wp.launch(things, self._of_things.shape, inputs, [self._of_things], device=self.device)
+        self._sum(self._of_things, self._of_worlds)
+        wp.launch(total, len(out), [self._of_worlds, overflow], [out], device=self.device)
+
+    def _add_up(self, parts: wp.array, scale: float, out: wp.array) -> None:
+        kernel = self._add[out.dtype._wp_scalar_type_]
+        if self._atomic:
+            inputs = [self.count, parts, self.factor.used, self.factor.nodes, scale]
+            self._sweep(kernel, self.found.capacity, inputs, [out])
+        else:
+            inputs = [parts, self.factor.used, self.places, self.numbers, self.items, scale]
+            self._sweep(kernel, len(out), inputs, [out])
+
+    def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
+        arrays.sweep(kernel, count, inputs, outputs, self.device)

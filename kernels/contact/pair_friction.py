@@ -1,0 +1,162 @@
+"""Friction of pairs: what is lagged at the start of a step, and energy, gradient and factor by the slip since then.
+
+Of the gradient g_i of a pair by its nodes at the lagged positions, the sum over the first thing's nodes is N n, with the normal force N
+and a unit vector n. The weights
+
+    w_i = g_i . n / N ,   their sum 1 over the first thing and -1 over the second,
+
+are those of the centre of pressure on either side, whatever distances the energy is made of: of one distance they are those of the
+closest points, of edges along each other those of all their ends that push. With t1, t2 at right angles to n, the slip since x^n and
+the dissipation potential (`densities.friction`) are
+
+    u = (t1, t2) . sum_i w_i (x_i - x_i^n) ,   psi = mu N nu h G(|u| / (nu h)) ,
+
+with forces f_i = -w_i f, f = (t1, t2) psi'(u) at most mu N. They have no resultant; with r = sum_i w_i x_i, from one centre of pressure
+to the other, their moment is that of -f at r. What would balance it turns surfaces about their middle, where friction here is applied.
+Where the forces of a pair on one side all but cancel, weights are large; still |f_i| <= mu |g_i . n|.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.contact.gather import SLOTS, factor_struct
+from ddg_warp.kernels.contact.pair_terms import groups_function, law_struct
+from ddg_warp.kernels.contact.surfaces import Kind, sides_struct
+from ddg_warp.kernels.densities import Density
+from ddg_warp.kernels.measures.slip import basis
+from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
+
+ROWS = 2  # directions of the slip
+
+
+@cache
+def lagged_struct(real):
+    """What is lagged of pairs (capacity,): mu N [N], zero where there is no friction, weights of nodes, and tangents (2, capacity)."""
+    V, W = wp.types.vector(3, real), wp.types.vector(SLOTS, real)
+
+    @wp.struct
+    class Lagged:
+        bound: wp.array(dtype=real)
+        weight: wp.array(dtype=W)
+        tangent: wp.array2d(dtype=V)
+
+    return Lagged
+
+
+@cache
+def lag_kernel(kind: Kind, real, linear, serial: bool):
+    """Keep pairs, their nodes and the items of nodes, and what is lagged of friction, from factors and gradients of contact."""
+    Law, Sides, Factor, Lagged = law_struct(real), sides_struct(real), factor_struct(linear), lagged_struct(real)
+    V, W, L = wp.types.vector(3, real), wp.types.vector(SLOTS, real), wp.types.vector(SLOTS, linear)
+    tangents, groups, until, size = basis(real), groups_function(real), until_function(serial), kind.first + kind.second
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def lag(
+        pairs: wp.array(dtype=wp.vec2i),
+        count: wp.array(dtype=int),
+        sides: Sides,
+        law: Law,
+        friction: wp.array2d(dtype=real),
+        contact: Factor,
+        gradient: wp.array2d(dtype=V),
+        items: wp.array(dtype=int),
+        pairs_out: wp.array(dtype=wp.vec2i),
+        factor: Factor,
+        lagged: Lagged,
+        items_out: wp.array(dtype=int),
+    ):
+        tid = wp.tid()
+        if tid >= count[0]:
+            return
+        for p in range(tid, until(tid, count[0])):
+            pairs_out[p] = pairs[p]
+            factor.nodes[p] = contact.nodes[p]
+            factor.used[p] = 0
+            for k in range(wp.static(size)):
+                items_out[wp.static(size) * p + k] = items[wp.static(size) * p + k]
+            lagged.bound[p] = real(0.0)
+            if contact.used[p] != 0:
+                _i, _j, a, b = groups(law, sides, pairs[p])
+                push = V()
+                for slot in range(wp.static(kind.first)):
+                    push += gradient[slot, p]
+                normal = wp.length(push)
+                # what is no number shows in the energy
+                if not (friction[a, b] * normal <= real(0.0)):
+                    n = push / normal
+                    t1, t2 = tangents(n)
+                    weight = W()
+                    for slot in range(wp.static(size)):
+                        weight[slot] = wp.dot(gradient[slot, p], n) / normal
+                    lagged.bound[p] = friction[a, b] * normal
+                    lagged.weight[p] = weight
+                    lagged.tangent[0, p] = t1
+                    lagged.tangent[1, p] = t2
+                    for k in range(wp.static(ROWS)):
+                        factor.weight[k, p] = L(
+                            linear(weight[0]), linear(weight[1]), linear(weight[2]), linear(weight[3])
+                        )
+
+    return lag
+
+
+@cache
+def friction_kernel(density: Density, real, linear, serial: bool):
+    """Energy, work, gradient by slot and factor of each pair at positions x, by its slip since `start`.
+
+    things: first things of pairs in one world; velocity: nu [m/s]; rate (worlds,): 1/h [1/s].
+    """
+    Factor, Lagged = factor_struct(linear), lagged_struct(real)
+    V, L = wp.types.vector(3, real), wp.types.vector(3, linear)
+    E, P = wp.types.vector(2, real), wp.types.vector(density.parameter_size(2), real)
+    energy_of, slope_of, root_of = density.functions(real, 2)
+    until = until_function(serial)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def evaluate(
+        pairs: wp.array(dtype=wp.vec2i),
+        count: wp.array(dtype=int),
+        things: int,
+        lagged: Lagged,
+        velocity: real,
+        rate: wp.array(dtype=real),
+        x: wp.array(dtype=V),
+        start: wp.array(dtype=V),
+        factor: Factor,
+        energy: wp.array(dtype=real),
+        work: wp.array(dtype=real),
+        gradient: wp.array2d(dtype=V),
+    ):
+        tid = wp.tid()
+        if tid >= count[0]:
+            return
+        for p in range(tid, until(tid, count[0])):
+            inverse = rate[pairs[p][0] / things]
+            bound = lagged.bound[p]
+            used = int(0)
+            energy[p] = real(0.0)
+            work[p] = real(0.0)
+            if not (bound * inverse <= real(0.0)):
+                nodes, weight = factor.nodes[p], lagged.weight[p]
+                move = V()
+                for slot in range(wp.static(SLOTS)):
+                    move += (x[nodes[slot]] - start[nodes[slot]]) * weight[slot]
+                t1, t2 = lagged.tangent[0, p], lagged.tangent[1, p]
+                u = E(wp.dot(t1, move), wp.dot(t2, move))
+                given = P(bound, real(1.0), velocity, real(0.0), real(0.0), inverse)
+                energy[p] = energy_of(u, given)
+                f = slope_of(u, given)
+                work[p] = wp.dot(f, u)
+                for slot in range(wp.static(SLOTS)):
+                    gradient[slot, p] = (t1 * f[0] + t2 * f[1]) * weight[slot]
+                root = root_of(u, given, E())
+                used = 1
+                for k in range(wp.static(ROWS)):
+                    v = t1 * root[k, 0] + t2 * root[k, 1]
+                    if wp.dot(v, v) > real(0.0):
+                        used |= 2 << k
+                        factor.direction[k, p] = L(linear(v[0]), linear(v[1]), linear(v[2]))
+            factor.used[p] = used
+
+    return evaluate

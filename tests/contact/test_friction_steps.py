@@ -1,0 +1,185 @@
+"""Friction on pairs over steps: what is lagged, what searches and captures leave of it, precision, and what is refused."""
+
+import numpy as np
+import pytest
+import warp as wp
+from friction_cases import MU, RATE, SLIP, VELOCITY, each_case, each_form, rates, rubbed
+from pair_cases import CASES, LAWS, MARGIN, REACH, bundle, move, repeats, state, terms, times, upload
+
+from ddg_warp import arrays
+from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.kernels.densities.contact import smooth_penalty
+from ddg_warp.solve.contact.broad_phase import BroadPhase
+from ddg_warp.solve.contact.pair_terms import PairTerms
+
+
+@each_case
+def test_two_runs_agree_to_the_bit_and_atomic_sums_to_rounding(device, case):
+    def run(atomic):
+        result, _, x, _ = rubbed(case, device, atomic=atomic)
+        result.work()
+        return [*state(result), times(result, np.random.default_rng(3).normal(size=x.shape)), result.dissipated.numpy()]
+
+    repeats(run)
+
+
+def test_worlds_are_alone(device):
+    """Each with its own rate."""
+    shapes, x = CASES["crossing"]()
+    random = np.random.default_rng(4)
+    starts = [x + 1e-3 * random.normal(size=x.shape) for _ in range(3)]
+    slips = [SLIP * random.normal(size=x.shape) for _ in range(3)]
+
+    def run(x, slip, *rate):
+        result, at = terms(shapes, x, device, worlds=len(rate), friction=MU, velocity=VELOCITY)
+        result.lag(at)
+        at.assign(x + slip)
+        result.evaluate(at, rates(result, *rate))
+        result.work()
+        return [*state(result), result.dissipated.numpy()]
+
+    given = (RATE, 0.0, 3.0 * RATE)
+    together = run(np.concatenate(starts), np.concatenate(slips), *given)
+    alone = [run(*each) for each in zip(starts, slips, given, strict=True)]
+    for whole, parts in zip(together, zip(*alone, strict=True), strict=True):
+        assert (whole == np.concatenate(parts)).all()
+    assert (together[-1] > 0.0).tolist() == [True, False, True]
+
+
+def test_searches_within_a_step_leave_friction_alone(device):
+    """Lists of contact change, then change back; and slip may count from elsewhere."""
+    result, at, x, _ = rubbed("crossing", device)
+    before = state(result)
+    number = [part.count.numpy()[0] for part in result.lists]
+    away = upload(x + 2.0 * MARGIN * np.random.default_rng(2).normal(size=x.shape), device)
+    result.search.search(away)
+    result.evaluate(away)
+    assert [part.count.numpy()[0] for part in result.lists] != number
+    result.evaluate(at, rates(result))
+    assert all((a == b).all() for a, b in zip(state(result), before, strict=True))
+    result.evaluate(at, rates(result), upload(x, device))
+    assert all((a == b).all() for a, b in zip(state(result), before, strict=True))
+    result.evaluate(at, rates(result), at)
+    assert not result.forces.numpy().any()
+
+
+def test_lists_grow_and_friction_has_to_be_lagged_anew(device):
+    shapes, x = CASES["crossing"]()
+    result, at = terms(shapes, x, device, friction=MU, velocity=VELOCITY)
+    there = upload(x + SLIP, device)
+
+    def step():
+        result.lag(at)
+        result.evaluate(there, rates(result))
+        return state(result)
+
+    with pytest.raises(SolverError, match=r"no pairs of the step's start; call lag\(\) there"):
+        result.evaluate(at, rates(result))
+    before = step()
+    for pairs in result.search.lists:
+        pairs.reserve(10)
+    result.search.search(at)
+    assert np.isinf(step()[0]).all()
+    assert result.search.fit(at) and result.fit()
+    with pytest.raises(SolverError, match=r"call lag\(\) there, anew after fit\(\)"):
+        result.evaluate(there, rates(result))
+    assert all((a == b).all() for a, b in zip(step(), before, strict=True))
+
+
+@pytest.mark.parametrize("conditional", [False, True])
+def test_captured_steps(device, conditional):
+    """Lagged where the last step ended, also in a conditional part."""
+    shapes, x = CASES["crossing"]()
+    result, at = terms(shapes, x, device, friction=MU, velocity=VELOCITY)
+    plain, _ = terms(shapes, x, device, friction=MU, velocity=VELOCITY)
+    start, rate = upload(x, device), rates(result)
+    given, out = upload(x, device), upload(0.0 * x, device)
+    wanted = wp.ones(1, dtype=int, device=device)
+
+    def lag():
+        result.search.update(start)
+        result.lag(start)
+
+    arrays.load_kernels([*result.search.kernels, *result.kernels], device)
+    with wp.ScopedCapture(device=device) as capture:
+        if conditional:
+            wp.capture_if(wanted, lag)
+        else:
+            lag()
+        result.search.update(at)
+        result.evaluate(at, rate)
+        out.zero_()
+        result.product(given, out)
+        result.blocks()
+        result.work()
+    speed = 0.3 * MARGIN * np.random.default_rng(5).normal(size=x.shape)
+    for step in range(4):
+        move(plain, start, x + step * speed)
+        plain.lag(start)
+        move(plain, at, x + (step + 1) * speed)
+        plain.evaluate(at, rate)
+        plain.work()
+        wp.capture_launch(capture.graph)
+        for one, other in zip(state(plain), state(result), strict=True):
+            assert np.abs(one - other).max() <= 1e-13 * np.abs(one).max()
+        assert np.abs(out.numpy() - times(plain, x)).max() < 1e-12 * np.abs(out.numpy()).max()
+        assert result.dissipated.numpy()[0] == pytest.approx(plain.dissipated.numpy()[0], rel=1e-12)
+        assert result.dissipated.numpy()[0] > 0.0
+
+
+@each_case
+@each_form
+def test_factors_in_single_precision(device, case, form):
+    whole, _, x, _ = rubbed(case, device, form)
+    single, *_ = rubbed(case, device, form, linear=wp.float32)
+    v = np.random.default_rng(6).normal(size=x.shape)
+    assert (single.forces.numpy() == whole.forces.numpy()).all()
+    exact = times(whole, v)
+    assert np.abs(times(single, v) - exact).max() < 1e-5 * np.abs(exact).max()
+
+
+@each_case
+def test_all_in_single_precision(device, case):
+    """A slip of 1 mm is known to 1e-4 of it."""
+    whole, _, x, after = rubbed(case, device, slip=1e-3, velocity=1.0)
+    at = upload(x, device, wp.vec3f)
+    search = BroadPhase(CASES[case]()[0], at, reach=REACH, margin=MARGIN)
+    single = PairTerms(search, smooth_penalty, **LAWS["penalty"][1], friction=MU, velocity=1.0)
+    single.lag(at)
+    single.law.stiffness.zero_()
+    at.assign(after)
+    single.evaluate(at, rates(single))
+    for result in (whole, single):
+        result.work()
+    v = np.random.default_rng(7).normal(size=x.shape)
+    for value, exact in (
+        (single.forces.numpy(), whole.forces.numpy()),
+        (times(single, v), times(whole, v)),
+        (single.dissipated.numpy(), whole.dissipated.numpy()),
+    ):
+        assert np.abs(value - exact).max() < 1e-3 * np.abs(exact).max()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"friction": -0.1}, r"friction = -0.1 of contact between groups 0 and 0 is not finite and not negative"),
+        (
+            {"groups": [0, 0, 0, 1], "friction": [[0.1, 0.2], [0.3, 0.4]]},
+            r"friction = 0.2 of contact between groups 0 and 1 is not symmetric",
+        ),
+        ({"friction_law": "coulomb"}, r"friction_law = 'coulomb' of contact; it is one of logistic, polynomial"),
+        ({"velocity": 0.0}, r"velocity = 0.0 of friction; it is positive and finite"),
+    ],
+)
+def test_wrong_parameters_are_named(device, options, message):
+    with pytest.raises(SceneError, match=message):
+        terms(*bundle(), device, **options)
+
+
+def test_rates_that_do_not_fit_are_refused(device):
+    result, at = terms(*bundle(), device, friction=MU)
+    result.lag(at)
+    for wrong in (rates(result, 1.0, 2.0), wp.ones(1, dtype=wp.float32, device=device)):
+        with pytest.raises(SolverError, match=r"rates of contact are 1 of float64, one a world, not \(. ?.?,?\)"):
+            result.evaluate(at, wrong)

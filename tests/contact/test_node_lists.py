@@ -1,0 +1,79 @@
+"""Lists of the pairs of nodes where one is in thousands: their order, and what one thread and many make of them."""
+
+import numpy as np
+import pytest
+import warp as wp
+from pair_cases import move, state, terms, times
+
+from ddg_warp import arrays
+from ddg_warp.kernels.contact import gather
+from ddg_warp.kernels.contact.surfaces import EDGES, POINT_TRIANGLE, Kind
+from ddg_warp.solve.contact.shapes import Shapes
+
+MU, RATE, SIDE = 0.4, 100.0, 50
+
+
+def star() -> tuple[Shapes, np.ndarray]:
+    """2,500 short rods that lie on one triangle, each with two points on it, some along its side."""
+    x, y = np.meshgrid(0.02 + 0.03 * np.arange(SIDE), 0.02 + 0.03 * np.arange(SIDE))
+    first = np.stack([x, y, np.full_like(x, 0.0058)], -1).reshape(-1, 3)
+    corners = [[-1.0, 0.018, 0.0], [5.0, 0.018, 0.0], [-1.0, 5.0, 0.0]]
+    points = np.concatenate([corners, np.stack([first, first + [0.01, 0.004, 0.0003]], 1).reshape(-1, 3)])
+    shapes = Shapes(points)
+    shapes.shell(np.array([[0, 1, 2]]), 0.004)
+    for rod in range(len(first)):
+        shapes.rod([3 + 2 * rod, 4 + 2 * rod], 0.003)
+    return shapes, points
+
+
+@pytest.mark.parametrize("atomic", [False, True])
+def test_a_node_in_thousands_of_pairs(device, monkeypatch, atomic):
+    """A thread a pair, and one for all: energies, forces, products and blocks, of contact and friction."""
+    shapes, x = star()
+    v = np.random.default_rng(1).normal(size=x.shape)
+    slip = 3e-6 * np.random.default_rng(2).normal(size=x.shape)
+
+    def run():
+        result, at = terms(shapes, x, device, friction=MU, atomic=atomic)
+        result.lag(at)
+        move(result, at, x + slip)
+        result.evaluate(at, wp.full(1, RATE, dtype=wp.float64, device=device))
+        result.work()
+        _, points = result.lists
+        assert points.numbers.numpy()[:3].tolist() == [2 * SIDE**2] * 3
+        for part in (points, result.frictions[1]):
+            for node in (0, 1, 2, 3):
+                start, number = (of.numpy()[node] for of in (part.places, part.numbers))
+                items = part.items.numpy()[start : start + number]
+                assert (np.diff(items) > 0).all() and (part.factor.nodes.numpy().ravel()[items] == node).all()
+        return [*state(result), times(result, v), times(result, v, at), result.dissipated.numpy()]
+
+    one = run()
+    monkeypatch.setattr(arrays, "serial", lambda device: False)
+    many = run()
+    for first, second in zip(one, many, strict=True):
+        assert np.abs(first).max() > 0.0
+        assert np.abs(first - second).max() <= (1e-12 if atomic else 0.0) * np.abs(first).max()
+
+
+@pytest.mark.parametrize("kind", [EDGES, POINT_TRIANGLE, Kind(2, 1)])
+def test_items_in_any_order_are_sorted(device, kind):
+    """5,000 pairs that all have one node in common, in any slot."""
+    count, size, rng = 5000, kind.first + kind.second, np.random.default_rng(3)
+    nodes = np.column_stack([np.zeros(count, int), rng.integers(1, 4000, (count, size - 1))])
+    nodes = rng.permuted(nodes, axis=1)  # some have one twice, which does not matter here
+    nodes = np.column_stack([nodes, np.repeat(nodes[:, :1], 4 - size, 1)])
+    items = (4 * np.arange(count)[:, None] + np.arange(size)).ravel()
+    of = nodes[:, :size].ravel()
+    numbers = np.bincount(of, minlength=4000)
+    starts = np.cumsum(numbers) - numbers
+    wanted = items[np.argsort(of, kind="stable")]
+    mixed = rng.permutation(len(items))
+    mixed = items[mixed][np.argsort(of[mixed], kind="stable")]
+    assert (mixed[:count] != wanted[:count]).any()
+    inputs = [wp.array(values, dtype=int, device=device) for values in ([count], starts, numbers, mixed)]
+    inputs.insert(1, wp.array(nodes, dtype=wp.vec4i, device=device))
+    ordered = wp.zeros(len(items), dtype=int, device=device)
+    _, _, sort = gather.list_kernels(kind, wp.float64, False)
+    wp.launch(sort, count, inputs, [ordered], device=device)
+    assert (ordered.numpy() == wanted).all()

@@ -1,0 +1,234 @@
+"""Friction on pairs: its forces as derivatives and in closed form, its energy and momentum, and what has none."""
+
+import numpy as np
+import pytest
+from friction_cases import MU, SLIP, SLIPS, VELOCITY, each_case, each_form, rates, rubbed
+from pair_cases import LAWS, assembled, bundle, central, psi, state, terms, times
+
+from ddg_warp.solve.contact.shapes import Shapes
+
+
+def shares_of(part) -> np.ndarray:
+    """Friction of pairs over mu N, where there is any."""
+    used = part.factor.used.numpy() != 0
+    force = part.gradient.numpy()[: part.found.kind.first, used].sum(0)
+    return np.linalg.norm(force, axis=1) / part.lagged.bound.numpy()[used]
+
+
+def share(form: str, y):
+    """Of mu N, by the slip over nu h."""
+    return np.tanh(7.5 * y) if form == "logistic" else np.where(y < 1.0, y * (2.0 - y), 1.0)
+
+
+@each_case
+@each_form
+def test_forces_and_products_are_differences(device, case, form):
+    result, at, x, after = rubbed(case, device, form)
+    forces = result.forces.numpy().copy()
+    assert all((part.factor.used.numpy() != 0).sum() > 5 for part in result.frictions)
+    shares = np.concatenate([shares_of(part) for part in result.frictions])
+    assert (shares < 0.8).sum() > 5 and (shares > 0.95).sum() > 5
+    for seed in range(5):
+        v = np.random.default_rng(seed).normal(size=x.shape)
+        product, exact = times(result, v), times(result, v, at)
+        assert (product == exact).all()
+
+        def quantities(s, v=v):
+            at.assign(after + s * v)
+            result.evaluate(at, rates(result))
+            return np.append(result.energy.numpy()[0], result.forces.numpy().ravel())
+
+        slopes = central(quantities, 2e-8)
+        at.assign(after)
+        result.evaluate(at, rates(result))
+        assert slopes[0] == pytest.approx(-(forces * v).sum(), rel=1e-6)
+        assert np.abs(product.ravel() + slopes[1:]).max() < 1e-6 * np.abs(product).max()
+
+
+@each_case
+@each_form
+def test_matrix_is_symmetric_and_positive(device, case, form):
+    result, *_ = rubbed(case, device, form)
+    n = len(result.forces)
+    matrix = assembled(result, n)
+    flat, largest = matrix.reshape(3 * n, 3 * n), np.abs(matrix).max()
+    assert np.abs(flat - flat.T).max() < 1e-14 * largest
+    assert np.linalg.eigvalsh(flat).min() > -1e-13 * largest
+
+
+@each_form
+def test_blocks_and_stiffness_are_those_of_the_matrix(device, form):
+    """Contact and friction together, without triangles: between nodes of an edge there is what the pairs of the edge add."""
+    shapes, x = bundle()
+    for other in range(4):
+        shapes.ignore(3, other)
+    result, at = terms(shapes, x, device, friction=MU, velocity=VELOCITY, friction_law=form)
+    result.lag(at)
+    at.assign(x + SLIPS[form] * np.random.default_rng(1).normal(size=x.shape))
+    n, nodes = len(x), shapes.things(2)[0]
+    for rate in (None, rates(result)):
+        result.evaluate(at, rate)
+        matrix = assembled(result, n).transpose(0, 2, 1, 3)
+        _, _, diagonal, between = state(result)
+        largest = np.abs(matrix).max()
+        own = matrix[np.arange(n), np.arange(n)]
+        assert np.abs(diagonal - own).max() < 1e-13 * largest
+        assert np.abs(between - matrix[nodes[:, 0], nodes[:, 1]]).max() < 1e-13 * largest
+        assert np.abs(result.stiffness.numpy() - np.trace(own, axis1=1, axis2=2)).max() < 1e-13 * largest
+        along = np.abs(between[:, 0, 0]).max()  # rods lie along x
+        assert along < 1e-3 * largest if rate is None else along > 1e-2 * largest
+
+
+def crossing() -> tuple[Shapes, np.ndarray]:
+    """Two rods that cross."""
+    x = np.array([[-0.03, 0.0, 0.0], [0.07, 0.0, 0.0], [0.01, -0.05, 0.0068], [0.01, 0.05, 0.0068]])
+    shapes = Shapes(x)
+    shapes.rod([0, 1], 0.003)
+    shapes.rod([2, 3], 0.003)
+    return shapes, x
+
+
+def landing() -> tuple[Shapes, np.ndarray]:
+    """A rod that stands on a triangle, and rubs with its end."""
+    x = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.3, 0.0], [0.1, 0.08, 0.0058], [0.1, 0.08, 0.1]])
+    shapes = Shapes(x)
+    shapes.shell(np.array([[0, 1, 2]]), 0.004)
+    shapes.rod([3, 4], 0.003)
+    return shapes, x
+
+
+@each_form
+@pytest.mark.parametrize("scene", [crossing, landing])
+@pytest.mark.parametrize("law", LAWS)
+def test_coulomb_law(device, scene, form, law):
+    """Against the slip, mu N times the law's share: N by the law of contact, for slips that stick and slide."""
+    shapes, x = scene()
+    result, at = terms(shapes, x, device, law, friction=MU, velocity=VELOCITY, friction_law=form)
+    result.lag(at)
+    upper = slice(2, 4) if scene is crossing else slice(3, 5)
+    push = result.forces.numpy()[upper].sum(0)
+    thickness = 0.0 if law == "barrier" else 0.006 if scene is crossing else 0.005
+    normal = -LAWS[law][1]["stiffness"] * central(lambda s: psi(law, np.array(x[upper.start, 2] - thickness + s)), 1e-7)
+    assert push == pytest.approx([0.0, 0.0, normal], rel=1e-6, abs=1e-12 * normal)
+    result.law.stiffness.zero_()
+    direction = np.array([0.6, -0.8, 0.0])
+    for y in (0.001, 0.1, 0.5, 0.99, 3.0, 50.0):
+        after = x.copy()
+        after[upper] += y * SLIP * direction + [0.0, 0.0, 3.0 * SLIP]  # along the normal there is none
+        at.assign(after)
+        result.evaluate(at, rates(result))
+        result.work()
+        force = result.forces.numpy()[upper].sum(0)
+        assert force == pytest.approx(-MU * push[2] * share(form, y) * direction, rel=1e-10, abs=1e-12 * normal)
+        assert np.linalg.norm(force) <= MU * push[2] * (1.0 + 1e-14)
+        assert result.dissipated.numpy()[0] == pytest.approx(-force @ direction * y * SLIP, rel=1e-9)
+        assert 0.0 < result.energy.numpy()[0] < result.dissipated.numpy()[0]
+    creep = np.arctanh(0.9) / 7.5 if form == "logistic" else 1.0 - np.sqrt(0.1)
+    assert share(form, creep) == pytest.approx(0.9)  # sticks at nine tenths of the most with so little slip
+
+
+@each_case
+def test_no_resultant_and_the_moment_of_the_offsets(device, case):
+    """Forces of a pair act at both centres of pressure, r apart: their moment is that of the force at r, at most |r| mu N."""
+    result, _, _, after = rubbed(case, device)
+    forces = result.forces.numpy()
+    largest = np.abs(forces).sum()
+    assert np.abs(forces.sum(0)).max() < 1e-14 * largest
+    moment, most = np.zeros(3), 0.0
+    for part in result.frictions:
+        used = part.factor.used.numpy() != 0
+        weight, bound = part.lagged.weight.numpy()[used], part.lagged.bound.numpy()[used]
+        nodes, pull = part.factor.nodes.numpy()[used], -part.gradient.numpy()[:, used]
+        first = part.found.kind.first
+        assert weight[:, :first].sum(1) == pytest.approx(1.0, abs=1e-12)
+        assert weight[:, first:].sum(1) == pytest.approx(-1.0, abs=1e-12)
+        r = np.einsum("ps,psd->pd", weight, after[nodes])
+        force = pull[:first].sum(0)
+        assert (np.linalg.norm(force, axis=1) <= bound * (1.0 + 1e-13)).all()
+        moment += np.cross(r, force).sum(0)
+        most += (np.linalg.norm(r, axis=1) * bound).sum()
+    assert np.abs(np.cross(after, forces).sum(0) - moment).max() < 1e-13 * largest * np.abs(after).max()
+    assert 0.0 < np.linalg.norm(moment) < most
+
+
+def test_nodes_of_edges_in_line_are_held_by_no_more_than_what_pushes_them(device):
+    """Where forces of ends all but cancel the centre of pressure is far away, and force and stiffness yet bounded."""
+    shapes, x = bundle(6, 10, 1e-6)
+    result, at = terms(shapes, x, device, friction=MU, velocity=VELOCITY)
+    result.lag(at)
+    most = [MU * np.linalg.norm(part.gradient.numpy(), axis=-1) for part in result.lists]
+    assert max(np.abs(part.lagged.weight.numpy()).max() for part in result.frictions) > 100.0
+    at.assign(x + SLIP * np.random.default_rng(1).normal(size=x.shape))
+    result.evaluate(at, rates(result))
+    for part, bound in zip(result.frictions, most, strict=True):
+        used = part.factor.used.numpy() != 0
+        force = np.linalg.norm(part.gradient.numpy(), axis=-1)
+        assert (force <= bound * (1.0 + 1e-9))[:, used].all() and (force > 0.1 * bound)[:, used].any()
+
+
+@each_case
+@each_form
+def test_friction_takes_energy(device, case, form):
+    """The work of the forces since the start of the step, no less than the potential and no more than that of Coulomb's law."""
+    for seed, slip in enumerate(SLIP * np.array([0.01, 0.3, 1.0, 10.0])):
+        result, _, x, after = rubbed(case, device, form, slip, seed)
+        result.work()
+        taken, energy = result.dissipated.numpy()[0], result.energy.numpy()[0]
+        assert taken == pytest.approx(-(result.forces.numpy() * (after - x)).sum(), rel=1e-10)
+        assert 0.0 < energy < taken
+        most = 0.0
+        for part in result.frictions:
+            used = part.factor.used.numpy() != 0
+            moved = (after - x)[part.factor.nodes.numpy()[used]]
+            length = np.linalg.norm(np.einsum("ps,psd->pd", part.lagged.weight.numpy()[used], moved), axis=1)
+            most += (part.lagged.bound.numpy()[used] * length).sum()
+        assert taken < most
+
+
+def test_rods_along_each_other_rub_with_all_of_their_normal_force(device):
+    """Near-parallel edges, where the energy is of many distances: a rod that is drawn off its neighbours is held by mu N of each."""
+    shapes, x = bundle(jitter=0.0)
+    x = x * [1.0, 1.0, 0.0] + [0.0, 0.0, -1.0] * (np.arange(len(x)) >= 15)[:, None]  # rods alone, in one plane
+    result, at = terms(shapes, x, device, friction=MU, velocity=VELOCITY)
+    result.lag(at)
+    middle = slice(5, 10)
+    contact = result.forces.numpy().copy()
+    outer = contact[:5].sum(0), contact[10:15].sum(0)
+    assert outer[0][1] < 0.0 < outer[1][1]
+    result.law.stiffness.zero_()
+    for direction in ([1.0, 0.0, 0.0], [0.0, 0.0, 1.0]):
+        after = x.copy()
+        after[middle] += 50.0 * SLIP * np.array(direction)
+        at.assign(after)
+        result.evaluate(at, rates(result))
+        force = result.forces.numpy()[middle].sum(0)
+        normal = np.abs(contact[:5, 1]).sum() + np.abs(contact[10:15, 1]).sum()
+        assert force == pytest.approx(-MU * normal * np.array(direction), rel=1e-9, abs=1e-12 * normal)
+
+
+def test_no_friction_without_rate_or_coefficient(device):
+    shapes, x = bundle()
+    groups = np.array([0, 0, 0, 1])
+    table = np.array([[0.0, MU], [MU, 0.0]])
+    none, _ = terms(shapes, x, device)
+    assert not none.frictions
+    assert not terms(shapes, x, device, friction=0.0)[0].frictions
+    some, at = terms(shapes, x, device, groups=groups, friction=table, velocity=VELOCITY)
+    after = x + SLIP * np.random.default_rng(1).normal(size=x.shape)
+    for result in (none, some):
+        result.lag(at)
+    at.assign(after)
+    none.evaluate(at, rates(none))
+    assert none.energy.numpy()[0] > 0.0
+    wanted = [*state(none), times(none, x)]
+    for rate in (None, rates(some, 0.0)):
+        some.evaluate(at, rates(some))
+        some.evaluate(at, rate)
+        some.work()
+        assert all((a == b).all() for a, b in zip([*state(some), times(some, x)], wanted, strict=True))
+        assert not some.dissipated.numpy().any()
+    some.evaluate(at, rates(some))
+    for part, sizes in zip(some.frictions, ((2, 2), (1, 3)), strict=True):
+        pairs = part.pairs.numpy()[part.factor.used.numpy() != 0]
+        one, other = (groups[shapes.things(size)[2][pairs[:, side]]] for side, size in enumerate(sizes))
+        assert len(pairs) > 5 and (one != other).all()
