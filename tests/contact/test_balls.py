@@ -1,10 +1,14 @@
-"""Balls and obstacles: what is a pair and what is not, where rods stop."""
+"""Balls and obstacles: what is a pair and what is not, where rods stop, energies and their derivatives."""
 
 import numpy as np
+import pytest
+import warp as wp
 from brute_force import SIDES, allowed, distances, listed, near, scene, upload
 from motion_cases import MARGIN, REACH, Motion
+from pair_cases import LAWS, central, psi
 
 from ddg_warp.solve.contact.broad_phase import BroadPhase
+from ddg_warp.solve.contact.pair_terms import PairTerms
 from ddg_warp.solve.contact.shapes import BALLS, Shapes
 
 
@@ -75,3 +79,54 @@ def test_obstacles_are_no_pairs_of_their_own(device):
         i, j = allowed(shapes, first, second)
         d, thickness = distances(shapes, points, first, second, i, j)
         assert (d - thickness <= REACH + MARGIN).sum() <= len(found)
+
+
+def rods_on_balls() -> tuple[Shapes, np.ndarray]:
+    """Ten rods, each with two balls that it all but touches: inside of an edge, and beside one of its ends."""
+    rng = np.random.default_rng(1)
+    _, points = scene(2, 5.0, rods=10, triangles=1)
+    lines = points[:210].reshape(10, 21, 3)
+    across = rng.normal(size=(10, 3))
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    inside = 0.6 * lines[:, 7] + 0.4 * lines[:, 8] + 0.0241 * across
+    ends = lines[:, 0] + 0.0241 * across
+    shapes = Shapes(np.concatenate([points[:210], inside, ends]))
+    for r in range(10):
+        shapes.rod(21 * r + np.arange(21), 0.004)
+    for k in range(20):
+        shapes.ball(210 + k, 0.02)
+    return shapes, shapes.points
+
+
+def test_energies_forces_and_products(device):
+    shapes, x = rods_on_balls()
+    rng = np.random.default_rng(3)
+    density, parameters = LAWS["penalty"]
+    at = upload(x, device)
+    search = BroadPhase(shapes, at, reach=REACH, margin=MARGIN)
+    terms = PairTerms(search, density, **parameters)
+
+    def energy(y: np.ndarray) -> float:
+        i, j = allowed(shapes, 2, BALLS)
+        d, thickness = distances(shapes, y, 2, BALLS, i, j)
+        return parameters["stiffness"] * psi("penalty", d - thickness).sum()
+
+    def forces(y: np.ndarray) -> np.ndarray:
+        at.assign(y)
+        terms.evaluate(at)
+        return terms.forces.numpy().copy()
+
+    v = rng.normal(size=x.shape)
+    force = forces(x)
+    terms.search.update(at)
+    assert terms.energy.numpy()[0] == pytest.approx(energy(x), rel=1e-11)
+    assert (terms.lists[-1].factor.used.numpy() != 0).sum() >= 20
+    along = central(lambda s: energy(x + s * v), 1e-7)
+    assert -(force * v).sum() == pytest.approx(along, rel=1e-6)
+    assert np.abs(force.sum(0)).max() < 1e-12 * np.abs(force).max()
+    exact = central(lambda s: -forces(x + s * v), 1e-7)
+    forces(x)
+    given = upload(v, device)
+    out = wp.zeros_like(given)
+    terms.product(given, out, at)
+    assert out.numpy() == pytest.approx(exact, rel=1e-6, abs=1e-6 * np.abs(exact).max())
