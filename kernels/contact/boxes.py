@@ -15,6 +15,8 @@ LEAST = 1e-30  # so that zero is rounded outwards, too [m]
 def box_kernel(size: int, real):
     """Boxes of things with `size` nodes, inflated by `share` of their radius and `more`, around both x and x + move.
 
+    From x + move the `shift` of the world is taken.
+
     Nodes that are no numbers are noted in `lost` as node + 1; a box around them is empty, at the origin.
     """
     Surface, X = surface_struct(real), wp.types.vector(3, real)
@@ -30,6 +32,7 @@ def box_kernel(size: int, real):
         count: int,
         x: wp.array(dtype=X),
         move: wp.array(dtype=X),
+        shift: wp.array(dtype=X),
         share: real,
         more: real,
         lower: wp.array(dtype=wp.vec3),
@@ -44,7 +47,7 @@ def box_kernel(size: int, real):
         for l in range(wp.static(size)):
             node = surface.nodes[k, l] + w * surface.nodes_a_world
             a = x[node]
-            b = a + move[node]
+            b = a + (move[node] - shift[w])
             if not (wp.isfinite(a) and wp.isfinite(b)):
                 sound = 0
                 wp.atomic_max(lost, 0, node + 1)

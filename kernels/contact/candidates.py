@@ -1,5 +1,9 @@
 """Pairs that are near: found through a tree of boxes, judged by their distance, listed in the order of their indices.
 
+Of a motion those are found that may come near anywhere on the way. A node that moves by m stays within |m| / 2 of the middle of its
+way, whatever its share of it, and a distance changes by no more than the fastest nodes of both sides together. Where a world moves
+at one share, m is what a node moves by beside the others of the pair, and boxes move with the world.
+
 Each thing notes its partners in a linked list, whose entries come from one counter; running sums then say where its part of the list
 of pairs starts. So two runs give the same list to the bit, whatever order threads run in, and a list that does not fit is left out
 whole: `overflow` says so, and `found` how long it would be.
@@ -9,10 +13,12 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.contact.motion import approach_functions, corners_function
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
 MOST = 2**31 - 1  # pairs that can be counted; more are told as so many
+HALF = 0.500001  # with rounding of float32
 
 
 @cache
@@ -36,12 +42,15 @@ def candidate_kernels(kind: Kind, grouped: bool, real):
     """find(...) partners and fill(...) the list of pairs."""
     Sides, X = sides_struct(real), wp.types.vector(3, real)
     slots, may_touch, thickness, closest = pair_functions(kind, real)
-    begin = query_function(grouped, real)
+    begin, corners = query_function(grouped, real), corners_function(real)
+    fastest, relative = approach_functions(kind, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def find(
         sides: Sides,
         x: wp.array(dtype=X),
+        move: wp.array(dtype=X),
+        together: wp.array(dtype=int),
         reach: real,
         found: wp.array(dtype=int),
         partner: wp.array(dtype=int),
@@ -49,15 +58,20 @@ def candidate_kernels(kind: Kind, grouped: bool, real):
         last: wp.array(dtype=int),
         partners: wp.array(dtype=int),
     ):
-        """Partners of a thing with a distance of at most both radii and `reach`."""
+        """Partners of a thing that may come as near as both radii and `reach` on their way."""
         i = wp.tid()
         query, w, k = begin(sides, i)
         number, at, j = int(0), int(-1), int(0)
         while wp.bvh_query_next(query, j):
             l = j - w * sides.counts[1]
             if may_touch(sides, k, l):
-                r, _ = closest(x, slots(sides, k, l, w))
-                allowed = thickness(sides, k, l) + reach
+                nodes = slots(sides, k, l, w)
+                p = corners(move, nodes)
+                speed = fastest(p)
+                if together[w] != 0:
+                    p, speed = relative(p)
+                r, _ = closest(corners(x, nodes) + real(0.5) * p)
+                allowed = thickness(sides, k, l) + reach + real(HALF) * speed
                 if wp.dot(r, r) <= allowed * allowed:
                     slot = wp.atomic_add(found, 0, 1)
                     number += 1

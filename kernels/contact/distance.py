@@ -13,7 +13,7 @@ import warp as wp
 
 @cache
 def distance_functions(real):
-    """share(p, a, u), segments(a0, a1, b0, b1) -> r, w and point_triangle(p, a, b, c) -> r, w; no position needs to be distinct."""
+    """segments(a0, a1, b0, b1), point_triangle(p, a, b, c) and edge_point(a, b, p, .) -> r, w; no position needs to be distinct."""
     X, W = wp.types.vector(3, real), wp.types.vector(4, real)
 
     @wp.func
@@ -60,4 +60,10 @@ def distance_functions(real):
             r, best = other, W(real(1.0), real(0.0), s - real(1.0), -s)
         return r, best
 
-    return share, segments, point_triangle
+    @wp.func
+    def edge_point(a: X, b: X, p: X, unused: X):
+        """From point p to edge a b."""
+        s = share(p, a, b - a)
+        return a + s * (b - a) - p, W(real(1.0) - s, s, real(-1.0), real(0.0))
+
+    return segments, point_triangle, edge_point

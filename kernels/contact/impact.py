@@ -11,8 +11,8 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.contact.candidates import query_function
-from ddg_warp.kernels.contact.distance import distance_functions
-from ddg_warp.kernels.contact.surfaces import EDGES, Kind, pair_functions, sides_struct
+from ddg_warp.kernels.contact.motion import approach_functions, corners_function
+from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
 REST, SAFE = 0.1, 0.9  # of the gap: what is left at the time found; what a part of the motion may use up
@@ -24,29 +24,15 @@ TOUCHING = 1e-9  # distance of two that pass, over the size of the pair
 @cache
 def impact_functions(kind: Kind, real):
     """impact(x, p, thickness) -> time; meet(x, p) -> whether two without thickness do. x, p: positions, displacements of the nodes."""
-    Y, first = wp.types.matrix((4, 3), real), kind.first
-    _, segments, point_triangle = distance_functions(real)
-    measure = segments if kind == EDGES else point_triangle
+    Y = wp.types.matrix((4, 3), real)
+    *_, closest = pair_functions(kind, real)
+    _, relative = approach_functions(kind, real)
     # of eight digits or sixteen, those that a distance keeps
     touching = TOUCHING if real is wp.float64 else 1e3 * TOUCHING
 
     @wp.func
-    def relative(p: Y):
-        """Displacements less their mean, and how fast the sides may approach."""
-        mean = real(0.25) * (p[0] + p[1] + p[2] + p[3])
-        q = wp.matrix_from_rows(p[0] - mean, p[1] - mean, p[2] - mean, p[3] - mean)
-        one, other = real(0.0), real(0.0)
-        for k in range(4):
-            if k < wp.static(first):
-                one = wp.max(one, wp.length(q[k]))
-            else:
-                other = wp.max(other, wp.length(q[k]))
-        return q, one + other
-
-    @wp.func
     def distance(x: Y, q: Y, t: real):
-        y = x + t * q
-        r, _ = measure(y[0], y[1], y[2], y[3])
+        r, _ = closest(x + t * q)
         return wp.length(r)
 
     @wp.func
@@ -59,12 +45,13 @@ def impact_functions(kind: Kind, real):
         if speed == real(0.0):
             return real(2.0)
         least, t = real(REST) * gap, real(0.0)
-        step = (gap - least) / speed
+        step = real(SAFE) * gap / speed
         for _ in range(wp.static(PARTS)):
             if t + step > real(1.0):
                 return real(2.0)
             gap = distance(x, q, t + step) - thickness
-            if gap < least:
+            # the first step is safe, also where it ends at the least gap but for rounding
+            if gap <= wp.where(t > real(0.0), least, real(0.0)):
                 return t
             t += step
             step = real(SAFE) * gap / speed
@@ -97,6 +84,7 @@ def impact_kernel(kind: Kind, grouped: bool, passing: bool, real):
     Sides, X = sides_struct(real), wp.types.vector(3, real)
     slots, may_touch, thickness, _ = pair_functions(kind, real)
     begin, (impact, meet) = query_function(grouped, real), impact_functions(kind, real)
+    corners = corners_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def impacts(
@@ -116,9 +104,8 @@ def impact_kernel(kind: Kind, grouped: bool, passing: bool, real):
             l = j - w * sides.counts[1]
             if not may_touch(sides, k, l):
                 continue
-            n = slots(sides, k, l, w)
-            y = wp.matrix_from_rows(x[n[0]], x[n[1]], x[n[2]], x[n[3]])
-            p = wp.matrix_from_rows(move[n[0]], move[n[1]], move[n[2]], move[n[3]])
+            nodes = slots(sides, k, l, w)
+            y, p = corners(x, nodes), corners(move, nodes)
             if wp.static(passing):
                 if meet(y, p):
                     met += 1

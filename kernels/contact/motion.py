@@ -1,90 +1,123 @@
-"""How far nodes have moved since a search, and how far each may move so that nothing passes.
-
-Node i may move by b_i = min(q min_pairs (d - keep thickness) / 2, (margin + reach) / 2 - moved_i), with 0 < q < 1 and the distance d of
-the pairs among the candidates that it belongs to: of a pair both sides take half, and every point of an edge or triangle moves no
-farther than one of its nodes; pairs that are no candidates were farther apart than thickness + margin + reach at the search. Bounds
-of this kind are those of Chen et al., "Offset geometric contact", ACM ToG 44(4), 2025.
-"""
+"""How far nodes have moved since a search, what of their motion is common, and the smallest gaps of pairs."""
 
 from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
+from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct, surface_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
+
+SAMPLES = 64  # edges of a world whose motion says what is common
+
+
+@cache
+def corners_function(real):
+    """corners(x, nodes) -> what four nodes have (4, 3)."""
+    X, N = wp.types.vector(3, real), wp.types.vector(4, int)
+
+    @wp.func
+    def corners(x: wp.array(dtype=X), nodes: N):
+        return wp.matrix_from_rows(x[nodes[0]], x[nodes[1]], x[nodes[2]], x[nodes[3]])
+
+    return corners
+
+
+@cache
+def approach_functions(kind: Kind, real):
+    """fastest(p): how far two sides may approach whose nodes move by p (4, 3); relative(p) -> p less its mean, `fastest` of that."""
+    Y, first = wp.types.matrix((4, 3), real), kind.first
+
+    @wp.func
+    def fastest(p: Y):
+        one, other = real(0.0), real(0.0)
+        for k in range(4):
+            if k < wp.static(first):
+                one = wp.max(one, wp.length(p[k]))
+            else:
+                other = wp.max(other, wp.length(p[k]))
+        return one + other
+
+    @wp.func
+    def relative(p: Y):
+        mean = real(0.25) * (p[0] + p[1] + p[2] + p[3])
+        q = wp.matrix_from_rows(p[0] - mean, p[1] - mean, p[2] - mean, p[3] - mean)
+        return q, fastest(q)
+
+    return fastest, relative
 
 
 @cache
 def motion_kernels(real, serial: bool):
-    """watch(...) whether a search is out of date, mark(...) it, start(...) bounds by what is no candidate, hold(...) a displacement."""
-    X, until = wp.types.vector(3, real), until_function(serial)
+    """watch(...) whether a search is out of date, mark(...) it, common(...) what of a motion is common."""
+    X, Surface, until = wp.types.vector(3, real), surface_struct(real), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def watch(x: wp.array(dtype=X), seen: wp.array(dtype=X), allowed: real, stale: wp.array(dtype=int)):
-        """Whether a node has moved farther than allowed; one that is no number has."""
+    def watch(
+        base: wp.array(dtype=X),
+        q: wp.array(dtype=X),
+        seen: wp.array(dtype=X),
+        allowed: real,
+        move: wp.array(dtype=X),
+        stale: wp.array(dtype=int),
+    ):
+        """Whether a node is farther than allowed from where it was seen; one that is no number is."""
         tid = wp.tid()
-        for i in range(tid, until(tid, x.shape[0])):
-            moved = x[i] - seen[i]
-            if not (wp.dot(moved, moved) <= allowed * allowed):
+        for i in range(tid, until(tid, q.shape[0])):
+            before, now = base[i] - seen[i], q[i] - seen[i]
+            if not (wp.dot(before, before) <= allowed * allowed and wp.dot(now, now) <= allowed * allowed):
                 stale[0] = 1
+            move[i] = q[i] - base[i]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def mark(
         x: wp.array(dtype=X),
+        move: wp.array(dtype=X),
         overflow: wp.array(dtype=int),
         seen: wp.array(dtype=X),
         stale: wp.array(dtype=int),
+        searched: wp.array(dtype=int),
         searches: wp.array(dtype=int),
     ):
-        """Notes where nodes are at a search, which is out of date at once if pairs did not fit."""
+        """Notes where nodes are to be after a search, which is out of date at once if pairs did not fit."""
         tid = wp.tid()
         if tid == 0:
             stale[0] = overflow[0]
+            searched[0] = 1
             searches[0] += 1
         for i in range(tid, until(tid, x.shape[0])):
-            seen[i] = x[i]
+            seen[i] = x[i] + move[i]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def start(
-        x: wp.array(dtype=X),
-        seen: wp.array(dtype=X),
-        allowed: real,
-        overflow: wp.array(dtype=int),
-        bound: wp.array(dtype=real),
+    def common(
+        edges: Surface, count: int, move: wp.array(dtype=X), together: wp.array(dtype=int), shift: wp.array(dtype=X)
     ):
-        tid = wp.tid()
-        for i in range(tid, until(tid, x.shape[0])):
-            bound[i] = wp.where(overflow[0] == 0, wp.max(allowed - wp.length(x[i] - seen[i]), real(0.0)), real(0.0))
+        """The mean motion of some edges, spread over them, where a world moves at one share; else zero."""
+        w = wp.tid()
+        mean, number = X(), wp.min(count, wp.static(SAMPLES))
+        if together[w] != 0:
+            for k in range(number):
+                i = int(wp.int64(k) * wp.int64(count) / wp.int64(number))
+                mean += move[edges.nodes[i, 0] + w * edges.nodes_a_world] / real(number)
+        if not wp.isfinite(mean):
+            mean = X()
+        shift[w] = mean
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def hold(bound: wp.array(dtype=real), move: wp.array(dtype=X), held: wp.array(dtype=int)):
-        """Shortens displacements that are longer than their bound, and counts them."""
-        tid = wp.tid()
-        for i in range(tid, until(tid, move.shape[0])):
-            length = wp.length(move[i])
-            if length > bound[i]:
-                move[i] = move[i] * (bound[i] / length)
-                wp.atomic_add(held, 0, 1)
-
-    return watch, mark, start, hold
+    return watch, mark, common
 
 
 @cache
-def bound_kernel(kind: Kind, real, serial: bool):
-    """Bounds of the nodes of pairs, and the smallest gap [m] of each world."""
+def gap_kernel(kind: Kind, real, serial: bool):
+    """The smallest gap [m] of each world."""
     Sides, X = sides_struct(real), wp.types.vector(3, real)
     slots, _, thickness, closest = pair_functions(kind, real)
-    until = until_function(serial)
+    corners, until = corners_function(real), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def bounds(
+    def gaps(
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
         sides: Sides,
         x: wp.array(dtype=X),
-        share: real,
-        keep: real,
-        bound: wp.array(dtype=real),
         gap: wp.array(dtype=real),
     ):
         tid = wp.tid()
@@ -93,12 +126,7 @@ def bound_kernel(kind: Kind, real, serial: bool):
         for p in range(tid, until(tid, count[0])):
             w = pairs[p][0] / sides.counts[0]
             i, j = pairs[p][0] - w * sides.counts[0], pairs[p][1] - w * sides.counts[1]
-            nodes = slots(sides, i, j, w)
-            r, _ = closest(x, nodes)
-            distance, both = wp.length(r), thickness(sides, i, j)
-            wp.atomic_min(gap, w, distance - both)
-            b = wp.max(real(0.5) * share * (distance - keep * both), real(0.0))
-            for k in range(4):
-                wp.atomic_min(bound, nodes[k], b)
+            r, _ = closest(corners(x, slots(sides, i, j, w)))
+            wp.atomic_min(gap, w, wp.length(r) - thickness(sides, i, j))
 
-    return bounds
+    return gaps

@@ -1,7 +1,8 @@
 """Energy of a pair of surfaces by their distance, its gradient, and the factor of its Gauss-Newton matrix.
 
-Of a point and a triangle it is psi(d) of their distance (`densities.contact`). The closest points of two edges jump where these are
-parallel. So with m the mollifier of `densities.contact`, 0 where edges a, b are parallel and 1 from some two degrees on, theirs is
+Of a point and a triangle, or an edge and a ball, it is psi(d) of their distance (`densities.contact`). The closest points of two edges
+jump where these are parallel. So with m the mollifier of `densities.contact`, 0 where edges a, b are parallel and 1 from some two
+degrees on, theirs is
 
     m psi(d_ab) + (1 - m) / 2 (G(a0, b) + G(a1, b) + G(b0, a) + G(b1, a)) ,   G(p, b) = psi(d_p,b) - (psi(d_p,b0) + psi(d_p,b1)) / 2 ,
 
@@ -22,7 +23,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.contact.surfaces import EDGES, Kind
+from ddg_warp.kernels.contact.surfaces import EDGE_POINT, EDGES, Kind
 from ddg_warp.kernels.densities import Density
 from ddg_warp.kernels.densities.contact import mollifier_function
 from ddg_warp.kernels.measures import closest_points
@@ -44,6 +45,8 @@ def shape_types(real):
 @cache
 def distance_function(kind: Kind, real):
     """near(x) -> (w, d, n): weights, length and direction of what is between the closest points."""
+    if kind == EDGE_POINT:
+        return _edge_point(real)
     X, W, V = shape_types(real)
     Q = wp.types.vector(9, real)
     closest_of = closest_points.edge_edge if kind == EDGES else closest_points.point_triangle
@@ -64,9 +67,9 @@ def distance_function(kind: Kind, real):
 
 
 @cache
-def end_function(real):
-    """end(x, k) -> (w, d, n) of end k of two edges, node k, and the other edge."""
-    X, W, V = shape_types(real)
+def point_edge_function(real):
+    """apart(p, a, b) -> (t, d, n): where on edge a b the closest point is, how far from p, and in which direction."""
+    _, _, V = shape_types(real)
     Q = wp.types.vector(6, real)
     closest = closest_points.point_edge(real)
     tiny = wp.constant(real(1.0e-30))
@@ -79,6 +82,29 @@ def end_function(real):
         r = u + e * rho[1]
         d = wp.length(r)
         return rho[1], d, r / wp.max(d, tiny)
+
+    return apart
+
+
+@cache
+def _edge_point(real):
+    """`near` of an edge and a point, node 2."""
+    X, W, V = shape_types(real)
+    apart = point_edge_function(real)
+
+    @wp.func
+    def near(x: X):
+        t, d, n = apart(x[2], x[0], x[1])
+        return W(real(1.0) - t, t, real(-1.0), real(0.0)), d, n
+
+    return near
+
+
+@cache
+def end_function(real):
+    """end(x, k) -> (w, d, n) of end k of two edges, node k, and the other edge."""
+    X, W, _ = shape_types(real)
+    apart = point_edge_function(real)
 
     @wp.func
     def end(x: X, k: int):

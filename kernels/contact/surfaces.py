@@ -1,8 +1,9 @@
-"""What may touch: points, edges and triangles with a radius, and the two kinds of pairs that suffice.
+"""What may touch: points, edges and triangles with a radius, and the kinds of pairs that suffice.
 
 Two surfaces that are piecewise straight and flat meet for the first time where an edge meets an edge or a point meets a triangle. So
 edges are paired with edges and points with triangles; the edges of rods are among the edges beside those of triangles, the nodes of
-rods among the points. Indices of things and nodes count all worlds, one world after the other, each alike.
+rods among the points. Balls are points with a radius of their own, which edges of rods are paired with; triangles meet them as they
+meet all points. Indices of things and nodes count all worlds, one world after the other, each alike.
 """
 
 from dataclasses import dataclass
@@ -15,7 +16,10 @@ from ddg_warp.kernels.contact.distance import distance_functions
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of pairs: nodes of the first and of the second thing. Of equal things each pair is taken once, the smaller index first."""
+    """A kind of pairs: nodes of the first and of the second thing. Of equal things each pair is taken once, the smaller index first.
+
+    Pairs have four slots for nodes; where there are fewer, the last one is repeated, without weight.
+    """
 
     first: int
     second: int
@@ -25,7 +29,7 @@ class Kind:
         return self.first == self.second
 
 
-EDGES, POINT_TRIANGLE = Kind(2, 2), Kind(1, 3)
+EDGES, POINT_TRIANGLE, EDGE_POINT = Kind(2, 2), Kind(1, 3), Kind(2, 1)
 
 
 @cache
@@ -53,7 +57,8 @@ def sides_struct(real):
     """Two surfaces whose pairs are asked for.
 
     first, second: see `surface_struct`; lower, upper: boxes of the first, in all worlds; tree: of the boxes of the second; counts: of
-    both in one world; ignored: keys of pairs of objects that pass through each other, sorted (smaller number times `objects` + larger).
+    both in one world; ignored: keys of pairs of objects that pass through each other, sorted (smaller number times `objects` + larger);
+    obstacle (objects,): not zero of those of which no two are a pair.
     """
     surface = surface_struct(real)
 
@@ -66,6 +71,7 @@ def sides_struct(real):
         tree: wp.uint64
         counts: wp.vec2i
         ignored: wp.array(dtype=wp.int64)
+        obstacle: wp.array(dtype=wp.uint8)
         objects: int
 
     return Sides
@@ -73,14 +79,14 @@ def sides_struct(real):
 
 @cache
 def pair_functions(kind: Kind, real):
-    """slots(sides, i, j, w) -> the four nodes; may_touch(sides, i, j); thickness(sides, i, j); closest(x, nodes) -> r, w.
+    """slots(sides, i, j, w) -> the four nodes; may_touch(sides, i, j); thickness(sides, i, j); closest(y) -> r, w.
 
-    Here i and j count the things of one world, w.
+    Here i and j count the things of one world, w; y (4, 3) are positions of the nodes.
     """
-    Sides, N = sides_struct(real), wp.types.vector(4, int)
-    X, S, count = wp.types.vector(3, real), wp.types.vector(4, real), kind.first
-    _, segments, point_triangle = distance_functions(real)
-    measure = segments if kind == EDGES else point_triangle
+    Sides, N, Y = sides_struct(real), wp.types.vector(4, int), wp.types.matrix((4, 3), real)
+    S, count = wp.types.vector(4, real), kind.first
+    used = kind.first + kind.second
+    measure = dict(zip((EDGES, POINT_TRIANGLE, EDGE_POINT), distance_functions(real), strict=True))[kind]
 
     @wp.func
     def slots(sides: Sides, i: int, j: int, w: int):
@@ -89,6 +95,8 @@ def pair_functions(kind: Kind, real):
             nodes[k] = sides.first.nodes[i, k] + offset
         for k in range(wp.static(kind.second)):
             nodes[wp.static(count) + k] = sides.second.nodes[j, k] + offset
+        for k in range(wp.static(used), 4):
+            nodes[k] = nodes[wp.static(used - 1)]
         return nodes
 
     @wp.func
@@ -109,6 +117,11 @@ def pair_functions(kind: Kind, real):
                 if sides.first.nodes[i, k] == sides.second.nodes[j, l]:
                     return False
         a, b = sides.first.object[i], sides.second.object[j]
+        if sides.obstacle[a] != wp.uint8(0) and sides.obstacle[b] != wp.uint8(0):
+            return False
+        if wp.static(kind == EDGE_POINT):
+            if sides.first.span[i][3] < real(0.0):
+                return False
         if wp.static(kind.alike):
             if a == b and within(sides.first.span[i], sides.second.span[j]):
                 return False
@@ -124,7 +137,7 @@ def pair_functions(kind: Kind, real):
         return sides.first.radius[i] + sides.second.radius[j]
 
     @wp.func
-    def closest(x: wp.array(dtype=X), nodes: N):
-        return measure(x[nodes[0]], x[nodes[1]], x[nodes[2]], x[nodes[3]])
+    def closest(y: Y):
+        return measure(y[0], y[1], y[2], y[3])
 
     return slots, may_touch, thickness, closest

@@ -1,8 +1,20 @@
 """Scenes for the contact search, and what it should find, by all pairs in NumPy."""
 
 import numpy as np
+import warp as wp
 
-from ddg_warp.solve.contact.shapes import Shapes
+from ddg_warp.solve.contact.shapes import BALLS, Shapes
+
+SIDES = ((2, 2), (1, 3))  # numbers of nodes of what is paired, where there are no balls
+
+
+def upload(x: np.ndarray, device: str, dtype=wp.vec3d) -> wp.array:
+    return wp.array(np.ascontiguousarray(x), dtype=dtype, device=device)
+
+
+def listed(search) -> list[np.ndarray]:
+    """Pairs of each list (n, 2), as they are ordered."""
+    return [pairs.pairs.numpy()[: pairs.count.numpy()[0]] for pairs in search.lists]
 
 
 def curves(rng, rods: int, nodes: int, spread: float, step: float) -> np.ndarray:
@@ -76,6 +88,10 @@ def allowed(shapes: Shapes, first: int, second: int) -> tuple[np.ndarray, np.nda
     fits = ~(nodes_a[:, None, :, None] == nodes_b[None, :, None, :]).any((2, 3))
     lower, upper = np.minimum(owner_a[:, None], owner_b), np.maximum(owner_a[:, None], owner_b)
     fits &= ~np.isin(lower * len(shapes.names) + upper, shapes.ignored)
+    still = np.array(sorted(shapes.obstacle), int)
+    fits &= ~(np.isin(lower, still) & np.isin(upper, still))
+    if second == BALLS:
+        fits &= span_a[:, 3:] >= 0.0
     if first == second:
         fits &= np.arange(len(nodes_a))[:, None] < np.arange(len(nodes_b))
         middle, half = 0.5 * (span_a[:, 0] + span_a[:, 1]), 0.5 * (span_a[:, 1] - span_a[:, 0])
@@ -91,6 +107,8 @@ def distances(shapes: Shapes, x: np.ndarray, first: int, second: int, i, j) -> t
     nodes_a, radius_a, *_ = shapes.things(first)
     nodes_b, radius_b, *_ = shapes.things(second)
     corners = [*np.moveaxis(x[nodes_a[i]], 1, 0), *np.moveaxis(x[nodes_b[j]], 1, 0)]
+    if second == BALLS:
+        return point_edge(corners[2], *corners[:2]), radius_a[i] + radius_b[j]
     return (edge_edge if first == 2 else point_triangle)(*corners), radius_a[i] + radius_b[j]
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from brute_force import near, scene
+from brute_force import SIDES, listed, near, scene, upload
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError, SolverError
@@ -12,17 +12,7 @@ from ddg_warp.solve.contact.pairs import RunningSums
 from ddg_warp.solve.contact.shapes import Shapes
 from ddg_warp.solve.contact.tree import Things
 
-SIDES = ((2, 2), (1, 3))
 REACH, MARGIN = 0.004, 0.01
-
-
-def upload(x: np.ndarray, device: str, dtype=wp.vec3d) -> wp.array:
-    return wp.array(np.ascontiguousarray(x), dtype=dtype, device=device)
-
-
-def listed(search: BroadPhase) -> list[np.ndarray]:
-    """Pairs of each list (n, 2), as they are ordered."""
-    return [pairs.pairs.numpy()[: pairs.count.numpy()[0]] for pairs in search.lists]
 
 
 def agree(search: BroadPhase, x: np.ndarray, sides=SIDES) -> None:
@@ -110,12 +100,9 @@ def test_lists_that_are_too_short_are_empty_until_they_have_grown(device):
     search.search(x)
     assert search.overflow.numpy()[0] == 1
     assert not any(len(found) for found in listed(search))
-    # until there is room nothing may move, and the search is out of date
-    search.bound(x)
-    assert not search.bounds.numpy().any()
     searches = search.searches.numpy()[0]
     search.update(x)
-    assert search.searches.numpy()[0] == searches + 1
+    assert search.searches.numpy()[0] == searches + 1  # it is out of date until there is room
     version = search.version
     assert search.fit(x)
     assert search.version == version + 1
@@ -174,28 +161,25 @@ def test_a_captured_update_follows_motion_and_searches_only_where_it_must(device
 def test_a_captured_motion_is_that_without_a_graph(device):
     shapes, points = scene(13, 0.5, rods=20, triangles=60)
     rng = np.random.default_rng(14)
-    x, wish = upload(points, device), 0.02 * rng.normal(size=points.shape)
-    move = upload(wish, device)
+    x, move = upload(points, device), upload(0.02 * rng.normal(size=points.shape), device)
     search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
     arrays.load_kernels(search.kernels, device)
 
     def step():
         search.rebuild(x)
         search.update(x)
-        search.bound(x)
+        search.measure(x)
         search.impact(x, move, keep=0.5)
         search.crossings(x, move)
-        search.hold(move)
 
     def results() -> list[bytes]:
-        numbers = (search.bounds, search.gap, search.time, search.crossed, move)
+        numbers = (search.gap, search.time, search.crossed)
         return [part.tobytes() for part in (*listed(search), *(array.numpy() for array in numbers))]
 
     step()
     plain = results()
     assert search.crossed.numpy()[0] > 0
     x.assign(points + 100.0)
-    move.assign(wish)
     with wp.ScopedCapture(device=device) as capture:
         step()
     x.assign(points)
@@ -221,7 +205,7 @@ def test_boxes_hold_what_they_are_around(device, offset):
     for size in shapes.sizes:
         nodes, radius, *_ = shapes.things(size)
         part = Things(shapes, size, 1, wp.float64, wp.get_device(device))
-        part.enclose(x, wp.zeros_like(x), 1.0, 0.002, lost)
+        part.enclose(x, wp.zeros_like(x), wp.zeros(1, dtype=wp.vec3d, device=device), 1.0, 0.002, lost)
         reach = (radius + 0.002)[:, None]
         below = points[nodes].min(1) - reach - part.lower.numpy().astype(float)
         above = part.upper.numpy().astype(float) - points[nodes].max(1) - reach
@@ -236,10 +220,10 @@ def test_two_runs_are_the_same_to_the_bit(device):
 
     def run() -> list[bytes]:
         search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
-        search.bound(x)
+        search.measure(x)
         search.impact(x, move, keep=0.0)
         search.crossings(x, move)
-        numbers = (search.bounds, search.gap, search.time, search.crossed)
+        numbers = (search.gap, search.time, search.crossed)
         return [part.tobytes() for part in (*listed(search), *(array.numpy() for array in numbers))]
 
     assert run() == run()
@@ -290,19 +274,6 @@ def test_positions_that_are_not_finite_are_refused_by_name(device):
 POINTS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
-def test_shares_that_make_no_sense_are_refused(device):
-    shapes, points = scene(12, 1.0, rods=4, triangles=4)
-    x = upload(points, device)
-    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
-    for call in (
-        lambda: search.bound(x, share=1.0),
-        lambda: search.bound(x, keep=-0.1),
-        lambda: search.impact(x, x, keep=2.0),
-    ):
-        with pytest.raises(SceneError, match=r"share = 1\.0|keep = -0\.1|keep = 2\.0"):
-            call()
-
-
 @pytest.mark.parametrize(
     ("describe", "message"),
     [
@@ -315,6 +286,9 @@ def test_shares_that_make_no_sense_are_refused(device):
         (lambda s: s.shell([[0, 1, 4], [0, 1, 3]], 0.1, name="sheet"), "triangle 1 of shell 'sheet' has no area"),
         (lambda s: s.shell([[0, 1, 4, 2]], 0.1), r"of shape \(1, 4\)"),
         (lambda s: s.shell([[0, 1, 4]], float("nan")), "thickness = nan"),
+        (lambda s: s.ball(5, 0.1, name="head"), "ball 'head' has node 5"),
+        (lambda s: s.ball(0.5, 0.1), "whole numbers"),
+        (lambda s: s.ball(0, 0.0), "ball 0: radius = 0.0"),
         (lambda s: s.ignore(s.rod([0, 1], 0.1), 1), "there is no object 1"),
         (lambda s: BroadPhase(s, wp.zeros(5, dtype=wp.vec3d, device="cpu"), reach=1.0, margin=1.0), "no objects"),
         (lambda s: BroadPhase(s, wp.zeros(4, dtype=wp.vec3d, device="cpu"), reach=1.0, margin=1.0), "5 vectors of 3"),

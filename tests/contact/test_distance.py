@@ -5,21 +5,28 @@ import numpy as np
 import pytest
 import warp as wp
 
-from ddg_warp.kernels.contact.surfaces import EDGES, POINT_TRIANGLE, pair_functions
+from ddg_warp.kernels.contact.motion import corners_function
+from ddg_warp.kernels.contact.surfaces import EDGE_POINT, EDGES, POINT_TRIANGLE, pair_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
-KINDS = {"edges": (EDGES, brute_force.edge_edge), "point and triangle": (POINT_TRIANGLE, brute_force.point_triangle)}
+KINDS = {
+    "edges": (EDGES, brute_force.edge_edge),
+    "point and triangle": (POINT_TRIANGLE, brute_force.point_triangle),
+    "edge and point": (EDGE_POINT, lambda a, b, p, _: brute_force.point_edge(p, a, b)),
+}
+REGIONS = {"edges": 9, "point and triangle": 7, "edge and point": 3}
 
 
 def measured(kind, corners: np.ndarray, device: str, real=wp.float64) -> tuple[np.ndarray, np.ndarray]:
     """Offsets (n, 3) and weights (n, 4) of corners (n, 4, 3)."""
     X, W = wp.types.vector(3, real), wp.types.vector(4, real)
     *_, closest = pair_functions(kind, real)
+    corners_of = corners_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
     def measure(x: wp.array(dtype=X), r: wp.array(dtype=X), w: wp.array(dtype=W)):
         i = wp.tid()
-        a, b = closest(x, wp.vec4i(4 * i, 4 * i + 1, 4 * i + 2, 4 * i + 3))
+        a, b = closest(corners_of(x, wp.vec4i(4 * i, 4 * i + 1, 4 * i + 2, 4 * i + 3)))
         r[i] = a
         w[i] = b
 
@@ -84,4 +91,4 @@ def test_every_region_is_met_and_has_zero_weights_outside(device, name):
     kind, _ = KINDS[name]
     _, w = measured(kind, configurations()["random"], device)
     regions = {tuple(row) for row in w != 0.0}
-    assert len(regions) == (9 if kind is EDGES else 7)
+    assert len(regions) == REGIONS[name]

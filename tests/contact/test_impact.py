@@ -1,9 +1,9 @@
-"""Bounds of motion, times of impact and crossings against dense sampling in time and closed forms."""
+"""Times of impact and crossings against dense sampling in time and closed forms."""
 
 import brute_force
 import numpy as np
 import pytest
-import warp as wp
+from brute_force import upload
 
 from ddg_warp.solve.contact.broad_phase import BroadPhase
 from ddg_warp.solve.contact.shapes import Shapes
@@ -11,10 +11,6 @@ from ddg_warp.solve.contact.shapes import Shapes
 REACH, MARGIN = 0.004, 0.01
 FRAMES = 2001
 SIDES = {"edges": (2, 2), "point and triangle": (1, 3)}
-
-
-def upload(x, device: str) -> wp.array:
-    return wp.array(np.ascontiguousarray(x), dtype=wp.vec3d, device=device)
 
 
 def pairs_apart(name: str, seed: int, count: int) -> tuple[Shapes, np.ndarray, np.ndarray]:
@@ -157,67 +153,3 @@ def test_crossings_of_random_motion_are_those_of_signed_volumes(device):
         wanted.append(int(meets))
     assert 50 < sum(wanted) < n
     assert search.crossed.numpy().tolist() == wanted
-
-
-def overlapping_free(seed: int, spread: float) -> tuple[Shapes, np.ndarray]:
-    """A scene in which nothing overlaps: objects that do are told to ignore each other."""
-    shapes, points = brute_force.scene(seed, spread, rods=30, triangles=60)
-    for first, second in SIDES.values():
-        i, j = np.array(sorted(brute_force.near(shapes, points, first, second, 0.0)), int).reshape(-1, 2).T
-        owners = shapes.things(first)[2][i], shapes.things(second)[2][j]
-        for a, b in set(zip(*map(np.ndarray.tolist, owners), strict=True)):
-            shapes.ignore(a, b)
-    return shapes, points
-
-
-def test_bounds_keep_all_gaps_open_whatever_the_direction(device):
-    """Nodes that move as far as they may, ten times over, anywhere: no gap closes, and none shrinks by more than was allowed."""
-    shapes, points = overlapping_free(5, 1.0)
-    x = upload(points, device)
-    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
-    rng = np.random.default_rng(6)
-    for _ in range(10):
-        search.update(x)
-        search.fit(x)
-        search.bound(x, share=0.9)
-        before = x.numpy()
-        wish = rng.normal(size=points.shape)
-        move = upload(wish, device)
-        search.held.zero_()
-        search.hold(move)
-        length, bound = np.linalg.norm(move.numpy(), axis=1), search.bounds.numpy()
-        used = np.unique(np.concatenate([shapes.things(size)[0].ravel() for size in (1, 2, 3)]))
-        assert length == pytest.approx(np.minimum(bound, np.linalg.norm(wish, axis=1)), rel=1e-12)
-        assert search.held.numpy()[0] == len(points)
-        assert bound.max() <= 0.5 * (MARGIN + REACH) and bound[used].min() > 0.0
-        search.crossings(x, move)
-        assert search.crossed.numpy()[0] == 0
-        after = before + move.numpy()
-        for side in SIDES.values():
-            i, j = np.array(sorted(brute_force.near(shapes, before, *side, 2 * MARGIN)), int).reshape(-1, 2).T
-            d, thickness = brute_force.distances(shapes, before, *side, i, j)
-            d_after, _ = brute_force.distances(shapes, after, *side, i, j)
-            nearest = d - thickness <= REACH
-            assert ((d_after - thickness)[nearest] >= (0.0999 * (d - thickness))[nearest]).all()
-            assert ((d_after - thickness) > 0.0).all()
-        x.assign(after)
-
-
-def test_smallest_gaps_and_one_tight_pair_that_holds_nobody_else(device):
-    """Of three parallel pairs the tight one alone is held back; bounds are 0.9 / 2 of a gap, or half of reach and margin."""
-    gap = np.array([1e-6, 1e-3, 1.0])
-    points = []
-    for k, g in enumerate(gap):
-        points += [[0, 10 * k, 0], [1, 10 * k, 0], [0, 10 * k, 0.02 + g], [1, 10 * k, 0.02 + g]]
-    shapes = Shapes(np.array(points, float))
-    for k in range(6):
-        shapes.rod([2 * k, 2 * k + 1], 0.01)
-    x = upload(shapes.points, device)
-    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
-    search.bound(x, share=0.9)
-    assert search.gap.numpy()[0] == pytest.approx(gap[0], rel=1e-9)
-    expected = np.repeat([0.45 * gap[0], 0.45 * gap[1], 0.5 * (MARGIN + REACH)], 4)
-    assert search.bounds.numpy() == pytest.approx(expected, rel=1e-9)
-    search.bound(x, share=0.9, keep=0.0)
-    expected = np.repeat([0.45 * (0.02 + gap[0]), 0.45 * (0.02 + gap[1]), 0.5 * (MARGIN + REACH)], 4)
-    assert search.bounds.numpy() == pytest.approx(np.minimum(expected, 0.5 * (MARGIN + REACH)), rel=1e-9)

@@ -1,4 +1,4 @@
-"""Candidates of contact on a device, how long they hold, and how far nodes may move; see `kernels.contact`."""
+"""Candidates of contact on a device, how long they hold, and how far everything may move; see `kernels.contact`."""
 
 import numpy as np
 import warp as wp
@@ -7,9 +7,10 @@ from ddg_warp import arrays
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels.contact.impact import impact_kernel
 from ddg_warp.kernels.contact.motion import motion_kernels
-from ddg_warp.kernels.contact.surfaces import EDGES, POINT_TRIANGLE
+from ddg_warp.kernels.contact.surfaces import EDGE_POINT, EDGES, POINT_TRIANGLE
+from ddg_warp.solve.contact.motion_filter import MotionFilter
 from ddg_warp.solve.contact.pairs import PairList
-from ddg_warp.solve.contact.shapes import Shapes
+from ddg_warp.solve.contact.shapes import BALLS, Shapes
 from ddg_warp.solve.contact.tree import Things
 
 SLACK = 1e-3  # of the margin, by which a search goes beyond it, for rounding
@@ -20,9 +21,9 @@ class BroadPhase:
     """Pairs of `shapes` that are near, in each of some worlds.
 
     All that is within thickness + `reach` is among the candidates as long as no node has moved by more than half of `margin` since they
-    were found. `update`, `bound`, `hold`, `impact` and `crossings` read nothing back and can be captured, `update` and `search` in
-    conditional parts of graphs, too. `rebuild` can be captured, on CUDA outside of those alone; there every step should begin with it.
-    `fit` and `check` read, between launches of graphs; what is not finite touches nothing, until they name it.
+    were found. `update`, `filter`, `measure`, `impact` and `crossings` read nothing back and can be captured, `update`, `filter` and
+    `search` in conditional parts of graphs, too. `rebuild` can be captured, on CUDA outside of those alone; there every step should
+    begin with it. `fit` and `check` read, between launches of graphs; what is not finite touches nothing, until they name it.
 
     Args:
         shapes: what may touch in one world.
@@ -34,8 +35,9 @@ class BroadPhase:
     Attributes:
         lists: a `PairList` for each kind of pairs that there can be.
         overflow: (1,), not zero once pairs did not fit: `fit` has to follow, and whatever came of the pairs is to be done again.
-        searches: (1,) how many there were; held: (1,) how many displacements were shortened.
-        bounds: (worlds times nodes,) [m]; gap [m], time and crossed, of each world: see `bound`, `impact` and `crossings`.
+        searches: (1,) how many there were.
+        gap [m], time and crossed, of each world: see `measure`, `impact` and `crossings`.
+        shares: (worlds times units,), limited: of each world, how many of them are below 1; see `filter`.
         version: grows whenever arrays were replaced by larger ones, and graphs that hold them have to be captured anew.
 
     Raises:
@@ -56,29 +58,34 @@ class BroadPhase:
         self.real = real
         things = {size: Things(shapes, size, worlds, real, self.device) for size in shapes.sizes}
         self._things = list(things.values())
-        self._seen, self._still = (wp.zeros(len(x), dtype=x.dtype, device=self.device) for _ in range(2))
-        self.overflow, self.searches, self._stale, self._lost, self.held = (
+        self._seen, self._still, self._move = (wp.zeros(len(x), dtype=x.dtype, device=self.device) for _ in range(3))
+        self._shift = wp.zeros(worlds, dtype=x.dtype, device=self.device)
+        self._never, self._always = (wp.full(worlds, flag, dtype=int, device=self.device) for flag in (0, 1))
+        self.overflow, self.searches, self._stale, self._searched, self._lost = (
             wp.zeros(1, dtype=int, device=self.device) for _ in range(5)
         )
-        self._trees = [things[size] for size in things if size > 1]
+        self._edges = things[2]
+        self._trees = [things[size] for size in things if size != 1]
+        self._motion = motion_kernels(real, arrays.serial(self.device))
         self.rebuild(x)
         grouped = worlds > 1
-        sides = [(EDGES, 2, 2)] + [(POINT_TRIANGLE, 1, 3)] * (3 in things)
+        sides = (
+            [(EDGES, 2, 2)] + [(POINT_TRIANGLE, 1, 3)] * (3 in things) + [(EDGE_POINT, 2, BALLS)] * (BALLS in things)
+        )
         self.lists = [
             PairList(kind, things[first], things[second], shapes, grouped, real, self.overflow)
             for kind, first, second in sides
         ]
-        self._motion = motion_kernels(real, arrays.serial(self.device))
         self._impacts, self._passes = (
             [impact_kernel(pairs.kind, grouped, passing, real) for pairs in self.lists] for passing in (False, True)
         )
         # what kernels of impacts have no use for
         self._unused = [wp.zeros(worlds, dtype=dtype, device=self.device) for dtype in (real, int, wp.int64)]
-        self.bounds = wp.zeros(len(x), dtype=real, device=self.device)
         self.gap = wp.zeros(worlds, dtype=real, device=self.device)
         self.time = wp.zeros(worlds, dtype=real, device=self.device)
         self.crossed = wp.zeros(worlds, dtype=int, device=self.device)
         self._firsts = [wp.zeros(1, dtype=wp.int64, device=self.device) for _ in self.lists]
+        self._filter = MotionFilter(self.lists, nodes, worlds, real, self.device)
         self.version = 0
         self.search(x)
         self.fit(x)
@@ -87,32 +94,74 @@ class BroadPhase:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         lists = [kernel for pairs in self.lists for kernel in pairs.kernels]
-        return [*lists, *(part.kernel for part in self._things), *self._motion, *self._impacts, *self._passes]
+        boxes = [part.kernel for part in self._things]
+        return [*lists, *boxes, *self._motion, *self._impacts, *self._passes, *self._filter.kernels]
+
+    @property
+    def shares(self) -> wp.array:
+        return self._filter.shares
+
+    @property
+    def limited(self) -> wp.array:
+        return self._filter.limited
 
     def rebuild(self, x: wp.array) -> None:
         """Build the trees anew; lists stay as they are. On CUDA searches use them until the next time, on the CPU they build their own.
 
         Where everything has changed places since, a search takes tens of times as long.
         """
-        self._enclose(x, self._still, 1.0, self._within)
+        self._enclose(x, self._still, self._never, 1.0, self._within)
         for part in self._trees:
             part.build()
 
-    def update(self, x: wp.array) -> None:
-        """Search again if some node has moved by more than half of the margin since the last search."""
-        watch, *_ = self._motion
-        self._sweep(watch, x, [x, self._seen, 0.5 * self.margin], [self._stale])
-        wp.capture_if(self._stale, lambda: self.search(x))
+    def update(self, base: wp.array, q: wp.array | None = None, together: wp.array | None = None) -> None:
+        """Search again along the motion from `base` to q if some node is, at either, farther than half of the margin from where it was.
 
-    def search(self, x: wp.array) -> None:
-        """Find all candidates at x."""
-        _, mark, *_ = self._motion
-        self._enclose(x, self._still, 1.0, self._within)
+        By default q is `base`: nothing moves. Of a motion that is not filtered the candidates hold from q on.
+        """
+        watch, *_ = self._motion
+        inputs = [base, base if q is None else q, self._seen, 0.5 * self.margin]
+        self._searched.zero_()
+        self._sweep(watch, base, inputs, [self._move, self._stale])
+        wp.capture_if(self._stale, lambda: self.search(base, self._move, together))
+
+    def search(self, x: wp.array, move: wp.array | None = None, together: wp.array | None = None) -> None:
+        """Find all candidates at x or, with `move`, anywhere on the straight motion from x by it.
+
+        Each node may go any share of its own way; in worlds where `together` (worlds,) is not zero, all go by one share.
+        """
+        _, mark, _ = self._motion
+        move = self._still if move is None else move
+        together = self._never if together is None else together
+        self._enclose(x, move, together, 1.0, self._within)
         for part in self._trees:
             part.renew()
         for pairs in self.lists:
-            pairs.search(x, 2.0 * self._within)
-        self._sweep(mark, x, [x, self.overflow], [self._seen, self._stale, self.searches])
+            pairs.search(x, move, together, 2.0 * self._within)
+        self._sweep(mark, x, [x, move, self.overflow], [self._seen, self._stale, self._searched, self.searches])
+
+    def filter(
+        self, base: wp.array, q: wp.array, unit: wp.array, together: wp.array, units: int, keep: float = 1.0
+    ) -> None:
+        """Shorten the motion from `base` to q so that no two come as near as `keep` of their thickness, in place.
+
+        Each unit of nodes goes by its own share, in `shares`, the smallest of each world in `time`; what all move in common shortens
+        nothing. Candidates are brought up to date. While pairs do not fit, nothing moves.
+
+        Args:
+            unit: of each node of a world (nodes,), which of its `units` it belongs to; -1 where it is never shortened: if it is a node
+                of an object that moves, others may not get out of its way.
+            together: (worlds,), not zero where all units have one share.
+            units: how many there are in a world.
+
+        Raises:
+            SceneError: if not 0 <= keep <= 1, or arrays are not as they should be.
+        """
+        _checked_keep(keep)
+        self._filter.check(unit, together, units)
+        self.update(base, q, together)
+        search = (self.overflow, self.time, self._searched, self._seen)
+        self._filter(base, self._move, q, unit, together, units, keep, search)
 
     def fit(self, x: wp.array) -> bool:
         """Make room for pairs that did not fit, and search again until they do; whether there were any. Reads from the device.
@@ -152,27 +201,11 @@ class BroadPhase:
                 outcome="not_finite",
             )
 
-    def bound(self, x: wp.array, share: float = 0.9, keep: float = 1.0) -> None:
-        """How far each node may move from x, in `bounds` [m]; the smallest gap of each world in `gap` [m], at most `reach`.
-
-        Nodes that move no farther leave (1 - share) of all distances beyond `keep` of the thickness. Candidates have to be up to date;
-        while pairs do not fit, nothing may move.
-
-        Raises:
-            SceneError: if not 0 < share < 1 or not 0 <= keep <= 1.
-        """
-        if not 0.0 < share < 1.0:
-            raise SceneError(f"share = {share!r} of gaps that motion may use up; it is between 0 and 1")
-        _checked_keep(keep)
-        *_, start, _ = self._motion
-        self._sweep(start, x, [x, self._seen, 0.5 * (self.margin + self.reach), self.overflow], [self.bounds])
+    def measure(self, x: wp.array) -> None:
+        """The smallest gap of each world in `gap` [m], at most `reach`. Candidates have to be up to date."""
         self.gap.fill_(self.reach)
         for pairs in self.lists:
-            pairs.bound(x, share, keep, self.bounds, self.gap)
-
-    def hold(self, move: wp.array) -> None:
-        """Shorten displacements to `bounds`, node by node, and add to `held` how many were."""
-        self._sweep(self._motion[-1], move, [self.bounds], [move, self.held])
+            pairs.measure(x, self.gap)
 
     def impact(self, x: wp.array, move: wp.array, keep: float = 1.0) -> None:
         """When in the motion from x by `move` two come as near as `keep` of their thickness, in `time` of each world; never late.
@@ -216,16 +249,19 @@ class BroadPhase:
         return 0.5 * (self.reach + (1.0 + SLACK) * self.margin)
 
     def _passing(self, kernels, x, move, keep: float, number, firsts) -> None:
-        self._enclose(x, move, keep, 0.0)
+        self._enclose(x, move, self._always, keep, 0.0)
         for part in self._trees:
             part.tree.refit()
         for kernel, pairs, least in zip(kernels, self.lists, firsts, strict=True):
             outputs = [self.time, number, least]
             wp.launch(kernel, pairs.first.all, [pairs.sides, x, move, keep], outputs, device=self.device)
 
-    def _enclose(self, x, move, share: float, more: float) -> None:
+    def _enclose(self, x, move, together, share: float, more: float) -> None:
+        *_, common = self._motion
+        inputs = [self._edges.surface, self._edges.count, move, together]
+        wp.launch(common, self.worlds, inputs, [self._shift], device=self.device)
         for part in self._things:
-            part.enclose(x, move, share, more, self._lost)
+            part.enclose(x, move, self._shift, share, more, self._lost)
 
     def _sweep(self, kernel, x, inputs: list, outputs: list) -> None:
         arrays.sweep(kernel, len(x), inputs, outputs, self.device)

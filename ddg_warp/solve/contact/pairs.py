@@ -5,7 +5,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.kernels.contact import sums
 from ddg_warp.kernels.contact.candidates import candidate_kernels
-from ddg_warp.kernels.contact.motion import bound_kernel
+from ddg_warp.kernels.contact.motion import gap_kernel
 from ddg_warp.kernels.contact.surfaces import Kind, sides_struct
 from ddg_warp.solve.contact.shapes import Shapes
 from ddg_warp.solve.contact.tree import Things
@@ -33,7 +33,7 @@ class RunningSums:
 
 
 class PairList:
-    """Pairs of one kind whose distance is at most both radii and a reach.
+    """Pairs of one kind whose distance is at most both radii and a reach, or may be on their way.
 
     Attributes:
         pairs: things (i, j) of both sides, counted over all worlds, sorted; the first `count` hold.
@@ -52,13 +52,15 @@ class PairList:
         self.sides.lower, self.sides.upper, self.sides.tree = first.lower, first.upper, second.tree.id
         self.sides.counts, self.sides.objects = wp.vec2i(first.count, second.count), len(shapes.names)
         self.sides.ignored = wp.array(shapes.ignored, dtype=wp.int64, device=self.device)
+        obstacle = [number in shapes.obstacle for number in range(len(shapes.names))]
+        self.sides.obstacle = wp.array(obstacle, dtype=wp.uint8, device=self.device)
         self._last, self.partners = (wp.zeros(first.all, dtype=int, device=self.device) for _ in range(2))
         self._sums = RunningSums(self.partners)
         self.starts = self._sums.starts
         self._find, self._fill = candidate_kernels(kind, grouped, real)
-        self._bounds = bound_kernel(kind, real, arrays.serial(self.device))
+        self._gaps = gap_kernel(kind, real, arrays.serial(self.device))
         self.found, self.count, self.needed = (wp.zeros(1, dtype=int, device=self.device) for _ in range(3))
-        self.kernels = [self._find, self._fill, self._bounds, sums.add_pieces, sums.run]
+        self.kernels = [self._find, self._fill, self._gaps, sums.add_pieces, sums.run]
         self.reserve(max(1024, 4 * first.all))
 
     @property
@@ -71,13 +73,13 @@ class PairList:
         self.pairs = wp.zeros(capacity, dtype=wp.vec2i, device=self.device)
         self.needed.zero_()
 
-    def search(self, x, reach: float) -> None:
-        """Find and list the pairs; boxes have to be up to date."""
+    def search(self, x, move, together, reach: float) -> None:
+        """Find and list the pairs; boxes have to be up to date; see `kernels.contact.candidates`."""
         self.found.zero_()
         wp.launch(
             self._find,
             self.first.all,
-            [self.sides, x, reach],
+            [self.sides, x, move, together, reach],
             [self.found, self._partner, self._before, self._last, self.partners],
             device=self.device,
         )
@@ -90,12 +92,7 @@ class PairList:
             device=self.device,
         )
 
-    def bound(self, x, share: float, keep: float, bound, gap) -> None:
-        """Lower the bounds of nodes of pairs, and the smallest gaps; see `kernels.contact.motion`."""
-        arrays.sweep(
-            self._bounds,
-            self.capacity,
-            [self.pairs, self.count, self.sides, x, share, keep],
-            [bound, gap],
-            self.device,
-        )
+    def measure(self, x, gap) -> None:
+        """Lower the smallest gaps of worlds to those of pairs."""
+        inputs = [self.pairs, self.count, self.sides, x]
+        arrays.sweep(self._gaps, self.capacity, inputs, [gap], self.device)

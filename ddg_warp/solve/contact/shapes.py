@@ -1,20 +1,23 @@
-"""What may touch in one world: edges of rods as capsules, triangles of shells with a thickness, and what is no pair."""
+"""What may touch in one world: edges of rods as capsules, triangles of shells with a thickness, balls, and what is no pair."""
 
 import numpy as np
 
 from ddg_warp.errors import SceneError
 
+BALLS = 0  # in place of a number of nodes: the points that are balls
 FLAT = 1e-12  # area of a triangle over the square of its longest edge, below which it has none
 
 
 class Shapes:
-    """Rods and shells over the nodes of one world, numbered as they are added.
+    """Rods, shells and balls over the nodes of one world, numbered as they are added.
+
+    No two objects that are `still` are a pair, nor is such an object with itself: obstacles, at rest or moved from outside.
 
     Args:
         points: positions (n, 3) at which nothing may be without length or area [m].
 
     Attributes:
-        edges, triangles, nodes: `Things`, the last with the nodes of all objects where there are triangles.
+        names: of all objects; obstacle: numbers of those that are still.
     """
 
     def __init__(self, points: np.ndarray):
@@ -22,11 +25,19 @@ class Shapes:
         if self.points.ndim != 2 or self.points.shape[1] != 3 or not np.isfinite(self.points).all():
             raise SceneError("points of a contact search have to be finite, of shape (n, 3)")
         self.names: list[str] = []
-        self._parts: dict[int, list] = {1: [], 2: [], 3: []}
+        self.obstacle: set[int] = set()
+        self._parts: dict[int, list] = {1: [], 2: [], 3: [], BALLS: []}
         self._ignored: set[tuple[int, int]] = set()
 
     def rod(
-        self, nodes, radius: float, *, closed: bool = False, apart: float | None = None, name: str | None = None
+        self,
+        nodes,
+        radius: float,
+        *,
+        closed: bool = False,
+        apart: float | None = None,
+        name: str | None = None,
+        still: bool = False,
     ) -> int:
         """Add a rod along nodes (m,), a row of capsules; returns the number of the object.
 
@@ -35,6 +46,7 @@ class Shapes:
             closed: whether an edge leads from the last node to the first.
             apart: edges with less than this between them along the rod [m] are no pair, nor are neighbours; by default pi radius, the
                 arc between opposite sides of the tightest bend that a rod so thick can have.
+            still: whether it is no pair with itself and others that are still.
 
         Raises:
             SceneError: names the rod, the edge or node, and the remedy.
@@ -53,9 +65,9 @@ class Shapes:
         ends = np.concatenate([[0.0], np.cumsum(lengths)])
         loop = np.full(len(edges), ends[-1] if closed else 0.0)
         span = np.column_stack([ends[:-1], ends[1:], loop, np.full(len(edges), float(apart))])
-        return self._add(name, radius, {1: nodes[:, None], 2: edges}, span)
+        return self._add(name, radius, {1: nodes[:, None], 2: edges}, span, still)
 
-    def shell(self, triangles, thickness: float, *, name: str | None = None) -> int:
+    def shell(self, triangles, thickness: float, *, name: str | None = None, still: bool = False) -> int:
         """Add a shell of triangles (m, 3) with a thickness [m], half of it on either side; returns the number of the object.
 
         Triangles, edges and points that share a node are no pairs.
@@ -76,7 +88,18 @@ class Shapes:
         edges = np.unique(sides, axis=0)
         span = np.broadcast_to([0.0, 0.0, 0.0, -1.0], (len(edges), 4))
         parts = {1: np.unique(triangles)[:, None], 2: edges, 3: triangles}
-        return self._add(name, 0.5 * thickness, parts, span)
+        return self._add(name, 0.5 * thickness, parts, span, still)
+
+    def ball(self, node: int, radius: float, *, name: str | None = None, still: bool = False) -> int:
+        """Add a ball around a node, which rods and shells touch, balls do not; returns the number of the object.
+
+        Raises:
+            SceneError: names the ball and the remedy.
+        """
+        name = f"ball '{name}'" if name else f"ball {len(self.names)}"
+        nodes = self._checked([node], 1, name)[:, None]
+        self._positive(radius, "radius", name)
+        return self._add(name, radius, {1: nodes, BALLS: nodes}, np.zeros((0, 4)), still)
 
     def ignore(self, first: int, second: int) -> None:
         """Two objects pass through each other; an object and itself: it has no contact with itself.
@@ -98,17 +121,17 @@ class Shapes:
 
     @property
     def sizes(self) -> list[int]:
-        """Numbers of nodes of the things that pairs need: edges, and points and triangles where there are triangles."""
-        return [1, 2, 3] if self._parts[3] else [2]
+        """Numbers of nodes of the things that pairs need: edges, points and triangles where there are triangles, and `BALLS`."""
+        return ([1, 2, 3] if self._parts[3] else [2]) + [BALLS] * bool(self._parts[BALLS])
 
     def things(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Points, edges or triangles by their number of nodes: nodes (n, size), radius, object (n,) and span (n, 4) of edges.
+        """Points, edges or triangles by their number of nodes, or `BALLS`: nodes (n, size), radius, object (n,), span (n, 4) of edges.
 
         Raises:
-            SceneError: if nothing was added.
+            SceneError: if neither rods nor shells were added.
         """
-        if not self.names:
-            raise SceneError("a contact search has no objects; add rods or shells")
+        if not self._parts[2]:
+            raise SceneError("a contact search has no objects but balls; add rods or shells")
         parts = self._parts[size]
         number = np.repeat([part[2] for part in parts], [len(part[0]) for part in parts])
         radius = np.repeat([part[1] for part in parts], [len(part[0]) for part in parts])
@@ -118,13 +141,17 @@ class Shapes:
         """A thing of a world as a message has it."""
         for nodes, _, number, _ in self._parts[size]:
             if index < len(nodes):
+                if size == BALLS:
+                    return f"{self.names[number]} (node {nodes[index, 0]})"
                 kind = ("point", "edge", "triangle")[size - 1]
                 return f"{kind} {index} of {self.names[number]} (nodes {', '.join(map(str, nodes[index]))})"
             index -= len(nodes)
         raise IndexError(index)
 
-    def _add(self, name: str, radius: float, parts: dict, span: np.ndarray) -> int:
+    def _add(self, name: str, radius: float, parts: dict, span: np.ndarray, still: bool) -> int:
         number = len(self.names)
+        if still:
+            self.obstacle.add(number)
         self.names.append(name)
         for size, nodes in parts.items():
             self._parts[size].append((nodes, radius, number, span if size == 2 else np.zeros((0, 4))))

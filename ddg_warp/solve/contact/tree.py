@@ -9,7 +9,7 @@ from ddg_warp.kernels.contact.surfaces import surface_struct
 
 
 class Things:
-    """Points, edges or triangles of `shapes` by their number of nodes, with boxes; `tree` is there where things are searched for.
+    """Points, edges, triangles or balls of `shapes`, with boxes; `tree` is there where things are searched for.
 
     Attributes:
         count: in one world; all: in all; surface: see `surface_struct`; lower, upper: of boxes (all,).
@@ -30,15 +30,15 @@ class Things:
         self.surface.nodes_a_world = len(shapes.points)
         self.lower, self.upper = (wp.zeros(self.all, dtype=wp.vec3, device=device) for _ in range(2))
         self.tree, self.device = None, device
-        self.kernel = box_kernel(size, real)
+        self.kernel = box_kernel(nodes.shape[1], real)
         self._worlds = worlds
 
-    def enclose(self, x, move, share: float, more: float, lost) -> None:
-        """Boxes around x and x + move, inflated by a share of the radius and more [m]."""
+    def enclose(self, x, move, shift, share: float, more: float, lost) -> None:
+        """Boxes around x and x + move, the latter less `shift` of the world, inflated by a share of the radius and more [m]."""
         wp.launch(
             self.kernel,
             self.all,
-            [self.surface, self.count, x, move, share, more],
+            [self.surface, self.count, x, move, shift, share, more],
             [self.lower, self.upper, lost],
             device=self.device,
         )

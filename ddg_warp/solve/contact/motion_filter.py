@@ -1,0 +1,71 @@
+"""Shortens a proposed motion on a device so that nothing passes through anything; see `kernels.contact.shares`."""
+
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels.contact.shares import limit_kernel, share_kernels
+
+
+class MotionFilter:
+    """Shares of motion for the pairs of some lists; see `BroadPhase.filter`.
+
+    Args:
+        nodes: of one world, the most units that there can be.
+
+    Attributes:
+        shares, limited: see `BroadPhase`.
+    """
+
+    def __init__(self, lists: list, nodes: int, worlds: int, real, device):
+        self._lists, self._nodes, self._worlds, self._device = lists, nodes, worlds, device
+        serial = arrays.serial(device)
+        self._limits = [limit_kernel(pairs.kind, real, serial) for pairs in lists]
+        self._start, self._turn, self._settle, self._finish, self._shorten = share_kernels(real, serial)
+        self.kernels = [*self._limits, self._start, self._turn, self._settle, self._finish, self._shorten]
+        self._all = [wp.zeros(worlds * nodes, dtype=real, device=device) for _ in range(3)]
+        self._earliest, self._later = (wp.zeros(worlds, dtype=real, device=device) for _ in range(2))
+        self._open, self.limited = (wp.zeros(worlds, dtype=int, device=device) for _ in range(2))
+        self._changed, self._rounds = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
+        self.shares = self._all[0]
+
+    def check(self, unit: wp.array, together: wp.array, units: int) -> None:
+        """Refuse arrays that do not fit."""
+        if unit.shape != (self._nodes,) or unit.dtype is not wp.int32:
+            raise SceneError(
+                f"unit of a motion: one int32 for each of {self._nodes} nodes, not {unit.shape} of {unit.dtype}"
+            )
+        if together.shape != (self._worlds,) or together.dtype is not wp.int32:
+            raise SceneError(
+                f"together of a motion: one int32 for each of {self._worlds} world(s), not {together.shape} of {together.dtype}"
+            )
+        if not 1 <= units <= self._nodes:
+            raise SceneError(f"units = {units!r} of a motion; they are 1 to {self._nodes}, the nodes of a world")
+
+    def __call__(self, base, move, q, unit, together, units: int, keep: float, search) -> None:
+        """Lower shares round by round, and shorten q to them; `search`: (overflow, time, searched, seen) of the candidates."""
+        overflow, time, searched, seen = search
+        shares, before, lowered = (array[: self._worlds * units] for array in self._all)
+        self.shares = shares
+        self._sweep(self._start, len(shares), [], [shares, before, lowered])
+        for times in (self._earliest, self._later, time):
+            times.fill_(1.0)
+        for numbers in (self._rounds, self.limited):
+            numbers.zero_()
+
+        def go(times: wp.array) -> None:
+            wp.launch(self._turn, self._worlds, [], [self._open, self._changed, self._rounds], device=self._device)
+            for kernel, pairs in zip(self._limits, self._lists, strict=True):
+                inputs = [pairs.pairs, pairs.count, pairs.sides, base, move, keep, unit, units]
+                self._sweep(kernel, pairs.capacity, inputs, [shares, before, lowered, times])
+            inputs = [together, self._earliest, lowered, self._rounds]
+            self._sweep(self._settle, len(shares), inputs, [shares, before, self._open, self._changed])
+
+        go(self._earliest)
+        wp.capture_while(self._changed, lambda: go(self._later))
+        outputs = [shares, time, self.limited]
+        self._sweep(self._finish, len(shares), [self._earliest, self._open, overflow], outputs)
+        self._sweep(self._shorten, len(q), [base, move, unit, units, shares, searched], [q, seen])
+
+    def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
+        arrays.sweep(kernel, count, inputs, outputs, self._device)

@@ -1,0 +1,72 @@
+"""Scenes in which nothing overlaps, and motions of them that are filtered."""
+
+import numpy as np
+import warp as wp
+from brute_force import SIDES, near, scene, upload
+
+from ddg_warp.solve.contact.broad_phase import BroadPhase
+from ddg_warp.solve.contact.shapes import Shapes
+
+REACH, MARGIN = 0.004, 0.01
+
+
+def tangle(seed: int, spread: float = 0.6) -> tuple[Shapes, np.ndarray]:
+    """A scene in which nothing overlaps: objects that do are told to ignore each other."""
+    shapes, points = scene(seed, spread, rods=30, triangles=60)
+    for first, second in SIDES:
+        i, j = np.array(sorted(near(shapes, points, first, second, 0.0)), int).reshape(-1, 2).T
+        owners = shapes.things(first)[2][i], shapes.things(second)[2][j]
+        for a, b in set(zip(*map(np.ndarray.tolist, owners), strict=True)):
+            shapes.ignore(a, b)
+    return shapes, points
+
+
+def units_of(shapes: Shapes, kind: str) -> tuple[np.ndarray, int]:
+    """Units of nodes (nodes,), and how many there are."""
+    n = len(shapes.points)
+    if kind == "node":
+        return np.arange(n), n
+    if kind == "world":
+        return np.zeros(n, int), 1
+    unit = np.full(n, -1)
+    for size in shapes.sizes:
+        nodes, _, owner, _ = shapes.things(size)
+        unit[nodes] = owner[:, None]
+    return unit, len(shapes.names)
+
+
+class Motion:
+    """A search at points (worlds times nodes, 3) with a filter of units of a kind."""
+
+    def __init__(
+        self,
+        shapes: Shapes,
+        points: np.ndarray,
+        device,
+        kind: str = "object",
+        worlds: int = 1,
+        together=(),
+        dtype=wp.vec3d,
+    ):
+        unit, self.units = units_of(shapes, kind)
+        self.base, self.q = (upload(points, device, dtype) for _ in range(2))
+        self.search = BroadPhase(shapes, self.base, worlds, reach=REACH, margin=MARGIN)
+        self.unit = wp.array(unit, dtype=int, device=device)
+        self.together = wp.array([int(w in together) for w in range(worlds)], dtype=int, device=device)
+
+    def launch(self, keep: float = 1.0) -> None:
+        self.search.filter(self.base, self.q, self.unit, self.together, self.units, keep)
+
+    def __call__(self, move: np.ndarray, keep: float = 1.0) -> np.ndarray:
+        """Where a displacement leads (worlds times nodes, 3)."""
+        base = self.base.numpy()
+        while True:
+            self.q.assign(base + move)
+            self.launch(keep)
+            if not self.search.fit(self.base):
+                return self.q.numpy().copy()
+
+    def results(self) -> list[bytes]:
+        """All that a filter writes, but for lists."""
+        search = self.search
+        return [array.numpy().tobytes() for array in (self.q, search.shares, search.time, search.limited, search._seen)]

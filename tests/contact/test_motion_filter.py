@@ -1,0 +1,260 @@
+"""Shares of a motion: nothing passes, nothing is held back that need not be, and searches along the motion find all pairs."""
+
+import numpy as np
+import pytest
+import warp as wp
+from brute_force import SIDES, listed, near, scene, upload
+from motion_cases import MARGIN, REACH, Motion, tangle, units_of
+from test_impact import gaps, pairs_apart
+
+from ddg_warp import arrays
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels.contact.shares import ROUNDS
+from ddg_warp.solve.contact.broad_phase import BroadPhase
+from ddg_warp.solve.contact.shapes import Shapes
+
+
+def wish(shapes: Shapes, rng, size: float, kind: str) -> np.ndarray:
+    """Random displacements, of nodes or, with a tenth of that beside, of objects."""
+    move = rng.normal(size=shapes.points.shape)
+    if kind != "node":
+        unit, units = units_of(shapes, "object")
+        move = rng.normal(size=(units, 3))[unit] + 0.1 * move
+    return size * move
+
+
+@pytest.mark.parametrize("kind", ["node", "object", "world"])
+@pytest.mark.parametrize("size", [0.01, 0.5])
+@pytest.mark.parametrize("dtype", [wp.vec3d, wp.vec3f])
+def test_no_gap_closes_and_nothing_passes(device, kind, size, dtype):
+    """Motions from once to fifty times the margin, three in a row."""
+    shapes, points = tangle(5)
+    motion, rng = Motion(shapes, points, device, kind, dtype=dtype), np.random.default_rng(6)
+    rounding = 1e-12 if dtype is wp.vec3d else 1e-6
+    for _ in range(3):
+        base, move = motion.base.numpy().astype(float), wish(shapes, rng, size, kind)
+        landing = motion(move).astype(float)
+        search, shares = motion.search, motion.search.shares.numpy()
+        assert shares.shape == (motion.units,) and 0.0 < shares.min() == search.time.numpy()[0] <= shares.max() <= 1.0
+        assert search.limited.numpy()[0] == (shares < 1.0).sum()
+        assert landing == pytest.approx(base + shares[motion.unit.numpy()][:, None] * move, rel=rounding, abs=rounding)
+        for t in np.linspace(0.0, 1.0, 5):
+            for side in SIDES:
+                assert not near(shapes, base + t * (landing - base), *side, 0.0)
+        search.crossings(motion.base, upload(landing - base, device, dtype))
+        assert search.crossed.numpy()[0] == 0
+        # candidates hold where the motion has led to
+        for side, found in zip(SIDES, listed(search), strict=True):
+            assert near(shapes, landing, *side, REACH) <= {tuple(pair) for pair in found.tolist()}
+        searches = search.searches.numpy()[0]
+        search.update(upload(landing + 0.49 * MARGIN / np.sqrt(3.0), device, dtype))
+        assert search.searches.numpy()[0] == searches
+        motion.base.assign(landing)
+    if size == 0.5:
+        assert shares.min() < 0.1
+
+
+@pytest.mark.parametrize("name", ["edges", "point and triangle"])
+@pytest.mark.parametrize("kind", ["node", "object", "world"])
+def test_pairs_stop_in_time_and_not_much_too_early(device, name, kind):
+    """Pairs at random, one in each of 300 worlds, against dense sampling in time: all that do not overlap at first stay apart."""
+    shapes, x, move = pairs_apart(name, 2, 300)
+    motion = Motion(shapes, x.reshape(-1, 3), device, kind, worlds=len(x))
+    landing = motion(move.reshape(-1, 3)).reshape(x.shape)
+    time = motion.search.time.numpy()
+    gap = np.array([gaps(shapes, name, x + t * move) for t in np.linspace(0.0, 1.0, 501)])
+    free = (gap[0] > 0.0).all(0)
+    hit = (gap <= 0.0).any(1).any(0) & free
+    shortened = np.array([gaps(shapes, name, x + t * (landing - x)) for t in np.linspace(0.0, 1.0, 501)])
+    assert (shortened[..., free] > 0.0).all()
+    assert hit.sum() > 30 and (time[hit] < 1.0).all() and (time[~free] == 0.0).all()
+    left, start = (all_of[..., hit].min(0) for all_of in (shortened.min(0), gap[0]))
+    assert np.median(left / start) < 0.4
+
+
+@pytest.mark.parametrize("kind", ["node", "object", "world"])
+def test_a_motion_that_all_share_is_not_shortened(device, kind):
+    """A translation by a thousand times what things are apart, with a little of each node's own."""
+    shapes, points = tangle(7)
+    rng = np.random.default_rng(8)
+    motion = Motion(shapes, points, device, kind, together=(0,) if kind != "world" else ())
+    wanted = np.array([3.0, -2.0, 1.0]) + 1e-7 * rng.normal(size=points.shape)
+    landing = motion(wanted)
+    assert landing.tobytes() == (points + wanted).tobytes()
+    assert motion.search.time.numpy()[0] == 1.0 and motion.search.limited.numpy()[0] == 0
+
+
+def test_what_goes_together_needs_few_candidates(device):
+    """Of a common motion of fifty margins, as many as at rest; where shares may differ, a hundred times as many."""
+    shapes, points = tangle(9)
+    move = np.tile([0.3, 0.4, 0.0], (len(points), 1))
+    x, step = upload(points, device), upload(move, device)
+    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    rest = [found.tolist() for found in listed(search)]
+    search.search(x, step, wp.ones(1, dtype=int, device=device))
+    assert [found.tolist() for found in listed(search)] == rest
+    search.search(x, step)
+    search.fit(x)
+    search.search(x, step)
+    assert len(listed(search)[0]) > 30 * len(rest[0])
+
+
+def test_one_tight_pair_holds_nobody_else(device):
+    """A thousand rods side by side sink by three times their distance; the first two, crossed by a still one, stop alone."""
+    n, apart = 1000, 0.05
+    y = apart * np.arange(n)
+    points = np.array([[[-0.01, at, 0.0], [0.01, at, 0.0]] for at in y]).reshape(-1, 3)
+    points = np.concatenate([points, [[0.0, -0.5 * apart, -0.03], [0.0, 1.5 * apart, -0.03]]])
+    shapes = Shapes(points)
+    for k in range(n + 1):
+        shapes.rod([2 * k, 2 * k + 1], 0.005, still=k == n)
+    motion = Motion(shapes, points, device)
+    move = np.zeros_like(points)
+    move[:-2, 2] = -3.0 * apart
+    landing = motion(move)
+    shares = motion.search.shares.numpy()
+    # of the gap of 0.02 nine tenths may be used up, and nine tenths of what is left
+    assert shares[:2] == pytest.approx(0.9 * 0.02 / (3.0 * apart), rel=1e-9)
+    assert (shares[2:n] == 1.0).all()
+    assert motion.search.limited.numpy()[0] == 3
+    assert (landing[4:] == (points + move)[4:]).all()
+
+
+@pytest.mark.parametrize("layers", [40, ROUNDS + 10])
+def test_what_falls_on_what_has_stopped_stops_layer_by_layer(device, layers):
+    """Crossed layers fall on the floor by five times their distance: those above go farther than the first, up to so many."""
+    apart = 0.02
+    ends = np.array([[-0.05, 0.0, 0.0], [0.05, 0.0, 0.0]])
+    points = np.concatenate(
+        [(ends[:, [1, 0, 2]] if k % 2 else ends) + [0.0, 0.0, apart * (k + 1)] for k in range(layers)]
+    )
+    points = np.concatenate([points, [[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]]])
+    shapes = Shapes(points)
+    for k in range(layers):
+        shapes.rod([2 * k, 2 * k + 1], 0.004)
+    shapes.shell([[2 * layers, 2 * layers + 1, 2 * layers + 2]], 1e-3, still=True)
+    motion = Motion(shapes, points, device)
+    move = np.zeros_like(points)
+    move[: 2 * layers, 2] = -5.0 * apart
+    landing = motion(move)
+    shares = motion.search.shares.numpy()[:layers]
+    height = landing[: 2 * layers : 2, 2]
+    assert (np.diff(height) > 0.008).all() and height[0] > 0.0045
+    assert shares[0] == motion.search.time.numpy()[0] == pytest.approx(0.9 * (apart - 0.0045) / (5.0 * apart), rel=1e-9)
+    if layers > ROUNDS:
+        assert (shares == shares[0]).all()
+    else:
+        assert (shares[1:] > 1.3 * shares[0]).all() and shares[-1] > 2.0 * shares[0]
+
+
+def test_worlds_have_shares_of_their_own(device):
+    """In one that goes together all have the smallest; one in which nothing moves has none below 1."""
+    shapes, points = tangle(10)
+    move = wish(shapes, np.random.default_rng(11), 0.05, "object")
+    alone = Motion(shapes, points, device)
+    landing = alone(move)
+    everywhere = np.concatenate([move, move, 0.0 * move])
+    motion = Motion(shapes, np.tile(points, (3, 1)), device, worlds=3, together=(1,))
+    base = motion.base.numpy()
+    result = motion(everywhere).reshape(3, -1, 3)
+    shares = motion.search.shares.numpy().reshape(3, -1)
+    assert result[0].tobytes() == landing.tobytes()
+    motion.search.impact(motion.base, upload(base + everywhere - base, device))
+    first = motion.search.time.numpy()
+    assert (shares[1] == first[1]).all() and 0.0 < first[1] < 1.0
+    assert first[1] <= shares[0].min() and shares[0].max() == 1.0
+    assert (shares[2] == 1.0).all() and (result[2] == points).all()
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_a_search_along_a_motion_finds_all_pairs_of_any_shares(device, together):
+    shapes, points = scene(12, 0.6, rods=20, triangles=60)
+    rng = np.random.default_rng(13)
+    move = wish(shapes, rng, 2.0 * MARGIN, "object")
+    x, step = upload(points, device), upload(move, device)
+    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    flags = wp.full(1, int(together), dtype=int, device=device)
+    search.search(x, step, flags)
+    if search.fit(x):
+        search.search(x, step, flags)
+    found = [{tuple(pair) for pair in pairs.tolist()} for pairs in listed(search)]
+    for k in range(20):
+        shares = (
+            np.full((1, 1), k / 19.0) if together else rng.uniform(size=(len(points), 1)) ** rng.choice([0.2, 1.0, 5.0])
+        )
+        for side, pairs in zip(SIDES, found, strict=True):
+            assert near(shapes, points + shares * move, *side, REACH + MARGIN) <= pairs
+
+
+def test_a_captured_filter_is_that_without_a_graph(device):
+    shapes, points = tangle(14)
+    small, large = (wish(shapes, np.random.default_rng(15), size, "object") for size in (1e-3, 0.05))
+
+    def run(captured: bool) -> list:
+        motion = Motion(shapes, points, device)
+        motion(large)  # lists have grown to what the motion needs
+        motion.search.rebuild(motion.base)
+        motion.search.search(motion.base)
+        step = motion.launch
+        if captured:
+            arrays.load_kernels(motion.search.kernels, device)
+            with wp.ScopedCapture(device=device) as capture:
+                motion.launch()
+            step = lambda: wp.capture_launch(capture.graph)  # noqa: E731
+        result = []
+        for move in (small, large, 0.5 * small):
+            motion.q.assign(motion.base.numpy() + move)
+            step()
+            result += motion.results() + [part.tobytes() for part in listed(motion.search)]
+            motion.base.assign(motion.q.numpy())
+        assert not motion.search.overflow.numpy()[0]
+        return [*result, motion.search.searches.numpy()[0]]
+
+    plain = run(False)
+    assert run(False) == plain
+    assert run(True) == plain
+
+
+def test_nothing_moves_while_pairs_do_not_fit(device):
+    shapes, points = tangle(16)
+    motion = Motion(shapes, points, device)
+    for pairs in motion.search.lists:
+        pairs.reserve(10)
+    motion.q.assign(points + wish(shapes, np.random.default_rng(17), 0.05, "object"))
+    motion.launch()
+    used = motion.unit.numpy() >= 0
+    assert (motion.q.numpy()[used] == points[used]).all()
+    assert motion.search.time.numpy()[0] == 0.0 and motion.search.overflow.numpy()[0] == 1
+
+
+def test_smallest_gaps(device):
+    gap = np.array([1e-6, 1e-3, 1.0])
+    points = []
+    for k, g in enumerate(gap):
+        points += [[0, 10 * k, 0], [1, 10 * k, 0], [0, 10 * k, 0.02 + g], [1, 10 * k, 0.02 + g]]
+    shapes = Shapes(np.array(points, float))
+    for k in range(6):
+        shapes.rod([2 * k, 2 * k + 1], 0.01)
+    x = upload(np.concatenate([shapes.points, 2.0 * shapes.points]), device)
+    search = BroadPhase(shapes, x, 2, reach=REACH, margin=MARGIN)
+    search.measure(x)
+    assert search.gap.numpy() == pytest.approx([gap[0], REACH], rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"keep": -0.1}, r"keep = -0\.1"),
+        ({"units": 0}, "units = 0 of a motion; they are 1 to"),
+        ({"unit": 7}, "unit of a motion: one int32 for each of 72 nodes, not"),
+        ({"together": 2}, r"together of a motion: one int32 for each of 1 world\(s\), not"),
+    ],
+)
+def test_what_can_not_be_filtered_is_refused_by_name(device, change, message):
+    shapes, points = scene(12, 1.0, rods=3, nodes=20, triangles=4)
+    motion = Motion(shapes, points, device)
+    given = {"unit": motion.unit, "together": motion.together, "units": motion.units, "keep": 1.0}
+    for name, value in change.items():
+        given[name] = wp.zeros(value, dtype=int, device=device) if name in ("unit", "together") else value
+    with pytest.raises(SceneError, match=message):
+        motion.search.filter(motion.base, motion.q, **given)
