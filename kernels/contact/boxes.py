@@ -8,12 +8,13 @@ from ddg_warp.kernels.contact.surfaces import surface_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
 ROUNDING = 3e-7  # more than two roundings of float32, relative: that of a sum and that of the conversion
+FAR = 1e15  # beyond anything [m], squared still a number
 LEAST = 1e-30  # so that zero is rounded outwards, too [m]
 
 
 @cache
-def box_kernel(size: int, real):
-    """Boxes of things with `size` nodes, inflated by `share` of their radius and `more`, around both x and x + move.
+def box_kernel(size: int, endless: bool, real):
+    """Boxes of things with `size` nodes, or around all there is if these are `endless`, inflated by `share` of their radius and `more`, around both x and x + move.
 
     From x + move the `shift` of the world is taken.
 
@@ -64,6 +65,10 @@ def box_kernel(size: int, real):
         for d in range(3):
             down[d] = outward(low[d] - reach, wp.float32(-1.0))
             up[d] = outward(high[d] + reach, wp.float32(1.0))
+        if wp.static(endless):
+            for d in range(3):
+                down[d] = wp.static(wp.float32(-FAR))
+                up[d] = wp.static(wp.float32(FAR))
         lower[i] = down
         upper[i] = up
 

@@ -66,11 +66,11 @@ def candidate_kernels(kind: Kind, grouped: bool, real):
             l = j - w * sides.counts[1]
             if may_touch(sides, k, l):
                 nodes = slots(sides, k, l, w)
-                p = corners(move, nodes)
-                speed = fastest(p)
+                y, p = corners(x, nodes), corners(move, nodes)
+                speed = fastest(y, p)
                 if together[w] != 0:
-                    p, speed = relative(p)
-                r, _ = closest(corners(x, nodes) + real(0.5) * p)
+                    p, speed = relative(y, p)
+                r, _ = closest(y + real(0.5) * p)
                 allowed = thickness(sides, k, l) + reach + real(HALF) * speed
                 if wp.dot(r, r) <= allowed * allowed:
                     slot = wp.atomic_add(found, 0, 1)

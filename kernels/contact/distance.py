@@ -13,7 +13,10 @@ import warp as wp
 
 @cache
 def distance_functions(real):
-    """segments(a0, a1, b0, b1), point_triangle(p, a, b, c) and edge_point(a, b, p, .) -> r, w; no position needs to be distinct."""
+    """segments(a0, a1, b0, b1), point_triangle(p, a, b, c), edge_point(a, b, p, .) -> r, w; no position needs to be distinct.
+
+    point_plane(p, a, b, c) -> r, w of the half-space behind the plane, zero inside of it.
+    """
     X, W = wp.types.vector(3, real), wp.types.vector(4, real)
 
     @wp.func
@@ -66,4 +69,12 @@ def distance_functions(real):
         s = share(p, a, b - a)
         return a + s * (b - a) - p, W(real(1.0) - s, s, real(-1.0), real(0.0))
 
-    return segments, point_triangle, edge_point
+    @wp.func
+    def point_plane(p: X, a: X, b: X, c: X):
+        u, v, w = b - a, c - a, p - a
+        n = wp.cross(u, v)
+        square = wp.dot(n, n)
+        at_b, at_c = wp.dot(wp.cross(w, v), n) / square, wp.dot(wp.cross(u, w), n) / square
+        return wp.max(wp.dot(w, n), real(0.0)) / square * n, W(real(1.0), at_b + at_c - real(1.0), -at_b, -at_c)
+
+    return segments, point_triangle, edge_point, point_plane

@@ -38,7 +38,7 @@ def impact_functions(kind: Kind, real):
     @wp.func
     def impact(x: Y, p: Y, thickness: real):
         """In [0, 1], or 2 where there is none; zero where the pair overlaps at the start."""
-        q, speed = relative(p)
+        q, speed = relative(x, p)
         gap = distance(x, q, real(0.0)) - thickness
         if gap <= real(0.0):
             return real(0.0)
@@ -60,7 +60,7 @@ def impact_functions(kind: Kind, real):
     @wp.func
     def meet(x: Y, p: Y):
         """Whether two come together on their way, or can not be told to stay apart."""
-        q, speed = relative(p)
+        q, speed = relative(x, p)
         size = speed + wp.length(x[1] - x[0]) + wp.length(x[2] - x[1]) + wp.length(x[3] - x[2])
         least, t = real(touching) * size, real(0.0)
         for _ in range(wp.static(PATIENCE)):

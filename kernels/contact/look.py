@@ -29,7 +29,7 @@ def look_kernel(kind: Kind, real):
         w = pairs[p][0] / sides.counts[0]
         i, j = pairs[p][0] - w * sides.counts[0], pairs[p][1] - w * sides.counts[1]
         nodes = slots(sides, i, j, w)
-        r, weights = closest(x, nodes)
+        r, weights = closest(wp.matrix_from_rows(x[nodes[0]], x[nodes[1]], x[nodes[2]], x[nodes[3]]))
         gap_out[p] = wp.length(r) - thickness(sides, i, j)
         point = real(-0.5) * r
         force = X()

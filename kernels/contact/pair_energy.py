@@ -47,6 +47,8 @@ def distance_function(kind: Kind, real):
     """near(x) -> (w, d, n): weights, length and direction of what is between the closest points."""
     if kind == EDGE_POINT:
         return _edge_point(real)
+    if kind.endless:
+        return _point_plane(real)
     X, W, V = shape_types(real)
     Q = wp.types.vector(9, real)
     closest_of = closest_points.edge_edge if kind == EDGES else closest_points.point_triangle
@@ -62,6 +64,25 @@ def distance_function(kind: Kind, real):
         r = a * rho[0] + b * rho[1] + c * rho[2]
         d = wp.length(r)
         return W(-rho[0], rho[0] - rho[1], rho[1] - rho[2], rho[2]), d, r / wp.max(d, tiny)
+
+    return near
+
+
+def _point_plane(real):
+    """The same of a half-space, with a distance that is below zero inside of it."""
+    X, W, _ = shape_types(real)
+
+    @wp.func
+    def near(x: X):
+        u = x[2] - x[1]
+        v = x[3] - x[1]
+        r = x[0] - x[1]
+        normal = wp.cross(u, v)
+        size = wp.length(normal)
+        n = normal / size
+        b = wp.dot(wp.cross(r, v), n) / size
+        c = wp.dot(wp.cross(u, r), n) / size
+        return W(real(1.0), b + c - real(1.0), -b, -c), wp.dot(r, n), n
 
     return near
 

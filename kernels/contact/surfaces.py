@@ -3,7 +3,7 @@
 Two surfaces that are piecewise straight and flat meet for the first time where an edge meets an edge or a point meets a triangle. So
 edges are paired with edges and points with triangles; the edges of rods are among the edges beside those of triangles, the nodes of
 rods among the points. Balls are points with a radius of their own, which edges of rods are paired with; triangles meet them as they
-meet all points. Indices of things and nodes count all worlds, one world after the other, each alike.
+meet all points. Half-spaces are met by points alone. Indices of things and nodes count all worlds, one world after the other, each alike.
 """
 
 from dataclasses import dataclass
@@ -18,18 +18,20 @@ from ddg_warp.kernels.contact.distance import distance_functions
 class Kind:
     """A kind of pairs: nodes of the first and of the second thing. Of equal things each pair is taken once, the smaller index first.
 
-    Pairs have four slots for nodes; where there are fewer, the last one is repeated, without weight.
+    Pairs have four slots for nodes; where there are fewer, the last one is repeated, without weight. The second thing may be
+    `endless`: the half-space behind the plane through three nodes, each 1 m from the first.
     """
 
     first: int
     second: int
+    endless: bool = False
 
     @property
     def alike(self) -> bool:
         return self.first == self.second
 
 
-EDGES, POINT_TRIANGLE, EDGE_POINT = Kind(2, 2), Kind(1, 3), Kind(2, 1)
+EDGES, POINT_TRIANGLE, EDGE_POINT, POINT_PLANE = Kind(2, 2), Kind(1, 3), Kind(2, 1), Kind(1, 3, True)
 
 
 @cache
@@ -86,7 +88,7 @@ def pair_functions(kind: Kind, real):
     Sides, N, Y = sides_struct(real), wp.types.vector(4, int), wp.types.matrix((4, 3), real)
     S, count = wp.types.vector(4, real), kind.first
     used = kind.first + kind.second
-    measure = dict(zip((EDGES, POINT_TRIANGLE, EDGE_POINT), distance_functions(real), strict=True))[kind]
+    measure = dict(zip((EDGES, POINT_TRIANGLE, EDGE_POINT, POINT_PLANE), distance_functions(real), strict=True))[kind]
 
     @wp.func
     def slots(sides: Sides, i: int, j: int, w: int):

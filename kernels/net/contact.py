@@ -95,7 +95,7 @@ def world_kernels(real):
 @cache
 def block_kernels(real, linear, serial: bool):
     """gain(...) by a motion, differ(...) of positions; settle(...) a product, lessen(...) the residual by it; aim(...), push(...) and
-    arrive(...) of supports."""
+    arrive(...) of supports; stay(...) of worlds that do not move."""
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     _, free = product_functions(linear)
     share, until = share_function(serial), until_function(serial)
@@ -212,7 +212,15 @@ def block_kernels(real, linear, serial: bool):
                     flags[DRIVEN, w] = wp.static(ON_THE_WAY)
         q[k + w * blocks] = x
 
-    return gain, differ, settle, lessen, aim, push, arrive
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def stay(q: wp.array(dtype=V), modes: wp.array(dtype=int), blocks: int, base: wp.array(dtype=V)):
+        """What does not move starts from where it is."""
+        w, start = share(wp.tid(), blocks)
+        if modes[w] == wp.static(NONE):
+            for k in range(start, until(start, blocks)):
+                base[k + w * blocks] = q[k + w * blocks]
+
+    return gain, differ, settle, lessen, aim, push, arrive, stay
 
 
 @cache

@@ -7,10 +7,10 @@ from ddg_warp import arrays
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels.contact.impact import impact_kernel
 from ddg_warp.kernels.contact.motion import motion_kernels
-from ddg_warp.kernels.contact.surfaces import EDGE_POINT, EDGES, POINT_TRIANGLE
+from ddg_warp.kernels.contact.surfaces import EDGE_POINT, EDGES, POINT_PLANE, POINT_TRIANGLE
 from ddg_warp.solve.contact.motion_filter import MotionFilter
 from ddg_warp.solve.contact.pairs import PairList
-from ddg_warp.solve.contact.shapes import BALLS, Shapes
+from ddg_warp.solve.contact.shapes import BALLS, PLANES, Shapes
 from ddg_warp.solve.contact.tree import Things
 
 SLACK = 1e-3  # of the margin, by which a search goes beyond it, for rounding
@@ -69,12 +69,11 @@ class BroadPhase:
         self._motion = motion_kernels(real, arrays.serial(self.device))
         self.rebuild(x)
         grouped = worlds > 1
-        sides = (
-            [(EDGES, 2, 2)] + [(POINT_TRIANGLE, 1, 3)] * (3 in things) + [(EDGE_POINT, 2, BALLS)] * (BALLS in things)
-        )
+        sides = (EDGES, 2, 2), (POINT_TRIANGLE, 1, 3), (EDGE_POINT, 2, BALLS), (POINT_PLANE, 1, PLANES)
         self.lists = [
             PairList(kind, things[first], things[second], shapes, grouped, real, self.overflow)
             for kind, first, second in sides
+            if second in things
         ]
         self._impacts, self._passes = (
             [impact_kernel(pairs.kind, grouped, passing, real) for pairs in self.lists] for passing in (False, True)

@@ -4,12 +4,12 @@ import numpy as np
 
 from ddg_warp.errors import SceneError
 
-BALLS = 0  # in place of a number of nodes: the points that are balls
+BALLS, PLANES = 0, -1  # in place of a number of nodes: the points that are balls, the planes of half-spaces
 FLAT = 1e-12  # area of a triangle over the square of its longest edge, below which it has none
 
 
 class Shapes:
-    """Rods, shells and balls over the nodes of one world, numbered as they are added.
+    """Rods, shells, balls and half-spaces over the nodes of one world, numbered as they are added.
 
     No two objects that are `still` are a pair, nor is such an object with itself: obstacles, at rest or moved from outside.
 
@@ -26,7 +26,7 @@ class Shapes:
             raise SceneError("points of a contact search have to be finite, of shape (n, 3)")
         self.names: list[str] = []
         self.obstacle: set[int] = set()
-        self._parts: dict[int, list] = {1: [], 2: [], 3: [], BALLS: []}
+        self._parts: dict[int, list] = {1: [], 2: [], 3: [], BALLS: [], PLANES: []}
         self._ignored: set[tuple[int, int]] = set()
 
     def rod(
@@ -51,7 +51,7 @@ class Shapes:
         Raises:
             SceneError: names the rod, the edge or node, and the remedy.
         """
-        name = f"rod '{name}'" if name else f"rod {len(self.names)}"
+        name = name or f"rod {len(self.names)}"
         nodes = self._checked(nodes, 1, name)
         if len(nodes) < 2 + closed:
             raise SceneError(f"{name} has {len(nodes)} nodes; it needs at least {2 + closed}")
@@ -75,7 +75,7 @@ class Shapes:
         Raises:
             SceneError: names the shell, the triangle, and the remedy.
         """
-        name = f"shell '{name}'" if name else f"shell {len(self.names)}"
+        name = name or f"shell {len(self.names)}"
         triangles = self._checked(triangles, 2, name)
         self._positive(thickness, "thickness", name)
         if triangles.shape[1:] != (3,) or not len(triangles):
@@ -96,10 +96,25 @@ class Shapes:
         Raises:
             SceneError: names the ball and the remedy.
         """
-        name = f"ball '{name}'" if name else f"ball {len(self.names)}"
+        name = name or f"ball {len(self.names)}"
         nodes = self._checked([node], 1, name)[:, None]
         self._positive(radius, "radius", name)
         return self._add(name, radius, {1: nodes, BALLS: nodes}, np.zeros((0, 4)), still)
+
+    def plane(self, nodes, *, name: str | None = None) -> int:
+        """Add the half-space behind the plane through three nodes, counter-clockwise as seen from outside; returns its number.
+
+        It is still, as `Shapes` says. The second and the third node are 1 m from the first, whatever moves them.
+
+        Raises:
+            SceneError: names the plane and the remedy.
+        """
+        name = name or f"plane {len(self.names)}"
+        nodes = self._checked(nodes, 1, name)
+        arms = np.linalg.norm(self.points[nodes[1:]] - self.points[nodes[:1]], axis=1) if len(nodes) == 3 else np.zeros(2)
+        if np.abs(arms - 1.0).max() > 1e-6:
+            raise SceneError(f"{name}: it takes three nodes, the second and the third 1 m from the first")
+        return self._add(name, 0.0, {PLANES: nodes[None]}, np.zeros((0, 4)), still=True)
 
     def ignore(self, first: int, second: int) -> None:
         """Two objects pass through each other; an object and itself: it has no contact with itself.
@@ -122,10 +137,17 @@ class Shapes:
     @property
     def sizes(self) -> list[int]:
         """Numbers of nodes of the things that pairs need: edges, points and triangles where there are triangles, and `BALLS`."""
-        return ([1, 2, 3] if self._parts[3] else [2]) + [BALLS] * bool(self._parts[BALLS])
+        known = self._parts
+        return [
+            *[1] * bool(known[3] or known[PLANES]),
+            2,
+            *[3] * bool(known[3]),
+            *[BALLS] * bool(known[BALLS]),
+            *[PLANES] * bool(known[PLANES]),
+        ]
 
     def things(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Points, edges or triangles by their number of nodes, or `BALLS`: nodes (n, size), radius, object (n,), span (n, 4) of edges.
+        """Points, edges or triangles by their number of nodes, `BALLS` or `PLANES`: nodes, radius, object (n,), span (n, 4) of edges.
 
         Raises:
             SceneError: if neither rods nor shells were added.
@@ -141,7 +163,7 @@ class Shapes:
         """A thing of a world as a message has it."""
         for nodes, _, number, _ in self._parts[size]:
             if index < len(nodes):
-                if size == BALLS:
+                if size <= 0:
                     return f"{self.names[number]} (node {nodes[index, 0]})"
                 kind = ("point", "edge", "triangle")[size - 1]
                 return f"{kind} {index} of {self.names[number]} (nodes {', '.join(map(str, nodes[index]))})"

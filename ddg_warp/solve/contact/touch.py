@@ -58,7 +58,7 @@ class Touch:
         """Candidates at blocks x, after `at`.
 
         Returns:
-            world: (n,); sizes, things: numbers of nodes of both, 1 to 3, and what number they have in a world (n, 2).
+            world: (n,); sizes, things: numbers of nodes of both (see `Shapes.things`), and what number they have in a world (n, 2).
             gap: (n,) [m]; point: between the closest points (n, 3) [m]; force: on the first of both (n, 3) [N].
         """
         found = [self._pairs(*each, x) for each in zip(self.search.lists, self.terms.lists, strict=True)]
@@ -75,7 +75,7 @@ class Touch:
         i, j = pairs.pairs.numpy()[:count].reshape(-1, 2).T
         return {
             "world": i // pairs.first.count,
-            "sizes": np.broadcast_to([pairs.kind.first, pairs.kind.second], (count, 2)),
+            "sizes": np.broadcast_to([pairs.first.size, pairs.second.size], (count, 2)),
             "things": np.column_stack([i % pairs.first.count, j % pairs.second.count]),
             "gap": gap.numpy(),
             "point": point.numpy().reshape(-1, 3),
@@ -98,17 +98,16 @@ def shapes_of(host) -> Shapes:
     """What may touch among the blocks of a net."""
     given, shapes = host.touching, Shapes(host.rest)
     for body in given.bodies:
-        options = {"name": body.label, "still": body.still}
-        if body.kind == CAPSULE:
-            shapes.rod(body.nodes, body.radius, apart=0.0, **options)
+        given_too = {"name": body.label, "still": body.still}
+        if body.kind == PLANE:
+            shapes.plane(body.nodes, name=body.label)
         elif body.kind == MESH:
-            shapes.shell(body.cells, 2.0 * body.radius, **options)
+            shapes.shell(body.cells, 2.0 * body.radius, **given_too)
         elif body.kind == BALL:
-            shapes.ball(int(body.nodes[0]), body.radius, **options)
-        elif body.kind == PLANE:
-            shapes.plane(body.nodes, **options)
+            shapes.ball(int(body.nodes[0]), body.radius, **given_too)
         else:
-            shapes.rod(body.nodes, body.radius, closed=body.closed, apart=given.law.apart, **options)
+            apart = 0.0 if body.kind == CAPSULE else given.law.apart
+            shapes.rod(body.nodes, body.radius, closed=body.closed, apart=apart, **given_too)
     for g, h in given.ignored:
         for one in np.flatnonzero(given.group == g):
             for other in np.flatnonzero(given.group == h):

@@ -6,10 +6,11 @@ import warp as wp
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.contact.boxes import box_kernel
 from ddg_warp.kernels.contact.surfaces import surface_struct
+from ddg_warp.solve.contact.shapes import PLANES
 
 
 class Things:
-    """Points, edges, triangles or balls of `shapes`, with boxes; `tree` is there where things are searched for.
+    """Points, edges, triangles, balls or planes of `shapes`, with boxes; `tree` is there where things are searched for.
 
     Attributes:
         count: in one world; all: in all; surface: see `surface_struct`; lower, upper: of boxes (all,).
@@ -30,7 +31,7 @@ class Things:
         self.surface.nodes_a_world = len(shapes.points)
         self.lower, self.upper = (wp.zeros(self.all, dtype=wp.vec3, device=device) for _ in range(2))
         self.tree, self.device = None, device
-        self.kernel = box_kernel(nodes.shape[1], real)
+        self.kernel = box_kernel(nodes.shape[1], size == PLANES, real)
         self._worlds = worlds
 
     def enclose(self, x, move, shift, share: float, more: float, lost) -> None:

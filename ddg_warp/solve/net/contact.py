@@ -59,7 +59,7 @@ class NetContact:
         made = contact.world_kernels(real)
         self._account, self._find_modes, self._find_predicted, self._depart, self._expect, self._refuse = made
         made = contact.block_kernels(real, linear, arrays.serial(device))
-        self._differ_gain, self._differ, self._settle, self._lessen, self._aim, self._push, self._arrive = made
+        self._differ_gain, self._differ, self._settle, self._lessen, self._aim, self._push, self._arrive, self._stay = made
         self._sum = Sums(worlds, newton.dots.shape[1], real, device)
         self._stiffen = None
 
@@ -102,7 +102,7 @@ class NetContact:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         own = [self._account, self._find_modes, self._find_predicted, self._depart, self._expect, self._refuse]
-        own += [self._differ_gain, self._differ, self._settle, self._lessen, self._aim, self._push, self._arrive]
+        own += [self._differ_gain, self._differ, self._settle, self._lessen, self._aim, self._push, self._arrive, self._stay]
         own += [self._stiffen] if self._stiffen else []
         return [*own, *self._sum.kernels, *self.search.kernels, *self.terms.kernels]
 
@@ -129,6 +129,7 @@ class NetContact:
         """Energies, forces and factors at the iterate."""
         self.search.update(self.newton.q)
         self.terms.evaluate(self.newton.q, self.newton.islands.rate if self.rubs else None)
+        self.terms.blocks()
 
     def account(self, change: wp.array, noise: wp.array) -> None:
         """Add to the change of the energy of worlds, and to its rounding."""
@@ -138,7 +139,6 @@ class NetContact:
     def assemble(self) -> None:
         """Its own part in the preconditioner."""
         newton = self.newton
-        self.terms.blocks()
         if chains := newton.chains:
             inputs = [chains.bands, chains.layout, self._ahead, self._edges, newton.islands.arrays[0]]
             inputs += [self.net.blocks, self.diagonal, self.terms.between]
@@ -184,7 +184,8 @@ class NetContact:
 
     def _hold(self) -> None:
         newton = self.newton
-        self.search.filter(newton.base, newton.q, self._unit, self._units, self._modes, keep=self.touch.keep)
+        self._sweep(self._stay, [newton.q, self._modes, self.net.blocks], [newton.base])
+        self.search.filter(newton.base, newton.q, self._unit, self._modes, self._units, self.touch.keep)
         if len(self._nodes):
             eps = ROUNDING * newton.eps
             inputs = [self._nodes, self._aims, newton.fixed, self._modes, eps, self.net.blocks, newton.q]
