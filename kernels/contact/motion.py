@@ -23,27 +23,23 @@ def corners_function(real):
 
 
 @cache
-def approach_functions(kind: Kind, real):
-    """fastest(p): how far two sides may approach whose nodes move by p (4, 3); relative(p) -> p less its mean, `fastest` of that."""
+def relative_function(kind: Kind, real):
+    """relative(p) -> displacements p (4, 3) less their mean, and how far the sides may approach by them."""
     Y, first = wp.types.matrix((4, 3), real), kind.first
-
-    @wp.func
-    def fastest(p: Y):
-        one, other = real(0.0), real(0.0)
-        for k in range(4):
-            if k < wp.static(first):
-                one = wp.max(one, wp.length(p[k]))
-            else:
-                other = wp.max(other, wp.length(p[k]))
-        return one + other
 
     @wp.func
     def relative(p: Y):
         mean = real(0.25) * (p[0] + p[1] + p[2] + p[3])
         q = wp.matrix_from_rows(p[0] - mean, p[1] - mean, p[2] - mean, p[3] - mean)
-        return q, fastest(q)
+        one, other = real(0.0), real(0.0)
+        for k in range(4):
+            if k < wp.static(first):
+                one = wp.max(one, wp.length(q[k]))
+            else:
+                other = wp.max(other, wp.length(q[k]))
+        return q, one + other
 
-    return fastest, relative
+    return relative
 
 
 @cache
