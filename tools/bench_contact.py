@@ -1,13 +1,15 @@
-"""Times the search for contact: strands packed as in a braid of straight fibres, by a tree of boxes and by a hash grid.
+"""Times the search for contact, by a tree of boxes and by a hash grid, and the filter of motions: strands packed as in a braid.
 
     python tools/bench_contact.py [--device cuda:0] [--quick] [--out DIR]
 
 Strands of 64 edges lie side by side, waved by less than they are apart, so that an edge has about 1.5 others within reach. Prints a
-table; writes contact_search_DEVICE.csv and .json. `rebuild`, `refit`, `search` (boxes, tree and list of pairs) and `bound` are parts
-of `BroadPhase`; `watch` is what a step pays where the last search still holds. `grid` is a `wp.HashGrid` of the edges' middles, built
-and asked for the same pairs, which are counted only. `moved` is a search after strands have moved by ten times their distance, with a
-tree built there; `moved_refit` with that from before. On CUDA the parts are captured graphs, timed by events; on the CPU the clock is
-that of this process.
+table; writes contact_search_DEVICE.csv and .json. `rebuild`, `refit`, `search` (boxes, tree and list of pairs) and `measure` are parts
+of `BroadPhase`; `watch` is what a step pays where the last search still holds. `filter` shortens motions, each strand's own, within
+what the last search allows for; `far` does for motions of five margins, `common` for one of fifty that all share beside motions of a
+tenth of a margin, both with the search along the way. `limited` is the share of strands that are shortened. `grid` is a `wp.HashGrid`
+of the edges' middles, built and asked for the same pairs, which are counted only. `moved` is a search after strands have moved by ten
+times their distance, with a tree built there; `moved_refit` with that from before. On CUDA the parts are captured graphs, timed by
+events; on the CPU the clock is that of this process.
 """
 
 import argparse
@@ -19,6 +21,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
+from ddg_warp.kernels.contact.motion import corners_function
 from ddg_warp.kernels.contact.surfaces import EDGES, pair_functions, sides_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS
 from ddg_warp.run.summary import machine, table, write_table
@@ -49,6 +52,7 @@ def grid_kernels(real):
     """middles(...) of edges and count(...) of pairs through a hash grid of them."""
     Sides, X = sides_struct(real), wp.types.vector(3, real)
     slots, may_touch, thickness, closest = pair_functions(EDGES, real)
+    corners = corners_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def middles(sides: Sides, x: wp.array(dtype=X), middle: wp.array(dtype=wp.vec3)):
@@ -70,7 +74,7 @@ def grid_kernels(real):
         query = wp.hash_grid_query(grid, middle[i], cell)
         while wp.hash_grid_query_next(query, j):
             if may_touch(sides, i, j):
-                r, _ = closest(x, slots(sides, i, j, 0))
+                r, _ = closest(corners(x, slots(sides, i, j, 0)))
                 allowed = thickness(sides, i, j) + reach
                 if wp.dot(r, r) <= allowed * allowed:
                     wp.atomic_add(pairs, 0, 1)
@@ -112,9 +116,10 @@ def measure(edges: int, device, repeats: int) -> dict:
         "rebuild_ms": clocked(device, lambda: search.rebuild(x), repeats),
         "refit_ms": clocked(device, pairs.second.tree.refit, repeats),
         "search_ms": clocked(device, lambda: search.search(x), repeats),
-        "bound_ms": clocked(device, lambda: search.bound(x), repeats),
+        "measure_ms": clocked(device, lambda: search.measure(x), repeats),
         "watch_ms": clocked(device, lambda: search.update(x), repeats),
     }
+    row |= _filtered(search, x, repeats)
     middle = wp.zeros(number, dtype=wp.vec3, device=device)
     middles, count = grid_kernels(search.real)
     grid, total = wp.HashGrid(128, 128, 128, device=device), wp.zeros(1, dtype=int, device=device)
@@ -144,18 +149,45 @@ def measure(edges: int, device, repeats: int) -> dict:
     return row | {"moved_refit_ms": _by_refit(search, points, x, device)}
 
 
+def _filtered(search: BroadPhase, x, repeats: int) -> dict:
+    """Times of filters, pairs that they need, and the share of strands that they shorten."""
+    device, strands = search.device, len(search.shapes.names)
+    unit = wp.array(np.repeat(np.arange(strands), EDGES_A_ROD + 1), dtype=int, device=device)
+    rng, base, row = np.random.default_rng(2), x.numpy(), {}
+    own = np.repeat(MARGIN * rng.normal(size=(strands, 3)), EDGES_A_ROD + 1, axis=0)
+    common = 50.0 * MARGIN * np.array([0.0, 0.6, 0.8])
+    for name, move, together in (("filter", 0.1 * own, 0), ("far", 5.0 * own, 0), ("common", 0.1 * own + common, 1)):
+        wish, q = wp.array(base + move, dtype=x.dtype, device=device), wp.empty_like(x)
+        flags = wp.full(1, together, dtype=int, device=device)
+
+        def part(wish=wish, q=q, flags=flags):
+            wp.copy(q, wish)
+            search.filter(x, q, unit, flags, strands)
+
+        part()
+        while search.fit(x):
+            part()
+        row[f"{name}_ms"] = clocked(device, part, repeats)
+        if name != "filter":
+            row[f"{name}_pairs"] = int(search.lists[0].count.numpy()[0])
+        row[f"{name}_limited"] = int(search.limited.numpy()[0]) / strands
+    search.search(x)
+    return row
+
+
 def _by_refit(search: BroadPhase, points, x, device) -> float:
     """Of a search at x with a tree that was built at `points`."""
     pairs, place = search.lists[0], x.numpy().copy()
     x.assign(points)
     search.rebuild(x)
     x.assign(place)
-    still, lost, within = wp.zeros_like(x), wp.zeros(1, dtype=int, device=device), REACH + 1.001 * MARGIN
+    still, shift, within = wp.zeros_like(x), wp.zeros(1, dtype=x.dtype, device=device), REACH + 1.001 * MARGIN
+    never, lost = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
 
     def part():
-        pairs.second.enclose(x, still, 1.0, 0.5 * within, lost)
+        pairs.second.enclose(x, still, shift, 1.0, 0.5 * within, lost)
         pairs.second.tree.refit()
-        pairs.search(x, within)
+        pairs.search(x, still, never, within)
 
     return clocked(device, part, 1)
 

@@ -1,8 +1,9 @@
 """Pairs that are near: found through a tree of boxes, judged by their distance, listed in the order of their indices.
 
-Of a motion those are found that may come near anywhere on the way. A node that moves by m stays within |m| / 2 of the middle of its
-way, whatever its share of it, and a distance changes by no more than the fastest nodes of both sides together. Where a world moves
-at one share, m is what a node moves by beside the others of the pair, and boxes move with the world.
+Of a motion those are found that may come near anywhere on the way. Whatever its share of its way, each node is between both ends of
+it; so the sides are as far apart as these ends are along any direction. The one asked is that of the closest points in the middle of
+the way, along which what does not move is as far apart as its distance. Where a world moves at one share, ways are what nodes move by
+beside the others of the pair, and boxes move with the world.
 
 Each thing notes its partners in a linked list, whose entries come from one counter; running sums then say where its part of the list
 of pairs starts. So two runs give the same list to the bit, whatever order threads run in, and a list that does not fit is left out
@@ -13,12 +14,11 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.contact.motion import approach_functions, corners_function
+from ddg_warp.kernels.contact.motion import corners_function, relative_function
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
 MOST = 2**31 - 1  # pairs that can be counted; more are told as so many
-HALF = 0.500001  # with rounding of float32
 
 
 @cache
@@ -40,10 +40,28 @@ def query_function(grouped: bool, real):
 @cache
 def candidate_kernels(kind: Kind, grouped: bool, real):
     """find(...) partners and fill(...) the list of pairs."""
-    Sides, X = sides_struct(real), wp.types.vector(3, real)
+    Sides, X, Y = sides_struct(real), wp.types.vector(3, real), wp.types.matrix((4, 3), real)
     slots, may_touch, thickness, closest = pair_functions(kind, real)
-    begin, corners = query_function(grouped, real), corners_function(real)
-    fastest, relative = approach_functions(kind, real)
+    begin, corners, relative = query_function(grouped, real), corners_function(real), relative_function(kind, real)
+    half, tiny = wp.constant(real(0.5)), wp.constant(real(1.0e-30))
+
+    @wp.func
+    def apart(x: Y, p: Y):
+        """Distance that two keep whose nodes go any share of p."""
+        y = x + half * p
+        r, _ = closest(y)
+        if wp.static(kind.endless):
+            _q, speed = relative(y, p)
+            return wp.length(r) - half * speed
+        n = r / wp.max(wp.length(r), tiny)
+        first, second = real(wp.inf), real(-wp.inf)
+        for k in range(4):
+            at, off = wp.dot(n, y[k] - y[0]), half * wp.abs(wp.dot(n, p[k]))
+            if k < wp.static(kind.first):
+                first = wp.min(first, at - off)
+            else:
+                second = wp.max(second, at + off)
+        return first - second
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def find(
@@ -67,12 +85,9 @@ def candidate_kernels(kind: Kind, grouped: bool, real):
             if may_touch(sides, k, l):
                 nodes = slots(sides, k, l, w)
                 y, p = corners(x, nodes), corners(move, nodes)
-                speed = fastest(y, p)
                 if together[w] != 0:
-                    p, speed = relative(y, p)
-                r, _ = closest(y + real(0.5) * p)
-                allowed = thickness(sides, k, l) + reach + real(HALF) * speed
-                if wp.dot(r, r) <= allowed * allowed:
+                    p, _speed = relative(y, p)
+                if apart(y, p) <= thickness(sides, k, l) + reach:
                     slot = wp.atomic_add(found, 0, 1)
                     number += 1
                     if slot < partner.shape[0]:

@@ -11,7 +11,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.contact.candidates import query_function
-from ddg_warp.kernels.contact.motion import approach_functions, corners_function
+from ddg_warp.kernels.contact.motion import corners_function, relative_function
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
@@ -26,7 +26,7 @@ def impact_functions(kind: Kind, real):
     """impact(x, p, thickness) -> time; meet(x, p) -> whether two without thickness do. x, p: positions, displacements of the nodes."""
     Y = wp.types.matrix((4, 3), real)
     *_, closest = pair_functions(kind, real)
-    _, relative = approach_functions(kind, real)
+    relative = relative_function(kind, real)
     # of eight digits or sixteen, those that a distance keeps
     touching = TOUCHING if real is wp.float64 else 1e3 * TOUCHING
 

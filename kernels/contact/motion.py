@@ -23,38 +23,38 @@ def corners_function(real):
 
 
 @cache
-def approach_functions(kind: Kind, real):
-    """fastest(x, p): how far two sides at x may approach whose nodes move by p (4, 3); relative(x, p) -> p less its mean, `fastest` of that.
+def relative_function(kind: Kind, real):
+    """relative(x, p) -> displacements p (4, 3) of nodes at x less their mean, and how far the sides may approach by them.
 
-    Where a half-space turns, its plane moves by more than its nodes, which are 1 m apart: by S more for each metre, S what they move by
+    Where a half-space turns, its plane moves by more than its nodes, which are 1 m apart: for each metre by S more, S what they move by
     beside each other.
     """
     Y, first = wp.types.matrix((4, 3), real), kind.first
     *_, closest = pair_functions(kind, real)
 
     @wp.func
-    def fastest(x: Y, p: Y):
+    def approach(x: Y, q: Y):
         if wp.static(kind.endless):
             _r, w = closest(x)
-            near = p[0] * w[0] + p[1] * w[1] + p[2] * w[2] + p[3] * w[3]
-            turn = wp.max(wp.length(p[2] - p[1]), wp.length(p[3] - p[1]))
-            return wp.length(near) + real(2.0) * turn * (wp.length(p[0] - p[1]) + turn)
+            turn = wp.max(wp.length(q[2] - q[1]), wp.length(q[3] - q[1]))
+            near = wp.length(q[0] * w[0] + q[1] * w[1] + q[2] * w[2] + q[3] * w[3])
+            return near + real(2.0) * turn * (wp.length(q[0] - q[1]) + turn)
         else:
             one, other = real(0.0), real(0.0)
             for k in range(4):
                 if k < wp.static(first):
-                    one = wp.max(one, wp.length(p[k]))
+                    one = wp.max(one, wp.length(q[k]))
                 else:
-                    other = wp.max(other, wp.length(p[k]))
+                    other = wp.max(other, wp.length(q[k]))
             return one + other
 
     @wp.func
     def relative(x: Y, p: Y):
         mean = real(0.25) * (p[0] + p[1] + p[2] + p[3])
         q = wp.matrix_from_rows(p[0] - mean, p[1] - mean, p[2] - mean, p[3] - mean)
-        return q, fastest(x, q)
+        return q, approach(x, q)
 
-    return fastest, relative
+    return relative
 
 
 @cache
