@@ -28,6 +28,7 @@ if TYPE_CHECKING:  # what editors and type checkers read; at run time see `_HOME
     from ddg_warp.scene.grip import Grip
     from ddg_warp.scene.material import Circle, Ellipse, Material, Rectangle, Ribbon, Stiffness
     from ddg_warp.scene.motion import Motion
+    from ddg_warp.scene.obstacles import Box, Capsule, Mesh, Plane, Sphere
     from ddg_warp.scene.path import Displacement, Stop
     from ddg_warp.scene.scene import Scene
     from ddg_warp.solve import continuation, stability, statics
@@ -35,6 +36,8 @@ if TYPE_CHECKING:  # what editors and type checkers read; at run time see `_HOME
 
 __version__ = "0.1.0"
 __all__ = [
+    "Box",
+    "Capsule",
     "Check",
     "Circle",
     "Controls",
@@ -46,8 +49,10 @@ __all__ = [
     "Integrator",
     "Law",
     "Material",
+    "Mesh",
     "Model",
     "Motion",
+    "Plane",
     "Recorder",
     "Rectangle",
     "Ribbon",
@@ -55,6 +60,7 @@ __all__ = [
     "SceneError",
     "SceneWarning",
     "SolverError",
+    "Sphere",
     "State",
     "Statics",
     "Stiffness",
@@ -72,6 +78,8 @@ __all__ = [
 ]
 
 _HOME = {
+    "Box": "scene.obstacles",
+    "Capsule": "scene.obstacles",
     "Check": "run.check",
     "Circle": "scene.material",
     "Controls": "model.controls",
@@ -83,8 +91,10 @@ _HOME = {
     "Integrator": "solve.dynamics",
     "Law": "scene.descriptions",
     "Material": "scene.material",
+    "Mesh": "scene.obstacles",
     "Model": "model.model",
     "Motion": "scene.motion",
+    "Plane": "scene.obstacles",
     "Recorder": "run.record",
     "Rectangle": "scene.material",
     "Ribbon": "scene.material",
@@ -92,6 +102,7 @@ _HOME = {
     "SceneError": "errors",
     "SceneWarning": "errors",
     "SolverError": "errors",
+    "Sphere": "scene.obstacles",
     "State": "model.state",
     "Statics": "scene.descriptions",
     "Stiffness": "scene.material",

@@ -38,7 +38,7 @@ FLAGS = (
     "reason",  # outcome of the solve that made it be given up
     "bent",  # whether the predictor has to turn edges
     "moved",  # whether this part of it succeeded
-    "driven",  # whether supports that contact holds up moved in the last step of the solve; see `kernels.net.contact`
+    "driven",  # whether supports that contact holds up moved in the last step of the solve; see `kernels.net.touch`
     # in the first column, whether any island is still active, and whether one turns the edges of a step or renews its frames
     "active",
     "turning",

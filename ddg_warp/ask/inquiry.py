@@ -44,7 +44,7 @@ def energies(model, state) -> dict:
 
 @launches
 def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
-    """Force and moment of every support of the scene: those of rods in the order they were added, then of shells, of rings, of obstacles.
+    """Force and moment of every support of the scene: of rods in the order they were added, then of shells, rings and obstacles.
 
     What holds an obstacle takes what is pushed against it, without friction.
     They balance the internal forces and the loads on held dofs, and hold the normals of clamped mesh edges and of planes of

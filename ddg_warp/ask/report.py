@@ -73,9 +73,15 @@ def step_lines(model, errors_of: Callable) -> list[str]:
 def contact_lines(touching) -> list[str]:
     """What may touch, and by which numbers."""
     law, still = touching.law, sum(body.still for body in touching.bodies)
-    numbers = ((touching.range, "range", "m"), (touching.stiffness, "stiffness", "N/m"), (touching.friction, "friction", ""))
+    numbers = (
+        (touching.range, "range", "m"),
+        (touching.stiffness, "stiffness", "N/m"),
+        (touching.friction, "friction", ""),
+    )
     said = (f"{name} {_between(values)}{unit and ' ' + unit}" for values, name, unit in numbers)
-    return [f"contact: {law.law} between {len(touching.bodies) - still} bodies and {still} obstacles, {', '.join(said)}"]
+    return [
+        f"contact: {law.law} between {len(touching.bodies) - still} bodies and {still} obstacles, {', '.join(said)}"
+    ]
 
 
 def contact_terms(touching) -> set[str]:

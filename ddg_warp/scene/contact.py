@@ -188,7 +188,9 @@ def check_contact(scene) -> None:
     if scene.dimension == 2:
         raise SceneError("contact: a scene with contact has dimension 3; leave dimension=2 to scenes without")
     if scene.axisymmetric_shells:
-        raise SceneError(f"contact: shell of revolution 0 ('{scene.axisymmetric_shells[0].name}') can not touch anything")
+        raise SceneError(
+            f"contact: shell of revolution 0 ('{scene.axisymmetric_shells[0].name}') can not touch anything"
+        )
     bodies = {batch.name for batch in scene.batches} | {shell.name for shell in scene.shells}
     names = touching_names(scene) | {obstacle.name for obstacle in scene.obstacles}
     asked = [("objects", name, bodies) for name in scene.touching.objects or ()]
@@ -196,9 +198,7 @@ def check_contact(scene) -> None:
     asked += [("contact_between", name, names) for between in scene.betweens for name in between.names]
     for what, name, known in asked:
         if name not in known:
-            raise SceneError(
-                f"contact: {what} names {name!r}; this scene has {', '.join(map(repr, sorted(known)))}"
-            )
+            raise SceneError(f"contact: {what} names {name!r}; this scene has {', '.join(map(repr, sorted(known)))}")
 
 
 def touching_names(scene) -> set[str]:

@@ -99,7 +99,9 @@ class Mesh:
         if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
             raise SceneError(f"Mesh: points have shape {points.shape}; they are finite, (points, 3) [m]")
         if cells.ndim != 2 or cells.shape[1] != 3 or cells.dtype.kind not in "iu" or not len(cells):
-            raise SceneError(f"Mesh: triangles have shape {cells.shape} of {cells.dtype}; they are whole numbers (T, 3)")
+            raise SceneError(
+                f"Mesh: triangles have shape {cells.shape} of {cells.dtype}; they are whole numbers (T, 3)"
+            )
         for triangle in np.flatnonzero(((cells < 0) | (cells >= len(points))).any(1))[:1]:
             raise SceneError(
                 f"Mesh: triangle {triangle} has corners {cells[triangle]}; vertices are 0 to {len(points) - 1}"
@@ -113,7 +115,7 @@ CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)
 SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
 
 
-def Box(center, half, rotation=None, radius: float = 0.0) -> Mesh:  # noqa: N802, a shape like the others
+def Box(center, half, rotation=None, radius: float = 0.0) -> Mesh:
     """A box about its `center` [m] with half lengths `half` (3,) [m], turned by a `rotation` (3, 3); edges are round with a `radius`."""
     center, half = (np.array(arguments.vector(f"Box: {n}", v)) for n, v in (("center", center), ("half", half)))
     if not (half > 0.0).all():

@@ -14,7 +14,9 @@ LEAST = 1e-30  # so that zero is rounded outwards, too [m]
 
 @cache
 def box_kernel(size: int, endless: bool, real):
-    """Boxes of things with `size` nodes, or around all there is if these are `endless`, inflated by `share` of their radius and `more`, around both x and x + move.
+    """Boxes of things with `size` nodes, or around all there is if these are `endless`.
+
+    They are around both x and x + move, inflated by `share` of the radius and `more`.
 
     From x + move the `shift` of the world is taken.
 

@@ -3,7 +3,8 @@
 Two surfaces that are piecewise straight and flat meet for the first time where an edge meets an edge or a point meets a triangle. So
 edges are paired with edges and points with triangles; the edges of rods are among the edges beside those of triangles, the nodes of
 rods among the points. Balls are points with a radius of their own, which edges of rods are paired with; triangles meet them as they
-meet all points. Half-spaces are met by points alone. Indices of things and nodes count all worlds, one world after the other, each alike.
+meet all points. Half-spaces are met by points alone. Indices of things and nodes count all worlds, one world after the other, each
+alike.
 """
 
 from dataclasses import dataclass

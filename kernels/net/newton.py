@@ -42,7 +42,7 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
 
     Args:
         turns: whether there are rods, whose edges turn; renews: whether there are frames, which may have to be renewed.
-        contact: whether supports may be on their way; see `kernels.net.contact`.
+        contact: whether supports may be on their way; see `kernels.net.touch`.
     """
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     balanced, decide = judge_functions(renews, real, contact)

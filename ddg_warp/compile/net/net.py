@@ -11,6 +11,7 @@ import numpy as np
 
 from ddg_warp.compile import axisymmetric
 from ddg_warp.compile import shells as shell_terms
+from ddg_warp.compile.bodies import Touching
 from ddg_warp.compile.loads import accumulate
 from ddg_warp.compile.net.outwards import Outwards, outwards
 from ddg_warp.compile.precision import float32_error, largest_carried, stiffnesses
@@ -109,7 +110,7 @@ class Net(Storage):
     fixed: np.ndarray
     meridians: list[axisymmetric.NetMeridian] = field(default_factory=list)
     obstacles: list[np.ndarray] = field(default_factory=list)
-    touching: "Touching | None" = None
+    touching: Touching | None = None
     frames: dict[int, np.ndarray] = field(default_factory=dict)
 
     @property

@@ -111,7 +111,9 @@ class Shapes:
         """
         name = name or f"plane {len(self.names)}"
         nodes = self._checked(nodes, 1, name)
-        arms = np.linalg.norm(self.points[nodes[1:]] - self.points[nodes[:1]], axis=1) if len(nodes) == 3 else np.zeros(2)
+        arms = (
+            np.linalg.norm(self.points[nodes[1:]] - self.points[nodes[:1]], axis=1) if len(nodes) == 3 else np.zeros(2)
+        )
         if np.abs(arms - 1.0).max() > 1e-6:
             raise SceneError(f"{name}: it takes three nodes, the second and the third 1 m from the first")
         return self._add(name, 0.0, {PLANES: nodes[None]}, np.zeros((0, 4)), still=True)

@@ -3,7 +3,6 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import arrays
 from ddg_warp.kernels.contact.look import look_kernel
 from ddg_warp.kernels.densities.contact import log_barrier, smooth_penalty
 from ddg_warp.scene.obstacles import BALL, CAPSULE, MESH, PLANE
@@ -89,7 +88,9 @@ class Touch:
         if not len(found["gap"]):
             return np.inf, ""
         k = int(np.argmin(np.where(np.isfinite(found["gap"]), found["gap"], np.inf)))
-        one, other = (self.shapes.describe(*map(int, of)) for of in zip(found["sizes"][k], found["things"][k], strict=True))
+        one, other = (
+            self.shapes.describe(*map(int, of)) for of in zip(found["sizes"][k], found["things"][k], strict=True)
+        )
         world = f" in world {found['world'][k]}" if self.net.worlds > 1 else ""
         return float(found["gap"][k]), f"{one} and {other}{world}"
 

@@ -38,7 +38,9 @@ class Balance:
         else:
             types = int, wp.types.matrix((3, 3), real)
             self._frames = [wp.zeros(0, dtype=dtype, device=net.device) for dtype in types]
-        self.kernels = [balance.balance_kernel(real, linear, drag, newton.contact is not None, arrays.serial(net.device))]
+        self.kernels = [
+            balance.balance_kernel(real, linear, drag, newton.contact is not None, arrays.serial(net.device))
+        ]
 
     def _meeting_of_sets(self):
         """What the elements of each set bring to the blocks."""

@@ -227,7 +227,9 @@ class Chains:
         """Factors of chains and joints of the worlds that want a direction; raises `lost` where one of them is indefinite."""
         self._lost, self._reduced = lost, False
         if not self.reduction:
-            self._launch(self._factorise, self.columns, [self.eliminated, self.count, wanted], [self.factors, lost], SERIAL)
+            self._launch(
+                self._factorise, self.columns, [self.eliminated, self.count, wanted], [self.factors, lost], SERIAL
+            )
         if self.joints:
             self._prepare_joints(matrix, fixed, wanted, lost)
 

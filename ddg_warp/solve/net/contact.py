@@ -1,4 +1,4 @@
-"""Contact within Newton's method on a net; see `kernels.net.contact`, and `solve.contact` for the search and the pairs.
+"""Contact within Newton's method on a net; see `kernels.net.touch`, and `solve.contact` for the search and the pairs.
 
 What is proposed, a predictor or a step, is cut rod by rod before anything passes through anything. Supports and obstacles that move
 are part of what is proposed: what contact holds up comes along with the next directions, which know how far it has yet to go.
@@ -11,7 +11,7 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.net import contact
+from ddg_warp.kernels.net import touch as kernels
 from ddg_warp.solve.contact.touch import Touch
 from ddg_warp.solve.net.system import Sums
 
@@ -32,9 +32,13 @@ class NetContact:
         self.newton, self.net = newton, newton.net
         net, host, real, linear, device = newton.net, newton.net.host, newton.real, newton.linear, newton.device
         if host.frames:
-            raise SceneError("contact: a support on an oblique plane of symmetry does not go with it; use an axis of space")
+            raise SceneError(
+                "contact: a support on an oblique plane of symmetry does not go with it; use an axis of space"
+            )
         if newton.frozen:
-            raise SceneError("contact: solver 'projective' keeps the matrix of a step, which contact changes; use 'newton'")
+            raise SceneError(
+                "contact: solver 'projective' keeps the matrix of a step, which contact changes; use 'newton'"
+            )
         newton.q.assign(np.tile(host.rest, (net.worlds, 1)))
         self.touch = Touch(net, linear, newton.q)
         self.shapes, self.search, self.terms = self.touch.shapes, self.touch.search, self.touch.terms
@@ -56,16 +60,18 @@ class NetContact:
         places = np.concatenate([host.moving[:, 0], host.turning[:, 0]])
         self._nodes = wp.array(places.astype(np.int32), dtype=int, device=device)
         self._aims = make((max(1, len(places)), worlds), net.vector)
-        made = contact.world_kernels(real)
+        made = kernels.world_kernels(real)
         self._account, self._find_modes, self._find_predicted, self._depart, self._expect, self._refuse = made
-        made = contact.block_kernels(real, linear, arrays.serial(device))
-        self._differ_gain, self._differ, self._settle, self._lessen, self._aim, self._push, self._arrive, self._stay = made
+        made = kernels.block_kernels(real, linear, arrays.serial(device))
+        self._differ_gain, self._differ, self._settle, self._lessen, self._aim, self._push, self._arrive, self._stay = (
+            made
+        )
         self._sum = Sums(worlds, newton.dots.shape[1], real, device)
         self._stiffen = None
 
     def bind(self, chains) -> None:
         """Have a part in what chains eliminate, once their plan is made."""
-        self._stiffen = contact.stiffen_kernel(chains.plan.twist, self.newton.linear)
+        self._stiffen = kernels.stiffen_kernel(chains.plan.twist, self.newton.linear)
         self._ahead = arrays.upload(self._edges_ahead(chains.plan), int, self.newton.device)
 
     def _number_units(self, host) -> tuple[wp.array, int]:
@@ -102,7 +108,16 @@ class NetContact:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         own = [self._account, self._find_modes, self._find_predicted, self._depart, self._expect, self._refuse]
-        own += [self._differ_gain, self._differ, self._settle, self._lessen, self._aim, self._push, self._arrive, self._stay]
+        own += [
+            self._differ_gain,
+            self._differ,
+            self._settle,
+            self._lessen,
+            self._aim,
+            self._push,
+            self._arrive,
+            self._stay,
+        ]
         own += [self._stiffen] if self._stiffen else []
         return [*own, *self._sum.kernels, *self.search.kernels, *self.terms.kernels]
 

@@ -59,7 +59,9 @@ class NetStep(PartStep):
         self._kept = [wp.zeros_like(array) for array in self._counts] if solver.contact else []
         self._begin, self._finish = newton.step_kernels(real, self.midpoint, arrays.serial(model.wp_device))
         if solver.contact and self.midpoint:
-            raise SceneError("contact: by the midpoint rule steps end beyond where forces balance, in overlaps; use 'implicit_euler'")
+            raise SceneError(
+                "contact: by the midpoint rule steps end beyond where forces balance, in overlaps; use 'implicit_euler'"
+            )
         self._lagged = model.net.lagged() if model.net.edges else None
         self.drag = NetDrag(model, self.midpoint) if host.drag else None
         self.energy = NetEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None

@@ -1,0 +1,54 @@
+"""What may touch what, and by which numbers."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ddg_warp.scene.contact import Contact
+
+ROD = "rod"
+
+
+@dataclass
+class Body:
+    """A rod, shell or obstacle: nodes, kind, radius [m], name of its group, how messages call it, cells of nodes."""
+
+    nodes: np.ndarray
+    kind: str
+    radius: float
+    name: str
+    label: str
+    cells: np.ndarray | None = None
+    closed: bool = False
+    still: bool = False
+
+
+@dataclass
+class Touching:
+    """Contact of a net.
+
+    Attributes:
+        law: what the scene says; bodies: what may touch, obstacles at last.
+        names: of the groups that numbers are of, one a name; group (bodies,): number of that of each.
+        friction, stiffness [N/m], range [m]: of two groups (groups, groups).
+        ignored: pairs of groups that pass through each other.
+    """
+
+    law: Contact
+    bodies: list[Body]
+    names: list[str]
+    group: np.ndarray
+    friction: np.ndarray
+    stiffness: np.ndarray
+    range: np.ndarray
+    ignored: list[tuple[int, int]] = field(default_factory=list)
+
+    @property
+    def reach(self) -> float:
+        """Largest range [m]."""
+        return float(self.range.max())
+
+    @property
+    def size(self) -> float:
+        """Typical radius of what is not an obstacle [m]."""
+        return float(np.median([body.radius for body in self.bodies if not body.still]))
