@@ -202,6 +202,25 @@ def end_functions(density: Density, real):
 
 
 @cache
+def bend_function(kind: Kind, density: Density, real):
+    """bends(x, p, threshold, d) -> psi' / d where the energy is that of the distance d alone, else 0; see `pair_bend`."""
+    X, W, V = shape_types(real)
+    E = wp.types.vector(1, real)
+    slope_of = density.laws(real, 1)[1]
+
+    @wp.func
+    def bends(x: X, p: V, threshold: real, d: real):
+        if wp.static(kind == EDGES):
+            normal = wp.cross(x[1] - x[0], x[3] - x[2])
+            if wp.dot(normal, normal) < threshold:
+                return real(0.0)
+        f = slope_of(E(d), p)
+        return f[0] / d
+
+    return bends
+
+
+@cache
 def pair_energy_functions(kind: Kind, density: Density, real):
     """Functions of nodes x, parameters p and, of edges, the threshold [m^4] of the mollifier and `inner`.
 

@@ -5,7 +5,13 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.contact.gather import SLOTS, factor_struct
-from ddg_warp.kernels.contact.pair_energy import distance_function, pair_energy_functions, rows_of, shape_types
+from ddg_warp.kernels.contact.pair_energy import (
+    bend_function,
+    distance_function,
+    pair_energy_functions,
+    rows_of,
+    shape_types,
+)
 from ddg_warp.kernels.contact.surfaces import EDGES, Kind, pair_functions, sides_struct
 from ddg_warp.kernels.densities import Density
 from ddg_warp.kernels.densities.contact import SHARE
@@ -84,6 +90,7 @@ def evaluate_kernel(kind: Kind, density: Density, real, linear, serial: bool):
     L = wp.types.vector(3, linear)
     near = distance_function(kind, real)
     evaluate_pair, row_of, _ = pair_energy_functions(kind, density, real)
+    bends = bend_function(kind, density, real)
     given, corners = read_functions(kind, real)
     until, rows = until_function(serial), rows_of(kind)
 
@@ -123,6 +130,7 @@ def evaluate_kernel(kind: Kind, density: Density, real, linear, serial: bool):
                             linear(weight[0]), linear(weight[1]), linear(weight[2]), linear(weight[3])
                         )
                 factor.used[pair] = used
+                factor.bend[pair] = linear(bends(at, p, threshold, d))
 
     return evaluate
 

@@ -5,7 +5,19 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import outcome
-from ddg_warp.kernels.islands import DECREMENT, DRIVEN, HALVINGS, MOVED, SLOT, STATUS, STEP_LENGTH, TODO, WANTED
+from ddg_warp.kernels.islands import (
+    CLAMPED,
+    DECREMENT,
+    DRIVEN,
+    HALVINGS,
+    ITERATION,
+    MOVED,
+    SLOT,
+    STATUS,
+    STEP_LENGTH,
+    TODO,
+    WANTED,
+)
 from ddg_warp.kernels.matrix.block_band import block_functions
 from ddg_warp.kernels.matrix.chain_blocks import layout_type
 from ddg_warp.kernels.matrix.chain_places import place_dofs, place_functions
@@ -20,7 +32,7 @@ WHOLE, UNITS, NONE = 1, 0, -1  # how a world moves: with one share, unit by unit
 @cache
 def world_kernels(real):
     """A thread a world: account(...) for the energy; modes(...) of motions, and of what is predicted(...); depart(...) on them;
-    expect(...) of steps that were cut; refuse(...) what crossed."""
+    expect(...) of steps that were cut; refuse(...) what crossed; curve(...) of matrices."""
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def account(
@@ -89,7 +101,13 @@ def world_kernels(real):
             else:
                 wp.atomic_min(least, 0, gap[w])
 
-    return account, modes, predicted, depart, expect, refuse
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def curve(flags: wp.array2d(dtype=int), late: int, curved: wp.array(dtype=int)):
+        """Where the matrix has what comes of pairs that turn."""
+        w = wp.tid()
+        curved[w] = wp.where(flags[ITERATION, w] > late and flags[CLAMPED, w] == 0, 1, 0)
+
+    return account, modes, predicted, depart, expect, refuse, curve
 
 
 @cache

@@ -72,11 +72,11 @@ def state(result: PairTerms) -> list[np.ndarray]:
     return [of.numpy().copy() for of in (result.energy, result.forces, result.diagonal, result.between)]
 
 
-def times(result: PairTerms, v: np.ndarray, at=None) -> np.ndarray:
-    """H v, of the exact Hessian where positions are given."""
+def times(result: PairTerms, v: np.ndarray, at=None, wanted=None) -> np.ndarray:
+    """H v, of the exact Hessian where positions are given, or with what comes of turning in worlds that want it."""
     given = upload(v, result.device, wp.types.vector(3, result.linear))
     out = wp.zeros_like(given)
-    result.product(given, out, at)
+    result.product(given, out, at, wanted)
     return out.numpy().copy()
 
 

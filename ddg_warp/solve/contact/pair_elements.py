@@ -55,6 +55,7 @@ class PairElements:
         vector = wp.types.vector(3, linear)
         self.factor.nodes = wp.zeros(capacity, dtype=wp.vec4i, device=self.device)
         self.factor.used = wp.zeros(capacity, dtype=int, device=self.device)
+        self.factor.bend = wp.zeros(capacity, dtype=linear, device=self.device)
         self.factor.direction = arrays.allocate((self._rows, capacity), vector, self.device)
         self.factor.weight = arrays.allocate((self._rows, capacity), wp.types.vector(4, linear), self.device)
         self.items = wp.zeros(self.size * capacity, dtype=int, device=self.device)

@@ -165,15 +165,18 @@ class PairTerms:
         for part in self.frictions:
             part.work(self.search.overflow, self.dissipated)
 
-    def product(self, v: wp.array, out: wp.array, x: wp.array | None = None) -> None:
+    def product(
+        self, v: wp.array, out: wp.array, x: wp.array | None = None, wanted: wp.array | None = None
+    ) -> None:
         """out += H v of the last `evaluate`, vectors of 3 (worlds times nodes,).
 
         H is the Gauss-Newton matrix, positive semi-definite by form; with the positions x of that `evaluate`, the exact Hessian. Of
-        friction both are the same.
+        friction both are the same. With `wanted` (worlds,), H has at x what of the exact one comes of pairs that turn
+        (`kernels.contact.pair_bend`), in worlds where that is not zero; it is exact but where edges are all but parallel.
         """
         for part in self.lists:
-            if x is None:
-                part.product(v, out)
+            if x is None or wanted is not None:
+                part.product(v, out, x, wanted)
             else:
                 part.exact_product(v, out, x, self.law)
         for part in self.frictions:

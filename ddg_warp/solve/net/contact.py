@@ -12,6 +12,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.net import touch as kernels
+from ddg_warp.solve.chains.newton import EARLY
 from ddg_warp.solve.contact.touch import Touch
 from ddg_warp.solve.net.system import Sums
 
@@ -25,6 +26,7 @@ class NetContact:
         search, terms: candidates, and the energy of those that are near.
         forces (W N,) [N], stiffness (W N,) [N/m]: what pushes nodes, and a bound on how stiff that is.
         diagonal: (W N,) blocks of its matrix at nodes.
+        bends: whether its matrix has what comes of pairs that turn, once the search is near; see `kernels.contact.pair_bend`.
         crossed: (1,) pairs that would have passed through each other in all steps so far; least: (1,) the smallest gap [m].
     """
 
@@ -50,7 +52,8 @@ class NetContact:
         def make(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=device)
 
-        self._modes, self._whole = make(worlds, int), make(worlds, int)
+        self._modes, self._curved = make(worlds, int), make(worlds, int)
+        self.bends, self._late = newton.psd != "gauss_newton", 0 if newton.psd == "none" else EARLY
         self._kept, self._gain = make((2, worlds), real), make(worlds, real)
         self._move = make(newton.all, net.vector)
         self._pushed = make(newton.all, wp.types.vector(3, linear))
@@ -61,7 +64,7 @@ class NetContact:
         self._nodes = wp.array(places.astype(np.int32), dtype=int, device=device)
         self._aims = make((max(1, len(places)), worlds), net.vector)
         made = kernels.world_kernels(real)
-        self._account, self._find_modes, self._find_predicted, self._depart, self._expect, self._refuse = made
+        self._account, self._find_modes, self._find_predicted, self._depart, self._expect, self._refuse, self._find_curved = made
         made = kernels.block_kernels(real, linear, arrays.serial(device))
         self._differ_gain, self._differ, self._settle, self._lessen, self._aim, self._push, self._arrive, self._stay = (
             made
@@ -107,7 +110,7 @@ class NetContact:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [self._account, self._find_modes, self._find_predicted, self._depart, self._expect, self._refuse]
+        own = [self._account, self._find_modes, self._find_predicted, self._depart, self._expect, self._refuse, self._find_curved]
         own += [
             self._differ_gain,
             self._differ,
@@ -154,6 +157,7 @@ class NetContact:
     def assemble(self) -> None:
         """Its own part in the preconditioner."""
         newton = self.newton
+        self._launch(self._find_curved, self.net.worlds, [newton.islands.arrays[0], self._late], [self._curved])
         if chains := newton.chains:
             inputs = [chains.bands, chains.layout, self._ahead, self._edges, newton.islands.arrays[0]]
             inputs += [self.net.blocks, self.diagonal, self.terms.between]
@@ -181,7 +185,7 @@ class NetContact:
     def multiply(self, p: wp.array, product: wp.array) -> None:
         """Add H p, and write p . H p block by block."""
         newton = self.newton
-        self.terms.product(p, product)
+        self.terms.product(p, product, newton.q, self._curved if self.bends else None)
         inputs = [p, newton.fixed, newton.islands.wanted, self.net.blocks]
         self._sweep(self._settle, inputs, [product, newton.krylov_dots])
 

@@ -98,10 +98,10 @@ class NetNewton:
         self.forcing = make(worlds, self.linear)
         self.pcg_work = make(1, wp.int64)
         self.frozen = Frozen(self.islands) if reuse else None
-        self.contact = NetContact(self) if host.touching else None
         self.psd = self.automatic_psd() if options.psd == "auto" else options.psd
         if self.psd == "none":
             self._require_exact()
+        self.contact = NetContact(self) if host.touching else None
         exact = [self.psd != "gauss_newton" and part.term.measure.packed > 0 for part in net.sets]
         self.exact_from = tuple((0 if self.psd == "none" else EARLY) if wanted else None for wanted in exact)
         banded = self.chains is not None and self.chains.banded
@@ -133,8 +133,9 @@ class NetNewton:
                 self.contact.bind(self.chains)
         self._direct = self.chains is not None and self.chains.exact
         fails = self.psd == "none"
-        repeats = not reuse and (fails or any(exact) or self._direct)
-        self._repeat = pcg.repeat_kernel(self.real, fails, any(exact)) if repeats else None
+        curved = any(exact) or (self.contact is not None and self.contact.bends)
+        repeats = not reuse and (fails or curved or self._direct)
+        self._repeat = pcg.repeat_kernel(self.real, fails, curved) if repeats else None
         self.negative = make(worlds, int)
         self._assembly = Assembly(
             net, self.system, self.parts, self.real, self.linear, self.exact_from, self.local, drag
@@ -160,7 +161,12 @@ class NetNewton:
                 )
 
     def automatic_psd(self) -> str:
-        """The mode that suits the rods; see `ChainNewton.automatic_psd`. Curvature that is rounding counts as none."""
+        """The mode that suits the rods; see `ChainNewton.automatic_psd`. Curvature that is rounding counts as none.
+
+        What touches turns about what it touches, and bends: without second derivatives the last digits take tens of iterations.
+        """
+        if self.net.host.touching:
+            return "progressive"
         bending = [part for part in self.net.sets if part.term.measure.packed and not self.frozen]
         turns = (part.parameters[name] * part.parameters["measure"] for part in bending for name in part.term.rest)
         return "progressive" if any(np.abs(turn).max() > STRAIGHT for turn in turns) else "gauss_newton"
