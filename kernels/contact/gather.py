@@ -18,7 +18,8 @@ SLOTS = 4  # nodes of a pair
 def factor_struct(linear):
     """Rows of the factors of pairs: where bit k + 1 of used[p] is set, row k of p has weight[k, p][i] direction[k, p] for its node i.
 
-    nodes (capacity,): of each pair, in all worlds; used (capacity,): zero of pairs that add nothing, else bit 0 is set. bend (capacity,): see `pair_bend`, zero where a pair has none.
+    nodes (capacity,): of each pair, in all worlds; used (capacity,): zero of pairs that add nothing, else bit 0 is set; bend
+    (capacity,): see `pair_bend`, zero where a pair has none.
     """
     V, W = wp.types.vector(3, linear), wp.types.vector(SLOTS, linear)
 

@@ -14,6 +14,16 @@ the dissipation potential (`densities.friction`) are
 with forces f_i = -w_i f, f = (t1, t2) psi'(u) at most mu N. They have no resultant; with r = sum_i w_i x_i, from one centre of pressure
 to the other, their moment is that of -f at r. What would balance it turns surfaces about their middle, where friction here is applied.
 Where the forces of a pair on one side all but cancel, weights are large; still |f_i| <= mu |g_i . n|.
+
+The potential has all but a kink at u = 0, and Newton's steps that know its second derivative alone overshoot it. So the matrix is that
+of the equations u = w phi(|u|), phi = mu N |u| / psi'(|u|), for the slip and the direction of friction w, |w| <= 1, as an unknown of
+its own (Chan, Golub and Mulet, SIAM J. Sci. Comput. 20, 1999, for the total variation):
+
+    mu N / phi (1 - beta (w u^T + u w^T) / (2 |u|)) ,   beta = phi'(|u|) ,
+
+positive semi-definite; forces stay those of the potential. With w = 0, at first, it is the secant's stiffness, which never overshoots;
+w goes to mu N w = psi' and the matrix to psi''. A step du moves w by that of the linearised equation, (u + du - w phi - w beta (u . du)
+/ |u|) / phi.
 """
 
 from functools import cache
@@ -105,13 +115,45 @@ def lag_kernel(kind: Kind, real, linear, serial: bool):
 def friction_kernel(density: Density, real, linear, serial: bool):
     """Energy, work, gradient by slot and factor of each pair at positions x, by its slip since `start`.
 
-    things: first things of pairs in one world; velocity: nu [m/s]; rate (worlds,): 1/h [1/s].
+    things: first things of pairs in one world; velocity: nu [m/s]; rate (worlds,): 1/h [1/s]; accepted, iteration (worlds,): which of
+    both rows of `slip` and `along` are the accepted iterate's, and how many there were; none, and w is that of the slip, without them.
     """
     Factor, Lagged = factor_struct(linear), lagged_struct(real)
     V, L = wp.types.vector(3, real), wp.types.vector(3, linear)
-    E, P = wp.types.vector(2, real), wp.types.vector(density.parameter_size(2), real)
-    energy_of, slope_of, root_of = density.functions(real, 2)
+    E, M = wp.types.vector(2, real), wp.types.matrix((2, 2), real)
+    P = wp.types.vector(density.parameter_size(2), real)
+    energy_of, slope_of, curvature_of = density.laws(real, 2)
     until = until_function(serial)
+    one, half, tiny = wp.constant(real(1.0)), wp.constant(real(0.5)), wp.constant(real(1.0e-30))
+
+    @wp.func
+    def secant(u: E, bound: real, p: P):
+        """mu N / phi, beta and u / |u|."""
+        size = wp.length(u)
+        n = u / wp.max(size, tiny)
+        f = slope_of(u, p)
+        c = curvature_of(u, p)
+        along = wp.dot(n, c * n)
+        across = wp.trace(c) - along
+        share = wp.length(f) / bound
+        beta = real(0.0)
+        if share > real(1.0e-6):
+            beta = wp.clamp((one - along / across) / share, real(0.0), one)
+        return across, beta, n
+
+    @wp.func
+    def turned(w: E, u: E, new: E, bound: real, p: P):
+        """w after a step from u to `new`."""
+        stiffness, beta, n = secant(u, bound, p)
+        inverse = stiffness / bound
+        v = w + (new - w * (one / inverse + beta * wp.dot(n, new - u))) * inverse
+        return v / wp.max(one, wp.length(v))
+
+    @wp.func
+    def root_of(m: M):
+        """Of a positive semi-definite matrix."""
+        s = wp.sqrt(wp.max(wp.determinant(m), real(0.0)))
+        return (m + wp.diag(E(s, s))) / wp.sqrt(wp.max(wp.trace(m) + real(2.0) * s, tiny))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def evaluate(
@@ -121,8 +163,12 @@ def friction_kernel(density: Density, real, linear, serial: bool):
         lagged: Lagged,
         velocity: real,
         rate: wp.array(dtype=real),
+        accepted: wp.array(dtype=int),
+        iteration: wp.array(dtype=int),
         x: wp.array(dtype=V),
         start: wp.array(dtype=V),
+        slip: wp.array2d(dtype=E),
+        along: wp.array2d(dtype=E),
         factor: Factor,
         energy: wp.array(dtype=real),
         work: wp.array(dtype=real),
@@ -132,7 +178,8 @@ def friction_kernel(density: Density, real, linear, serial: bool):
         if tid >= count[0]:
             return
         for p in range(tid, until(tid, count[0])):
-            inverse = rate[pairs[p][0] / things]
+            world = pairs[p][0] / things
+            inverse = rate[world]
             bound = lagged.bound[p]
             used = int(0)
             energy[p] = real(0.0)
@@ -150,7 +197,19 @@ def friction_kernel(density: Density, real, linear, serial: bool):
                 work[p] = wp.dot(f, u)
                 for slot in range(wp.static(SLOTS)):
                     gradient[slot, p] = (t1 * f[0] + t2 * f[1]) * weight[slot]
-                root = root_of(u, given, E())
+                w = f / bound
+                if accepted.shape[0] > 0:
+                    old = accepted[world]
+                    w = E()
+                    if iteration[world] > 0:
+                        w = turned(along[old, p], slip[old, p], u, bound, given)
+                    slip[1 - old, p] = u
+                    along[1 - old, p] = w
+                stiffness, beta, n = secant(u, bound, given)
+                between = wp.outer(w, n)
+                root = root_of(
+                    wp.diag(E(stiffness, stiffness)) - (between + wp.transpose(between)) * (half * beta * stiffness)
+                )
                 used = 1
                 for k in range(wp.static(ROWS)):
                     v = t1 * root[k, 0] + t2 * root[k, 1]

@@ -49,6 +49,8 @@ class FrictionElements(PairElements):
             getattr(self, name).zero_()
         capacity = self.found.capacity
         self.pairs = wp.zeros(capacity, dtype=wp.vec2i, device=self.device)
+        pair = wp.types.vector(2, self._real)
+        self._slip, self._along = (arrays.allocate((2, capacity), pair, self.device) for _ in range(2))
         self._work, self.lagged.bound = (wp.zeros(capacity, dtype=self._real, device=self.device) for _ in range(2))
         self.lagged.weight = wp.zeros(capacity, dtype=wp.types.vector(4, self._real), device=self.device)
         self.lagged.tangent = arrays.allocate((ROWS, capacity), wp.types.vector(3, self._real), self.device)
@@ -61,10 +63,13 @@ class FrictionElements(PairElements):
         for name in self._kept:
             wp.copy(getattr(self, name), getattr(of, name))
 
-    def evaluate(self, x, start, rate: wp.array, forces: wp.array, energy: wp.array, overflow: wp.array) -> None:
+    def evaluate(
+        self, x, start, rate: wp.array, iterates: tuple, forces: wp.array, energy: wp.array, overflow: wp.array
+    ) -> None:
         """Write factors at x by the slip since `start`; add to the forces on nodes and to the energies of worlds."""
-        inputs = [self.pairs, self.count, self.found.first.count, self.lagged, self._velocity, rate, x, start]
-        outputs = [self.factor, self._energy, self._work, self.gradient]
+        inputs = [self.pairs, self.count, self.found.first.count, self.lagged, self._velocity, rate, *iterates]
+        inputs += [x, start]
+        outputs = [self._slip, self._along, self.factor, self._energy, self._work, self.gradient]
         self._sweep(self._evaluate, self.found.capacity, inputs, outputs)
         self._add_up(self.gradient, -1.0, forces)
         self._add_energies(self._energy, overflow, energy)

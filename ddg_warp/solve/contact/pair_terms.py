@@ -94,6 +94,7 @@ class PairTerms:
         self._version, self._lagged = search.version, -1
         self.frictions = self._with_friction(friction, friction_law, velocity, number, atomic)
         self._start = wp.zeros_like(self.forces)
+        self._no_iterates = (wp.zeros(0, dtype=int, device=self.device),) * 2
 
     @property
     def kernels(self) -> list:
@@ -134,12 +135,20 @@ class PairTerms:
         wp.copy(self._start, x)
         self._lagged = self._version
 
-    def evaluate(self, x: wp.array, rate: wp.array | None = None, start: wp.array | None = None) -> None:
+    def evaluate(
+        self,
+        x: wp.array,
+        rate: wp.array | None = None,
+        start: wp.array | None = None,
+        iterates: tuple[wp.array, wp.array] | None = None,
+    ) -> None:
         """Energies, forces and factors at positions x; with rates, those of friction too.
 
         Args:
             rate: 1/h of each world (worlds,) [1/s]; no friction where it is 0.
             start: positions that slip starts from, by default those of `lag`.
+            iterates: of each world, which of two iterates is the accepted one, 0 or 1, and how many there were; then the matrix of
+                friction is that of its direction as an unknown of its own, see `kernels.contact.pair_friction`.
 
         Raises:
             SolverError: if the lists of the search have grown since `fit`, or friction was not lagged since then, or rates do not fit.
@@ -156,8 +165,9 @@ class PairTerms:
             part.evaluate(x, self.law, self.forces, self.energy, self.search.overflow)
         start = self._start if start is None else start
         rate = self._no_rate if rate is None else rate
+        iterates = self._no_iterates if iterates is None else iterates
         for part in self.frictions:
-            part.evaluate(x, start, rate, self.forces, self.energy, self.search.overflow)
+            part.evaluate(x, start, rate, iterates, self.forces, self.energy, self.search.overflow)
 
     def work(self) -> None:
         """Write `dissipated`: what friction takes from its start to the last `evaluate`, the sum of its forces times slip [J]."""
@@ -165,9 +175,7 @@ class PairTerms:
         for part in self.frictions:
             part.work(self.search.overflow, self.dissipated)
 
-    def product(
-        self, v: wp.array, out: wp.array, x: wp.array | None = None, wanted: wp.array | None = None
-    ) -> None:
+    def product(self, v: wp.array, out: wp.array, x: wp.array | None = None, wanted: wp.array | None = None) -> None:
         """out += H v of the last `evaluate`, vectors of 3 (worlds times nodes,).
 
         H is the Gauss-Newton matrix, positive semi-definite by form; with the positions x of that `evaluate`, the exact Hessian. Of

@@ -64,7 +64,15 @@ class NetContact:
         self._nodes = wp.array(places.astype(np.int32), dtype=int, device=device)
         self._aims = make((max(1, len(places)), worlds), net.vector)
         made = kernels.world_kernels(real)
-        self._account, self._find_modes, self._find_predicted, self._depart, self._expect, self._refuse, self._find_curved = made
+        (
+            self._account,
+            self._find_modes,
+            self._find_predicted,
+            self._depart,
+            self._expect,
+            self._refuse,
+            self._find_curved,
+        ) = made
         made = kernels.block_kernels(real, linear, arrays.serial(device))
         self._differ_gain, self._differ, self._settle, self._lessen, self._aim, self._push, self._arrive, self._stay = (
             made
@@ -110,7 +118,15 @@ class NetContact:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [self._account, self._find_modes, self._find_predicted, self._depart, self._expect, self._refuse, self._find_curved]
+        own = [
+            self._account,
+            self._find_modes,
+            self._find_predicted,
+            self._depart,
+            self._expect,
+            self._refuse,
+            self._find_curved,
+        ]
         own += [
             self._differ_gain,
             self._differ,
@@ -145,8 +161,12 @@ class NetContact:
 
     def evaluate(self) -> None:
         """Energies, forces and factors at the iterate."""
-        self.search.update(self.newton.q)
-        self.terms.evaluate(self.newton.q, self.newton.islands.rate if self.rubs else None)
+        q, islands = self.newton.q, self.newton.islands
+        self.search.update(q)
+        if self.rubs:
+            self.terms.evaluate(q, islands.rate, iterates=(islands.slot, islands.iteration))
+        else:
+            self.terms.evaluate(q)
         self.terms.blocks()
 
     def account(self, change: wp.array, noise: wp.array) -> None:
