@@ -43,7 +43,10 @@ def compare_searches(searches: wp.array(dtype=int), listed: wp.array(dtype=int),
 
 @cache
 def list_kernels(kind: Kind, real, serial: bool):
-    """number(...) and fill(...) the items of nodes, sort(...) each list into `ordered`."""
+    """number(...) and fill(...) the items of nodes, sort(...) each list into `ordered`.
+
+    Nodes of a world that are `silent`, not zero, have none.
+    """
     Sides, until, size = sides_struct(real), until_function(serial), kind.first + kind.second
     slots, *_ = pair_functions(kind, real)
 
@@ -52,6 +55,7 @@ def list_kernels(kind: Kind, real, serial: bool):
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
         sides: Sides,
+        silent: wp.array(dtype=wp.uint8),
         nodes_out: wp.array(dtype=wp.vec4i),
         numbers: wp.array(dtype=int),
     ):
@@ -63,12 +67,14 @@ def list_kernels(kind: Kind, real, serial: bool):
             nodes = slots(sides, pairs[p][0] - w * sides.counts[0], pairs[p][1] - w * sides.counts[1], w)
             nodes_out[p] = wp.vec4i(nodes[0], nodes[1], nodes[2], nodes[3])
             for slot in range(wp.static(size)):
-                wp.atomic_add(numbers, nodes[slot], 1)
+                if silent[nodes[slot] - w * silent.shape[0]] == wp.uint8(0):
+                    wp.atomic_add(numbers, nodes[slot], 1)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def fill(
         count: wp.array(dtype=int),
         nodes: wp.array(dtype=wp.vec4i),
+        numbers: wp.array(dtype=int),
         starts: wp.array(dtype=int),
         filled: wp.array(dtype=int),
         items: wp.array(dtype=int),
@@ -79,14 +85,15 @@ def list_kernels(kind: Kind, real, serial: bool):
         for p in range(tid, until(tid, count[0])):
             for slot in range(wp.static(size)):
                 node = nodes[p][slot]
-                items[starts[node] + wp.atomic_add(filled, node, 1)] = wp.static(SLOTS) * p + slot
+                if numbers[node] > 0:
+                    items[starts[node] + wp.atomic_add(filled, node, 1)] = wp.static(SLOTS) * p + slot
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def sort(
         count: wp.array(dtype=int),
         nodes: wp.array(dtype=wp.vec4i),
-        starts: wp.array(dtype=int),
         numbers: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
         items: wp.array(dtype=int),
         ordered: wp.array(dtype=int),
     ):
@@ -96,12 +103,14 @@ def list_kernels(kind: Kind, real, serial: bool):
             return
         for p in range(tid, until(tid, count[0])):
             for slot in range(wp.static(size)):
-                start = starts[nodes[p][slot]]
+                node = nodes[p][slot]
+                start = starts[node]
                 item = wp.static(SLOTS) * p + slot
                 smaller = int(0)
-                for k in range(start, start + numbers[nodes[p][slot]]):
+                for k in range(start, start + numbers[node]):
                     smaller += wp.where(items[k] < item, 1, 0)
-                ordered[start + smaller] = item
+                if numbers[node] > 0:
+                    ordered[start + smaller] = item
 
     return number, fill, sort
 

@@ -15,7 +15,9 @@ from ddg_warp.solve.contact.pairs import PairList, RunningSums
 class ContactElements(PairElements):
     """Contact of the pairs of one list; see `PairTerms` and, for arguments, `PairElements`."""
 
-    def __init__(self, found: PairList, law: Density, nodes: int, worlds: int, real, linear, atomic: bool):
+    def __init__(
+        self, found: PairList, law: Density, nodes: int, worlds: int, real, linear, atomic: bool, silent: wp.array
+    ):
         kind = found.kind
         super().__init__(found, rows_of(kind), nodes, worlds, real, linear, atomic)
         serial = arrays.serial(self.device)
@@ -26,7 +28,7 @@ class ContactElements(PairElements):
         self.kernels += [self._bend, *self._listing, self._evaluate, self._exact, sums.add_pieces, sums.run]
         self.count, self.starts, self.partners = found.count, found.starts, found.partners
         self.numbers, self._filled = (wp.zeros(nodes, dtype=int, device=self.device) for _ in range(2))
-        self._running = RunningSums(self.numbers)
+        self._running, self._silent = RunningSums(self.numbers), silent
         self.places = self._running.starts
         self.reserve()
 
@@ -40,12 +42,17 @@ class ContactElements(PairElements):
         (number, fill, sort), capacity = self._listing, self.found.capacity
         self.numbers.zero_()
         self._filled.zero_()
-        self._sweep(number, capacity, [self.pairs, self.count, self.found.sides], [self.factor.nodes, self.numbers])
+        self._sweep(
+            number,
+            capacity,
+            [self.pairs, self.count, self.found.sides, self._silent],
+            [self.factor.nodes, self.numbers],
+        )
         self._running()
-        inputs = [self.count, self.factor.nodes, self.places]
+        inputs = [self.count, self.factor.nodes, self.numbers, self.places]
         self._sweep(fill, capacity, inputs, [self._filled, self._unordered])
         if self._unordered is not self.items:
-            self._sweep(sort, capacity, [*inputs, self.numbers, self._unordered], [self.items])
+            self._sweep(sort, capacity, [*inputs, self._unordered], [self.items])
 
     def evaluate(self, x: wp.array, law, forces: wp.array, energy: wp.array, overflow: wp.array) -> None:
         """Write factors at x; add to the forces on nodes and to the energies of worlds."""

@@ -41,6 +41,7 @@ class PairTerms:
         velocity: nu [m/s], positive: what sticks creeps with a share of it.
         linear: type of factors and of vectors of products, by default that of positions.
         atomic: whether sums are added atomically, in an order that on CUDA differs from run to run.
+        silent: nodes of a world that forces and products need not be told of, which may be in thousands of pairs.
 
     Attributes:
         energy: (worlds,) [J], that of contact and the potential of friction; forces: (worlds times nodes,) [N].
@@ -69,6 +70,7 @@ class PairTerms:
         velocity: float = 1e-3,
         linear=None,
         atomic: bool = False,
+        silent: np.ndarray | None = None,
     ):
         self.search, self.device, self.real = search, search.device, search.real
         self.linear = linear or self.real
@@ -85,10 +87,14 @@ class PairTerms:
         block = wp.types.matrix((3, 3), self.linear)
         self.diagonal = wp.zeros(nodes, dtype=block, device=self.device)
         self.between = wp.zeros(search.worlds * len(square), dtype=block, device=self.device)
+        told_not = np.zeros(len(search.shapes.points), np.uint8)
+        told_not[[] if silent is None else silent] = 1
+        told_not = wp.array(told_not, dtype=wp.uint8, device=self.device)
         self._listed = wp.full(1, -1, dtype=int, device=self.device)
         self._stale = wp.zeros(1, dtype=int, device=self.device)
         self.lists = [
-            ContactElements(pairs, law, nodes, search.worlds, self.real, self.linear, atomic) for pairs in search.lists
+            ContactElements(pairs, law, nodes, search.worlds, self.real, self.linear, atomic, told_not)
+            for pairs in search.lists
         ]
         self._trace = gather.trace_kernel(self.real, self.linear)
         self._version, self._lagged = search.version, -1

@@ -16,14 +16,14 @@ MARGIN = 1.0  # of a typical radius, by which searches go beyond the reach
 
 
 class Touch:
-    """Contact of a `DeviceNet` with blocks x (W N,), where it is searched for at first.
+    """Contact of a `DeviceNet` with blocks x (W N,), where it is searched for at first; `silent` nodes are told of no forces.
 
     Attributes:
         shapes, search, terms: what may touch, candidates, and the energy of those that are near.
         keep: part of the thickness that motion never goes into.
     """
 
-    def __init__(self, net, linear, x: wp.array):
+    def __init__(self, net, linear, x: wp.array, silent: np.ndarray | None = None):
         self.net, given = net, net.host.touching
         self.law, self.keep = given.law, KEEP[given.law.law]
         self.shapes = shapes_of(net.host)
@@ -39,6 +39,7 @@ class Touch:
             friction_law=self.law.friction_law,
             velocity=self.law.velocity,
             linear=linear,
+            silent=silent,
         )
 
     def at(self, x: wp.array) -> None:

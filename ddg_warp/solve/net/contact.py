@@ -42,7 +42,8 @@ class NetContact:
                 "contact: solver 'projective' keeps the matrix of a step, which contact changes; use 'newton'"
             )
         newton.q.assign(np.tile(host.rest, (net.worlds, 1)))
-        self.touch = Touch(net, linear, newton.q)
+        held = np.concatenate([np.zeros(0, int), *host.obstacles])  # forces on them are asked of states, not here
+        self.touch = Touch(net, linear, newton.q, held)
         self.shapes, self.search, self.terms = self.touch.shapes, self.touch.search, self.touch.terms
         self._edges = len(self.shapes.things(2)[0])
         self.rubs = bool(host.touching.friction.any())
