@@ -13,34 +13,35 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.contact.gather import SLOTS, factor_struct
-from ddg_warp.kernels.contact.surfaces import EDGE_POINT, EDGES, Kind
-from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
+from ddg_warp.kernels.contact.surfaces import EDGE_POINT, EDGES, POINT_PLANE, POINT_TRIANGLE
+
+KINDS = EDGES, EDGE_POINT, POINT_TRIANGLE, POINT_PLANE
+TRIANGLES = KINDS.index(POINT_TRIANGLE)
 
 
 @cache
-def bend_function(kind: Kind, linear):
-    """bend(x, w, v) -> D D'' v of nodes x (4, 3) with weights w, times a movement v (4, 3)."""
+def bend_function(linear):
+    """bend(kind, x, w, v) -> D D'' v of nodes x (4, 3) with weights w, times a movement v (4, 3); `kind` is a place in `KINDS`."""
     Y, W = wp.types.matrix((4, 3), linear), wp.types.vector(4, linear)
 
     @wp.func
-    def free(w: W):
+    def free(kind: int, w: W):
         """c_0 and c_1, zero where there is no such parameter."""
         zero, one = linear(0.0), linear(1.0)
         c0, c1 = W(), W()
-        if wp.static(kind == EDGES or kind == EDGE_POINT):
+        if kind < wp.static(TRIANGLES):
             if w[0] != zero and w[1] != zero:
                 c0 = W(-one, one, zero, zero)
-            if wp.static(kind == EDGES):
-                if w[2] != zero and w[3] != zero:
-                    c1 = W(zero, zero, one, -one)
+            if kind == 0 and w[2] != zero and w[3] != zero:
+                c1 = W(zero, zero, one, -one)
         else:
+            endless = kind > wp.static(TRIANGLES)
             b, c, d = w[1] != zero, w[2] != zero, w[3] != zero
-            if wp.static(kind.endless) or (b and c):
+            if endless or (b and c):
                 c0 = W(zero, one, -one, zero)
-            if wp.static(kind.endless) or (b and d):
+            if endless or (b and d):
                 c1 = W(zero, one, zero, -one)
-            if wp.static(not kind.endless) and c and d and not b:
+            if c and d and not (b or endless):
                 c0 = W(zero, zero, one, -one)
         return c0, c1
 
@@ -49,10 +50,10 @@ def bend_function(kind: Kind, linear):
         return x[0] * w[0] + x[1] * w[1] + x[2] * w[2] + x[3] * w[3]
 
     @wp.func
-    def bend(x: Y, w: W, v: Y):
+    def bend(kind: int, x: Y, w: W, v: Y):
         tiny = linear(1.0e-30)
         r, s = total(w, x), total(w, v)
-        c0, c1 = free(w)
+        c0, c1 = free(kind, w)
         e0, e1 = total(c0, x), total(c1, x)
         b0 = wp.dot(e0, s) + wp.dot(r, total(c0, v))
         b1 = wp.dot(e1, s) + wp.dot(r, total(c1, v))
@@ -67,42 +68,3 @@ def bend_function(kind: Kind, linear):
         return wp.outer(w, across) - wp.outer(c0 * g0 + c1 * g1, r)
 
     return bend
-
-
-@cache
-def bend_kernel(kind: Kind, real, linear, serial: bool):
-    """Add the product of psi' D'' with v to that of each pair, by slot, in the worlds that want it."""
-    Factor, X, V = factor_struct(linear), wp.types.vector(3, real), wp.types.vector(3, linear)
-    bend, until = bend_function(kind, linear), until_function(serial)
-
-    @wp.func
-    def beside(x: X, y: X):
-        """One position beside another, before digits are lost."""
-        u = x - y
-        return V(linear(u[0]), linear(u[1]), linear(u[2]))
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def add(
-        pairs: wp.array(dtype=wp.vec2i),
-        count: wp.array(dtype=int),
-        things: int,
-        wanted: wp.array(dtype=int),
-        x: wp.array(dtype=X),
-        factor: Factor,
-        v: wp.array(dtype=V),
-        parts: wp.array2d(dtype=V),
-    ):
-        """things: first things of pairs in one world."""
-        tid = wp.tid()
-        if tid >= count[0]:
-            return
-        for p in range(tid, until(tid, count[0])):
-            if factor.used[p] != 0 and factor.bend[p] != linear(0.0) and wanted[pairs[p][0] / things] != 0:
-                n = factor.nodes[p]
-                o = x[n[0]]
-                at = wp.matrix_from_rows(V(), beside(x[n[1]], o), beside(x[n[2]], o), beside(x[n[3]], o))
-                y = bend(at, factor.weight[0, p], wp.matrix_from_rows(v[n[0]], v[n[1]], v[n[2]], v[n[3]]))
-                for slot in range(wp.static(SLOTS)):
-                    parts[slot, p] = parts[slot, p] + y[slot] * factor.bend[p]
-
-    return add

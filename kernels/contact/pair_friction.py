@@ -59,6 +59,7 @@ def lag_kernel(kind: Kind, real, linear, serial: bool):
     """Keep pairs, their nodes and the items of nodes, and what is lagged of friction, from factors and gradients of contact."""
     Law, Sides, Factor, Lagged = law_struct(real), sides_struct(real), factor_struct(linear), lagged_struct(real)
     V, W, L = wp.types.vector(3, real), wp.types.vector(SLOTS, real), wp.types.vector(SLOTS, linear)
+    E = wp.types.vector(2, real)
     tangents, groups, until, size = basis(real), groups_function(real), until_function(serial), kind.first + kind.second
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -75,12 +76,18 @@ def lag_kernel(kind: Kind, real, linear, serial: bool):
         factor: Factor,
         lagged: Lagged,
         items_out: wp.array(dtype=int),
+        slip: wp.array2d(dtype=E),
+        along: wp.array2d(dtype=E),
     ):
+        """Of pairs that were others before, slips and directions of iterates are forgotten."""
         tid = wp.tid()
         if tid >= count[0]:
             return
         for p in range(tid, until(tid, count[0])):
             pairs_out[p] = pairs[p]
+            for row in range(2):
+                slip[row, p] = E()
+                along[row, p] = E()
             factor.nodes[p] = contact.nodes[p]
             factor.used[p] = 0
             for k in range(wp.static(size)):

@@ -136,39 +136,6 @@ def evaluate_kernel(kind: Kind, density: Density, real, linear, serial: bool):
 
 
 @cache
-def product_kernel(rows: int, linear, serial: bool):
-    """F^T F v of each pair, by slot."""
-    Factor, V, until = factor_struct(linear), wp.types.vector(3, linear), until_function(serial)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def product(count: wp.array(dtype=int), factor: Factor, v: wp.array(dtype=V), parts: wp.array2d(dtype=V)):
-        tid = wp.tid()
-        if tid >= count[0]:
-            return
-        for p in range(tid, until(tid, count[0])):
-            used = factor.used[p]
-            if used != 0:
-                n = factor.nodes[p]
-                v0, v1, v2, v3 = v[n[0]], v[n[1]], v[n[2]], v[n[3]]
-                y0, y1, y2, y3 = V(), V(), V(), V()
-                for k in range(wp.static(rows)):
-                    if (used >> (k + 1)) & 1 != 0:
-                        w = factor.weight[k, p]
-                        along = factor.direction[k, p]
-                        force = along * wp.dot(along, v0 * w[0] + v1 * w[1] + v2 * w[2] + v3 * w[3])
-                        y0 += force * w[0]
-                        y1 += force * w[1]
-                        y2 += force * w[2]
-                        y3 += force * w[3]
-                parts[0, p] = y0
-                parts[1, p] = y1
-                parts[2, p] = y2
-                parts[3, p] = y3
-
-    return product
-
-
-@cache
 def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: bool):
     """Product of the exact Hessian of each pair with v, by slot: the reverse of the derivative along v."""
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)

@@ -6,6 +6,7 @@ import warp as wp
 
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.islands import (
+    ACTIVE,
     CLAMPED,
     DECREMENT,
     DRIVEN,
@@ -32,7 +33,7 @@ WHOLE, UNITS, NONE = 1, 0, -1  # how a world moves: with one share, unit by unit
 @cache
 def world_kernels(real):
     """A thread a world: account(...) for the energy; modes(...) of motions, and of what is predicted(...); depart(...) on them;
-    expect(...) of steps that were cut; refuse(...) what crossed; curve(...) of matrices."""
+    expect(...) of steps that were cut; refuse(...) what crossed; curve(...) of matrices; again(...) with another friction."""
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def account(
@@ -107,12 +108,22 @@ def world_kernels(real):
         w = wp.tid()
         curved[w] = wp.where(flags[ITERATION, w] > late and flags[CLAMPED, w] == 0, 1, 0)
 
-    return account, modes, predicted, depart, expect, refuse, curve
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def again(flags: wp.array2d(dtype=int)):
+        """Worlds that have converged go on, under another friction: their next iterate is accepted."""
+        w = wp.tid()
+        if flags[MOVED, w] != 0 and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING):
+            flags[STATUS, w] = 0
+            flags[HALVINGS, w] = 0
+            flags[DRIVEN, w] = wp.static(THERE)
+            flags[ACTIVE, 0] = 1
+
+    return account, modes, predicted, depart, expect, refuse, curve, again
 
 
 @cache
 def block_kernels(real, linear, serial: bool):
-    """gain(...) by a motion, differ(...) of positions; settle(...) a product, lessen(...) the residual by it; aim(...), push(...) and
+    """gain(...) by a motion, differ(...) of positions; lessen(...) the residual by a product; aim(...), push(...) and
     arrive(...) of supports; stay(...) of worlds that do not move."""
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     _, free = product_functions(linear)
@@ -143,25 +154,6 @@ def block_kernels(real, linear, serial: bool):
         tid = wp.tid()
         for i in range(tid, until(tid, q.shape[0])):
             move_out[i] = q[i] - base[i]
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def settle(
-        p: wp.array(dtype=H),
-        fixed: wp.array(dtype=wp.uint8),
-        wanted: wp.array(dtype=int),
-        blocks: int,
-        product: wp.array(dtype=H),
-        dots_out: wp.array2d(dtype=linear),
-    ):
-        """A product on free dofs, and p . product block by block."""
-        w, start = share(wp.tid(), blocks)
-        if wanted[w] != 1:
-            return
-        for k in range(start, until(start, blocks)):
-            i = k + w * blocks
-            y = wp.cw_mul(product[i], free(fixed[k]))
-            product[i] = y
-            dots_out[w, k] = wp.dot(p[i], y)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def lessen(
@@ -238,7 +230,7 @@ def block_kernels(real, linear, serial: bool):
             for k in range(start, until(start, blocks)):
                 base[k + w * blocks] = q[k + w * blocks]
 
-    return gain, differ, settle, lessen, aim, push, arrive, stay
+    return gain, differ, lessen, aim, push, arrive, stay
 
 
 @cache

@@ -4,7 +4,6 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.kernels.contact import gather, sums
-from ddg_warp.kernels.contact.pair_bend import bend_kernel
 from ddg_warp.kernels.contact.pair_energy import rows_of
 from ddg_warp.kernels.contact.pair_terms import evaluate_kernel, exact_product_kernel
 from ddg_warp.kernels.densities import Density
@@ -24,8 +23,7 @@ class ContactElements(PairElements):
         self._listing = gather.list_kernels(kind, real, serial)
         self._evaluate = evaluate_kernel(kind, law, real, linear, serial)
         self._exact = exact_product_kernel(kind, law, real, linear, serial)
-        self._bend = bend_kernel(kind, real, linear, serial)
-        self.kernels += [self._bend, *self._listing, self._evaluate, self._exact, sums.add_pieces, sums.run]
+        self.kernels += [*self._listing, self._evaluate, self._exact, sums.add_pieces, sums.run]
         self.count, self.starts, self.partners = found.count, found.starts, found.partners
         self.numbers, self._filled = (wp.zeros(nodes, dtype=int, device=self.device) for _ in range(2))
         self._running, self._silent = RunningSums(self.numbers), silent
@@ -61,18 +59,8 @@ class ContactElements(PairElements):
         self._add_up(self.gradient, -1.0, forces)
         self._add_energies(self._energy, overflow, energy)
 
-    def product(self, v: wp.array, out: wp.array, x: wp.array | None = None, wanted: wp.array | None = None) -> None:
-        """Add the product of the Gauss-Newton matrix with v; with that of `pair_bend` at x in the worlds that want it."""
-        if wanted is None:
-            super().product(v, out)
-            return
-        self._sweep(self._product, self.found.capacity, [self.count, self.factor, v], [self._parts])
-        inputs = [self.pairs, self.count, self.found.first.count, wanted, x, self.factor, v]
-        self._sweep(self._bend, self.found.capacity, inputs, [self._parts])
-        self._add_up(self._parts, 1.0, out)
-
     def exact_product(self, v: wp.array, out: wp.array, x: wp.array, law) -> None:
         """Add the product of the exact Hessian at x, those of `evaluate`, with v."""
         inputs = [self.pairs, self.count, self.found.sides, law, x, self.factor, v]
-        self._sweep(self._exact, self.found.capacity, inputs, [self._parts])
-        self._add_up(self._parts, 1.0, out)
+        self._sweep(self._exact, self.found.capacity, inputs, [self.parts])
+        self._add_up(self.parts, 1.0, out)

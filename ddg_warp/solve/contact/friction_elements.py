@@ -59,7 +59,8 @@ class FrictionElements(PairElements):
         """Take the pairs of contact as it was evaluated last."""
         of = self._contact
         inputs = [of.pairs, of.count, self.found.sides, law, self._friction, of.factor, of.gradient, of.items]
-        self._sweep(self._lag, self.found.capacity, inputs, [self.pairs, self.factor, self.lagged, self.items])
+        outputs = [self.pairs, self.factor, self.lagged, self.items, self._slip, self._along]
+        self._sweep(self._lag, self.found.capacity, inputs, outputs)
         for name in self._kept:
             wp.copy(getattr(self, name), getattr(of, name))
 

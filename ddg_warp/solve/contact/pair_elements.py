@@ -5,7 +5,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.contact import gather
-from ddg_warp.kernels.contact.pair_terms import energy_kernels, product_kernel
+from ddg_warp.kernels.contact.pair_terms import energy_kernels
 from ddg_warp.solve.contact.pairs import PairList
 from ddg_warp.solve.net.system import Sums
 
@@ -27,10 +27,9 @@ class PairElements:
     """
 
     def __init__(self, found: PairList, rows: int, nodes: int, worlds: int, real, linear, atomic: bool):
-        self.found, self.device, self._rows, self._real, self._linear = found, found.device, rows, real, linear
+        self.found, self.device, self.rows, self._real, self._linear = found, found.device, rows, real, linear
         self._atomic, serial, kind = atomic, arrays.serial(self.device), found.kind
         self.size = kind.first + kind.second
-        self._product = product_kernel(rows, linear, serial)
         self._add = {dtype: gather.sum_kernels(self.size, dtype, serial)[int(atomic)] for dtype in (real, linear)}
         self._blocks = gather.block_kernels(kind, rows, real, linear, serial)
         self._energies = energy_kernels(real)
@@ -38,7 +37,7 @@ class PairElements:
         self._sum = Sums(worlds, found.first.count, real, self.device)
         self._of_worlds = wp.zeros(worlds, dtype=real, device=self.device)
         self.factor = gather.factor_struct(linear)()
-        self.kernels = [*self._add.values(), *self._blocks, *self._energies, *self._sum.kernels, self._product]
+        self.kernels = [*self._add.values(), *self._blocks, *self._energies, *self._sum.kernels]
 
     def reserve(self) -> None:
         """Make room for as many pairs as the list of the search has.
@@ -56,20 +55,15 @@ class PairElements:
         self.factor.nodes = wp.zeros(capacity, dtype=wp.vec4i, device=self.device)
         self.factor.used = wp.zeros(capacity, dtype=int, device=self.device)
         self.factor.bend = wp.zeros(capacity, dtype=linear, device=self.device)
-        self.factor.direction = arrays.allocate((self._rows, capacity), vector, self.device)
-        self.factor.weight = arrays.allocate((self._rows, capacity), wp.types.vector(4, linear), self.device)
+        self.factor.direction = arrays.allocate((self.rows, capacity), vector, self.device)
+        self.factor.weight = arrays.allocate((self.rows, capacity), wp.types.vector(4, linear), self.device)
         self.items = wp.zeros(self.size * capacity, dtype=int, device=self.device)
         self._energy = wp.zeros(capacity, dtype=self._real, device=self.device)
         shape = (gather.SLOTS, capacity)
-        self._parts = arrays.allocate(shape, vector, self.device)
-        self.gradient = self._parts
+        self.parts = arrays.allocate(shape, vector, self.device)
+        self.gradient = self.parts
         if linear is not self._real:
             self.gradient = arrays.allocate(shape, wp.types.vector(3, self._real), self.device)
-
-    def product(self, v: wp.array, out: wp.array) -> None:
-        """Add the product of the Gauss-Newton matrix with v."""
-        self._sweep(self._product, self.found.capacity, [self.count, self.factor, v], [self._parts])
-        self._add_up(self._parts, 1.0, out)
 
     def blocks(self, diagonal: wp.array, between: wp.array) -> None:
         """Add the blocks of nodes, and those between the nodes of edges."""

@@ -14,6 +14,7 @@ from ddg_warp.kernels.densities.friction import logistic_friction, polynomial_fr
 from ddg_warp.solve.contact.broad_phase import BroadPhase
 from ddg_warp.solve.contact.contact_elements import ContactElements
 from ddg_warp.solve.contact.friction_elements import FrictionElements
+from ddg_warp.solve.contact.pair_product import PairProduct
 from ddg_warp.solve.contact.shapes import Shapes
 
 FRICTION = {"logistic": logistic_friction, "polynomial": polynomial_friction}
@@ -100,13 +101,15 @@ class PairTerms:
         self._version, self._lagged = search.version, -1
         self.frictions = self._with_friction(friction, friction_law, velocity, number, atomic)
         self._start = wp.zeros_like(self.forces)
+        self._product = PairProduct(self._parts, self.real, self.linear, atomic)
+        self._rub = PairProduct(self.frictions, self.real, self.linear, atomic) if self.frictions else None
         self._no_iterates = (wp.zeros(0, dtype=int, device=self.device),) * 2
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         parts = [kernel for part in self._parts for kernel in part.kernels]
-        return [gather.compare_searches, self._trace, *parts]
+        return [gather.compare_searches, self._trace, *self._product.kernels, *parts]
 
     @property
     def _parts(self) -> list:
@@ -121,14 +124,16 @@ class PairTerms:
             return False
         for part in self._parts:
             part.reserve()
+        for product in filter(None, (self._product, self._rub)):
+            product.fit()
         self._listed.fill_(-1)
         self._version = self.search.version
         return True
 
-    def lag(self, x: wp.array) -> None:
+    def lag(self, x: wp.array, again: bool = False) -> None:
         """Evaluate contact at x, and take pairs, normal forces and tangents of friction from it, and x as where slip starts.
 
-        Does nothing where there is no friction.
+        Slip still starts from where it did if friction is lagged `again`. Does nothing where there is no friction.
 
         Raises:
             SolverError: if the lists of the search have grown since `fit`.
@@ -138,7 +143,8 @@ class PairTerms:
         self.evaluate(x)
         for part in self.frictions:
             part.lag(self.law)
-        wp.copy(self._start, x)
+        if not again:
+            wp.copy(self._start, x)
         self._lagged = self._version
 
     def evaluate(
@@ -188,13 +194,21 @@ class PairTerms:
         friction both are the same. With `wanted` (worlds,), H has at x what of the exact one comes of pairs that turn
         (`kernels.contact.pair_bend`), in worlds where that is not zero; it is exact but where edges are all but parallel.
         """
+        if x is None or wanted is not None:
+            self._product(v, out, x, wanted)
+            return
         for part in self.lists:
-            if x is None or wanted is not None:
-                part.product(v, out, x, wanted)
-            else:
-                part.exact_product(v, out, x, self.law)
-        for part in self.frictions:
-            part.product(v, out)
+            part.exact_product(v, out, x, self.law)
+        if self._rub:
+            self._rub(v, out)
+
+    def settle(self, v, out, x, wanted, fixed: wp.array, busy: wp.array, dots: wp.array) -> None:
+        """`product` on free dofs, in worlds that are `busy` (1), of which v . out is written node by node, too.
+
+        Args:
+            fixed: of each node of a world, bits of its held dofs; dots: (worlds, nodes).
+        """
+        self._product.settle(v, out, x, wanted, fixed, busy, dots)
 
     def blocks(self) -> None:
         """Write `diagonal`, `between` and `stiffness` of the last `evaluate`."""

@@ -73,11 +73,12 @@ class NetContact:
             self._expect,
             self._refuse,
             self._find_curved,
+            self._again,
         ) = made
+        self._kernels = list(made)
         made = kernels.block_kernels(real, linear, arrays.serial(device))
-        self._differ_gain, self._differ, self._settle, self._lessen, self._aim, self._push, self._arrive, self._stay = (
-            made
-        )
+        self._differ_gain, self._differ, self._lessen, self._aim, self._push, self._arrive, self._stay = made
+        self._kernels += made
         self._sum = Sums(worlds, newton.dots.shape[1], real, device)
         self._stiffen = None
 
@@ -119,26 +120,7 @@ class NetContact:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [
-            self._account,
-            self._find_modes,
-            self._find_predicted,
-            self._depart,
-            self._expect,
-            self._refuse,
-            self._find_curved,
-        ]
-        own += [
-            self._differ_gain,
-            self._differ,
-            self._settle,
-            self._lessen,
-            self._aim,
-            self._push,
-            self._arrive,
-            self._stay,
-        ]
-        own += [self._stiffen] if self._stiffen else []
+        own = [*self._kernels, *([self._stiffen] if self._stiffen else [])]
         return [*own, *self._sum.kernels, *self.search.kernels, *self.terms.kernels]
 
     def begin(self, before: wp.array) -> None:
@@ -150,6 +132,17 @@ class NetContact:
         self.search.update(before)
         if self.rubs:
             self.terms.lag(before)
+
+    def lag_again(self) -> None:
+        """Take friction anew from where the solve has come to, for worlds that have converged."""
+        self.search.update(self.newton.q)
+        self.terms.lag(self.newton.q, again=True)
+        self._launch(self._again, self.net.worlds, [self.newton.islands.arrays[0]], [])
+
+    @property
+    def more_lags(self) -> int:
+        """How often that is to be done in a step."""
+        return self.touch.law.lags - 1 if self.rubs else 0
 
     def place(self) -> None:
         """Cut the predictor, once supports are placed, where they have to be."""
@@ -206,9 +199,9 @@ class NetContact:
     def multiply(self, p: wp.array, product: wp.array) -> None:
         """Add H p, and write p . H p block by block."""
         newton = self.newton
-        self.terms.product(p, product, newton.q, self._curved if self.bends else None)
-        inputs = [p, newton.fixed, newton.islands.wanted, self.net.blocks]
-        self._sweep(self._settle, inputs, [product, newton.krylov_dots])
+        curved = self._curved if self.bends else None
+        busy, dots = newton.islands.wanted, newton.krylov_dots
+        self.terms.settle(p, product, newton.q, curved, newton.fixed, busy, dots)
 
     def hold(self) -> None:
         """Cut what was moved, and say what that is expected to gain."""

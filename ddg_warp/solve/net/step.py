@@ -119,6 +119,9 @@ class NetStep(PartStep):
             solver.contact.place()
         solver.solve(start)
         if solver.contact:
+            for _ in range(solver.contact.more_lags):
+                solver.contact.lag_again()
+                solver.solve(start)
             solver.contact.finish(before.q)
         if self.energy:
             self.energy.judge(before, start)

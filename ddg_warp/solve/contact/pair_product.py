@@ -1,0 +1,57 @@
+"""Products of the matrix of contact and friction with vectors; see `kernels.contact.pair_product`."""
+
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.kernels.contact.pair_bend import KINDS
+from ddg_warp.kernels.contact.pair_product import product_kernels, set_struct
+from ddg_warp.solve.contact.contact_elements import ContactElements
+
+
+class PairProduct:
+    """The product of the matrix of some lists of pair elements with a vector; `fit` follows whenever they have got more room."""
+
+    def __init__(self, parts: list, real, linear, atomic: bool):
+        self._parts, self._linear, self._atomic, self._device = parts, linear, atomic, parts[0].device
+        types = int, wp.types.vector(3, real)
+        self._nothing = [wp.zeros(0, dtype=dtype, device=self._device) for dtype in types]
+        made = product_kernels(real, linear, arrays.serial(self._device))
+        self._multiply, self._gather, self._settle, self._scatter = made
+        self.kernels = [self._multiply, self._settle, self._scatter if atomic else self._gather]
+        self.fit()
+
+    def fit(self) -> None:
+        """Take the arrays that the lists have now."""
+        self._sets = [self._set(part) for part in self._parts]  # an array of structures keeps nothing alive
+        self.sets = wp.array(self._sets, dtype=set_struct(self._linear), device=self._device)
+        self._most = max(part.found.capacity for part in self._parts)
+
+    def __call__(self, v: wp.array, out: wp.array, x: wp.array | None = None, wanted: wp.array | None = None) -> None:
+        """out += H v; with what turns at positions x in the worlds that want it."""
+        self._write(v, x, wanted)
+        if self._atomic:
+            self._sweep(self._scatter, self._most, [self.sets], [out])
+        else:
+            self._sweep(self._gather, len(out), [self.sets], [out])
+
+    def settle(self, v, out, x, wanted, fixed: wp.array, busy: wp.array, dots: wp.array) -> None:
+        """The same on free dofs in worlds that are busy, and v . out node by node."""
+        self._write(v, x, wanted)
+        self._sweep(self._settle, len(out), [self.sets, v, fixed, busy], [out, dots])
+
+    def _write(self, v, x, wanted) -> None:
+        given = self._nothing if wanted is None else [wanted, x]
+        self._sweep(self._multiply, self._most, [self.sets, *given, v], [])
+
+    def _set(self, part):
+        own = set_struct(self._linear)()
+        for name in ("nodes", "used", "direction", "weight", "bend"):
+            setattr(own, name, getattr(part.factor, name))
+        for name in ("pairs", "count", "parts", "places", "numbers", "items"):
+            setattr(own, name, getattr(part, name))
+        own.kind = KINDS.index(part.found.kind) if isinstance(part, ContactElements) else -1
+        own.rows, own.things = part.rows, part.found.first.count
+        return own
+
+    def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
+        arrays.sweep(kernel, count, inputs, outputs, self._device)

@@ -1,0 +1,141 @@
+"""Products of the matrix of contact and friction with a vector: of all lists of pairs at once, then gathered to nodes."""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.contact.gather import SLOTS
+from ddg_warp.kernels.contact.pair_bend import bend_function
+from ddg_warp.kernels.matrix.sliced import product_functions
+from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
+
+
+@cache
+def set_struct(linear):
+    """A list of pairs: its factor (see `gather.factor_struct`), what it writes by slot, and the items of nodes.
+
+    kind: place in `pair_bend.KINDS`, -1 without `bend`; rows: of its factor; things: first things of pairs in one world.
+    """
+    V, W = wp.types.vector(3, linear), wp.types.vector(SLOTS, linear)
+
+    @wp.struct
+    class PairSet:
+        pairs: wp.array(dtype=wp.vec2i)
+        count: wp.array(dtype=int)
+        nodes: wp.array(dtype=wp.vec4i)
+        used: wp.array(dtype=int)
+        direction: wp.array2d(dtype=V)
+        weight: wp.array2d(dtype=W)
+        bend: wp.array(dtype=linear)
+        parts: wp.array2d(dtype=V)
+        places: wp.array(dtype=int)
+        numbers: wp.array(dtype=int)
+        items: wp.array(dtype=int)
+        kind: int
+        rows: int
+        things: int
+
+    return PairSet
+
+
+@cache
+def product_kernels(real, linear, serial: bool):
+    """multiply(...) the pairs; gather(...) or scatter(...) to nodes; settle(...), which gathers on free dofs, with dot products."""
+    PairSet, until = set_struct(linear), until_function(serial)
+    X, V = wp.types.vector(3, real), wp.types.vector(3, linear)
+    bend = bend_function(linear)
+    _, free = product_functions(linear)
+
+    @wp.func
+    def beside(x: X, y: X):
+        """One position beside another, before digits are lost."""
+        u = x - y
+        return V(linear(u[0]), linear(u[1]), linear(u[2]))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def multiply(
+        sets: wp.array(dtype=PairSet), wanted: wp.array(dtype=int), x: wp.array(dtype=X), v: wp.array(dtype=V)
+    ):
+        """F^T F v of each pair, by slot, with that of `pair_bend` in the worlds that want it, if any are given."""
+        tid = wp.tid()
+        for s in range(sets.shape[0]):
+            own = sets[s]
+            if tid < own.count[0]:
+                for p in range(tid, until(tid, own.count[0])):
+                    used = own.used[p]
+                    if used != 0:
+                        n = own.nodes[p]
+                        u = wp.matrix_from_rows(v[n[0]], v[n[1]], v[n[2]], v[n[3]])
+                        y = wp.matrix(shape=(4, 3), dtype=linear)
+                        for k in range(own.rows):
+                            if (used >> (k + 1)) & 1 != 0:
+                                w = own.weight[k, p]
+                                along = own.direction[k, p]
+                                y += wp.outer(w, along * wp.dot(along, w * u))
+                        if wanted.shape[0] > 0 and own.kind >= 0:
+                            c = own.bend[p]
+                            if c != linear(0.0) and wanted[own.pairs[p][0] / own.things] != 0:
+                                o = x[n[0]]
+                                at = wp.matrix_from_rows(
+                                    V(), beside(x[n[1]], o), beside(x[n[2]], o), beside(x[n[3]], o)
+                                )
+                                y += bend(own.kind, at, own.weight[0, p], u) * c
+                        for slot in range(wp.static(SLOTS)):
+                            own.parts[slot, p] = y[slot]
+
+    @wp.func
+    def total(sets: wp.array(dtype=PairSet), node: int):
+        y = V()
+        for s in range(sets.shape[0]):
+            own = sets[s]
+            start = own.places[node]
+            for k in range(start, start + own.numbers[node]):
+                item = own.items[k]
+                p = item / wp.static(SLOTS)
+                if own.used[p] != 0:
+                    y += own.parts[item - wp.static(SLOTS) * p, p]
+        return y
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def gather(sets: wp.array(dtype=PairSet), out: wp.array(dtype=V)):
+        """Adds to the nodes."""
+        tid = wp.tid()
+        for node in range(tid, until(tid, out.shape[0])):
+            out[node] = out[node] + total(sets, node)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def settle(
+        sets: wp.array(dtype=PairSet),
+        p: wp.array(dtype=V),
+        fixed: wp.array(dtype=wp.uint8),
+        busy: wp.array(dtype=int),
+        out: wp.array(dtype=V),
+        dots_out: wp.array2d(dtype=linear),
+    ):
+        """Adds to free dofs in worlds that are busy (1), and writes p . out node by node."""
+        tid = wp.tid()
+        for node in range(tid, until(tid, out.shape[0])):
+            w = node / fixed.shape[0]
+            if busy[w] == 1:
+                k = node - w * fixed.shape[0]
+                y = wp.cw_mul(out[node] + total(sets, node), free(fixed[k]))
+                out[node] = y
+                dots_out[w, k] = wp.dot(p[node], y)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def scatter(sets: wp.array(dtype=PairSet), out: wp.array(dtype=V)):
+        """Adds to the nodes in any order."""
+        tid = wp.tid()
+        for s in range(sets.shape[0]):
+            own = sets[s]
+            if tid < own.count[0]:
+                for p in range(tid, until(tid, own.count[0])):
+                    if own.used[p] != 0:
+                        last = int(-1)
+                        for slot in range(wp.static(SLOTS)):
+                            node = own.nodes[p][slot]
+                            if node != last:  # the last node is repeated where a pair has fewer
+                                wp.atomic_add(out, node, own.parts[slot, p])
+                            last = node
+
+    return multiply, gather, settle, scatter
