@@ -15,6 +15,7 @@ LOST_IN_ROUNDING = (
 )
 ENERGY_DRIFT = 9  # the midpoint rule would have made or lost more energy than it may; see `kernels.energy`
 CROSSED = 10  # things would have passed through each other
+NO_ROOM = 11  # surfaces have come so near that a barrier, whose forces grow without bound, has lost its digits
 
 NAMES = {
     CONVERGED: "converged",
@@ -27,4 +28,5 @@ NAMES = {
     LOST_IN_ROUNDING: "lost_in_rounding",
     ENERGY_DRIFT: "energy_drift",
     CROSSED: "crossed",
+    NO_ROOM: "no_room",
 }

@@ -27,6 +27,7 @@ from ddg_warp.kernels.net.newton import ON_THE_WAY, THERE
 from ddg_warp.kernels.search import PLACE, STRAIGHT
 from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
 
+FOLLOWING = 1e-6  # to what the residual is reduced where supports are on their way
 WHOLE, UNITS, NONE = 1, 0, -1  # how a world moves: with one share, unit by unit, not at all
 
 
@@ -38,13 +39,20 @@ def world_kernels(real):
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def account(
         energy: wp.array(dtype=real),
+        gap: wp.array(dtype=real),
+        least: real,
         flags: wp.array2d(dtype=int),
         kept: wp.array2d(dtype=real),
         change: wp.array(dtype=real),
         noise: wp.array(dtype=real),
     ):
-        """Adds what contact has to the change of the energy since the accepted iterate, and to its rounding."""
+        """Adds what contact has to the change of the energy since the accepted iterate, and to its rounding.
+
+        A world in which a gap is less than `least` does not go on: what goes on there is tried again in shorter steps.
+        """
         w = wp.tid()
+        if flags[STATUS, w] == 0 and gap[w] < least:
+            flags[STATUS, w] = wp.static(outcome.NO_ROOM)
         if flags[STATUS, w] == 0:
             accepted = flags[SLOT, w]
             kept[1 - accepted, w] = energy[w]
@@ -159,14 +167,17 @@ def block_kernels(real, linear, serial: bool):
     def lessen(
         product: wp.array(dtype=H),
         fixed: wp.array(dtype=wp.uint8),
-        wanted: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
         blocks: int,
         right: wp.array(dtype=H),
+        forcing: wp.array(dtype=linear),
     ):
-        """Takes a product from the residual on free dofs."""
+        """Takes a product from the residual on free dofs; what follows supports has to do so to a part of a gap."""
         w, start = share(wp.tid(), blocks)
-        if wanted[w] == 0:
+        if flags[WANTED, w] == 0:
             return
+        if start == 0 and flags[DRIVEN, w] == wp.static(ON_THE_WAY):
+            forcing[w] = wp.min(forcing[w], linear(wp.static(FOLLOWING)))
         for k in range(start, until(start, blocks)):
             i = k + w * blocks
             right[i] = right[i] - wp.cw_mul(product[i], free(fixed[k]))
@@ -223,12 +234,27 @@ def block_kernels(real, linear, serial: bool):
         q[k + w * blocks] = x
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def stay(q: wp.array(dtype=V), modes: wp.array(dtype=int), blocks: int, base: wp.array(dtype=V)):
-        """What does not move starts from where it is."""
+    def stay(
+        q: wp.array(dtype=V),
+        base: wp.array(dtype=V),
+        unit: wp.array(dtype=int),
+        nodes: int,
+        far: real,
+        blocks: int,
+        start_out: wp.array(dtype=V),
+        modes: wp.array(dtype=int),
+    ):
+        """Where motions start: what does not move, from where it is. Worlds in which a node goes `far` have one share."""
         w, start = share(wp.tid(), blocks)
-        if modes[w] == wp.static(NONE):
-            for k in range(start, until(start, blocks)):
-                base[k + w * blocks] = q[k + w * blocks]
+        still = modes[w] == wp.static(NONE)
+        for k in range(start, until(start, blocks)):
+            i = k + w * blocks
+            start_out[i] = base[i]
+            if still:
+                start_out[i] = q[i]
+            elif k < nodes and unit[k] >= 0:
+                if wp.length_sq(q[i] - base[i]) > far * far:
+                    modes[w] = wp.static(WHOLE)
 
     return gain, differ, lessen, aim, push, arrive, stay
 

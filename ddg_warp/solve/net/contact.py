@@ -10,12 +10,15 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
+from ddg_warp.compile.conditions import pose_starts
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.net import touch as kernels
 from ddg_warp.solve.chains.newton import EARLY
 from ddg_warp.solve.contact.touch import Touch
 from ddg_warp.solve.net.system import Sums
 
+FAR = 4.0  # margins that a node goes from which on a world has one share: of so long ways too many pairs would be near
+LEAST = 1e-3  # of the range, the gap from which on a barrier has no room
 ROUNDING = 16.0  # units in the last place within which supports have arrived
 
 
@@ -30,7 +33,7 @@ class NetContact:
         crossed: (1,) pairs that would have passed through each other in all steps so far; least: (1,) the smallest gap [m].
     """
 
-    def __init__(self, newton):
+    def __init__(self, newton, model):
         self.newton, self.net = newton, newton.net
         net, host, real, linear, device = newton.net, newton.net.host, newton.real, newton.linear, newton.device
         if host.frames:
@@ -57,10 +60,10 @@ class NetContact:
         self.bends, self._late = newton.psd != "gauss_newton", 0 if newton.psd == "none" else EARLY
         self._kept, self._gain = make((2, worlds), real), make(worlds, real)
         self._move = make(newton.all, net.vector)
-        self._pushed = make(newton.all, wp.types.vector(3, linear))
+        self._way, self._pushed = (make(newton.all, wp.types.vector(3, linear)) for _ in range(2))
         self.crossed, self.least = make(1, wp.int64), wp.full(1, math.inf, dtype=real, device=device)
         self._counts = self.crossed, self.least, self.search.searches
-        self._unit, self._units = self._number_units(host)
+        self._unit, self._units = self._number_units(host, model.motions)
         places = np.concatenate([host.moving[:, 0], host.turning[:, 0]])
         self._nodes = wp.array(places.astype(np.int32), dtype=int, device=device)
         self._aims = make((max(1, len(places)), worlds), net.vector)
@@ -81,14 +84,15 @@ class NetContact:
         self._kernels += made
         self._sum = Sums(worlds, newton.dots.shape[1], real, device)
         self._stiffen = None
+        self._least = LEAST * float(host.touching.range.min()) if self.touch.keep else -math.inf
 
     def bind(self, chains) -> None:
         """Have a part in what chains eliminate, once their plan is made."""
         self._stiffen = kernels.stiffen_kernel(chains.plan.twist, self.newton.linear)
         self._ahead = arrays.upload(self._edges_ahead(chains.plan), int, self.newton.device)
 
-    def _number_units(self, host) -> tuple[wp.array, int]:
-        """Unit of every block: what is cut together, a rod, a shell or an obstacle; and how many there are."""
+    def _number_units(self, host, motions: list) -> tuple[wp.array, int]:
+        """Unit of every block: what is cut together, a rod, a shell, or all that one motion moves; and how many there are."""
         unit = np.full(host.blocks, -1, np.int32)
         count = 0
         for rod in host.rods:
@@ -97,11 +101,11 @@ class NetContact:
         for shell in host.shells:
             unit[shell.nodes], unit[shell.edges[shell.edges >= 0]] = count, count
             count += 1
-        for nodes in host.obstacles:
-            unit[nodes] = count
-            count += 1
         unit = _joined(unit, host)
-        return wp.array(unit, dtype=int, device=self.newton.device), count
+        starts = pose_starts(motions)
+        for places, poses in ((host.moving[:, 0], host.moving[:, 1:].max(1)), host.turning.T):
+            unit[places] = count + np.searchsorted(starts, poses, side="right") - 1
+        return wp.array(unit, dtype=int, device=self.newton.device), count + len(motions)
 
     def _edges_ahead(self, plan) -> np.ndarray:
         """The contact edge from the node of each place of the chains to that of the next, -1 for none."""
@@ -162,10 +166,12 @@ class NetContact:
         else:
             self.terms.evaluate(q)
         self.terms.blocks()
+        self.search.measure(q)
 
     def account(self, change: wp.array, noise: wp.array) -> None:
         """Add to the change of the energy of worlds, and to its rounding."""
-        inputs = [self.terms.energy, self.newton.islands.arrays[0], self._kept, change, noise]
+        inputs = [self.terms.energy, self.search.gap, self._least, self.newton.islands.arrays[0], self._kept]
+        inputs += [change, noise]
         self._launch(self._account, self.net.worlds, inputs, [])
 
     def assemble(self) -> None:
@@ -183,18 +189,18 @@ class NetContact:
         if not count:
             newton.krylov.solve()
             return
-        newton.direction.zero_()
-        self._go()
+        self._go(self._way)
         self._pushed.zero_()
-        self.terms.product(newton.direction, self._pushed)
-        self._sweep(self._lessen, [self._pushed, newton.fixed, newton.islands.wanted, self.net.blocks], [newton.right])
+        self.terms.product(self._way, self._pushed)
+        inputs = [self._pushed, newton.fixed, newton.islands.arrays[0], self.net.blocks]
+        self._sweep(self._lessen, inputs, [newton.right, newton.forcing])
         newton.krylov.solve()
-        self._go()
+        self._go(newton.direction)
 
-    def _go(self) -> None:
+    def _go(self, out: wp.array) -> None:
         newton = self.newton
         inputs = [self._nodes, self._aims, newton.q, newton.fixed, newton.islands.wanted, self.net.blocks]
-        self._launch(self._push, (len(self._nodes), self.net.worlds), inputs, [newton.direction])
+        self._launch(self._push, (len(self._nodes), self.net.worlds), inputs, [out])
 
     def multiply(self, p: wp.array, product: wp.array) -> None:
         """Add H p, and write p . H p block by block."""
@@ -217,8 +223,10 @@ class NetContact:
 
     def _hold(self) -> None:
         newton = self.newton
-        self._sweep(self._stay, [newton.q, self._modes, self.net.blocks], [newton.base])
-        self.search.filter(newton.base, newton.q, self._unit, self._modes, self._units, self.touch.keep)
+        far = FAR * self.search.margin
+        inputs = [newton.q, newton.base, self._unit, self.net.host.nodes, far, self.net.blocks]
+        self._sweep(self._stay, inputs, [self._move, self._modes])
+        self.search.filter(self._move, newton.q, self._unit, self._modes, self._units, self.touch.keep)
         if len(self._nodes):
             eps = ROUNDING * newton.eps
             inputs = [self._nodes, self._aims, newton.fixed, self._modes, eps, self.net.blocks, newton.q]

@@ -101,7 +101,7 @@ class NetNewton:
         self.psd = self.automatic_psd() if options.psd == "auto" else options.psd
         if self.psd == "none":
             self._require_exact()
-        self.contact = NetContact(self) if host.touching else None
+        self.contact = NetContact(self, model) if host.touching else None
         exact = [self.psd != "gauss_newton" and part.term.measure.packed > 0 for part in net.sets]
         self.exact_from = tuple((0 if self.psd == "none" else EARLY) if wanted else None for wanted in exact)
         banded = self.chains is not None and self.chains.banded

@@ -1,0 +1,118 @@
+"""Obstacles at rest and moved: what they carry, what they push, and what holds within a step."""
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+
+RADIUS = 2e-3
+SOFT = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
+
+
+def bar(z: float, motion=None, **contact) -> ddg.Scene:
+    """A straight rod along x at a height, over the origin."""
+    scene = ddg.Scene(mass_damping=5.0)
+    s = np.linspace(-0.05, 0.05, 11)
+    scene.add_rod(np.stack([s, 0 * s, 0 * s + z], 1), section=ddg.Circle(RADIUS), material=SOFT)
+    scene.contact(**contact)
+    return scene
+
+
+def run(scene, device, steps: int, dt: float = 0.01, **options):
+    model = scene.build(device=device)
+    integrator = ddg.Integrator(model, **options)
+    state = model.state()
+    for _ in range(steps):
+        state = integrator.step(state, dt)
+    return model, integrator, state
+
+
+SHAPES = {
+    "plane": ddg.Plane(),
+    "sphere": ddg.Sphere((0.0, 0.0, -0.3), 0.3),
+    "capsule": ddg.Capsule((0.0, -0.1, -0.05), (0.0, 0.1, -0.05), 0.05),
+    "box": ddg.Box((0.0, 0.0, -0.05), (0.1, 0.1, 0.05)),
+    "mesh": ddg.Mesh([[-0.2, -0.2, 0.0], [0.3, -0.2, 0.0], [-0.1, 0.3, 0.0]], [[0, 1, 2]]),
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_obstacles_carry_what_lies_on_them(device, shape):
+    """At rest the reaction of the obstacle is the weight, rho A L g."""
+    scene = bar(1.3 * RADIUS, friction=0.5)
+    scene.add_obstacle(SHAPES[shape])
+    model, integrator, state = run(scene, device, 120)
+    section = model.scene.batches[0].section
+    weight = section.mass_per_length * 0.1 * 9.81
+    found = model.contacts(state)
+    np.testing.assert_allclose(np.abs(found.force.sum(0)), [0.0, 0.0, weight], atol=2e-3 * weight)
+    np.testing.assert_allclose(model.reactions(state)[0].force, [0.0, 0.0, weight], atol=2e-3 * weight)
+    assert 0.0 < integrator.statistics()["contact"]["smallest_gap"] <= found.gap.min() + 1e-12
+
+
+@pytest.mark.parametrize("shape", ["plane", "sphere", "capsule", "box"])
+def test_moved_obstacles_take_along_what_is_in_their_way(device, shape):
+    """An obstacle that goes up by many gaps in a step lifts the rod, and nothing passes."""
+    height = 0.05
+    motion = ddg.Motion(translation=lambda t: (0.0, 0.0, height * min(1.0, t / 0.2)))
+    scene = bar(1.3 * RADIUS, friction=0.5)
+    scene.add_obstacle(SHAPES[shape], motion=motion)
+    model, integrator, state = run(scene, device, 25)
+    step, gap = height / 20, model.net.host.touching.reach
+    assert step > 2.0 * gap
+    z = state.points()[:, 2]
+    assert z[5] > height + 0.9 * RADIUS
+    assert integrator.statistics()["contact"]["smallest_gap"] > 0.0
+    nodes = model.net.host.obstacles[0]
+    np.testing.assert_allclose(
+        state.net.q.numpy()[nodes] - model.net.host.rest[nodes], [[0.0, 0.0, height]] * len(nodes), atol=1e-12
+    )
+
+
+def test_a_turned_mesh_sweeps_a_rod_aside(device):
+    """A wall that turns about z pushes the rod ahead of it."""
+    wall = ddg.Mesh([[-0.001, 0, -0.1], [0.2, 0, -0.1], [0.2, 0, 0.1], [-0.001, 0, 0.1]], [[0, 1, 2], [0, 2, 3]])
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), mass_damping=20.0)
+    s = np.linspace(-0.05, 0.05, 11)
+    scene.add_rod(np.stack([0 * s + 0.1, 0 * s + 0.01, s], 1), section=ddg.Circle(RADIUS), material=SOFT)
+    scene.contact()
+    scene.add_obstacle(wall, motion=ddg.Motion(angle=lambda t: 2.0 * t))
+    _, integrator, state = run(scene, device, 50)
+    angle = np.arctan2(state.points()[:, 1], state.points()[:, 0])
+    assert (angle > 2.0 * 0.5).all()
+    assert integrator.statistics()["contact"]["smallest_gap"] > 0.0
+
+
+def test_a_slope_holds_by_friction_up_to_its_coefficient(device):
+    """tan(slope) < mu sticks, creeping by less than the velocity; tan(slope) > mu slides with g (sin - mu cos)."""
+    slope, velocity = 0.3, 1e-4
+    normal = (np.sin(slope), 0.0, np.cos(slope))
+    down = np.array([np.cos(slope), 0.0, -np.sin(slope)])
+    for mu in (0.5, 0.1):
+        scene = ddg.Scene()
+        s = np.linspace(-0.05, 0.05, 11)
+        line = np.outer(s, [0.0, 1.0, 0.0]) + np.array(normal) * 1.3 * RADIUS
+        scene.add_rod(line, section=ddg.Circle(RADIUS), material=SOFT)
+        scene.contact(friction=mu, velocity=velocity)
+        scene.add_obstacle(ddg.Plane(normal=normal))
+        model = scene.build(device=device)
+        integrator = ddg.Integrator(model)
+        state = model.state()
+        speeds = []
+        for _ in range(60):
+            state = integrator.step(state, 0.005)
+            speeds.append((state.net.v.numpy()[:11] @ down).mean())
+        if mu > np.tan(slope):
+            assert abs(speeds[-1]) < velocity
+        else:
+            expected = 9.81 * (np.sin(slope) - mu * np.cos(slope))
+            np.testing.assert_allclose((speeds[-1] - speeds[29]) / (30 * 0.005), expected, rtol=0.02)
+
+
+@pytest.mark.parametrize("lags", [1, 3])
+def test_friction_is_lagged_as_often_as_stated(device, lags):
+    scene = bar(1.3 * RADIUS, friction=0.5, lags=lags)
+    scene.add_obstacle(ddg.Plane(), motion=ddg.Motion(translation=lambda t: (0.1 * t, 0.0, 0.0)))
+    _, integrator, state = run(scene, device, 60)
+    assert state.net.v.numpy()[:11, 0].mean() == pytest.approx(0.1, rel=0.05)  # taken along
+    assert integrator._net.newton.contact.more_lags == lags - 1
