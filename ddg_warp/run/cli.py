@@ -217,7 +217,7 @@ def settings_of(chosen: argparse.Namespace, module, name: str) -> tuple[dict, di
 
 def say(result, content: dict, checks: list, directory: Path) -> None:
     """Print what a run did."""
-    from ddg_warp.run.summary import checks_table
+    from ddg_warp.run.summary import checks_table, contact_line
 
     print(result.model.report(), end="\n\n")
     steps = f"{content['steps']} steps of {content['ms_per_step']:.3g} ms"
@@ -225,6 +225,8 @@ def say(result, content: dict, checks: list, directory: Path) -> None:
         f"{content['scene']}: {content['sim_time']:g} s in {steps}; "
         f"{content['wall_time']:.3g} s in all, {content['compile_time']:.3g} s to build and compile"
     )
+    if "contact" in content:
+        print(contact_line(content["contact"]))
     if "stable" in content:
         verdicts = {
             True: "stable",
