@@ -17,8 +17,8 @@ PACKAGES = ("ddg-warp", "warp-lang", "numpy", "scipy", "h5py", "usd-core", "matp
 def summary(scene: str, parameters: Mapping, result, checks: Iterable) -> dict:
     """The content of summary.json.
 
-    `failure` is there only where the solver failed, `stable` only of equilibria (null: not asked), `contact` only of scenes with contact:
-    its law and `statistics()["contact"]` of the integrator.
+    `failure` is there only where the solver failed, `stable` only of equilibria (null: not asked); `contact`, its law and
+    `statistics()["contact"]` of the integrator, only of scenes with contact.
     """
     statistics = result.statistics
     content = {

@@ -116,7 +116,7 @@ SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2,
 
 
 def Box(center, half, rotation=None, radius: float = 0.0) -> Mesh:
-    """A box about its `center` [m] with half lengths `half` (3,) [m], turned by a `rotation` (3, 3); edges are round with a `radius`."""
+    """A box about its `center` with half lengths `half` (3,) [m], turned by a `rotation` (3, 3), round at edges with a `radius`."""
     center, half = (np.array(arguments.vector(f"Box: {n}", v)) for n, v in (("center", center), ("half", half)))
     if not (half > 0.0).all():
         raise SceneError(f"Box: half = {half}; half lengths are positive [m]")

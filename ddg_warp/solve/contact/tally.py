@@ -54,7 +54,7 @@ class Tally:
         wp.launch(self._take, self._worlds, inputs, [self.counts, self.work], device=self.device)
 
     def statistics(self) -> dict:
-        """Sums over worlds: "contacts", pairs after the last step and in the mean over all, "friction_work" [J] if there is friction."""
+        """Sums over worlds: "contacts", pairs after the last step and in the mean, and with friction "friction_work" [J]."""
         counts = self.counts.numpy()
         mean = (counts[SUM] / counts[PARTS].clip(1)).sum()
         result = {"contacts": {"mean": float(mean), "last": int(counts[LAST].sum())}}
