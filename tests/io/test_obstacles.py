@@ -159,5 +159,5 @@ def test_other_obstacles_are_refused(device, tmp_path):
 
 def test_contacts_of_no_contact_are_refused(device, tmp_path):
     model = scene(contact=False).build(device=device)
-    with pytest.raises(ValueError, match="the model has no contact; add scene.contact"):
+    with pytest.raises(ValueError, match=r"the model has no contact; add scene\.contact"):
         ddg.Recorder(model, tmp_path, contacts=True)
