@@ -4,8 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ddg_warp.compile.bodies import ROD
 from ddg_warp.kernels.solve import cyclic_reduction
-from ddg_warp.kernels.terms import ALL, CONTACT, FRICTION
+from ddg_warp.kernels.terms import ALL
+from ddg_warp.scene.obstacles import BALL, CAPSULE, MESH, PLANE
 from ddg_warp.scene.scene import Dynamics
 from ddg_warp.solve.chains.step import DIRECT
 from ddg_warp.solve.choice import automatic, net_preconditioner
@@ -85,11 +87,13 @@ def contact_lines(touching) -> list[str]:
 
 
 def contact_terms(touching) -> set[str]:
-    """Names of the terms that are its."""
-    law, rubs = touching.law, touching.friction.any()
-    polynomial = law.friction_law == "polynomial"
-    names = {name for name in CONTACT if name.startswith(law.law)}
-    return names | {name for name in FRICTION if rubs and name.endswith("_polynomial") == polynomial}
+    """Names of the terms that are its: edges always meet edges, and ends of rods in rows of edges; the others what there is."""
+    law, kinds = touching.law, {body.kind for body in touching.bodies}
+    pairs = {"edge_edge"} | ({"point_edge"} if kinds & {ROD, CAPSULE, BALL} else set())
+    pairs |= {name for kind, name in ((MESH, "point_triangle"), (PLANE, "obstacle")) if kind in kinds}
+    names = {f"{law.law}_{pair}" for pair in pairs}
+    suffix = "_polynomial" if law.friction_law == "polynomial" else ""
+    return names | {f"friction_{pair}{suffix}" for pair in pairs if touching.friction.any()}
 
 
 def _between(values: np.ndarray) -> str:

@@ -8,6 +8,8 @@ SCALE = ("#c9d6e8", "#6f9bd1", "#3b5fa8", "#7a2f79", "#d1495b")
 """From low to high, at equal distances."""
 PALETTE = ((0.12, 0.47, 0.71), (0.89, 0.47, 0.20), (0.17, 0.63, 0.42), (0.74, 0.27, 0.35), (0.55, 0.42, 0.70))
 """RGB of batches of rods and of surfaces, in turn."""
+OBSTACLE, CONTACT = (0.62, 0.63, 0.65), (0.86, 0.15, 0.13)
+"""RGB of obstacles, and of points in contact."""
 
 
 def on_scale(values: np.ndarray, low: float, high: float) -> np.ndarray:

@@ -3,9 +3,12 @@
     /trajectory   time (F,) [s], points (F, P, 3) [m], velocities (F, P, 3) [m/s] and directors (F, E, 3) if wanted,
                   series/NAME (F,); with several worlds (F, B, P, 3) and (F, B, E, 3);
                   at_points/NAME (F, B P) and at_cells/NAME (F, B (R + T)), the rods of all worlds, which have none, then
-                  their triangles: fields if wanted, of all worlds
+                  their triangles: fields if wanted, of all worlds; obstacle_points (F, M, 3) or (F, B, M, 3) [m], nodes of
+                  obstacles that something moves; contacts/{world, objects, point, gap, force} (n, ...), pairs of all frames
+                  one after the other if wanted, those of frame f up to contacts/ends[f]
     /model        curves/{counts, closed, radius, names, batch}, surfaces/{triangles, first, names, thickness} if there are
-                  any, parameters/NAME, attributes/NAME of rods
+                  any, obstacles/{...}, see `Obstacles`, touching/{names, size, force}, see `Touching`, parameters/NAME,
+                  attributes/NAME of rods
     /control      how the run was driven
     /checkpoint   a and b, in turn the state at the last frame, at full precision; the attribute current says which
     /VTKHDF       the same points for ParaView, see `vtkhdf`
@@ -20,7 +23,6 @@ ParaView and VTK's reader know the format by the suffix .vtkhdf: a link of that 
 from __future__ import annotations
 
 import datetime
-import json
 import os
 import platform
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,14 +34,25 @@ import h5py
 import numpy as np
 
 from ddg_warp.io import Shapes, existing
-from ddg_warp.io.hdf5_read import CURVE_FIELDS, SURFACE_FIELDS, TrajectoryError, TrajectoryReader, read_rods, undamaged
+from ddg_warp.io.contacts import Contacts
+from ddg_warp.io.hdf5_read import TrajectoryError, TrajectoryReader, read_rods, undamaged
+from ddg_warp.io.hdf5_write import (
+    cut_contacts,
+    extend,
+    extend_contacts,
+    overwrite,
+    write_attributes,
+    write_control,
+    write_model,
+)
 from ddg_warp.io.journal import recover, transaction
+from ddg_warp.io.obstacles import same_obstacles
 from ddg_warp.io.vtkhdf import write_view
 
 __all__ = ["TrajectoryError", "TrajectoryReader", "TrajectoryWriter", "read_rods"]
 
-CHUNK_BYTES = 2**20
 BLOCK_BYTES = 2**27  # frames held in memory at most
+PAIR_BYTES = 80  # of a pair in contact
 OTHER_SLOT = {"a": "b", "b": "a"}
 
 
@@ -57,6 +70,7 @@ class TrajectoryWriter:
         at_points: Names of fields at the points.
         at_cells: Names of fields of the triangles.
         attributes: Values of each rod by name, shape (R,), stored in /model/attributes.
+        contacts: Whether frames come with contacts.
     """
 
     def __init__(
@@ -72,21 +86,25 @@ class TrajectoryWriter:
         at_points: Sequence[str] = (),
         at_cells: Sequence[str] = (),
         attributes: Mapping[str, np.ndarray] | None = None,
+        contacts: bool = False,
     ):
         names = ["points"] + ["velocities"] * velocities + ["directors"] * directors
+        names += ["obstacle_points"] * (model.obstacles is not None and bool(model.obstacles.moved.any()))
         names += [f"at_points/{name}" for name in at_points] + [f"at_cells/{name}" for name in at_cells]
-        self._prepare(path, model, block, names)
+        self._prepare(path, model, block, names, contacts)
         partial = self.path.with_name(self.path.name + ".partial")
         with _removed_on_failure(partial), transaction(partial, new=True) as file:
-            _write_attributes(file, _origin() | dict(provenance or {}))
-            _write_model(file.create_group("model"), model)
+            write_attributes(file, _origin() | dict(provenance or {}))
+            write_model(file.create_group("model"), model)
             for name, values in (attributes or {}).items():
-                _overwrite(file.require_group("model/attributes"), name, np.asarray(values))
-            _write_control(file.create_group("control"), control or {})
+                overwrite(file.require_group("model/attributes"), name, np.asarray(values))
+            write_control(file.create_group("control"), control or {})
             trajectory = file.create_group("trajectory")
-            _extend(trajectory, "time", np.zeros(0), block)
+            extend(trajectory, "time", np.zeros(0), block)
             for name in names:
-                _extend(trajectory, name, np.zeros((0, *self._shape(name))), block)
+                extend(trajectory, name, np.zeros((0, *self._shape(name))), block)
+            if contacts:
+                extend_contacts(trajectory.create_group("contacts"), [], block)
         self.path.with_name(self.path.name + ".journal").unlink(missing_ok=True)
         os.replace(partial, self.path)
         _link(self.path)
@@ -108,6 +126,7 @@ class TrajectoryWriter:
         recover(path)
         with TrajectoryReader(path) as reader:
             frame, slot, names = reader.checkpoint_frame, reader.checkpoint_slot, reader.recorded
+            contacts = reader.contacts is not None
             same = np.array_equal(reader.curves.counts, model.curves.counts)
             if not (same and np.array_equal(reader.curves.closed, model.curves.closed)):
                 raise TrajectoryError(f"{path}: the file holds other rods than the model; resume with its own scene")
@@ -115,8 +134,12 @@ class TrajectoryWriter:
                 raise TrajectoryError(
                     f"{path}: the file holds other surfaces than the model; resume with its own scene"
                 )
+            if not same_obstacles(reader.obstacles, model.obstacles):
+                raise TrajectoryError(
+                    f"{path}: the file holds other obstacles than the model; resume with its own scene"
+                )
         writer = cls.__new__(cls)
-        writer._prepare(path, model, block, names)
+        writer._prepare(path, model, block, names, contacts)
         writer._slot = OTHER_SLOT[slot]
         writer._cut(frame, provenance)
         return writer
@@ -138,13 +161,20 @@ class TrajectoryWriter:
         """Names of the fields that frames come with."""
         return [name.rpartition("/")[2] for name in self._names if "/" in name]
 
-    def append(self, state, observed: Mapping[str, float] | None = None, fields: Mapping | None = None) -> None:
+    def append(
+        self,
+        state,
+        observed: Mapping[str, float] | None = None,
+        fields: Mapping | None = None,
+        contacts: Contacts | None = None,
+    ) -> None:
         """Adds the frame of a state and what was observed of it; every frame observes the same names.
 
         Args:
             state: The state.
             observed: Numbers by name.
             fields: Fields by name: of points (worlds, P), of triangles (worlds, T).
+            contacts: What touches, where that is recorded.
         """
         observed = dict(observed or {})
         if self._frames and observed.keys() != self._frames[0]["series"].keys():
@@ -153,10 +183,11 @@ class TrajectoryWriter:
         for name in (name for name in self._names if "/" in name):
             values = np.ravel((fields or {})[name.rpartition("/")[2]])
             frame[name] = np.concatenate([np.full(self._shape(name)[0] - len(values), np.nan), values])
-        self._frames.append({"time": state.time, "series": observed, **frame})
+        self._frames.append({"time": state.time, "series": observed, "contacts": contacts, **frame})
+        self._pairs += len(contacts) if self.contacts else 0
         # The solver may reuse the state's buffers before the block is written: keep a copy now.
         self._snapshot = {name: np.array(value) for name, value in state.snapshot().items()}
-        if len(self._frames) == self._block:
+        if len(self._frames) == self._block or PAIR_BYTES * self._pairs > BLOCK_BYTES:
             self.flush()
 
     def flush(self) -> None:
@@ -171,23 +202,27 @@ class TrajectoryWriter:
         with transaction(self.path, scratch=f"checkpoint/{slot}") as file:
             trajectory = file["trajectory"]
             for name in ("time", *self._names):
-                _extend(trajectory, name, np.stack([frame[name] for frame in self._frames]), self._block)
+                extend(trajectory, name, np.stack([frame[name] for frame in self._frames]), self._block)
+            if self.contacts:
+                extend_contacts(trajectory["contacts"], [frame["contacts"] for frame in self._frames], self._block)
             self._extend_series(trajectory)
             write_view(file, self._shapes)
             checkpoint = file.require_group(f"checkpoint/{slot}")
             checkpoint.attrs["frame"] = len(trajectory["time"])
             for name, value in self._snapshot.items():
-                _overwrite(checkpoint, name, value)
+                overwrite(checkpoint, name, value)
             file["checkpoint"].attrs["current"] = slot
         self._slot = OTHER_SLOT[slot]
         self._frames.clear()
+        self._pairs = 0
 
     def close(self) -> None:
         """Writes what is left."""
         self.flush()
 
-    def _prepare(self, path, model, block: int, names: list[str]) -> None:
+    def _prepare(self, path, model, block: int, names: list[str], contacts: bool) -> None:
         self.path = Path(path)
+        self.contacts, self._pairs = contacts, 0
         self._model = model
         self._names = names
         self._slot = "a"
@@ -205,6 +240,8 @@ class TrajectoryWriter:
                 rows if name.startswith("at_points") else len(curves.counts) + len(_triangles(self._model.surfaces))
             )
             return (worlds * of_a_world,)
+        if name == "obstacle_points":
+            rows = int(np.count_nonzero(self._model.obstacles.moving))
         if name == "directors":
             rows = int(np.sum(curves.counts)) - np.count_nonzero(~np.asarray(curves.closed))
         return (rows, 3) if worlds == 1 else (worlds, rows, 3)
@@ -215,17 +252,19 @@ class TrajectoryWriter:
             raise TrajectoryError(f"{self.path}: observed {sorted(names)}, but the file holds {sorted(group)}")
         for name in names:
             values = np.array([frame["series"][name] for frame in self._frames], dtype=np.float64)
-            _extend(group, name, values, self._block)
+            extend(group, name, values, self._block)
 
     def _cut(self, frame: int, provenance: Mapping) -> None:
         """Drops the frames from `frame` on, and brings the attributes up to date."""
         with transaction(self.path) as file:
-            _write_attributes(file, provenance)
+            write_attributes(file, provenance)
             trajectory = file["trajectory"]
             if len(trajectory["time"]) == frame:
                 return
             for name in ("time", *self._names, *(f"series/{name}" for name in trajectory.get("series", ()))):
                 trajectory[name].resize(frame, axis=0)
+            if self.contacts:
+                cut_contacts(trajectory["contacts"], frame)
             write_view(file, self._shapes)
 
 
@@ -257,55 +296,5 @@ def _origin() -> dict[str, str]:
     return {"program": "ddg_warp", "version": ours, "date": date, "machine": platform.platform()}
 
 
-def _write_attributes(group: h5py.Group, values: Mapping) -> None:
-    for name, value in values.items():
-        group.attrs[name] = value if isinstance(value, str | int | float) else json.dumps(value, default=str)
-
-
 def _triangles(surfaces) -> np.ndarray:
     return np.zeros((0, 3), int) if surfaces is None else surfaces.triangles
-
-
-def _write_model(group: h5py.Group, model) -> None:
-    curves, parameters = group.create_group("curves"), group.create_group("parameters")
-    for name in CURVE_FIELDS:
-        _overwrite(curves, name, np.asarray(getattr(model.curves, name)))
-    for name in SURFACE_FIELDS if model.surfaces is not None else ():
-        _overwrite(group.require_group("surfaces"), name, np.asarray(getattr(model.surfaces, name)))
-    for name, value in model.parameters().items():
-        _overwrite(parameters, name, np.asarray(value))
-
-
-def _write_control(group: h5py.Group, control: Mapping) -> None:
-    arrays = {name: value for name, value in control.items() if isinstance(value, np.ndarray)}
-    for name, value in arrays.items():
-        _overwrite(group, name, value)
-    _write_attributes(group, {name: value for name, value in control.items() if name not in arrays})
-
-
-def _extend(group: h5py.Group, name: str, rows: np.ndarray, block: int) -> None:
-    """Appends rows to a dataset, which is made if there is none.
-
-    Chunks hold a power of two of rows, at most a block and about a mebibyte: a block of 64 then fills whole chunks.
-    """
-    if name not in group:
-        row_bytes = max(8, 8 * int(np.prod(rows.shape[1:])))
-        chunk = 1 << int(np.log2(max(1, min(block, CHUNK_BYTES // row_bytes))))
-        options = {"maxshape": (None, *rows.shape[1:]), "chunks": (chunk, *rows.shape[1:])}
-        group.create_dataset(name, shape=(0, *rows.shape[1:]), dtype=np.float64, **options)
-    dataset = group[name]
-    start = len(dataset)
-    dataset.resize(start + len(rows), axis=0)
-    dataset[start:] = rows
-
-
-def _overwrite(group: h5py.Group, name: str, value: np.ndarray) -> None:
-    """Writes a dataset, in place where one of the same kind exists."""
-    if value.dtype.kind in "UO":
-        value = value.astype(h5py.string_dtype())
-    if name in group and (group[name].shape, group[name].dtype) == (value.shape, value.dtype):
-        group[name][...] = value
-        return
-    if name in group:
-        del group[name]
-    group[name] = value

@@ -5,16 +5,21 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import fields as fields_of
 from pathlib import Path
 
 import h5py
 import numpy as np
 
 from ddg_warp.io import CurveError, Curves, CurveSet, Surfaces, checked_curves, existing
+from ddg_warp.io.contacts import FIELDS as PAIR_FIELDS
+from ddg_warp.io.contacts import Contacts, Touching
 from ddg_warp.io.journal import open_to_read
+from ddg_warp.io.obstacles import Obstacles
 
 CURVE_FIELDS = ("counts", "closed", "radius", "names", "batch")
 SURFACE_FIELDS = ("triangles", "first", "names", "thickness")
+FRAMES = ("points", "velocities", "directors", "obstacle_points")
 
 
 class TrajectoryError(ValueError):
@@ -51,6 +56,23 @@ class Frames:
             return self._dataset[frames]
 
 
+class ContactFrames:
+    """What touches in each frame, read when indexed by a number: `Contacts`."""
+
+    def __init__(self, group: h5py.Group, names: list[str], path: Path):
+        self._group, self._names, self._path = group, names, path
+        self._ends = np.concatenate([[0], group["ends"][:]])
+
+    def __len__(self) -> int:
+        return len(self._ends) - 1
+
+    def __getitem__(self, frame: int) -> Contacts:
+        first, last = self._ends[range(len(self))[frame] :][:2]
+        with undamaged(self._path):
+            found = {name: self._group[name][first:last] for name in PAIR_FIELDS}
+        return Contacts(names=self._names, **found)
+
+
 class TrajectoryReader:
     """Reads a trajectory file, also one that is being written or whose writer was killed.
 
@@ -63,6 +85,10 @@ class TrajectoryReader:
         series: Observed values by name, each of shape (F,).
         curves: How the points are joined to rods.
         surfaces: How the points are joined to triangles, or None.
+        obstacles: What rods and surfaces touch, as surfaces, or None.
+        obstacle_points: Nodes of obstacles that something moves [m], shape (F, M, 3) or (F, B, M, 3), read when indexed, or None.
+        contacts: What touches, `Contacts` of each frame, read when indexed by a number, or None where it was not recorded.
+        touching: What recordings of contact need to know, or None.
         parameters: The model's parameters by name.
         attributes: Values of each rod by name that a groom came with.
         provenance: The attributes of the file.
@@ -86,7 +112,7 @@ class TrajectoryReader:
             raise TrajectoryError(f"{self.path}: there is no group /trajectory; is it a trajectory.h5?")
         trajectory, model = self._file["trajectory"], self._file["model"]
         self.time = trajectory["time"][:]
-        self.recorded = [name for name in ("points", "velocities", "directors") if name in trajectory]
+        self.recorded = [name for name in FRAMES if name in trajectory]
         self.recorded += [f"{at}/{name}" for at in ("at_points", "at_cells") for name in trajectory.get(at, ())]
         fields = {name: Frames(trajectory[name], self.path) for name in self.recorded}
         self.points, self.velocities = fields["points"], fields.get("velocities")
@@ -97,6 +123,17 @@ class TrajectoryReader:
         self.surfaces = None
         if "surfaces" in model:
             self.surfaces = Surfaces(**{name: _array(model["surfaces"][name]) for name in SURFACE_FIELDS})
+        self.obstacles, self.obstacle_points = None, fields.get("obstacle_points")
+        if "obstacles" in model:
+            self.obstacles = Obstacles(
+                **{field.name: _array(model["obstacles"][field.name]) for field in fields_of(Obstacles)}
+            )
+        self.touching = self.contacts = None
+        if "touching" in model:
+            names, size, force = (_array(model["touching"][name]) for name in ("names", "size", "force"))
+            self.touching = Touching(names.tolist(), float(size), float(force))
+        if "contacts" in trajectory:
+            self.contacts = ContactFrames(trajectory["contacts"], self.touching.names, self.path)
         _refuse_misfits(self.curves, self.surfaces, self.points.shape[-2])
         self.parameters = _all_arrays(model["parameters"])
         self.attributes = _all_arrays(model["attributes"]) if "attributes" in model else {}

@@ -1,9 +1,8 @@
 """USD: recorded rods and surfaces out. `read_curves` and `validate` are here too, for one import.
 
 All rods of a batch (of one name and one material) stand in one prim below /World, with a preview surface of its own: a linear
-BasisCurves, or a Mesh of tubes for programs that draw no
-curves or drop their materials. Every surface is a Mesh of its own. z is up, lengths are in metres, times in seconds
-times timeCodesPerSecond.
+BasisCurves, or a Mesh of tubes for programs that draw no curves or drop their materials. Every surface and every obstacle is a
+Mesh of its own, contact is Points. z is up, lengths are in metres, times in seconds times timeCodesPerSecond.
 USD saves a file in place, over its old table of contents, so that a process killed meanwhile leaves it unreadable.
 The stage therefore lives in a file `NAME.partial.usdc`; after each save a copy of it takes the final name in one step.
 USD does not survive a full disk either. Before each save the room is taken that it can need at most, and given back.
@@ -21,7 +20,10 @@ from pxr import Tf, Usd, UsdGeom, Vt
 
 from ddg_warp.io import CurveError, Curves, Shapes
 from ddg_warp.io.colors import PALETTE
+from ddg_warp.io.contacts import Contacts, Touching
+from ddg_warp.io.obstacles import Obstacles
 from ddg_warp.io.usd_check import validate
+from ddg_warp.io.usd_contact import ContactsPrim, ObstaclePrim
 from ddg_warp.io.usd_prims import ColorBy, CurvesPrim, Frame, PointsPrim, SurfacePrim, TubesPrim
 from ddg_warp.io.usd_read import read_curves
 
@@ -45,6 +47,8 @@ class CurvesWriter:
         tube: Whether to write tubes instead of curves.
         attributes: Values of each rod by name, shape (R,), of a world: numbers or texts, such as the ids and groups of a groom.
         block: Frames between two saves, at least; a killed process leaves the frames saved last.
+        obstacles: What rods and surfaces touch, such as `model.obstacles`; those that something moves once a world.
+        touching: What recordings of contact need to know, where frames come with contacts.
     """
 
     def __init__(
@@ -58,6 +62,8 @@ class CurvesWriter:
         tube: bool = False,
         block: int = 32,
         attributes: Mapping[str, np.ndarray] | None = None,
+        obstacles: Obstacles | None = None,
+        touching: Touching | None = None,
     ):
         self.path = Path(path)
         self._partial = self.path.with_name(f"{self.path.stem}.partial{self.path.suffix}")
@@ -81,6 +87,12 @@ class CurvesWriter:
             self._prims += _define_rods(self._stage, shapes, colors, color_by, TubesPrim if tube else CurvesPrim, kept)
         if shapes.surfaces is not None:
             self._prims += _define_surfaces(self._stage, shapes, color_by)
+        for k in range(0 if obstacles is None else len(obstacles)):
+            for world in range(shapes.worlds if obstacles.moved[k] else 1):
+                path = _free_path(self._stage, str(obstacles.names[k]))
+                self._prims.append(ObstaclePrim(self._stage, path, obstacles, k, world))
+        if touching is not None:
+            self._prims.append(ContactsPrim(self._stage, _free_path(self._stage, "contacts"), touching))
         self._unsaved = _size_of_defaults(self._stage)
 
     def __enter__(self) -> CurvesWriter:
@@ -97,6 +109,8 @@ class CurvesWriter:
         velocities=None,
         scalars: Mapping[str, np.ndarray] | None = None,
         triangle_scalars: Mapping[str, np.ndarray] | None = None,
+        obstacles: np.ndarray | None = None,
+        contacts: Contacts | None = None,
     ) -> None:
         """Adds a frame.
 
@@ -106,10 +120,13 @@ class CurvesWriter:
             velocities: Velocities [m/s], shape (P, 3).
             scalars: Values at the points by name, each of shape (P,), or vectors (P, 3), written unchanged as primvars.
             triangle_scalars: Values of the triangles of all surfaces by name, each of shape (T,), likewise.
+            obstacles: Nodes of obstacles that something moves [m], shape (M, 3), world after world.
+            contacts: What touches.
         """
         code = Usd.TimeCode(round(time * self._fps, 6))
+        frame = Frame(points, velocities, scalars or {}, triangle_scalars or {}, obstacles, contacts)
         for prim in self._prims:
-            prim.write(code, Frame(points, velocities, scalars or {}, triangle_scalars or {}))
+            prim.write(code, frame)
         if self._frames == 0:
             self._stage.SetStartTimeCode(code.GetValue())
         self._stage.SetEndTimeCode(code.GetValue())

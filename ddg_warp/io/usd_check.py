@@ -15,7 +15,7 @@ def validate(path) -> list[str]:
 
     USD's own validators run where the installed USD has them. Beside them, for every BasisCurves and Mesh at every
     time sample: counts match the points, all is finite, widths are positive, normals are unit vectors or 0 where there are
-    any, and the extent contains the points.
+    any, and the extent contains the points. Of Points as many widths as points, positive, and finite values.
     """
     path = existing(path)
     try:
@@ -26,7 +26,10 @@ def validate(path) -> list[str]:
     shapes = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.BasisCurves) or prim.IsA(UsdGeom.Mesh)]
     if not shapes:
         problems.append(f"{path}: there are neither BasisCurves nor meshes")
-    return problems + [f"{prim.GetPath()}: {problem}" for prim in shapes for problem in _problems(prim)]
+    points = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Points)]
+    found = [(prim, problem) for prim in shapes for problem in _problems(prim)]
+    found += [(prim, problem) for prim in points for problem in _problems_of_points(UsdGeom.Points(prim))]
+    return problems + [f"{prim.GetPath()}: {problem}" for prim, problem in found]
 
 
 def _from_validators(stage: Usd.Stage) -> list[str]:
@@ -56,6 +59,17 @@ def _problems(prim: Usd.Prim) -> list[str]:
     return problems
 
 
+def _problems_of_points(prim: UsdGeom.Points) -> list[str]:
+    """Those of Points, of which every time sample has a number of its own."""
+    problems = []
+    for time in prim.GetPointsAttr().GetTimeSamples() or [Usd.TimeCode.Default()]:
+        widths = np.array(prim.GetWidthsAttr().Get(time) or [])
+        problems += [f"at time {time}, {each}" for each in _check_frame(prim, time, len(widths), 0.5 * widths)]
+        if not (widths > 0.0).all():
+            problems.append(f"at time {time}, the widths are not positive")
+    return problems
+
+
 def _check_faces(mesh: UsdGeom.Mesh) -> tuple[int, list[str]]:
     """(points that the faces use, problems)."""
     counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [0])
@@ -66,8 +80,8 @@ def _check_faces(mesh: UsdGeom.Mesh) -> tuple[int, list[str]]:
     return indices.max() + 1, problems
 
 
-def _check_frame(shape: UsdGeom.PointBased, time, count: int, margin: float) -> list[str]:
-    """Problems of the points, velocities and extent at one time; `margin` is half the largest width."""
+def _check_frame(shape: UsdGeom.PointBased, time, count: int, margin: float | np.ndarray) -> list[str]:
+    """Problems of the points, velocities and extent at one time; `margin` is half the largest width, or of the width of each point."""
     points = np.array(shape.GetPointsAttr().Get(time) or [], dtype=np.float64).reshape(-1, 3)
     if len(points) != count:
         return [f"there are {len(points)} points, but the topology takes {count}"]
@@ -85,9 +99,10 @@ def _check_frame(shape: UsdGeom.PointBased, time, count: int, margin: float) -> 
     extent = np.array(shape.GetExtentAttr().Get(time) or [], dtype=np.float64)
     if extent.shape != (2, 3):
         return [*problems, "there is no extent"]
+    if not count:
+        return problems
     slack = EXTENT_SLACK * max(np.ptp(extent), np.abs(extent).max())
-    if (points.min(axis=0) - margin < extent[0] - slack).any() or (
-        points.max(axis=0) + margin > extent[1] + slack
-    ).any():
+    margin = np.reshape(margin, (-1, 1))
+    if (points - margin < extent[0] - slack).any() or (points + margin > extent[1] + slack).any():
         problems.append("the extent does not contain the curves")
     return problems

@@ -11,6 +11,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom, Vt
 from ddg_warp.geometry.operators import vertex_normals
 from ddg_warp.io import Curves, Surfaces
 from ddg_warp.io.colors import on_scale
+from ddg_warp.io.contacts import Contacts
 from ddg_warp.io.tube import SIDES, tube_faces, tube_points
 from ddg_warp.io.usd_materials import bind_preview_surface
 
@@ -28,12 +29,15 @@ class ColorBy:
 
 @dataclass(frozen=True)
 class Frame:
-    """What prims write at one time; points (P, 3) [m], velocities (P, 3) [m/s] or None, scalars by name."""
+    """What prims write at one time; points (P, 3) [m], velocities (P, 3) [m/s] or None, scalars by name; nodes (worlds M, 3) [m] of
+    obstacles that something moves, and contacts, or None."""
 
     points: np.ndarray
     velocities: np.ndarray | None
     at_points: Mapping[str, np.ndarray]
     at_triangles: Mapping[str, np.ndarray]
+    obstacles: np.ndarray | None = None
+    contacts: Contacts | None = None
 
 
 class PointsPrim:
@@ -54,33 +58,33 @@ class PointsPrim:
         uniform = color.ndim == 1
         kind = UsdGeom.Tokens.constant if uniform else UsdGeom.Tokens.vertex
         self._color = self._primvars.CreatePrimvar("displayColor", Sdf.ValueTypeNames.Color3fArray, kind)
-        self._color.Set(_vectors([color] if uniform else self._at_vertices(color)))
+        self._color.Set(vectors([color] if uniform else self._at_vertices(color)))
         bind_preview_surface(prim.GetPrim().GetStage(), prim.GetPrim(), color)
 
     def write(self, code: Usd.TimeCode, frame: Frame) -> None:
         """Sets the samples of one frame."""
-        shown = _vectors(self._vertices(np.asarray(frame.points, dtype=np.float64)[self._rows]))
+        shown = vectors(self._vertices(np.asarray(frame.points, dtype=np.float64)[self._rows]))
         self._sample(self._prim.GetPointsAttr(), shown, code)
         self._sample(self._prim.GetExtentAttr(), self._extent(shown), code)
         if frame.velocities is not None:
             velocities = self._at_vertices(np.asarray(frame.velocities)[self._rows])
-            self._sample(self._prim.GetVelocitiesAttr(), _vectors(velocities), code)
+            self._sample(self._prim.GetVelocitiesAttr(), vectors(velocities), code)
         for name, values in frame.at_points.items():
             mine = self._at_vertices(np.asarray(values)[self._rows])
             if mine.ndim == 1:
                 self._write_scalar(code, name, mine, UsdGeom.Tokens.vertex)
             else:
                 primvar = self._primvars.CreatePrimvar(name, Sdf.ValueTypeNames.Vector3fArray, UsdGeom.Tokens.vertex)
-                self._sample(primvar.GetAttr(), _vectors(mine), code)
+                self._sample(primvar.GetAttr(), vectors(mine), code)
 
     def _write_scalar(self, code: Usd.TimeCode, name: str, values: np.ndarray, kind: str) -> None:
         primvar = self._primvars.CreatePrimvar(name, Sdf.ValueTypeNames.FloatArray, kind)
-        self._sample(primvar.GetAttr(), _floats(values), code)
+        self._sample(primvar.GetAttr(), floats(values), code)
         if self._color_by is not None and name == self._color_by.name:
             self._color.GetAttr().ClearDefault()  # the samples are at other places than the one color was
             self._color.SetInterpolation(kind)
             colors = on_scale(values, self._color_by.low, self._color_by.high)
-            self._sample(self._color.GetAttr(), _vectors(colors), code)
+            self._sample(self._color.GetAttr(), vectors(colors), code)
 
     def _sample(self, attribute: Usd.Attribute, value, code: Usd.TimeCode) -> None:
         """Sets the value of an attribute at a time."""
@@ -111,7 +115,7 @@ class CurvesPrim(PointsPrim):
     def __init__(self, stage: Usd.Stage, path: str, curves: Curves, rows, color, color_by):
         self._curves = curves
         super().__init__(self._define(stage, path), rows, color, color_by)
-        radius = _floats(self._at_vertices(curves.radius))
+        radius = floats(self._at_vertices(curves.radius))
         self._primvars.CreatePrimvar("radius", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex).Set(radius)
 
     def add_attributes(self, attributes: Mapping[str, np.ndarray]) -> None:
@@ -132,7 +136,7 @@ class CurvesPrim(PointsPrim):
         curves.CreateCurveVertexCountsAttr(_ints(self._curves.counts))
         widths = 2.0 * self._curves.radius
         uniform = np.ptp(widths) == 0.0
-        self._widths = _floats(widths[:1] if uniform else widths)
+        self._widths = floats(widths[:1] if uniform else widths)
         curves.CreateWidthsAttr(self._widths)
         curves.SetWidthsInterpolation(UsdGeom.Tokens.constant if uniform else UsdGeom.Tokens.vertex)
         return curves
@@ -146,7 +150,7 @@ class TubesPrim(CurvesPrim):
 
     def _define(self, stage: Usd.Stage, path: str) -> UsdGeom.PointBased:
         sizes, indices = tube_faces(self._curves.counts, self._curves.closed)
-        return _define_mesh(stage, path, sizes, indices, double_sided=False)
+        return define_mesh(stage, path, sizes, indices, double_sided=False)
 
     def _at_faces(self, values: np.ndarray) -> np.ndarray:
         sizes, indices = tube_faces(self._curves.counts, self._curves.closed)
@@ -178,24 +182,25 @@ class SurfacePrim(PointsPrim):
         rows, local = np.unique(surfaces.triangles[part], return_inverse=True)
         self.triangles = local.reshape(-1, 3)  # what `vertex_normals` asks of a surface
         self._part = part
-        mesh = _define_mesh(stage, path, np.full(len(self.triangles), 3), self.triangles.ravel(), double_sided=True)
+        mesh = define_mesh(stage, path, np.full(len(self.triangles), 3), self.triangles.ravel(), double_sided=True)
         super().__init__(mesh, rows, color, color_by)
         mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
         thickness = surfaces.thickness[part]
         uniform = np.ptp(thickness) == 0.0
         kind = UsdGeom.Tokens.constant if uniform else UsdGeom.Tokens.uniform
         primvar = self._primvars.CreatePrimvar("thickness", Sdf.ValueTypeNames.FloatArray, kind)
-        primvar.Set(_floats(thickness[:1] if uniform else thickness))
+        primvar.Set(floats(thickness[:1] if uniform else thickness))
 
     def write(self, code: Usd.TimeCode, frame: Frame) -> None:
         super().write(code, frame)
         points = np.asarray(frame.points, dtype=np.float64)[self._rows]
-        self._sample(self._prim.GetNormalsAttr(), _vectors(vertex_normals(self, points)), code)
+        self._sample(self._prim.GetNormalsAttr(), vectors(vertex_normals(self, points)), code)
         for name, values in frame.at_triangles.items():
             self._write_scalar(code, name, np.asarray(values)[self._part], UsdGeom.Tokens.uniform)
 
 
-def _define_mesh(stage: Usd.Stage, path: str, sizes: np.ndarray, indices: np.ndarray, double_sided: bool):
+def define_mesh(stage: Usd.Stage, path: str, sizes: np.ndarray, indices: np.ndarray, double_sided: bool):
+    """A Mesh without points, of faces with `sizes` corners and their `indices`, as they are."""
     mesh = UsdGeom.Mesh.Define(stage, path)
     mesh.CreateFaceVertexCountsAttr(_ints(sizes))
     mesh.CreateFaceVertexIndicesAttr(_ints(indices))
@@ -204,11 +209,13 @@ def _define_mesh(stage: Usd.Stage, path: str, sizes: np.ndarray, indices: np.nda
     return mesh
 
 
-def _vectors(values) -> Vt.Vec3fArray:
-    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32))
+def vectors(values) -> Vt.Vec3fArray:
+    """Vectors (n, 3) for USD."""
+    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32).reshape(-1, 3))
 
 
-def _floats(values) -> Vt.FloatArray:
+def floats(values) -> Vt.FloatArray:
+    """Numbers (n,) for USD."""
     return Vt.FloatArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32))
 
 
@@ -223,7 +230,7 @@ def _texts(values) -> Vt.StringArray:
 KINDS = {
     "i": (Sdf.ValueTypeNames.IntArray, _ints),
     "u": (Sdf.ValueTypeNames.IntArray, _ints),
-    "f": (Sdf.ValueTypeNames.FloatArray, _floats),
+    "f": (Sdf.ValueTypeNames.FloatArray, floats),
     "U": (Sdf.ValueTypeNames.StringArray, _texts),
 }
 """Type of a primvar for a kind of NumPy array; texts for what is neither a whole number nor a real one."""

@@ -217,7 +217,7 @@ def _runner(what: str | Callable, ranges: Mapping, options: Mapping) -> SceneRun
             )
     if unknown := options.keys() - set(OPTIONS):
         raise SceneError(f"options: {', '.join(sorted(unknown))}: there are {', '.join(OPTIONS)}")
-    check_fields([name for name in options.get("fields", ()) if name not in ("velocities", "directors")])
+    check_fields([name for name in options.get("fields", ()) if name not in ("velocities", "directors", "contacts")])
     return FunctionRun(what) if callable(what) else SceneRun(what, dict(options))
 
 

@@ -11,6 +11,8 @@ from ddg_warp.compile.conditions import scene_motions
 from ddg_warp.compile.precision import choose, warn_of_rounding
 from ddg_warp.errors import SceneError
 from ddg_warp.io import Curves, Surfaces
+from ddg_warp.io.contacts import Touching
+from ddg_warp.io.obstacles import Obstacles
 from ddg_warp.kernels import element, step
 from ddg_warp.model import glue, validate
 from ddg_warp.model.group import Group
@@ -98,6 +100,20 @@ class Model:
         """Shells as triangles among the rows of `State.points`; None without."""
         return self.order.surfaces
 
+    @property
+    def obstacles(self) -> Obstacles | None:
+        """Obstacles as surfaces to look at; None without."""
+        return self.order.obstacles
+
+    @property
+    def touching(self) -> Touching | None:
+        """What recordings of contact need to know; None without."""
+        host = self.net.host.touching if self.net is not None else None
+        if host is None:
+            return None
+        force = float(np.median(host.stiffness * host.range))
+        return Touching([body.label for body in host.bodies], host.size, force)
+
     @cached_property
     def touch(self):
         """What may touch, and what does at states that it is asked about (`Touch`); None without contact."""
@@ -145,7 +161,7 @@ class Model:
         return drag(self, state)
 
     def contacts(self, state: State):
-        """What touches what at a state, `ask.contacts.Contacts`; see there."""
+        """What touches what at a state, `io.contacts.Contacts`; see `ask.contacts`."""
         from ddg_warp.ask.contacts import contacts
 
         validate.check_state("contacts", self, state)

@@ -7,6 +7,7 @@ import warp as wp
 
 from ddg_warp.compile import axisymmetric
 from ddg_warp.io import Curves, Surfaces
+from ddg_warp.io.obstacles import Obstacles
 from ddg_warp.model.group import Group
 
 
@@ -49,6 +50,15 @@ class Order:
             names=np.array([shell.name for shell in self.model.scene.shells], dtype=object),
             thickness=np.concatenate([shell.plate.thickness for shell in shells]),
         )
+
+    @cached_property
+    def obstacles(self) -> Obstacles | None:
+        """Obstacles as surfaces; None without."""
+        scene = self.model.scene
+        if not scene.obstacles:
+            return None
+        points = [batch.points.reshape(-1, 3) for batch in scene.batches] + [shell.points for shell in scene.shells]
+        return Obstacles.of(scene.obstacles, np.concatenate(points))
 
     @cached_property
     def net_rows(self) -> tuple[np.ndarray, np.ndarray]:

@@ -95,6 +95,15 @@ class State:
         """Velocities of nodes, ordered as `points` [m/s]."""
         return self.model.order.nodes([arrays.download(group.v) for group in self.groups], self.net and self.net.v)
 
+    def obstacle_points(self) -> np.ndarray:
+        """Positions of the nodes of obstacles that something moves (M, 3) or (worlds, M, 3) [m], see `Model.obstacles`."""
+        model = self.model
+        if model.obstacles is None:
+            return np.zeros((0, 3) if model.worlds == 1 else (model.worlds, 0, 3))
+        nodes = np.concatenate(model.net.host.obstacles)[model.obstacles.moving]
+        values = self.net.q.numpy().astype(float).reshape(model.worlds, -1, 3)[:, nodes]
+        return values[0] if model.worlds == 1 else values
+
     def angles(self) -> np.ndarray | None:
         """Angles theta of edges [rad] (edges,) or (worlds, edges); None if no rod has twist."""
         model = self.model

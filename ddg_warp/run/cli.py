@@ -79,7 +79,9 @@ def parser(arguments: list[str]) -> Parser:
     run.add_argument("--resume", type=Path, metavar="DIR", help="continue the run recorded in DIR")
     run.add_argument("--force", action="store_true", help="replace a run that is there already")
     run.add_argument(
-        "--fields", metavar="NAME,...", help="record these too, such as velocities,directors,axial_force,shell_energy"
+        "--fields",
+        metavar="NAME,...",
+        help="record these too, such as velocities,directors,contacts,axial_force,shell_energy",
     )
     run.add_argument("--json", type=Path, metavar="FILE", help="write the summary to FILE too")
     if arguments[:1] == ["run"] and len(arguments) > 1 and not arguments[1].startswith("-"):
@@ -217,7 +219,7 @@ def settings_of(chosen: argparse.Namespace, module, name: str) -> tuple[dict, di
 
 def say(result, content: dict, checks: list, directory: Path) -> None:
     """Print what a run did."""
-    from ddg_warp.run.summary import checks_table
+    from ddg_warp.run.summary import checks_table, contact_line
 
     print(result.model.report(), end="\n\n")
     steps = f"{content['steps']} steps of {content['ms_per_step']:.3g} ms"
@@ -225,6 +227,8 @@ def say(result, content: dict, checks: list, directory: Path) -> None:
         f"{content['scene']}: {content['sim_time']:g} s in {steps}; "
         f"{content['wall_time']:.3g} s in all, {content['compile_time']:.3g} s to build and compile"
     )
+    if "contact" in content:
+        print(contact_line(content["contact"]))
     if "stable" in content:
         verdicts = {
             True: "stable",
@@ -266,6 +270,8 @@ def draw(directory: Path, module, result, shapes: int = 6) -> None:
         if (applied := result.scene.applied_field) is not None:
             last = frames[-1][0]
             options["field"] = partial(applied.over, t=last, otherwise=last if result.dt is None else 1.0)
+        if reader.obstacles is not None:
+            options["bodies"] = standing(reader, {frame: float(at[frame]) for frame in chosen})
         if hasattr(module, "picture") and not result.failure:
             options |= module.picture(result, dict(frames))
         rods_picture(reader, path=directory / "picture.png", title=title, **options)
@@ -273,6 +279,15 @@ def draw(directory: Path, module, result, shapes: int = 6) -> None:
         path_plot(result.path, directory / "path.png", title, unit)
     if result.learned is not None:
         lines_plot(directory / "learned.png", **module.plot(result))
+
+
+def standing(reader, times: dict[int, float]) -> dict[float, tuple]:
+    """Obstacles of the first world as surfaces, by the times of frames; still ones at the first, behind all else."""
+    obstacles, nodes, shown = reader.obstacles, reader.obstacle_points, {}
+    for frame, time in times.items():
+        moved = None if nodes is None else nodes[frame].reshape(-1, *nodes.shape[-2:])[0]
+        shown[time] = obstacles.surface(moved, obstacles.moved | (not shown))
+    return shown
 
 
 def list_all(chosen: argparse.Namespace) -> int:

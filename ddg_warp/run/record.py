@@ -12,6 +12,7 @@ from ddg_warp import arguments
 from ddg_warp.ask.fields import CELL_FIELDS, POINT_FIELDS, check_fields, directors_at_points
 from ddg_warp.errors import SceneError
 from ddg_warp.io import Shapes
+from ddg_warp.io.contacts import Contacts
 from ddg_warp.run.run_directory import LOCK, SCENE, TRAJECTORY, lock_directory, refuse_to_replace
 
 DEFAULT_FPS = 24.0
@@ -44,6 +45,8 @@ class Recorder:
         velocities: Whether to record velocities.
         directors: Whether to record the first material directors.
         fields: Names of numbers along rods and over surfaces to record, see `ddg_warp.ask.fields`; a resumed run goes on with its own.
+        contacts: Whether to record what touches, see `Model.contacts`: pairs, places, gaps and forces; in the scene as points, as
+            wide as forces say. A resumed run goes on with or without as it began.
         attributes: Values of each rod by name, shape (R,), such as the `attributes` of curves that were read: ids, groups.
         provenance: Attributes of the trajectory, beside version, date and machine.
         control: How the run is driven, stored in the trajectory.
@@ -71,6 +74,7 @@ class Recorder:
         velocities: bool = False,
         directors: bool = False,
         fields: Sequence[str] = (),
+        contacts: bool = False,
         attributes: Mapping[str, np.ndarray] | None = None,
         provenance: Mapping | None = None,
         control: Mapping | None = None,
@@ -91,6 +95,9 @@ class Recorder:
         self._wanted = check_fields(fields)
         if set(self._wanted) & set(CELL_FIELDS) and model.surfaces is None:
             raise ValueError(f"fields = {fields!r}: the model has no surfaces; leave out {', '.join(CELL_FIELDS)}")
+        if contacts and model.touching is None:
+            raise ValueError("contacts: the model has no contact; add scene.contact(), or leave contacts out")
+        self._contacts = contacts
         if color_by is not None and (not isinstance(color_by, tuple | list) or len(color_by) != 3):
             raise ValueError(f"color_by is {color_by!r}; give (name, value at the low end, value at the high end)")
         if color_by is not None and (color_by[0] not in COLORS or model.surfaces is None):
@@ -104,7 +111,7 @@ class Recorder:
             if not (resume or force):
                 refuse_to_replace(self.directory)
             wanted = {"velocities": velocities, "directors": directors, "provenance": provenance, "control": control}
-            wanted["attributes"] = attributes
+            wanted |= {"attributes": attributes, "contacts": contacts}
             wanted["at_points"] = [name for name in self._wanted if name in POINT_FIELDS]
             wanted["at_cells"] = [name for name in self._wanted if name in CELL_FIELDS]
             self._open(model, hdf5, usd, resume, block, fps or _fps_of(model, every), tube, wanted)
@@ -120,7 +127,7 @@ class Recorder:
             path = self.directory / TRAJECTORY
             if resume:
                 self._trajectory = TrajectoryWriter.resume(path, model, block=block, provenance=wanted["provenance"])
-                self._wanted = tuple(self._trajectory.fields)
+                self._wanted, self._contacts = tuple(self._trajectory.fields), self._trajectory.contacts
                 with TrajectoryReader(path) as reader:
                     wanted["attributes"] = reader.attributes
             else:
@@ -137,6 +144,8 @@ class Recorder:
                 block=block,
                 color_by=self._color_by,
                 attributes=wanted["attributes"],
+                obstacles=model.obstacles,
+                touching=model.touching if self._contacts else None,
             )
         if resume:
             self._replay()
@@ -180,14 +189,16 @@ class Recorder:
         self._last = state.time
         try:
             fields = self._fields_of(state)
+            contacts = self._model.contacts(state) if self._contacts else None
             if self._trajectory is not None:
-                self._trajectory.append(state, observed, fields)
+                self._trajectory.append(state, observed, fields, contacts)
             if self._scene is not None:
                 velocities = state.velocities() if self._velocities else None
                 if self._directors:
                     shape = (self._model.worlds, np.shape(state.points())[-2])
                     fields = fields | {"director": directors_at_points(self._model.curves, state.directors(), shape)}
-                self._show(state.time, state.points(), velocities, fields | self._colors(state))
+                others = (state.obstacle_points(), contacts)
+                self._show(state.time, state.points(), velocities, fields | self._colors(state), *others)
         except OSError as error:
             self._abandon()
             raise self._told(error) from error
@@ -240,7 +251,7 @@ class Recorder:
                 if self._directors and reader.directors is not None:
                     shape = (self._model.worlds, reader.points.shape[-2])
                     fields["director"] = directors_at_points(reader.curves, reader.directors[frame], shape)
-                self._show(reader.time[frame], reader.points[frame], velocities, fields)
+                self._show(reader.time[frame], reader.points[frame], velocities, fields, *_others(reader, frame))
 
     def _fields_of(self, state) -> dict[str, np.ndarray]:
         """The fields of a state by name, (worlds, points) or (worlds, triangles)."""
@@ -262,7 +273,13 @@ class Recorder:
         return {name: triangle_fields(state.model, state)[name].ravel()}
 
     def _show(
-        self, time: float, points: np.ndarray, velocities: np.ndarray | None, fields: Mapping | None = None
+        self,
+        time: float,
+        points: np.ndarray,
+        velocities: np.ndarray | None,
+        fields: Mapping | None = None,
+        obstacles: np.ndarray | None = None,
+        contacts: Contacts | None = None,
     ) -> None:
         """Adds a frame of all worlds to the scene; fields that a point has not are 0 there."""
         velocities = None if velocities is None else np.reshape(velocities, (-1, 3))
@@ -271,8 +288,19 @@ class Recorder:
         fields = {name: np.nan_to_num(np.ravel(values)) for name, values in fields.items()}
         at_points = {name: fields.pop(name) for name in POINT_FIELDS if name in fields} | directors
         self._scene.write(
-            time, np.reshape(points, (-1, 3)), velocities=velocities, scalars=at_points, triangle_scalars=fields
+            time,
+            np.reshape(points, (-1, 3)),
+            velocities=velocities,
+            scalars=at_points,
+            triangle_scalars=fields,
+            obstacles=None if obstacles is None else np.reshape(obstacles, (-1, 3)),
+            contacts=contacts,
         )
+
+
+def _others(reader, frame: int) -> tuple[np.ndarray | None, Contacts | None]:
+    """Of a frame of a trajectory the nodes of obstacles that something moves, and what touches, where it has them."""
+    return tuple(each if each is None else each[frame] for each in (reader.obstacle_points, reader.contacts))
 
 
 def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False, revolve: int = 0) -> None:
@@ -297,8 +325,9 @@ def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False
         first = reader.points[0].reshape(-1, 3)[:count]
         turned = Revolution(reader.curves, first, revolve) if revolve else None
         shapes = turned.shapes if turned else shapes
-        kept = {} if turned else reader.attributes
-        with CurvesWriter(path, shapes, fps=fps or round(1.0 / spacing, 6), tube=tube, attributes=kept) as writer:
+        given = {"obstacles": reader.obstacles, "touching": reader.touching if reader.contacts is not None else None}
+        given = {} if turned else given | {"attributes": reader.attributes}
+        with CurvesWriter(path, shapes, fps=fps or round(1.0 / spacing, 6), tube=tube, **given) as writer:
             shape = (worlds, reader.points.shape[-2])
             for frame, time in enumerate(reader.time):
                 points = reader.points[frame].reshape(-1, 3)
@@ -311,7 +340,9 @@ def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False
                     if reader.directors is None
                     else {"director": directors_at_points(reader.curves, reader.directors[frame], shape)}
                 )
-                writer.write(time, points, velocities=velocities, scalars=directors)
+                nodes, contacts = _others(reader, frame)
+                nodes = None if nodes is None else nodes.reshape(-1, 3)
+                writer.write(time, points, velocities=velocities, scalars=directors, obstacles=nodes, contacts=contacts)
 
 
 def _fps_of(model, every: int) -> float:

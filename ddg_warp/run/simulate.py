@@ -124,7 +124,7 @@ def simulate(
         duration: End of the run [s] instead of the scene's, or instead of that of the run to resume.
         resume: Directory of an earlier run, which this one continues.
         force: Whether to replace a run that `out` holds already.
-        fields: What to record beside positions: "velocities", "directors" and the names of `ddg_warp.ask.fields`.
+        fields: What to record beside positions: "velocities", "directors", "contacts" and the names of `ddg_warp.ask.fields`.
         usd: Whether to record scene.usdc, too.
         observe: (model, state) -> values by name, taken at the start and after every step.
         provenance: Attributes of the trajectory: scene, parameters, command.
@@ -317,10 +317,10 @@ def open_recorder(model, out, resume, dt, provenance, force, fields, usd):
     directory, again = Path(resume or out), resume is not None
     if again:  # where it comes from stays what it was
         provenance = {name: provenance[name] for name in provenance.keys() & {"duration"}}
-    vectors = {name: name in fields for name in ("velocities", "directors")}
-    fields = [name for name in fields if name not in vectors]
+    asked = {name: name in fields for name in ("velocities", "directors", "contacts")}
+    fields = [name for name in fields if name not in asked]
     options = {"fps": fps, "resume": again, "force": force, "fields": fields, "usd": usd, "provenance": provenance}
-    return Recorder(model, directory, **options, **vectors)
+    return Recorder(model, directory, **options, **asked)
 
 
 def wall_clock(device: str) -> Callable[[], float]:

@@ -15,7 +15,11 @@ PACKAGES = ("ddg-warp", "warp-lang", "numpy", "scipy", "h5py", "usd-core", "matp
 
 
 def summary(scene: str, parameters: Mapping, result, checks: Iterable) -> dict:
-    """The content of summary.json; `failure` is there only where the solver failed, `stable` only of equilibria (null: not asked)."""
+    """The content of summary.json.
+
+    `failure` is there only where the solver failed, `stable` only of equilibria (null: not asked); `contact`, its law and
+    `statistics()["contact"]` of the integrator, only of scenes with contact.
+    """
     statistics = result.statistics
     content = {
         "scene": scene,
@@ -34,9 +38,25 @@ def summary(scene: str, parameters: Mapping, result, checks: Iterable) -> dict:
         "energy": result.energies,
         "checks": [check.as_dict() for check in checks],
     }
+    if "contact" in statistics:
+        content["contact"] = {"law": result.scene.touching.law, **statistics["contact"]}
     if result.dt is None:
         content["stable"] = result.state.stable
     return content | ({"failure": result.failure} if result.failure else {})
+
+
+def contact_line(contact: Mapping) -> str:
+    """The entry `contact` of a summary in a line."""
+    pairs, gap = contact["contacts"], contact["smallest_gap"]
+    said = [
+        f"contact by {contact['law']}: {pairs['last']} pairs at the end, {pairs['mean']:.3g} in the mean",
+        f"smallest gap {gap:.3g} m" if math.isfinite(gap) else "no gap below the range",
+        f"{contact['refused_crossings']} refused crossings",
+        f"{contact['searches']} searches",
+    ]
+    if "friction_work" in contact:
+        said.append(f"friction took {contact['friction_work']:.3g} J")
+    return ", ".join(said)
 
 
 def write_json(path: str | Path, content) -> None:

@@ -102,8 +102,9 @@ def _ring(scene, material) -> Added:
 
 def _joined(rigid: bool, **options):
     def add(scene, material) -> Added:
-        first = scene.add_rod(line(0.0 * X, 0.5 * X, 4), section=RECTANGLE, material=material, **options)
-        second = scene.add_rod(line(0.5 * X, X, 4), section=RECTANGLE, material=material, **options)
+        given = {"section": RECTANGLE, "material": material} | options
+        first = scene.add_rod(line(0.0 * X, 0.5 * X, 4), **given)
+        second = scene.add_rod(line(0.5 * X, X, 4), **given)
         scene.join([(first, -1), (second, 0)], rigid=rigid)
 
         def hold(scene, motion=None):
@@ -188,6 +189,37 @@ def _mixed(*adders):
     return add
 
 
+RANGE = 1e-3  # of contact [m]
+
+
+def _between_balls(adder, at: tuple, thick: float):
+    """What `adder` adds, with a ball above and one below a point of it, a little more than the range of contact away."""
+
+    def add(scene, material) -> Added:
+        added = adder(scene, material)
+        apart = 0.05 + thick + 1.02 * RANGE
+        for side in (-1.0, 1.0):
+            scene.add_obstacle(ddg.Sphere(tuple(np.array(at) + [0.0, 0.0, side * apart]), 0.05), name="ball")
+        scene.contact(range=RANGE, friction=0.2)
+        return added
+
+    return add
+
+
+def over_floor(scene, gap: float, motion=None) -> float:
+    """Put a floor below everything, of which the parts pass through each other; its height [m]."""
+    low = [batch.points[..., 2].min() - np.max(batch.section.radius) for batch in scene.batches]
+    low += [shell.points[:, 2].min() - 0.5 * np.max(shell.thickness) for shell in scene.shells]
+    height = min(low, default=0.0) - gap
+    scene.add_obstacle(ddg.Plane((0.0, 0.0, height)), motion=motion, name="floor")
+    scene.contact(range=RANGE, friction=0.2)
+    names = sorted({part.name for part in (*scene.batches, *scene.shells)})
+    for i, one in enumerate(names):
+        for other in names[i:]:
+            scene.contact_between(one, other, ignore=True)
+    return height
+
+
 UP = (0.0, 1.0, 0.0)  # the axis that turns within the plane of x and z
 HANGING = line(0.0 * X, -0.5 * Z, 6)
 
@@ -213,4 +245,9 @@ OBJECTS = {
     "shells of both kinds": Object(_mixed(_sheet("midedge_dof"), _dome), axis=UP, turns=False),
     "rods by the turning angle": Object(_mixed(_rod(curvature="angle"), _joined(True, curvature="angle"))),
     "magnetised rod": Object(_magnetised, turns=False),
+    "rod in contact": Object(_between_balls(_rod(line(0.0 * X, X, 8), section=ddg.Circle(0.02)), X, 0.02), axis=UP),
+    "rods in contact, joined": Object(
+        _between_balls(_joined(True, section=ddg.Circle(0.02)), (0.875, 0.0, 0.0), 0.02), axis=UP
+    ),
+    "shell in contact": Object(_between_balls(_sheet("midedge_dof"), (0.8, 0.25, 0.0), 0.005)),
 }

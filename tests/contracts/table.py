@@ -14,11 +14,14 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+from contact_questions import CONTACT_QUESTIONS
 from objects import OBJECTS
-from questions import QUESTIONS, Variant
+from questions import QUESTIONS as OTHERS
+from questions import Variant
 
 import ddg_warp as ddg
 
+QUESTIONS = {**OTHERS, **CONTACT_QUESTIONS}
 VARIANTS = [(worlds, precision) for worlds in (1, 3) for precision in ("float64", "mixed")]
 RODS = (
     "rod",
@@ -31,7 +34,9 @@ RODS = (
 )
 JOINED = ("rods joined rigidly", "rods joined by a hinge", "planar rods joined rigidly")
 MANY_RODS = ("rods alone and joined", "rods by the turning angle")
-SHELLS = tuple(name for name in OBJECTS if name.startswith("shell,"))
+RODS_IN_CONTACT = ("rod in contact", "rods in contact, joined")
+IN_CONTACT = (*RODS_IN_CONTACT, "shell in contact")
+SHELLS = (*(name for name in OBJECTS if name.startswith("shell,")), "shell in contact")
 
 # What is refused: question -> objects -> words of the message.
 REFUSED = {
@@ -42,12 +47,14 @@ REFUSED = {
         ),
         **dict.fromkeys((*SHELLS, "shell of revolution", "shells of both kinds"), ("rod 0", "does not exist")),
     },
-    "fields": dict.fromkeys((*RODS, *JOINED, "shell of revolution", *MANY_RODS), ("no surfaces",)),
+    "fields": dict.fromkeys((*RODS, *JOINED, "shell of revolution", *MANY_RODS, *RODS_IN_CONTACT), ("no surfaces",)),
     "set rest": {
-        **dict.fromkeys((*RODS, *JOINED, "shell of revolution", *MANY_RODS), ("shell 0", "does not exist")),
+        **dict.fromkeys(
+            (*RODS, *JOINED, "shell of revolution", *MANY_RODS, *RODS_IN_CONTACT), ("shell 0", "does not exist")
+        ),
         "shell, isometric": ("'isometric'", "flat rest shape", "use"),
     },
-    "pressure": dict.fromkeys((*RODS, *JOINED, *MANY_RODS), ("shell 0", "does not exist")),
+    "pressure": dict.fromkeys((*RODS, *JOINED, *MANY_RODS, *RODS_IN_CONTACT), ("shell 0", "does not exist")),
     "couple": dict.fromkeys((*SHELLS, "shell of revolution", "shells of both kinds"), ("rod 0", "does not exist")),
     "drag": {
         **dict.fromkeys((*SHELLS, "shells of both kinds"), ("shell 0", "name the rods")),
@@ -60,6 +67,23 @@ for _question in (
     *("implicit euler", "implicit midpoint", "record", "export", "failure", "grip", "controls", "reset"),
 ):
     REFUSED.setdefault(_question, {})["shell, curved membrane"] = ("shell 0", "'curved'", "statics", "membrane='flat'")
+for _question in ("contact", "moved obstacle"):
+    REFUSED[_question] = {
+        **dict.fromkeys(("planar rod", "planar rods joined rigidly"), ("dimension 3", "leave dimension=2")),
+        **dict.fromkeys(("shell of revolution", "shells of both kinds"), ("shell of revolution 0", "can not touch")),
+        **dict.fromkeys(IN_CONTACT, ("has contact already", "use contact_between")),
+        "shell, curved membrane": ("shell 0", "'curved'", "statics", "membrane='flat'"),
+    }
+for _question in (
+    *("reactions", "motion", "turned clamp", "load", "couple", "pressure", "grip"),
+    *("equilibrium", "spectrum", "continuation"),
+):
+    REFUSED.setdefault(_question, {})
+    REFUSED[_question] = (
+        dict.fromkeys(IN_CONTACT, ("contact: equilibria", "step the scene in time")) | REFUSED[_question]
+    )
+REFUSED["implicit midpoint"] |= dict.fromkeys(IN_CONTACT, ("contact: ", "use 'implicit_euler'"))
+REFUSED["failure"] |= dict.fromkeys(IN_CONTACT, ("contact: ", "'ball'", "overlap", "move them apart"))
 MANY = {"continuation": ("one world",)}  # what several worlds are refused
 
 

@@ -6,8 +6,8 @@ Every fourth cell is run in one of the variants of worlds and precision; all of 
 
 import pytest
 from objects import OBJECTS
-from questions import QUESTIONS, Variant
-from table import REFUSED, answer, cells, expected
+from questions import Variant
+from table import QUESTIONS, REFUSED, answer, cells, expected
 
 # A precision needs kernels of its own of whatever a cell touches: a rod stands for the others in mixed precision.
 MIXED = ("rod",)

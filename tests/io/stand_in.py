@@ -62,6 +62,9 @@ class State:
     def velocities(self) -> np.ndarray:
         return np.cos(self.q)
 
+    def obstacle_points(self) -> np.ndarray:
+        return np.zeros((0, 3))
+
     def directors(self) -> np.ndarray:
         return np.tile([0.0, 0.0, 1.0], (14, 1))
 
@@ -75,6 +78,8 @@ class Model:
 
     curves: Curves = field(default_factory=curves)
     surfaces: Surfaces | None = None
+    obstacles: object = None
+    touching: object = None
     worlds: int = 1
     scene: object = None
 

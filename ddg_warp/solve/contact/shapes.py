@@ -70,14 +70,15 @@ class Shapes:
     def shell(self, triangles, thickness: float, *, name: str | None = None, still: bool = False) -> int:
         """Add a shell of triangles (m, 3) with a thickness [m], half of it on either side; returns the number of the object.
 
-        Triangles, edges and points that share a node are no pairs.
+        What is still may have none, as what touches it has a radius. Triangles, edges and points that share a node are no pairs.
 
         Raises:
             SceneError: names the shell, the triangle, and the remedy.
         """
         name = name or f"shell {len(self.names)}"
         triangles = self._checked(triangles, 2, name)
-        self._positive(thickness, "thickness", name)
+        if thickness != 0.0 or not still:
+            self._positive(thickness, "thickness", name)
         if triangles.shape[1:] != (3,) or not len(triangles):
             raise SceneError(f"{name} has triangles of shape {triangles.shape}; it is (m, 3), with at least one")
         a, b, c = np.moveaxis(self.points[triangles], 1, 0)

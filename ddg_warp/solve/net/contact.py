@@ -14,6 +14,7 @@ from ddg_warp.compile.conditions import pose_starts
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.net import touch as kernels
 from ddg_warp.solve.chains.newton import EARLY
+from ddg_warp.solve.contact.tally import Tally
 from ddg_warp.solve.contact.touch import Touch
 from ddg_warp.solve.net.system import Sums
 
@@ -62,7 +63,8 @@ class NetContact:
         self._move = make(newton.all, net.vector)
         self._way, self._pushed = (make(newton.all, wp.types.vector(3, linear)) for _ in range(2))
         self.crossed, self.least = make(1, wp.int64), wp.full(1, math.inf, dtype=real, device=device)
-        self._counts = self.crossed, self.least, self.search.searches
+        self.tally = Tally(self.terms)
+        self._counts = self.crossed, self.least, self.search.searches, *self.tally.arrays
         self._unit, self._units = self._number_units(host, model.motions)
         places = np.concatenate([host.moving[:, 0], host.turning[:, 0]])
         self._nodes = wp.array(places.astype(np.int32), dtype=int, device=device)
@@ -125,11 +127,12 @@ class NetContact:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         own = [*self._kernels, *([self._stiffen] if self._stiffen else [])]
-        return [*own, *self._sum.kernels, *self.search.kernels, *self.terms.kernels]
+        return [*own, *self._sum.kernels, *self.search.kernels, *self.terms.kernels, *self.tally.kernels]
 
     def begin(self, before: wp.array) -> None:
         """Start a step from positions: the trees of the search anew."""
         self.search.rebuild(before)
+        self.tally.begin()
 
     def start(self, before: wp.array) -> None:
         """Start an attempt: candidates at positions `before`, and what friction takes from there."""
@@ -240,18 +243,19 @@ class NetContact:
         self.search.measure(newton.q)
         inputs = [self.search.crossed, self.search.gap, newton.islands.arrays[0]]
         self._launch(self._refuse, self.net.worlds, inputs, [self.crossed, self.least])
+        self.tally(newton.islands.arrays[0])
 
     def statistics(self) -> dict:
-        """Over all steps so far: searches, pairs that would have passed through each other, the smallest gap [m], infinite without any.
-
-        And how many candidates there are now.
+        """Over all steps so far: searches, pairs that would have passed through each other, the smallest gap [m], infinite where none
+        was within the range; how many candidates there are now; and what `Tally.statistics` has.
         """
+        least = self.least.numpy()[0]
         return {
             "searches": int(self.search.searches.numpy()[0]),
             "refused_crossings": int(self.crossed.numpy()[0]),
-            "smallest_gap": float(self.least.numpy()[0]),
+            "smallest_gap": float(least) if least < least.dtype.type(self.search.reach) else math.inf,
             "candidates": sum(int(pairs.count.numpy()[0]) for pairs in self.search.lists),
-        }
+        } | self.tally.statistics()
 
     def go_on(self, other: "NetContact") -> None:
         """Count on from another one."""
@@ -275,7 +279,10 @@ class NetContact:
     def outgrown(self, x: wp.array) -> bool:
         """Whether pairs did not fit, for which there is room then. Reads from the device."""
         grown = self.search.fit(x)
-        return self.terms.fit() or grown
+        grown = self.terms.fit() or grown
+        if grown:
+            self.tally.forget()
+        return grown
 
     def _sweep(self, kernel, inputs: list, outputs: list) -> None:
         arrays.sweep(kernel, self.net.blocks, inputs, outputs, self.newton.device, worlds=self.net.worlds)

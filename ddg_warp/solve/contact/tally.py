@@ -1,0 +1,61 @@
+"""What contact comes to over the steps of an integrator; see `kernels.contact.tally`."""
+
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.kernels.contact.tally import LAST, PARTS, SUM, count_kernel, take_kernel
+from ddg_warp.solve.contact.pair_terms import PairTerms
+
+
+class Tally:
+    """Pairs that push each other, and the work of friction, over all steps so far. Reads nothing back and can be captured.
+
+    Attributes:
+        counts: of each world (3, worlds), see `kernels.contact.tally`; work: what friction took (worlds,) [J].
+    """
+
+    def __init__(self, terms: PairTerms):
+        self.terms, self.device = terms, terms.device
+        self._worlds = terms.search.worlds
+        self._touching = wp.zeros(self._worlds, dtype=int, device=self.device)
+        self.counts = wp.zeros((3, self._worlds), dtype=wp.int64, device=self.device)
+        self.work = wp.zeros(self._worlds, dtype=wp.float64, device=self.device)
+        self._before = [wp.zeros_like(array) for array in self.arrays]
+        self._count, self._take = count_kernel(arrays.serial(self.device)), take_kernel(terms.real)
+
+    @property
+    def arrays(self) -> list[wp.array]:
+        """What is counted."""
+        return [self.counts, self.work]
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [self._count, self._take]
+
+    def begin(self) -> None:
+        """Remember what it is before a step, which may have to be done again."""
+        for kept, array in zip(self._before, self.arrays, strict=True):
+            wp.copy(kept, array)
+
+    def forget(self) -> None:
+        """Take back the last step."""
+        for kept, array in zip(self._before, self.arrays, strict=True):
+            wp.copy(array, kept)
+
+    def __call__(self, flags: wp.array) -> None:
+        """Add the terms as they were evaluated last, in the worlds whose flags say that a part of a step is done."""
+        self._touching.zero_()
+        for part in self.terms.lists:
+            inputs = [part.pairs, part.count, part.factor.used, part.found.first.count]
+            arrays.sweep(self._count, part.found.capacity, inputs, [self._touching], self.device)
+        self.terms.work()
+        inputs = [self._touching, self.terms.dissipated, flags]
+        wp.launch(self._take, self._worlds, inputs, [self.counts, self.work], device=self.device)
+
+    def statistics(self) -> dict:
+        """Sums over worlds: "contacts", pairs after the last step and in the mean, and with friction "friction_work" [J]."""
+        counts = self.counts.numpy()
+        mean = (counts[SUM] / counts[PARTS].clip(1)).sum()
+        result = {"contacts": {"mean": float(mean), "last": int(counts[LAST].sum())}}
+        return result | ({"friction_work": float(self.work.numpy().sum())} if self.terms.frictions else {})

@@ -1,0 +1,60 @@
+"""What contact comes to over steps: pairs that push each other, and the work of friction, counted on the device."""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels import outcome
+from ddg_warp.kernels.islands import MOVED, STATUS
+from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
+
+SUM, PARTS, LAST = (
+    0,
+    1,
+    2,
+)  # of the counts of each world: pairs over all parts of steps, how many these are, pairs of the last one
+
+
+@cache
+def count_kernel(serial: bool):
+    """count(...): the pairs of a list that push each other, by world; things: first things of pairs in one world."""
+    until = until_function(serial)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def count(
+        pairs: wp.array(dtype=wp.vec2i),
+        number: wp.array(dtype=int),
+        used: wp.array(dtype=int),
+        things: int,
+        touching: wp.array(dtype=int),
+    ):
+        tid = wp.tid()
+        if tid >= number[0]:
+            return
+        for p in range(tid, until(tid, number[0])):
+            if used[p] != 0:
+                wp.atomic_add(touching, pairs[p][0] / things, 1)
+
+    return count
+
+
+@cache
+def take_kernel(real):
+    """take(...): add what a part of a step came to, in the worlds that took it."""
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def take(
+        touching: wp.array(dtype=int),
+        dissipated: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        counts: wp.array2d(dtype=wp.int64),
+        work: wp.array(dtype=wp.float64),
+    ):
+        w = wp.tid()
+        if flags[MOVED, w] != 0 and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING):
+            counts[wp.static(SUM), w] = counts[wp.static(SUM), w] + wp.int64(touching[w])
+            counts[wp.static(PARTS), w] = counts[wp.static(PARTS), w] + wp.int64(1)
+            counts[wp.static(LAST), w] = wp.int64(touching[w])
+            work[w] = work[w] + wp.float64(dissipated[w])
+
+    return take

@@ -1,0 +1,67 @@
+"""What is asked of objects in contact: questions as those of `questions`."""
+
+import numpy as np
+from objects import over_floor
+from questions import Variant, _mass, close
+
+import ddg_warp as ddg
+
+STEP, COUNT = 2e-3, 8
+
+
+def _hits(kind, variant, velocities, gravity: float, motion=None, controls=None) -> tuple:
+    """Steps of an object without supports over a floor, with what is true at each of them; the last state and the integrator."""
+    scene, _ = kind.scene(held=False, gravity=(0.0, 0.0, -gravity))
+    over_floor(scene, 2e-3, motion)
+    model = variant.build(scene)
+    integrator = ddg.Integrator(model, rtol=1e-9)
+    speed = np.zeros((variant.worlds, model.points_count, 3)) + velocities[:, None]
+    state, mass, touched = model.state(velocities=speed if variant.worlds > 1 else speed[0]), _mass(model), 0
+    for k in range(1, COUNT + 1):
+        before = variant.each(state.velocities())
+        state = integrator.step(state, STEP, controls and controls(k))
+        after = variant.each(state.velocities())
+        force = (mass[:, None] * (after - before)).sum(1) / STEP + mass.sum() * np.array([0.0, 0.0, gravity])
+        pushed = variant.each(model.reactions(state)[-1].force)
+        close(pushed[:, 2], force[:, 2], rtol=1e-6, atol=1e-6 * mass.sum(), what="the floor carries what it stops")
+        found = model.contacts(state)
+        summed = np.zeros((variant.worlds, 3))
+        np.add.at(summed, found.world, found.force)  # floors come last: the first of each pair is pushed
+        close(summed, pushed, rtol=1e-9, atol=1e-12, what="contacts are what the floor pushes")
+        assert (found.gap > 0.0).all()
+        energy = variant.each(model.energies(state)["contact"])
+        assert ((energy > 0.0) == (pushed[:, 2] > 0.0)).all()
+        touched += len(found)
+    assert touched, "nothing touched"
+    statistics = integrator.statistics()
+    assert statistics["contact"]["refused_crossings"] == 0
+    assert statistics["contact"]["friction_work"] >= 0.0
+    return state, integrator
+
+
+def contact(kind, variant):
+    """What falls onto a floor pushes it with what the floor takes of its momentum; worlds are as alone."""
+    speeds = np.array([[0.2, 0.0, -0.5 - 0.1 * w] for w in range(variant.worlds)])
+    state, _ = _hits(kind, variant, speeds, 5.0)
+    for world, points in enumerate(variant.each(state.points())):
+        alone, _ = _hits(kind, Variant(variant.device, variant.precision), speeds[world : world + 1], 5.0)
+        close(points, alone.points(), atol=1e-8)
+
+
+def moved_obstacle(kind, variant):
+    """A floor that a grip lifts in every world pushes as one that a motion lifts at that rate."""
+    rates, none = 0.5 + 0.1 * np.arange(variant.worlds), np.zeros((variant.worlds, 3))
+
+    def controls(k):
+        poses = np.zeros((variant.worlds, 1, 6))
+        poses[:, 0, 2] = k * STEP * rates
+        return ddg.Controls(poses)
+
+    state, _ = _hits(kind, variant, none, 1.0, ddg.Grip(), controls)
+    for world, points in enumerate(variant.each(state.points())):
+        motion = ddg.Motion(lambda t, rate=rates[world]: (0.0, 0.0, rate * t))
+        alone, _ = _hits(kind, Variant(variant.device, variant.precision), none[:1], 1.0, motion)
+        close(points, alone.points(), atol=1e-8)
+
+
+CONTACT_QUESTIONS = {"contact": contact, "moved obstacle": moved_obstacle}

@@ -1,0 +1,163 @@
+"""Obstacles and contact in recordings: where they stand, what is read back, resumed and exported."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pxr import Usd, UsdGeom
+
+import ddg_warp as ddg
+from ddg_warp.geometry import meshes
+from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader
+from ddg_warp.io.usd_check import validate
+from ddg_warp.run.cli import main, standing
+
+MOTION = ddg.Motion(translation=lambda t: (0.0, 0.5 * t, 0.0), angle=lambda t: 3.0 * t, axis=(1.0, 0.0, 0.5))
+DT, RADIUS = 0.01, 2e-3
+HEAD = meshes.sphere(1, 0.03)
+
+
+def scene(motion=MOTION, contact: bool = True) -> ddg.Scene:
+    """A rod that falls onto a floor, and obstacles of every kind beside it."""
+    scene = ddg.Scene(analysis=ddg.Dynamics(dt=DT, duration=6 * DT))
+    x = np.linspace(-0.05, 0.05, 9)
+    material = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
+    scene.add_rod(np.stack([x, 0 * x, 0 * x + RADIUS + 1.5e-3], 1), section=ddg.Circle(RADIUS), material=material)
+    if contact:
+        scene.contact(friction=0.2)
+        scene.add_obstacle(ddg.Plane(), name="floor")
+        scene.add_obstacle(ddg.Sphere((0.0, 0.2, 0.1), 0.02), motion=motion, name="ball")
+        scene.add_obstacle(ddg.Capsule((0.0, 0.3, 0.1), (0.1, 0.35, 0.2), 0.02), motion=motion, name="capsule")
+        scene.add_obstacle(ddg.Box((0.0, -0.2, 0.1), (0.02, 0.03, 0.04)), motion=motion, name="box")
+        scene.add_obstacle(ddg.Mesh(HEAD[0] + [0.3, 0.0, 0.1], HEAD[1]), name="head")
+    return scene
+
+
+def volume(points, cells) -> float:
+    """Enclosed by triangles that are seen counter-clockwise from outside [m^3]."""
+    a, b, c = np.moveaxis((points - points.mean(0))[cells], 1, 0)
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+
+
+def run(device, folder, steps: int, worlds: int = 1, resume: bool = False, **options):
+    """States of a recorded run."""
+    model = scene().build(device=device, worlds=worlds)
+    integrator, state = ddg.Integrator(model), model.state()
+    with ddg.Recorder(model, folder, block=2, resume=resume, **options) as recorder:
+        if resume:
+            with TrajectoryReader(Path(folder) / "trajectory.h5") as reader:
+                state = model.restore(reader.checkpoint())
+        recorder.record(state)
+        states = [state.copy()]
+        while round(state.time / DT) < steps:
+            state = integrator.step(state, DT)
+            recorder.record(state)
+            states.append(state.copy())
+    return model, states
+
+
+def test_surfaces_have_the_volumes_of_the_bodies(device):
+    obstacles = scene().build(device=device).obstacles
+    assert obstacles.names.tolist() == ["floor", "ball", "capsule", "box", "head"]
+    expected = {
+        "ball": 4.0 / 3.0 * np.pi * 0.02**3,
+        "capsule": np.pi * 0.02**2 * np.linalg.norm([0.1, 0.05, 0.1]) + 4.0 / 3.0 * np.pi * 0.02**3,
+        "box": 8.0 * 0.02 * 0.03 * 0.04,
+        "head": volume(*HEAD),
+    }
+    for k, name in enumerate(obstacles.names):
+        points, cells = obstacles.points(k), obstacles.cells(k)
+        if name in expected:
+            np.testing.assert_allclose(volume(points, cells), expected[name], rtol=0.012)
+        else:  # seen from outside, and larger than what is over it
+            corners = points[cells]
+            normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            assert (normal[:, 2] > 0.0).all()
+            assert (points.min(0)[:2] < [-0.05, -0.23]).all()
+            assert (points.max(0)[:2] > [0.33, 0.37]).all()
+
+
+def test_surfaces_move_with_the_obstacles(device):
+    model = scene().build(device=device, worlds=2)
+    integrator, state = ddg.Integrator(model), model.state()
+    for _ in range(3):
+        state = integrator.step(state, DT)
+    obstacles, nodes = model.obstacles, state.obstacle_points()
+    assert nodes.shape == (2, 11, 3)
+    box, capsule = 3, 2
+    np.testing.assert_allclose(
+        obstacles.points(box, nodes[1, obstacles.rows(box)]), MOTION.place(3 * DT, obstacles.points(box)), atol=1e-12
+    )
+    ends = nodes[0, obstacles.rows(capsule)]
+    shown, way = obstacles.points(capsule, ends), ends[1] - ends[0]
+    along = np.clip((shown - ends[0]) @ way / (way @ way), 0.0, 1.0)
+    np.testing.assert_allclose(np.linalg.norm(shown - ends[0] - along[:, None] * way, axis=1), 0.02, rtol=1e-9)
+
+
+@pytest.mark.parametrize("worlds", [1, 2])
+def test_recorded_obstacles_and_contacts_read_back(device, tmp_path, worlds):
+    model, states = run(device, tmp_path, 6, worlds, contacts=True)
+    with TrajectoryReader(tmp_path / "trajectory.h5") as reader:
+        assert len(reader) == len(reader.contacts) == 7
+        for frame, state in enumerate(states):
+            np.testing.assert_array_equal(reader.obstacle_points[frame], state.obstacle_points())
+            found, expected = reader.contacts[frame], model.contacts(state)
+            for name in ("world", "objects", "point", "gap", "force"):
+                np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
+            assert found.names == expected.names
+        assert len(reader.contacts[-1]) >= 9 * worlds
+        with pytest.raises(IndexError):
+            reader.contacts[7]
+        for name in ("rest", "counts", "triangles", "spans"):
+            np.testing.assert_array_equal(getattr(reader.obstacles, name), getattr(model.obstacles, name))
+        shown = standing(reader, {0: 0.0, 6: 0.06})
+        assert len(shown[0.0][1]) > len(shown[0.06][1])  # what is still is shown once
+    assert validate(tmp_path / "scene.usdc") == []
+    stage = Usd.Stage.Open(str(tmp_path / "scene.usdc"))
+    still, moved = (UsdGeom.Mesh(stage.GetPrimAtPath(f"/World/{name}")).GetPointsAttr() for name in ("head", "box"))
+    assert still.GetNumTimeSamples() == 0
+    assert moved.GetNumTimeSamples() == 7
+    last = model.obstacles.points(3, np.reshape(states[-1].obstacle_points(), (-1, 11, 3))[0, model.obstacles.rows(3)])
+    np.testing.assert_allclose(moved.Get(moved.GetTimeSamples()[-1]), last, atol=1e-7)
+    assert bool(stage.GetPrimAtPath("/World/box_2")) == (worlds == 2)
+    points = UsdGeom.Points(stage.GetPrimAtPath("/World/contacts"))
+    time = points.GetPointsAttr().GetTimeSamples()[-1]
+    expected = model.contacts(states[-1])
+    np.testing.assert_allclose(points.GetPointsAttr().Get(time), expected.point, atol=1e-7)
+    widths = np.array(points.GetWidthsAttr().Get(time))
+    forces = np.linalg.norm(expected.force, axis=1)
+    assert widths[forces.argmax()] == widths.max() > 0.0
+
+
+def test_a_resumed_run_is_the_run_that_went_on(device, tmp_path):
+    run(device, tmp_path / "straight", 6, contacts=True)
+    run(device, tmp_path / "parts", 3, contacts=True)
+    run(device, tmp_path / "parts", 6, resume=True)
+    with (
+        TrajectoryReader(tmp_path / "straight" / "trajectory.h5") as one,
+        TrajectoryReader(tmp_path / "parts" / "trajectory.h5") as other,
+    ):
+        np.testing.assert_array_equal(one.points[:], other.points[:])
+        np.testing.assert_array_equal(one.obstacle_points[:], other.obstacle_points[:])
+        for frame in range(7):
+            np.testing.assert_array_equal(one.contacts[frame].force, other.contacts[frame].force)
+    assert validate(tmp_path / "parts" / "scene.usdc") == []
+    assert main(["export", str(tmp_path / "parts"), "--to", str(tmp_path / "out.usda")]) == 0
+    assert validate(tmp_path / "out.usda") == []
+    stage = Usd.Stage.Open(str(tmp_path / "out.usda"))
+    assert {"floor", "ball", "capsule", "box", "head", "contacts"} <= {
+        prim.GetName() for prim in stage.GetPrimAtPath("/World").GetChildren()
+    }
+
+
+def test_other_obstacles_are_refused(device, tmp_path):
+    run(device, tmp_path, 2)
+    other = scene(motion=None).build(device=device)
+    with pytest.raises(TrajectoryError, match="other obstacles than the model; resume with its own scene"):
+        ddg.Recorder(other, tmp_path, resume=True)
+
+
+def test_contacts_of_no_contact_are_refused(device, tmp_path):
+    model = scene(contact=False).build(device=device)
+    with pytest.raises(ValueError, match=r"the model has no contact; add scene\.contact"):
+        ddg.Recorder(model, tmp_path, contacts=True)
