@@ -137,7 +137,10 @@ def evaluate_kernel(kind: Kind, density: Density, real, linear, serial: bool):
 
 @cache
 def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: bool):
-    """Product of the exact Hessian of each pair with v, by slot: the reverse of the derivative along v."""
+    """Product of the exact Hessian of each pair with v, by slot: the reverse of the derivative along v.
+
+    If worlds are `wanted`, of those pairs alone in these that `pair_bend` does not know.
+    """
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
     X, *_ = shape_types(real)
     V, L, until = wp.types.vector(3, real), wp.types.vector(3, linear), until_function(serial)
@@ -153,13 +156,17 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: boo
         x: wp.array(dtype=V),
         factor: Factor,
         v: wp.array(dtype=L),
+        wanted: wp.array(dtype=int),
         parts: wp.array2d(dtype=L),
     ):
         tid = wp.tid()
         if tid >= count[0]:
             return
         for pair in range(tid, until(tid, count[0])):
-            if factor.used[pair] != 0:
+            asked = factor.used[pair] != 0
+            if asked and wanted.shape[0] > 0:
+                asked = factor.bend[pair] == linear(0.0) and wanted[pairs[pair][0] / sides.counts[0]] != 0
+            if asked:
                 p, threshold, inner = given(law, sides, pairs[pair])
                 nodes = factor.nodes[pair]
                 move = X()

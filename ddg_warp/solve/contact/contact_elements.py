@@ -6,6 +6,7 @@ from ddg_warp import arrays
 from ddg_warp.kernels.contact import gather, sums
 from ddg_warp.kernels.contact.pair_energy import rows_of
 from ddg_warp.kernels.contact.pair_terms import evaluate_kernel, exact_product_kernel
+from ddg_warp.kernels.contact.surfaces import EDGES
 from ddg_warp.kernels.densities import Density
 from ddg_warp.solve.contact.pair_elements import PairElements
 from ddg_warp.solve.contact.pairs import PairList, RunningSums
@@ -24,10 +25,11 @@ class ContactElements(PairElements):
         self._evaluate = evaluate_kernel(kind, law, real, linear, serial)
         self._exact = exact_product_kernel(kind, law, real, linear, serial)
         self.kernels += [*self._listing, self._evaluate, self._exact, sums.add_pieces, sums.run]
+        self.mollified = kind == EDGES
         self.count, self.starts, self.partners = found.count, found.starts, found.partners
         self.numbers, self._filled = (wp.zeros(nodes, dtype=int, device=self.device) for _ in range(2))
         self._running, self._silent = RunningSums(self.numbers), silent
-        self.places = self._running.starts
+        self.places, self._nowhere = self._running.starts, wp.zeros(0, dtype=int, device=self.device)
         self.reserve()
 
     def reserve(self) -> None:
@@ -61,6 +63,10 @@ class ContactElements(PairElements):
 
     def exact_product(self, v: wp.array, out: wp.array, x: wp.array, law) -> None:
         """Add the product of the exact Hessian at x, those of `evaluate`, with v."""
-        inputs = [self.pairs, self.count, self.found.sides, law, x, self.factor, v]
-        self._sweep(self._exact, self.found.capacity, inputs, [self.parts])
+        self.multiply(v, x, law, self._nowhere)
         self._add_up(self.parts, 1.0, out)
+
+    def multiply(self, v: wp.array, x: wp.array, law, wanted: wp.array) -> None:
+        """Write it by slot; if worlds are `wanted`, of those pairs alone in these that `pair_bend` does not know."""
+        inputs = [self.pairs, self.count, self.found.sides, law, x, self.factor, v, wanted]
+        self._sweep(self._exact, self.found.capacity, inputs, [self.parts])

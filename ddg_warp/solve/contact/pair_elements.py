@@ -23,8 +23,11 @@ class PairElements:
     Attributes:
         factor: see `gather.factor_struct`.
         pairs, count, starts, partners: as those of a `PairList`; of the subclass.
+        mollified: whether some of their matrices take more than a factor and what turns, see `kernels.contact.pair_energy`.
         numbers, places: of each node, how many items it has and where they start in `items`; of the subclass, but for `items`.
     """
+
+    mollified = False
 
     def __init__(self, found: PairList, rows: int, nodes: int, worlds: int, real, linear, atomic: bool):
         self.found, self.device, self.rows, self._real, self._linear = found, found.device, rows, real, linear

@@ -11,7 +11,8 @@ from ddg_warp.solve.contact.contact_elements import ContactElements
 class PairProduct:
     """The product of the matrix of some lists of pair elements with a vector; `fit` follows whenever they have got more room."""
 
-    def __init__(self, parts: list, real, linear, atomic: bool):
+    def __init__(self, parts: list, law, real, linear, atomic: bool):
+        self._law, self._mollified = law, [part for part in parts if part.mollified]
         self._parts, self._linear, self._atomic, self._device = parts, linear, atomic, parts[0].device
         types = int, wp.types.vector(3, real)
         self._nothing = [wp.zeros(0, dtype=dtype, device=self._device) for dtype in types]
@@ -42,6 +43,8 @@ class PairProduct:
     def _write(self, v, x, wanted) -> None:
         given = self._nothing if wanted is None else [wanted, x]
         self._sweep(self._multiply, self._most, [self.sets, *given, v], [])
+        for part in self._mollified if wanted is not None else ():
+            part.multiply(v, x, self._law, wanted)
 
     def _set(self, part):
         own = set_struct(self._linear)()

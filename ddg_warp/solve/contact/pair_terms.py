@@ -101,8 +101,8 @@ class PairTerms:
         self._version, self._lagged = search.version, -1
         self.frictions = self._with_friction(friction, friction_law, velocity, number, atomic)
         self._start = wp.zeros_like(self.forces)
-        self._product = PairProduct(self._parts, self.real, self.linear, atomic)
-        self._rub = PairProduct(self.frictions, self.real, self.linear, atomic) if self.frictions else None
+        self._product = PairProduct(self._parts, self.law, self.real, self.linear, atomic)
+        self._rub = PairProduct(self.frictions, self.law, self.real, self.linear, atomic) if self.frictions else None
         self._no_iterates = (wp.zeros(0, dtype=int, device=self.device),) * 2
 
     @property
