@@ -43,21 +43,16 @@ def compare_searches(searches: wp.array(dtype=int), listed: wp.array(dtype=int),
 
 @cache
 def list_kernels(kind: Kind, real, serial: bool):
-    """number(...) and fill(...) the items of nodes, sort(...) each list into `ordered`.
+    """name(...) the nodes of pairs; number(...) and fill(...) the items of nodes, sort(...) each list into `ordered`.
 
-    Nodes of a world that are `silent`, not zero, have none.
+    Items are of pairs that are used, and of none of the nodes of a world that are `silent`, not zero.
     """
     Sides, until, size = sides_struct(real), until_function(serial), kind.first + kind.second
     slots, *_ = pair_functions(kind, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def number(
-        pairs: wp.array(dtype=wp.vec2i),
-        count: wp.array(dtype=int),
-        sides: Sides,
-        silent: wp.array(dtype=wp.uint8),
-        nodes_out: wp.array(dtype=wp.vec4i),
-        numbers: wp.array(dtype=int),
+    def name(
+        pairs: wp.array(dtype=wp.vec2i), count: wp.array(dtype=int), sides: Sides, nodes_out: wp.array(dtype=wp.vec4i)
     ):
         tid = wp.tid()
         if tid >= count[0]:
@@ -66,15 +61,31 @@ def list_kernels(kind: Kind, real, serial: bool):
             w = pairs[p][0] / sides.counts[0]
             nodes = slots(sides, pairs[p][0] - w * sides.counts[0], pairs[p][1] - w * sides.counts[1], w)
             nodes_out[p] = wp.vec4i(nodes[0], nodes[1], nodes[2], nodes[3])
-            for slot in range(wp.static(size)):
-                if silent[nodes[slot] - w * silent.shape[0]] == wp.uint8(0):
-                    wp.atomic_add(numbers, nodes[slot], 1)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def number(
+        count: wp.array(dtype=int),
+        nodes: wp.array(dtype=wp.vec4i),
+        used: wp.array(dtype=int),
+        silent: wp.array(dtype=wp.uint8),
+        numbers: wp.array(dtype=int),
+    ):
+        tid = wp.tid()
+        if tid >= count[0]:
+            return
+        for p in range(tid, until(tid, count[0])):
+            if used[p] != 0:
+                for slot in range(wp.static(size)):
+                    node = nodes[p][slot]
+                    if silent[node % silent.shape[0]] == wp.uint8(0):
+                        wp.atomic_add(numbers, node, 1)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def fill(
         count: wp.array(dtype=int),
         nodes: wp.array(dtype=wp.vec4i),
-        numbers: wp.array(dtype=int),
+        used: wp.array(dtype=int),
+        silent: wp.array(dtype=wp.uint8),
         starts: wp.array(dtype=int),
         filled: wp.array(dtype=int),
         items: wp.array(dtype=int),
@@ -85,15 +96,17 @@ def list_kernels(kind: Kind, real, serial: bool):
         for p in range(tid, until(tid, count[0])):
             for slot in range(wp.static(size)):
                 node = nodes[p][slot]
-                if numbers[node] > 0:
+                if used[p] != 0 and silent[node % silent.shape[0]] == wp.uint8(0):
                     items[starts[node] + wp.atomic_add(filled, node, 1)] = wp.static(SLOTS) * p + slot
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def sort(
         count: wp.array(dtype=int),
         nodes: wp.array(dtype=wp.vec4i),
-        numbers: wp.array(dtype=int),
+        used: wp.array(dtype=int),
+        silent: wp.array(dtype=wp.uint8),
         starts: wp.array(dtype=int),
+        numbers: wp.array(dtype=int),
         items: wp.array(dtype=int),
         ordered: wp.array(dtype=int),
     ):
@@ -104,15 +117,15 @@ def list_kernels(kind: Kind, real, serial: bool):
         for p in range(tid, until(tid, count[0])):
             for slot in range(wp.static(size)):
                 node = nodes[p][slot]
-                start = starts[node]
-                item = wp.static(SLOTS) * p + slot
-                smaller = int(0)
-                for k in range(start, start + numbers[node]):
-                    smaller += wp.where(items[k] < item, 1, 0)
-                if numbers[node] > 0:
+                if used[p] != 0 and silent[node % silent.shape[0]] == wp.uint8(0):
+                    start = starts[node]
+                    item = wp.static(SLOTS) * p + slot
+                    smaller = int(0)
+                    for k in range(start, start + numbers[node]):
+                        smaller += wp.where(items[k] < item, 1, 0)
                     ordered[start + smaller] = item
 
-    return number, fill, sort
+    return name, number, fill, sort
 
 
 @cache

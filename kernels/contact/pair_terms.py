@@ -137,10 +137,7 @@ def evaluate_kernel(kind: Kind, density: Density, real, linear, serial: bool):
 
 @cache
 def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: bool):
-    """Product of the exact Hessian of each pair with v, by slot: the reverse of the derivative along v.
-
-    If worlds are `wanted`, of those pairs alone in these that `pair_bend` does not know.
-    """
+    """Product of the exact Hessian of each pair with v, by slot: the reverse of the derivative along v."""
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
     X, *_ = shape_types(real)
     V, L, until = wp.types.vector(3, real), wp.types.vector(3, linear), until_function(serial)
@@ -156,17 +153,13 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: boo
         x: wp.array(dtype=V),
         factor: Factor,
         v: wp.array(dtype=L),
-        wanted: wp.array(dtype=int),
         parts: wp.array2d(dtype=L),
     ):
         tid = wp.tid()
         if tid >= count[0]:
             return
         for pair in range(tid, until(tid, count[0])):
-            asked = factor.used[pair] != 0
-            if asked and wanted.shape[0] > 0:
-                asked = factor.bend[pair] == linear(0.0) and wanted[pairs[pair][0] / sides.counts[0]] != 0
-            if asked:
+            if factor.used[pair] != 0:
                 p, threshold, inner = given(law, sides, pairs[pair])
                 nodes = factor.nodes[pair]
                 move = X()
@@ -178,6 +171,101 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: boo
                     parts[slot, pair] = L(linear(dx[slot, 0]), linear(dx[slot, 1]), linear(dx[slot, 2]))
 
     return product
+
+
+@cache
+def mollified_kernels(density: Density, real, linear, serial: bool):
+    """Exact Hessians of pairs of edges that `pair_bend` does not know, kept as long as there is room: those all but parallel.
+
+    mark(...) them, choose(...) lists them in order, differentiate(...) writes a column of each, a thread a column, multiply(...).
+    """
+    Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
+    X, *_ = shape_types(real)
+    V, L, until = wp.types.vector(3, real), wp.types.vector(3, linear), until_function(serial)
+    _, _, along = pair_energy_functions(EDGES, density, real)
+    given, corners = read_functions(EDGES, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def mark(
+        pairs: wp.array(dtype=wp.vec2i),
+        count: wp.array(dtype=int),
+        things: int,
+        wanted: wp.array(dtype=int),
+        factor: Factor,
+        marks: wp.array(dtype=int),
+    ):
+        tid = wp.tid()
+        for p in range(tid, until(tid, marks.shape[0])):
+            marks[p] = 0
+            if p < count[0]:
+                if factor.used[p] != 0 and factor.bend[p] == linear(0.0) and wanted[pairs[p][0] / things] != 0:
+                    marks[p] = 1
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def choose(marks: wp.array(dtype=int), starts: wp.array(dtype=int), chosen: wp.array(dtype=int)):
+        tid = wp.tid()
+        for p in range(tid, until(tid, marks.shape[0])):
+            if marks[p] != 0 and starts[p] < chosen.shape[0]:
+                chosen[starts[p]] = p
+
+    @wp.func
+    def number(marks: wp.array(dtype=int), starts: wp.array(dtype=int), most: int):
+        last = marks.shape[0] - 1
+        return wp.min(starts[last] + marks[last], most)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def differentiate(
+        pairs: wp.array(dtype=wp.vec2i),
+        sides: Sides,
+        law: Law,
+        x: wp.array(dtype=V),
+        factor: Factor,
+        marks: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
+        chosen: wp.array(dtype=int),
+        columns: wp.array3d(dtype=L),
+    ):
+        tid = wp.tid()
+        total = 12 * number(marks, starts, chosen.shape[0])
+        if tid >= total:
+            return
+        for i in range(tid, until(tid, total)):
+            m = i / 12
+            column = i - 12 * m
+            pair = chosen[m]
+            p, threshold, inner = given(law, sides, pairs[pair])
+            move = X()
+            move[column / 3, column % 3] = real(1.0)
+            dx, _dv, _dp, _dt, _ds = wp.grad(along)(corners(x, factor.nodes[pair]), move, p, threshold, inner)
+            for slot in range(wp.static(SLOTS)):
+                columns[column, slot, m] = L(linear(dx[slot, 0]), linear(dx[slot, 1]), linear(dx[slot, 2]))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def multiply(
+        factor: Factor,
+        marks: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
+        chosen: wp.array(dtype=int),
+        columns: wp.array3d(dtype=L),
+        v: wp.array(dtype=L),
+        parts: wp.array2d(dtype=L),
+    ):
+        """By slot, as it is symmetric."""
+        tid = wp.tid()
+        total = number(marks, starts, chosen.shape[0])
+        if tid >= total:
+            return
+        for m in range(tid, until(tid, total)):
+            p = chosen[m]
+            n = factor.nodes[p]
+            for slot in range(wp.static(SLOTS)):
+                y = L()
+                for d in range(3):
+                    for k in range(wp.static(SLOTS)):
+                        y[d] += wp.dot(columns[3 * slot + d, k, m], v[n[k]])
+                parts[slot, p] = y
+
+    return mark, choose, differentiate, multiply
 
 
 @cache

@@ -114,7 +114,7 @@ def world_kernels(real):
     def curve(flags: wp.array2d(dtype=int), late: int, curved: wp.array(dtype=int)):
         """Where the matrix has what comes of pairs that turn."""
         w = wp.tid()
-        curved[w] = wp.where(flags[ITERATION, w] > late and flags[CLAMPED, w] == 0, 1, 0)
+        curved[w] = wp.where(flags[WANTED, w] != 0 and flags[ITERATION, w] > late and flags[CLAMPED, w] == 0, 1, 0)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def again(flags: wp.array2d(dtype=int)):

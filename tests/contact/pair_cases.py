@@ -76,6 +76,8 @@ def times(result: PairTerms, v: np.ndarray, at=None, wanted=None) -> np.ndarray:
     """H v, of the exact Hessian where positions are given, or with what comes of turning in worlds that want it."""
     given = upload(v, result.device, wp.types.vector(3, result.linear))
     out = wp.zeros_like(given)
+    if wanted is not None:
+        result.prepare(at, wanted)
     result.product(given, out, at, wanted)
     return out.numpy().copy()
 

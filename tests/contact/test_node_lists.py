@@ -71,9 +71,12 @@ def test_items_in_any_order_are_sorted(device, kind):
     mixed = rng.permutation(len(items))
     mixed = items[mixed][np.argsort(of[mixed], kind="stable")]
     assert (mixed[:count] != wanted[:count]).any()
-    inputs = [wp.array(values, dtype=int, device=device) for values in ([count], numbers, starts, mixed)]
+    inputs = [
+        wp.array(values, dtype=int, device=device) for values in ([count], np.ones(count), starts, numbers, mixed)
+    ]
     inputs.insert(1, wp.array(nodes, dtype=wp.vec4i, device=device))
+    inputs.insert(3, wp.zeros(4000, dtype=wp.uint8, device=device))
     ordered = wp.zeros(len(items), dtype=int, device=device)
-    _, _, sort = gather.list_kernels(kind, wp.float64, False)
+    *_, sort = gather.list_kernels(kind, wp.float64, False)
     wp.launch(sort, count, inputs, [ordered], device=device)
     assert (ordered.numpy() == wanted).all()

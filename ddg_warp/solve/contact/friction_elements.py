@@ -49,11 +49,11 @@ class FrictionElements(PairElements):
             getattr(self, name).zero_()
         capacity = self.found.capacity
         self.pairs = wp.zeros(capacity, dtype=wp.vec2i, device=self.device)
-        pair = wp.types.vector(2, self._real)
+        pair = wp.types.vector(2, self.real)
         self._slip, self._along = (arrays.allocate((2, capacity), pair, self.device) for _ in range(2))
-        self._work, self.lagged.bound = (wp.zeros(capacity, dtype=self._real, device=self.device) for _ in range(2))
-        self.lagged.weight = wp.zeros(capacity, dtype=wp.types.vector(4, self._real), device=self.device)
-        self.lagged.tangent = arrays.allocate((ROWS, capacity), wp.types.vector(3, self._real), self.device)
+        self._work, self.lagged.bound = (wp.zeros(capacity, dtype=self.real, device=self.device) for _ in range(2))
+        self.lagged.weight = wp.zeros(capacity, dtype=wp.types.vector(4, self.real), device=self.device)
+        self.lagged.tangent = arrays.allocate((ROWS, capacity), wp.types.vector(3, self.real), self.device)
 
     def lag(self, law) -> None:
         """Take the pairs of contact as it was evaluated last."""

@@ -23,14 +23,14 @@ class PairElements:
     Attributes:
         factor: see `gather.factor_struct`.
         pairs, count, starts, partners: as those of a `PairList`; of the subclass.
-        mollified: whether some of their matrices take more than a factor and what turns, see `kernels.contact.pair_energy`.
+        mollified: those whose matrices take more than a factor and what turns (`Mollified`); None without.
         numbers, places: of each node, how many items it has and where they start in `items`; of the subclass, but for `items`.
     """
 
-    mollified = False
+    mollified = None
 
     def __init__(self, found: PairList, rows: int, nodes: int, worlds: int, real, linear, atomic: bool):
-        self.found, self.device, self.rows, self._real, self._linear = found, found.device, rows, real, linear
+        self.found, self.device, self.rows, self.real, self.linear = found, found.device, rows, real, linear
         self._atomic, serial, kind = atomic, arrays.serial(self.device), found.kind
         self.size = kind.first + kind.second
         self._add = {dtype: gather.sum_kernels(self.size, dtype, serial)[int(atomic)] for dtype in (real, linear)}
@@ -48,7 +48,7 @@ class PairElements:
         Raises:
             SolverError: if there are more than can be counted.
         """
-        capacity, linear = self.found.capacity, self._linear
+        capacity, linear = self.found.capacity, self.linear
         if capacity > MOST:
             raise SolverError(
                 f"contact has room for {MOST} pairs, not {capacity}; use a smaller margin or reach",
@@ -61,12 +61,12 @@ class PairElements:
         self.factor.direction = arrays.allocate((self.rows, capacity), vector, self.device)
         self.factor.weight = arrays.allocate((self.rows, capacity), wp.types.vector(4, linear), self.device)
         self.items = wp.zeros(self.size * capacity, dtype=int, device=self.device)
-        self._energy = wp.zeros(capacity, dtype=self._real, device=self.device)
+        self._energy = wp.zeros(capacity, dtype=self.real, device=self.device)
         shape = (gather.SLOTS, capacity)
         self.parts = arrays.allocate(shape, vector, self.device)
         self.gradient = self.parts
-        if linear is not self._real:
-            self.gradient = arrays.allocate(shape, wp.types.vector(3, self._real), self.device)
+        if linear is not self.real:
+            self.gradient = arrays.allocate(shape, wp.types.vector(3, self.real), self.device)
 
     def blocks(self, diagonal: wp.array, between: wp.array) -> None:
         """Add the blocks of nodes, and those between the nodes of edges."""

@@ -12,13 +12,14 @@ class PairProduct:
     """The product of the matrix of some lists of pair elements with a vector; `fit` follows whenever they have got more room."""
 
     def __init__(self, parts: list, law, real, linear, atomic: bool):
-        self._law, self._mollified = law, [part for part in parts if part.mollified]
+        self._law, self._mollified = law, [part.mollified for part in parts if part.mollified]
         self._parts, self._linear, self._atomic, self._device = parts, linear, atomic, parts[0].device
         types = int, wp.types.vector(3, real)
         self._nothing = [wp.zeros(0, dtype=dtype, device=self._device) for dtype in types]
         made = product_kernels(real, linear, arrays.serial(self._device))
         self._multiply, self._gather, self._settle, self._scatter = made
         self.kernels = [self._multiply, self._settle, self._scatter if atomic else self._gather]
+        self.kernels += [kernel for part in self._mollified for kernel in part.kernels]
         self.fit()
 
     def fit(self) -> None:
@@ -26,6 +27,11 @@ class PairProduct:
         self._sets = [self._set(part) for part in self._parts]  # an array of structures keeps nothing alive
         self.sets = wp.array(self._sets, dtype=set_struct(self._linear), device=self._device)
         self._most = max(part.found.capacity for part in self._parts)
+
+    def prepare(self, x: wp.array, wanted: wp.array) -> None:
+        """What products with what turns take at positions x, in the worlds that want it."""
+        for part in self._mollified:
+            part.differentiate(x, self._law, wanted)
 
     def __call__(self, v: wp.array, out: wp.array, x: wp.array | None = None, wanted: wp.array | None = None) -> None:
         """out += H v; with what turns at positions x in the worlds that want it."""
@@ -44,7 +50,7 @@ class PairProduct:
         given = self._nothing if wanted is None else [wanted, x]
         self._sweep(self._multiply, self._most, [self.sets, *given, v], [])
         for part in self._mollified if wanted is not None else ():
-            part.multiply(v, x, self._law, wanted)
+            part.multiply(v)
 
     def _set(self, part):
         own = set_struct(self._linear)()

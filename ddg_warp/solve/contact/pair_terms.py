@@ -192,7 +192,7 @@ class PairTerms:
 
         H is the Gauss-Newton matrix, positive semi-definite by form; with the positions x of that `evaluate`, the exact Hessian. Of
         friction both are the same. With `wanted` (worlds,), H has at x what of the exact one comes of pairs that turn
-        (`kernels.contact.pair_bend`), in worlds where that is not zero; it is exact but where edges are all but parallel.
+        (`kernels.contact.pair_bend`), in worlds where that is not zero, once `prepare` was called there.
         """
         if x is None or wanted is not None:
             self._product(v, out, x, wanted)
@@ -201,6 +201,10 @@ class PairTerms:
             part.exact_product(v, out, x, self.law)
         if self._rub:
             self._rub(v, out)
+
+    def prepare(self, x: wp.array, wanted: wp.array) -> None:
+        """What products take that have at x what comes of pairs that turn, in worlds where `wanted` (worlds,) is not zero."""
+        self._product.prepare(x, wanted)
 
     def settle(self, v, out, x, wanted, fixed: wp.array, busy: wp.array, dots: wp.array) -> None:
         """`product` on free dofs, in worlds that are `busy` (1), of which v . out is written node by node, too.

@@ -181,6 +181,8 @@ class NetContact:
         """Its own part in the preconditioner."""
         newton = self.newton
         self._launch(self._find_curved, self.net.worlds, [newton.islands.arrays[0], self._late], [self._curved])
+        if self.bends:
+            self.terms.prepare(newton.q, self._curved)
         if chains := newton.chains:
             inputs = [chains.bands, chains.layout, self._ahead, self._edges, newton.islands.arrays[0]]
             inputs += [self.net.blocks, self.diagonal, self.terms.between]

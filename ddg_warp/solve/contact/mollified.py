@@ -1,0 +1,54 @@
+"""Exact Hessians of edges that are all but parallel; see `kernels.contact.pair_terms`."""
+
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.kernels.contact.gather import SLOTS
+from ddg_warp.kernels.contact.pair_terms import mollified_kernels
+from ddg_warp.kernels.densities import Density
+from ddg_warp.solve.contact.pairs import RunningSums
+
+ROOM = 4  # one in so many pairs may be such a one; more keep the Gauss-Newton matrix, which takes iterations alone
+LEAST = 256  # pairs that there is room for
+
+
+class Mollified:
+    """Those among the `ContactElements` of edges with a law."""
+
+    def __init__(self, elements, law: Density):
+        self._of = elements
+        serial = arrays.serial(elements.device)
+        self.kernels = mollified_kernels(law, elements.real, elements.linear, serial)
+        self._mark, self._choose, self._differentiate, self._multiply = self.kernels
+
+    def reserve(self) -> None:
+        """Make room, as `PairElements` do."""
+        of, capacity = self._of, self._of.found.capacity
+        room = max(LEAST, capacity // ROOM)
+        self._marks = wp.zeros(capacity, dtype=int, device=of.device)
+        self._running = RunningSums(self._marks)
+        self._chosen = wp.zeros(room, dtype=int, device=of.device)
+        vector = wp.types.vector(3, of.linear)
+        self._columns = arrays.allocate((3 * SLOTS, SLOTS, room), vector, of.device)
+
+    def differentiate(self, x: wp.array, law, wanted: wp.array) -> None:
+        """Find them at positions x in worlds that want it, and their Hessians."""
+        of = self._of
+        inputs = [of.pairs, of.count, of.found.first.count, wanted, of.factor]
+        self._sweep(self._mark, len(self._marks), inputs, [self._marks])
+        self._running()
+        self._sweep(self._choose, len(self._marks), self._list[:2], [self._chosen])
+        inputs = [of.pairs, of.found.sides, law, x, of.factor, *self._list]
+        self._sweep(self._differentiate, 3 * SLOTS * len(self._chosen), inputs, [self._columns])
+
+    def multiply(self, v: wp.array) -> None:
+        """Write their products with v by slot."""
+        inputs = [self._of.factor, *self._list, self._columns, v]
+        self._sweep(self._multiply, len(self._chosen), inputs, [self._of.parts])
+
+    @property
+    def _list(self) -> list[wp.array]:
+        return [self._marks, self._running.starts, self._chosen]
+
+    def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
+        arrays.sweep(kernel, count, inputs, outputs, self._of.device)
