@@ -47,7 +47,7 @@ def momentum(model, state) -> tuple[np.ndarray, np.ndarray]:
 def test_rods_that_fly_at_each_other_bounce(device, law):
     """Sum of impulses is zero (Newton's third law); speeds along the line of the centres fall to a fraction."""
     scene, velocities = heap(law)
-    model, integrator, states = run(device, scene, velocities, 30, rtol=1e-9)
+    model, integrator, states = run(device, scene, velocities, 30, rtol=1e-11)
     size = model.net.host.mass[: model.net.host.nodes, 0].sum() * np.abs(velocities).max()
     for state in states:
         linear, _ = momentum(model, state)
