@@ -1,0 +1,61 @@
+"""A cloth falls on a ball and over its sides onto the floor, in folds that touch each other.
+
+The cloth, a square of rubber foil, is thin against what bends it: its weight folds it within (D / rho h g)^(1/3) = 3 cm. Implicit Euler
+only loses energy. Once it lies, ball and floor carry its weight.
+"""
+
+import numpy as np
+
+import ddg_warp as ddg
+from ddg_warp.geometry import meshes
+from ddg_warp.run.check import once_reached
+from ddg_warp.scenes import _touching
+
+SIDE = 1.0  # m
+THICKNESS = 2e-3  # m
+MATERIAL = ddg.Material(young=3e5, poisson=0.3, density=500.0, viscosity=5e-3)
+RADIUS = 0.2  # m, of the ball
+RANGE = 2e-3  # m, of contact
+RESTS = 1.0  # s, by which the cloth lies, damped
+
+
+def build(
+    cells: int = 16,
+    dt: float = 1.0 / 100.0,
+    duration: float = 1.0,
+    friction: float = 0.3,
+    damping: float = 3.0,
+    law: str = "barrier",
+) -> ddg.Scene:
+    """The cloth a little above the ball.
+
+    Args:
+        cells: along a side of the cloth, of two triangles each
+        dt: time step [s]
+        duration: of the run [s]
+        friction: Coulomb's coefficient everywhere
+        damping: of masses, by the air [1/s]
+        law: barrier or penalty
+    """
+    points, triangles = meshes.rectangle(cells, cells, (SIDE, SIDE), "alternating")
+    points = points - [0.5 * SIDE, 0.5 * SIDE, 0.0]
+    points[:, 2] = 2.0 * RADIUS + THICKNESS + 2.0 * RANGE
+    scene = ddg.Scene(mass_damping=damping, analysis=ddg.Dynamics(dt=dt, duration=duration))
+    scene.add_shell(points, triangles, thickness=THICKNESS, material=MATERIAL, bending="hinge", name="cloth")
+    scene.contact(law=law, range=RANGE, friction=friction, velocity=1e-2)
+    scene.add_obstacle(ddg.Sphere((0.0, 0.0, RADIUS), RADIUS), name="ball")
+    scene.add_obstacle(ddg.Plane(), name="floor")
+    return scene
+
+
+def observe(model, state) -> dict[str, float]:
+    """See `_touching.observe`; and the lowest vertex and the largest speed."""
+    speed = np.linalg.norm(state.velocities().reshape(-1, 3), axis=1).max()
+    return _touching.observe(model, state) | {"lowest": state.points()[:, 2].min(), "speed": float(speed)}
+
+
+def check(result) -> list[ddg.Check]:
+    """Nothing passes or overlaps; at rest ball and floor carry the weight."""
+    names = ("force of obstacles less inertia over weight",)
+    found = _touching.checks(result)
+    return found + once_reached(result, RESTS, names, lambda: [_touching.weight_check(result, 0.03)])
