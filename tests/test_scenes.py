@@ -14,7 +14,7 @@ SMALL = {
     "cantilever": {},
     "cantilever_plate_shear": {"n": 16, "steps": 4},
     "crossed_beams": {},
-    "cloth_on_sphere": {"cells": 8, "duration": 0.3},
+    "cloth_on_sphere": {"cells": 8},
     "cloth_twist": {"around": 16, "along": 8, "turns": 0.2},
     "deep_arch": {},
     "flagellum": {"n": 25, "steps": 50},
