@@ -8,6 +8,7 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.run.check import once_reached
+from ddg_warp.scenes import _touching
 
 LENGTH = 1.0  # m
 RADIUS = 0.01  # m
@@ -16,7 +17,7 @@ GAP = 0.02  # of the overlap, the range of contact
 SOURCE = "two springs of 192 EI / L^3 in series"
 
 
-def build(n: int = 40, overlap: float = 1e-3, dt: float = 1.0, law: str = "barrier") -> ddg.Scene:
+def build(n: int = 40, overlap: float = 1e-3, dt: float = 1.0, law: str = "barrier", seed: int = -1) -> ddg.Scene:
     """The beams along x and along y, a gap of twice the range apart.
 
     Args:
@@ -24,11 +25,16 @@ def build(n: int = 40, overlap: float = 1e-3, dt: float = 1.0, law: str = "barri
         overlap: how far the clamps go on from where the beams touch, over the length
         dt: time step [s]
         law: "barrier" or "penalty"
+        seed: of a jitter of where the nodes are at first, a quarter of the range of contact; none below 0
     """
     if n < 4 or n % 2:
         raise ValueError(f"n = {n}; a beam has an even number of edges, 4 at least, and a node in the middle")
     down = overlap * LENGTH
-    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), analysis=ddg.Dynamics(dt=dt, duration=2 * SPEED_UP * dt))
+    scene = ddg.Scene(
+        gravity=(0.0, 0.0, 0.0),
+        analysis=ddg.Dynamics(dt=dt, duration=2 * SPEED_UP * dt),
+        initial=lambda model: jittered(model, 0.25 * GAP * down, seed),
+    )
     s = np.linspace(-0.5, 0.5, n + 1) * LENGTH
     apart = 2.0 * RADIUS + 2.0 * GAP * down
     lower = np.stack([s, 0.0 * s, 0.0 * s], axis=1)
@@ -49,6 +55,13 @@ def build(n: int = 40, overlap: float = 1e-3, dt: float = 1.0, law: str = "barri
     return scene
 
 
+def jittered(model, size: float, seed: int):
+    """The beams at rest, inner nodes moved by up to a size [m]."""
+    points = np.concatenate([batch.points[0] for batch in model.scene.batches])
+    inner = np.tile(np.pad(np.ones(len(points) // 2 - 2), 1), 2)[:, None]
+    return model.state(points=points + size * inner * _touching.jitter(points.shape, seed))
+
+
 def observe(model, state) -> dict[str, float]:
     """Heights of both middles [m], and the vertical force on the clamps of the lower beam [N]."""
     points = state.points()
@@ -66,7 +79,8 @@ def check(result) -> list[ddg.Check]:
     """Force and deflections against those of springs, and action against reaction."""
     batch = result.model.scene.batches[0]
     names = ("force L^3 / (EI delta)", "deflection of the lower beam over delta", "action and reaction")
-    return once_reached(result, result.model.scene.analysis.duration, names, lambda: _checks(result, batch, names))
+    checks = once_reached(result, result.model.scene.analysis.duration, names, lambda: _checks(result, batch, names))
+    return checks + _touching.kept_apart(result)
 
 
 def _checks(result, batch, names) -> list[ddg.Check]:
@@ -86,3 +100,9 @@ def _checks(result, batch, names) -> list[ddg.Check]:
 def benchmark() -> ddg.bench.Study:
     """The force over the nodes of the beams."""
     return ddg.bench.Study({"n": (10, 20, 40, 80)}, "force", whole=True)
+
+
+def picture(result, frames) -> dict:
+    """The beams as thick as they are, at the end."""
+    last = max(frames)
+    return {"points_by_time": frames, "bodies": {last: _touching.tubes(result.model, frames[last])}}

@@ -1,0 +1,157 @@
+"""Three rods on an inclined plane: one lies down and rests, one slides down, one is thrown downhill and stops.
+
+Coulomb's law: at the angle a a rod rests where tan(a) < mu. Else it slides with the acceleration g (sin a - mu cos a); thrown at the
+speed v it stops after v^2 / (2 g (mu cos a - sin a)). Friction that is regularised lets what rests creep: the logistic law carries
+tan(a) / mu of mu N at the speed nu atanh(tan(a) / mu) / 7.5, and no faster, however long it rests. Friction acts on the middle line
+of a rod, which therefore slides and never rolls.
+"""
+
+import numpy as np
+
+import ddg_warp as ddg
+from ddg_warp.geometry import meshes
+from ddg_warp.run.check import once_reached
+from ddg_warp.scenes import _touching
+
+LENGTH = 0.3  # m
+RADIUS = 0.005  # m
+GRAVITY = 9.81  # m/s^2
+LANE = 0.1  # m, between rods
+LEAN = 0.05  # rad, by which the rod that lies down leans at first
+RANGE = 1e-4  # m, of contact
+SETTLED = 0.5  # part of the run after which what rests has come to rest
+STEEPNESS = 7.5  # of the logistic law
+NAMES = ("rests", "slides", "thrown")
+
+
+def build(
+    n: int = 20,
+    angle: float = 10.0,
+    friction: float = 0.35,
+    slippery: float = 0.08,
+    speed: float = 1.0,
+    velocity: float = 1e-3,
+    dt: float = 1e-3,
+    duration: float = 1.2,
+    seed: int = -1,
+) -> ddg.Scene:
+    """The rods side by side, along the slope, which falls towards x.
+
+    Args:
+        n: edges of each rod
+        angle: of the plane [degrees]
+        friction: coefficient of the rod that rests and of the one that is thrown
+        slippery: coefficient of the one that slides
+        speed: of the one that is thrown [m/s]
+        velocity: of the friction law, nu [m/s]
+        dt: time step [s]
+        duration: of the run [s]
+        seed: of a jitter of where rods start; none below 0
+    """
+    a = np.radians(angle)
+    if not 0.0 < a < 0.5 * np.pi:
+        raise ValueError(f"angle = {angle}; a slope is between 0 and 90 degrees")
+    if not slippery < np.tan(a) < friction:
+        raise ValueError(f"friction = {friction}; tan(angle) = {np.tan(a):.3g} is between it and slippery = {slippery}")
+    down, normal = np.array([np.cos(a), 0.0, -np.sin(a)]), np.array([np.sin(a), 0.0, np.cos(a)])
+    scene = ddg.Scene(
+        gravity=(0.0, 0.0, -GRAVITY),
+        analysis=ddg.Dynamics(dt=dt, duration=duration),
+        initial=lambda model: thrown(model, speed * down),
+    )
+    jitter = _touching.jitter((len(NAMES), 3), seed)
+    s = np.linspace(0.0, LENGTH, n + 1)[:, None]
+    for k, name in enumerate(NAMES):
+        lean = (LEAN if name == "rests" else 0.0) * (1.0 + 0.3 * jitter[k, 0])
+        along = np.cos(lean) * down + np.sin(lean) * normal + 0.02 * jitter[k, 1] * np.array([0.0, 1.0, 0.0])
+        start = k * LANE * np.array([0.0, 1.0, 0.0]) + (RADIUS + RANGE * (1.05 + 0.05 * jitter[k, 2])) * normal
+        scene.add_rod(
+            start + s * along / np.linalg.norm(along),
+            section=ddg.Circle(RADIUS),
+            material=ddg.Material(young=1e7, density=1000.0, poisson=0.5),
+            name=name,
+        )
+    scene.add_obstacle(ddg.Plane(normal=tuple(normal)), name="plane")
+    scene.contact(range=RANGE, friction=friction, velocity=velocity)
+    scene.contact_between("slides", "plane", friction=slippery)
+    return scene
+
+
+def thrown(model, velocity: np.ndarray):
+    """The rods at rest but for the one that is thrown."""
+    velocities = np.zeros((len(NAMES), len(model.scene.batches[0].points[0]), 3))
+    velocities[NAMES.index("thrown")] = velocity
+    return model.state(velocities=velocities.reshape(-1, 3))
+
+
+def observe(model, state) -> dict[str, float]:
+    """How far down the slope each rod is [m], the smallest gap [m], and what the plane carries over the weight that lies on it."""
+    normal = np.array(model.scene.obstacles[0].shape.normal)
+    down = np.array([normal[2], 0.0, -normal[0]])
+    batches = model.scene.batches
+    start = np.array([batch.points[0].mean(0) for batch in batches])
+    middles = state.points().reshape(-1, len(batches), *batches[0].points.shape[1:])[0].mean(1)
+    weight = sum(batch.section.mass_per_length for batch in batches) * LENGTH * GRAVITY * normal[2]
+    carried = np.reshape(model.reactions(state)[-1].force, (-1, 3))[0] @ normal
+    moved = dict(zip(NAMES, (middles - start) @ down, strict=True))
+    return moved | {"gap": _touching.smallest_gap(model, state), "carried": float(carried / weight)}
+
+
+def check(result) -> list[ddg.Check]:
+    """Weight carried, creep of what rests, way of what slides and of what stops."""
+    names = (
+        "plane carries, over the weight across it",
+        "creep of the rod that rests [m/s]",
+        "way of the rod that slides [m]",
+        "way of the rod that was thrown [m]",
+    )
+    scene = result.model.scene
+    checks = once_reached(result, scene.analysis.duration, names, lambda: _checks(result, scene, names))
+    return checks + _touching.kept_apart(result)
+
+
+def _checks(result, scene, names) -> list[ddg.Check]:
+    normal = np.array(scene.obstacles[0].shape.normal)
+    tangent, cosine = normal[0] / normal[2], normal[2]
+    law, slippery = scene.touching, scene.betweens[0].friction
+    speed = np.linalg.norm(scene.initial(result.model).velocities().reshape(-1, 3), axis=-1).max()
+    series = {name: np.array(values) for name, values in result.series.items()}
+    t, late = np.array(result.times), np.array(result.times) > SETTLED * result.times[-1]
+    rests = series["rests"][late]
+    creep = (rests[-1] - rests[0]) / (t[late][-1] - t[late][0])
+    slow = law.velocity * np.arctanh(tangent / law.friction) / STEEPNESS
+    pull = GRAVITY * cosine * (tangent - slippery)
+    brake = GRAVITY * cosine * (law.friction - tangent)
+    # implicit Euler advances by the speed at the end of each step; what was thrown creeps once it has stopped
+    slid = 0.5 * pull * t[-1] * (t[-1] + result.dt)
+    stopped = 0.5 * speed * (speed / brake - result.dt) + slow * (t[-1] - speed / brake)
+    late_by_a_step = min(
+        ddg.Check.COARSEST, 0.01 * max(1.0, result.dt / 1e-3)
+    )  # friction, as its normal force is lagged
+    return [
+        ddg.Check(names[0], series["carried"][late].mean(), 1.0, 1e-3, "balance of forces"),
+        ddg.Check(names[1], creep, slow, 0.01, "nu atanh(tan(a) / mu) / 7.5", True),
+        ddg.Check(names[2], series["slides"][-1], slid, late_by_a_step, "g (sin a - mu cos a) t^2 / 2", True),
+        ddg.Check(names[3], series["thrown"][-1], stopped, late_by_a_step, "v^2 / (2 g (mu cos a - sin a))", True),
+    ]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The way of the rod that was thrown over the steps."""
+    return ddg.bench.Study({"dt": (4e-3, 2e-3, 1e-3, 5e-4)}, "way of the rod that was thrown", whole=True)
+
+
+def picture(result, frames) -> dict:
+    """The rods as thick as they are on the plane, at the end."""
+    scene, last = result.model.scene, max(frames)
+    plane = scene.obstacles[0].shape
+    points = frames[last]
+    down, across = np.array([plane.normal[2], 0.0, -plane.normal[0]]), np.array([0.0, 1.0, 0.0])
+    low, high = (f([f(shape @ down) for shape in frames.values()]) for f in (np.min, np.max))
+    corners, cells = meshes.rectangle(1, 1)
+    x, y = low + (high - low) * corners[:, :1], LANE * (3.0 * corners[:, 1:2] - 0.5)
+    floor = x * down + y * across
+    return {
+        "points_by_time": frames,
+        "bodies": {min(frames): (floor, cells)} | {last: _touching.tubes(result.model, points)},
+    }
