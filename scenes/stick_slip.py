@@ -1,8 +1,8 @@
 """A rod that hangs from a clamp is pushed onto a rough floor: it buckles, its tip sticks, and then slips.
 
-The tip of a rod of length L just touches the floor, and the clamp comes down by delta. While the tip sticks, the rod is an elastica that
-is clamped at its top and hinged at its tip: it pushes with the normal force P and with the horizontal force H, and H / P grows with delta
-from 0. Where it reaches mu the tip slips. Regularised friction lets what sticks creep, by less than its speed nu.
+The tip of a rod of length L just touches the floor, and the clamp comes down by delta. While the tip sticks, the rod is an elastica
+that is clamped at its top and hinged at its tip: it pushes with the normal force P and with the horizontal force H, and H / P grows
+with delta from 0. Where it reaches mu the tip slips. Regularised friction lets what sticks creep, by less than its speed nu.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ MASS_PER_LENGTH = 1e-3  # kg/m
 RANGE = 1e-4  # m, of contact
 CLOSE = 0.5  # of the range, the gap at first: the floor pushes from the start, else friction would begin a step late
 NUDGE = 0.1  # N, in the middle at first; tells the rod where to buckle
-NUDGED = 0.05  # part of the way in which it fades
+NUDGED = 0.006  # way over L in which it fades
 BEYOND = 1.1  # times the delta of the slip, to which the clamp comes down
 STEP_TIME = 1.0  # s, long against the periods of the rod: the march is one of equilibria
 SLIP = {0.05: (0.01238049378, 20.28494139), 0.1: (0.04687417821, 20.54906118), 0.2: (0.1548673548, 21.38052121)}
@@ -59,8 +59,9 @@ def build(friction: float = 0.2, n: int = 40, steps: int = 150, velocity: float 
     rod = scene.add_rod(points, section=section, name="rod")
     way = BEYOND * SLIP[friction][0] * LENGTH
     scene.clamp_end(rod, "first", motion=ddg.Motion(translation=lambda t: (0.0, 0.0, -way * t / duration)))
+    fades = min(1.0, NUDGED * LENGTH / way) * duration
     nudge = NUDGE * (1.0 + 0.5 * float(_touching.jitter((), seed)))
-    scene.add_force(rod, n // 2, (nudge, 0.0, 0.0), amplitude=lambda t: max(0.0, 1.0 - t / (NUDGED * duration)))
+    scene.add_force(rod, n // 2, (nudge, 0.0, 0.0), amplitude=lambda t: max(0.0, 1.0 - t / fades))
     scene.add_obstacle(ddg.Plane(), name="floor")
     scene.contact(range=RANGE, stiffness=5.0 * B / LENGTH**2 / RANGE, friction=friction, velocity=velocity)
     return scene
