@@ -67,9 +67,11 @@ class Contacts:
     ) -> None:
         """Let rods, shells and obstacles touch: nothing passes through anything.
 
-        Rods are rows of capsules, shells and meshes have a thickness. Two surfaces push each other where the gap between them is
-        below `range`. By "barrier" the force grows without bound as the gap closes, and nothing overlaps; by "penalty" it grows with
-        the overlap, and the lines and surfaces in the middle never cross. See `kernels.densities.contact` and `friction`.
+        Rods are rows of capsules, as thick as the `radius` of their section: of one that is no circle that of the circle of its area,
+        of `Stiffness` the one it was given, where it changes along the rod the largest. Shells and meshes have a thickness. Two
+        surfaces push each other where the gap between them is below `range`. By "barrier" the force grows without bound as the gap
+        closes, and nothing overlaps; by "penalty" it grows with the overlap, and the lines and surfaces in the middle never cross.
+        See `kernels.densities.contact` and `friction`.
 
         Args:
             law: "barrier" or "penalty".
@@ -110,7 +112,7 @@ class Contacts:
             arguments.count(f"{call}lags", lags),
             apart,
             MappingProxyType(dict(radius or {})),
-            None if objects is None else tuple(dict.fromkeys([objects] if isinstance(objects, str) else objects)),
+            None if objects is None else _names(f"{call}objects", objects),
         )
 
     def contact_between(
@@ -127,7 +129,7 @@ class Contacts:
 
         Args:
             one, other: names as given to `add_rods`, `add_shell` and `add_obstacle`.
-            ignore: whether they pass through each other.
+            ignore: whether they pass through each other; nothing else is given then.
             friction, stiffness, range: as of `contact`.
 
         Raises:
@@ -139,6 +141,15 @@ class Contacts:
                 arguments.positive(call + name, value)
         friction = None if friction is None else _friction(f"{call}friction", friction)
         ignore = arguments.flag(f"{call}ignore", ignore)
+        given = [
+            name
+            for name, value in (("friction", friction), ("stiffness", stiffness), ("range", range))
+            if value is not None
+        ]
+        if ignore and given:
+            raise SceneError(f"{call}what passes through each other has no {given[0]}; give ignore or {given[0]}")
+        if not (ignore or given):
+            raise SceneError(f"{call}nothing is different; give ignore=True, friction, stiffness or range")
         self.betweens.append(Between((one, other), ignore, friction, stiffness, range))
 
     def add_obstacle(
@@ -157,6 +168,8 @@ class Contacts:
         Raises:
             SceneError: no such shape, or a motion that does not fit.
         """
+        if not isinstance(name, str) or not name:
+            raise SceneError(f"add_obstacle: name is {name!r}; give a text")
         if not isinstance(shape, Plane | Sphere | Capsule | Mesh):
             raise SceneError(f"add_obstacle '{name}': shape is {shape!r}; give Plane, Sphere, Capsule, Box or Mesh")
         if motion is not None and not isinstance(motion, Motion | Grip):
@@ -192,13 +205,19 @@ def check_contact(scene) -> None:
             f"contact: shell of revolution 0 ('{scene.axisymmetric_shells[0].name}') can not touch anything"
         )
     bodies = {batch.name for batch in scene.batches} | {shell.name for shell in scene.shells}
-    names = touching_names(scene) | {obstacle.name for obstacle in scene.obstacles}
+    moving, obstacles = touching_names(scene), {obstacle.name for obstacle in scene.obstacles}
+    names = moving | obstacles
     asked = [("objects", name, bodies) for name in scene.touching.objects or ()]
-    asked += [("radius", name, bodies) for name in scene.touching.radius]
+    asked += [("radius", name, moving) for name in scene.touching.radius]
     asked += [("contact_between", name, names) for between in scene.betweens for name in between.names]
     for what, name, known in asked:
         if name not in known:
-            raise SceneError(f"contact: {what} names {name!r}; this scene has {', '.join(map(repr, sorted(known)))}")
+            raise SceneError(f"contact: {what} names {name!r}; what can touch is {', '.join(map(repr, sorted(known)))}")
+    for between in scene.betweens:
+        if not moving & set(between.names):
+            raise SceneError(
+                "contact_between {!r} and {!r}: obstacles never touch each other; leave it out".format(*between.names)
+            )
 
 
 def touching_names(scene) -> set[str]:
@@ -208,6 +227,14 @@ def touching_names(scene) -> set[str]:
     if scene.touching.objects is not None:
         return set(scene.touching.objects)
     return {batch.name for batch in scene.batches} | {shell.name for shell in scene.shells}
+
+
+def _names(what: str, values) -> tuple[str, ...]:
+    """Names without repetition, from one or several."""
+    values = [values] if isinstance(values, str) else values
+    if not np.iterable(values) or not len(values := tuple(dict.fromkeys(values))):
+        raise SceneError(f"{what} is {values!r}; give a name or a list of names of rods and shells")
+    return values
 
 
 def _friction(what: str, value: float) -> float:

@@ -47,7 +47,7 @@ class Stiffness:
         GJ: twisting stiffness [N m^2].
         mass_per_length: rho A [kg/m].
         rotary_inertia: rho (I1 + I2) [kg m], inertia about the tangent per length.
-        radius: of the drawn tube [m].
+        radius: of the drawn tube, and of the rod in contact [m].
         viscosity: strain-rate damping [s], as in `Material`.
         area: of the section [m^2], which a magnetisation needs; 0 where it is not known.
     """

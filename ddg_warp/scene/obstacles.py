@@ -120,9 +120,13 @@ def Box(center, half, rotation=None, radius: float = 0.0) -> Mesh:
     center, half = (np.array(arguments.vector(f"Box: {n}", v)) for n, v in (("center", center), ("half", half)))
     if not (half > 0.0).all():
         raise SceneError(f"Box: half = {half}; half lengths are positive [m]")
-    turn = np.eye(3) if rotation is None else np.array(rotation, float)
-    if turn.shape != (3, 3) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-9):
-        raise SceneError("Box: rotation is no rotation matrix (3, 3)")
+    try:
+        turn = np.eye(3) if rotation is None else np.array(rotation, float)
+        turns = turn.shape == (3, 3) and np.allclose(turn @ turn.T, np.eye(3), atol=1e-9) and np.linalg.det(turn) > 0.0
+    except (TypeError, ValueError):
+        turns = False
+    if not turns:
+        raise SceneError(f"Box: rotation = {rotation!r} is no rotation matrix (3, 3)")
     cells = np.concatenate([SIDES[:, [0, 1, 2]], SIDES[:, [0, 2, 3]]])
     return Mesh(center + (CORNERS * half) @ turn.T, cells, radius)
 

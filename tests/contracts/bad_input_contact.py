@@ -1,0 +1,144 @@
+"""Bad inputs to contact: its law, what differs between objects, and obstacles."""
+
+# fmt: off
+import numpy as np
+from bad_inputs import DOME, INF, NAN, RUBBER, built, dome, each, refuse, rods
+
+import ddg_warp as ddg
+from ddg_warp.geometry import meshes
+
+TURN = np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+FLAT = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, -1.0], [2.0, 0.0, -1.0]])
+
+
+def scene() -> ddg.Scene:
+    """Two rods, apart and clamped, called 'rod' and 'odd'."""
+    made = rods(np.linspace((0.0, 0.5, 0.0), (1.0, 0.5, 0.0), 5))
+    made.clamp([0, 1])
+    return made
+
+
+def touching(**options) -> ddg.Scene:
+    """The same, in contact."""
+    made = scene()
+    made.contact(**options)
+    return made
+
+
+def over(shape, made: ddg.Scene | None = None, **options) -> ddg.Scene:
+    """The same with an obstacle."""
+    made = made or touching()
+    made.add_obstacle(shape, **options)
+    return made
+
+
+def stepped(made: ddg.Scene, **options):
+    """A step of it."""
+    model = built(made)
+    return ddg.Integrator(model, **options).step(model.state(), 1e-3)
+
+
+def between(*names, **options):
+    """What differs between two names, in a scene with a floor."""
+    made = over(ddg.Plane((0.0, 0.0, -1.0)), name="floor")
+    made.contact_between(*names, **options)
+    return built(made)
+
+
+for _name, _unit in (("range", "[m]"), ("stiffness", "[N/m]"), ("velocity", "[m/s]")):
+    each("contact", _name, [0.0, -1.0, NAN, INF, "large", (1.0, 2.0)], lambda v, name=_name: touching(**{name: v}),
+         f"contact: {_name}", "positive", _unit)
+each("contact", "friction", [-1.0, NAN, INF, "rough", True], lambda v: touching(friction=v), "contact: friction", "zero or more")
+each("contact", "apart", [-1.0, NAN, INF, "far"], lambda v: touching(apart=v), "contact: apart", "zero or more [m]")
+each("contact", "lags", [0, -1, 2.5, "two"], lambda v: touching(lags=v), "contact: lags", "whole number")
+each("contact", "law", ["spring", None, 3], lambda v: touching(law=v), "contact: law", "'barrier' or 'penalty'")
+each("contact", "friction law", ["dry", None], lambda v: touching(friction_law=v), "friction_law", "'logistic' or 'polynomial'")
+each("contact", "radius", [0.1, [1.0]], lambda v: touching(radius=v), "contact: radius", "dictionary")
+each("contact", "radius of a name", [0.0, -1.0, NAN, INF, "thick", [1.0, 2.0]], lambda v: touching(radius={"odd": v}),
+     "contact: radius of 'odd'", "positive", "[m]")
+each("contact", "objects", [[], 3, ()], lambda v: touching(objects=v), "contact: objects", "names")
+each("contact", "names of objects", ["none", [0], ["rod", "none"]], lambda v: built(touching(objects=v)),
+     "contact: objects names", "'odd', 'rod'")
+refuse("contact", {
+    "twice": (lambda: touching().contact(), "has contact already", "contact_between"),
+    "radius of no object": (lambda: built(touching(radius={"none": 0.1})), "radius names 'none'", "'odd', 'rod'"),
+    "radius of what can not touch": (lambda: built(touching(objects="rod", radius={"odd": 0.1})), "radius names 'odd'", "is 'rod'"),
+    "between a name that is not there": (lambda: between("rod", "none", ignore=True), "names 'none'", "'floor', 'odd', 'rod'"),
+    "between numbers": (lambda: between(0, 1, ignore=True), "contact_between names 0"),
+    "between obstacles": (lambda: between("floor", "floor", friction=0.1), "'floor' and 'floor'", "obstacles never touch"),
+    "between, and nothing": (lambda: between("rod", "floor"), "'rod' and 'floor'", "nothing is different", "ignore=True"),
+    "between, ignored and rough": (lambda: between("rod", "odd", ignore=True, friction=0.1), "'rod' and 'odd'", "no friction"),
+    "between, ignored a little": (lambda: between("rod", "odd", ignore=0.5), "'rod' and 'odd'", "ignore", "True or False"),
+    "between without contact": (lambda: built(scene(), lambda s: s.contact_between("rod", "odd", ignore=True)), "add scene.contact()"),
+    "obstacles without contact": (lambda: built(over(ddg.Plane(), scene())), "obstacle 0 ('obstacle')", "add scene.contact()"),
+    "in a plane": (lambda: built(rods(scene=ddg.Scene(dimension=2)), lambda s: s.contact()), "dimension 3", "dimension=2"),
+    "shells of revolution": (lambda: built(dome(DOME), lambda s: s.contact()), "shell of revolution 0 ('dome')", "can not touch"),
+    "overlap": (lambda: stepped(over(ddg.Plane((0.0, 0.0, 1.0)))), "rod 0", "'obstacle'", "overlap by", "move them apart"),
+})
+each("contact", "between friction", [-1.0, NAN, INF, "rough"], lambda v: between("rod", "floor", friction=v),
+     "'rod' and 'floor'", "friction")
+each("contact", "between stiffness", [0.0, -1.0, NAN, "hard"], lambda v: between("rod", "odd", stiffness=v),
+     "'rod' and 'odd'", "stiffness")
+each("contact", "between range", [0.0, -1.0, NAN, "far"], lambda v: between("rod", "odd", range=v), "'rod' and 'odd'", "range")
+
+each("obstacles", "shape", [None, ddg.Plane, "plane", 3], over, "add_obstacle 'obstacle'", "give Plane, Sphere, Capsule, Box or Mesh")
+each("obstacles", "motion", ["up", 3.0, lambda t: (0.0, 0.0, t)], lambda v: over(ddg.Plane(), motion=v), "add_obstacle", "Motion")
+each("obstacles", "name", [3, "", None], lambda v: over(ddg.Plane(), name=v), "add_obstacle: name", "text")
+each("obstacles", "point", [(0.0, 0.0), NAN, "here", (0.0, 0.0, INF)], ddg.Plane, "Plane: point", "three finite numbers")
+each("obstacles", "normal", [(0.0, 0.0), (0.0, 0.0, NAN)], lambda v: ddg.Plane(normal=v), "Plane: normal", "three finite numbers")
+each("obstacles", "center", [(0.0, 0.0), NAN, None], lambda v: ddg.Sphere(v, 0.1), "Sphere: center", "three finite numbers")
+each("obstacles", "radius of a ball", [0.0, -1.0, NAN, INF, "big"], lambda v: ddg.Sphere((0.0,) * 3, v), "Sphere: radius", "positive")
+each("obstacles", "end", [(0.0, 0.0), NAN, None], lambda v: ddg.Capsule((0.0,) * 3, v, 0.1), "Capsule: end", "three finite numbers")
+each("obstacles", "radius of a capsule", [0.0, -1.0, NAN, "big"], lambda v: ddg.Capsule((0.0,) * 3, (1.0,) * 3, v),
+     "Capsule: radius", "positive")
+each("obstacles", "half lengths", [1.0, (1.0, 1.0), (0.0, 1.0, 1.0), (1.0, -1.0, 1.0)], lambda v: ddg.Box((0.0,) * 3, v), "Box: half")
+each("obstacles", "rotation", [np.eye(2), 2.0 * np.eye(3), np.diag([1.0, 1.0, -1.0]), "turned", 0.3],
+     lambda v: ddg.Box((0.0,) * 3, (1.0,) * 3, v), "Box: rotation", "(3, 3)")
+each("obstacles", "half a thickness", [-1.0, NAN, INF, "thick"], lambda v: ddg.Mesh(*meshes.sphere(0), v),
+     "Mesh: radius", "zero or more")
+refuse("obstacles", {
+    "a normal of zero": (lambda: ddg.Plane(normal=(0.0, 0.0, 0.0)), "Plane", "normal is zero"),
+    "a capsule of one point": (lambda: ddg.Capsule((1.0,) * 3, (1.0,) * 3, 0.1), "Capsule", "one point", "Sphere"),
+    "a mesh of nothing": (lambda: ddg.Mesh(None, None), "Mesh", "(points, 3)"),
+    "a mesh of no triangles": (lambda: ddg.Mesh(FLAT, np.zeros((0, 3), int)), "Mesh", "(T, 3)"),
+    "a mesh with a hole": (lambda: ddg.Mesh(FLAT * [1.0, 1.0, NAN], [[0, 1, 2]]), "Mesh", "finite"),
+    "a mesh of other points": (lambda: ddg.Mesh(FLAT, [[0, 1, 3]]), "Mesh: triangle 0", "vertices are 0 to 2"),
+    "a mesh of fractions": (lambda: ddg.Mesh(FLAT, [[0.0, 1.0, 2.0]]), "Mesh", "whole numbers"),
+    "a triangle without area": (lambda: stepped(over(ddg.Mesh(FLAT, [[0, 1, 2]]))), "triangle 0", "'obstacle'", "no area"),
+    "a triangle of two points": (lambda: stepped(over(ddg.Mesh(FLAT, [[0, 1, 1]]))), "triangle 0", "'obstacle'", "no area"),
+    "displacements of others": (
+        lambda: over(ddg.Sphere((0.0, 0.0, -1.0), 0.1), motion=ddg.Motion(lambda t: np.zeros((3, 3)))),
+        *("add_obstacle 'obstacle'", "3 displacements", "1 points", "one for all"),
+    ),
+    "a motion that starts elsewhere": (
+        lambda: built(over(ddg.Plane((0.0, 0.0, -1.0)), motion=ddg.Motion(lambda t: (0.0, 0.0, 1.0 + t)))),
+        *("add_obstacle", "t = 0", "supports start where they are"),
+    ),
+    "a motion that fails": (
+        lambda: stepped(over(ddg.Plane((0.0, 0.0, -1.0)), motion=ddg.Motion(lambda t: (0.0, 0.0, NAN if t else 0.0)))),
+        *("translation", "not finite at t = 0.001"),
+    ),
+})
+
+_CALLS = {
+    "statics": lambda: ddg.statics.solve(built(touching())),
+    "continuation": lambda: ddg.continuation.Continuation(built(touching()), {"z": ddg.Displacement.of(-1, "z")}).trace(),
+    "spectrum": lambda: (model := built(touching()), ddg.stability.spectrum(model, model.state())),
+}
+refuse("contact", {name: (call, "contact: equilibria", "step the scene in time") for name, call in _CALLS.items()} | {
+    "midpoint": (lambda: stepped(touching(), scheme="implicit_midpoint"), "contact: ", "implicit_euler"),
+    "projective": (lambda: stepped(touching(), solver="projective"), "contact: ", "'newton'"),
+    "asked without": (lambda: (model := built(scene()), model.contacts(model.state())), "contacts: ", "add scene.contact()"),
+    "an oblique plane of symmetry": (
+        lambda: stepped(_on_oblique_plane()), "contact: ", "oblique plane", "axis of space"
+    ),
+})
+
+
+def _on_oblique_plane() -> ddg.Scene:
+    points, triangles = meshes.rectangle(3, 3)
+    made = ddg.Scene()
+    made.add_shell(points @ TURN, triangles, thickness=0.01, material=RUBBER)
+    made.symmetry(0, [0, 4, 8, 12], TURN[0])
+    made.contact()
+    return made
