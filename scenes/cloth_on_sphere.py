@@ -55,7 +55,7 @@ def observe(model, state) -> dict[str, float]:
 
 
 def check(result) -> list[ddg.Check]:
-    """Nothing passes or overlaps; at rest ball and floor carry the weight, of which friction, which is not told, has some hundredths."""
+    """Nothing passes or overlaps; at rest ball and floor carry the weight; of that friction, which is not told, has a part."""
     names = ("force of obstacles less inertia over weight",)
     found = _touching.checks(result)
     return found + once_reached(result, RESTS, names, lambda: [_touching.weight_check(result, 0.1)])

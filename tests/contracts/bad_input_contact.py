@@ -82,7 +82,7 @@ each("contact", "between stiffness", [0.0, -1.0, NAN, "hard"], lambda v: between
 each("contact", "between range", [0.0, -1.0, NAN, "far"], lambda v: between("rod", "odd", range=v), "'rod' and 'odd'", "range")
 
 each("obstacles", "shape", [None, ddg.Plane, "plane", 3], over, "add_obstacle 'obstacle'", "give Plane, Sphere, Capsule, Box or Mesh")
-each("obstacles", "motion", ["up", 3.0, lambda t: (0.0, 0.0, t)], lambda v: over(ddg.Plane(), motion=v), "add_obstacle", "Motion")
+each("obstacles", "motion", ["up", 3.0, len], lambda v: over(ddg.Plane(), motion=v), "add_obstacle", "Motion")
 each("obstacles", "name", [3, "", None], lambda v: over(ddg.Plane(), name=v), "add_obstacle: name", "text")
 each("obstacles", "point", [(0.0, 0.0), NAN, "here", (0.0, 0.0, INF)], ddg.Plane, "Plane: point", "three finite numbers")
 each("obstacles", "normal", [(0.0, 0.0), (0.0, 0.0, NAN)], lambda v: ddg.Plane(normal=v), "Plane: normal", "three finite numbers")
