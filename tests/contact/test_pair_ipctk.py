@@ -15,6 +15,11 @@ from ddg_warp.solve.contact.shapes import Shapes
 ipctk = pytest.importorskip("ipctk")
 COUNT, RANGE, STIFFNESS = 1000, 0.4, 50.0
 MU, VELOCITY = 0.3, 0.1
+DISTANCES = {
+    "edges": ipctk.edge_edge_distance,
+    "point and triangle": ipctk.point_triangle_distance,
+    "edge and point": lambda a, b, p, _: ipctk.point_edge_distance(p, a, b),
+}
 STENCILS = {"edge_edge": edge_edge, "point_triangle": point_triangle}
 
 
@@ -28,8 +33,7 @@ def test_distances_of_the_search(device, name, case):
     corners = corners[(sine < 1e-15) | (sine > 1e-7)][:COUNT]
     assert len(corners) == COUNT
     r, _ = measured(KINDS[name][0], corners, device)
-    of = ipctk.edge_edge_distance if name == "edges" else ipctk.point_triangle_distance
-    assert (r**2).sum(1) == pytest.approx(np.array([of(*nodes) for nodes in corners]), rel=1e-12, abs=1e-13)
+    assert (r**2).sum(1) == pytest.approx(np.array([DISTANCES[name](*nodes) for nodes in corners]), rel=1e-12, abs=1e-13)
 
 
 def scene(stencil: str) -> Shapes:
