@@ -35,6 +35,7 @@ def _hits(kind, variant, velocities, gravity: float, motion=None, controls=None)
     assert touched, "nothing touched"
     statistics = integrator.statistics()
     assert statistics["contact"]["refused_crossings"] == 0
+    assert set(statistics["outcomes"]) <= {"converged", "converged_to_rounding"}, statistics["outcomes"]
     assert statistics["contact"]["friction_work"] >= 0.0
     return state, integrator
 
