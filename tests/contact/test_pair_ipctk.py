@@ -33,7 +33,9 @@ def test_distances_of_the_search(device, name, case):
     corners = corners[(sine < 1e-15) | (sine > 1e-7)][:COUNT]
     assert len(corners) == COUNT
     r, _ = measured(KINDS[name][0], corners, device)
-    assert (r**2).sum(1) == pytest.approx(np.array([DISTANCES[name](*nodes) for nodes in corners]), rel=1e-12, abs=1e-13)
+    assert (r**2).sum(1) == pytest.approx(
+        np.array([DISTANCES[name](*nodes) for nodes in corners]), rel=1e-12, abs=1e-13
+    )
 
 
 def scene(stencil: str) -> Shapes:
