@@ -13,6 +13,7 @@ SMALL = {
     "cable_gripped_at_both_ends": {"n": 40},
     "cantilever": {},
     "cantilever_plate_shear": {"n": 16, "steps": 4},
+    "capstan": {"n": 30, "steps": 40},
     "cloth_on_sphere": {"cells": 8},
     "cloth_twist": {"around": 16, "along": 8, "turns": 0.2},
     "crossed_beams": {"n": 20},

@@ -1,0 +1,157 @@
+"""A rod slides over a fixed drum: friction multiplies its tension (Euler and Eytelwein).
+
+A string that is wound about a drum by the angle phi and slides needs T2 = T1 exp(mu phi). Friction acts here on the middle line of a
+rod, between the closest points of rod and axis, so that it makes no couple and the exponent is mu, not the smaller one of friction at
+the surface. A rod with bending stiffness B bends beyond where it leaves the drum, of radius R to its middle line, by an angle t with
+sin(t/2) = sqrt(B / T) / 2R to the line of its pull T, and there the drum pushes with the single force T sin(t):
+
+    T2 (cos t2 - mu sin t2) = T1 (cos t1 + mu sin t1) exp(mu (phi - t1 - t2)) ,
+
+which is T1 exp(mu phi) up to t^2. One end is pulled by a dead force T1, the other drawn away at a constant speed.
+"""
+
+import numpy as np
+
+import ddg_warp as ddg
+from ddg_warp.run.check import once_reached
+from ddg_warp.scenes import _touching
+
+DRUM = 0.05  # m, radius
+RADIUS = 0.001  # m
+RANGE = 1e-4  # m, of contact
+AROUND = DRUM + RADIUS + 0.5 * RANGE  # m, about where the middle line runs
+B = 1e-4  # N m^2
+STIFF = 4.0e4  # EA over T2
+MASS_PER_LENGTH = 1e-4  # kg/m
+TAIL = 1.0  # length of either end off the drum over AROUND
+SPREAD = 6.0  # radii between neighbouring turns
+STEP_TIME = 1.0  # s, long against all periods: the march is one of equilibria
+SPEED = 2.5e-3 * AROUND  # m/s, at which the rod is drawn
+SATURATED = 0.5  # velocity of the friction law over the speed: what slides has all of the friction
+SETTLED = 0.5  # part of the run after which the tension is averaged
+
+
+def build(
+    friction: float = 0.3,
+    turns: float = 0.5,
+    n: int = 60,
+    tension: float = 1000.0,
+    steps: int = 60,
+    seed: int = -1,
+) -> ddg.Scene:
+    """The rod about a drum along y, wound upwards over its top.
+
+    Args:
+        friction: coefficient
+        turns: by which the rod is wound about the drum
+        n: edges in half a turn
+        tension: of the slack end, T1 R^2 / B
+        steps: time steps
+        seed: of a jitter of the nodes at first, a fifth of the range of contact; none below 0
+    """
+    if not 0.0 < turns <= 1.0:
+        raise ValueError(f"turns = {turns}; the rod is wound by up to one turn")
+    if n < 8:
+        raise ValueError(f"n = {n}; half a turn has 8 edges at least")
+    if not tension * 4.0 > 1.0 + 4.0 / TAIL**2:
+        raise ValueError(f"tension = {tension}; below {0.25 + 1.0 / TAIL**2:g} the rod is too stiff to lie on the drum")
+    slack = tension * B / AROUND**2
+    points, ends = wound(2.0 * np.pi * turns, np.pi * AROUND / n)
+    scene = ddg.Scene(
+        gravity=(0.0, 0.0, 0.0),
+        analysis=ddg.Dynamics(dt=STEP_TIME, duration=steps * STEP_TIME),
+        initial=lambda model: bent(model, points, seed),
+    )
+    EA = STIFF * slack * np.exp(2.0 * np.pi * friction * turns)
+    section = ddg.Stiffness(EA=EA, EI1=B, GJ=B, mass_per_length=MASS_PER_LENGTH, rotary_inertia=1e-10, radius=RADIUS)
+    rod = scene.add_rod(points, section=section, natural="straight", name="rod")
+    scene.add_force(rod, 0, slack * ends[0])
+    scene.fix(rod, [-1], motion=ddg.Motion(translation=lambda t: tuple(SPEED * t * ends[1])))
+    scene.add_obstacle(ddg.Capsule((0.0, -DRUM, 0.0), (0.0, DRUM, 0.0), DRUM), name="drum")
+    scene.contact(range=RANGE, friction=friction, velocity=SATURATED * SPEED)
+    return scene
+
+
+def wound(angle: float, edge: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) [m] of a helix about y with straight ends, and unit vectors (2, 3) along these, away from the drum.
+
+    Edges of a length [m] touch the cylinder of the radius AROUND in their middles.
+    """
+    around = AROUND / np.cos(0.5 * edge / AROUND)
+    rise = SPREAD * RADIUS / (2.0 * np.pi) * (angle > np.pi)  # up to half a turn it stays in a plane
+    speed = np.hypot(around, rise)
+    tail = TAIL * around
+    count = int(np.ceil((angle * speed + 2.0 * tail) / edge))
+    s = np.linspace(-0.5, 0.5, count + 1) * (angle * speed + 2.0 * tail)
+    a = np.clip(s / speed, -0.5 * angle, 0.5 * angle)
+    beyond = (s - a * speed)[:, None]
+    tangent = np.stack([around * np.cos(a), rise + 0.0 * a, -around * np.sin(a)], axis=1) / speed
+    points = np.stack([around * np.sin(a), rise * a, around * np.cos(a)], axis=1) + beyond * tangent
+    return points, np.stack([-tangent[0], tangent[-1]])
+
+
+def bent(model, points: np.ndarray, seed: int):
+    """The rod where it is wound; its rest shape is straight."""
+    free = np.arange(len(points))[:, None] < len(points) - 1
+    return model.state(points=points + 0.2 * RANGE * free * _touching.jitter(points.shape, seed))
+
+
+def observe(model, state) -> dict[str, float]:
+    """Tension of the end that is drawn over that of the slack one, and the smallest gap [m]."""
+    slack = np.array(model.scene.loads[0].force)
+    drawn = np.reshape(model.reactions(state)[0].force, (-1, 3))[0]
+    return {
+        "ratio": float(np.linalg.norm(drawn) / np.linalg.norm(slack)),
+        "gap": _touching.smallest_gap(model, state),
+    }
+
+
+def expected(friction: float, angle: float, slack: float) -> float:
+    """T2 / T1 of a rod, wound by an angle [rad] between its pulls, T1 = slack [N]."""
+    from scipy.optimize import brentq
+
+    def leaves(tension):
+        return 2.0 * np.arcsin(min(1.0, 0.5 * np.sqrt(B / tension) / AROUND))
+
+    first = leaves(slack)
+    low = slack * (np.cos(first) + friction * np.sin(first))
+
+    def excess(tension):
+        t = leaves(tension)
+        return tension * (np.cos(t) - friction * np.sin(t)) - low * np.exp(friction * (angle - first - t))
+
+    string = slack * np.exp(friction * angle)
+    return brentq(excess, 0.5 * string, 2.0 * string) / slack
+
+
+def check(result) -> list[ddg.Check]:
+    """The ratio of tensions against that of a rod and that of a string."""
+    names = ("T2 / T1 of a rod", "T2 / T1 of a string")
+    checks = once_reached(result, result.model.scene.analysis.duration, names, lambda: _checks(result, names))
+    return checks + _touching.kept_apart(result)
+
+
+def _checks(result, names) -> list[ddg.Check]:
+    scene = result.model.scene
+    mu, slack = scene.touching.friction, np.array(scene.loads[0].force)
+    tension = np.linalg.norm(slack)
+    steps = np.diff(scene.batches[0].points[0], axis=0)
+    steps /= np.linalg.norm(steps, axis=1)[:, None]
+    angle = np.arccos(np.clip((steps[1:] * steps[:-1]).sum(axis=1), -1.0, 1.0)).sum()
+    late = np.array(result.times) > SETTLED * result.times[-1]
+    ratio = np.array(result.series["ratio"])[late].mean()
+    leaves = B / tension / AROUND**2  # t1^2
+    return [
+        ddg.Check(names[0], ratio, expected(mu, angle, tension), 0.02, "capstan with bending stiffness, exact", True),
+        ddg.Check(names[1], ratio, np.exp(mu * angle), 0.02 + leaves, "Euler and Eytelwein", True),
+    ]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The ratio of tensions over the edges of half a turn."""
+    return ddg.bench.Study({"n": (15, 30, 60, 120)}, "T2 / T1 of a rod", whole=True)
+
+
+def picture(result, frames) -> dict:
+    """The rod at first and at the end, on the drum."""
+    return {"points_by_time": {t: frames[t] for t in (min(frames), max(frames))}}
