@@ -24,17 +24,17 @@ from ddg_warp.kernels.matrix.chain_blocks import layout_type
 from ddg_warp.kernels.matrix.chain_places import place_dofs, place_functions
 from ddg_warp.kernels.matrix.sliced import product_functions
 from ddg_warp.kernels.net.newton import ON_THE_WAY, THERE
-from ddg_warp.kernels.search import PLACE, STRAIGHT
+from ddg_warp.kernels.search import PLACE, RELAG, STRAIGHT
 from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
 
-FOLLOWING = 1e-6  # to what the residual is reduced where supports are on their way
 WHOLE, UNITS, NONE = 1, 0, -1  # how a world moves: with one share, unit by unit, not at all
 
 
 @cache
 def world_kernels(real):
     """A thread a world: account(...) for the energy; modes(...) of motions, and of what is predicted(...); depart(...) on them;
-    expect(...) of steps that were cut; refuse(...) what crossed; curve(...) of matrices; again(...) with another friction."""
+    expect(...) of steps that were cut; refuse(...) what crossed; curve(...) of matrices; again(...) with another friction;
+    short(...) of predictors that were cut."""
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def account(
@@ -126,13 +126,20 @@ def world_kernels(real):
             flags[DRIVEN, w] = wp.static(THERE)
             flags[ACTIVE, 0] = 1
 
-    return account, modes, predicted, depart, expect, refuse, curve, again
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def short(modes: wp.array(dtype=int), time: wp.array(dtype=real), flags: wp.array2d(dtype=int)):
+        w = wp.tid()
+        if modes[w] != wp.static(NONE) and time[w] < real(1.0):
+            flags[DRIVEN, w] = wp.static(ON_THE_WAY)
+
+    return account, modes, predicted, depart, expect, refuse, curve, again, short
 
 
 @cache
 def block_kernels(real, linear, serial: bool):
     """gain(...) by a motion, differ(...) of positions; lessen(...) the residual by a product; aim(...), push(...) and
-    arrive(...) of supports; stay(...) of worlds that do not move."""
+    arrive(...) of supports; stay(...) of worlds that do not move; part(...) with what was proposed; way(...) that is left, and
+    add(...) it."""
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     _, free = product_functions(linear)
     share, until = share_function(serial), until_function(serial)
@@ -167,20 +174,16 @@ def block_kernels(real, linear, serial: bool):
     def lessen(
         product: wp.array(dtype=H),
         fixed: wp.array(dtype=wp.uint8),
-        flags: wp.array2d(dtype=int),
+        wanted: wp.array(dtype=int),
         blocks: int,
         right: wp.array(dtype=H),
-        forcing: wp.array(dtype=linear),
     ):
-        """Takes a product from the residual on free dofs; what follows supports has to do so to a part of a gap."""
+        """Takes a product from the residual on free dofs of worlds."""
         w, start = share(wp.tid(), blocks)
-        if flags[WANTED, w] == 0:
-            return
-        if start == 0 and flags[DRIVEN, w] == wp.static(ON_THE_WAY):
-            forcing[w] = wp.min(forcing[w], linear(wp.static(FOLLOWING)))
-        for k in range(start, until(start, blocks)):
-            i = k + w * blocks
-            right[i] = right[i] - wp.cw_mul(product[i], free(fixed[k]))
+        if wanted[w] != 0:
+            for k in range(start, until(start, blocks)):
+                i = k + w * blocks
+                right[i] = right[i] - wp.cw_mul(product[i], free(fixed[k]))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def aim(nodes: wp.array(dtype=int), blocks: int, q: wp.array(dtype=V), aims_out: wp.array2d(dtype=V)):
@@ -197,7 +200,7 @@ def block_kernels(real, linear, serial: bool):
         blocks: int,
         direction: wp.array(dtype=H),
     ):
-        """The way that supports have yet to go, among the directions, which are zero there."""
+        """What is left of the way of supports: they go to where they have to be."""
         i, w = wp.tid()
         if wanted[w] == 0:
             return
@@ -243,6 +246,7 @@ def block_kernels(real, linear, serial: bool):
         blocks: int,
         start_out: wp.array(dtype=V),
         modes: wp.array(dtype=int),
+        proposed: wp.array(dtype=V),
     ):
         """Where motions start: what does not move, from where it is. Worlds in which a node goes `far` have one share."""
         w, start = share(wp.tid(), blocks)
@@ -252,11 +256,52 @@ def block_kernels(real, linear, serial: bool):
             start_out[i] = base[i]
             if still:
                 start_out[i] = q[i]
-            elif k < nodes and unit[k] >= 0:
-                if wp.length_sq(q[i] - base[i]) > far * far:
-                    modes[w] = wp.static(WHOLE)
+            else:
+                proposed[i] = q[i]
+                if k < nodes and unit[k] >= 0:
+                    if wp.length_sq(q[i] - base[i]) > far * far:
+                        modes[w] = wp.static(WHOLE)
 
-    return gain, differ, lessen, aim, push, arrive, stay
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def part(
+        q: wp.array(dtype=V),
+        modes: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        blocks: int,
+        proposed: wp.array(dtype=V),
+        going: wp.array(dtype=int),
+    ):
+        """Nothing but where it is remains of worlds that are not on their way, or whose frames are new."""
+        w, start = share(wp.tid(), blocks)
+        along = flags[DRIVEN, w] == wp.static(ON_THE_WAY)
+        if along and flags[STATUS, w] == 0:
+            going[0] = 1
+        if not along or flags[TODO, w] == wp.static(RELAG):
+            for k in range(start, until(start, blocks)):
+                proposed[k + w * blocks] = q[k + w * blocks]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def way(
+        q: wp.array(dtype=V),
+        proposed: wp.array(dtype=V),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        way_out: wp.array(dtype=H),
+    ):
+        w, start = share(wp.tid(), blocks)
+        for k in range(start, until(start, blocks)):
+            i = k + w * blocks
+            d = proposed[i] - q[i]
+            way_out[i] = wp.where(wanted[w] != 0, H(linear(d[0]), linear(d[1]), linear(d[2])), H())
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def add(way: wp.array(dtype=H), wanted: wp.array(dtype=int), blocks: int, direction: wp.array(dtype=H)):
+        w, start = share(wp.tid(), blocks)
+        if wanted[w] != 0:
+            for k in range(start, until(start, blocks)):
+                direction[k + w * blocks] += way[k + w * blocks]
+
+    return gain, differ, lessen, aim, push, arrive, stay, part, way, add
 
 
 @cache

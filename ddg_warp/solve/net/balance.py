@@ -18,7 +18,8 @@ class Balance:
         self.newton, net, real, linear = newton, newton.net, newton.real, newton.linear
         self.chains = newton.chains if newton.chains and newton.chains.banded else None
         given, found = balance.given_type(real, drag)(), balance.found_type(real, linear)()
-        for name in ("q", "base", "target", "mass", "gravity", "load", "fixed", "arm", "longest"):
+        given.q = newton.here
+        for name in ("base", "target", "mass", "gravity", "load", "fixed", "arm", "longest"):
             setattr(given, name, getattr(newton, name))
         given.allowed, given.blocks, given.nodes = newton.allowed.blocks, net.blocks, net.host.nodes
         given.rtol, given.floor = newton.options.rtol, newton.options.floor_factor * newton.eps

@@ -1,7 +1,9 @@
 """Contact within Newton's method on a net; see `kernels.net.touch`, and `solve.contact` for the search and the pairs.
 
 What is proposed, a predictor or a step, is cut rod by rod before anything passes through anything. Supports and obstacles that move
-are part of what is proposed: what contact holds up comes along with the next directions, which know how far it has yet to go.
+are part of what is proposed. Worlds in which these, or the predictor, were cut are on their way: their iterate is where they are
+bound for, where all but contact is balanced, and contact is linear about where they have come to. So the next direction begins with
+what is left of the way, whatever holds it up.
 """
 
 import math
@@ -30,6 +32,7 @@ class NetContact:
         search, terms: candidates, and the energy of those that are near.
         forces (W N,) [N], stiffness (W N,) [N/m]: what pushes nodes, and a bound on how stiff that is.
         diagonal: (W N,) blocks of its matrix at nodes.
+        bound: (W N,) where iterates of worlds on their way are bound for, and where those of others are.
         bends: whether its matrix has what comes of pairs that turn, once the search is near; see `kernels.contact.pair_bend`.
         crossed: (1,) pairs that would have passed through each other in all steps so far; least: (1,) the smallest gap [m].
     """
@@ -61,7 +64,9 @@ class NetContact:
         self.bends, self._late = newton.psd != "gauss_newton", 0 if newton.psd == "none" else EARLY
         self._kept, self._gain = make((2, worlds), real), make(worlds, real)
         self._move = make(newton.all, net.vector)
+        self.bound = make(newton.all, net.vector)
         self._way, self._pushed = (make(newton.all, wp.types.vector(3, linear)) for _ in range(2))
+        self._going = make(1, int)
         self.crossed, self.least = make(1, wp.int64), wp.full(1, math.inf, dtype=real, device=device)
         self.tally = Tally(self.terms)
         self._counts = self.crossed, self.least, self.search.searches, *self.tally.arrays
@@ -79,10 +84,22 @@ class NetContact:
             self._refuse,
             self._find_curved,
             self._again,
+            self._find_short,
         ) = made
         self._kernels = list(made)
         made = kernels.block_kernels(real, linear, arrays.serial(device))
-        self._differ_gain, self._differ, self._lessen, self._aim, self._push, self._arrive, self._stay = made
+        (
+            self._differ_gain,
+            self._differ,
+            self._lessen,
+            self._aim,
+            self._push,
+            self._arrive,
+            self._stay,
+            self._part,
+            self._find_way,
+            self._add,
+        ) = made
         self._kernels += made
         self._sum = Sums(worlds, newton.dots.shape[1], real, device)
         self._stiffen = None
@@ -158,7 +175,9 @@ class NetContact:
             inputs = [self._nodes, self.net.blocks, newton.q]
             self._launch(self._aim, (len(self._nodes), self.net.worlds), inputs, [self._aims])
         self._launch(self._find_predicted, self.net.worlds, [newton.islands.arrays[0]], [self._modes])
-        self._hold()
+        self._cut()
+        self._launch(self._find_short, self.net.worlds, [self._modes, self.search.time], [newton.islands.arrays[0]])
+        self._go_on()
 
     def evaluate(self) -> None:
         """Energies, forces and factors at the iterate."""
@@ -189,23 +208,26 @@ class NetContact:
             self._launch(self._stiffen, (chains.longest, chains.columns), inputs, [chains.eliminated])
 
     def direct(self) -> None:
-        """Directions by conjugate gradients, along with what supports have yet to go."""
-        newton, count = self.newton, len(self._nodes)
-        if not count:
-            newton.krylov.solve()
-            return
-        self._go(self._way)
+        """Directions by conjugate gradients, along with what is left of the way."""
+        wp.capture_if(self._going, self._approach)
+        self.newton.krylov.solve()
+        wp.capture_if(self._going, self._follow)
+
+    def _approach(self) -> None:
+        """Take from the residual what contact has against the rest of the way."""
+        newton, blocks = self.newton, self.net.blocks
+        busy = newton.islands.wanted
+        self._sweep(self._find_way, [newton.q, self.bound, busy, blocks], [self._way])
+        if len(self._nodes):
+            inputs = [self._nodes, self._aims, newton.q, newton.fixed, busy, blocks]
+            self._launch(self._push, (len(self._nodes), self.net.worlds), inputs, [self._way])
         self._pushed.zero_()
         self.terms.product(self._way, self._pushed)
-        inputs = [self._pushed, newton.fixed, newton.islands.arrays[0], self.net.blocks]
-        self._sweep(self._lessen, inputs, [newton.right, newton.forcing])
-        newton.krylov.solve()
-        self._go(newton.direction)
+        self._sweep(self._lessen, [self._pushed, newton.fixed, busy, blocks], [newton.right])
 
-    def _go(self, out: wp.array) -> None:
+    def _follow(self) -> None:
         newton = self.newton
-        inputs = [self._nodes, self._aims, newton.q, newton.fixed, newton.islands.wanted, self.net.blocks]
-        self._launch(self._push, (len(self._nodes), self.net.worlds), inputs, [out])
+        self._sweep(self._add, [self._way, newton.islands.wanted, self.net.blocks], [newton.direction])
 
     def multiply(self, p: wp.array, product: wp.array) -> None:
         """Add H p, and write p . H p block by block."""
@@ -219,23 +241,31 @@ class NetContact:
         newton = self.newton
         self._launch(self._find_modes, self.net.worlds, [newton.islands.arrays[0]], [self._modes])
         self._launch(self._depart, self.net.worlds, [self._modes], [newton.islands.arrays[0]])
-        self._hold()
+        self._cut()
+        self._go_on()
         inputs = [newton.right, newton.q, newton.base, self._modes, self.net.blocks]
         self._sweep(self._differ_gain, inputs, [newton.dots])
         self._sum(newton.dots, self._gain)
         inputs = [self._modes, self.search.time, self._gain]
         self._launch(self._expect, self.net.worlds, inputs, [newton.islands.arrays[1]])
 
-    def _hold(self) -> None:
+    def _cut(self) -> None:
+        """Shorten what is proposed, which stays among what is `bound`."""
         newton = self.newton
         far = FAR * self.search.margin
         inputs = [newton.q, newton.base, self._unit, self.net.host.nodes, far, self.net.blocks]
-        self._sweep(self._stay, inputs, [self._move, self._modes])
+        self._sweep(self._stay, inputs, [self._move, self._modes, self.bound])
         self.search.filter(self._move, newton.q, self._unit, self._modes, self._units, self.touch.keep)
         if len(self._nodes):
             eps = ROUNDING * newton.eps
             inputs = [self._nodes, self._aims, newton.fixed, self._modes, eps, self.net.blocks, newton.q]
             self._launch(self._arrive, (len(self._nodes), self.net.worlds), inputs, [newton.islands.arrays[0]])
+
+    def _go_on(self) -> None:
+        """Let go of what was proposed where nothing is on its way."""
+        self._going.zero_()
+        inputs = [self.newton.q, self._modes, self.newton.islands.arrays[0], self.net.blocks]
+        self._sweep(self._part, inputs, [self.bound, self._going])
 
     def finish(self, before: wp.array) -> None:
         """Take no part of a step in which things passed through each other."""

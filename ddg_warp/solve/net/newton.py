@@ -147,6 +147,7 @@ class NetNewton:
         self.allowed = Allowed(net, self.real, self.linear)
         outer = outer_forces(host, gravity)
         self.outer = self.allowed.assign(self.allowed.bodies.loads(outer)[None])
+        self.here = self.contact.bound if self.contact else self.q
         self._balance = Balance(self, drag)
         self._worst = Sums(worlds, self.allowed.ratio.shape[1], self.real, device, largest=True)
         self._multilevel = preconditioner in ("multilevel", "chain_multilevel")
@@ -229,12 +230,12 @@ class NetNewton:
             self.contact.hold()
 
     def evaluate(self, state) -> None:
-        """Energies, gradients and factors of all elements at the iterate."""
+        """Energies, gradients and factors of all elements at the iterate, `here`."""
         for index, (part, own, kernel) in enumerate(zip(self.net.sets, self.parts, self._evaluate, strict=True)):
             arrays.sweep(
                 kernel,
                 part.elements,
-                [self.net.elements(state, index, self.q, self.islands.rate), *self.islands.arrays],
+                [self.net.elements(state, index, self.here, self.islands.rate), *self.islands.arrays],
                 [own["factor"], own["tension"], own["second"], own["gradient"], own["energy"], own["stiffness"]],
                 self.device,
                 128,
