@@ -41,6 +41,7 @@ def world_kernels(real):
         energy: wp.array(dtype=real),
         gap: wp.array(dtype=real),
         least: real,
+        overflow: wp.array(dtype=int),
         flags: wp.array2d(dtype=int),
         kept: wp.array2d(dtype=real),
         change: wp.array(dtype=real),
@@ -48,10 +49,11 @@ def world_kernels(real):
     ):
         """Adds what contact has to the change of the energy since the accepted iterate, and to its rounding.
 
-        A world in which a gap is less than `least` does not go on: what goes on there is tried again in shorter steps.
+        A world in which a gap is less than `least` does not go on: what goes on there is tried again in shorter steps. Nor does any
+        while pairs do not fit: the step will be done again.
         """
         w = wp.tid()
-        if flags[STATUS, w] == 0 and gap[w] < least:
+        if flags[STATUS, w] == 0 and (gap[w] < least or overflow[0] != 0):
             flags[STATUS, w] = wp.static(outcome.NO_ROOM)
         if flags[STATUS, w] == 0:
             accepted = flags[SLOT, w]
@@ -86,12 +88,14 @@ def world_kernels(real):
         time: wp.array(dtype=real),
         decrease: wp.array(dtype=real),
         scalars: wp.array2d(dtype=real),
+        stalled: wp.array(dtype=int),
     ):
-        """What a step that was cut is expected to gain, over its length."""
+        """What a step that was cut is expected to gain, over its length. If that drowns in rounding, it is not for being near."""
         w = wp.tid()
         length = scalars[STEP_LENGTH, w]
         if modes[w] != wp.static(NONE) and time[w] < real(1.0) and length > real(0.0):
             scalars[DECREMENT, w] = wp.max(decrease[w], real(0.0)) / length
+            stalled[w] = 0
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def refuse(

@@ -14,6 +14,7 @@ from ddg_warp.solve.contact.shapes import BALLS, PLANES, Shapes
 from ddg_warp.solve.contact.tree import Things
 
 SLACK = 1e-3  # of the margin, by which a search goes beyond it, for rounding
+ROOM = 0.8  # of the reach, to which motion closes a gap at once; only half of what is left of it then
 NONE = np.iinfo(np.int64).max
 
 
@@ -160,7 +161,7 @@ class BroadPhase:
         self._filter.check(unit, together, units)
         self.update(base, q, together)
         search = (self.overflow, self.time, self._searched, self._seen)
-        self._filter(base, self._move, q, unit, together, units, keep, search)
+        self._filter(base, self._move, q, unit, together, units, keep, self._room(keep), search)
 
     def fit(self, x: wp.array) -> bool:
         """Make room for pairs that did not fit, and search again until they do; whether there were any. Reads from the device.
@@ -253,7 +254,12 @@ class BroadPhase:
             part.tree.refit()
         for kernel, pairs, least in zip(kernels, self.lists, firsts, strict=True):
             outputs = [self.time, number, least]
-            wp.launch(kernel, pairs.first.all, [pairs.sides, x, move, keep], outputs, device=self.device)
+            inputs = [pairs.sides, x, move, keep, self._room(keep)]
+            wp.launch(kernel, pairs.first.all, inputs, outputs, device=self.device)
+
+    def _room(self, keep: float) -> float:
+        """What is left where surfaces must not touch."""
+        return ROOM * self.reach if keep > 0.0 else 0.0
 
     def _enclose(self, x, move, together, share: float, more: float) -> None:
         *_, common = self._motion

@@ -20,7 +20,7 @@ from ddg_warp.solve.contact.tally import Tally
 from ddg_warp.solve.contact.touch import Touch
 from ddg_warp.solve.net.system import Sums
 
-FAR = 4.0  # margins that a node goes from which on a world has one share: of so long ways too many pairs would be near
+FAR = 16.0  # margins that a node goes from which on a world has one share: of so long ways too many pairs would be near
 LEAST = 1e-3  # of the range, the gap from which on a barrier has no room
 ROUNDING = 16.0  # units in the last place within which supports have arrived
 
@@ -192,8 +192,8 @@ class NetContact:
 
     def account(self, change: wp.array, noise: wp.array) -> None:
         """Add to the change of the energy of worlds, and to its rounding."""
-        inputs = [self.terms.energy, self.search.gap, self._least, self.newton.islands.arrays[0], self._kept]
-        inputs += [change, noise]
+        inputs = [self.terms.energy, self.search.gap, self._least, self.search.overflow]
+        inputs += [self.newton.islands.arrays[0], self._kept, change, noise]
         self._launch(self._account, self.net.worlds, inputs, [])
 
     def assemble(self) -> None:
@@ -247,7 +247,7 @@ class NetContact:
         self._sweep(self._differ_gain, inputs, [newton.dots])
         self._sum(newton.dots, self._gain)
         inputs = [self._modes, self.search.time, self._gain]
-        self._launch(self._expect, self.net.worlds, inputs, [newton.islands.arrays[1]])
+        self._launch(self._expect, self.net.worlds, inputs, [newton.islands.arrays[1], newton.stalled])
 
     def _cut(self) -> None:
         """Shorten what is proposed, which stays among what is `bound`."""
