@@ -68,6 +68,7 @@ SMALL = {
     "strands_random": {"count": 6},
     "tip_load": {"n": 50},
     "vibration": {"n": 25},
+    "walker": {"steps": 75},
     "whirling": {},
 }
 LONG = (
