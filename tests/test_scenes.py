@@ -11,7 +11,7 @@ SMALL = {
     "bend_twist": {"n": 50},
     "bilayer_strip": {"cells": 4},
     "cable_gripped_at_both_ends": {"n": 40},
-    "cable_on_table": {"n": 100, "speed": 0.12},
+    "cable_on_table": {"n": 80},
     "cantilever": {},
     "cantilever_plate_shear": {"n": 16, "steps": 4},
     "capstan": {"n": 30, "steps": 40},
