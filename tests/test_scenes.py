@@ -6,6 +6,7 @@ from ddg_warp.run.catalog import load_scene, parameters, scene_files
 from ddg_warp.run.simulate import simulate
 
 SMALL = {
+    "active_gripper": {"n": 40, "dt": 0.02},
     "axisymmetric_dome": {"n": 40},
     "bend_45": {"n": 32},
     "bend_twist": {"n": 50},
@@ -19,6 +20,7 @@ SMALL = {
     "cloth_twist": {"around": 16, "along": 8, "turns": 0.2},
     "crossed_beams": {"n": 20},
     "deep_arch": {},
+    "flag_on_pole": {"cells": 12},
     "flagellum": {"n": 25, "steps": 50},
     "flying_beam": {"n": 20},
     "greenhill": {"n": 100},
