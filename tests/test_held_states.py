@@ -168,3 +168,33 @@ def test_the_last_good_state_of_an_error_stays(device):
         except SolverError:
             pass
     same([caught.value.state], [good])
+
+
+def test_a_resumed_run_has_the_parameters_that_callbacks_set(device, tmp_path):
+    """By the time: muscles, say."""
+
+    def build(duration):
+        scene = ddg.Scene(
+            analysis=ddg.Dynamics(dt=0.01, duration=duration),
+            callbacks=[lambda state: state.model.set_parameter("rod_bend_twist", "rest_1", 20.0 * state.time)],
+        )
+        rod = scene.add_rod(
+            np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 11),
+            section=ddg.Circle(0.01),
+            material=ddg.Material(young=1e7, density=1000.0),
+            natural="straight",
+        )
+        scene.clamp(rod)
+        return scene
+
+    def run(end, **where):
+        found = simulate(
+            build(end), device=device, duration=end, options={"rtol": 1e-10}, progress=False, usd=False, **where
+        )
+        return found.state.points().copy()
+
+    straight = run(0.06)
+    before = run(0.03, out=tmp_path)
+    resumed = run(0.06, resume=tmp_path)
+    assert np.abs(straight - before).max() > 1e-2
+    np.testing.assert_allclose(resumed, straight, rtol=0.0, atol=1e-10)

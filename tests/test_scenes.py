@@ -6,11 +6,13 @@ from ddg_warp.run.catalog import load_scene, parameters, scene_files
 from ddg_warp.run.simulate import simulate
 
 SMALL = {
+    "active_gripper": {"n": 40, "dt": 0.02},
     "axisymmetric_dome": {"n": 40},
     "bend_45": {"n": 32},
     "bend_twist": {"n": 50},
     "bilayer_strip": {"cells": 4},
     "cable_gripped_at_both_ends": {"n": 40},
+    "cable_on_table": {"n": 80},
     "cantilever": {},
     "cantilever_plate_shear": {"n": 16, "steps": 4},
     "capstan": {"n": 30, "steps": 40},
@@ -18,6 +20,7 @@ SMALL = {
     "cloth_twist": {"around": 16, "along": 8, "turns": 0.2},
     "crossed_beams": {"n": 20},
     "deep_arch": {},
+    "flag_on_pole": {"cells": 12},
     "flagellum": {"n": 25, "steps": 50},
     "flying_beam": {"n": 20},
     "greenhill": {"n": 100},
@@ -68,6 +71,7 @@ SMALL = {
     "strands_random": {"count": 6},
     "tip_load": {"n": 50},
     "vibration": {"n": 25},
+    "walker": {"steps": 75},
     "whirling": {},
 }
 LONG = (

@@ -78,7 +78,7 @@ def contact_lines(touching) -> list[str]:
     numbers = (
         (touching.range, "range", "m"),
         (touching.stiffness, "stiffness", "N/m"),
-        (touching.friction, "friction", ""),
+        (touching.friction[..., None] * touching.ways, "friction", ""),
     )
     said = (f"{name} {_between(values)}{unit and ' ' + unit}" for values, name, unit in numbers)
     return [

@@ -31,6 +31,7 @@ class Touching:
         law: what the scene says; bodies: what may touch, obstacles at last.
         names: of the groups that numbers are of, one a name; group (bodies,): number of that of each.
         friction, stiffness [N/m], range [m]: of two groups (groups, groups).
+        ways: what friction is multiplied by where a rod slides forwards, backwards and across (groups, groups, 3).
         ignored: pairs of groups that pass through each other.
     """
 
@@ -39,6 +40,7 @@ class Touching:
     names: list[str]
     group: np.ndarray
     friction: np.ndarray
+    ways: np.ndarray
     stiffness: np.ndarray
     range: np.ndarray
     ignored: list[tuple[int, int]] = field(default_factory=list)

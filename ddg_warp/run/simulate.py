@@ -299,12 +299,17 @@ def recorded_duration(resume: str | Path | None, scene: float) -> float:
 
 
 def continue_from(result: Result, directory: Path) -> None:
-    """Put the checkpoint of the run in `directory`, and what was observed up to it, into a new result."""
+    """Put the checkpoint of the run in `directory`, and what was observed up to it, into a new result.
+
+    The scene's callbacks see the state, so that parameters which they set by the time are what they were.
+    """
     from ddg_warp.io.hdf5 import TrajectoryReader
 
     with TrajectoryReader(directory / "trajectory.h5") as reader:
         frames = reader.checkpoint_frame
         result.state = result.model.restore(reader.checkpoint())
+        for callback in result.scene.callbacks:
+            callback(result.state)
         result.times = reader.time[:frames].tolist()
         result.series = {name: values[:frames].tolist() for name, values in reader.series.items()}
 

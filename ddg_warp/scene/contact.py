@@ -14,6 +14,8 @@ from ddg_warp.scene.obstacles import Capsule, Mesh, Obstacle, Plane, Sphere
 
 LAWS = ("barrier", "penalty")
 FRICTION_LAWS = ("logistic", "polynomial")
+WAYS = ("forwards", "backwards", "across")
+ONE = "; contact_between of rods and an obstacle takes one forwards, one backwards and one across"
 
 
 @dataclass(frozen=True)
@@ -34,11 +36,11 @@ class Contact:
 
 @dataclass(frozen=True)
 class Between:
-    """What is different between objects of two names; None where it is not."""
+    """What is different between objects of two names; None where it is not. Friction is a number, or forwards, backwards and across."""
 
     names: tuple[str, str]
     ignore: bool
-    friction: float | None
+    friction: float | tuple[float, float, float] | None
     stiffness: float | None
     range: float | None
 
@@ -79,7 +81,7 @@ class Contacts:
                 a shell.
             stiffness: of the law [N/m]; by default of every object what lets a node's weight, or bending as tight as ten radii, close
                 the gap by some part of the range, and between two the geometric mean.
-            friction: Coulomb's coefficient.
+            friction: Coulomb's coefficient; `contact_between` takes one for each direction, too.
             friction_law: "logistic" or "polynomial": how friction grows with the speed.
             velocity: the speed nu from which on all of the friction acts, nearly [m/s]: what sticks creeps by less.
             lags: how often in a step friction takes the normal forces and directions anew.
@@ -106,7 +108,7 @@ class Contacts:
             arguments.choice(f"{call}law", law, LAWS),
             range,
             stiffness,
-            _friction(f"{call}friction", friction),
+            _friction(f"{call}friction", friction, ONE),
             arguments.choice(f"{call}friction_law", friction_law, FRICTION_LAWS),
             arguments.positive(f"{call}velocity", velocity, "m/s"),
             arguments.count(f"{call}lags", lags),
@@ -121,7 +123,7 @@ class Contacts:
         other: str,
         *,
         ignore: bool = False,
-        friction: float | None = None,
+        friction: float | tuple[float, float, float] | None = None,
         stiffness: float | None = None,
         range: float | None = None,
     ) -> None:
@@ -130,16 +132,24 @@ class Contacts:
         Args:
             one, other: names as given to `add_rods`, `add_shell` and `add_obstacle`.
             ignore: whether they pass through each other; nothing else is given then.
-            friction, stiffness, range: as of `contact`.
+            friction: as of `contact`; or, of rods on an obstacle, three coefficients: of a rod that slides forwards, towards its last
+                node, backwards, and across itself (snakes, worms, bristles). Between these directions it is as
+                `kernels.contact.pair_friction` says.
+            stiffness, range: as of `contact`.
 
         Raises:
-            SceneError: an argument that is none of these.
+            SceneError: an argument that is none of these; at `build`, three coefficients between what is no rod and an obstacle.
         """
         call = f"contact_between {one!r} and {other!r}: "
         for name, value in (("stiffness", stiffness), ("range", range)):
             if value is not None:
                 arguments.positive(call + name, value)
-        friction = None if friction is None else _friction(f"{call}friction", friction)
+        if np.iterable(friction) and not isinstance(friction, str):
+            friction = arguments.vector(f"{call}friction forwards, backwards and across", friction)
+            for way, value in zip(WAYS, friction, strict=True):
+                _friction(f"{call}friction {way}", value)
+        elif friction is not None:
+            friction = _friction(f"{call}friction", friction)
         ignore = arguments.flag(f"{call}ignore", ignore)
         given = [
             name
@@ -218,6 +228,20 @@ def check_contact(scene) -> None:
             raise SceneError(
                 "contact_between {!r} and {!r}: obstacles never touch each other; leave it out".format(*between.names)
             )
+        if isinstance(between.friction, tuple):
+            _check_directed(scene, between, obstacles)
+
+
+def _check_directed(scene, between: Between, obstacles: set[str]) -> None:
+    """Refuse friction by direction of anything but rods on an obstacle."""
+    rods, shells = {batch.name for batch in scene.batches}, {shell.name for shell in scene.shells}
+    rods, obstacles = rods - shells - obstacles, obstacles - rods - shells
+    one, other = between.names
+    if not ((one in rods and other in obstacles) or (other in rods and one in obstacles)):
+        raise SceneError(
+            f"contact_between {one!r} and {other!r}: friction forwards, backwards and across is of rods on an obstacle, and names of "
+            "their own; give one coefficient"
+        )
 
 
 def touching_names(scene) -> set[str]:
@@ -237,5 +261,5 @@ def _names(what: str, values) -> tuple[str, ...]:
     return values
 
 
-def _friction(what: str, value: float) -> float:
-    return arguments.number(what, value, "a coefficient, zero or more", lambda v: v >= 0.0 and np.isfinite(v))
+def _friction(what: str, value: float, more: str = "") -> float:
+    return arguments.number(what, value, f"a coefficient, zero or more{more}", lambda v: v >= 0.0 and np.isfinite(v))

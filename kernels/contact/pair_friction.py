@@ -15,6 +15,12 @@ with forces f_i = -w_i f, f = (t1, t2) psi'(u) at most mu N. They have no result
 to the other, their moment is that of -f at r. What would balance it turns surfaces about their middle, where friction here is applied.
 Where the forces of a pair on one side all but cancel, weights are large; still |f_i| <= mu |g_i . n|.
 
+Rods on obstacles may have one coefficient forwards, one backwards and one across: `directed`. Then mu is the smallest that is not zero,
+t1 lies along the rod, and t1 and t2 are as long as the coefficients of their directions over mu, t1 by the sense of the slip. So psi is
+convex with a continuous slope; forces are at most those whose components, over the most along and across, have squares with a sum of 1,
+and among these those that take most energy (Michalowski and Mroz, Arch. Mech. 30, 1978, 259). For a rod that is inclined to the surface
+the component of the slip along the rod counts as along, the rest as across.
+
 The potential has all but a kink at u = 0, and Newton's steps that know its second derivative alone overshoot it. So the matrix is that
 of the equations u = w phi(|u|), phi = mu N |u| / psi'(|u|), for the slip and the direction of friction w, |w| <= 1, as an unknown of
 its own (Chan, Golub and Mulet, SIAM J. Sci. Comput. 20, 1999, for the total variation):
@@ -42,7 +48,10 @@ ROWS = 2  # directions of the slip
 
 @cache
 def lagged_struct(real):
-    """What is lagged of pairs (capacity,): mu N [N], zero where there is no friction, weights of nodes, and tangents (2, capacity)."""
+    """What is lagged of pairs (capacity,): mu N [N], zero where there is no friction, weights of nodes, and tangents (2, capacity).
+
+    Tangents that are directed are of slips forwards; in a third row there is the first one of slips backwards.
+    """
     V, W = wp.types.vector(3, real), wp.types.vector(SLOTS, real)
 
     @wp.struct
@@ -55,12 +64,38 @@ def lagged_struct(real):
 
 
 @cache
-def lag_kernel(kind: Kind, real, linear, serial: bool):
-    """Keep pairs, their nodes and the items of nodes, and what is lagged of friction, from factors and gradients of contact."""
+def directed_basis(real):
+    """directed(n, d, way) -> tangents at right angles to n, of slips forwards along d, across, and backwards, as long as `way` says."""
+    V, tangents, tiny = wp.types.vector(3, real), basis(real), wp.constant(real(1.0e-12))
+
+    @wp.func
+    def directed(n: V, d: V, way: V):
+        t1, _t = tangents(n)
+        d = wp.normalize(d)
+        flat = d - n * wp.dot(n, d)
+        share = wp.min(wp.dot(flat, flat), real(1.0))
+        if share > tiny:
+            t1 = flat / wp.sqrt(share)
+        across = way[2] * way[2] * (real(1.0) - share)
+        forwards = wp.sqrt(way[0] * way[0] * share + across)
+        backwards = wp.sqrt(way[1] * way[1] * share + across)
+        return t1 * forwards, wp.cross(n, t1) * way[2], t1 * backwards
+
+    return directed
+
+
+@cache
+def lag_kernel(kind: Kind, real, linear, serial: bool, directed: bool):
+    """Keep pairs, their nodes and the items of nodes, and what is lagged of friction, from factors and gradients of contact.
+
+    x: lagged positions; beside (things,): the two nodes that say where the rod of a first thing of one world leads; ways: by groups,
+    coefficients forwards, backwards and across over `friction`. All three are read where friction is directed.
+    """
     Law, Sides, Factor, Lagged = law_struct(real), sides_struct(real), factor_struct(linear), lagged_struct(real)
     V, W, L = wp.types.vector(3, real), wp.types.vector(SLOTS, real), wp.types.vector(SLOTS, linear)
     E = wp.types.vector(2, real)
     tangents, groups, until, size = basis(real), groups_function(real), until_function(serial), kind.first + kind.second
+    along_rod = directed_basis(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def lag(
@@ -69,6 +104,9 @@ def lag_kernel(kind: Kind, real, linear, serial: bool):
         sides: Sides,
         law: Law,
         friction: wp.array2d(dtype=real),
+        x: wp.array(dtype=V),
+        beside: wp.array(dtype=wp.vec2i),
+        ways: wp.array2d(dtype=V),
         contact: Factor,
         gradient: wp.array2d(dtype=V),
         items: wp.array(dtype=int),
@@ -94,7 +132,7 @@ def lag_kernel(kind: Kind, real, linear, serial: bool):
                 items_out[wp.static(size) * p + k] = items[wp.static(size) * p + k]
             lagged.bound[p] = real(0.0)
             if contact.used[p] != 0:
-                _i, _j, a, b = groups(law, sides, pairs[p])
+                i, _j, a, b = groups(law, sides, pairs[p])
                 push = V()
                 for slot in range(wp.static(kind.first)):
                     push += gradient[slot, p]
@@ -102,7 +140,13 @@ def lag_kernel(kind: Kind, real, linear, serial: bool):
                 # what is no number shows in the energy
                 if not (friction[a, b] * normal <= real(0.0)):
                     n = push / normal
-                    t1, t2 = tangents(n)
+                    if wp.static(directed):
+                        first = pairs[p][0] / sides.counts[0] * sides.first.nodes_a_world
+                        d = x[beside[i][1] + first] - x[beside[i][0] + first]
+                        t1, t2, back = along_rod(n, d, ways[a, b])
+                        lagged.tangent[2, p] = back
+                    else:
+                        t1, t2 = tangents(n)
                     weight = W()
                     for slot in range(wp.static(size)):
                         weight[slot] = wp.dot(gradient[slot, p], n) / normal
@@ -119,7 +163,7 @@ def lag_kernel(kind: Kind, real, linear, serial: bool):
 
 
 @cache
-def friction_kernel(density: Density, real, linear, serial: bool):
+def friction_kernel(density: Density, real, linear, serial: bool, directed: bool):
     """Energy, work, gradient by slot and factor of each pair at positions x, by its slip since `start`.
 
     things: first things of pairs in one world; velocity: nu [m/s]; rate (worlds,): 1/h [1/s]; accepted, iteration (worlds,): which of
@@ -196,7 +240,11 @@ def friction_kernel(density: Density, real, linear, serial: bool):
                 move = V()
                 for slot in range(wp.static(SLOTS)):
                     move += (x[nodes[slot]] - start[nodes[slot]]) * weight[slot]
-                t1, t2 = lagged.tangent[0, p], lagged.tangent[1, p]
+                way = int(0)
+                if wp.static(directed):
+                    if wp.dot(lagged.tangent[0, p] + lagged.tangent[2, p], move) < real(0.0):
+                        way = 2
+                t1, t2 = lagged.tangent[way, p], lagged.tangent[1, p]
                 u = E(wp.dot(t1, move), wp.dot(t2, move))
                 given = P(bound, real(1.0), velocity, real(0.0), real(0.0), inverse)
                 energy[p] = energy_of(u, given)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from pair_cases import CASES, terms
+from pair_cases import CASES, central, terms, times
 
 MU, RATE, VELOCITY = 0.4, 100.0, 0.01
 SLIP = VELOCITY / RATE  # at which the polynomial law slides
@@ -26,3 +26,23 @@ def rubbed(case: str, device, form: str = "logistic", slip: float | None = None,
     at.assign(after)
     result.evaluate(at, rates(result))
     return result, at, x, after
+
+
+def hold_to_differences(result, at: wp.array, after: np.ndarray) -> None:
+    """Forces and products with random vectors at positions `after`, which are at `at`, against central differences."""
+    forces = result.forces.numpy().copy()
+    for seed in range(5):
+        v = np.random.default_rng(seed).normal(size=after.shape)
+        product, exact = times(result, v), times(result, v, at)
+        assert (product == exact).all()
+
+        def quantities(s, v=v):
+            at.assign(after + s * v)
+            result.evaluate(at, rates(result))
+            return np.append(result.energy.numpy()[0], result.forces.numpy().ravel())
+
+        slopes = central(quantities, 2e-8)
+        at.assign(after)
+        result.evaluate(at, rates(result))
+        assert slopes[0] == pytest.approx(-(forces * v).sum(), rel=1e-6)
+        assert np.abs(product.ravel() + slopes[1:]).max() < 1e-6 * np.abs(product).max()

@@ -48,7 +48,8 @@ def between(*names, **options):
 for _name, _unit in (("range", "[m]"), ("stiffness", "[N/m]"), ("velocity", "[m/s]")):
     each("contact", _name, [0.0, -1.0, NAN, INF, "large", (1.0, 2.0)], lambda v, name=_name: touching(**{name: v}),
          f"contact: {_name}", "positive", _unit)
-each("contact", "friction", [-1.0, NAN, INF, "rough", True], lambda v: touching(friction=v), "contact: friction", "zero or more")
+each("contact", "friction", [-1.0, NAN, INF, "rough", True, (0.1, 0.2, 0.3)], lambda v: touching(friction=v),
+     "contact: friction", "zero or more", "contact_between")
 each("contact", "apart", [-1.0, NAN, INF, "far"], lambda v: touching(apart=v), "contact: apart", "zero or more [m]")
 each("contact", "lags", [0, -1, 2.5, "two"], lambda v: touching(lags=v), "contact: lags", "whole number")
 each("contact", "law", ["spring", None, 3], lambda v: touching(law=v), "contact: law", "'barrier' or 'penalty'")
@@ -64,6 +65,7 @@ refuse("contact", {
     "radius of no object": (lambda: built(touching(radius={"none": 0.1})), "radius names 'none'", "'odd', 'rod'"),
     "radius of what can not touch": (lambda: built(touching(objects="rod", radius={"odd": 0.1})), "radius names 'odd'", "is 'rod'"),
     "between a name that is not there": (lambda: between("rod", "none", ignore=True), "names 'none'", "'floor', 'odd', 'rod'"),
+    "friction by direction of a shell": (lambda: _shell_over_floor((0.1, 0.2, 0.3)), "'shell' and 'floor'", "rods on an obstacle"),
     "between numbers": (lambda: between(0, 1, ignore=True), "contact_between names 0"),
     "between obstacles": (lambda: between("floor", "floor", friction=0.1), "'floor' and 'floor'", "obstacles never touch"),
     "between, and nothing": (lambda: between("rod", "floor"), "'rod' and 'floor'", "nothing is different", "ignore=True"),
@@ -77,6 +79,12 @@ refuse("contact", {
 })
 each("contact", "between friction", [-1.0, NAN, INF, "rough"], lambda v: between("rod", "floor", friction=v),
      "'rod' and 'floor'", "friction")
+each("contact", "friction by direction", [(0.1, 0.2), (0.1, 0.2, NAN), [0.1, (0.2, 0.3)], (0.1, 0.2, "rough"), ()],
+     lambda v: between("rod", "floor", friction=v), "'rod' and 'floor'", "forwards, backwards and across", "three finite numbers")
+each("contact", "friction across", [(0.1, 0.2, -0.3)], lambda v: between("rod", "floor", friction=v),
+     "'rod' and 'floor'", "friction across is -0.3", "zero or more")
+each("contact", "friction by direction of two", [("rod", "odd"), ("odd", "odd")], lambda v: between(*v, friction=(0.1, 0.2, 0.3)),
+     "friction forwards, backwards and across", "rods on an obstacle", "one coefficient")
 each("contact", "between stiffness", [0.0, -1.0, NAN, "hard"], lambda v: between("rod", "odd", stiffness=v),
      "'rod' and 'odd'", "stiffness")
 each("contact", "between range", [0.0, -1.0, NAN, "far"], lambda v: between("rod", "odd", range=v), "'rod' and 'odd'", "range")
@@ -133,6 +141,15 @@ refuse("contact", {name: (call, "contact: equilibria", "step the scene in time")
         lambda: stepped(_on_oblique_plane()), "contact: ", "oblique plane", "axis of space"
     ),
 })
+
+
+def _shell_over_floor(friction) -> ddg.Model:
+    made = ddg.Scene()
+    made.add_shell(*meshes.rectangle(3, 3), thickness=0.01, material=RUBBER, name="shell")
+    made.add_obstacle(ddg.Plane((0.0, 0.0, -1.0)), name="floor")
+    made.contact()
+    made.contact_between("shell", "floor", friction=friction)
+    return built(made)
 
 
 def _on_oblique_plane() -> ddg.Scene:

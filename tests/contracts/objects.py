@@ -192,7 +192,7 @@ def _mixed(*adders):
 RANGE = 1e-3  # of contact [m]
 
 
-def _between_balls(adder, at: tuple, thick: float):
+def _between_balls(adder, at: tuple, thick: float, friction=0.2):
     """What `adder` adds, with a ball above and one below a point of it, a little more than the range of contact away."""
 
     def add(scene, material) -> Added:
@@ -200,7 +200,9 @@ def _between_balls(adder, at: tuple, thick: float):
         apart = 0.05 + thick + 1.02 * RANGE
         for side in (-1.0, 1.0):
             scene.add_obstacle(ddg.Sphere(tuple(np.array(at) + [0.0, 0.0, side * apart]), 0.05), name="ball")
-        scene.contact(range=RANGE, friction=0.2)
+        scene.contact(range=RANGE)
+        for part in (*scene.batches, *scene.shells):
+            scene.contact_between(part.name, "ball", friction=friction)
         return added
 
     return add
@@ -245,7 +247,9 @@ OBJECTS = {
     "shells of both kinds": Object(_mixed(_sheet("midedge_dof"), _dome), axis=UP, turns=False),
     "rods by the turning angle": Object(_mixed(_rod(curvature="angle"), _joined(True, curvature="angle"))),
     "magnetised rod": Object(_magnetised, turns=False),
-    "rod in contact": Object(_between_balls(_rod(line(0.0 * X, X, 8), section=ddg.Circle(0.02)), X, 0.02), axis=UP),
+    "rod in contact": Object(
+        _between_balls(_rod(line(0.0 * X, X, 8), section=ddg.Circle(0.02)), X, 0.02, (0.2, 0.3, 0.4)), axis=UP
+    ),
     "rods in contact, joined": Object(
         _between_balls(_joined(True, section=ddg.Circle(0.02)), (0.875, 0.0, 0.0), 0.02), axis=UP
     ),

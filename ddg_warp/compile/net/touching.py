@@ -55,7 +55,7 @@ def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray) -> Touc
     count, moving = len(names), np.array([not body.still for body in bodies])
     radius = min(body.radius for body in bodies if not body.still)
     within = np.full((count, count), HALF * radius if law.range is None else law.range)
-    friction = np.full((count, count), law.friction)
+    rough = np.full((count, count, 3), law.friction)
     own = np.full(count, np.nan)  # of obstacles that of what they touch counts
     for g in np.unique(group[moving]):
         own[g] = scale[moving & (group == g)].max()
@@ -65,10 +65,20 @@ def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray) -> Touc
     ignored, place = [], {name: i for i, name in enumerate(names.tolist())}
     for between in scene.betweens:
         g, h = (place[name] for name in between.names)
-        for table, value in ((friction, between.friction), (stiffness, between.stiffness), (within, between.range)):
+        for table, value in ((rough, between.friction), (stiffness, between.stiffness), (within, between.range)):
             if value is not None:
                 table[g, h] = table[h, g] = value
         if between.ignore:
             ignored.append((g, h))
     stiffness = np.where(np.isnan(stiffness), force / within, stiffness)
-    return Touching(law, bodies, names.tolist(), group, friction, stiffness, within, ignored)
+    return Touching(law, bodies, names.tolist(), group, *_by_way(rough), stiffness, within, ignored)
+
+
+def _by_way(friction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of coefficients forwards, backwards and across (..., 3) the smallest but zero, and multiples of it.
+
+    So what sticks creeps by less than the velocity of the law, whichever way it is pulled.
+    """
+    least = np.where(friction > 0.0, friction, np.inf).min(-1)
+    none = np.isinf(least)
+    return np.where(none, 0.0, least), np.where(none[..., None], 1.0, friction / least[..., None])

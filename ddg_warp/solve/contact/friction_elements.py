@@ -1,5 +1,6 @@
 """Friction on the pairs that contact had at the start of a step: memory and launches of `kernels.contact.pair_friction`."""
 
+import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
@@ -16,6 +17,8 @@ class FrictionElements(PairElements):
         contact: of the same pairs.
         friction: coefficients by groups of both objects (groups, groups).
         velocity: below which surfaces stick [m/s].
+        directed: nodes beside first things (things, 2), and by groups coefficients over `friction` forwards, backwards and across
+            (groups, groups, 3), see `lag_kernel`; None: it is the same all ways.
     """
 
     def __init__(
@@ -24,6 +27,7 @@ class FrictionElements(PairElements):
         density: Density,
         friction: wp.array,
         velocity: float,
+        directed: tuple[np.ndarray, np.ndarray] | None,
         nodes: int,
         worlds: int,
         real,
@@ -33,8 +37,14 @@ class FrictionElements(PairElements):
         super().__init__(contact.found, ROWS, nodes, worlds, real, linear, atomic)
         serial = arrays.serial(self.device)
         self._contact, self._friction, self._velocity = contact, friction, velocity
-        self._lag = lag_kernel(self.found.kind, real, linear, serial)
-        self._evaluate = friction_kernel(density, real, linear, serial)
+        self._lag = lag_kernel(self.found.kind, real, linear, serial, directed is not None)
+        self._evaluate = friction_kernel(density, real, linear, serial, directed is not None)
+        self._rows, self._directions = ROWS, (None, None)
+        if directed is not None:
+            beside, ways = directed
+            self._rows += 1
+            ways = wp.array(ways, dtype=wp.types.vector(3, real), device=self.device)
+            self._directions = arrays.upload(beside.astype(np.int32), wp.vec2i, self.device), ways
         self.kernels += [self._lag, self._evaluate]
         self._kept = ("count", "starts", "partners", "numbers", "places")
         for name in self._kept:
@@ -53,12 +63,13 @@ class FrictionElements(PairElements):
         self._slip, self._along = (arrays.allocate((2, capacity), pair, self.device) for _ in range(2))
         self._work, self.lagged.bound = (wp.zeros(capacity, dtype=self.real, device=self.device) for _ in range(2))
         self.lagged.weight = wp.zeros(capacity, dtype=wp.types.vector(4, self.real), device=self.device)
-        self.lagged.tangent = arrays.allocate((ROWS, capacity), wp.types.vector(3, self.real), self.device)
+        self.lagged.tangent = arrays.allocate((self._rows, capacity), wp.types.vector(3, self.real), self.device)
 
-    def lag(self, law) -> None:
-        """Take the pairs of contact as it was evaluated last."""
+    def lag(self, law, x: wp.array) -> None:
+        """Take the pairs of contact as it was evaluated last, at x."""
         of = self._contact
-        inputs = [of.pairs, of.count, self.found.sides, law, self._friction, of.factor, of.gradient, of.items]
+        inputs = [of.pairs, of.count, self.found.sides, law, self._friction, x, *self._directions]
+        inputs += [of.factor, of.gradient, of.items]
         outputs = [self.pairs, self.factor, self.lagged, self.items, self._slip, self._along]
         self._sweep(self._lag, self.found.capacity, inputs, outputs)
         for name in self._kept:

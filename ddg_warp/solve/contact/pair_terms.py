@@ -38,6 +38,8 @@ class PairTerms:
             thickness: distance at which the gap is zero [m], by default the sum of both radii. Numbers, or symmetric (groups, groups).
         groups: of each object (objects,), from 0; by default all are in one.
         friction: coefficient mu, a number or symmetric (groups, groups), not negative; None or 0: no friction is built.
+        ways: multiples of it (groups, groups, 3), not negative, of a rod, the first of two objects, that slides forwards, towards its
+            last node, backwards, and across; by default it is the same all ways.
         friction_law: "logistic" or "polynomial", see `densities.friction`.
         velocity: nu [m/s], positive: what sticks creeps with a share of it.
         linear: type of factors and of vectors of products, by default that of positions.
@@ -67,6 +69,7 @@ class PairTerms:
         thickness=None,
         groups=None,
         friction=None,
+        ways=None,
         friction_law: str = "logistic",
         velocity: float = 1e-3,
         linear=None,
@@ -99,7 +102,7 @@ class PairTerms:
         ]
         self._trace = gather.trace_kernel(self.real, self.linear)
         self._version, self._lagged = search.version, -1
-        self.frictions = self._with_friction(friction, friction_law, velocity, number, atomic)
+        self.frictions = self._with_friction(friction, ways, friction_law, velocity, number, atomic)
         self._start = wp.zeros_like(self.forces)
         self._product = PairProduct(self._parts, self.law, self.real, self.linear, atomic)
         self._rub = PairProduct(self.frictions, self.law, self.real, self.linear, atomic) if self.frictions else None
@@ -142,7 +145,7 @@ class PairTerms:
             return
         self.evaluate(x)
         for part in self.frictions:
-            part.lag(self.law)
+            part.lag(self.law, x)
         if not again:
             wp.copy(self._start, x)
         self._lagged = self._version
@@ -232,7 +235,7 @@ class PairTerms:
         if self.frictions and self._lagged != self._version:
             raise SolverError("friction has no pairs of the step's start; call lag() there, anew after fit()")
 
-    def _with_friction(self, friction, law: str, velocity: float, number: int, atomic: bool) -> list[FrictionElements]:
+    def _with_friction(self, friction, ways, law: str, velocity: float, number: int, atomic: bool) -> list:
         """Friction of each list, where there is any."""
         if law not in FRICTION:
             raise SceneError(f"friction_law = {law!r} of contact; it is one of {', '.join(FRICTION)}")
@@ -242,8 +245,23 @@ class PairTerms:
         if not table.any():
             return []
         table = wp.array(table, dtype=self.real, device=self.device)
-        sizes = (len(self.forces), self.search.worlds, self.real, self.linear, atomic)
-        return [FrictionElements(part, FRICTION[law], table, float(velocity), *sizes) for part in self.lists]
+        same = ways is None or (np.asarray(ways) == 1.0).all()
+        ways = None if same else [_table("ways", way, number, False) for way in np.moveaxis(np.asarray(ways), -1, 0)]
+        return [
+            FrictionElements(
+                part,
+                FRICTION[law],
+                table,
+                float(velocity),
+                None if same else (self.search.shapes.beside(part.found.kind.first), np.stack(ways, -1)),
+                len(self.forces),
+                self.search.worlds,
+                self.real,
+                self.linear,
+                atomic,
+            )
+            for part in self.lists
+        ]
 
     def _list(self) -> None:
         for part in self.lists:

@@ -162,6 +162,20 @@ class Shapes:
         radius = np.repeat([part[1] for part in parts], [len(part[0]) for part in parts])
         return np.concatenate([part[0] for part in parts]), radius, number, np.concatenate([part[3] for part in parts])
 
+    def beside(self, size: int) -> np.ndarray:
+        """Of edges both nodes, of points on rods the nodes before and after them, where there are any, else themselves (n, 2)."""
+        nodes, _, owner, _ = self.things(size)
+        if size == 2:
+            return nodes
+        ends, _, owners, _ = self.things(2)
+        own, result = owner * len(self.points) + nodes[:, 0], np.repeat(nodes, 2, axis=1)
+        for side in range(2):
+            keys = owners * len(self.points) + ends[:, 1 - side]
+            order = np.argsort(keys)
+            at = order[np.minimum(np.searchsorted(keys[order], own), len(keys) - 1)]
+            result[:, side] = np.where(keys[at] == own, ends[at, side], nodes[:, 0])
+        return result
+
     def describe(self, size: int, index: int) -> str:
         """A thing of a world as a message has it."""
         for nodes, _, number, _ in self._parts[size]:

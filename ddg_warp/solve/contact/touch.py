@@ -36,6 +36,7 @@ class Touch:
             range=given.range,
             groups=given.group,
             friction=given.friction,
+            ways=given.ways,
             friction_law=self.law.friction_law,
             velocity=self.law.velocity,
             linear=linear,

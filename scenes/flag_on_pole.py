@@ -1,0 +1,127 @@
+"""A flag on a pole in a wind that veers and dies: the flag is blown about the pole, lies against it, and hangs in folds.
+
+The hoist of the flag is sewn to a rope, whose ends are held beside the pole. The wind is a dead force on the cloth, as large
+everywhere; it blows away from the pole first and turns half about it, so that cloth and rope are pressed against the pole. Once it is
+calm the flag falls, onto itself and the pole. At every time the pole and the ends of the rope carry weight and inertia.
+"""
+
+import numpy as np
+
+import ddg_warp as ddg
+from ddg_warp.geometry import meshes
+from ddg_warp.run.check import once_reached
+from ddg_warp.scenes import _touching
+
+WIDTH, HEIGHT = 0.6, 0.4  # m, of the flag
+THICKNESS = 2e-3  # m
+CLOTH = ddg.Material(young=3e5, poisson=0.3, density=300.0, viscosity=5e-3)
+POLE, ROPE = 0.02, 3e-3  # m, radii
+RANGE = 1.5e-3  # m, of contact
+APART = POLE + ROPE + 2.0 * RANGE  # m, from the middle of the pole to the rope
+STREAMS, VEERS, BLOWS, DIES = 0.4, 1.2, 2.2, 2.4  # s, until when the wind does
+
+
+def build(
+    cells: int = 16,
+    wind: float = 1.5,
+    friction: float = 0.3,
+    damping: float = 3.0,
+    dt: float = 0.01,
+    duration: float = 4.0,
+    seed: int = -1,
+) -> ddg.Scene:
+    """The flag in the plane of x and z, the pole along z.
+
+    Args:
+        cells: of the flag along its hoist, half as many more along its fly, of two triangles each
+        wind: its force over the weight of the flag
+        friction: Coulomb's coefficient everywhere
+        damping: of masses, by the air [1/s]
+        dt: time step [s]
+        duration: of the run [s]
+        seed: of a jitter of the cloth's vertices across it at first, a tenth of the range of contact; none below 0
+    """
+    along = round(cells * WIDTH / HEIGHT)
+    points, triangles = meshes.rectangle(along, cells, (WIDTH, HEIGHT), "alternating")
+    points = points[:, [0, 2, 1]] + [APART, 0.0, -0.5 * HEIGHT]
+    hoist = np.flatnonzero(points[:, 0] < APART + 1e-9)
+    start = points + 0.1 * RANGE * _touching.jitter((len(points), 1), seed) * [0.0, 1.0, 0.0]
+    scene = ddg.Scene(mass_damping=damping, analysis=ddg.Dynamics(dt=dt, duration=duration))
+    flag = scene.add_shell(start, triangles, thickness=THICKNESS, material=CLOTH, bending="hinge", name="flag")
+    line = start[hoist[np.argsort(points[hoist, 2])]]
+    cell = np.array([0.0, 0.0, HEIGHT / cells])
+    rope = scene.add_rod(
+        np.concatenate([[line[0] - cell], line, [line[-1] + cell]]),
+        section=ddg.Stiffness(
+            EA=1e4, EI1=1e-4, mass_per_length=0.03, rotary_inertia=1e-7, radius=ROPE, GJ=1e-4, viscosity=0.02
+        ),
+        name="rope",
+    )
+    scene.attach(rope, range(1, len(line) + 1), flag, hoist[np.argsort(points[hoist, 2])], spin="free")
+    scene.fix(rope, [0, -1])
+    for k, axis in enumerate(np.eye(3)[:2]):
+        force = shares(points, triangles)[:, None] * wind * 9.81 * CLOTH.density * THICKNESS * axis
+        scene.add_vertex_force(flag, np.arange(len(points)), force, amplitude=lambda t, k=k: float(blowing(t)[k]))
+    scene.add_obstacle(ddg.Capsule((0.0, 0.0, -HEIGHT), (0.0, 0.0, HEIGHT), POLE), name="pole")
+    scene.contact(range=RANGE, friction=friction, velocity=1e-2)
+    return scene
+
+
+def shares(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Area that belongs to each vertex (n,) [m^2]."""
+    a, b, c = np.moveaxis(points[triangles], 1, 0)
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return np.bincount(triangles.ravel(), np.repeat(area / 3.0, 3), len(points))
+
+
+def blowing(t: float) -> np.ndarray:
+    """Direction of the wind (2,), times how strong it is: along x at first, against it in the end."""
+    angle = np.pi * np.clip((t - STREAMS) / (VEERS - STREAMS), 0.0, 1.0)
+    return np.array([np.cos(angle), np.sin(angle)]) * np.clip((DIES - t) / (DIES - BLOWS), 0.0, 1.0)
+
+
+def observe(model, state) -> dict[str, float]:
+    """See `_touching.observe`, but what pole and rope carry together; direction of the flag from the pole [rad], pairs with itself."""
+    found, pairs = _touching.observe(model, state), model.contacts(state).objects
+    flag = state.points().reshape(-1, 3)[model.scene.batches[0].nodes :].mean(0)
+    return found | {
+        "carried": float(sum(np.reshape(each.force, (-1, 3))[0, 2] for each in model.reactions(state))),
+        "direction": float(np.arctan2(flag[1], flag[0])),
+        "folds": float((pairs[:, 0] == pairs[:, 1]).sum()),
+    }
+
+
+def check(result) -> list[ddg.Check]:
+    """Nothing passes or overlaps; the flag goes with the wind about the pole, touches it, and itself; what holds it carries it."""
+    names = (
+        "direction of the flag, blown against the pole [rad]",
+        "flag touches pole and itself",
+        "force less inertia over weight",
+    )
+    end = result.model.scene.analysis.duration
+    return _touching.checks(result) + once_reached(result, end, names, lambda: _checks(result, names))
+
+
+def _checks(result, names) -> list[ddg.Check]:
+    t, series = np.array(result.times), {name: np.array(values) for name, values in result.series.items()}
+    direction, blown = np.unwrap(series["direction"]), (t > BLOWS - 0.3) & (t <= BLOWS)
+    touched = (series["contacts"][blown].min() > 0.0) and series["folds"][t > DIES].max() > 0.0
+    return [
+        ddg.Check(names[0], direction[blown].mean(), np.pi, 0.3, "downwind"),
+        ddg.Check(names[1], float(touched), 1.0, 0.0, "as it is blown, and as it falls"),
+        _touching.weight_check(result, 0.02),
+    ]
+
+
+def picture(result, frames) -> dict:
+    """The flag and its pole at first, blown against it, and at the end."""
+    pole = result.model.scene.obstacles[0].shape
+    ring, cells = meshes.cylinder(24, 1, POLE, 2.0 * HEIGHT)
+    ring = ring + pole.points[0]
+    times = sorted(frames)
+    times = times[0], min(times, key=lambda t: abs(t - BLOWS)), times[-1]
+    return {
+        "points_by_time": {t: frames[t] for t in times},
+        "bodies": {t: (ring, cells) for t in times},
+        "side_by_side": True,
+    }

@@ -1,0 +1,254 @@
+"""Friction of rods by direction, forwards, backwards and across: derivatives, closed forms, energy, and rods that slide and stick."""
+
+import numpy as np
+import pytest
+import warp as wp
+from friction_cases import MU, SLIP, VELOCITY, each_case, each_form, hold_to_differences, rates, rubbed
+from pair_cases import CASES, assembled, repeats, state, terms, times
+
+import ddg_warp as ddg
+from ddg_warp.errors import SceneError
+from ddg_warp.solve.contact.shapes import Shapes
+
+WAYS = np.array([1.0, 1.7, 2.5])  # forwards, backwards and across, over MU
+RADIUS, RANGE = 5e-3, 1e-4
+
+
+def directed(case: str) -> dict:
+    """Rods in one group, shells in another, and friction by direction along the rods, which are the first of every pair with them."""
+    shapes, _ = CASES[case]()
+    ways = np.ones((2, 2, 3))
+    ways[0] = ways[:, 0] = WAYS
+    return {"groups": np.array([int(name.startswith("shell")) for name in shapes.names]), "ways": ways}
+
+
+@each_case
+@each_form
+def test_forces_and_products_are_differences(device, case, form):
+    """At slips of which none turns from forwards to backwards within the differences: there second derivatives jump."""
+    result, at, _, after = rubbed(case, device, form, seed=5, **directed(case))
+    plain, *_ = rubbed(case, device, form, seed=5, groups=directed(case)["groups"])
+    forces = result.forces.numpy()
+    assert np.abs(forces - plain.forces.numpy()).max() > 0.1 * np.abs(forces).max()
+    hold_to_differences(result, at, after)
+
+
+@each_case
+@each_form
+def test_matrix_is_symmetric_and_positive(device, case, form):
+    result, *_ = rubbed(case, device, form, **directed(case))
+    n = len(result.forces)
+    flat = assembled(result, n).reshape(3 * n, 3 * n)
+    largest = np.abs(flat).max()
+    assert np.abs(flat - flat.T).max() < 1e-14 * largest
+    assert np.linalg.eigvalsh(flat).min() > -1e-13 * largest
+
+
+@each_case
+@each_form
+def test_friction_takes_energy_and_makes_no_resultant(device, case, form):
+    for seed, slip in enumerate(SLIP * np.array([0.01, 0.3, 1.0, 10.0])):
+        result, _, x, after = rubbed(case, device, form, slip, seed, **directed(case))
+        result.work()
+        forces, taken = result.forces.numpy(), result.dissipated.numpy()[0]
+        assert taken == pytest.approx(-(forces * (after - x)).sum(), rel=1e-10)
+        assert 0.0 < result.energy.numpy()[0] < taken
+        assert np.abs(forces.sum(0)).max() < 1e-13 * np.abs(forces).sum()
+
+
+@each_case
+def test_two_runs_agree_to_the_bit_and_atomic_sums_to_rounding(device, case):
+    def run(atomic):
+        result, _, x, _ = rubbed(case, device, atomic=atomic, **directed(case))
+        return [*state(result), times(result, np.random.default_rng(3).normal(size=x.shape))]
+
+    repeats(run)
+
+
+@each_case
+def test_factors_in_single_precision(device, case):
+    whole, _, x, _ = rubbed(case, device, **directed(case))
+    single, *_ = rubbed(case, device, linear=wp.float32, **directed(case))
+    v = np.random.default_rng(6).normal(size=x.shape)
+    assert (single.forces.numpy() == whole.forces.numpy()).all()
+    exact = times(whole, v)
+    assert np.abs(times(single, v) - exact).max() < 1e-5 * np.abs(exact).max()
+
+
+def lying(tilt: float) -> tuple[Shapes, np.ndarray]:
+    """A rod that touches a triangle with its first edge, along x but for the `tilt` [rad]."""
+    s = np.array([0.0, 0.05, 0.1])
+    rod = np.stack([0.05 + s * np.cos(tilt), 0.05 + 0.0 * s, 0.0065 + s * np.sin(tilt)], 1)
+    x = np.concatenate([[[-1.0, -1.0, 0.0], [2.0, -1.0, 0.0], [-1.0, 2.0, 0.0]], rod])
+    shapes = Shapes(x)
+    shapes.shell(np.array([[0, 1, 2]]), 0.004)
+    shapes.rod([3, 4, 5], 0.003)
+    return shapes, x
+
+
+@each_form
+@pytest.mark.parametrize("tilt", [0.0, 0.4, 0.5 * np.pi])
+def test_coulomb_law_by_direction(device, form, tilt):
+    """What slides is braked by N D^2 u / |D u|, D of the components along the rod and across it; what stands rubs across."""
+    shapes, x = lying(tilt)
+    ways = np.ones((2, 2, 3))
+    ways[0, 1] = ways[1, 0] = WAYS
+    given = {"groups": np.array([1, 0]), "friction": MU, "ways": ways, "velocity": VELOCITY, "friction_law": form}
+    result, at = terms(shapes, x, device, **given)
+    result.lag(at)
+    normal = result.forces.numpy()[3:].sum(0)[2]
+    result.law.stiffness.zero_()
+    assert normal > 0.0
+    for angle in np.linspace(0.0, 2.0 * np.pi, 9)[:-1] + 0.1:
+        u = np.array([np.cos(angle), np.sin(angle)])
+        along = WAYS[0] if u[0] > 0.0 else WAYS[1]
+        D2 = MU**2 * np.array([np.cos(tilt) ** 2 * along**2 + np.sin(tilt) ** 2 * WAYS[2] ** 2, WAYS[2] ** 2])
+        after = x.copy()
+        after[3:, :2] += 1e3 * SLIP * u
+        at.assign(after)
+        result.evaluate(at, rates(result))
+        result.work()
+        force = result.forces.numpy()[3:].sum(0)
+        size = np.sqrt(D2 @ u**2)
+        assert force == pytest.approx([*(-normal * D2 * u / size), 0.0], rel=1e-9, abs=1e-12 * normal)
+        assert result.dissipated.numpy()[0] == pytest.approx(normal * size * 1e3 * SLIP, rel=1e-9)
+
+
+@each_form
+def test_forces_are_continuous_where_the_slip_turns_back(device, form):
+    shapes, x = lying(0.0)
+    ways = np.ones((2, 2, 3))
+    ways[0, 1] = ways[1, 0] = [1.0, 3.0, 2.0]
+    given = {"groups": np.array([1, 0]), "friction": MU, "ways": ways, "velocity": VELOCITY, "friction_law": form}
+    result, at = terms(shapes, x, device, **given)
+    result.lag(at)
+
+    def force(along):
+        after = x.copy()
+        after[3:, 0] += along
+        after[3:, 1] += 0.1 * SLIP
+        at.assign(after)
+        result.evaluate(at, rates(result))
+        return result.forces.numpy()[3:].sum(0)
+
+    before, after = (force(s * 1e-9 * SLIP) for s in (-1.0, 1.0))
+    assert np.linalg.norm(after - before) < 1e-6 * np.linalg.norm(after[:2])
+    assert force(-SLIP)[0] > 1.5 * -force(SLIP)[0] > 0.0
+
+
+FORWARDS, BACKWARDS, ACROSS = 0.2, 0.45, 0.6
+
+
+def rod_on(obstacle, given=(FORWARDS, BACKWARDS, ACROSS), along=(1.0, 0.0, 0.0), up=(0.0, 0.0, 1.0)) -> ddg.Scene:
+    """A stiff rod about the origin, just above an obstacle below it."""
+    along, up = np.array(along), np.array(up)
+    scene = ddg.Scene()
+    points = np.linspace(-0.05, 0.05, 11)[:, None] * along + up * (RADIUS + 1.01 * RANGE)
+    scene.add_rod(points, section=ddg.Circle(RADIUS), material=ddg.Material(young=1e9, density=1000.0), name="rod")
+    scene.add_obstacle(obstacle, name="ground")
+    scene.contact(range=RANGE, velocity=1e-4)
+    scene.contact_between("rod", "ground", friction=given)
+    return scene
+
+
+def thrown(scene, direction, device, count: int, dt: float = 1e-3, **options):
+    """Mean velocities at `count` steps of a rod that lies down and is then thrown at 1 m/s; model, integrator and last state."""
+    model = scene.build(device=device)
+    integrator, state = ddg.Integrator(model, **options), model.state()
+    for _ in range(30):
+        state = integrator.step(state, 2e-3)
+    state = model.state(points=state.points(), velocities=np.tile(np.array(direction, float), (11, 1)))
+    integrator, speeds = ddg.Integrator(model, **options), [state.velocities().mean(0)]
+    for _ in range(count):
+        state = integrator.step(state, dt)
+        speeds.append(state.velocities().mean(0))
+    return np.array(speeds), model, integrator, state
+
+
+@pytest.mark.parametrize(
+    ("direction", "mu"),
+    [
+        ((1.0, 0.0, 0.0), FORWARDS),
+        ((-1.0, 0.0, 0.0), BACKWARDS),
+        ((0.0, 1.0, 0.0), ACROSS),
+        ((0.0, -1.0, 0.0), ACROSS),
+    ],
+)
+def test_a_rod_slows_by_the_coefficient_of_its_way_and_stops(device, direction, mu):
+    count = round(1.3 / (mu * 9.81) / 5e-3)
+    speeds, _, integrator, _ = thrown(rod_on(ddg.Plane()), direction, device, count, 5e-3)
+    early, late = 2, count // 2
+    braked = (speeds[early] - speeds[late]) / ((late - early) * 5e-3)
+    assert braked @ direction == pytest.approx(mu * 9.81, rel=1e-3)
+    assert np.abs(np.cross(braked, direction)[[0, 2]]).max() < 1e-3
+    assert np.linalg.norm(speeds[-1]) < 1e-4
+    statistics = integrator.statistics()
+    assert set(statistics["outcomes"]) == {"converged"} and statistics["contact"]["refused_crossings"] == 0
+
+
+def test_work_of_friction_is_what_a_rod_loses(device):
+    """Thrown aslant, where friction turns its way: the sum of -m v1 . (v1 - v0) of steps of implicit Euler; and it turns lengthways."""
+    speeds, model, integrator, _ = thrown(rod_on(ddg.Plane()), (0.6, 0.8, 0.0), device, 40, rtol=1e-10)
+    mass = model.net.host.mass[:11, 0].sum()
+    taken = -mass * ((speeds[1:] - speeds[:-1]) * speeds[1:])[:, :2].sum()
+    assert integrator.statistics()["contact"]["friction_work"] == pytest.approx(taken, rel=1e-3)
+    assert taken > 0.0
+    angles = np.arctan2(speeds[:, 1], speeds[:, 0])
+    assert (np.diff(angles) < 0.0).all()
+
+
+@pytest.mark.parametrize(("turn", "holds"), [(0.0, False), (np.pi, True), (0.5 * np.pi, True)])
+def test_a_slope_between_coefficients_holds_backwards_and_across(device, turn, holds):
+    """tan(slope) = 0.35: forwards a rod slides down by g (sin - mu cos), else it sticks and creeps by less than the velocity."""
+    slope = np.arctan(0.35)
+    normal = np.array([np.sin(slope), 0.0, np.cos(slope)])
+    down = np.array([np.cos(slope), 0.0, -np.sin(slope)])
+    along = np.cos(turn) * down + np.sin(turn) * np.cross(normal, down)
+    model = rod_on(ddg.Plane(normal=tuple(normal)), along=along, up=normal).build(device=device)
+    integrator, state, speeds = ddg.Integrator(model), model.state(), []
+    for _ in range(60):
+        state = integrator.step(state, 2e-3)
+        speeds.append(state.velocities().mean(0) @ down)
+    if holds:
+        assert 0.0 < speeds[-1] < 1e-4
+    else:
+        expected = 9.81 * (np.sin(slope) - FORWARDS * np.cos(slope))
+        assert (speeds[-1] - speeds[29]) / (30 * 2e-3) == pytest.approx(expected, rel=1e-3)
+
+
+OBSTACLES = {
+    "capsule": ddg.Capsule((-1.0, 0.0, -0.1), (1.0, 0.0, -0.1), 0.1),
+    "box": ddg.Box((0.0, 0.0, -0.1), (1.0, 1.0, 0.1)),
+    "ball": ddg.Sphere((0.0, 0.0, -1e3), 1e3),
+}
+
+
+@pytest.mark.parametrize("shape", OBSTACLES)
+@pytest.mark.parametrize(("sign", "mu"), [(1.0, FORWARDS), (-1.0, BACKWARDS)])
+def test_every_kind_of_obstacle_knows_the_way(device, shape, sign, mu):
+    """Balls and capsules are round, so that the rod is held to one plane; on a large ball it touches at one point."""
+    scene = rod_on(OBSTACLES[shape])
+    scene.fix(0, range(11), "y")
+    speeds, *_ = thrown(scene, (sign, 0.0, 0.0), device, 20)
+    assert sign * (speeds[4, 0] - speeds[-1, 0]) / 16e-3 == pytest.approx(mu * 9.81, rel=1e-3)
+
+
+def test_a_coefficient_may_be_zero(device):
+    """On skates: free along itself, held across."""
+    for direction, mu in (((1.0, 0.0, 0.0), 0.0), ((0.0, 1.0, 0.0), ACROSS)):
+        speeds, *_ = thrown(rod_on(ddg.Plane(), (0.0, 0.0, ACROSS)), direction, device, 20)
+        assert (speeds[4] - speeds[-1]) @ direction / 16e-3 == pytest.approx(mu * 9.81, rel=1e-3, abs=1e-4)
+
+
+def test_three_equal_coefficients_are_one(device):
+    """To the bit."""
+    found = [thrown(rod_on(ddg.Plane(), given), (0.6, 0.8, 0.0), device, 20)[3].points() for given in (0.3, (0.3,) * 3)]
+    assert (found[0] == found[1]).all()
+
+
+def test_ways_that_are_not_symmetric_are_named(device):
+    options = directed("parallel")
+    options["ways"][0, 1, 2] = 3.0
+    shapes, x = CASES["parallel"]()
+    with pytest.raises(SceneError, match=r"ways = 3.0 of contact between groups 0 and 1 is not symmetric"):
+        terms(shapes, x, device, friction=MU, **options)
