@@ -2,8 +2,8 @@
 
 Additive continuous collision detection after Li, Kaufman and Jiang, "Codimensional incremental potential contact", ACM ToG 40(4),
 2021, algorithm 1: the distance of a pair falls at most as fast as its fastest nodes of both sides approach, less what all move in
-common. Time goes on by the part of the gap that is safe at that speed, until the gap is `REST` of what it was or, where that is less
-than some `room`, as much of that as `NEAR` of what it was: the time found is never late.
+common. Time goes on by the part of the gap that is safe at that speed, until the gap is `REST` of what it was or, in reach, as much as
+`NEAR` of that and of the reach: the time found is never late.
 """
 
 from functools import cache
@@ -15,7 +15,7 @@ from ddg_warp.kernels.contact.motion import corners_function, relative_function
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
-REST, NEAR = 0.1, 0.5  # of the gap: what is left at the time found, of wide ones and of narrow ones
+REST, NEAR = 0.1, 0.7  # of the gap: what is left of wide ones; of narrow ones, and of the reach
 PARTS = 1000  # in which a motion is followed; where that does not do, the time reached so far is safe, too
 PATIENCE = 100_000  # the same for what is to be told apart from passing
 TOUCHING = 1e-9  # distance of two that pass, over the size of the pair
@@ -23,7 +23,7 @@ TOUCHING = 1e-9  # distance of two that pass, over the size of the pair
 
 @cache
 def impact_functions(kind: Kind, real):
-    """impact(x, p, thickness, room) -> time; meet(x, p) -> whether two without thickness do.
+    """impact(x, p, thickness, reach) -> time; meet(x, p) -> whether two without thickness do.
 
     x, p: positions and displacements of the nodes.
     """
@@ -39,7 +39,7 @@ def impact_functions(kind: Kind, real):
         return wp.length(r)
 
     @wp.func
-    def impact(x: Y, p: Y, thickness: real, room: real):
+    def impact(x: Y, p: Y, thickness: real, reach: real):
         """In [0, 1], or 2 where there is none; zero where the pair overlaps at the start."""
         q, speed = relative(x, p)
         gap = distance(x, q, real(0.0)) - thickness
@@ -47,7 +47,7 @@ def impact_functions(kind: Kind, real):
             return real(0.0)
         if speed == real(0.0):
             return real(2.0)
-        least, t = wp.max(real(REST) * gap, wp.min(real(NEAR) * gap, room)), real(0.0)
+        least, t = wp.max(real(REST) * gap, real(NEAR) * wp.min(gap, reach)), real(0.0)
         safe = (gap - least) / gap
         step = safe * gap / speed
         for _ in range(wp.static(PARTS)):
@@ -96,7 +96,7 @@ def impact_kernel(kind: Kind, grouped: bool, passing: bool, real):
         x: wp.array(dtype=X),
         move: wp.array(dtype=X),
         keep: real,
-        room: real,
+        reach: real,
         time: wp.array(dtype=real),
         number: wp.array(dtype=int),
         least: wp.array(dtype=wp.int64),
@@ -117,7 +117,7 @@ def impact_kernel(kind: Kind, grouped: bool, passing: bool, real):
                     key = wp.int64(i) * wp.int64(sides.counts[1] * number.shape[0]) + wp.int64(j)
                     wp.atomic_min(least, 0, key)
             else:
-                soonest = wp.min(soonest, impact(y, p, keep * thickness(sides, k, l), room))
+                soonest = wp.min(soonest, impact(y, p, keep * thickness(sides, k, l), reach))
         if wp.static(passing):
             if met > 0:
                 wp.atomic_add(number, w, met)

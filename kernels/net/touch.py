@@ -9,6 +9,7 @@ from ddg_warp.kernels.islands import (
     ACTIVE,
     CLAMPED,
     DECREMENT,
+    DETOURS,
     DRIVEN,
     HALVINGS,
     ITERATION,
@@ -87,12 +88,23 @@ def world_kernels(real):
         modes: wp.array(dtype=int),
         time: wp.array(dtype=real),
         decrease: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         stalled: wp.array(dtype=int),
+        projected: wp.array(dtype=int),
     ):
-        """What a step that was cut is expected to gain, over its length. If that drowns in rounding, it is not for being near."""
+        """What a step that was cut is expected to gain, over its length. If that drowns in rounding, it is not for being near.
+
+        Where the matrix was indefinite and the step is not whole, things are not yet where the exact one is of use: the next iterate
+        does without it at once, and it was no detour (`kernels.islands.patience_function`).
+        """
         w = wp.tid()
         length = scalars[STEP_LENGTH, w]
+        if modes[w] != wp.static(NONE) and (time[w] < real(1.0) or flags[HALVINGS, w] > 0) and projected[w] != 0:
+            flags[CLAMPED, w] = 1
+            if projected[w] == 1:
+                flags[DETOURS, w] = flags[DETOURS, w] - 1
+                projected[w] = 2
         if modes[w] != wp.static(NONE) and time[w] < real(1.0) and length > real(0.0):
             scalars[DECREMENT, w] = wp.max(decrease[w], real(0.0)) / length
             stalled[w] = 0
@@ -115,9 +127,11 @@ def world_kernels(real):
                 wp.atomic_min(least, 0, gap[w])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def curve(flags: wp.array2d(dtype=int), late: int, curved: wp.array(dtype=int)):
-        """Where the matrix has what comes of pairs that turn."""
+    def curve(flags: wp.array2d(dtype=int), late: int, curved: wp.array(dtype=int), projected: wp.array(dtype=int)):
+        """Where the matrix has what comes of pairs that turn, and where it is the projected one."""
         w = wp.tid()
+        if flags[WANTED, w] != 0:
+            projected[w] = flags[CLAMPED, w]
         curved[w] = wp.where(flags[WANTED, w] != 0 and flags[ITERATION, w] > late and flags[CLAMPED, w] == 0, 1, 0)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

@@ -14,7 +14,6 @@ from ddg_warp.solve.contact.shapes import BALLS, PLANES, Shapes
 from ddg_warp.solve.contact.tree import Things
 
 SLACK = 1e-3  # of the margin, by which a search goes beyond it, for rounding
-ROOM = 0.8  # of the reach, to which motion closes a gap at once; only half of what is left of it then
 NONE = np.iinfo(np.int64).max
 
 
@@ -141,7 +140,13 @@ class BroadPhase:
         self._sweep(mark, x, [x, move, self.overflow], [self._seen, self._stale, self._searched, self.searches])
 
     def filter(
-        self, base: wp.array, q: wp.array, unit: wp.array, together: wp.array, units: int, keep: float = 1.0
+        self,
+        base: wp.array,
+        q: wp.array,
+        unit: wp.array,
+        together: wp.array,
+        units: int,
+        keep: float = 1.0,
     ) -> None:
         """Shorten the motion from `base` to q so that no two come as near as `keep` of their thickness, in place.
 
@@ -258,8 +263,8 @@ class BroadPhase:
             wp.launch(kernel, pairs.first.all, inputs, outputs, device=self.device)
 
     def _room(self, keep: float) -> float:
-        """What is left where surfaces must not touch."""
-        return ROOM * self.reach if keep > 0.0 else 0.0
+        """The reach, in which gaps close step by step; none where they may close."""
+        return self.reach if keep > 0.0 else 0.0
 
     def _enclose(self, x, move, together, share: float, more: float) -> None:
         *_, common = self._motion

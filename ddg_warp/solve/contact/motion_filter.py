@@ -42,11 +42,11 @@ class MotionFilter:
         if not 1 <= units <= self._nodes:
             raise SceneError(f"units = {units!r} of a motion; they are 1 to {self._nodes}, the nodes of a world")
 
-    def __call__(self, base, move, q, unit, together, units: int, keep: float, room: float, search) -> None:
+    def __call__(self, base, move, q, unit, together, units: int, keep: float, reach: float, search) -> None:
         """Lower shares round by round, and shorten q to them.
 
         Args:
-            room: see `kernels.contact.impact`; search: (overflow, time, searched, seen) of the candidates.
+            reach: gap in which surfaces matter [m]; search: (overflow, time, searched, seen) of the candidates.
         """
         overflow, time, searched, seen = search
         shares, before, lowered = (array[: self._worlds * units] for array in self._all)
@@ -60,7 +60,7 @@ class MotionFilter:
         def go(times: wp.array) -> None:
             wp.launch(self._turn, self._worlds, [], [self._open, self._changed, self._rounds], device=self._device)
             for kernel, pairs in zip(self._limits, self._lists, strict=True):
-                inputs = [pairs.pairs, pairs.count, pairs.sides, base, move, keep, room, unit, units]
+                inputs = [pairs.pairs, pairs.count, pairs.sides, base, move, keep, reach, unit, units]
                 self._sweep(kernel, pairs.capacity, inputs, [shares, before, lowered, times])
             inputs = [together, self._earliest, lowered, self._rounds]
             self._sweep(self._settle, len(shares), inputs, [shares, before, self._open, self._changed])

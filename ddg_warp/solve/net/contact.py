@@ -60,7 +60,7 @@ class NetContact:
         def make(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=device)
 
-        self._modes, self._curved = make(worlds, int), make(worlds, int)
+        self._modes, self._curved, self._projected = (make(worlds, int) for _ in range(3))
         self.bends, self._late = newton.psd != "gauss_newton", 0 if newton.psd == "none" else EARLY
         self._kept, self._gain = make((2, worlds), real), make(worlds, real)
         self._move = make(newton.all, net.vector)
@@ -199,7 +199,8 @@ class NetContact:
     def assemble(self) -> None:
         """Its own part in the preconditioner."""
         newton = self.newton
-        self._launch(self._find_curved, self.net.worlds, [newton.islands.arrays[0], self._late], [self._curved])
+        outputs = [self._curved, self._projected]
+        self._launch(self._find_curved, self.net.worlds, [newton.islands.arrays[0], self._late], outputs)
         if self.bends:
             self.terms.prepare(newton.q, self._curved)
         if chains := newton.chains:
@@ -247,7 +248,8 @@ class NetContact:
         self._sweep(self._differ_gain, inputs, [newton.dots])
         self._sum(newton.dots, self._gain)
         inputs = [self._modes, self.search.time, self._gain]
-        self._launch(self._expect, self.net.worlds, inputs, [newton.islands.arrays[1], newton.stalled])
+        outputs = [*newton.islands.arrays, newton.stalled, self._projected]
+        self._launch(self._expect, self.net.worlds, inputs, outputs)
 
     def _cut(self) -> None:
         """Shorten what is proposed, which stays among what is `bound`."""
