@@ -46,6 +46,12 @@ class Touching:
     ignored: list[tuple[int, int]] = field(default_factory=list)
 
     @property
+    def numbers(self) -> dict[str, np.ndarray]:
+        """What may differ from world to world, by name: of two groups (groups, groups), and the "radius" of bodies (bodies,)."""
+        named = {name: getattr(self, name) for name in ("stiffness", "range", "friction")}
+        return named | {"radius": np.array([body.radius for body in self.bodies])}
+
+    @property
     def reach(self) -> float:
         """Largest range [m]."""
         return float(self.range.max())

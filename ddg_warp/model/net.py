@@ -100,6 +100,7 @@ class DeviceNet:
         mass: of the dofs of blocks (worlds, N) [kg, kg m^2]; weighed: whether it may be another one than that of `host`.
         moves: what inertia or drag give a rate, as masses of the dofs of blocks (N,) that are positive there.
         drag: coefficients of the edges that feel some, world by world (rows, W E), as of `kernels.drag`; None without.
+        touching: numbers of contact by name: "stiffness", "range" and "friction" (worlds, groups, groups), "radius" (worlds, bodies).
     """
 
     def __init__(self, host: Net, worlds: int, device, real, motions: np.ndarray):
@@ -116,6 +117,11 @@ class DeviceNet:
             self.drag = wp.array(np.tile(coefficients, (1, worlds)), dtype=real, device=device)
             felt[ends] = 1.0
             felt[angles[angles >= 0], 0] = 1.0
+        self.touching = {}
+        if host.touching:
+            for name, values in host.touching.numbers.items():
+                tiled = np.tile(values, (worlds, *[1] * values.ndim))
+                self.touching[name] = wp.array(tiled, dtype=real, device=device)
         self.moves = wp.array(host.mass + felt, dtype=self.vector, device=device)
         self.ends = wp.array(np.ascontiguousarray(host.ends, np.int32).reshape(-1, 2), dtype=int, device=device)
         self.still = wp.zeros(worlds, dtype=real, device=device)

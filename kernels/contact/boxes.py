@@ -62,7 +62,7 @@ def box_kernel(size: int, endless: bool, real):
             lower[i] = wp.vec3()
             upper[i] = wp.vec3()
             return
-        reach = surface.radius[k] * share + more
+        reach = surface.radius[w, surface.object[k]] * share + more
         down, up = wp.vec3(), wp.vec3()
         for d in range(3):
             down[d] = outward(low[d] - reach, wp.float32(-1.0))

@@ -87,7 +87,7 @@ def candidate_kernels(kind: Kind, grouped: bool, real):
                 y, p = corners(x, nodes), corners(move, nodes)
                 if together[w] != 0:
                     p, _speed = relative(y, p)
-                if apart(y, p) <= thickness(sides, k, l) + reach:
+                if apart(y, p) <= thickness(sides, k, l, w) + reach:
                     slot = wp.atomic_add(found, 0, 1)
                     number += 1
                     if slot < partner.shape[0]:

@@ -117,7 +117,7 @@ def impact_kernel(kind: Kind, grouped: bool, passing: bool, real):
                     key = wp.int64(i) * wp.int64(sides.counts[1] * number.shape[0]) + wp.int64(j)
                     wp.atomic_min(least, 0, key)
             else:
-                soonest = wp.min(soonest, impact(y, p, keep * thickness(sides, k, l), reach))
+                soonest = wp.min(soonest, impact(y, p, keep * thickness(sides, k, l, w), reach))
         if wp.static(passing):
             if met > 0:
                 wp.atomic_add(number, w, met)

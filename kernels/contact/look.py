@@ -30,7 +30,7 @@ def look_kernel(kind: Kind, real):
         i, j = pairs[p][0] - w * sides.counts[0], pairs[p][1] - w * sides.counts[1]
         nodes = slots(sides, i, j, w)
         r, weights = closest(wp.matrix_from_rows(x[nodes[0]], x[nodes[1]], x[nodes[2]], x[nodes[3]]))
-        gap_out[p] = wp.length(r) - thickness(sides, i, j)
+        gap_out[p] = wp.length(r) - thickness(sides, i, j, w)
         point = real(-0.5) * r
         force = X()
         for k in range(wp.static(kind.first)):

@@ -138,6 +138,6 @@ def gap_kernel(kind: Kind, real, serial: bool):
             w = pairs[p][0] / sides.counts[0]
             i, j = pairs[p][0] - w * sides.counts[0], pairs[p][1] - w * sides.counts[1]
             r, _ = closest(corners(x, slots(sides, i, j, w)))
-            wp.atomic_min(gap, w, wp.length(r) - thickness(sides, i, j))
+            wp.atomic_min(gap, w, wp.length(r) - thickness(sides, i, j, w))
 
     return gaps

@@ -103,7 +103,6 @@ def lag_kernel(kind: Kind, real, linear, serial: bool, directed: bool):
         count: wp.array(dtype=int),
         sides: Sides,
         law: Law,
-        friction: wp.array2d(dtype=real),
         x: wp.array(dtype=V),
         beside: wp.array(dtype=wp.vec2i),
         ways: wp.array2d(dtype=V),
@@ -132,16 +131,17 @@ def lag_kernel(kind: Kind, real, linear, serial: bool, directed: bool):
                 items_out[wp.static(size) * p + k] = items[wp.static(size) * p + k]
             lagged.bound[p] = real(0.0)
             if contact.used[p] != 0:
-                i, _j, a, b = groups(law, sides, pairs[p])
+                w, i, _j, a, b = groups(law, sides, pairs[p])
+                mu = law.friction[w, a, b]
                 push = V()
                 for slot in range(wp.static(kind.first)):
                     push += gradient[slot, p]
                 normal = wp.length(push)
                 # what is no number shows in the energy
-                if not (friction[a, b] * normal <= real(0.0)):
+                if not (mu * normal <= real(0.0)):
                     n = push / normal
                     if wp.static(directed):
-                        first = pairs[p][0] / sides.counts[0] * sides.first.nodes_a_world
+                        first = w * sides.first.nodes_a_world
                         d = x[beside[i][1] + first] - x[beside[i][0] + first]
                         t1, t2, back = along_rod(n, d, ways[a, b])
                         lagged.tangent[2, p] = back
@@ -150,7 +150,7 @@ def lag_kernel(kind: Kind, real, linear, serial: bool, directed: bool):
                     weight = W()
                     for slot in range(wp.static(size)):
                         weight[slot] = wp.dot(gradient[slot, p], n) / normal
-                    lagged.bound[p] = friction[a, b] * normal
+                    lagged.bound[p] = mu * normal
                     lagged.weight[p] = weight
                     lagged.tangent[0, p] = t1
                     lagged.tangent[1, p] = t2

@@ -20,7 +20,8 @@ from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 @cache
 def law_struct(real):
-    """Parameters of pairs by the groups of both objects: stiffness [N/m], range and thickness [m], below zero for the sum of radii.
+    """Parameters of pairs by the groups of both objects (worlds, groups, groups): stiffness [N/m], range and thickness [m], the latter
+    below zero for the sum of radii, and the coefficient of friction.
 
     group (objects,); square (edges,): squared lengths of edges at rest [m^2]; inner (edges,): of both nodes, see `pair_energy`.
     """
@@ -29,9 +30,10 @@ def law_struct(real):
     @wp.struct
     class Law:
         group: wp.array(dtype=int)
-        stiffness: wp.array2d(dtype=real)
-        range: wp.array2d(dtype=real)
-        thickness: wp.array2d(dtype=real)
+        stiffness: wp.array3d(dtype=real)
+        range: wp.array3d(dtype=real)
+        thickness: wp.array3d(dtype=real)
+        friction: wp.array3d(dtype=real)
         square: wp.array(dtype=real)
         inner: wp.array(dtype=U)
 
@@ -40,14 +42,14 @@ def law_struct(real):
 
 @cache
 def groups_function(real):
-    """groups(law, sides, pair) -> i, j of a pair of all worlds in its own one, and the groups of both."""
+    """groups(law, sides, pair) -> world w of a pair of all worlds, i and j in it, and the groups of both."""
     Law, Sides = law_struct(real), sides_struct(real)
 
     @wp.func
     def groups(law: Law, sides: Sides, pair: wp.vec2i):
         w = pair[0] / sides.counts[0]
         i, j = pair[0] - w * sides.counts[0], pair[1] - w * sides.counts[1]
-        return i, j, law.group[sides.first.object[i]], law.group[sides.second.object[j]]
+        return w, i, j, law.group[sides.first.object[i]], law.group[sides.second.object[j]]
 
     return groups
 
@@ -63,17 +65,17 @@ def read_functions(kind: Kind, real):
 
     @wp.func
     def given(law: Law, sides: Sides, pair: wp.vec2i):
-        i, j, a, b = groups(law, sides, pair)
-        both = law.thickness[a, b]
+        w, i, j, a, b = groups(law, sides, pair)
+        both = law.thickness[w, a, b]
         if both < real(0.0):
-            both = thickness(sides, i, j)
+            both = thickness(sides, i, j, w)
         threshold = real(1.0)
         inner = W()
         if wp.static(kind == EDGES):
             threshold = real(wp.static(SHARE)) * law.square[i] * law.square[j]
             one, other = law.inner[i], law.inner[j]
             inner = W(one[0], one[1], other[0], other[1])
-        return P(law.stiffness[a, b], law.range[a, b], both), threshold, inner
+        return P(law.stiffness[w, a, b], law.range[w, a, b], both), threshold, inner
 
     @wp.func
     def corners(x: wp.array(dtype=V), nodes: wp.vec4i):
@@ -136,8 +138,11 @@ def evaluate_kernel(kind: Kind, density: Density, real, linear, serial: bool):
 
 
 @cache
-def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: bool):
-    """Product of the exact Hessian of each pair with v, by slot: the reverse of the derivative along v."""
+def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: bool, unbent: bool = False):
+    """Product of the exact Hessian of each pair with v, by slot: the reverse of the derivative along v.
+
+    `unbent`: of those pairs alone that `pair_bend` does not know.
+    """
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
     X, *_ = shape_types(real)
     V, L, until = wp.types.vector(3, real), wp.types.vector(3, linear), until_function(serial)
@@ -159,7 +164,10 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: boo
         if tid >= count[0]:
             return
         for pair in range(tid, until(tid, count[0])):
-            if factor.used[pair] != 0:
+            asked = factor.used[pair] != 0
+            if wp.static(unbent):
+                asked = asked and factor.bend[pair] == linear(0.0)
+            if asked:
                 p, threshold, inner = given(law, sides, pairs[pair])
                 nodes = factor.nodes[pair]
                 move = X()

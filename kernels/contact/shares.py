@@ -66,7 +66,7 @@ def limit_kernel(kind: Kind, real, serial: bool):
             if changed != 0:
                 p = corners(move, nodes)
                 p = wp.matrix_from_rows(s[0] * p[0], s[1] * p[1], s[2] * p[2], s[3] * p[3])
-                t = impact(corners(x, nodes), p, keep * thickness(sides, i, j), reach)
+                t = impact(corners(x, nodes), p, keep * thickness(sides, i, j, w), reach)
                 if t < real(1.0):
                     wp.atomic_min(time, w, t)
                     if most == least:

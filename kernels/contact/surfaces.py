@@ -39,15 +39,16 @@ EDGES, POINT_TRIANGLE, EDGE_POINT, POINT_PLANE = Kind(2, 2), Kind(1, 3), Kind(2,
 def surface_struct(real):
     """Points, edges or triangles of one world.
 
-    nodes (count, 1 to 3); radius [m]; object: who they belong to; span (start, end, loop, apart) of edges of rods: arc lengths of the
-    ends, of the whole rod where it is closed (else 0), and that within which edges of a rod are no pair (-1: of no rod) [m].
+    nodes (count, 1 to 3); object: who they belong to; radius: of all objects in all worlds (worlds, objects) [m]; span (start, end,
+    loop, apart) of edges of rods: arc lengths of the ends, of the whole rod where it is closed (else 0), and that within which edges
+    of a rod are no pair (-1: of no rod) [m].
     """
     span_type = wp.types.vector(4, real)
 
     @wp.struct
     class Surface:
         nodes: wp.array2d(dtype=int)
-        radius: wp.array(dtype=real)
+        radius: wp.array2d(dtype=real)
         object: wp.array(dtype=int)
         span: wp.array(dtype=span_type)
         nodes_a_world: int
@@ -82,7 +83,7 @@ def sides_struct(real):
 
 @cache
 def pair_functions(kind: Kind, real):
-    """slots(sides, i, j, w) -> the four nodes; may_touch(sides, i, j); thickness(sides, i, j); closest(y) -> r, w.
+    """slots(sides, i, j, w) -> the four nodes; may_touch(sides, i, j); thickness(sides, i, j, w); closest(y) -> r, w.
 
     Here i and j count the things of one world, w; y (4, 3) are positions of the nodes.
     """
@@ -136,8 +137,8 @@ def pair_functions(kind: Kind, real):
         return True
 
     @wp.func
-    def thickness(sides: Sides, i: int, j: int):
-        return sides.first.radius[i] + sides.second.radius[j]
+    def thickness(sides: Sides, i: int, j: int, w: int):
+        return sides.first.radius[w, sides.first.object[i]] + sides.second.radius[w, sides.second.object[j]]
 
     @wp.func
     def closest(y: Y):

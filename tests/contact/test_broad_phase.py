@@ -204,7 +204,8 @@ def test_boxes_hold_what_they_are_around(device, offset):
     lost = wp.zeros(1, dtype=int, device=device)
     for size in shapes.sizes:
         nodes, radius, *_ = shapes.things(size)
-        part = Things(shapes, size, 1, wp.float64, wp.get_device(device))
+        radii = wp.array([shapes.radii], dtype=wp.float64, device=device)
+        part = Things(shapes, size, 1, wp.float64, wp.get_device(device), radii)
         part.enclose(x, wp.zeros_like(x), wp.zeros(1, dtype=wp.vec3d, device=device), 1.0, 0.002, lost)
         reach = (radius + 0.002)[:, None]
         below = points[nodes].min(1) - reach - part.lower.numpy().astype(float)

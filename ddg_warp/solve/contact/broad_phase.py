@@ -31,6 +31,7 @@ class BroadPhase:
         reach: gap [m] within which surfaces matter, positive.
         margin: by how much farther candidates may be apart when they are found [m], positive: large ones are more pairs, small ones
             more searches.
+        radius: of every object in every world (worlds, objects) [m], in place of those of `shapes`.
 
     Attributes:
         lists: a `PairList` for each kind of pairs that there can be.
@@ -44,7 +45,16 @@ class BroadPhase:
         SceneError: if x, reach or margin are not as they should be.
     """
 
-    def __init__(self, shapes: Shapes, x: wp.array, worlds: int = 1, *, reach: float, margin: float):
+    def __init__(
+        self,
+        shapes: Shapes,
+        x: wp.array,
+        worlds: int = 1,
+        *,
+        reach: float,
+        margin: float,
+        radius: wp.array | None = None,
+    ):
         for name, value in (("reach", reach), ("margin", margin)):
             if not 0.0 < value < np.inf:
                 raise SceneError(f"{name} = {value!r} of a contact search; it is positive and finite [m]")
@@ -56,7 +66,9 @@ class BroadPhase:
         self.shapes, self.worlds, self.reach, self.margin = shapes, worlds, float(reach), float(margin)
         self.device, real = x.device, x.dtype._wp_scalar_type_
         self.real = real
-        things = {size: Things(shapes, size, worlds, real, self.device) for size in shapes.sizes}
+        if radius is None:
+            radius = wp.array(np.tile(shapes.radii, (worlds, 1)), dtype=real, device=self.device)
+        things = {size: Things(shapes, size, worlds, real, self.device, radius) for size in shapes.sizes}
         self._things = list(things.values())
         self._seen, self._still, self._move = (wp.zeros(len(x), dtype=x.dtype, device=self.device) for _ in range(3))
         self._shift = wp.zeros(worlds, dtype=x.dtype, device=self.device)

@@ -3,69 +3,66 @@
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.contact import gather, sums
 from ddg_warp.kernels.contact.pair_energy import rows_of
 from ddg_warp.kernels.contact.pair_terms import evaluate_kernel, exact_product_kernel
 from ddg_warp.kernels.contact.surfaces import EDGES
 from ddg_warp.kernels.densities import Density
-from ddg_warp.solve.contact.mollified import Mollified
+from ddg_warp.solve.contact.mollified import Mollified, Unkept
+from ddg_warp.solve.contact.node_items import NodeItems
 from ddg_warp.solve.contact.pair_elements import PairElements
-from ddg_warp.solve.contact.pairs import PairList, RunningSums
+from ddg_warp.solve.contact.pairs import PairList
 
 
 class ContactElements(PairElements):
     """Contact of the pairs of one list; see `PairTerms` and, for arguments, `PairElements`."""
 
     def __init__(
-        self, found: PairList, law: Density, nodes: int, worlds: int, real, linear, atomic: bool, silent: wp.array
+        self,
+        found: PairList,
+        law: Density,
+        nodes: int,
+        worlds: int,
+        real,
+        linear,
+        atomic: bool,
+        silent: wp.array,
+        exact: bool,
     ):
         kind = found.kind
         super().__init__(found, rows_of(kind), nodes, worlds, real, linear, atomic)
         serial = arrays.serial(self.device)
-        self._listing = gather.list_kernels(kind, real, serial)
+        self._listed = NodeItems(kind, nodes, real, silent)
         self._evaluate = evaluate_kernel(kind, law, real, linear, serial)
         self._exact = exact_product_kernel(kind, law, real, linear, serial)
-        self.kernels += [*self._listing, self._evaluate, self._exact, sums.add_pieces, sums.run]
-        self.mollified = Mollified(self, law) if kind == EDGES else None
+        self.kernels += [*self._listed.kernels, self._evaluate, self._exact]
+        self.mollified = (Unkept if exact else Mollified)(self, law) if kind == EDGES else None
         self.count, self.starts, self.partners = found.count, found.starts, found.partners
-        self.numbers, self._filled = (wp.zeros(nodes, dtype=int, device=self.device) for _ in range(2))
-        self._running, self._silent = RunningSums(self.numbers), silent
-        self.places = self._running.starts
+        self.numbers, self.places = self._listed.numbers, self._listed.places
         self.reserve()
 
     def reserve(self) -> None:
         super().reserve()
         self.pairs = self.found.pairs
+        self._listed.reserve(self.found.capacity)
+        self.items = self._listed.items
         if self.mollified:
             self.mollified.reserve()
-        self._unordered = self.items if arrays.serial(self.device) else wp.zeros_like(self.items)
 
     def list(self) -> None:
         """Name the nodes of pairs, after a search."""
         inputs = [self.pairs, self.count, self.found.sides]
-        self._sweep(self._listing[0], self.found.capacity, inputs, [self.factor.nodes])
+        self._sweep(self._listed.name, self.found.capacity, inputs, [self.factor.nodes])
 
     def evaluate(self, x: wp.array, law, forces: wp.array, energy: wp.array, overflow: wp.array) -> None:
         """Write factors at x, and list the pairs of nodes; add to the forces on nodes and to the energies of worlds."""
         inputs = [self.pairs, self.count, self.found.sides, law, x]
         self._sweep(self._evaluate, self.found.capacity, inputs, [self.factor, self._energy, self.gradient])
-        self._list_used()
-        self._add_up(self.gradient, -1.0, forces)
+        self._listed.list(self.count, self.factor.nodes, self.factor.used)
+        self.add_up(self.gradient, -1.0, forces)
         self._add_energies(self._energy, overflow, energy)
-
-    def _list_used(self) -> None:
-        (_, number, fill, sort), capacity = self._listing, self.found.capacity
-        self.numbers.zero_()
-        self._filled.zero_()
-        inputs = [self.count, self.factor.nodes, self.factor.used, self._silent]
-        self._sweep(number, capacity, inputs, [self.numbers])
-        self._running()
-        self._sweep(fill, capacity, [*inputs, self.places], [self._filled, self._unordered])
-        if self._unordered is not self.items:
-            self._sweep(sort, capacity, [*inputs, self.places, self.numbers, self._unordered], [self.items])
 
     def exact_product(self, v: wp.array, out: wp.array, x: wp.array, law) -> None:
         """Add the product of the exact Hessian at x, those of `evaluate`, with v."""
         inputs = [self.pairs, self.count, self.found.sides, law, x, self.factor, v]
         self._sweep(self._exact, self.found.capacity, inputs, [self.parts])
-        self._add_up(self.parts, 1.0, out)
+        self.add_up(self.parts, 1.0, out)

@@ -15,7 +15,6 @@ class FrictionElements(PairElements):
 
     Args:
         contact: of the same pairs.
-        friction: coefficients by groups of both objects (groups, groups).
         velocity: below which surfaces stick [m/s].
         directed: nodes beside first things (things, 2), and by groups coefficients over `friction` forwards, backwards and across
             (groups, groups, 3), see `lag_kernel`; None: it is the same all ways.
@@ -25,7 +24,6 @@ class FrictionElements(PairElements):
         self,
         contact: ContactElements,
         density: Density,
-        friction: wp.array,
         velocity: float,
         directed: tuple[np.ndarray, np.ndarray] | None,
         nodes: int,
@@ -36,7 +34,7 @@ class FrictionElements(PairElements):
     ):
         super().__init__(contact.found, ROWS, nodes, worlds, real, linear, atomic)
         serial = arrays.serial(self.device)
-        self._contact, self._friction, self._velocity = contact, friction, velocity
+        self._contact, self._velocity = contact, velocity
         self._lag = lag_kernel(self.found.kind, real, linear, serial, directed is not None)
         self._evaluate = friction_kernel(density, real, linear, serial, directed is not None)
         self._rows, self._directions = ROWS, (None, None)
@@ -58,6 +56,7 @@ class FrictionElements(PairElements):
         for name in self._kept:
             getattr(self, name).zero_()
         capacity = self.found.capacity
+        self.items = wp.zeros(self.size * capacity, dtype=int, device=self.device)
         self.pairs = wp.zeros(capacity, dtype=wp.vec2i, device=self.device)
         pair = wp.types.vector(2, self.real)
         self._slip, self._along = (arrays.allocate((2, capacity), pair, self.device) for _ in range(2))
@@ -68,7 +67,7 @@ class FrictionElements(PairElements):
     def lag(self, law, x: wp.array) -> None:
         """Take the pairs of contact as it was evaluated last, at x."""
         of = self._contact
-        inputs = [of.pairs, of.count, self.found.sides, law, self._friction, x, *self._directions]
+        inputs = [of.pairs, of.count, self.found.sides, law, x, *self._directions]
         inputs += [of.factor, of.gradient, of.items]
         outputs = [self.pairs, self.factor, self.lagged, self.items, self._slip, self._along]
         self._sweep(self._lag, self.found.capacity, inputs, outputs)
@@ -83,7 +82,7 @@ class FrictionElements(PairElements):
         inputs += [x, start]
         outputs = [self._slip, self._along, self.factor, self._energy, self._work, self.gradient]
         self._sweep(self._evaluate, self.found.capacity, inputs, outputs)
-        self._add_up(self.gradient, -1.0, forces)
+        self.add_up(self.gradient, -1.0, forces)
         self._add_energies(self._energy, overflow, energy)
 
     def work(self, overflow: wp.array, dissipated: wp.array) -> None:

@@ -4,7 +4,7 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.kernels.contact.gather import SLOTS
-from ddg_warp.kernels.contact.pair_terms import mollified_kernels
+from ddg_warp.kernels.contact.pair_terms import exact_product_kernel, mollified_kernels
 from ddg_warp.kernels.densities import Density
 from ddg_warp.solve.contact.pairs import RunningSums
 
@@ -52,3 +52,27 @@ class Mollified:
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
         arrays.sweep(kernel, count, inputs, outputs, self._of.device)
+
+
+class Unkept:
+    """The same of all of them, in every world, whose Hessians are not kept but found anew in every product."""
+
+    def __init__(self, elements, law: Density):
+        self._of = elements
+        self._multiply = exact_product_kernel(
+            elements.found.kind, law, elements.real, elements.linear, arrays.serial(elements.device), unbent=True
+        )
+        self.kernels = [self._multiply]
+
+    def reserve(self) -> None:
+        """As of `Mollified`: nothing is kept."""
+
+    def differentiate(self, x: wp.array, law, wanted: wp.array) -> None:
+        """From now on those at positions x."""
+        self._at = x, law
+
+    def multiply(self, v: wp.array) -> None:
+        """As of `Mollified`."""
+        of, (x, law) = self._of, self._at
+        inputs = [of.pairs, of.count, of.found.sides, law, x, of.factor, v]
+        arrays.sweep(self._multiply, of.found.capacity, inputs, [of.parts], of.device)

@@ -24,7 +24,7 @@ class PairElements:
         factor: see `gather.factor_struct`.
         pairs, count, starts, partners: as those of a `PairList`; of the subclass.
         mollified: those whose matrices take more than a factor and what turns (`Mollified`); None without.
-        numbers, places: of each node, how many items it has and where they start in `items`; of the subclass, but for `items`.
+        numbers, places, items: of each node, how many items it has and where they start in `items`; of the subclass.
     """
 
     mollified = None
@@ -60,7 +60,6 @@ class PairElements:
         self.factor.bend = wp.zeros(capacity, dtype=linear, device=self.device)
         self.factor.direction = arrays.allocate((self.rows, capacity), vector, self.device)
         self.factor.weight = arrays.allocate((self.rows, capacity), wp.types.vector(4, linear), self.device)
-        self.items = wp.zeros(self.size * capacity, dtype=int, device=self.device)
         self._energy = wp.zeros(capacity, dtype=self.real, device=self.device)
         shape = (gather.SLOTS, capacity)
         self.parts = arrays.allocate(shape, vector, self.device)
@@ -83,13 +82,14 @@ class PairElements:
         self._sum(self._of_things, self._of_worlds)
         wp.launch(total, len(out), [self._of_worlds, overflow], [out], device=self.device)
 
-    def _add_up(self, parts: wp.array, scale: float, out: wp.array) -> None:
-        kernel = self._add[out.dtype._wp_scalar_type_]
+    def add_up(self, parts: wp.array, scale: float, out: wp.array, items=None) -> None:
+        """Add what pairs that are used have written by slot (`SLOTS`, capacity) to nodes, by default those that have items."""
+        kernel, of = self._add[out.dtype._wp_scalar_type_], items or self
         if self._atomic:
             inputs = [self.count, parts, self.factor.used, self.factor.nodes, scale]
             self._sweep(kernel, self.found.capacity, inputs, [out])
         else:
-            inputs = [parts, self.factor.used, self.places, self.numbers, self.items, scale]
+            inputs = [parts, self.factor.used, of.places, of.numbers, of.items, scale]
             self._sweep(kernel, len(out), inputs, [out])
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:

@@ -8,17 +8,15 @@ import warp as wp
 
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels.contact import gather
-from ddg_warp.kernels.contact.pair_terms import law_struct
 from ddg_warp.kernels.densities import Density
 from ddg_warp.kernels.densities.friction import logistic_friction, polynomial_friction
 from ddg_warp.solve.contact.broad_phase import BroadPhase
 from ddg_warp.solve.contact.contact_elements import ContactElements
 from ddg_warp.solve.contact.friction_elements import FrictionElements
+from ddg_warp.solve.contact.law_tables import law_tables, table
 from ddg_warp.solve.contact.pair_product import PairProduct
-from ddg_warp.solve.contact.shapes import Shapes
 
 FRICTION = {"logistic": logistic_friction, "polynomial": polynomial_friction}
-ROUNDING = 1e-6  # by which a range may exceed the reach, less than what searches go beyond it
 
 
 class PairTerms:
@@ -45,6 +43,8 @@ class PairTerms:
         linear: type of factors and of vectors of products, by default that of positions.
         atomic: whether sums are added atomically, in an order that on CUDA differs from run to run.
         silent: nodes of a world that forces and products need not be told of, which may be in thousands of pairs.
+        shared: by name of what is by groups, arrays (worlds, groups, groups) that the law has in place of its own.
+        exact: whether products with what turns are exact for edges that are all but parallel, too, however many these are.
 
     Attributes:
         energy: (worlds,) [J], that of contact and the potential of friction; forces: (worlds times nodes,) [N].
@@ -75,34 +75,33 @@ class PairTerms:
         linear=None,
         atomic: bool = False,
         silent: np.ndarray | None = None,
+        shared: dict[str, wp.array] | None = None,
+        exact: bool = False,
     ):
         self.search, self.device, self.real = search, search.device, search.real
         self.linear = linear or self.real
-        self.law = law_struct(self.real)()
-        number = self._set(stiffness, range, thickness, groups)
+        given = {"stiffness": stiffness, "range": range, "thickness": thickness, "friction": friction}
+        self.law, rubs = law_tables(search, given, groups, shared or {})
         nodes = len(search.shapes.points) * search.worlds
-        square, inner = _edges(search.shapes)
-        self.law.square = wp.array(square, dtype=self.real, device=self.device)
-        self.law.inner = wp.array(inner, dtype=wp.types.vector(2, self.real), device=self.device)
         self.energy = wp.zeros(search.worlds, dtype=self.real, device=self.device)
         self.dissipated, self._no_rate = wp.zeros_like(self.energy), wp.zeros_like(self.energy)
         self.forces = wp.zeros(nodes, dtype=wp.types.vector(3, self.real), device=self.device)
         self.stiffness = wp.zeros(nodes, dtype=self.real, device=self.device)
         block = wp.types.matrix((3, 3), self.linear)
         self.diagonal = wp.zeros(nodes, dtype=block, device=self.device)
-        self.between = wp.zeros(search.worlds * len(square), dtype=block, device=self.device)
+        self.between = wp.zeros(search.worlds * len(self.law.square), dtype=block, device=self.device)
         told_not = np.zeros(len(search.shapes.points), np.uint8)
         told_not[[] if silent is None else silent] = 1
         told_not = wp.array(told_not, dtype=wp.uint8, device=self.device)
         self._listed = wp.full(1, -1, dtype=int, device=self.device)
         self._stale = wp.zeros(1, dtype=int, device=self.device)
         self.lists = [
-            ContactElements(pairs, law, nodes, search.worlds, self.real, self.linear, atomic, told_not)
+            ContactElements(pairs, law, nodes, search.worlds, self.real, self.linear, atomic, told_not, exact)
             for pairs in search.lists
         ]
         self._trace = gather.trace_kernel(self.real, self.linear)
         self._version, self._lagged = search.version, -1
-        self.frictions = self._with_friction(friction, ways, friction_law, velocity, number, atomic)
+        self.frictions = self._with_friction(rubs, ways, friction_law, velocity, atomic)
         self._start = wp.zeros_like(self.forces)
         self._product = PairProduct(self._parts, self.law, self.real, self.linear, atomic)
         self._rub = PairProduct(self.frictions, self.law, self.real, self.linear, atomic) if self.frictions else None
@@ -235,23 +234,21 @@ class PairTerms:
         if self.frictions and self._lagged != self._version:
             raise SolverError("friction has no pairs of the step's start; call lag() there, anew after fit()")
 
-    def _with_friction(self, friction, ways, law: str, velocity: float, number: int, atomic: bool) -> list:
+    def _with_friction(self, rubs: bool, ways, law: str, velocity: float, atomic: bool) -> list[FrictionElements]:
         """Friction of each list, where there is any."""
         if law not in FRICTION:
             raise SceneError(f"friction_law = {law!r} of contact; it is one of {', '.join(FRICTION)}")
         if not 0.0 < velocity < np.inf:
             raise SceneError(f"velocity = {velocity!r} of friction; it is positive and finite [m/s]")
-        table = _table("friction", 0.0 if friction is None else friction, number, False)
-        if not table.any():
+        if not rubs:
             return []
-        table = wp.array(table, dtype=self.real, device=self.device)
+        number = self.law.friction.shape[1]
         same = ways is None or (np.asarray(ways) == 1.0).all()
-        ways = None if same else [_table("ways", way, number, False) for way in np.moveaxis(np.asarray(ways), -1, 0)]
+        ways = None if same else [table("ways", way, number, False) for way in np.moveaxis(np.asarray(ways), -1, 0)]
         return [
             FrictionElements(
                 part,
                 FRICTION[law],
-                table,
                 float(velocity),
                 None if same else (self.search.shapes.beside(part.found.kind.first), np.stack(ways, -1)),
                 len(self.forces),
@@ -266,70 +263,3 @@ class PairTerms:
     def _list(self) -> None:
         for part in self.lists:
             part.list()
-
-    def _set(self, stiffness, range, thickness, groups) -> int:
-        """Check the parameters of contact and upload them; the number of groups."""
-        objects = len(self.search.shapes.names)
-        groups = np.zeros(objects, int) if groups is None else np.asarray(groups)
-        if groups.shape != (objects,) or groups.dtype.kind not in "iu" or groups.min() < 0:
-            raise SceneError(f"groups = {groups!r} of contact; they are {objects} whole numbers from 0, one an object")
-        number = int(groups.max()) + 1
-        values = {
-            "stiffness": _table("stiffness", stiffness, number, False),
-            "range": _table("range", range, number, True),
-            "thickness": np.full((number, number), -1.0)
-            if thickness is None
-            else _table("thickness", thickness, number, False),
-        }
-        self._within_reach(values["range"], values["thickness"], groups)
-        self.law.group = wp.array(groups, dtype=int, device=self.device)
-        for name, value in values.items():
-            setattr(self.law, name, wp.array(value, dtype=self.real, device=self.device))
-        return number
-
-    def _within_reach(self, within: np.ndarray, thickness: np.ndarray, groups: np.ndarray) -> None:
-        """Refuse ranges in which the search does not find all pairs."""
-        shapes = self.search.shapes
-        _, radius, owner, _ = shapes.things(2)
-        radii = np.zeros(len(groups))
-        radii[owner] = radius
-        thinnest = {int(g): np.flatnonzero(groups == g)[radii[groups == g].argmin()] for g in np.unique(groups)}
-        for g, one in thinnest.items():
-            for h, other in thinnest.items():
-                both = radii[one] + radii[other]
-                excess = within[g, h] + (thickness[g, h] - both if thickness[g, h] >= 0.0 else 0.0)
-                if excess > self.search.reach * (1.0 + ROUNDING):
-                    raise SceneError(
-                        f"{shapes.names[one]} and {shapes.names[other]} push each other up to {both + excess:.6g} m apart, but are"
-                        f" searched for within {both + self.search.reach:.6g}; give the search a reach of {excess:.6g} m"
-                    )
-
-
-def _edges(shapes: Shapes) -> tuple[np.ndarray, np.ndarray]:
-    """Squared lengths of edges at rest (n,), and of both nodes (n, 2) 1/2 inside of a rod, 0 at its ends, -1 of shells."""
-    nodes, _, owner, span = shapes.things(2)
-    ends = shapes.points[nodes]
-    keys = owner[:, None] * len(shapes.points) + nodes
-    _, which, times = np.unique(keys, return_inverse=True, return_counts=True)
-    inner = np.where(times[which.reshape(keys.shape)] > 1, 0.5, 0.0)
-    inner[span[:, 3] < 0.0] = -1.0
-    return np.square(ends[:, 1] - ends[:, 0]).sum(1), inner
-
-
-def _table(name: str, value, number: int, positive: bool) -> np.ndarray:
-    """A parameter by pairs of groups (number, number)."""
-    table = np.asarray(value, float)
-    if table.shape not in ((), (number, number)):
-        raise SceneError(
-            f"{name} of contact has shape {table.shape}; it is a number, or one a pair of {number} group(s)"
-        )
-    table = np.array(np.broadcast_to(table, (number, number)))
-    wrong = ~(np.isfinite(table) & ((table > 0.0) if positive else (table >= 0.0)))
-    for fault, where in (
-        ("is not finite and " + ("positive" if positive else "not negative"), wrong),
-        ("is not symmetric", table != table.T),
-    ):
-        if where.any():
-            g, h = np.argwhere(where)[0]
-            raise SceneError(f"{name} = {float(table[g, h])!r} of contact between groups {g} and {h} {fault}")
-    return table

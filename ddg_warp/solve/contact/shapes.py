@@ -17,7 +17,7 @@ class Shapes:
         points: positions (n, 3) at which nothing may be without length or area [m].
 
     Attributes:
-        names: of all objects; obstacle: numbers of those that are still.
+        names, radii: of all objects [m]; obstacle: numbers of those that are still.
     """
 
     def __init__(self, points: np.ndarray):
@@ -25,6 +25,7 @@ class Shapes:
         if self.points.ndim != 2 or self.points.shape[1] != 3 or not np.isfinite(self.points).all():
             raise SceneError("points of a contact search have to be finite, of shape (n, 3)")
         self.names: list[str] = []
+        self.radii: list[float] = []
         self.obstacle: set[int] = set()
         self._parts: dict[int, list] = {1: [], 2: [], 3: [], BALLS: [], PLANES: []}
         self._ignored: set[tuple[int, int]] = set()
@@ -192,6 +193,7 @@ class Shapes:
         if still:
             self.obstacle.add(number)
         self.names.append(name)
+        self.radii.append(radius)
         for size, nodes in parts.items():
             self._parts[size].append((nodes, radius, number, span if size == 2 else np.zeros((0, 4))))
         return number

@@ -16,19 +16,32 @@ MARGIN = 1.0  # of a typical radius, by which searches go beyond the reach
 
 
 class Touch:
-    """Contact of a `DeviceNet` with blocks x (W N,), where it is searched for at first; `silent` nodes are told of no forces.
+    """Contact of a `DeviceNet` with blocks x (W N,), where it is searched for at first, by the numbers that the net has on the device.
+
+    Args:
+        silent: nodes that are told of no forces.
+        margin: of searches, by default that of steps; exact: as of `PairTerms`.
 
     Attributes:
         shapes, search, terms: what may touch, candidates, and the energy of those that are near.
         keep: part of the thickness that motion never goes into.
     """
 
-    def __init__(self, net, linear, x: wp.array, silent: np.ndarray | None = None):
+    def __init__(
+        self,
+        net,
+        linear,
+        x: wp.array,
+        silent: np.ndarray | None = None,
+        margin: float | None = None,
+        exact: bool = False,
+    ):
         self.net, given = net, net.host.touching
         self.law, self.keep = given.law, KEEP[given.law.law]
         self.shapes = shapes_of(net.host)
-        margin = MARGIN * max(given.size, given.reach)
-        self.search = BroadPhase(self.shapes, x, net.worlds, reach=given.reach, margin=margin)
+        margin = margin or MARGIN * max(given.size, given.reach)
+        radius = net.touching["radius"]
+        self.search = BroadPhase(self.shapes, x, net.worlds, reach=given.reach, margin=margin, radius=radius)
         self.terms = PairTerms(
             self.search,
             LAWS[self.law.law],
@@ -41,6 +54,8 @@ class Touch:
             velocity=self.law.velocity,
             linear=linear,
             silent=silent,
+            shared=net.touching,
+            exact=exact,
         )
 
     def at(self, x: wp.array) -> None:

@@ -12,12 +12,15 @@ from ddg_warp.solve.contact.shapes import PLANES
 class Things:
     """Points, edges, triangles, balls or planes of `shapes`, with boxes; `tree` is there where things are searched for.
 
+    Args:
+        radius: of every object in every world (worlds, objects) [m].
+
     Attributes:
         count: in one world; all: in all; surface: see `surface_struct`; lower, upper: of boxes (all,).
     """
 
-    def __init__(self, shapes, size: int, worlds: int, real, device):
-        nodes, radius, owner, span = shapes.things(size)
+    def __init__(self, shapes, size: int, worlds: int, real, device, radius: wp.array):
+        nodes, _, owner, span = shapes.things(size)
         self.count, self.all, self.size = len(nodes), worlds * len(nodes), size
         if self.all >= 2**31:
             raise SceneError(
@@ -25,7 +28,7 @@ class Things:
             )
         self.surface = surface_struct(real)()
         self.surface.nodes = wp.array(np.ascontiguousarray(nodes), dtype=int, device=device)
-        self.surface.radius = wp.array(radius, dtype=real, device=device)
+        self.surface.radius = radius
         self.surface.object = wp.array(owner, dtype=int, device=device)
         self.surface.span = wp.array(np.ascontiguousarray(span), dtype=wp.types.vector(4, real), device=device)
         self.surface.nodes_a_world = len(shapes.points)

@@ -18,6 +18,7 @@ from ddg_warp.kernels.net import touch as kernels
 from ddg_warp.solve.chains.newton import EARLY
 from ddg_warp.solve.contact.tally import Tally
 from ddg_warp.solve.contact.touch import Touch
+from ddg_warp.solve.net.contact_bands import ContactBands
 from ddg_warp.solve.net.system import Sums
 
 FAR = 16.0  # margins that a node goes from which on a world has one share: of so long ways too many pairs would be near
@@ -52,7 +53,6 @@ class NetContact:
         held = np.concatenate([np.zeros(0, int), *host.obstacles])  # forces on them are asked of states, not here
         self.touch = Touch(net, linear, newton.q, held)
         self.shapes, self.search, self.terms = self.touch.shapes, self.touch.search, self.touch.terms
-        self._edges = len(self.shapes.things(2)[0])
         self.rubs = bool(host.touching.friction.any())
         worlds = net.worlds
         self.forces, self.stiffness, self.diagonal = self.terms.forces, self.terms.stiffness, self.terms.diagonal
@@ -102,13 +102,12 @@ class NetContact:
         ) = made
         self._kernels += made
         self._sum = Sums(worlds, newton.dots.shape[1], real, device)
-        self._stiffen = None
+        self._bands = None
         self._least = LEAST * float(host.touching.range.min()) if self.touch.keep else -math.inf
 
     def bind(self, chains) -> None:
         """Have a part in what chains eliminate, once their plan is made."""
-        self._stiffen = kernels.stiffen_kernel(chains.plan.twist, self.newton.linear)
-        self._ahead = arrays.upload(self._edges_ahead(chains.plan), int, self.newton.device)
+        self._bands = ContactBands(chains, self.shapes)
 
     def _number_units(self, host, motions: list) -> tuple[wp.array, int]:
         """Unit of every block: what is cut together, a rod, a shell, or all that one motion moves; and how many there are."""
@@ -126,24 +125,10 @@ class NetContact:
             unit[places] = count + np.searchsorted(starts, poses, side="right") - 1
         return wp.array(unit, dtype=int, device=self.newton.device), count + len(motions)
 
-    def _edges_ahead(self, plan) -> np.ndarray:
-        """The contact edge from the node of each place of the chains to that of the next, -1 for none."""
-        ends, *_ = self.shapes.things(2)
-        blocks = self.net.blocks
-        node = plan.places[0]
-        after = np.full_like(node, -1)
-        after[:-1] = np.where(plan.chain[1:] == plan.chain[:-1], node[1:], -1)
-        keys = ends[:, 0].astype(np.int64) * blocks + ends[:, 1]
-        order = np.argsort(keys)
-        wanted = node.astype(np.int64) * blocks + after
-        at = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
-        found = (node >= 0) & (after >= 0) & (keys[order][at] == wanted)
-        return np.where(found, order[at], -1).astype(np.int32)
-
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [*self._kernels, *([self._stiffen] if self._stiffen else [])]
+        own = [*self._kernels, *(self._bands.kernels if self._bands else [])]
         return [*own, *self._sum.kernels, *self.search.kernels, *self.terms.kernels, *self.tally.kernels]
 
     def begin(self, before: wp.array) -> None:
@@ -203,10 +188,8 @@ class NetContact:
         self._launch(self._find_curved, self.net.worlds, [newton.islands.arrays[0], self._late], outputs)
         if self.bends:
             self.terms.prepare(newton.q, self._curved)
-        if chains := newton.chains:
-            inputs = [chains.bands, chains.layout, self._ahead, self._edges, newton.islands.arrays[0]]
-            inputs += [self.net.blocks, self.diagonal, self.terms.between]
-            self._launch(self._stiffen, (chains.longest, chains.columns), inputs, [chains.eliminated])
+        if self._bands:
+            self._bands(self.terms, newton.islands.arrays[0])
 
     def direct(self) -> None:
         """Directions by conjugate gradients, along with what is left of the way."""

@@ -1,0 +1,48 @@
+"""Which pairs each node is in; see `kernels.contact.gather`."""
+
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.kernels.contact import gather, sums
+from ddg_warp.kernels.contact.surfaces import Kind
+from ddg_warp.solve.contact.pairs import RunningSums
+
+
+class NodeItems:
+    """Items of nodes on pairs of one kind.
+
+    Args:
+        nodes: of all worlds.
+        silent: nodes of a world that have none.
+
+    Attributes:
+        numbers, places: of each node, how many items it has and where they start in `items`.
+    """
+
+    def __init__(self, kind: Kind, nodes: int, real, silent: wp.array):
+        self.device, self._size, self._silent = silent.device, kind.first + kind.second, silent
+        self.numbers, self._filled = (wp.zeros(nodes, dtype=int, device=self.device) for _ in range(2))
+        self._running = RunningSums(self.numbers)
+        self.places = self._running.starts
+        self.name, self._number, self._fill, self._sort = gather.list_kernels(kind, real, arrays.serial(self.device))
+        self.kernels = [self.name, self._number, self._fill, self._sort, sums.add_pieces, sums.run]
+
+    def reserve(self, capacity: int) -> None:
+        """Make room for the items of so many pairs."""
+        self.items = wp.zeros(self._size * capacity, dtype=int, device=self.device)
+        self._unordered = self.items if arrays.serial(self.device) else wp.zeros_like(self.items)
+
+    def list(self, count: wp.array, nodes: wp.array, used: wp.array) -> None:
+        """Of the first `count` pairs with these nodes, those that are used."""
+        self.numbers.zero_()
+        self._filled.zero_()
+        inputs = [count, nodes, used, self._silent]
+        self._sweep(self._number, len(nodes), inputs, [self.numbers])
+        self._running()
+        self._sweep(self._fill, len(nodes), [*inputs, self.places], [self._filled, self._unordered])
+        if self._unordered is not self.items:
+            inputs += [self.places, self.numbers, self._unordered]
+            self._sweep(self._sort, len(nodes), inputs, [self.items])
+
+    def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
+        arrays.sweep(kernel, count, inputs, outputs, self.device)
