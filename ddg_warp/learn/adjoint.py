@@ -89,6 +89,8 @@ class Adjoint:
             _require_one_solve(own, kept, ends, part)
         read = tape.before, tape.after, tape.parts, given, self.integrator._solved(tape.dt)
         found = self.pull_parts(*read)
+        while self.outgrown(tape.parts):
+            found = self.pull_parts(*read)
         if self.net and self.net.solve.failed is not None and self.net.solve.failed.numpy().any():
             found = self.pull_parts(*read, factors=True)
         found = _copied(*found)
@@ -107,6 +109,10 @@ class Adjoint:
             changed = own.suit(part, s, given) or changed
             own.upload(start, start + dt)
         return changed
+
+    def outgrown(self, parts: list) -> bool:
+        """Whether the last `pull_parts` had more pairs in contact than there was room for; see `NetAdjoint.outgrown`."""
+        return self.net is not None and self.net.outgrown(parts[-1].solved.q)
 
     def pull_parts(
         self, before: State, after: State, parts: list, given: State, s: float, factors: bool = False

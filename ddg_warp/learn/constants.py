@@ -1,4 +1,4 @@
-"""Masses, rotary inertia and coefficients of drag as parameters by name.
+"""Masses, rotary inertia, coefficients of drag and numbers of contact as parameters by name.
 
     "rod.mass"       [kg] of the points of all rods, with what `Scene.add_mass` has added there
     "rod.inertia"    [kg m^2] about the tangent, of the edges of rods with twist
@@ -7,8 +7,12 @@
                      of the edges of rods with such drag, per length; the last of those with twist
     "drag.lateral", "drag.friction", "drag.leading" [N/m], "drag.slope" (the tangent of `angle`), "drag.speed" [m/s]
                      of the edges of rods in a granular medium
+    "contact.stiffness" [N/m], "contact.range" [m], no larger than the largest of the scene, "contact.friction"
+                     between objects of two names, or of one, that may touch; the last in scenes with friction
+    "contact.radius" [m] of rods and obstacles that have one, half thicknesses of shells and meshes
 
-Points and edges are in the order of `State.points` and `State.angles`. Where several are one point of a net, its mass is the sum.
+What has numbers of contact, and in which order, `contact_places.contact_elements` tells. Points and edges are in the order of
+`State.points` and `State.angles`. Where several are one point of a net, its mass is the sum.
 """
 
 from collections.abc import Callable, Iterator
@@ -17,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ddg_warp.kernels import drag
+from ddg_warp.learn import contact_places
 from ddg_warp.learn.layout import view
 from ddg_warp.learn.places import ArrayPlace
 from ddg_warp.model.masses import point_masses
@@ -31,8 +36,11 @@ GRANULAR = {
     "speed": drag.SPEED,
 }
 COEFFICIENTS = {f"drag.{name}": row for name, row in (VISCOUS | GRANULAR).items()}
-NAMES = (*MASSES, "rod.inertia", *COEFFICIENTS)
-SIGNED, POSITIVE = ("drag.leading",), ("drag.slope", "drag.speed")  # others are not negative
+NAMES = (*MASSES, "rod.inertia", *COEFFICIENTS, *contact_places.NAMES)
+SIGNED, POSITIVE = (
+    ("drag.leading",),
+    ("drag.slope", "drag.speed", "contact.range", "contact.radius"),
+)  # others are not negative
 
 
 @dataclass
@@ -56,8 +64,11 @@ def elements(model, name: str) -> np.ndarray:
     return np.unique(np.concatenate([np.zeros(0, int), *(part.rows for part in _parts(model, name))]))
 
 
-def array_places(model, name: str) -> tuple[int, list[ArrayPlace]]:
+def array_places(model, name: str) -> tuple[int, list[ArrayPlace | contact_places.ContactPlace]]:
     """How many elements have such a parameter, and where these are; none where the model has nothing of the kind."""
+    if name in contact_places.NAMES:
+        count = len(contact_places.contact_elements(model, name))
+        return count, [contact_places.ContactPlace(model, name)] if count else []
     rows = elements(model, name)
     made = [
         ArrayPlace(

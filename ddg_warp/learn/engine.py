@@ -10,7 +10,6 @@ import torch
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.errors import SceneError
 from ddg_warp.kernels.adjoint.step import smooth_kernel, solved_kernel
 from ddg_warp.learn.adjoint import Adjoint, EquilibriumAdjoint
 from ddg_warp.learn.chains import Kept
@@ -44,8 +43,6 @@ class Engine:
     """
 
     def __init__(self, model, scheme: str, options: dict):
-        if model.net is not None and model.net.host.touching:
-            raise SceneError("contact: steps with contact have no gradients yet; step the model by an Integrator")
         self.model, self.device = model, str(wp.device_to_torch(model.wp_device))
         self.midpoint = scheme == "implicit_midpoint"
         self.integrator = Integrator(model, scheme, failures="flag", check_every=FOREVER, energy_bound=None, **options)
@@ -71,6 +68,18 @@ class Engine:
         integrator.advance(0, start, dt, anew=True)
         s = integrator._solved(dt)
         return copies(self.target) + [self._smooth(part, s, graded) for part in integrator._parts]
+
+    def check(self, state) -> None:
+        """Refuse to start from the tensors of a state in which surfaces overlap. Reads from the device where there is contact.
+
+        Raises:
+            SceneError: names the pair and by how much.
+        """
+        net = self.integrator._net
+        if net is not None and net.newton.contact and not torch._C._are_functorch_transforms_active():
+            with torch.no_grad(), self.stream():
+                self.fill(self.source, state)
+                net.newton.contact.check(self.before.net.q)
 
     @staticmethod
     def fill(places: list[torch.Tensor], values) -> None:
@@ -142,6 +151,9 @@ class Engine:
                 wp.launch(self._solves, failed.shape, [failed], [place], device=failed.device)
 
         self._graphs.replay(dt, launch)
+        while adjoint.outgrown(parts):
+            self._graphs.clear()
+            self._graphs.replay(dt, launch)
         found, inputs = self._found
         if self.poses:
             ends = self.before, self.after

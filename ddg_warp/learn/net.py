@@ -10,6 +10,7 @@ from ddg_warp.kernels.drag import block_inertia
 from ddg_warp.kernels.net.elements import FRAME
 from ddg_warp.learn.drag import NetDragAdjoint
 from ddg_warp.learn.followers import Followers
+from ddg_warp.learn.net_contact import ContactAdjoint
 from ddg_warp.learn.net_predictor import NetPredictor
 from ddg_warp.learn.net_shares import Shares
 from ddg_warp.learn.net_solve import NetSolve
@@ -43,7 +44,9 @@ class NetInputs:
         mass: by the masses of the dofs of blocks (W N,); load: by the forces on them, zero at held dofs.
         held: by where held dofs are at the solution (W N,).
         drag: by coefficients of drag (rows, W edges that feel it); None without any.
-        rate, damping, gravity: by what all blocks share, the share of each (W N,); elements_rate: by the rate, of every set (W E,).
+        rate, damping, gravity: by what all blocks share, the share of each (W N,); elements_rate: by the rate, of every set (W E,), and
+            of friction.
+        touching, radius: by the numbers of contact, as of `ContactAdjoint`; None without.
     """
 
     parameters: list[wp.array]
@@ -57,6 +60,8 @@ class NetInputs:
     gravity: wp.array
     drag: wp.array | None
     elements_rate: list[wp.array]
+    touching: wp.array | None = None
+    radius: wp.array | None = None
 
 
 class NetAdjoint:
@@ -66,7 +71,7 @@ class NetAdjoint:
         scheme, posed: as of `ChainAdjoint`.
 
     Raises:
-        SceneError: a motion has no gradient; see `Supports`.
+        SceneError: a motion has no gradient, or contact; see `Supports` and `ContactAdjoint`.
     """
 
     def __init__(self, model, scheme: str | None, posed: bool = False):
@@ -82,7 +87,8 @@ class NetAdjoint:
         self.predictor = NetPredictor.of(model, net, motion, scheme)
         self._shares = Shares(model)
         self.drag = NetDragAdjoint(model, net, midpoint, self._shares.gather) if drag else None
-        self.solve = NetSolve(model, self.drag, scheme is not None)
+        self.contact = ContactAdjoint(net) if host.touching and scheme else None
+        self.solve = NetSolve(model, self.drag, self.contact and self.contact.system, scheme is not None)
         self.gravity = wp.array(np.tile(model.scene.gravity, (net.worlds, 1)), dtype=net.vector, device=self.device)
         self._damping = wp.array([model.scene.mass_damping], dtype=real, device=self.device)
         self._pull = [reverse.pull_kernel(part.term, real) for part in net.sets]
@@ -116,12 +122,15 @@ class NetAdjoint:
             drag=self.drag.by_coefficients if drag else None,
             elements_rate=[wp.zeros(part.elements * net.worlds, dtype=real, device=self.device) for part in net.sets],
         )
+        if self.contact:
+            self._inputs.touching, self._inputs.radius = self.contact.by_groups, self.contact.by_radius
+            self._inputs.elements_rate.append(self.contact.by_rate)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         own = [*self._pull, *(kernel for kernel in self._strains if kernel), self._solution, self._start, self._ended]
-        parts = (self._shares, self.solve, self.supports, self.drag, self.followers, self.predictor)
+        parts = (self._shares, self.solve, self.supports, self.drag, self.followers, self.predictor, self.contact)
         return own + [kernel for part in parts if part for kernel in part.kernels]
 
     def suit(self, step, s: float, given: bool = False) -> bool:
@@ -191,14 +200,18 @@ class NetAdjoint:
         read = [given.q, given.v, by_end, self._inertia, rate, last, net.blocks]
         self._launch(self._solution, len(by_q), read, [by_q])
         damped = replace(solved, last=before.last)
+        self._rates.fill_(rate)
+        if self.contact:
+            self.contact.system.find(before.q, solved.q, self._rates)
         self.solve(damped, rate, kept.time, by_q, w, factors)
         shares.clear()
-        self._rates.fill_(rate)
         for i, kernel in enumerate(self._pull):
             written = [shares.slots[i], shares.lags[i], inputs.parameters[i], start.last[i], inputs.elements_rate[i]]
             self._over(i, kernel, [net.elements(damped, i, rate=self._rates), w], written)
         shares.collect(by_q, carried, inputs.data)
         shares.add_own(own)
+        if self.contact:
+            self.contact.pull(before.q, solved.q, w, self._rates, by_q, start.q)
         if self.solve.held is not None:
             wp.map(wp.add, by_q, self.solve.held, out=by_q)
         if self.supports:
@@ -230,6 +243,13 @@ class NetAdjoint:
             [start.q, start.v, inputs.mass, inputs.rate, inputs.damping, inputs.gravity],
         )
         return start, inputs
+
+    def outgrown(self, q: wp.array) -> bool:
+        """Whether the last `pull`, to a solution q, had more pairs in contact than there was room for, and is to be done again.
+
+        Reads from the device where there is contact.
+        """
+        return self.contact is not None and self.contact.outgrown(q)
 
     def _clear(self) -> None:
         """Zero what is added to."""

@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.compile.storage import FREE
+from ddg_warp.errors import SolverError
 from ddg_warp.learn.solve import HostSolve
 from ddg_warp.solve.net.exact import ExactSystem
 from ddg_warp.solve.net.tangent import NetTangent
@@ -17,6 +18,7 @@ class NetSolve:
 
     Args:
         drag: `NetDragAdjoint`, None without drag.
+        contact: `ExactContact`, which is where the solution is; None without contact.
         steps: whether of steps.
 
     Attributes:
@@ -25,10 +27,10 @@ class NetSolve:
         held: of the last solve on the host, what loads that follow held dofs add to derivatives by these (W N,); None where none do.
     """
 
-    def __init__(self, model, drag, steps: bool):
+    def __init__(self, model, drag, contact, steps: bool):
         net = self.net = model.net
         self.model, self.drag = model, drag
-        self.system = ExactSystem(model, drag and drag.inertia) if steps else None
+        self.system = ExactSystem(model, drag and drag.inertia, contact) if steps else None
         self.failed = self.system and self.system.failed
         self.held = None
         self._rate = wp.zeros(net.worlds, dtype=net.real, device=net.device)
@@ -58,13 +60,18 @@ class NetSolve:
             factors: solve on the host, as conjugate gradients have failed.
 
         Raises:
-            SolverError: H is singular; on the host alone, see `failed`.
+            SolverError: H is singular; on the host alone, see `failed`. Or there is contact, which the host knows not.
         """
         coefficient = rate * (rate + self.model.scene.mass_damping)
         if self.system and not factors:
             self._rate.fill_(rate)
             self.system.solve(state, coefficient, self._rate, right, w)
             return
+        if self.system and self.system.contact:
+            raise SolverError(
+                "contact: conjugate gradients have not solved the reverse of the step: no gradient goes through it; take a smaller dt",
+                outcome="no_gradient",
+            )
         tangent, host = self.tangent, self._host
         more = self.drag.matrix if self.drag else None
         given = tangent.into(right.numpy().astype(float).ravel())

@@ -124,7 +124,7 @@ class Simulator(torch.nn.Module):
                 from rest, within that step; states without that come from `world_state`.
 
         Raises:
-            SceneError: shapes do not fit.
+            SceneError: shapes do not fit, or surfaces overlap that touch; under transforms of torch steps tell.
         """
         moved = {"positions": positions, "velocities": velocities}
         moved = {name: self._tensor(name, values) for name, values in moved.items() if values is not None}
@@ -136,6 +136,7 @@ class Simulator(torch.nn.Module):
         for name, arrays in (("positions", ("x", "q")), ("velocities", ("v", "v"))):
             if name in moved:
                 values = engine.layout.put_points(values, *arrays, moved[name])
+        engine.check(values)
         return WorldState(tuple(values), 0.0, engine)
 
     def world_state(self, state) -> WorldState:
@@ -144,11 +145,13 @@ class Simulator(torch.nn.Module):
         Unlike by `initial_state`, frames are those of the state, and dampers have its strains behind them, not those at rest.
 
         Raises:
-            SceneError: it is no state of this simulator's model, which has as many worlds.
+            SceneError: it is no state of this simulator's model, which has as many worlds; or surfaces overlap that touch.
         """
         validate.check_state("world_state", self.model, state)
         engine = self.engine(self.model.worlds)
-        return WorldState(tuple(copies(tensors(state, engine.fields))), state.time, engine)
+        values = copies(tensors(state, engine.fields))
+        engine.check(values)
+        return WorldState(tuple(values), state.time, engine)
 
     @torch.compiler.disable  # what is compiled goes on behind it: launches of Warp are nothing that a compiler sees
     def step(self, state: WorldState, parameters: dict | None = None, controls: dict | None = None) -> WorldState:

@@ -31,6 +31,20 @@ def functions(real):
 
 
 @cache
+def take_kernel(real):
+    """Frames of rod edges of worlds that moved; others keep those that their last solve had."""
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def take(moved: wp.array(dtype=int), edges: int, frame: wp.array2d(dtype=real), frame_out: wp.array2d(dtype=real)):
+        f = wp.tid()
+        if moved[f / edges] != 0:
+            for c in range(6):
+                frame_out[c, f] = frame[c, f]
+
+    return take
+
+
+@cache
 def edge_kernel(real, serial: bool):
     """Frames of rod edges, transported to the tangents of positions q and orthonormalised."""
     V, share, until = wp.types.vector(3, real), share_function(serial), until_function(serial)

@@ -4,10 +4,12 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp import arrays
+from ddg_warp.learn.adjoint import Adjoint
 
 DEVICE = "cpu"  # what models of these tests are built for; see `conftest`
 CHANGE = 1e-5  # of the loss, by a step of differences
 TIGHT = {"rtol": 1e-13}
+CLOSE = 1e-6  # relative error of a gradient, as asked
 
 
 def built(scene):
@@ -154,3 +156,38 @@ def lively(model, steps: int = 3, dt: float = 0.01, speed: float = 0.3, spin: fl
                 more[model.net.host.nodes :] *= spin / speed
             arrays.assign(array, values + meaning.keep(name, more))
     return state
+
+
+def pulled(model, state, dt: float, steps: int, scheme: str = "implicit_euler"):
+    """Derivatives of the loss of some steps by the first state, what each step read, the last first, and the loss's `Difference`."""
+    weights = directions(model, state, 5)
+
+    def advance(start):
+        integrator = ddg.Integrator(model, scheme=scheme, **TIGHT)
+        for _ in range(steps):
+            start = integrator.step(start, dt)
+        return start
+
+    adjoint = Adjoint(ddg.Integrator(model, scheme=scheme, **TIGHT))
+    tapes, at = [], state
+    for _ in range(steps):
+        at, tape = adjoint.step(at, dt)
+        tapes.append(tape)
+    given, inputs = cotangent(model, weights), []
+    for tape in reversed(tapes):
+        given, read = adjoint.pull(tape, given)
+        inputs.append(read)
+    return given, inputs, Difference(model, state.copy(), weights, advance)
+
+
+def close(found: float, wanted: float, scale: float = 0.0) -> bool:
+    return abs(found - wanted) <= CLOSE * max(abs(wanted), scale)
+
+
+def check_state(model, gradient, difference) -> None:
+    """By every array of the first state, along a direction in which nothing cancels."""
+    for entry, meant in directions(model, difference.state, 7).items():
+        values = arrays.download(entries(gradient)[entry])
+        direction = along(values, meant)
+        found = float((values * direction).sum())
+        assert close(found, difference.by_entry(entry, direction, found)), entry

@@ -9,10 +9,9 @@ from ddg_warp.compile import precision
 from ddg_warp.errors import SolverError
 from ddg_warp.geometry import meshes
 from ddg_warp.learn.adjoint import Adjoint
-from tests.learn.differences import TIGHT, Difference, along, built, cotangent, directions, entries, lively
+from tests.learn.differences import TIGHT, along, built, check_state, close, directions, entries, lively, pulled
 
 DT = 0.01
-CLOSE = 1e-6  # relative error of a gradient, as asked
 SOFT = ddg.Material(young=1e6, density=1000.0, viscosity=0.01)
 T = np.linspace(0.0, 1.0, 6)
 CURVE = np.stack([0.3 * T, 0.05 * np.sin(3.0 * T), 0.04 * np.cos(5.0 * T)], axis=1)
@@ -142,39 +141,9 @@ def shared(values: np.ndarray, shape: tuple) -> np.ndarray:
     return values
 
 
-def close(found: float, wanted: float, scale: float = 0.0) -> bool:
-    return abs(found - wanted) <= CLOSE * max(abs(wanted), scale)
-
-
 def differentiated(name: str, scheme: str, steps: int):
     model = built(SCENES[name]())
-    state = lively(model, scheme=scheme)
-    weights = directions(model, state, 5)
-
-    def advance(start):
-        integrator = ddg.Integrator(model, scheme=scheme, **TIGHT)
-        for _ in range(steps):
-            start = integrator.step(start, DT)
-        return start
-
-    adjoint = Adjoint(ddg.Integrator(model, scheme=scheme, **TIGHT))
-    tapes, at = [], state
-    for _ in range(steps):
-        at, tape = adjoint.step(at, DT)
-        tapes.append(tape)
-    given, inputs = cotangent(model, weights), []
-    for tape in reversed(tapes):
-        given, read = adjoint.pull(tape, given)
-        inputs.append(read)
-    return model, given, inputs, Difference(model, state.copy(), weights, advance)
-
-
-def check_state(model, gradient, difference) -> None:
-    for entry, meant in directions(model, difference.state, 7).items():
-        values = arrays.download(entries(gradient)[entry])
-        direction = along(values, meant)
-        found = float((values * direction).sum())
-        assert close(found, difference.by_entry(entry, direction, found)), entry
+    return model, *pulled(model, lively(model, scheme=scheme), DT, steps, scheme)
 
 
 CASES = [(name, scheme) for name in SCENES for scheme in ("implicit_euler", "implicit_midpoint")]

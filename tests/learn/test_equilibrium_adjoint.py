@@ -6,8 +6,8 @@ import pytest
 from ddg_warp import arrays, statics
 from ddg_warp.errors import SolverError
 from ddg_warp.learn.adjoint import EquilibriumAdjoint
-from tests.learn.differences import Difference, along, built, cotangent, directions, product
-from tests.learn.test_adjoint import SCENES, by_parameters, close, shared, tables
+from tests.learn.differences import Difference, along, built, close, cotangent, directions, product
+from tests.learn.test_adjoint import SCENES, by_parameters, shared, tables
 
 RTOL = 1e-13
 

@@ -13,8 +13,8 @@ from ddg_warp.errors import SceneError
 from ddg_warp.geometry import meshes
 from ddg_warp.learn import solve
 from tests.learn import differences
-from tests.learn.differences import TIGHT, built
-from tests.learn.test_adjoint import CLOSE, CURVE, DT, SCENES, SOFT, a_scene
+from tests.learn.differences import CLOSE, TIGHT, built
+from tests.learn.test_adjoint import CURVE, DT, SCENES, SOFT, a_scene
 
 torch = pytest.importorskip("torch")
 from ddg_warp.torch import RodParameters, ShellParameters, Simulator  # noqa: E402
@@ -198,9 +198,12 @@ def test_steps_are_those_of_the_integrator():
     np.testing.assert_array_equal(tensors.angles[0].cpu().numpy(), state.angles())
 
 
-def test_a_world_without_a_gradient_says_so_alone():
+@pytest.mark.parametrize(
+    ("name", "scheme"), [("twisted", "implicit_euler"), ("joined", "implicit_euler"), ("joined", "implicit_midpoint")]
+)
+def test_a_world_without_a_gradient_says_so_alone(name, scheme):
     """One of two worlds is thrown so fast that its step is made in parts."""
-    own = Simulator(built(SCENES["twisted"]()), 0.02, max_iterations=4)
+    own = Simulator(built(SCENES[name]()), 0.02, max_iterations=4, scheme=scheme)
     points = own.model.points_count
     speed = torch.zeros((2, points, 3), dtype=torch.float64)
     torch.manual_seed(0)

@@ -28,6 +28,7 @@ class ExactSystem:
 
     Args:
         inertia: inertia and drag of the blocks (worlds, N); None without drag.
+        contact: `ExactContact`, which is where the solution is; None without contact.
 
     Attributes:
         tolerance: what conjugate gradients leave of the residual, in the norm of their preconditioner.
@@ -35,11 +36,11 @@ class ExactSystem:
         failed: not zero of worlds where it is more, so that w means nothing (worlds,).
     """
 
-    contact = None
     tolerance = 1e-12
     missed = 1e-6
 
-    def __init__(self, model, inertia: wp.array | None = None):
+    def __init__(self, model, inertia: wp.array | None = None, contact=None):
+        self.contact = contact
         net, real = model.net, model.types.real
         self.net, self.device, self.real, self.linear = net, net.device, real, wp.float64
         worlds, host, device = net.worlds, net.host, net.device
@@ -64,6 +65,8 @@ class ExactSystem:
         drag = inertia is not None
         if self.chains:
             self.chains.bind(self.system, [], real, self.linear, (), drag)
+        if contact:
+            contact.bind(self)
         self._begin, self._add = exact_kernels(real, self.linear, drag, arrays.serial(device))
         self._into, self._back, self._keep = block_kernels(real, self.linear)
         self._rest, self._check = check_kernels(self.linear)
@@ -85,7 +88,7 @@ class ExactSystem:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        used = [part.kernels for part in (self.krylov, self.chains, self.planes) if part]
+        used = [part.kernels for part in (self.krylov, self.chains, self.planes, self.contact) if part]
         own = [self._begin, self._add, self._into, self._back, self._keep, self._rest, self._check]
         return [*own, *self._hessians, *(kernel for kernels in used for kernel in kernels)]
 
@@ -132,12 +135,15 @@ class ExactSystem:
             self.planes.matrix(self.matrix, self.islands.wanted)
         if self.chains:
             self.chains.assemble(self.matrix, self.mass, self.islands)
+        if self.contact:
+            self.contact.assemble()
 
     def check(self) -> None:
         """`failed`, by the residual that the solution leaves."""
         krylov, wanted = self.krylov, self.islands.wanted
         wanted.fill_(1)
         krylov.multiply(self.direction)
+        krylov.couple(self.direction)
         read = [self.right, krylov.product, krylov.inverse, self.net.blocks]
         self._launch(self._rest, self.all, read, [krylov.rest, krylov.z, self.krylov_dots])
         krylov.precondition(krylov.z)

@@ -117,7 +117,9 @@ class ConjugateGradients:
         )
 
     def couple(self, p: wp.array) -> None:
-        """Add to H p, and to p . H p, what is in no matrix."""
+        """Add to H p, and to p . H p, contact's part, which is in no matrix."""
+        if self.newton.contact:
+            self.newton.contact.multiply(p, self.product)
 
     def multiply(self, p: wp.array) -> None:
         """H p on free dofs where none of H lies in bands, and p . H p block by block."""
@@ -168,11 +170,6 @@ class Directions(ConjugateGradients):
             [newton.forcing, wanted, self.busy],
             device=newton.device,
         )
-
-    def couple(self, p: wp.array) -> None:
-        """Contact's part."""
-        if self.newton.contact:
-            self.newton.contact.multiply(p, self.product)
 
     def cycle(self) -> None:
         """One iteration."""

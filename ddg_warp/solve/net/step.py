@@ -8,7 +8,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.compile.precision import largest_carried
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.net import elements, newton
+from ddg_warp.kernels.net import elements, frames, newton
 from ddg_warp.model.net import NetState
 from ddg_warp.scene import drag
 from ddg_warp.solve.choice import net_preconditioner
@@ -63,6 +63,7 @@ class NetStep(PartStep):
                 "contact: by the midpoint rule steps end beyond where forces balance, in overlaps; use 'implicit_euler'"
             )
         self._lagged = model.net.lagged() if model.net.edges else None
+        self._take = frames.take_kernel(real)
         self.drag = NetDrag(model, self.midpoint) if host.drag else None
         self.energy = NetEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.motion = NetMotion(model, self.midpoint) if host.moves else None
@@ -145,15 +146,17 @@ class NetStep(PartStep):
         Frames lagged at the start of the step would spin about their edges by O(h) at the midpoint, unseen by the rotary
         inertia: the rule would be of first order. Rotations of joints have no inertia and are not predicted, so that those
         found are of the whole half step. Normals that supports turn, and the magnetic field, are those that the solve is about.
+        Worlds that have finished keep the frames of their solve, by which gradients tell whether these were renewed.
         """
         if not self.net.edges:
             return replace(before, data=self._data)
         frame, lag = self._lagged
         start = NetState(self.newton.q, before.v, frame, lag, before.last, self._data)
         if self.midpoint:
-            self.net.carry(before, start, moved=self.islands.moved)
+            self.net.carry(before, start, kept=start, moved=self.islands.moved)
             return start
-        wp.copy(frame, before.frame)
+        inputs = [self.islands.moved, self.net.edges, before.frame]
+        wp.launch(self._take, frame.shape[1], inputs, [frame], device=self.model.wp_device)
         for part, own, given in zip(self.net.sets, lag, before.lag, strict=True):
             if part.term.measure.advance:
                 wp.copy(own, given)
@@ -163,7 +166,7 @@ class NetStep(PartStep):
     def own_kernels(self) -> list:
         """Kernels of an attempt, without those of the solver."""
         real, net = self.model.types.real, self.net
-        kernels = [self._begin, self._finish]
+        kernels = [self._begin, self._finish, self._take]
         for part in net.sets:
             kernels += [elements.term_kernels(part.term, real)[3]] if part.term.density.lagged else []
         return kernels

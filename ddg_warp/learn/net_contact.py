@@ -1,0 +1,151 @@
+"""Reverse of contact in the steps of a net; see `ddg_warp.kernels.adjoint.contact`."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels.adjoint import contact_sums
+from ddg_warp.kernels.adjoint.contact import NUMBERS, RATE, pull_kernel, rub_kernel
+from ddg_warp.kernels.contact.gather import SLOTS
+from ddg_warp.solve.contact.node_items import NodeItems
+from ddg_warp.solve.contact.pair_terms import FRICTION
+from ddg_warp.solve.contact.touch import LAWS
+from ddg_warp.solve.net.exact_contact import ExactContact
+
+PIECES, LEAST = 256, 64  # of the first things of a world, at most, and what one has at least
+
+
+class ContactAdjoint:
+    """Of the contact of a `DeviceNet`, friction included; derivatives by obstacles are those by their nodes.
+
+    What is differentiated is a step solved exactly: by positions at its end and, with friction, at its start, where this takes normal
+    forces, directions and slip from; by the numbers of pairs; by the length of the step. Against differences it errs by 1e-9 to 1e-7.
+
+    At kinks gradients are those of one side: where closest points go over an end of an edge or a side of a triangle, whose second
+    derivatives jump there; where a pair begins to push, beyond the second derivative of a barrier, and with 1e-14 of the force of a
+    penalty; where the polynomial law of friction begins to slide. What sticks creeps, which is smooth. What keeps a step from being
+    taken at once, the cut of motions, is no part of it. Lengths of edges at rest, which tell what is all but parallel, and arc lengths
+    within which edges are no pair stay as they were built.
+
+    Attributes:
+        by_groups: by stiffness, range, thickness, friction and rate, of groups of first and second things (`NUMBERS`, worlds, groups,
+            groups); by_radius (worlds, bodies).
+
+    Raises:
+        SceneError: friction is lagged more than once in a step.
+    """
+
+    def __init__(self, net):
+        given, real, device = net.host.touching, net.real, net.device
+        if given.law.lags > 1 and given.friction.any():
+            raise SceneError(
+                f"contact: friction that is lagged {given.law.lags} times in a step has no gradient; take lags=1 and shorter steps"
+            )
+        self.net, self.system = net, ExactContact(net)
+        terms, search = self.system.terms, self.system.search
+        serial, nodes = arrays.serial(device), len(terms.forces)
+        every = wp.zeros(net.blocks, dtype=wp.uint8, device=device)
+        self._rubs, self._velocity = terms.frictions or [None] * len(terms.lists), given.law.velocity
+        law, friction = LAWS[given.law.law], FRICTION[given.law.friction_law]
+        kinds = [pairs.kind for pairs in search.lists]
+        self._pull = [pull_kernel(kind, law, real, serial) for kind in kinds]
+        self._rub = [rub_kernel(kind, law, friction, real, serial) for kind in kinds if terms.frictions]
+        self._sides = [contact_sums.side_kernels(kind, real) for kind in kinds]
+        self._group, self._bodies = contact_sums.group_kernels(real), contact_sums.body_kernel(real)
+        self._items = [NodeItems(kind, nodes, real, every) for kind in kinds]
+        self.by_groups = self._zeros(NUMBERS, *terms.law.stiffness.shape)
+        self.by_radius = self._zeros(*net.touching["radius"].shape)
+        self._things, self._starts = {}, {}
+        for size in search.shapes.sizes:
+            owner = search.shapes.things(size)[2]
+            self._things[size] = self._zeros(net.worlds * len(owner))
+            starts = np.searchsorted(owner, np.arange(len(given.bodies) + 1)).astype(np.int32)
+            self._starts[size] = wp.array(starts, dtype=int, device=device)
+        most = max(self._pieces(pairs)[0] for pairs in search.lists)
+        self._partial = self._zeros(NUMBERS, net.worlds * most, *terms.law.stiffness.shape[1:])
+        self._reserve()
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        own = [*self._pull, *self._rub, *self._group, self._bodies]
+        return [*own, *(k for pair in self._sides for k in pair), *(k for items in self._items for k in items.kernels)]
+
+    @property
+    def by_rate(self) -> wp.array:
+        """Part of `by_groups`."""
+        return self.by_groups[RATE].flatten()
+
+    def outgrown(self, q: wp.array) -> bool:
+        """As of `ExactContact`; what was pulled then is to be pulled again."""
+        grown = self.system.outgrown(q)
+        if grown:
+            self._reserve()
+        return grown
+
+    def _reserve(self) -> None:
+        """Make room for as many pairs as the search has."""
+        lists, vector = self.system.search.lists, self.net.vector
+        most = max(pairs.capacity for pairs in lists)
+        self._numbers = self._zeros(NUMBERS, most)
+        self._start_parts = arrays.allocate((SLOTS, most), vector, self.net.device)
+        for items, pairs in zip(self._items, lists, strict=True):
+            items.reserve(pairs.capacity)
+
+    def pull(self, before: wp.array, q: wp.array, w: wp.array, rate: wp.array, by_q: wp.array, by_before: wp.array):
+        """After `find` of `system` with the same, add to derivatives by blocks at the solution and at the start; write the others.
+
+        Args:
+            w: solution of the linear system (W N,).
+        """
+        terms = self.system.terms
+        for array in (self.by_groups, self.by_radius, *self._things.values()):
+            array.zero_()
+        for i, (part, rub) in enumerate(zip(terms.lists, self._rubs, strict=True)):
+            read, pairs = [part.pairs, part.count, part.found.sides, terms.law], part.found.capacity
+            self._items[i].list(part.count, part.factor.nodes, part.factor.used)
+            inputs = [*read, part.factor.nodes, part.factor.used, q, w]
+            self._sweep(self._pull[i], pairs, inputs, [part.gradient, self._numbers])
+            part.add_up(part.gradient, 1.0, by_q, self._items[i])
+            self._sum(i, part)
+            if rub:
+                self._items[i].list(rub.count, rub.factor.nodes, rub.factor.used)
+                read = [rub.pairs, rub.count, part.found.sides, terms.law, rub.factor.nodes, rub.factor.used]
+                inputs = [*read, before, q, w, self._velocity, rate]
+                self._sweep(self._rub[i], pairs, inputs, [rub.gradient, self._start_parts, self._numbers])
+                rub.add_up(rub.gradient, 1.0, by_q, self._items[i])
+                rub.add_up(self._start_parts, 1.0, by_before, self._items[i])
+                self._sum(i, rub)
+        for size, found in self._things.items():
+            starts, things = self._starts[size], len(found) // self.net.worlds
+            self._launch(self._bodies, self.by_radius.shape, [found, starts, things], [self.by_radius])
+
+    def _sum(self, index: int, part) -> None:
+        """Add what the pairs of elements have by their numbers to that of groups and things."""
+        found, law = part.found, self.system.terms.law
+        pieces, total = self._group
+        number, things = self._pieces(found)
+        lists = [part.count, part.starts, part.partners]
+        inputs = [*lists, part.pairs, found.sides, law, self._numbers, number, things]
+        self._launch(pieces, self.net.worlds * number, inputs, [self._partial])
+        self._launch(total, self.by_groups.shape[1:], [self._partial, number], [self.by_groups])
+        first, second = self._sides[index]
+        self._launch(first, found.first.all, [*lists, self._numbers], [self._things[found.first.size]])
+        items = self._items[index]
+        inputs = [part.pairs, found.sides, items.places, items.numbers, items.items, self._numbers]
+        self._launch(second, found.second.all, inputs, [self._things[found.second.size]])
+
+    def _pieces(self, pairs) -> tuple[int, int]:
+        """How many pieces the first things of a world are summed in, and how many things each has."""
+        things = max(LEAST, -(-pairs.first.count // PIECES))
+        return -(-pairs.first.count // things), things
+
+    def _zeros(self, *shape: int) -> wp.array:
+        return wp.zeros(shape, dtype=self.net.real, device=self.net.device)
+
+    def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
+        arrays.sweep(kernel, count, inputs, outputs, self.net.device)
+
+    def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim, inputs, outputs, device=self.net.device)

@@ -1,0 +1,65 @@
+"""Contact and friction at the solution of a step, in linear systems with the exact Hessian; see `ExactSystem`."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp.solve.contact.touch import Touch
+from ddg_warp.solve.net.contact_bands import ContactBands
+
+MARGIN = 1e-3  # of the reach, by which searches go beyond it: what is searched for stays where it is
+
+
+class ExactContact:
+    """Contact of a `DeviceNet`. Candidates are found again, at the start and at the solution, so that nothing is kept of steps.
+
+    Attributes:
+        touch: search, pairs and their terms, friction as it is lagged at the start.
+        diagonal: blocks at nodes, for preconditioners.
+    """
+
+    def __init__(self, net):
+        self.net, given = net, net.host.touching
+        held = np.concatenate([np.zeros(0, int), *net.host.obstacles])  # whose rows of H do not count
+        self.touch = Touch(net, wp.float64, net.rest().q, held, MARGIN * given.reach, exact=True)
+        self.search, self.terms = self.touch.search, self.touch.terms
+        self.diagonal = self.terms.diagonal
+        self._q = self._bands = None
+
+    def bind(self, system) -> None:
+        """Serve an `ExactSystem`."""
+        self._system = system
+        self._bands = ContactBands(system.chains, self.touch.shapes) if system.chains else None
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [*self.search.kernels, *self.terms.kernels, *(self._bands.kernels if self._bands else [])]
+
+    def find(self, before: wp.array, q: wp.array, rate: wp.array) -> None:
+        """Of a step from blocks `before` to the solution q, at rates 1/h (worlds,). Launches alone."""
+        search, terms = self.search, self.terms
+        search.rebuild(before)
+        if terms.frictions:
+            search.search(before)
+            terms.lag(before)
+        search.search(q)
+        terms.evaluate(q, rate if terms.frictions else None)
+        terms.blocks()
+        terms.prepare(q, self.net.every)
+        self._q = q
+
+    def assemble(self) -> None:
+        """Its own part in the preconditioner."""
+        if self._bands:
+            self._bands(self.terms, self._system.islands.arrays[0])
+
+    def multiply(self, p: wp.array, product: wp.array) -> None:
+        """Add H p, and write p . H p block by block."""
+        system = self._system
+        given = system.fixed, system.islands.wanted, system.krylov_dots
+        self.terms.settle(p, product, self._q, self.net.every, *given)
+
+    def outgrown(self, q: wp.array) -> bool:
+        """Whether pairs did not fit, for which there is room then. Reads from the device."""
+        grown = self.search.fit(q)
+        return self.terms.fit() or grown

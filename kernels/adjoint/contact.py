@@ -1,0 +1,145 @@
+"""Reverse of contact and friction in a step of a net, pair by pair; see `kernels.variation` for what is differentiated.
+
+Of a loss with w from H^T w = g, what contact brings is the derivative of -w . dE/dx, E the energy of pairs (`contact.pair_energy`) at
+the solution x, by x, stiffness, range and thickness. Friction is a function of what it lags, too (`contact.pair_friction`): with the
+gradient g of contact at the start x^n of the step, which is one of x^n and of the same numbers, its force along w is
+
+    w . f = sum_i weight_i w_i . (t1, t2) psi'(u; mu N) ,   N, n = sum g_i of the first thing,   weight_i = g_i . n / N ,
+    u = (t1, t2) . sum_i weight_i (x_i - x_i^n) ,
+
+and its reverse goes through normal force, normal and weights at x^n, through the slip from x^n to x, and to coefficient and rate. The
+matrix of all this by x is symmetric, as what is lagged is no function of x.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.contact.gather import SLOTS
+from ddg_warp.kernels.contact.pair_energy import pair_energy_functions, shape_types
+from ddg_warp.kernels.contact.pair_terms import groups_function, law_struct, read_functions
+from ddg_warp.kernels.contact.surfaces import Kind, sides_struct
+from ddg_warp.kernels.densities import Density
+from ddg_warp.kernels.measures.slip import basis
+from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
+
+STIFFNESS, RANGE, THICKNESS, FRICTION, RATE = range(5)
+NUMBERS = 5  # of a pair, that derivatives are by
+
+
+@cache
+def pull_kernel(kind: Kind, density: Density, real, serial: bool):
+    """pull(...): what pairs bring by slot, and by their numbers (`NUMBERS`, capacity), zero of pairs that push nothing."""
+    Law, Sides = law_struct(real), sides_struct(real)
+    V, until = wp.types.vector(3, real), until_function(serial)
+    _, _, along = pair_energy_functions(kind, density, real)
+    given, corners = read_functions(kind, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def pull(
+        pairs: wp.array(dtype=wp.vec2i),
+        count: wp.array(dtype=int),
+        sides: Sides,
+        law: Law,
+        nodes: wp.array(dtype=wp.vec4i),
+        used: wp.array(dtype=int),
+        x: wp.array(dtype=V),
+        w: wp.array(dtype=V),
+        parts: wp.array2d(dtype=V),
+        numbers: wp.array2d(dtype=real),
+    ):
+        tid = wp.tid()
+        if tid >= count[0]:
+            return
+        for pair in range(tid, until(tid, count[0])):
+            for i in range(wp.static(NUMBERS)):
+                numbers[i, pair] = real(0.0)
+            if used[pair] != 0:
+                p, threshold, inner = given(law, sides, pairs[pair])
+                n = nodes[pair]
+                dx, _dv, dp, _dt, _ds = wp.grad(along)(corners(x, n), -corners(w, n), p, threshold, inner)
+                for slot in range(wp.static(SLOTS)):
+                    parts[slot, pair] = V(dx[slot, 0], dx[slot, 1], dx[slot, 2])
+                for i in range(3):
+                    numbers[i, pair] = dp[i]
+
+    return pull
+
+
+@cache
+def rub_kernel(kind: Kind, density: Density, friction: Density, real, serial: bool):
+    """rub(...): what friction brings by slot of the solution and of the start, and by the numbers of pairs, as `pull_kernel` has it."""
+    Law, Sides = law_struct(real), sides_struct(real)
+    X, W, P = shape_types(real)
+    V, E = wp.types.vector(3, real), wp.types.vector(2, real)
+    D, until = wp.types.vector(friction.parameter_size(2), real), until_function(serial)
+    evaluate, _, _ = pair_energy_functions(kind, density, real)
+    given, corners = read_functions(kind, real)
+    tangents, groups = basis(real), groups_function(real)
+    slope_of = friction.laws(real, 2)[1]
+
+    @wp.func
+    def force(start: X, x: X, v: X, p: P, threshold: real, inner: W, mu: real, velocity: real, inverse: real):
+        """The derivative of the potential of friction by x, along v."""
+        _e, g = evaluate(start, p, threshold, inner)
+        push = V()
+        for slot in range(wp.static(kind.first)):
+            push += g[slot]
+        normal = wp.length(push)
+        n = push / normal
+        weight = (g * n) / normal
+        t1, t2 = tangents(n)
+        move = (x[0] - start[0]) * weight[0] + (x[1] - start[1]) * weight[1]
+        move += (x[2] - start[2]) * weight[2] + (x[3] - start[3]) * weight[3]
+        along = v[0] * weight[0] + v[1] * weight[1] + v[2] * weight[2] + v[3] * weight[3]
+        u = E(wp.dot(t1, move), wp.dot(t2, move))
+        f = slope_of(u, D(mu * normal, real(1.0), velocity, real(0.0), real(0.0), inverse))
+        return wp.dot(f, E(wp.dot(t1, along), wp.dot(t2, along)))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def rub(
+        pairs: wp.array(dtype=wp.vec2i),
+        count: wp.array(dtype=int),
+        sides: Sides,
+        law: Law,
+        nodes: wp.array(dtype=wp.vec4i),
+        used: wp.array(dtype=int),
+        start: wp.array(dtype=V),
+        x: wp.array(dtype=V),
+        w: wp.array(dtype=V),
+        velocity: real,
+        rate: wp.array(dtype=real),
+        parts: wp.array2d(dtype=V),
+        start_parts: wp.array2d(dtype=V),
+        numbers: wp.array2d(dtype=real),
+    ):
+        tid = wp.tid()
+        if tid >= count[0]:
+            return
+        for pair in range(tid, until(tid, count[0])):
+            for i in range(wp.static(NUMBERS)):
+                numbers[i, pair] = real(0.0)
+            if used[pair] != 0:
+                world, _i, _j, a, b = groups(law, sides, pairs[pair])
+                p, threshold, inner = given(law, sides, pairs[pair])
+                n = nodes[pair]
+                ds, dx, _dv, dp, _dt, _di, dmu, _dn, dr = wp.grad(force)(
+                    corners(start, n),
+                    corners(x, n),
+                    -corners(w, n),
+                    p,
+                    threshold,
+                    inner,
+                    law.friction[world, a, b],
+                    velocity,
+                    rate[world],
+                )
+                for slot in range(wp.static(SLOTS)):
+                    parts[slot, pair] = V(dx[slot, 0], dx[slot, 1], dx[slot, 2])
+                    start_parts[slot, pair] = V(ds[slot, 0], ds[slot, 1], ds[slot, 2])
+                for i in range(3):
+                    numbers[i, pair] = dp[i]
+                numbers[wp.static(FRICTION), pair] = dmu
+                numbers[wp.static(RATE), pair] = dr
+
+    return rub

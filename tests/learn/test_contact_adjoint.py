@@ -1,0 +1,159 @@
+"""Gradients of steps in contact against central differences: by states, stiffness, range, radii, friction, and the length of steps."""
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp import arrays
+from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.kernels.adjoint.contact import FRICTION, RANGE, STIFFNESS
+from ddg_warp.learn.adjoint import Adjoint
+from tests.learn.contact_cases import DT, SCENES, scene_of, touching
+from tests.learn.differences import CHANGE, TIGHT, built, check_state, close, entries, pulled
+
+RUBBING = {"friction": 0.3, "velocity": 0.05}  # what slides does so at twice the velocity, what turns slower
+SLIDING = 0.1  # [m/s]
+ROWS = {"stiffness": STIFFNESS, "range": RANGE, "friction": FRICTION}
+each_scene = pytest.mark.parametrize("name", SCENES)
+each_law = pytest.mark.parametrize("law", ["barrier", "penalty"])
+
+
+def differentiated(name: str, law: str, steps: int, speed: float = 0.0, **contact):
+    model = built(scene_of(name, law, **contact))
+    ranges = model.net.touching["range"]
+    ranges.assign(0.99 * ranges.numpy())  # beyond which it may go, up to the reach of searches
+    state = touching(model, along=speed)
+    model.touch.at(state.net.q)
+    assert any(part.factor.used.numpy()[: part.count.numpy()[0]].any() for part in model.touch.terms.lists)
+    gradient, inputs, difference = pulled(model, state, DT, steps)
+    integrator = ddg.Integrator(model, **TIGHT)  # one for all differences, as a graph takes longer than its steps
+
+    def advance(start):
+        for _ in range(steps):
+            start = integrator.step(start, DT)
+        return start
+
+    difference.advance = advance
+    return model, gradient, inputs, difference
+
+
+def by_number(inputs: list, name: str) -> np.ndarray:
+    """Derivatives by a number of contact, symmetric where it is of two groups."""
+    if name == "radius":
+        return sum(read[-1].radius.numpy() for read in inputs)
+    found = sum(read[-1].touching.numpy()[ROWS[name]] for read in inputs)
+    return 0.5 * (found + found.swapaxes(1, 2))
+
+
+def check_numbers(model, inputs: list, difference, names: tuple) -> None:
+    """Along a change of each in which nothing cancels."""
+    for name in names:
+        own, gradient = model.net.touching[name], by_number(inputs, name)
+        values = own.numpy().copy()
+        direction = np.where(gradient < 0.0, -1.0, 1.0) * values
+        found = float((gradient * direction).sum())
+        assert found != 0.0, name
+        step = min(1e-3, 0.3 * CHANGE / abs(found))
+        reference = difference.by(lambda x, a=own, v=values, d=direction: a.assign(v + x * d), step)
+        assert close(found, reference, scale=1e-4 * abs(difference.loss())), (name, found, reference)
+
+
+@each_law
+@each_scene
+def test_a_step_by_its_state_and_numbers(name, law):
+    model, gradient, inputs, difference = differentiated(name, law, 1)
+    check_state(model, gradient, difference)
+    check_numbers(model, inputs, difference, ("stiffness", "range", "radius"))
+
+
+@each_law
+@pytest.mark.parametrize("form", ["logistic", pytest.param("polynomial", marks=pytest.mark.slow)])
+@each_scene
+def test_a_step_that_rubs(name, law, form):
+    model, gradient, inputs, difference = differentiated(name, law, 1, SLIDING, friction_law=form, **RUBBING)
+    check_state(model, gradient, difference)
+    check_numbers(model, inputs, difference, ("stiffness", "range", "radius", "friction"))
+
+
+@each_law
+@pytest.mark.parametrize("name", ["crossing rods", "rod on ball", "rod on mesh", "sheets"])
+def test_eight_steps_of_sliding(name, law):
+    model, gradient, inputs, difference = differentiated(name, law, 8, SLIDING, **RUBBING)
+    check_state(model, gradient, difference)
+    check_numbers(model, inputs, difference, ("stiffness", "radius", "friction"))
+
+
+@pytest.mark.parametrize("name", ["parallel rods", "rod on plane"])
+def test_what_sticks_creeps(name):
+    """At a tenth of the speed that slides: friction is then all but its bound times the slip."""
+    model, gradient, inputs, difference = differentiated(name, "barrier", 3, friction=0.8, velocity=0.5)
+    check_state(model, gradient, difference)
+    check_numbers(model, inputs, difference, ("friction",))
+
+
+@pytest.mark.parametrize("name", ["crossing rods", "rod on sheet"])
+def test_a_step_by_its_length(name):
+    model, _, (inputs,), difference = differentiated(name, "penalty", 1, SLIDING, **RUBBING)
+    own = inputs[0]
+    by_rate = sum(float(array.numpy().sum()) for array in (own.rate, *own.elements_rate))
+    assert float(own.elements_rate[-1].numpy().sum()) != 0.0
+
+    def longer(x):
+        difference.advance = lambda start: ddg.Integrator(model, **TIGHT).step(start, DT + x)
+
+    assert close(-by_rate / DT**2, difference.by(longer, 1e-8))
+
+
+def test_elements_of_what_touches():
+    """Stiffnesses of rods and sheets, as without contact."""
+    model, _, inputs, difference = differentiated("rod on sheet", "barrier", 2, SLIDING, **RUBBING)
+    for part, found in zip(model.net.sets, zip(*(read[-1].parameters for read in inputs), strict=True), strict=True):
+        row, (parameter, values) = 1, list(part.parameters.values.items())[1]
+        total = float(sum(own.numpy()[row].sum() for own in found))
+        reference = difference.by_parameter(part.parameters, parameter, np.ones_like(values), 1e-4 * values.max())
+        assert close(total, reference, scale=1e-4 * abs(difference.loss()) / values.max()), parameter
+
+
+def test_gradients_repeat_bit_by_bit():
+    first, second = (differentiated("sheets", "barrier", 2, SLIDING, **RUBBING)[1:3] for _ in range(2))
+    for name, array in entries(first[0]).items():
+        np.testing.assert_array_equal(arrays.download(array), arrays.download(entries(second[0])[name]))
+    for name in (*ROWS, "radius"):
+        np.testing.assert_array_equal(by_number(first[1], name), by_number(second[1], name))
+
+
+def test_pairs_that_do_not_fit_are_made_room_for():
+    """Gradients are the same to the bit."""
+    model = built(scene_of("sheets", "penalty", **RUBBING))
+    state = touching(model, along=SLIDING)
+    found = []
+    for few in (False, True):
+        adjoint = Adjoint(ddg.Integrator(model, **TIGHT))
+        after, tape = adjoint.step(state, DT)
+        if few:
+            contact = adjoint.net.contact
+            for pairs in contact.system.search.lists:
+                pairs.reserve(1)
+            contact.system.search.version += 1
+            contact.outgrown(after.net.q)
+            for pairs in contact.system.search.lists:
+                assert pairs.capacity < 1024
+        found.append(adjoint.pull(tape, after)[0].net.q.numpy())
+    np.testing.assert_array_equal(*found)
+
+
+def test_what_has_no_gradient_is_refused():
+    model = built(scene_of("rod on plane", lags=2, **RUBBING))
+    with pytest.raises(
+        SceneError, match=r"contact: friction that is lagged 2 times in a step has no gradient; take lags=1"
+    ):
+        Adjoint(ddg.Integrator(model))
+    Adjoint(ddg.Integrator(built(scene_of("rod on plane", lags=2))))  # without friction there is nothing to lag
+    model = built(scene_of("crossing rods"))
+    adjoint = Adjoint(ddg.Integrator(model))
+    after, tape = adjoint.step(touching(model), DT)
+    adjoint.net.solve.system.missed = 0.0  # which no solution leaves
+    with pytest.raises(
+        SolverError, match=r"contact: conjugate gradients have not solved .* no gradient goes through it"
+    ):
+        adjoint.pull(tape, after)

@@ -1,0 +1,175 @@
+"""What goes into steps in contact as tensors: numbers of contact of every world, moved obstacles, starts; and what is refused."""
+
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp.errors import SceneError
+from tests.learn import differences
+from tests.learn.contact_cases import DT, RADIUS, RANGE, bar, scene_of, touching
+from tests.learn.differences import TIGHT
+
+torch = pytest.importorskip("torch")
+from ddg_warp.learn.contact_places import contact_elements  # noqa: E402
+from ddg_warp.torch import Simulator  # noqa: E402
+from tests.learn.test_torch import check  # noqa: E402
+
+RUBBING = {"friction": 0.3, "velocity": 0.05}
+
+
+def simulator(name: str, law: str = "barrier", worlds: int = 1, **contact) -> tuple[Simulator, object]:
+    """And a state of every world in which things slide on each other."""
+    return simulated(scene_of(name, law, **contact), worlds)
+
+
+def simulated(scene, worlds: int = 1):
+    model = scene.build(device=differences.DEVICE, precision="float64", worlds=worlds)
+    own = Simulator(model, DT, **TIGHT)
+    return own, own.world_state(touching(model, along=0.1))
+
+
+def weighed(state):
+    """A loss of all that moves."""
+    weight = torch.sin(3.0 * torch.arange(state.positions[0].numel(), dtype=torch.float64)).reshape(-1, 3)
+    return (weight * state.positions).sum() + 0.01 * (weight.roll(1) * state.velocities).sum()
+
+
+@pytest.mark.parametrize(
+    ("name", "law"), [("crossing rods", "penalty"), ("rod on ball", "barrier"), ("sheets", "barrier")]
+)
+def test_numbers_of_every_world_over_steps(name, law):
+    """Two worlds with numbers of their own, five steps of sliding."""
+    own, start = simulator(name, law, 2, **RUBBING)
+    factor = torch.tensor([[1.0], [0.8]], dtype=torch.float64)
+    names = [f"contact.{name}" for name in ("stiffness", "range", "friction", "radius")]
+    usual = {name: own.parameter(name, 2) for name in names}
+    changed = {name: value * (factor if "radius" not in name else 1.0) for name, value in usual.items()}
+    changed["contact.range"] = 0.99 * changed["contact.range"]
+
+    def loss(**given):
+        given = {name.replace("_", "."): value for name, value in given.items()}
+        return weighed(own.rollout(start, given, steps=5)[-1])
+
+    given = {name.replace(".", "_"): value for name, value in changed.items()}
+    sizes = {"stiffness": 1e-4 * 50.0, "range": 3e-4 * RANGE, "friction": 1e-4, "radius": 1e-6 * RADIUS}
+    check(loss, given, {name: sizes[name.partition("_")[2]] for name in given})
+    torch.testing.assert_close(own.parameter("contact.stiffness", 2), usual["contact.stiffness"])
+
+
+SHAPES = {
+    "plane": ddg.Plane(),
+    "ball": ddg.Sphere((0.001, 0.002, -0.1), 0.1),
+    "capsule": ddg.Capsule((0.002, -0.1, -0.03), (0.0, 0.1, -0.03), 0.03),
+    "mesh": ddg.Mesh([[-0.2, -0.21, 0.0], [0.3, -0.2, 0.0], [-0.1, 0.3, 0.0]], [[0, 1, 2]]),
+}
+
+
+@pytest.mark.parametrize("law", ["barrier", "penalty"])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_moved_obstacles(shape, law):
+    """Poses of a grip that lifts, shifts and turns what a rod lies on, over four steps, and one that keeps the last pose."""
+    scene = ddg.Scene(gravity=(1.0, 0.7, -40.0), mass_damping=0.7)
+    bar(scene, RADIUS + 0.8 * RANGE)
+    scene.add_obstacle(SHAPES[shape], motion=ddg.Grip(pivot=(0.01, 0.0, -0.02)), name="obstacle")
+    scene.contact(law=law, range=RANGE, stiffness=50.0, **RUBBING)
+    own, start = simulated(scene)
+    poses = torch.tensor([[[1e-4, 2e-4, 1e-4, 2e-3, -1e-3, 4e-3]]], dtype=torch.float64)
+
+    def loss(poses):
+        states = own.rollout(start, None, lambda number: {"poses": poses * (number + 1)}, steps=4)
+        return weighed(own.step(states[-1]))
+
+    check(loss, {"poses": poses}, {"poses": 1e-7})
+
+
+def test_positions_and_velocities_at_the_start():
+    own, start = simulator("crossing rods", "penalty", **RUBBING)
+
+    def loss(positions, velocities):
+        state = own.initial_state(positions=positions, velocities=velocities)
+        return weighed(own.rollout(state, steps=3)[-1])
+
+    points = start.positions.clone()
+    check(loss, {"positions": points, "velocities": start.velocities.clone()}, {"positions": 1e-8, "velocities": 1e-5})
+
+
+def test_a_coefficient_of_friction_is_found_again():
+    """From where a rod that slides has come to."""
+    own, start = simulator("rod on plane", **RUBBING)
+    goal = own.rollout(start, {"contact.friction": 0.45}, steps=8)[-1].positions
+    mu = torch.tensor(0.2, dtype=torch.float64, requires_grad=True)
+    optimiser = torch.optim.LBFGS([mu], lr=1.0, line_search_fn="strong_wolfe", max_iter=30, tolerance_change=1e-14)
+
+    def closure():
+        optimiser.zero_grad()
+        loss = 1e10 * ((own.rollout(start, {"contact.friction": mu}, steps=8)[-1].positions - goal) ** 2).sum()
+        loss.backward()
+        return loss
+
+    optimiser.step(closure)
+    assert abs(float(mu.detach()) - 0.45) < 1e-6
+
+
+def test_transforms_and_checkpoints():
+    """A gradient of a batch of coefficients is that of each, and the same with states made anew."""
+    own, start = simulator("rod on ball", **RUBBING)
+
+    def loss(mu, **kept):
+        return weighed(own.rollout(start, {"contact.friction": mu}, steps=4, **kept)[-1])
+
+    given = torch.tensor([0.1, 0.25, 0.4], dtype=torch.float64)
+    single = [torch.func.grad(loss)(mu) for mu in given]
+    together = torch.func.vmap(torch.func.grad(loss))(given)
+    torch.testing.assert_close(together, torch.stack(single), rtol=1e-8, atol=0.0)
+    mu = given[0].clone().requires_grad_()
+    (again,) = torch.autograd.grad(loss(mu, checkpoint_every=2), mu)
+    torch.testing.assert_close(again, single[0], rtol=0.0, atol=0.0)
+
+
+def test_a_world_in_which_a_step_fails_has_no_gradient_alone():
+    """It starts in an overlap, which no step leads out of."""
+    own, start = simulator("rod on plane", worlds=2)
+    k = own.parameter("contact.stiffness").requires_grad_()
+    radius = own.parameter("contact.radius")
+    radius[1] *= 2.0
+    state = own.step(start, {"contact.stiffness": k, "contact.radius": radius})
+    (found,) = torch.autograd.grad((state.positions**2).sum((1, 2)).sum(), k)
+    assert torch.isfinite(found[0]).all()
+    assert torch.isnan(found[1]).all()
+    assert own.outcomes()[0] == "converged" != own.outcomes()[1]
+
+
+def test_names_of_what_has_numbers():
+    own, _ = simulator("rod on sheet")
+    assert contact_elements(own.model, "contact.stiffness") == [("bar", "bar"), ("bar", "lower"), ("lower", "lower")]
+    assert contact_elements(own.model, "contact.radius") == ["rod 0", "shell 0"]
+    assert own.parameter("contact.radius").tolist() == [[RADIUS, RADIUS]]
+    own, _ = simulator("rod on plane", **RUBBING)
+    assert contact_elements(own.model, "contact.friction") == [("bar", "bar"), ("bar", "obstacle")]
+    assert contact_elements(own.model, "contact.radius") == ["rod 0"]
+
+
+def test_what_does_not_fit_is_refused():
+    own, start = simulator("rod on plane", worlds=2)
+    wide = own.parameter("contact.range").clone()
+    wide[1, 1] *= 1.5
+    with pytest.raises(
+        SceneError, match=r"contact.range of 'bar' and 'obstacle' is 0.0015 m in world 1.*largest range"
+    ):
+        own.step(start, {"contact.range": wide})
+    with pytest.raises(
+        SceneError, match=r"nothing has 'contact.friction'; this model has .*contact.stiffness, contact.range"
+    ):
+        own.step(start, {"contact.friction": 0.1})
+    with pytest.raises(SceneError, match=r"contact.radius.*positive"):
+        own.step(start, {"contact.radius": 0.0})
+    points = start.positions.clone()
+    points[:, 2, 2] = 0.5 * RADIUS
+    with pytest.raises(SceneError, match=r"obstacle 0 .*overlap by"):
+        own.initial_state(positions=points)
+    lagged, start = simulator("rod on plane", lags=2, **RUBBING)
+    velocities = torch.zeros_like(start.velocities, requires_grad=True)
+    state = lagged.step(lagged.initial_state(velocities=velocities))
+    with pytest.raises(SceneError, match=r"friction that is lagged 2 times in a step has no gradient"):
+        state.positions.sum().backward()
+    with pytest.raises(SceneError, match=r"contact: equilibria"):
+        own.equilibrium()
