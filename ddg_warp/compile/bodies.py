@@ -11,7 +11,8 @@ ROD = "rod"
 
 @dataclass
 class Body:
-    """A rod, shell or obstacle: nodes, kind, radius [m], name of its group, how messages call it, cells of nodes."""
+    """A rod, shell or obstacle: nodes, kind, radius [m], name of its group, how messages call it, cells of nodes, and which shell it
+    is, -1 for none."""
 
     nodes: np.ndarray
     kind: str
@@ -21,6 +22,7 @@ class Body:
     cells: np.ndarray | None = None
     closed: bool = False
     still: bool = False
+    shell: int = -1
 
 
 @dataclass

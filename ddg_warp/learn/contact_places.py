@@ -23,6 +23,16 @@ def contact_elements(model, name: str) -> list:
     return [(given.names[g], given.names[h]) for g, h in zip(*_meeting(given), strict=True)]
 
 
+def sized(model, shells: bool) -> dict[int, int]:
+    """Of the values of "contact.radius" those that sections of rods, or thicknesses of shells, tell, and of which shell each is."""
+    given = model.net.host.touching if model.net is not None else None
+    if given is None:
+        return {}
+    bodies = [given.bodies[i] for i in _round(given)]
+    told = [i for i, body in enumerate(bodies) if not body.still and body.name not in given.law.radius]
+    return {i: bodies[i].shell for i in told if (bodies[i].shell >= 0) == shells}
+
+
 def _round(given) -> np.ndarray:
     """Bodies that have a radius, or a thickness."""
     return np.flatnonzero(given.numbers["radius"] > 0.0)

@@ -9,6 +9,7 @@ from ddg_warp.scene.drag import Granular
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.material import Circle, Ellipse, Material, Ribbon
 from ddg_warp.scene.motion import Motion
+from ddg_warp.scene.obstacles import Plane, Sphere
 from ddg_warp.scene.scene import Scene
 
 T = np.linspace(0.0, 1.0, 6)
@@ -125,6 +126,32 @@ def _some_drag(scene: Scene, rods) -> None:
     scene.add_mass(rods[2], -1, 0.002)
 
 
+def _touch(scene: Scene, law: str, **options) -> None:
+    """Contact that begins far off, with friction."""
+    scene.contact(law=law, range=0.02, stiffness=5.0, friction=0.3, velocity=0.5, **options)
+
+
+def _crossing(scene: Scene, material: Material) -> None:
+    """Rods that cross, one of them held."""
+    rods = [scene.add_rod(CURVE, section=Circle(0.004), material=material, name="lower")]
+    points = CURVE[3] + np.stack([0.1 * T - 0.05, 0.3 * T - 0.15, 0.014 + 0.03 * (T - 0.5) ** 2], axis=1)
+    rods.append(scene.add_rod(points, section=Circle(0.003), material=material, name="upper"))
+    scene.clamp(rods[0], edges=[0, -1])
+    _touch(scene, "barrier")
+
+
+def _on_ball(scene: Scene, material: Material) -> None:
+    """A rod on a ball that a grip moves."""
+    scene.add_rod(CURVE, section=Circle(0.004), material=material)
+    scene.add_obstacle(Sphere((0.18, 0.05, -0.352), 0.3), motion=Grip(pivot=(0.1, 0.0, -0.2)))
+    _touch(scene, "penalty")
+
+
+def _over_plane(scene: Scene, shell: int) -> None:
+    scene.add_obstacle(Plane((0.0, 0.0, -0.01), (-0.03, 0.0, 1.0)))
+    _touch(scene, "barrier")
+
+
 def _timed(t: float) -> tuple:
     return (0.0, 2e-2 * t, 1e-2)
 
@@ -186,6 +213,9 @@ OBJECTS: dict[str, tuple[int, Callable]] = {
         3,
         _sheet("midedge_dof", lambda s, k, first: s.clamp_boundary(k, first, motion=SWING)),
     ),
+    "rods in contact": (3, _crossing),
+    "rod on a gripped ball": (3, _on_ball),
+    "shell on a plane": (3, _sheet("midedge_dof", more=_over_plane)),
     "rod under a couple": (3, _rod(more=lambda s, r: s.add_couple(r, -1, (1e-4, 2e-4, -1e-4)))),
     "shell under pressure": (3, _sheet("midedge_dof", more=lambda s, k: s.add_pressure(k, 5.0))),
 }

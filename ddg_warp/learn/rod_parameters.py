@@ -7,7 +7,7 @@ import torch
 import warp as wp
 
 from ddg_warp.errors import SceneError
-from ddg_warp.learn import constants
+from ddg_warp.learn import constants, contact_places
 from ddg_warp.learn.modules import parameter_key, usual_values
 from ddg_warp.scene.drag import Laws, Viscous
 
@@ -21,10 +21,12 @@ class RodParameters(torch.nn.Module):
         stretching, bending, twisting   c EA; c EI in both directions; c GJ
         density                         c rho: masses and rotary inertia; those of `Scene.add_mass` stay
         radius                          all lengths of the section: c^2 EA, c^4 EI, c^4 GJ, c^2 of masses, c^4 of rotary inertia, drag
-                                        as `Viscous` has it of a radius, 1 / c of the curvature at which the law of a `Ribbon` changes
+                                        as `Viscous` has it of a radius, c of the radius in contact, 1 / c of the curvature at
+                                        which the law of a `Ribbon` changes
 
-    The size of a section does not tell coefficients of drag that are given outright, which stay, nor stiffnesses: rods whose section is
-    a `Stiffness`, or that have laws of their own, have no radius; nor have magnetised rods. Glue to shells stays as it is.
+    The size of a section does not tell coefficients of drag and radii in contact that are given outright, which stay, nor
+    stiffnesses: rods whose section is a `Stiffness`, or that have laws of their own, have no radius; nor have magnetised rods. Glue
+    to shells stays as it is.
 
     Args:
         simulator: whose rods they are.
@@ -57,7 +59,7 @@ class RodParameters(torch.nn.Module):
             self.register_buffer(parameter_key(own), usual_values(simulator, own))
         if "rod.mass" in self._powers:
             self.register_buffer("_sections", torch.tensor(constants.of_sections(model, "rod.mass"), **made))
-        for own in ("drag.tangential", "drag.normal", "drag.rotational"):
+        for own in ("drag.tangential", "drag.normal", "drag.rotational", contact_places.RADIUS):
             if own in self._powers:
                 self.register_buffer(f"{parameter_key(own)}_share", torch.tensor(_share(model, own), **made))
 
@@ -69,7 +71,7 @@ class RodParameters(torch.nn.Module):
             exponent = sum(power * logarithms[name] for name, power in powers.items() if name in logarithms)
             if own == "rod.mass":
                 result[own] = usual + self._sections * torch.expm1(exponent)
-            elif own == "drag.rotational":  # 4 pi mu a^2
+            elif own in ("drag.rotational", contact_places.RADIUS):  # 4 pi mu a^2, and a
                 result[own] = usual * (1.0 + getattr(self, f"{parameter_key(own)}_share") * torch.expm1(exponent))
             elif own.startswith("drag."):  # k mu / (ln(S / a) + constant)
                 result[own] = usual / (1.0 - usual * getattr(self, f"{parameter_key(own)}_share") * exponent)
@@ -97,14 +99,20 @@ def _powers(model) -> dict[str, dict[str, int]]:
     for own, power in (("drag.tangential", 1), ("drag.normal", 1), ("drag.rotational", 2)):
         if constants.array_places(model, own)[1] and _share(model, own).any():
             found[own] = {"radius": power}
+    if contact_places.sized(model, shells=False):
+        found[contact_places.RADIUS] = {"radius": 1}
     return found
 
 
 def _share(model, name: str) -> np.ndarray:
     """Of every edge with such drag, how it depends on the radius a: of its 1 / zeta by -ln(a) [m^2 / N s], or whether it is as a^2.
 
-    Zero of drag that is given outright.
+    Zero of drag that is given outright. Of radii in contact, whether it is one of rods that is not.
     """
+    if name == contact_places.RADIUS:
+        return np.isin(
+            np.arange(constants.array_places(model, name)[0]), list(contact_places.sized(model, shells=False))
+        )
     laws = Laws(model.scene)
     rods = [model.order.edge(row)[1] for row in constants.elements(model, name)]
     found = [laws.given[laws.of_rods[rod]] for rod in rods]

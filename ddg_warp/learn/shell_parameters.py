@@ -9,6 +9,7 @@ import warp as wp
 from ddg_warp import arguments
 from ddg_warp.compile.shells import triangles_beside
 from ddg_warp.errors import SceneError
+from ddg_warp.learn import contact_places
 from ddg_warp.learn.modules import parameter_key, usual_values
 from ddg_warp.learn.places import meeting
 from ddg_warp.model.rest_shapes import edges_along
@@ -33,7 +34,8 @@ class ShellParameters(torch.nn.Module):
     Learned are numbers c, zero at first, of whole shells, of triangles, or of what else `by` says:
 
         young       E exp(c)
-        thickness   h exp(c), of the stiffness of membrane and bending, and of masses
+        thickness   h exp(c), of the stiffness of membrane and bending, of masses, and of what touches, where contact was not
+                    given another one: as everywhere that of the thickest triangle
         density     rho exp(c), of masses, which a metric at rest does not change
         poisson     -1/4 + 3/4 tanh(artanh((4 nu + 1) / 3) + c), between -1 and 1/2
         metric      F^T exp(2 c) F, c a strain of logarithms
@@ -95,6 +97,11 @@ class ShellParameters(torch.nn.Module):
         if self._weighs:
             values["_mass"] = usual_values(simulator, "shell.mass")
             values |= _vertices(model, [i for i, *_ in chosen])
+        self._touching = {}
+        if "thickness" in names:
+            self._touching = _half_thicknesses(model, [i for i, *_ in chosen], counts)
+        if self._touching:
+            values["_half_thickness"] = usual_values(simulator, contact_places.RADIUS)
         for name, value in values.items():
             self.register_buffer(name, value if value is None else value.detach().to(device).clone())
         count = sum(counts) if shares is None else shares.shape[1]
@@ -152,6 +159,11 @@ class ShellParameters(torch.nn.Module):
             more = torch.expm1(sum(self._spread(self.changes[name]) for name in HEAVY if name in self.changes))
             more = torch.nn.functional.pad(more * self._corner_mass, (0, 1))[:, self._corners]
             result["shell.mass"] = self._mass + more.sum(-1)
+        if self._touching:
+            half = [0.5 * now["thickness"][:, triangles].amax(-1) for triangles in self._touching.values()]
+            usual = self._half_thickness.expand(len(half[0]), -1)
+            rows = torch.as_tensor(list(self._touching), device=usual.device)
+            result[contact_places.RADIUS] = usual.index_copy(1, rows, torch.stack(half, -1).to(usual.dtype))
         return result
 
     def _spread(self, change: torch.Tensor) -> torch.Tensor:
@@ -236,6 +248,14 @@ def _vertices(model, chosen: list[int]) -> dict[str, torch.Tensor]:
     found = meeting(np.concatenate(vertex), np.concatenate(triangle), int(starts[-1]), total)
     mass = np.concatenate([held[i].corner_mass for i in chosen])
     return {"_corners": torch.as_tensor(found), "_corner_mass": torch.as_tensor(mass)}
+
+
+def _half_thicknesses(model, chosen: list[int], counts: list[int]) -> dict[int, slice]:
+    """Of the values of "contact.radius" those of chosen shells, and the triangles of each among those of all chosen."""
+    starts = np.cumsum([0, *counts])
+    triangles = {shell: slice(*starts[k : k + 2].tolist()) for k, shell in enumerate(chosen)}
+    told = contact_places.sized(model, shells=True)
+    return {row: triangles[shell] for row, shell in told.items() if shell in triangles}
 
 
 def _of_triangles(what: str, now: dict[str, torch.Tensor]) -> torch.Tensor:

@@ -35,10 +35,10 @@ def parallel(scene):
     rod(scene, upper, name="upper")
 
 
-def _over(shape, slope: float = 0.003, height: float = RADIUS + 0.8 * RANGE):
+def _over(shape, motion=None):
     def build(scene):
-        bar(scene, height, slope)
-        scene.add_obstacle(shape, name="obstacle")
+        bar(scene, RADIUS + 0.8 * RANGE)
+        scene.add_obstacle(shape, motion=motion, name="obstacle")
 
     return build
 
@@ -77,6 +77,9 @@ SCENES = {
     "rod on ball": _over(ddg.Sphere((0.001, 0.002, -0.1), 0.1)),
     "rod on capsule": _over(ddg.Capsule((0.002, -0.1, -0.03), (0.0, 0.1, -0.03), 0.03)),
     "rod on mesh": _over(MESH),
+    "rod on moved mesh": _over(
+        MESH, ddg.Motion(lambda t: t * np.array([[0.03, 0, 0], [0, 0.1, 0.03], [0, 0, 0], [0, 0, 0.1]]))
+    ),
     "sheet on ball": sheet_on_ball,
     "sheets": sheets,
     "rod on sheet": rod_on_sheet,

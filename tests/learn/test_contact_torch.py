@@ -1,5 +1,6 @@
 """What goes into steps in contact as tensors: numbers of contact of every world, moved obstacles, starts; and what is refused."""
 
+import numpy as np
 import pytest
 
 import ddg_warp as ddg
@@ -10,7 +11,7 @@ from tests.learn.differences import TIGHT
 
 torch = pytest.importorskip("torch")
 from ddg_warp.learn.contact_places import contact_elements  # noqa: E402
-from ddg_warp.torch import Simulator  # noqa: E402
+from ddg_warp.torch import RodParameters, ShellParameters, Simulator  # noqa: E402
 from tests.learn.test_torch import check  # noqa: E402
 
 RUBBING = {"friction": 0.3, "velocity": 0.05}
@@ -173,3 +174,46 @@ def test_what_does_not_fit_is_refused():
         state.positions.sum().backward()
     with pytest.raises(SceneError, match=r"contact: equilibria"):
         own.equilibrium()
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "learned"),
+    [
+        ("crossing rods", RodParameters, "radius"),
+        ("sheets", ShellParameters, "thickness"),
+        ("rod on sheet", RodParameters, "radius"),
+    ],
+)
+def test_sizes_of_sections_are_those_that_touch(name, module, learned):
+    """Learned radii and thicknesses give what a scene has that is built with them, contact included."""
+    own, _ = simulator(name, "penalty")
+    factors = module(own, names=(learned,))
+    values = factors()
+    (change,) = factors.parameters()
+    with torch.no_grad():
+        change += np.log(1.1)
+    touching = factors()["contact.radius"] / own.parameter("contact.radius")
+    wanted = {"crossing rods": [1.1, 1.1], "sheets": [1.1, 1.1], "rod on sheet": [1.1, 1.0]}[name]
+    torch.testing.assert_close(touching, torch.tensor([wanted], dtype=torch.float64), rtol=1e-12, atol=0.0)
+    torch.testing.assert_close(values["contact.radius"], own.parameter("contact.radius"), rtol=1e-14, atol=0.0)
+
+
+def test_learned_radii_have_gradients():
+    own, start = simulator("crossing rods", "penalty", **RUBBING)
+    factors = RodParameters(own, names=("radius",))
+
+    def loss(change):
+        given = torch.func.functional_call(factors, {"logarithms.radius": change}, ())
+        return weighed(own.rollout(start, given, steps=3)[-1])
+
+    check(loss, {"change": torch.zeros((1, 1), dtype=torch.float64)}, {"change": 1e-6})
+
+
+def test_radii_that_are_given_stay():
+    own, _ = simulated(scene_of("crossing rods", "penalty", radius={"upper": 1.2 * RADIUS}))
+    factors = RodParameters(own, names=("radius",))
+    (change,) = factors.parameters()
+    with torch.no_grad():
+        change += np.log(1.1)
+    found = factors()["contact.radius"] / RADIUS
+    torch.testing.assert_close(found, torch.tensor([[1.1, 1.2]], dtype=torch.float64), rtol=1e-12, atol=0.0)

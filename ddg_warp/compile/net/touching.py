@@ -31,7 +31,8 @@ def touching(scene, net: Net) -> Touching | None:
         if (name := shell.surface.name) in names:
             plate = shell.plate
             half = law.radius.get(name, 0.5 * float(plate.thickness.max()))
-            bodies.append(Body(shell.nodes, MESH, half, name, f"shell {index}", shell.nodes[shell.surface.triangles]))
+            cells = shell.nodes[shell.surface.triangles]
+            bodies.append(Body(shell.nodes, MESH, half, name, f"shell {index}", cells, shell=index))
             bending = float((plate.young * plate.thickness**3 / 12.0 / (1.0 - plate.poisson**2)).max())
             forces.append((net.mass[shell.nodes, 0].max(), bending / half))
     weight = max(GRAVITY, float(np.linalg.norm(scene.gravity)))
