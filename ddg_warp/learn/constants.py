@@ -8,7 +8,8 @@
     "drag.lateral", "drag.friction", "drag.leading" [N/m], "drag.slope" (the tangent of `angle`), "drag.speed" [m/s]
                      of the edges of rods in a granular medium
     "contact.stiffness" [N/m], "contact.range" [m], no larger than the largest of the scene, "contact.friction"
-                     between objects of two names, or of one, that may touch; the last in scenes with friction
+                     between objects of two names, or of one, that may touch; the last in scenes with friction, by direction the
+                     smallest that is not zero, to which the others keep their ratios
     "contact.radius" [m] of rods and obstacles that have one, half thicknesses of shells and meshes
 
 What has numbers of contact, and in which order, `contact_places.contact_elements` tells. Points and edges are in the order of

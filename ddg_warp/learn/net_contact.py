@@ -12,6 +12,7 @@ from ddg_warp.solve.contact.node_items import NodeItems
 from ddg_warp.solve.contact.pair_terms import FRICTION
 from ddg_warp.solve.contact.touch import LAWS
 from ddg_warp.solve.net.exact_contact import ExactContact
+from ddg_warp.solve.net.system import lists
 
 PIECES, LEAST = 256, 64  # of the first things of a world, at most, and what one has at least
 
@@ -24,9 +25,9 @@ class ContactAdjoint:
 
     At kinks gradients are those of one side: where closest points go over an end of an edge or a side of a triangle, whose second
     derivatives jump there; where a pair begins to push, beyond the second derivative of a barrier, and with 1e-14 of the force of a
-    penalty; where the polynomial law of friction begins to slide. What sticks creeps, which is smooth. What keeps a step from being
-    taken at once, the cut of motions, is no part of it. Lengths of edges at rest, which tell what is all but parallel, and arc lengths
-    within which edges are no pair stay as they were built.
+    penalty; where the polynomial law of friction begins to slide, or friction by direction changes sense along the rod. What sticks
+    creeps, which is smooth. The cut of motions, which may keep a step from being taken at once, is no part of it. Lengths of edges at
+    rest, which tell what is all but parallel, and arc lengths within which edges are no pair stay as they were built.
 
     Attributes:
         by_groups: by stiffness, range, thickness, friction and rate, of groups of first and second things (`NUMBERS`, worlds, groups,
@@ -50,7 +51,10 @@ class ContactAdjoint:
         law, friction = LAWS[given.law.law], FRICTION[given.law.friction_law]
         kinds = [pairs.kind for pairs in search.lists]
         self._pull = [pull_kernel(kind, law, real, serial) for kind in kinds]
-        self._rub = [rub_kernel(kind, law, friction, real, serial) for kind in kinds if terms.frictions]
+        directed = bool(terms.frictions) and terms.frictions[0].directions[0] is not None
+        self._rub = [rub_kernel(kind, law, friction, real, serial, directed) for kind in kinds if terms.frictions]
+        self._direct = contact_sums.direction_kernels(real) if directed else ()
+        self._leads = [self._led(search.shapes.beside(kind.first)) for kind in kinds if directed]
         self._sides = [contact_sums.side_kernels(kind, real) for kind in kinds]
         self._group, self._bodies = contact_sums.group_kernels(real), contact_sums.body_kernel(real)
         self._items = [NodeItems(kind, nodes, real, every) for kind in kinds]
@@ -69,7 +73,7 @@ class ContactAdjoint:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [*self._pull, *self._rub, *self._group, self._bodies]
+        own = [*self._pull, *self._rub, *self._group, self._bodies, *self._direct]
         return [*own, *(k for pair in self._sides for k in pair), *(k for items in self._items for k in items.kernels)]
 
     @property
@@ -90,6 +94,7 @@ class ContactAdjoint:
         most = max(pairs.capacity for pairs in lists)
         self._numbers = self._zeros(NUMBERS, most)
         self._start_parts = arrays.allocate((SLOTS, most), vector, self.net.device)
+        self._by_direction = wp.zeros(most if self._direct else 1, dtype=vector, device=self.net.device)
         for items, pairs in zip(self._items, lists, strict=True):
             items.reserve(pairs.capacity)
 
@@ -112,11 +117,13 @@ class ContactAdjoint:
             if rub:
                 self._items[i].list(rub.count, rub.factor.nodes, rub.factor.used)
                 read = [rub.pairs, rub.count, part.found.sides, terms.law, rub.factor.nodes, rub.factor.used]
-                inputs = [*read, before, q, w, self._velocity, rate]
-                self._sweep(self._rub[i], pairs, inputs, [rub.gradient, self._start_parts, self._numbers])
+                inputs = [*read, before, q, w, self._velocity, rate, *rub.directions]
+                written = [rub.gradient, self._start_parts, self._numbers, self._by_direction]
+                self._sweep(self._rub[i], pairs, inputs, written)
                 rub.add_up(rub.gradient, 1.0, by_q, self._items[i])
                 rub.add_up(self._start_parts, 1.0, by_before, self._items[i])
                 self._sum(i, rub)
+                self._lead(i, rub, by_before)
         for size, found in self._things.items():
             starts, things = self._starts[size], len(found) // self.net.worlds
             self._launch(self._bodies, self.by_radius.shape, [found, starts, things], [self.by_radius])
@@ -135,6 +142,22 @@ class ContactAdjoint:
         items = self._items[index]
         inputs = [part.pairs, found.sides, items.places, items.numbers, items.items, self._numbers]
         self._launch(second, found.second.all, inputs, [self._things[found.second.size]])
+
+    def _led(self, beside: np.ndarray) -> tuple:
+        """Of nodes, which first things lead from and to them: starts and items; and memory of what comes by directions."""
+        starts, items = lists(beside.ravel(), self.net.blocks)
+        found = wp.zeros((self.net.worlds, len(beside)), dtype=self.net.vector, device=self.net.device)
+        upload = (arrays.upload(np.asarray(v, np.int32), int, self.net.device) for v in (starts, items))
+        return *upload, found
+
+    def _lead(self, index: int, rub, by_before: wp.array) -> None:
+        """Add to derivatives by the start what comes by the directions of rods."""
+        if self._direct:
+            things, gather = self._direct
+            starts, items, found = self._leads[index]
+            flat, nodes = found.flatten(), by_before.reshape((self.net.worlds, self.net.blocks))
+            self._launch(things, len(flat), [rub.count, rub.starts, rub.partners, self._by_direction], [flat])
+            self._launch(gather, nodes.shape, [starts, items, found], [nodes])
 
     def _pieces(self, pairs) -> tuple[int, int]:
         """How many pieces the first things of a world are summed in, and how many things each has."""

@@ -7,8 +7,9 @@ gradient g of contact at the start x^n of the step, which is one of x^n and of t
     w . f = sum_i weight_i w_i . (t1, t2) psi'(u; mu N) ,   N, n = sum g_i of the first thing,   weight_i = g_i . n / N ,
     u = (t1, t2) . sum_i weight_i (x_i - x_i^n) ,
 
-and its reverse goes through normal force, normal and weights at x^n, through the slip from x^n to x, and to coefficient and rate. The
-matrix of all this by x is symmetric, as what is lagged is no function of x.
+and its reverse goes through normal force, normal and weights at x^n, through the slip from x^n to x, and to coefficient and rate; and
+through the directions of rods at x^n, where friction is directed. The matrix of all this by x is symmetric, as what is lagged is no
+function of x.
 """
 
 from functools import cache
@@ -17,6 +18,7 @@ import warp as wp
 
 from ddg_warp.kernels.contact.gather import SLOTS
 from ddg_warp.kernels.contact.pair_energy import pair_energy_functions, shape_types
+from ddg_warp.kernels.contact.pair_friction import directed_basis
 from ddg_warp.kernels.contact.pair_terms import groups_function, law_struct, read_functions
 from ddg_warp.kernels.contact.surfaces import Kind, sides_struct
 from ddg_warp.kernels.densities import Density
@@ -67,19 +69,24 @@ def pull_kernel(kind: Kind, density: Density, real, serial: bool):
 
 
 @cache
-def rub_kernel(kind: Kind, density: Density, friction: Density, real, serial: bool):
-    """rub(...): what friction brings by slot of the solution and of the start, and by the numbers of pairs, as `pull_kernel` has it."""
+def rub_kernel(kind: Kind, density: Density, friction: Density, real, serial: bool, directed: bool):
+    """rub(...): what friction brings by slot of the solution and of the start, and by the numbers of pairs, as `pull_kernel` has it.
+
+    Where it is `directed`, by the directions of rods (capacity,), too, from `beside` by `ways` as of `pair_friction.lag_kernel`.
+    """
     Law, Sides = law_struct(real), sides_struct(real)
     X, W, P = shape_types(real)
     V, E = wp.types.vector(3, real), wp.types.vector(2, real)
     D, until = wp.types.vector(friction.parameter_size(2), real), until_function(serial)
     evaluate, _, _ = pair_energy_functions(kind, density, real)
     given, corners = read_functions(kind, real)
-    tangents, groups = basis(real), groups_function(real)
+    tangents, groups, along_rod = basis(real), groups_function(real), directed_basis(real)
     slope_of = friction.laws(real, 2)[1]
 
     @wp.func
-    def force(start: X, x: X, v: X, p: P, threshold: real, inner: W, mu: real, velocity: real, inverse: real):
+    def force(
+        start: X, x: X, v: X, d: V, way: V, p: P, threshold: real, inner: W, mu: real, velocity: real, inverse: real
+    ):
         """The derivative of the potential of friction by x, along v."""
         _e, g = evaluate(start, p, threshold, inner)
         push = V()
@@ -88,10 +95,14 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, serial: bo
         normal = wp.length(push)
         n = push / normal
         weight = (g * n) / normal
-        t1, t2 = tangents(n)
         move = (x[0] - start[0]) * weight[0] + (x[1] - start[1]) * weight[1]
         move += (x[2] - start[2]) * weight[2] + (x[3] - start[3]) * weight[3]
         along = v[0] * weight[0] + v[1] * weight[1] + v[2] * weight[2] + v[3] * weight[3]
+        if wp.static(directed):
+            ahead, t2, back = along_rod(n, d, way)
+            t1 = wp.where(wp.dot(ahead + back, move) < real(0.0), back, ahead)
+        else:
+            t1, t2 = tangents(n)
         u = E(wp.dot(t1, move), wp.dot(t2, move))
         f = slope_of(u, D(mu * normal, real(1.0), velocity, real(0.0), real(0.0), inverse))
         return wp.dot(f, E(wp.dot(t1, along), wp.dot(t2, along)))
@@ -109,9 +120,12 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, serial: bo
         w: wp.array(dtype=V),
         velocity: real,
         rate: wp.array(dtype=real),
+        beside: wp.array(dtype=wp.vec2i),
+        ways: wp.array2d(dtype=V),
         parts: wp.array2d(dtype=V),
         start_parts: wp.array2d(dtype=V),
         numbers: wp.array2d(dtype=real),
+        directions: wp.array(dtype=V),
     ):
         tid = wp.tid()
         if tid >= count[0]:
@@ -119,14 +133,23 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, serial: bo
         for pair in range(tid, until(tid, count[0])):
             for i in range(wp.static(NUMBERS)):
                 numbers[i, pair] = real(0.0)
+            if wp.static(directed):
+                directions[pair] = V()
             if used[pair] != 0:
-                world, _i, _j, a, b = groups(law, sides, pairs[pair])
+                world, i, _j, a, b = groups(law, sides, pairs[pair])
+                d, way = V(), V()
+                if wp.static(directed):
+                    first = world * sides.first.nodes_a_world
+                    d = start[beside[i][1] + first] - start[beside[i][0] + first]
+                    way = ways[a, b]
                 p, threshold, inner = given(law, sides, pairs[pair])
                 n = nodes[pair]
-                ds, dx, _dv, dp, _dt, _di, dmu, _dn, dr = wp.grad(force)(
+                ds, dx, _dv, dd, _dw, dp, _dt, _di, dmu, _dn, dr = wp.grad(force)(
                     corners(start, n),
                     corners(x, n),
                     -corners(w, n),
+                    d,
+                    way,
                     p,
                     threshold,
                     inner,
@@ -141,5 +164,7 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, serial: bo
                     numbers[i, pair] = dp[i]
                 numbers[wp.static(FRICTION), pair] = dmu
                 numbers[wp.static(RATE), pair] = dr
+                if wp.static(directed):
+                    directions[pair] = dd
 
     return rub

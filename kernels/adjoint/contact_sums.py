@@ -103,6 +103,41 @@ def side_kernels(kind: Kind, real):
 
 
 @cache
+def direction_kernels(real):
+    """things(...): sums of derivatives by directions of first things; gather(...) adds them to the nodes that these lead between."""
+    V = wp.types.vector(3, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def things(
+        count: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
+        partners: wp.array(dtype=int),
+        directions: wp.array(dtype=V),
+        out: wp.array(dtype=V),
+    ):
+        i = wp.tid()
+        own = V()
+        if count[0] > 0:
+            for p in range(starts[i], starts[i] + partners[i]):
+                own += directions[p]
+        out[i] = own
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def gather(
+        starts: wp.array(dtype=int), items: wp.array(dtype=int), found: wp.array2d(dtype=V), out: wp.array2d(dtype=V)
+    ):
+        """An item is twice the number of a thing in its world, and one more where it leads to the node."""
+        w, k = wp.tid()
+        own = V()
+        for index in range(starts[k], starts[k + 1]):
+            by = found[w, items[index] / 2]
+            own += wp.where(items[index] % 2 == 1, by, -by)
+        out[w, k] = out[w, k] + own
+
+    return things, gather
+
+
+@cache
 def body_kernel(real):
     """bodies(...): add what the things of each body have, which lie in a row."""
 

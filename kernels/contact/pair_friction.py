@@ -69,6 +69,11 @@ def directed_basis(real):
     V, tangents, tiny = wp.types.vector(3, real), basis(real), wp.constant(real(1.0e-12))
 
     @wp.func
+    def root(square: real):
+        """Whose reverse is a number at zero, too."""
+        return wp.where(square > real(0.0), wp.sqrt(wp.max(square, real(1.0e-30))), real(0.0))
+
+    @wp.func
     def directed(n: V, d: V, way: V):
         t1, _t = tangents(n)
         d = wp.normalize(d)
@@ -77,8 +82,8 @@ def directed_basis(real):
         if share > tiny:
             t1 = flat / wp.sqrt(share)
         across = way[2] * way[2] * (real(1.0) - share)
-        forwards = wp.sqrt(way[0] * way[0] * share + across)
-        backwards = wp.sqrt(way[1] * way[1] * share + across)
+        forwards = root(way[0] * way[0] * share + across)
+        backwards = root(way[1] * way[1] * share + across)
         return t1 * forwards, wp.cross(n, t1) * way[2], t1 * backwards
 
     return directed

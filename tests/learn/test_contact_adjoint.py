@@ -18,8 +18,11 @@ each_scene = pytest.mark.parametrize("name", SCENES)
 each_law = pytest.mark.parametrize("law", ["barrier", "penalty"])
 
 
-def differentiated(name: str, law: str, steps: int, speed: float = 0.0, **contact):
-    model = built(scene_of(name, law, **contact))
+def differentiated(name: str, law: str, steps: int, speed: float = 0.0, ways=None, **contact):
+    scene = scene_of(name, law, **contact)
+    if ways:
+        scene.contact_between("bar", "obstacle", friction=ways)
+    model = built(scene)
     ranges = model.net.touching["range"]
     ranges.assign(0.99 * ranges.numpy())  # beyond which it may go, up to the reach of searches
     state = touching(model, along=speed)
@@ -73,6 +76,16 @@ def test_a_step_that_rubs(name, law, form):
     model, gradient, inputs, difference = differentiated(name, law, 1, SLIDING, friction_law=form, **RUBBING)
     check_state(model, gradient, difference)
     check_numbers(model, inputs, difference, ("stiffness", "range", "radius", "friction"))
+
+
+@pytest.mark.parametrize("ways", [(0.2, 0.6, 0.4), pytest.param((0.0, 0.5, 0.3), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("speed", [SLIDING, -SLIDING])
+@pytest.mark.parametrize("name", ["rod on plane", "rod on ball", "rod on capsule", "rod on mesh"])
+def test_friction_by_direction(name, speed, ways):
+    """Of a rod that slides forwards and backwards, whose directions are those of its edges, or across its nodes."""
+    model, gradient, inputs, difference = differentiated(name, "barrier", 2, speed, ways, **RUBBING)
+    check_state(model, gradient, difference)
+    check_numbers(model, inputs, difference, ("radius", "friction"))
 
 
 @each_law

@@ -18,6 +18,9 @@ class FrictionElements(PairElements):
         velocity: below which surfaces stick [m/s].
         directed: nodes beside first things (things, 2), and by groups coefficients over `friction` forwards, backwards and across
             (groups, groups, 3), see `lag_kernel`; None: it is the same all ways.
+
+    Attributes:
+        directions: both of `directed` on the device, None without.
     """
 
     def __init__(
@@ -37,12 +40,12 @@ class FrictionElements(PairElements):
         self._contact, self._velocity = contact, velocity
         self._lag = lag_kernel(self.found.kind, real, linear, serial, directed is not None)
         self._evaluate = friction_kernel(density, real, linear, serial, directed is not None)
-        self._rows, self._directions = ROWS, (None, None)
+        self._rows, self.directions = ROWS, (None, None)
         if directed is not None:
             beside, ways = directed
             self._rows += 1
             ways = wp.array(ways, dtype=wp.types.vector(3, real), device=self.device)
-            self._directions = arrays.upload(beside.astype(np.int32), wp.vec2i, self.device), ways
+            self.directions = arrays.upload(beside.astype(np.int32), wp.vec2i, self.device), ways
         self.kernels += [self._lag, self._evaluate]
         self._kept = ("count", "starts", "partners", "numbers", "places")
         for name in self._kept:
@@ -67,7 +70,7 @@ class FrictionElements(PairElements):
     def lag(self, law, x: wp.array) -> None:
         """Take the pairs of contact as it was evaluated last, at x."""
         of = self._contact
-        inputs = [of.pairs, of.count, self.found.sides, law, x, *self._directions]
+        inputs = [of.pairs, of.count, self.found.sides, law, x, *self.directions]
         inputs += [of.factor, of.gradient, of.items]
         outputs = [self.pairs, self.factor, self.lagged, self.items, self._slip, self._along]
         self._sweep(self._lag, self.found.capacity, inputs, outputs)
