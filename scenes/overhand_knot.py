@@ -1,0 +1,162 @@
+"""An overhand knot of n turns in a long rod is drawn tight: n = 1 is the trefoil, n = 2 the double overhand knot.
+
+A loose knot is a loop of radius R and a braid, where the two strands wind about each other by some 2 n + 1 half turns. Drawn by a
+traction F, a rod of radius h and bending stiffness B needs, by matched expansions in epsilon = sqrt(h / R),
+
+    F h^2 / B = epsilon^4 / 2 + c epsilon^5 + mu P h^2 / B ,    P h^2 / B = sigma epsilon^3 + O(epsilon^4) :
+
+half of the loop's curvature squared, what the braid changes of the energy, and friction of the normal force P in the braid (Audoly,
+Clauvelin and Neukirch, Elastic knots, PRL 99, 164301, 2007; sigma = 0.492 of the trefoil). In the braid half the distance of the
+strands is h v(s / sqrt(h R)), a curve about the unit disc that makes the integral of |v''|^2 / 2 least, with curvatures of opposite
+sign and size 1/2 beyond: sigma is the total force of the disc on it and c comes of its energy. They were found by finite differences.
+Another turn adds 2 pi / 12^(3/4) to sigma, nearly, as the braid becomes a helix.
+
+R is the rod's length less the distance of its ends over 2 pi, h half of the distance at which strands touch. Edges grow along the rod,
+so that nodes of one strand pass those of the other at different times: by equal ones they would lock.
+"""
+
+import numpy as np
+
+import ddg_warp as ddg
+from ddg_warp.run.check import once_reached
+from ddg_warp.scenes import _touching
+
+RADIUS = 1e-3  # m
+B = 1e-4  # N m^2
+STIFF = 10.0  # EA h^2 / B
+RANGE = 0.4 * RADIUS  # m, of contact
+CLOSE = 1.15  # radii, half the distance of the strands at first
+LOOSE = 300.0  # R / h of one turn at first
+TAIL = 0.7  # length of either end beyond the loop over R at first
+GROWS = 0.3  # edges grow by as much either way from the middle of the rod
+STEP_TIME = 1.0  # s, long against all periods: the march is one of equilibria
+INERTIA = 1e-3  # of what moves, over the traction
+SATURATED = 0.2  # velocity of the friction law over the slowest with which the strands slide
+SETTLED = 0.1  # part of the run after which it is compared
+SIGMA = {1: 0.492, 2: 1.468}  # P h^2 / (B epsilon^3)
+BRAID = {1: 0.472, 2: 1.402}  # c
+SOURCE = "Audoly, Clauvelin and Neukirch, 2007"
+
+
+def build(
+    n: int = 1, friction: float = 0.1, tighter: float = 4.0, edge: float = 2.0, steps: int = 150, seed: int = -1
+) -> ddg.Scene:
+    """The knot, its ends along x and its loop in the plane of x and y.
+
+    Args:
+        n: turns, 1 or 2
+        friction: coefficient
+        tighter: by what R shrinks from 300 n^2 radii of the rod
+        edge: length of an edge in the middle over n radii of the rod
+        steps: time steps
+        seed: of a jitter of the nodes at first, a twentieth of the range of contact; none below 0
+    """
+    if n not in SIGMA:
+        raise ValueError(f"n = {n}; there are references for 1 and 2 turns")
+    if not tighter > 1.0:
+        raise ValueError(f"tighter = {tighter}; R shrinks by more than 1")
+    if not 0.0 < edge <= 8.0:
+        raise ValueError(f"edge = {edge}; edges are 8 n radii of the rod at most")
+    R = LOOSE * n**2 * RADIUS
+    points = tied(n, R, edge * n * RADIUS)
+    duration = steps * STEP_TIME
+    scene = ddg.Scene(
+        gravity=(0.0, 0.0, 0.0),
+        analysis=ddg.Dynamics(dt=STEP_TIME, duration=duration),
+        initial=lambda model: model.state(
+            points=points + 0.05 * RANGE * _inner(points) * _touching.jitter(points.shape, seed)
+        ),
+    )
+    speed = np.pi * R * np.log(tighter) / duration
+    section = ddg.Stiffness(
+        EA=STIFF * B / RADIUS**2, EI1=B, mass_per_length=INERTIA * B / (R * speed) ** 2, radius=RADIUS
+    )
+    rod = scene.add_rod(points, section=section, natural="straight", twist=False, name="rod")
+
+    def drawn(t: float) -> float:
+        return np.pi * R * (1.0 - tighter ** -(t / duration))
+
+    scene.fix(rod, [0], motion=ddg.Motion(translation=lambda t: (-drawn(t), 0.0, 0.0)))
+    scene.fix(rod, [-1], motion=ddg.Motion(translation=lambda t: (drawn(t), 0.0, 0.0)))
+    # what touches pushes with some B h n / R^2 an edge, and is to keep the strands about half of the range apart
+    stiffness = 3.0 * B * n / R**2 / RADIUS
+    scene.contact(range=RANGE, stiffness=stiffness, friction=friction, velocity=SATURATED * speed / tighter)
+    return scene
+
+
+def tied(n: int, R: float, edge: float) -> np.ndarray:
+    """Points (m, 3) [m] of a loose knot: two straight ends, a circle of radius R [m], and strands that wind about each other where
+    these touch. Edges have a length [m] in the middle of the rod.
+    """
+    around, reach = 0.6 * R, (3.8 + 5.86 * (n - 1)) * np.sqrt(RADIUS * R)
+    x = np.linspace(-around, around, 8001)
+    height = R - np.sqrt(R**2 - x**2)
+    share = np.clip(0.5 * (x / min(reach, 0.9 * around) + 1.0), 0.0, 1.0)
+    angle = (2 * n + 1) * np.pi * share**2 * (3.0 - 2.0 * share)
+    apart = np.hypot(height, 2.0 * CLOSE * RADIUS * (1.0 - (x / around) ** 2) ** 2)
+    half = 0.5 * apart[:, None] * np.stack([0.0 * x, np.cos(angle), np.sin(angle)], axis=1)
+    middle = np.stack([x, 0.5 * height, 0.0 * x], axis=1)
+    turn = np.linspace(np.arcsin(0.6), 2.0 * np.pi - np.arcsin(0.6), 8001)[1:-1]
+    loop = R * np.stack([np.sin(turn), 1.0 - np.cos(turn), 0.0 * turn], axis=1)
+    end = np.zeros((2001, 3))
+    end[:, 0] = np.linspace(-TAIL * R, 0.0, 2001) - around
+    curve = np.concatenate([end[:-1], middle - half, loop, middle + half, -end[-2::-1]])
+    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1)))
+    k = np.linspace(0.0, 1.0, int(np.ceil(along[-1] / edge)) + 1)
+    place = (k - GROWS * k * (1.0 - k)) * along[-1]
+    return np.stack([np.interp(place, along, component) for component in curve.T], axis=1)
+
+
+def _inner(points: np.ndarray) -> np.ndarray:
+    return np.pad(np.ones(len(points) - 2), 1)[:, None]
+
+
+def observe(model, state) -> dict[str, float]:
+    """Traction F [N], normal force P in the braid [N], R [m], half of the distance of strands that touch, and the smallest gap [m]."""
+    points, found = state.points().reshape(-1, 3), model.contacts(state)
+    first, last = (np.reshape(reaction.force, (-1, 3))[0] for reaction in model.reactions(state))
+    push = np.linalg.norm(found.force, axis=1)
+    slack = np.linalg.norm(np.diff(points, axis=0), axis=1).sum() - np.linalg.norm(points[-1] - points[0])
+    return {
+        "traction": 0.5 * (last[0] - first[0]),
+        "normal": push.sum(),
+        "radius": slack / (2.0 * np.pi),
+        "half": RADIUS + 0.5 * float((push * found.gap).sum() / max(push.sum(), 1e-300)),
+        "gap": _touching.smallest_gap(model, state),
+    }
+
+
+def check(result) -> list[ddg.Check]:
+    """Traction against that of the loose knot, and normal force against its limit."""
+    names = ("traction over that of a loose knot", "P h^2 / (B epsilon^3) at epsilon = 0")
+    checks = once_reached(result, result.model.scene.analysis.duration, names, lambda: _checks(result, names))
+    return checks + _touching.kept_apart(result)
+
+
+def _checks(result, names) -> list[ddg.Check]:
+    scene = result.model.scene
+    R = np.array(result.series["radius"])
+    n = round(float(np.sqrt(R[0] / RADIUS / LOOSE)))
+    late = np.array(result.times) > SETTLED * result.times[-1]
+    R, traction, normal, h = (np.array(result.series[k])[late] for k in ("radius", "traction", "normal", "half"))
+    epsilon = np.sqrt(h / R)
+    law = (0.5 * epsilon**4 + BRAID[n] * epsilon**5) * B / h**2 + scene.touching.friction * normal
+    limit = np.polyfit(epsilon, normal * h**2 / B / epsilon**3, 1)[1]
+    return [
+        ddg.Check(names[0], (traction / law).mean(), 1.0, 0.1, SOURCE, True),
+        ddg.Check(names[1], limit, SIGMA[n], 0.1, SOURCE, True),
+    ]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The normal force in the braid over the length of edges."""
+    return ddg.bench.Study({"edge": (8.0, 4.0, 2.0)}, "P h^2 / (B epsilon^3)", whole=True)
+
+
+def picture(result, frames) -> dict:
+    """The second half of the run, without the ends of the rod."""
+    shown = {t: points.copy() for t, points in frames.items() if t >= 0.5 * max(frames)}
+    reach = 0.9 * np.ptp(shown[min(shown)][:, 1])
+    for points in shown.values():
+        points[:, 0] = points[:, 0].clip(-reach, reach)
+    return {"points_by_time": shown}

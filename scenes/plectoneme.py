@@ -1,0 +1,183 @@
+"""A long rod under tension is twisted until it winds about itself: a plectoneme, two strands on one helix, with a loop at its end.
+
+Of a plectoneme of the radius r, at which the strands touch, and the angle a between them and its axis the energy is stationary,
+
+    M r / B = 2 sin^3(a) cos(a) / cos(2 a) ,    T r^2 / B = sin^4(a) (1 / 2 + 1 / cos(2 a)) ,
+
+with B the bending stiffness, T the tension and M the torque: while it grows, both are constant (Clauvelin, Audoly and Neukirch,
+Mechanical response of plectonemic DNA: an analytical solution, Macromolecules 41, 4479, 2008). The twisting stiffness says how much
+of the turns goes there, and no more. Here the tension is a dead force, the ends are hinges, and one of them is turned. A
+straight rod bears more than twice that torque before it buckles; so it is drawn with a loop of one turn and a half, which tension and
+twist close.
+"""
+
+import numpy as np
+
+import ddg_warp as ddg
+from ddg_warp.run.check import once_reached
+from ddg_warp.scenes import _touching
+
+RADIUS = 1e-3  # m
+B = 1e-4  # N m^2
+STIFF = 10.0  # EA h^2 / B
+RANGE = 0.4 * RADIUS  # m, of contact
+CLOSE = 1.15  # radii, half the distance of the strands at first
+BEND = 8.0 * RADIUS  # m, radius at which the ends turn into the strands at first
+WOUND = 1.5  # turns of the strands at first
+LOOP = (6.0 * RADIUS, 14.0 * RADIUS)  # m, about half of the width and the height of the loop at first
+STEP_TIME = 1.0  # s, long against all periods: the march is one of equilibria
+MASS_PER_LENGTH = (
+    1000.0  # kg/m; in steps so long inertia is some thousandths of the tension, yet slows what is drawn too freely
+)
+TWISTED = 1.1  # torque at first over that of the plectoneme
+SETTLED = 0.6  # part of the run after which tension, torque and angle are compared
+SOURCE = "Clauvelin, Audoly and Neukirch, 2008"
+
+
+def build(
+    angle: float = 0.4, turns: float = 7.0, tail: float = 70.0, edge: float = 1.0, steps: int = 200, seed: int = -1
+) -> ddg.Scene:
+    """The rod along x, with a loop in it along y.
+
+    Args:
+        angle: between strands and axis for which the tension is meant [rad]
+        turns: of the end
+        tail: length of the rod on either side over its radius, at first
+        edge: length of an edge over the radius of the rod
+        steps: time steps
+        seed: of a jitter of the nodes at first, a tenth of the range of contact; none below 0
+    """
+    if not 0.1 <= angle <= 0.7:
+        raise ValueError(f"angle = {angle}; strands lie at 0.1 to 0.7 to the axis, below pi / 4")
+    if not 0.0 < edge <= 2.0:
+        raise ValueError(f"edge = {edge}; edges are 2 radii of the rod at most")
+    points = looped(angle, tail * RADIUS, edge * RADIUS)
+    duration = steps * STEP_TIME
+    free = np.pad(np.ones(len(points) - 2), 1)[:, None]
+    scene = ddg.Scene(
+        gravity=(0.0, 0.0, 0.0),
+        analysis=ddg.Dynamics(dt=STEP_TIME, duration=duration),
+        initial=lambda model: model.state(points=points + 0.1 * RANGE * free * _touching.jitter(points.shape, seed)),
+    )
+    section = ddg.Stiffness(
+        EA=STIFF * B / RADIUS**2,
+        EI1=B,
+        GJ=B,
+        mass_per_length=MASS_PER_LENGTH,
+        rotary_inertia=MASS_PER_LENGTH * RADIUS**2,
+        radius=RADIUS,
+    )
+    rod = scene.add_rod(points, section=section, natural=(0.0, 0.0, TWISTED * law(angle)[0] / RADIUS), name="rod")
+    scene.fix(rod, [0])
+    scene.fix(rod, [-1], components="yz")
+    scene.fix_twist(rod, [0])
+    scene.fix_twist(
+        rod, [-1], motion=ddg.Motion(angle=lambda t: -2.0 * np.pi * turns * t / duration, axis=(1.0, 0.0, 0.0))
+    )
+    tension = law(angle)[1] * B / RADIUS**2
+    scene.add_force(rod, -1, (tension, 0.0, 0.0))
+    scene.contact(range=RANGE, stiffness=0.1 * B / RADIUS**3)
+    return scene
+
+
+def law(angle: float) -> tuple[float, float]:
+    """M r / B and T r^2 / B of strands at an angle [rad] to the axis."""
+    s, c, both = np.sin(angle), np.cos(angle), np.cos(2.0 * angle)
+    return 2.0 * s**3 * c / both, s**4 * (0.5 + 1.0 / both)
+
+
+def looped(angle: float, tail: float, edge: float) -> np.ndarray:
+    """Points (n, 3) [m] of two ends of a length [m] along x, which turn into strands about y with a loop; edges of a length [m]."""
+    r = CLOSE * RADIUS
+    high = 2.0 * np.pi * WOUND * r / np.tan(angle)
+    u = np.linspace(0.0, 1.0, 4001)
+    turn, end = 0.5 * np.pi * u, np.linspace(tail, 0.0, 4001)
+    # distance from y, angle about it, and height, from the end to the top of the loop
+    distance = [r + BEND + end, r + BEND * (1.0 - np.sin(turn)), r + 0.0 * u]
+    distance.append(np.cos(turn) * (r + LOOP[0] * np.sin(turn) ** 2))
+    about = [0.0 * u, 0.0 * u, np.pi * 2.0 * WOUND * u, 2.0 * np.pi * WOUND + 0.0 * u]
+    height = [0.0 * u, BEND * (1.0 - np.cos(turn)), BEND + high * u, BEND + high + LOOP[1] * np.sin(turn)]
+    d, a, y = (np.concatenate([part[:-1] for part in parts]) for parts in (distance, about, height))
+    one = np.stack([-d * np.cos(a), y, d * np.sin(a)], axis=1)
+    curve = np.concatenate([one, (one * [-1.0, 1.0, -1.0])[::-1]])
+    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1)))
+    place = np.linspace(0.0, along[-1], int(np.ceil(along[-1] / edge)) + 1)
+    return np.stack([np.interp(place, along, component) for component in curve.T], axis=1)
+
+
+def observe(model, state) -> dict[str, float]:
+    """Torque [N m], tension [N], half of the distance of strands that touch [m], and the smallest gap [m]; of the middle of what
+    touches the angle [rad] between strands and axis and the mean distance [m] from it, and its length [m]."""
+    points, found = state.points().reshape(-1, 3), model.contacts(state)
+    push = np.linalg.norm(found.force, axis=1)
+    reactions = model.reactions(state)
+    inner, axis = wound(points, found.point)
+    angle = radius = np.nan
+    if len(inner) > 8:
+        tangents = np.diff(points, axis=0)
+        tangents /= np.linalg.norm(tangents, axis=1)[:, None]
+        angle = np.arccos(np.abs(tangents[inner[:-1]] @ axis)).mean()
+        away = points[inner] - points[inner].mean(axis=0)
+        radius = np.sqrt(((away - np.outer(away @ axis, axis)) ** 2).sum(axis=1)).mean()
+    return {
+        "torque": abs(np.reshape(reactions[2].moment, (-1, 3))[0, 0]),
+        "tension": abs(np.reshape(reactions[0].force, (-1, 3))[0, 0]),
+        "half": RADIUS + 0.5 * float((push * found.gap).sum() / max(push.sum(), 1e-300)),
+        "gap": _touching.smallest_gap(model, state),
+        "angle": angle,
+        "radius": radius,
+        "length": float(np.ptp(found.point @ axis)) if len(found.point) else 0.0,
+    }
+
+
+def wound(points: np.ndarray, touching: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes of the middle half of what touches at points (n, 3) [m], and the direction (3,) of its axis."""
+    if len(touching) < 4:
+        return np.zeros(0, int), np.array([0.0, 1.0, 0.0])
+    middle = touching.mean(axis=0)
+    axis = np.linalg.svd(touching - middle)[2][0]
+    along, reach = (points - middle) @ axis, 0.25 * np.ptp(touching @ axis)
+    near = np.linalg.norm(points - middle - np.outer(along, axis), axis=1) < 3.0 * RADIUS
+    return np.flatnonzero((np.abs(along) < reach) & near), axis
+
+
+def check(result) -> list[ddg.Check]:
+    """Torque, tension, angle and radius of the plectoneme while it grows."""
+    names = (
+        "torque M r / B by the tension",
+        "tension T r^2 / B by the angle",
+        "angle by the tension",
+        "radius over that of contact",
+    )
+    checks = once_reached(result, result.model.scene.analysis.duration, names, lambda: _checks(result, names))
+    return checks + _touching.kept_apart(result)
+
+
+def _checks(result, names) -> list[ddg.Check]:
+    from scipy.optimize import brentq
+
+    late = np.array(result.times) > SETTLED * result.times[-1]
+    values = {name: np.array(series)[late].mean() for name, series in result.series.items()}
+    r, tension = values["half"], values["tension"]
+    pull = tension * r**2 / B
+    angle = brentq(lambda a: law(a)[1] - pull, 1e-3, 0.75)
+    return [
+        ddg.Check(names[0], values["torque"] * r / B, law(angle)[0], 0.05, SOURCE, True),
+        ddg.Check(names[1], pull, law(values["angle"])[1], 0.05, SOURCE, True),
+        ddg.Check(names[2], values["angle"], angle, 0.05, SOURCE, True),
+        ddg.Check(names[3], values["radius"] / r, 1.0, 0.05, "the strands touch on the axis", True),
+    ]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The torque over the length of edges."""
+    return ddg.bench.Study({"edge": (2.0, 1.4, 1.0, 0.7)}, "torque", whole=True)
+
+
+def picture(result, frames) -> dict:
+    """The rod at the end, without most of its ends."""
+    last = max(frames)
+    points = frames[last].copy()
+    top = points[points[:, 1].argmax(), 0]
+    points[:, 0] = points[:, 0].clip(top - 30.0 * RADIUS, top + 30.0 * RADIUS)
+    return {"points_by_time": {last: points}}

@@ -1,0 +1,51 @@
+"""Steps that contact holds up: what is cut short is not taken for rounding, and a knot that locks says so."""
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp.errors import SolverError
+from ddg_warp.scenes import overhand_knot
+from ddg_warp.solve.tangent import Tangent
+
+
+def test_steps_that_are_cut_end_in_balance(device):
+    """A rod that is drawn by its clamp onto a floor that it almost touches: motion is cut to nothing, forces are not small."""
+    radius, apart, edges = 2e-3, 2e-5, 40
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    points = np.zeros((edges + 1, 3))
+    points[:, 2] = np.linspace(1.0, 0.0, edges + 1) + radius + apart
+    section = ddg.Stiffness(EA=1e6, EI1=1.0, GJ=1.0, mass_per_length=1e-3, rotary_inertia=1e-9, radius=radius)
+    rod = scene.add_rod(points, section=section)
+    scene.clamp_end(rod, "first", motion=ddg.Motion(translation=lambda t: (0.0, 0.0, -1e-3 * t)))
+    scene.add_force(rod, edges // 2, (0.1, 0.0, 0.0))
+    scene.add_obstacle(ddg.Plane())
+    scene.contact(range=apart, stiffness=1e6)
+    model = scene.build(device=device)
+    integrator = ddg.Integrator(model)
+    state = integrator.step(model.state(), 1.0)
+    tangent = Tangent(model)
+    left = np.where(tangent.free, tangent.gradient(state) - tangent.loads(1.0, tangent.dofs(state)), 0.0)
+    assert np.abs(left).max() < 1e-5  # inertia is some 1e-6 N
+    assert list(integrator.statistics()["outcomes"]) == ["converged"]
+
+
+@pytest.mark.slow
+def test_a_knot_is_drawn_until_it_locks(device):
+    """Far beyond the loose knot every step converges, until no room is left, which names the edges; nothing passes through."""
+    scene = overhand_knot.build(tighter=100.0, steps=200)
+    model = scene.build(device=device)
+    integrator, state = ddg.Integrator(model), scene.initial(model)
+    locked = None
+    for _ in range(200):
+        try:
+            state = integrator.step(state, scene.analysis.dt)
+        except SolverError as error:
+            locked = str(error)
+            break
+    found = overhand_knot.observe(model, state)
+    assert found["radius"] < 20.0 * overhand_knot.RADIUS
+    assert locked is None or ("no_room" in locked and "is between edge" in locked)
+    contact = integrator.statistics()["contact"]
+    assert contact["refused_crossings"] == 0
+    assert contact["smallest_gap"] > 0.0
