@@ -36,6 +36,7 @@ SMALL = {
     "identify_stiffness": {},
     "inverse_rest_shape": {"strands": 2},
     "leaf": {"cells": 20},
+    "knit_patch": {"rows": 2, "columns": 2, "n": 16, "dt": 0.02},
     "lee_frame": {"n": 40},
     "localized_helix": {},
     "magnetic_buckling": {"over": 0.9},
