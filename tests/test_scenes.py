@@ -74,6 +74,7 @@ SMALL = {
     "vibration": {"n": 25},
     "walker": {"steps": 75},
     "whirling": {},
+    "woven_cylinder": {"strands": 8, "rings": 5, "turns": 0.08, "dt": 0.02},
 }
 LONG = (
     "helical_flagellum",
