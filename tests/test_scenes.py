@@ -20,6 +20,7 @@ SMALL = {
     "cloth_twist": {"around": 16, "along": 8, "turns": 0.2},
     "crossed_beams": {"n": 20},
     "deep_arch": {},
+    "entangled_worms": {"count": 7, "n": 40, "dt": 0.02},
     "flag_on_pole": {"cells": 12},
     "flagellum": {"n": 25, "steps": 50},
     "flying_beam": {"n": 20},
