@@ -27,6 +27,7 @@ SMALL = {
     "greenhill": {"n": 100},
     "gridshell_dome": {"rods": 3},
     "hair": {"strands": 16},
+    "hair_combed": {"gaps": 2, "rows": 2, "n": 24},
     "hanging_chain": {"n": 25},
     "hanging_sheet": {},
     "helical_flagellum": {"n": 24},
