@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
+from ddg_warp.io.tube import SIDES
 from ddg_warp.run import figure
 from ddg_warp.run.catalog import load_scene, one_liner, scene_files
 from ddg_warp.run.cli import main
 from ddg_warp.run.simulate import simulate
+from ddg_warp.scenes import _touching
 
 
 @pytest.fixture
@@ -117,6 +119,31 @@ def test_hair_is_shown_with_its_head_side_by_side(drawn):
     np.testing.assert_allclose(np.linalg.norm(roots - centre, axis=1), radius, rtol=0.05)
     figure.rods_picture(result.model, path="unused.png", **options)
     assert len(drawn[0].axes) == 3
+
+
+def test_rods_as_thick_as_they_are(drawn):
+    """Tubes of an open and a closed rod have their surfaces, each in a color of its own, with obstacles in grey, instead of lines."""
+    angle = 2.0 * np.pi * np.arange(60) / 60
+    scene = ddg.Scene()
+    section = {"section": ddg.Circle(0.05), "material": ddg.Material(1e6)}
+    scene.add_rod(np.linspace((-1.0, 0.0, 0.0), (1.0, 0.0, 0.0), 5), **section)
+    scene.add_rod(np.stack([np.cos(angle), np.sin(angle), 0.0 * angle + 1.0], axis=1), closed=True, **section)
+    scene.add_obstacle(ddg.Capsule((0, 0, 3), (1, 0, 3), 0.1), motion=ddg.Motion(translation=lambda t: (0.0, 0.0, t)))
+    scene.contact()
+    model = scene.build("cpu")
+    points, triangles, colors = _touching.colored_tubes(model, model.state().points(), t=2.0)
+    a, b, c = np.moveaxis(points[triangles], 1, 0)
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    own = [(colors == color).all(axis=1) for color in [*_touching.colors(model), [_touching.GREY] * 3]]
+    assert np.sum(own) == len(triangles)
+    perimeter = 2.0 * SIDES * 0.05 * np.sin(np.pi / SIDES)
+    ring = 120.0 * np.sin(np.pi / 60)
+    assert [area[mine].sum() for mine in own[:2]] == pytest.approx([2.0 * perimeter, ring * perimeter], rel=1e-3)
+    assert points[triangles[own[2]], 2].min() == pytest.approx(4.9, abs=1e-3)
+    bodies = {0.0: (points, triangles, colors)}
+    figure.rods_picture(model, {0.0: model.state().points()}, "unused.png", bodies=bodies, lines=False)
+    (faces,) = drawn[0].axes[0].collections
+    assert len(faces.get_facecolor()) == len(triangles)
 
 
 def test_what_is_learned_is_drawn(drawn):

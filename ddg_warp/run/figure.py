@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgba_array
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
@@ -48,7 +48,8 @@ def rods_picture(
     unit: str = "m",
     values: np.ndarray | None = None,
     colors: np.ndarray | None = None,
-    bodies: Mapping[float, tuple[np.ndarray, np.ndarray]] | None = None,
+    bodies: Mapping[float, tuple[np.ndarray, ...]] | None = None,
+    lines: bool = True,
     side_by_side: bool = False,
     field: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> None:
@@ -65,7 +66,8 @@ def rods_picture(
         unit: That of lengths.
         values: A number at each point, shape (P,) of all worlds, which colors the latest shape; `label` is then its name.
         colors: RGB of each rod, shape (R, 3), instead of a color a time.
-        bodies: What else stands there at each time: points (n, 3) and triangles (t, 3).
+        bodies: What else stands there at each time: points (n, 3) and triangles (t, 3), grey, or with RGB of each (t, 3).
+        lines: Whether rods are drawn, as lines; not where bodies show them as thick as they are.
         side_by_side: Whether every shape has a panel of its own.
         field: Vectors (n, 3) at points (n, 3), drawn as arrows behind the latest shape, the largest as long as their distance.
     """
@@ -78,7 +80,7 @@ def rods_picture(
     surfaces = getattr(rods, "surfaces", None)
     worlds = points.shape[1] // Shapes.of(curves, surfaces).point_count
     shapes = Shapes.of(curves, surfaces, worlds)
-    extents = np.concatenate([points.reshape(-1, 3), *(body for body, _ in (bodies or {}).values())])
+    extents = np.concatenate([points.reshape(-1, 3), *(body for body, *_ in (bodies or {}).values())])
     low, high = extents.min(axis=0), extents.max(axis=0)
     flat = np.flatnonzero(high - low <= FLAT * np.max(high - low))
     axes = [k for k in range(3) if k != (flat[0] if len(flat) else None)]
@@ -99,13 +101,14 @@ def rods_picture(
         if values is not None:
             color = TIME_COLORS(norm(values)) if latest else LIGHT_GREY
         if time in (bodies or {}):
-            body, triangles = bodies[time]
-            _draw_triangles(plot, body[triangles][..., axes], LIGHT_GREY)
+            body, triangles, *shades = bodies[time]
+            shade = to_rgba_array(shades[0]) if shades else LIGHT_GREY
+            _draw_triangles(plot, body[triangles][..., axes], shade)
         if surfaces is not None:
             faces = shapes.surfaces.triangles
             shade = color[faces].mean(axis=1) if np.ndim(color) == 2 else color
             _draw_triangles(plot, shape[faces][..., axes], shade)
-        if len(curves.counts):
+        if lines and len(curves.counts):
             shade = color[shapes.rows] if np.ndim(color) == 2 else color
             _draw_rods(plot, shape[shapes.rows][:, axes], shapes.curves, shade if colors is None else colors, latest)
         if side_by_side:

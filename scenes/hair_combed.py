@@ -1,0 +1,147 @@
+"""A comb is pulled down through curled hair: what it feels, and that every strand stays between its own teeth.
+
+Strands hang from held roots, as helices that widen with the distance from them. Teeth of the comb stand between groups of strands, by
+the roots, and move down and out of the hair. They are closer than the curls are wide, and draw these straight as they pass. Roots and
+comb together carry at every time the weight of the hair and its inertia, and the hair gains no more energy than the comb does work. The
+comb is smooth; strands rub on each other.
+"""
+
+import numpy as np
+
+import ddg_warp as ddg
+from ddg_warp.scenes import _touching
+
+LENGTH = 0.12  # m
+RADIUS, TOOTH = 4e-4, 1e-3  # m, of strands and teeth
+SPACING = 2e-3  # m, of strands
+ABREAST = 3  # strands of a row between two teeth
+RANGE = 2e-4  # m, of contact
+APART = 2.0 * RADIUS + 1.5 * RANGE  # m, between strands at first
+CURL, TURNS = 3e-3, 3.0  # m, radius of the helices, and how many turns a strand has
+STRAIGHT = 0.02  # m, by the roots, where there are no curls yet
+BEYOND = 0.012  # m, of teeth to both sides of the roots
+BEGINS = 8e-3  # m, of the comb below the roots
+LEAVES = 0.03  # m, of the comb below the ends of straight strands
+HAIR = ddg.Material(young=1e7, density=1000.0, poisson=0.5)
+
+
+def build(
+    gaps: int = 4,
+    rows: int = 4,
+    n: int = 40,
+    friction: float = 0.3,
+    speed: float = 0.2,
+    damping: float = 4.0,
+    dt: float = 1.0 / 300.0,
+    seed: int = 1,
+) -> ddg.Scene:
+    """The strands hang down along z from the plane z = 0, the teeth are along x.
+
+    Args:
+        gaps: between teeth, of 3 strands in each row
+        rows: of strands, one behind the other
+        n: edges of a strand
+        friction: Coulomb's coefficient between strands
+        speed: of the comb [m/s]
+        damping: of masses, by the air [1/s]
+        dt: time step [s]
+        seed: of the random phases of the curls
+    """
+    duration = np.ceil((LENGTH + LEAVES - BEGINS) / speed / dt) * dt
+    points = _touching.pushed_apart(curled(gaps, rows, n, np.random.default_rng(seed)), APART, held=2)
+    scene = ddg.Scene(mass_damping=damping, analysis=ddg.Dynamics(dt=dt, duration=duration))
+    hair = scene.add_rods(points, section=ddg.Circle(RADIUS), material=HAIR, name="hair")
+    scene.clamp(hair, edges=[0])
+    moved = ddg.Motion(translation=lambda t: (0.0, 0.0, -speed * t))
+    for y in teeth(gaps):
+        start, end = (-BEYOND, y, -BEGINS), (SPACING * (rows - 1) + BEYOND, y, -BEGINS)
+        scene.add_obstacle(ddg.Capsule(start, end, TOOTH), motion=moved, name="comb")
+    scene.contact(range=RANGE, friction=friction)
+    scene.contact_between("hair", "comb", friction=0.0)
+    return scene
+
+
+def teeth(gaps: int) -> np.ndarray:
+    """Where teeth are along y (gaps + 1,) [m]; those between groups of strands are one more spacing wide."""
+    return SPACING * (ABREAST + 1) * np.arange(gaps + 1)
+
+
+def curled(gaps: int, rows: int, n: int, random) -> np.ndarray:
+    """Strands (rods, nodes, 3) [m]: one gap after the other, row by row; they may overlap."""
+    y = (teeth(gaps)[:-1, None] + SPACING * np.arange(1, ABREAST + 1)).ravel()
+    roots = np.stack(np.meshgrid(y, SPACING * np.arange(rows), indexing="ij"), axis=-1).reshape(-1, 1, 2)[..., ::-1]
+    s = np.linspace(0.0, LENGTH, n + 1)
+    wide = CURL * np.sin(0.5 * np.pi * np.clip((s - STRAIGHT) / (0.5 * LENGTH), 0.0, 1.0)) ** 2
+    angle = 2.0 * np.pi * TURNS * s / LENGTH + random.uniform(-0.7, 0.7, (len(roots), 1))
+    curl = wide[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.concatenate([roots + curl, np.broadcast_to(-s[:, None], (*angle.shape, 1))], axis=-1)
+
+
+def observe(model, state) -> dict[str, float]:
+    """See `_touching.observe`; force of the comb upwards [N], strands that are in a gap not their own, and the balance of forces [N].
+
+    The last is what roots and comb exert on the hair, with its weight, by components; its momentum [N s] follows.
+    """
+    roots, *comb = (np.array(reaction.force) for reaction in model.reactions(state))
+    forces = sum(comb) + roots + _touching.mass(model) * np.array(model.scene.gravity)
+    momentum = _touching.momentum(model, state)
+    parts = {f"{n}_{k}": float(v[k]) for n, v in (("force", forces), ("momentum", momentum)) for k in range(3)}
+    return (
+        _touching.observe(model, state) | parts | {"comb": float(sum(comb)[2]), "astray": float(astray(model, state))}
+    )
+
+
+def comb_at(model, t: float) -> float:
+    """Height of the comb at a time [m]."""
+    return float(model.scene.obstacles[0].motion.shift(t)[0, 2]) - BEGINS
+
+
+def astray(model, state) -> int:
+    """How often strands cross the height of the comb in another gap than that of their roots."""
+    points, gaps = state.points().reshape(_touching.rods_of(model), -1, 3), len(model.scene.obstacles) - 1
+    above = points[..., 2] - comb_at(model, state.time)
+    rod, edge = np.nonzero(above[:, :-1] * above[:, 1:] <= 0.0)
+    share = above[rod, edge] / (above[rod, edge] - above[rod, edge + 1])
+    y = (1.0 - share) * points[rod, edge, 1] + share * points[rod, edge + 1, 1]
+    return int((np.searchsorted(teeth(gaps), y) - 1 != rod // (len(points) // gaps)).sum())
+
+
+def check(result) -> list[ddg.Check]:
+    """Nothing passes or overlaps, forces and momentum balance, the comb's work covers the energy, and no strand leaves its gap."""
+    model, times = result.model, np.array(result.times)
+    series = {name: np.array(values) for name, values in result.series.items()}
+    force, momentum = (np.stack([series[f"{name}_{k}"] for k in range(3)], axis=1) for name in ("force", "momentum"))
+    inertia = np.diff(momentum, axis=0) / np.diff(times)[:, None] + model.scene.mass_damping * momentum[1:]
+    off = np.linalg.norm(force[1:] - inertia, axis=1) / _touching.weight(model)
+    # a step that is taken in parts ends with the force of the last
+    whole = np.sort(off)[: max(1, len(off) - result.statistics["retries"])]
+    way = np.diff([comb_at(model, t) for t in times])
+    return [
+        *_touching.checks(result),
+        ddg.Check("forces less inertia over the weight", whole.max(), 0.0, 1e-5, "Newton"),
+        _touching.energy_check(result, np.append(0.0, np.cumsum(series["comb"][1:] * way)), 2e-3),
+        ddg.Check("strands in another gap than their roots", series["astray"].max(), 0.0, 0.0, "teeth part the hair"),
+    ]
+
+
+def benchmark() -> ddg.bench.Study:
+    """Work of the comb over edges and steps."""
+    return ddg.bench.Study(
+        {"n": (20, 40), "dt": (1 / 150, 1 / 300)},
+        lambda result: np.mean(result.series["comb"]),
+        {"n": 60, "dt": 1 / 1200},
+        fixed={"gaps": 2, "rows": 2},
+        unit="N",
+    )
+
+
+def picture(result, frames) -> dict:
+    """The hair and the comb before, at two thirds, and at the end."""
+    times = sorted(frames)
+    times = times[0], times[2 * len(times) // 3], times[-1]
+    return {
+        "points_by_time": {t: frames[t] for t in times},
+        "bodies": {t: _touching.colored_tubes(result.model, frames[t], t) for t in times},
+        "lines": False,
+        "side_by_side": True,
+    }
