@@ -91,13 +91,18 @@ def shown(frames) -> dict:
     return {t: frames[t] for t in list(frames)[:: max(1, (len(frames) - 1) // (PANELS - 1))]}
 
 
-def head(roots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) and triangles (t, 3) of the ball that roots (count, 3) stand on, in least squares a little below them."""
-    # The sphere through the roots: |x|^2 = 2 c . x + (r^2 - |c|^2).
+def ball(roots: np.ndarray) -> tuple[np.ndarray, float]:
+    """Center (3,) and radius [m] of the sphere that roots (count, 3) stand on, in least squares."""
+    # |x|^2 = 2 c . x + (r^2 - |c|^2)
     found, *_ = np.linalg.lstsq(np.column_stack([2.0 * roots, np.ones(len(roots))]), (roots**2).sum(1), rcond=None)
-    radius = np.sqrt(found[3] + found[:3] @ found[:3])
-    ball, triangles = meshes.sphere(4)
-    return found[:3] + HEAD * radius * ball, triangles
+    return found[:3], float(np.sqrt(found[3] + found[:3] @ found[:3]))
+
+
+def head(roots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) and triangles (t, 3) of the ball that roots (count, 3) stand on, a little below them."""
+    center, radius = ball(roots)
+    points, triangles = meshes.sphere(4)
+    return center + HEAD * radius * points, triangles
 
 
 def colors(count: int) -> np.ndarray:

@@ -9,7 +9,7 @@ comb is smooth; strands rub on each other.
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.scenes import _touching
+from ddg_warp.scenes import _layouts, _touching
 
 LENGTH = 0.12  # m
 RADIUS, TOOTH = 4e-4, 1e-3  # m, of strands and teeth
@@ -48,7 +48,7 @@ def build(
         seed: of the random phases of the curls
     """
     duration = np.ceil((LENGTH + LEAVES - BEGINS) / speed / dt) * dt
-    points = _touching.pushed_apart(curled(gaps, rows, n, np.random.default_rng(seed)), APART, held=2)
+    points = _layouts.pushed_apart(curled(gaps, rows, n, np.random.default_rng(seed)), APART, held=2)
     scene = ddg.Scene(mass_damping=damping, analysis=ddg.Dynamics(dt=dt, duration=duration))
     hair = scene.add_rods(points, section=ddg.Circle(RADIUS), material=HAIR, name="hair")
     scene.clamp(hair, edges=[0])

@@ -10,7 +10,7 @@ that is lower than half a length is no packing in this sense, and is not compare
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.scenes import _touching
+from ddg_warp.scenes import _layouts, _touching
 
 LENGTH = 0.1  # m
 RADIUS = 1e-3  # m; L / D = 50
@@ -46,7 +46,7 @@ def build(
         raise ValueError(f"width = {width / LENGTH}; a box is at least as wide as its rods are long, 1 or more")
     diameter = 2.0 * RADIUS
     box = count * np.pi * RADIUS**2 * LENGTH / (START * diameter / LENGTH * width**2)
-    ends = _touching.placed_apart(
+    ends = _layouts.placed_apart(
         np.random.default_rng(seed), count, LENGTH, 1.5 * diameter, (width, width), max(box, 0.25 * LENGTH)
     )
     scene = ddg.Scene(analysis=ddg.Dynamics(dt=dt, duration=duration))

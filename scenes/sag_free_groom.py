@@ -31,7 +31,7 @@ def build(path: str = str(GROOM), count: int = 512, young: float = 1.5e8) -> ddg
 
     Args:
         path: USD file with curves of equal vertex counts
-        count: strands; fewer are picked evenly, more are copies turned about the vertical
+        count: strands; fewer are picked evenly, more are copies that stand between them
         young: Young's modulus [Pa]
     """
     points, radius = groom(path, count)

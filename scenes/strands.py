@@ -3,7 +3,8 @@
 The strands come from a USD file as an artist would export it. Their shape there is their rest shape, so that curls hold while
 gravity and the motion of the head work on them. A strand stands for a wisp of hair: thicker than a hair, and so much softer that
 the bending length (EI / w)^(1/3), with w its weight per length, is 9 cm, near the 5 cm of a single hair.
-All strands are held by their first edge; they do not touch each other.
+All strands are held by their first edge. With `contact` they touch each other and the head, which moves as they do; without they
+pass through both.
 """
 
 from pathlib import Path
@@ -11,14 +12,18 @@ from pathlib import Path
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.scenes import _strands
+from ddg_warp.scenes import _layouts, _strands, _touching
 
 GROOM = Path(__file__).resolve().parent / "data" / "strands.usdc"
 PERIOD = 1.0  # s, of the head's motion
 REST = 2.0  # s; the head has come to rest by then
 TURN = 0.9  # rad
-
-observe = _strands.observe
+CROWD = 512  # strands, from which on they are thinner where they touch, so that they fill as much of the room
+FRICTION = 0.2
+STEPS = {False: 60.0, True: 240.0}  # a second, without contact and with
+REFUSED = 100  # pairs: a strand that swings about its root moves along an arc
+BORNE = 3.0  # weights of a strand that push surfaces to some part of the range of contact, so that flying ones stop
+CLEAR = 0.3  # of the radius, at least between strands that touch at the start
 
 
 def build(
@@ -26,19 +31,24 @@ def build(
     count: int = 512,
     young: float = 4.0e7,
     sway: float = 0.12,
+    contact: bool = False,
 ) -> ddg.Scene:
     """The groom on its moving head.
 
     Args:
         path: USD file with curves of equal vertex counts
-        count: strands; fewer are picked evenly, more are copies turned about the vertical
+        count: strands; fewer are picked evenly, more are copies that stand between them
         young: Young's modulus [Pa]
         sway: sideways amplitude of the head [m]
+        contact: whether strands touch each other and the head
     """
     points, radius = groom(path, count)
+    thin = radius * min(1.0, np.sqrt(CROWD / count))
+    if contact:
+        points = _layouts.pushed_apart(points, 2.0 * thin * (1.0 + CLEAR), held=2)
     scene = ddg.Scene(
         mass_damping=0.4,  # 1/s, drag of the air
-        analysis=ddg.Dynamics(dt=1.0 / 60.0, duration=REST, scheme="implicit_euler"),
+        analysis=ddg.Dynamics(dt=1.0 / STEPS[contact], duration=REST, scheme="implicit_euler"),
     )
     strands = scene.add_rods(
         points,
@@ -47,7 +57,13 @@ def build(
         natural="shape",
         name="strands",
     )
-    scene.clamp(strands, edges=[0], motion=head_motion(points, sway))
+    motion = head_motion(points, sway)
+    scene.clamp(strands, edges=[0], motion=motion)
+    if contact:
+        center, size = _strands.ball(points[:, 0])
+        weight = scene.batches[0].section.mass_per_length * _strands.edge_lengths(points[0]).sum() * _strands.GRAVITY
+        scene.contact(range=thin, stiffness=BORNE * weight / thin, friction=FRICTION, radius={"strands": thin})
+        scene.add_obstacle(ddg.Sphere(tuple(center), _strands.HEAD * size), motion=motion, name="head")
     return scene
 
 
@@ -67,10 +83,24 @@ def groom(path: str, count: int) -> tuple[np.ndarray, float]:
     radius = float(np.mean(np.concatenate([each.radius for each in curves])))
     if count <= len(strands):
         return strands[np.linspace(0, len(strands) - 1, count).round().astype(int)], radius
-    copies = -(-count // len(strands))
-    pivot = strands[:, 0].mean(axis=0)
-    turns = [ddg.Motion(pivot=tuple(pivot)).rotation(k * _strands.GOLDEN_ANGLE) for k in range(copies)]
-    return np.concatenate([(strands - pivot) @ turn.T + pivot for turn in turns])[:count], radius
+    return more(strands, count), radius
+
+
+def more(strands: np.ndarray, count: int) -> np.ndarray:
+    """Copies (count, nodes, 3) of strands on a head, turned about the vertical to roots that are spread evenly over the same cap."""
+    center, size = _strands.ball(strands[:, 0])
+    normal = (strands[:, 0] - center) / size
+    order = np.argsort(-normal[:, 2])  # from the crown outwards, as the new roots are
+    number = np.arange(count)
+    taken = order[number * len(order) // count]
+    height = 1.0 - (1.0 - normal[order[-1], 2]) * (number + 0.5) / count
+    azimuth = _strands.GOLDEN_ANGLE * number
+    root = np.stack([np.sqrt(1.0 - height**2) * np.cos(azimuth), np.sqrt(1.0 - height**2) * np.sin(azimuth), height], 1)
+    turn = azimuth - np.arctan2(normal[taken, 1], normal[taken, 0])
+    shape = strands[taken] - strands[taken, :1]
+    flat = (shape[..., 0] + 1j * shape[..., 1]) * np.exp(1j * turn)[:, None]
+    turned = np.stack([flat.real, flat.imag, shape[..., 2]], axis=-1)
+    return center + size * root[:, None] + turned
 
 
 def head_motion(points: np.ndarray, sway: float) -> ddg.Motion:
@@ -89,9 +119,21 @@ def head_motion(points: np.ndarray, sway: float) -> ddg.Motion:
     )
 
 
+def observe(model, state) -> dict[str, float]:
+    """As of all scenes of hair, and of contact where there is any."""
+    found = _strands.observe(model, state)
+    return {**_touching.observe(model, state), **found} if model.scene.touching else found
+
+
 def check(result) -> list[ddg.Check]:
-    """Converged and finite everywhere, roots where the head has them, lengths kept, no more energy than there can be."""
-    return _strands.checks(result, 1e-3, "weight and inertia over EA")
+    """Converged and finite everywhere, roots where the head has them, lengths kept, no more energy than there can be.
+
+    With contact nothing passes through anything, either.
+    """
+    checks = _strands.checks(result, 1e-3, "weight and inertia over EA")
+    if result.model.scene.touching:  # steps may be taken in halves
+        return [*_touching.checks(result, REFUSED), *checks[2:]]
+    return checks
 
 
 def benchmark() -> ddg.bench.Study:

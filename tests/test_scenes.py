@@ -130,6 +130,10 @@ def test_small(device, name):
     checked(name, device, **SMALL[name])
 
 
+def test_hair_that_touches(device):
+    checked("strands", device, count=16, contact=True)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name, small in SMALL.items() if small])
 def test_defaults(device, name):
