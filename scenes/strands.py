@@ -1,4 +1,4 @@
-"""Hair: 512 curled strands of a groom, carried by a head that moves sideways, turns, and comes to rest.
+"""Hair: curled strands of a groom, carried by a head that moves sideways, turns, and comes to rest.
 
 The strands come from a USD file as an artist would export it. Their shape there is their rest shape, so that curls hold while
 gravity and the motion of the head work on them. A strand stands for a wisp of hair: thicker than a hair, and so much softer that
