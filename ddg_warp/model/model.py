@@ -160,6 +160,13 @@ class Model:
         validate.check_state("drag", self, state)
         return drag(self, state)
 
+    def pushed_apart(self, state: State, gap: float | None = None) -> tuple[State, float]:
+        """A state like another at which nothing overlaps, and how far a node moved at most [m]; see `ask.pushed_apart`."""
+        from ddg_warp.ask.pushed_apart import pushed_apart
+
+        validate.check_state("pushed_apart", self, state)
+        return pushed_apart(self, state, gap)
+
     def contacts(self, state: State):
         """What touches what at a state, `io.contacts.Contacts`; see `ask.contacts`."""
         from ddg_warp.ask.contacts import contacts

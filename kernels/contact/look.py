@@ -41,3 +41,33 @@ def look_kernel(kind: Kind, real):
         force_out[p] = force
 
     return look
+
+
+@cache
+def closest_kernel(kind: Kind, real):
+    """Of each pair the way from the second thing to the first between their closest points [m], the nodes, their shares of these
+    points, negative on the second, and the thickness [m]."""
+    Sides, X, W = sides_struct(real), wp.types.vector(3, real), wp.types.vector(4, real)
+    slots, _, thickness, closest = pair_functions(kind, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def closest_points(
+        pairs: wp.array(dtype=wp.vec2i),
+        sides: Sides,
+        x: wp.array(dtype=X),
+        way_out: wp.array(dtype=X),
+        nodes_out: wp.array(dtype=wp.vec4i),
+        shares_out: wp.array(dtype=W),
+        thickness_out: wp.array(dtype=real),
+    ):
+        p = wp.tid()
+        w = pairs[p][0] / sides.counts[0]
+        i, j = pairs[p][0] - w * sides.counts[0], pairs[p][1] - w * sides.counts[1]
+        nodes = slots(sides, i, j, w)
+        way, shares = closest(wp.matrix_from_rows(x[nodes[0]], x[nodes[1]], x[nodes[2]], x[nodes[3]]))
+        way_out[p] = way
+        shares_out[p] = shares
+        nodes_out[p] = nodes
+        thickness_out[p] = thickness(sides, i, j, w)
+
+    return closest_points

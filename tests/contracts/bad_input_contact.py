@@ -39,6 +39,12 @@ def stepped(made: ddg.Scene, **options):
     return ddg.Integrator(model, **options).step(model.state(), 1e-3)
 
 
+def pushed(made: ddg.Scene, gap):
+    """Its first state with nothing closer than a gap."""
+    model = built(made)
+    return model.pushed_apart(model.state(), gap)
+
+
 def between(*names, **options):
     """What differs between two names, in a scene with a floor."""
     made = over(ddg.Plane((0.0, 0.0, -1.0)), name="floor")
@@ -89,6 +95,12 @@ each("contact", "friction by direction of two", [("rod", "odd"), ("odd", "odd")]
 each("contact", "between stiffness", [0.0, -1.0, NAN, "hard"], lambda v: between("rod", "odd", stiffness=v),
      "'rod' and 'odd'", "stiffness")
 each("contact", "between range", [0.0, -1.0, NAN, "far"], lambda v: between("rod", "odd", range=v), "'rod' and 'odd'", "range")
+each("contact", "gap to push apart to", [0.0, -1.0, NAN, "far"], lambda v: pushed(touching(), v), "pushed_apart: gap", "positive")
+refuse("contact", {
+    "pushed apart too far": (lambda: pushed(touching(), 1e3), "pushed_apart: gap is 1000 m", "may not exceed"),
+    "pushed apart without contact": (lambda: pushed(scene(), None), "pushed_apart", "add scene.contact()"),
+    "pushed apart what is held": (lambda: pushed(over(ddg.Plane((0.0, 0.0, 1.0))), None), "pushed_apart", "'obstacle'", "rounds"),
+})
 
 each("obstacles", "shape", [None, ddg.Plane, "plane", 3], over, "add_obstacle 'obstacle'", "give Plane, Sphere, Capsule, Box or Mesh")
 each("obstacles", "motion", ["up", 3.0, len], lambda v: over(ddg.Plane(), motion=v), "add_obstacle", "Motion")

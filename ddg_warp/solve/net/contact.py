@@ -289,8 +289,8 @@ class NetContact:
         least = 0.0 if self.touch.keep else -self.touch.search.reach
         if gap <= least:
             raise SceneError(
-                f"contact: {pair} overlap by {-gap:.3g} m at the start; move them apart, give them a smaller radius, or let them "
-                "pass by contact_between(..., ignore=True)"
+                f"contact: {pair} overlap by {-gap:.3g} m at the start; move them apart, as model.pushed_apart(state) does, give "
+                "them a smaller radius, or let them pass by contact_between(..., ignore=True)"
             )
 
     def outgrown(self, x: wp.array) -> bool:

@@ -1,0 +1,101 @@
+"""States in which things overlap, and those made of them in which nothing does."""
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp.ask.pushed_apart import BEYOND, PART
+from ddg_warp.errors import SceneError, SolverError
+
+RADIUS, RANGE = 2e-3, 1e-3
+MATERIAL = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
+
+
+def scene_of(*directions, lift: float = 0.0, nodes: int = 4) -> ddg.Scene:
+    """Rods through the origin, each higher than the one before by `lift`."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    along = np.linspace(-0.1, 0.1, nodes)[:, None]
+    for k, direction in enumerate(directions):
+        points = along * np.array(direction) / np.linalg.norm(direction) + [0.0, 0.0, k * lift]
+        scene.add_rod(points, section=ddg.Circle(radius=RADIUS), material=MATERIAL, name=f"rod {k}")
+    scene.contact(range=RANGE)
+    return scene
+
+
+def test_rods_that_meet_in_a_point_pass_by_each_other(device):
+    """Both give way by halves, across both: all four nodes have half of the closest point and move by half of what is missing."""
+    model = scene_of((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)).build(device=device, precision="float64")
+    state = model.state()
+    before = state.points().copy()
+    with pytest.raises(SceneError, match="overlap"):
+        ddg.Integrator(model).step(state, 1e-3)
+    new, moved = model.pushed_apart(state)
+    least = PART * RANGE
+    assert moved == pytest.approx(0.5 * (2.0 * RADIUS + BEYOND * least), rel=1e-12)
+    change = new.points() - before
+    assert np.abs(change[:, :2]).max() < 1e-15
+    assert np.abs(change[[0, 3, 4, 7]]).max() == 0.0
+    assert model.contacts(new).gap.min() == pytest.approx(BEYOND * least, rel=1e-9)
+    assert state.points().tobytes() == before.tobytes()
+    ddg.Integrator(model).step(new, 1e-3)
+
+
+def test_what_is_held_stays(device):
+    """A rod too deep in the floor is lifted by what is missing; one that is clamped is passed by the other alone."""
+    scene = scene_of((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), lift=0.5 * RADIUS)
+    scene.fix(0, [0, 1, 2, 3])
+    scene.add_obstacle(ddg.Plane((0.0, 0.0, -RADIUS - 0.5 * RANGE)))
+    model = scene.build(device=device, precision="float64")
+    state = model.state()
+    new, moved = model.pushed_apart(state, 0.2 * RANGE)
+    change = new.points() - state.points()
+    assert np.abs(change[:4]).max() == 0.0
+    assert moved == pytest.approx(1.5 * RADIUS + BEYOND * 0.2 * RANGE, rel=1e-9)
+    sunk = scene_of((1.0, 0.0, 0.0))
+    sunk.add_obstacle(ddg.Plane((0.0, 0.0, -0.25 * RADIUS)))
+    model = sunk.build(device=device, precision="float64")
+    new, moved = model.pushed_apart(model.state())
+    assert moved == pytest.approx(0.75 * RADIUS + BEYOND * PART * RANGE, rel=1e-9)
+    assert np.ptp(new.points()[:, 2]) < 1e-15
+
+
+@pytest.mark.parametrize("precision", ["float64", "mixed"])
+def test_a_heap_comes_apart(device, precision):
+    """Twelve rods through one point above a sheet, in two worlds: nothing is too close then, and steps go on from there."""
+    rng = np.random.default_rng(3)
+    scene = scene_of(*rng.normal(size=(12, 3)), lift=1e-4, nodes=16)
+    sheet = np.array([[-0.2, -0.2, -0.11], [0.2, -0.2, -0.11], [0.0, 0.2, -0.11]])
+    scene.add_obstacle(ddg.Mesh(sheet, np.array([[0, 1, 2]]), 1e-3))
+    model = scene.build(worlds=2, device=device, precision=precision)
+    points = model.state().points()
+    points[1] += 1e-4 * rng.normal(size=points[1].shape)
+    state = model.state(points=points, velocities=rng.normal(size=points.shape))
+    new, moved = model.pushed_apart(state)
+    assert 2.0 * RADIUS < moved < 60.0 * RADIUS
+    assert model.contacts(new).gap.min() >= PART * RANGE
+    assert moved == pytest.approx(np.linalg.norm(new.points() - state.points(), axis=-1).max(), rel=1e-5)
+    assert new.velocities().tobytes() == state.velocities().tobytes()
+    again, _ = model.pushed_apart(state)
+    assert again.points().tobytes() == new.points().tobytes()
+    same, none = model.pushed_apart(new, 0.5 * PART * RANGE)
+    assert none == 0.0 and same.points().tobytes() == new.points().tobytes()
+    after = ddg.Integrator(model).step(model.state(points=new.points()), 1e-4)
+    assert np.isfinite(after.points()).all()
+
+
+def test_refusals(device):
+    scene = scene_of((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    for rod in range(2):
+        scene.fix(rod, [0, 1, 2, 3])
+    model = scene.build(device=device)
+    with pytest.raises(SolverError, match=r"pushed_apart: edge 1 of rod 0 .* and edge 1 of rod 1 .* after 1000 rounds"):
+        model.pushed_apart(model.state())
+    with pytest.raises(SceneError, match="it may not exceed"):
+        model.pushed_apart(model.state(), 2.0 * RANGE)
+    with pytest.raises(SceneError, match="gap is -1"):
+        model.pushed_apart(model.state(), -1.0)
+    bare = ddg.Scene()
+    bare.add_rod(np.eye(3), section=ddg.Circle(radius=RADIUS), material=MATERIAL)
+    model = bare.build(device=device)
+    with pytest.raises(SceneError, match="has no contact"):
+        model.pushed_apart(model.state())
