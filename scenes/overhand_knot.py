@@ -8,8 +8,8 @@ traction F, a rod of radius h and bending stiffness B needs, by matched expansio
 half of the loop's curvature squared, what the braid changes of the energy, and friction of the normal force P in the braid (Audoly,
 Clauvelin and Neukirch, Elastic knots, PRL 99, 164301, 2007; sigma = 0.492 of the trefoil). In the braid half the distance of the
 strands is h v(s / sqrt(h R)), a curve about the unit disc that makes the integral of |v''|^2 / 2 least, with curvatures of opposite
-sign and size 1/2 beyond: sigma is the total force of the disc on it and c comes of its energy. They were found by finite differences.
-Another turn adds 2 pi / 12^(3/4) to sigma, nearly, as the braid becomes a helix.
+sign and size 1/2 beyond: sigma is the total force of the disc on it and c comes of its energy (by finite
+differences, `tests/accuracy/test_braid.py`). Another turn adds 2 pi / 12^(3/4) to sigma, nearly, as the braid becomes a helix.
 
 R is the rod's length less the distance of its ends over 2 pi, h half of the distance at which strands touch. Edges grow along the rod,
 so that nodes of one strand pass those of the other at different times: by equal ones they would lock.
