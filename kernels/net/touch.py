@@ -108,6 +108,8 @@ def world_kernels(real):
         if modes[w] != wp.static(NONE) and time[w] < real(1.0) and length > real(0.0):
             scalars[DECREMENT, w] = wp.max(decrease[w], real(0.0)) / length
             stalled[w] = 0
+        if flags[DRIVEN, w] != 0:
+            stalled[w] = 0
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def refuse(
