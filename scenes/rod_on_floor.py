@@ -31,6 +31,8 @@ def build(
     slippery: float = 0.08,
     speed: float = 1.0,
     velocity: float = 1e-3,
+    stiffness: float = 2e4,
+    range: float = RANGE,
     dt: float = 1e-3,
     duration: float = 1.2,
     seed: int = -1,
@@ -44,6 +46,8 @@ def build(
         slippery: coefficient of the one that slides
         speed: of the one that is thrown [m/s]
         velocity: of the friction law, nu [m/s]
+        stiffness: of contact [N/m]
+        range: of contact [m]
         dt: time step [s]
         duration: of the run [s]
         seed: of a jitter of where rods start; none below 0
@@ -64,7 +68,7 @@ def build(
     for k, name in enumerate(NAMES):
         lean = (LEAN if name == "rests" else 0.0) * (1.0 + 0.3 * jitter[k, 0])
         along = np.cos(lean) * down + np.sin(lean) * normal + 0.02 * jitter[k, 1] * np.array([0.0, 1.0, 0.0])
-        start = k * LANE * np.array([0.0, 1.0, 0.0]) + (RADIUS + RANGE * (1.05 + 0.05 * jitter[k, 2])) * normal
+        start = k * LANE * np.array([0.0, 1.0, 0.0]) + (RADIUS + range * (1.05 + 0.05 * jitter[k, 2])) * normal
         scene.add_rod(
             start + s * along / np.linalg.norm(along),
             section=ddg.Circle(RADIUS),
@@ -72,7 +76,7 @@ def build(
             name=name,
         )
     scene.add_obstacle(ddg.Plane(normal=tuple(normal)), name="plane")
-    scene.contact(range=RANGE, friction=friction, velocity=velocity)
+    scene.contact(range=range, stiffness=stiffness, friction=friction, velocity=velocity)
     scene.contact_between("slides", "plane", friction=slippery)
     return scene
 
@@ -137,8 +141,11 @@ def _checks(result, scene, names) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The way of the rod that was thrown over the steps."""
-    return ddg.bench.Study({"dt": (4e-3, 2e-3, 1e-3, 5e-4)}, "way of the rod that was thrown", whole=True)
+    """The way of the rod that was thrown over what contact, steps and nodes are, one by one."""
+    grid = {"n": (5, 10, 20, 40), "dt": (4e-3, 2e-3, 1e-3, 5e-4), "velocity": (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)}
+    grid |= {"stiffness": (2e3, 6e3, 2e4, 6e4, 2e5), "range": (2.5e-5, 5e-5, RANGE, 2e-4, 4e-4)}
+    grid |= {"rtol": (1e-3, 1e-4, 1e-5, 1e-6, 1e-8)}
+    return ddg.bench.Study(grid, "way of the rod that was thrown", one_by_one=True)
 
 
 def picture(result, frames) -> dict:
