@@ -33,6 +33,7 @@ def build(
     velocity: float = 1e-3,
     stiffness: float = 2e4,
     range: float = RANGE,
+    lags: int = 2,
     dt: float = 1e-3,
     duration: float = 1.2,
     seed: int = -1,
@@ -48,6 +49,7 @@ def build(
         velocity: of the friction law, nu [m/s]
         stiffness: of contact [N/m]
         range: of contact [m]
+        lags: how often in a step friction takes the normal forces anew
         dt: time step [s]
         duration: of the run [s]
         seed: of a jitter of where rods start; none below 0
@@ -76,7 +78,7 @@ def build(
             name=name,
         )
     scene.add_obstacle(ddg.Plane(normal=tuple(normal)), name="plane")
-    scene.contact(range=range, stiffness=stiffness, friction=friction, velocity=velocity)
+    scene.contact(range=range, stiffness=stiffness, friction=friction, velocity=velocity, lags=lags)
     scene.contact_between("slides", "plane", friction=slippery)
     return scene
 
@@ -141,10 +143,10 @@ def _checks(result, scene, names) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The way of the rod that was thrown over what contact, steps and nodes are, one by one."""
+    """The way of the rod that was thrown over what contact, friction, steps and nodes are, one by one."""
     grid = {"n": (5, 10, 20, 40), "dt": (4e-3, 2e-3, 1e-3, 5e-4), "velocity": (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)}
     grid |= {"stiffness": (2e3, 6e3, 2e4, 6e4, 2e5), "range": (2.5e-5, 5e-5, RANGE, 2e-4, 4e-4)}
-    grid |= {"rtol": (1e-3, 1e-4, 1e-5, 1e-6, 1e-8)}
+    grid |= {"rtol": (1e-3, 1e-4, 1e-5, 1e-6, 1e-8), "lags": (1, 2, 3)}
     return ddg.bench.Study(grid, "way of the rod that was thrown", one_by_one=True)
 
 
