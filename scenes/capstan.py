@@ -27,7 +27,7 @@ TAIL = 1.0  # length of either end off the drum over AROUND
 SPREAD = 6.0  # radii between neighbouring turns
 STEP_TIME = 1.0  # s, long against all periods: the march is one of equilibria
 SPEED = 2.5e-3 * AROUND  # m/s, at which the rod is drawn
-SATURATED = 0.5  # velocity of the friction law over the speed: what slides has all of the friction
+VELOCITY = 0.5 * SPEED  # m/s, of the friction law: what slides has all of the friction
 SETTLED = 0.5  # part of the run after which the tension is averaged
 
 
@@ -37,6 +37,10 @@ def build(
     n: int = 60,
     tension: float = 1000.0,
     steps: int = 60,
+    stiffness: float = 1e4,
+    range: float = RANGE,
+    velocity: float = VELOCITY,
+    lags: int = 1,
     seed: int = -1,
 ) -> ddg.Scene:
     """The rod about a drum along y, wound upwards over its top.
@@ -47,6 +51,10 @@ def build(
         n: edges in half a turn
         tension: of the slack end, T1 R^2 / B
         steps: time steps
+        stiffness: of contact [N/m]
+        range: of contact [m]
+        velocity: of the friction law, nu [m/s]; the rod is drawn at twice its default
+        lags: how often in a step friction takes the normal forces anew
         seed: of a jitter of the nodes at first, a fifth of the range of contact; none below 0
     """
     if not 0.0 < turns <= 1.0:
@@ -56,7 +64,7 @@ def build(
     if not tension * 4.0 > 1.0 + 4.0 / TAIL**2:
         raise ValueError(f"tension = {tension}; below {0.25 + 1.0 / TAIL**2:g} the rod is too stiff to lie on the drum")
     slack = tension * B / AROUND**2
-    points, ends = wound(2.0 * np.pi * turns, np.pi * AROUND / n)
+    points, ends = wound(2.0 * np.pi * turns, np.pi * AROUND / n, DRUM + RADIUS + 0.5 * range)
     scene = ddg.Scene(
         gravity=(0.0, 0.0, 0.0),
         analysis=ddg.Dynamics(dt=STEP_TIME, duration=steps * STEP_TIME),
@@ -68,16 +76,16 @@ def build(
     scene.add_force(rod, 0, slack * ends[0])
     scene.fix(rod, [-1], motion=ddg.Motion(translation=lambda t: tuple(SPEED * t * ends[1])))
     scene.add_obstacle(ddg.Capsule((0.0, -DRUM, 0.0), (0.0, DRUM, 0.0), DRUM), name="drum")
-    scene.contact(range=RANGE, friction=friction, velocity=SATURATED * SPEED)
+    scene.contact(range=range, stiffness=stiffness, friction=friction, velocity=velocity, lags=lags)
     return scene
 
 
-def wound(angle: float, edge: float) -> tuple[np.ndarray, np.ndarray]:
+def wound(angle: float, edge: float, radius: float) -> tuple[np.ndarray, np.ndarray]:
     """Points (n, 3) [m] of a helix about y with straight ends, and unit vectors (2, 3) along these, away from the drum.
 
-    Edges of a length [m] touch the cylinder of the radius AROUND in their middles.
+    Edges of a length [m] touch the cylinder of a radius [m] in their middles.
     """
-    around = AROUND / np.cos(0.5 * edge / AROUND)
+    around = radius / np.cos(0.5 * edge / radius)
     rise = SPREAD * RADIUS / (2.0 * np.pi) * (angle > np.pi)  # up to half a turn it stays in a plane
     speed = np.hypot(around, rise)
     tail = TAIL * around
@@ -93,7 +101,7 @@ def wound(angle: float, edge: float) -> tuple[np.ndarray, np.ndarray]:
 def bent(model, points: np.ndarray, seed: int):
     """The rod where it is wound; its rest shape is straight."""
     free = np.arange(len(points))[:, None] < len(points) - 1
-    return model.state(points=points + 0.2 * RANGE * free * _touching.jitter(points.shape, seed))
+    return model.state(points=points + 0.2 * model.scene.touching.range * free * _touching.jitter(points.shape, seed))
 
 
 def observe(model, state) -> dict[str, float]:
@@ -148,8 +156,14 @@ def _checks(result, names) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The ratio of tensions over the edges of half a turn."""
-    return ddg.bench.Study({"n": (15, 30, 60, 120)}, "T2 / T1 of a rod", whole=True)
+    """The ratio of tensions over what contact, friction, steps and nodes are, one by one."""
+    grid = {"n": (15, 30, 60, 120), "dt": (4.0, 2.0, 1.0, 0.5)}
+    grid |= {
+        name: tuple(usual * s for s in (0.1, 0.3, 1.0, 3.0, 10.0))
+        for name, usual in (("stiffness", 1e4), ("velocity", VELOCITY))
+    }
+    grid |= {"range": (2.5e-5, 5e-5, RANGE, 2e-4, 4e-4), "rtol": (1e-3, 1e-4, 1e-5, 1e-6, 1e-8), "lags": (1, 2, 3)}
+    return ddg.bench.Study(grid, "T2 / T1 of a rod", one_by_one=True)
 
 
 def picture(result, frames) -> dict:

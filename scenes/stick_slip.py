@@ -18,7 +18,7 @@ B = 1.0  # N m^2
 STIFF = 1e5  # EA L^2 / B
 MASS_PER_LENGTH = 1e-3  # kg/m
 RANGE = 1e-4  # m, of contact
-CLOSE = 0.5  # of the range, the gap at first: the floor pushes from the start, else friction would begin a step late
+CLOSE = 0.5  # of the range, the gap at first: the floor pushes from the start
 NUDGE = 0.1  # N, in the middle at first; tells the rod where to buckle
 NUDGED = 0.006  # way over L in which it fades
 BEYOND = 1.1  # times the delta of the slip, to which the clamp comes down
@@ -35,7 +35,16 @@ STICKS = {
 SOURCE = "elastica, clamped and hinged, by collocation to 1e-12"
 
 
-def build(friction: float = 0.2, n: int = 40, steps: int = 150, velocity: float = 1e-6, seed: int = -1) -> ddg.Scene:
+def build(
+    friction: float = 0.2,
+    n: int = 40,
+    steps: int = 150,
+    velocity: float = 1e-6,
+    stiffness: float = 5e4,
+    range: float = RANGE,
+    lags: int = 2,
+    seed: int = -1,
+) -> ddg.Scene:
     """The rod along z, its tip at the range of contact above the floor z = 0.
 
     Args:
@@ -43,6 +52,9 @@ def build(friction: float = 0.2, n: int = 40, steps: int = 150, velocity: float 
         n: edges of the rod, an even number
         steps: in which the clamp comes down
         velocity: of the friction law, nu [m/s]; the clamp moves by about 1e-3 m/s
+        stiffness: of contact [N/m]
+        range: of contact [m]
+        lags: how often in a step friction takes the normal forces anew
         seed: of a jitter of how strongly the rod is nudged aside; none below 0
     """
     if friction not in SLIP:
@@ -52,7 +64,7 @@ def build(friction: float = 0.2, n: int = 40, steps: int = 150, velocity: float 
     duration = steps * STEP_TIME
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), analysis=ddg.Dynamics(dt=STEP_TIME, duration=duration))
     points = np.zeros((n + 1, 3))
-    points[:, 2] = np.linspace(LENGTH, 0.0, n + 1) + RADIUS + CLOSE * RANGE
+    points[:, 2] = np.linspace(LENGTH, 0.0, n + 1) + RADIUS + CLOSE * range
     section = ddg.Stiffness(
         EA=STIFF * B / LENGTH**2, EI1=B, GJ=B, mass_per_length=MASS_PER_LENGTH, rotary_inertia=1e-9, radius=RADIUS
     )
@@ -63,7 +75,7 @@ def build(friction: float = 0.2, n: int = 40, steps: int = 150, velocity: float 
     nudge = NUDGE * (1.0 + 0.5 * float(_touching.jitter((), seed)))
     scene.add_force(rod, n // 2, (nudge, 0.0, 0.0), amplitude=lambda t: max(0.0, 1.0 - t / fades))
     scene.add_obstacle(ddg.Plane(), name="floor")
-    scene.contact(range=RANGE, stiffness=5.0 * B / LENGTH**2 / RANGE, friction=friction, velocity=velocity)
+    scene.contact(range=range, stiffness=stiffness, friction=friction, velocity=velocity, lags=lags)
     return scene
 
 
@@ -123,8 +135,12 @@ def _checks(result, series, slips, reference, names) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The delta of the slip over the nodes of the rod."""
-    return ddg.bench.Study({"n": (10, 20, 40, 80)}, "delta / L of the slip", whole=True)
+    """The delta of the slip over what contact, friction, steps and nodes are, one by one."""
+    grid = {"n": (10, 20, 40, 80), "dt": (3.0, 1.5, 1.0, 0.5), "velocity": (1e-7, 1e-6, 1e-5, 1e-4)}
+    grid |= {"stiffness": (5e3, 1.5e4, 5e4, 1.5e5, 5e5), "range": (2.5e-5, 5e-5, RANGE, 2e-4, 4e-4)}
+    return ddg.bench.Study(
+        grid | {"rtol": (1e-3, 1e-4, 1e-5, 1e-6, 1e-8), "lags": (1, 2, 3)}, "delta / L of the slip", one_by_one=True
+    )
 
 
 def picture(result, frames) -> dict:

@@ -153,6 +153,25 @@ def test_order_of_what_converges():
     assert bench.orders(study, rows)["dt"] == pytest.approx(1.0, abs=1e-6)
 
 
+def test_settings_are_varied_one_by_one(cantilever, study, device, tmp_path):
+    """Each beside the defaults, which are run once; orders and lines go through these."""
+    grid = {"dt": (0.02, 0.01, 0.005), "n": (25, 50), "rtol": (1e-4,)}
+    alone = replace(study, grid=grid, reference={"dt": 0.0003125}, series=(), one_by_one=True)
+    rows, unit = bench.measure(cantilever, alone, device=device)
+    usual = {"dt": 0.01, "n": 50, "rtol": 1e-6}
+    differ = [{name: row[name] for name in grid if row[name] != usual[name]} for row in rows]
+    assert differ == [{"dt": 0.02}, {"dt": 0.005}, {"n": 25}, {"rtol": 1e-4}, {}]
+    assert [row["default"] for row in rows] == [False] * 4 + [True]
+    assert bench.orders(alone, rows)["dt"] == pytest.approx(1.0, abs=0.1)
+    assert set(bench.orders(alone, rows)) == {"dt"}
+    bench.plot(alone, rows, tmp_path / "one.png", "cantilever", unit)
+    assert {path.name for path in tmp_path.iterdir()} == {"one.png", "one_settings.png"}
+    with pytest.raises(InputError, match="varies 'scheme' one by one; it varies numbers"):
+        replace(alone, grid={"scheme": ("implicit_euler",)})
+    with pytest.raises(InputError, match="names of the grid are its series; leave series out"):
+        replace(alone, series=("dt",))
+
+
 def scenes() -> list:
     """Names of all scenes; those that are learned when they are built take minutes, and torch."""
     marks = (pytest.mark.slow, pytest.mark.skipif(find_spec("torch") is None, reason="needs torch"))

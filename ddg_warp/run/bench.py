@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -40,8 +41,13 @@ class Study:
             every case.
         unit: Of what is measured; that of a check stands in its name.
         scale: What errors are divided by to be relative ones; by default the size of the reference.
+        one_by_one: Whether a case varies one number and leaves all others as they are by default, instead of every combination; the
+            plot then has a line for each name, and a second one has the error over each setting.
         whole: Whether the time is that of the run and its check, as it always is in statics, instead of that of the steps: for what
             the check computes.
+
+    Raises:
+        InputError: one_by_one goes with series, or with what is no number.
     """
 
     grid: Mapping[str, tuple]
@@ -51,10 +57,25 @@ class Study:
     series: tuple[str, ...] = ()
     unit: str = ""
     scale: float | None = None
+    one_by_one: bool = False
     whole: bool = False
 
-    def cases(self) -> list[dict]:
-        """Every combination of the grid, the last name varying fastest."""
+    def __post_init__(self):
+        if self.one_by_one and self.series:
+            raise InputError(
+                "a study varies settings one by one, where the names of the grid are its series; leave series out"
+            )
+        texts = (name for name, values in self.grid.items() if any(isinstance(value, str | bool) for value in values))
+        if self.one_by_one and (name := next(texts, None)):
+            raise InputError(
+                f"a study varies '{name}' one by one; it varies numbers, and '{name}' is better in `fixed`"
+            )
+
+    def cases(self, usual: Mapping = MappingProxyType({})) -> list[dict]:
+        """Every combination of the grid, the last name varying fastest; or, one by one, settings beside the scene's `usual` ones."""
+        if self.one_by_one:
+            others = ((n, v) for n, values in self.grid.items() for v in values if v != usual.get(n))
+            return [{**usual, name: value} for name, value in others]
         return [dict(zip(self.grid, values, strict=True)) for values in itertools.product(*self.grid.values())]
 
 
@@ -150,7 +171,7 @@ def measure(module, study: Study, *, device: str | None = None, precision: str |
     """
     shared = dict(study.fixed) | ({} if precision is None else {"precision": precision})
     usual = defaults(module, study, device)
-    cases = study.cases()
+    cases = study.cases(usual)
     if not any(_alike(case, usual) for case in cases):
         cases.append(usual)
     clock = clock_of(device) or time.perf_counter
@@ -296,16 +317,18 @@ def best(study: Study, rows: list[dict]) -> list[dict]:
 def orders(study: Study, rows: list[dict]) -> dict[str, float]:
     """Observed orders in the settings that refine: the median of log(error) over log(setting) between neighbouring cases.
 
-    Of a number of edges, cells or steps the order is that in their size. What else is set is as in the case of least error; where
-    that keeps the error from falling with every refinement, there is no order.
+    Of a number of edges, cells or steps the order is that in their size. What else is set is as in the case of least error, or the
+    default one where cases vary one name; where that keeps the error from falling with every refinement, there is no order.
     """
     result = {}
     good = [row for row in rows if row["error"] > 0.0]
     for name, values in study.grid.items():
         if name == "rtol" or len(values) < 3 or not good or isinstance(values[0], str | bool):
             continue
-        finest, others = min(good, key=lambda row: row["error"]), [other for other in study.grid if other != name]
-        line = {row[name]: row["error"] for row in good if all(row[other] == finest[other] for other in others)}
+        finest = (
+            next(row for row in rows if row["default"]) if study.one_by_one else min(good, key=lambda row: row["error"])
+        )
+        line = {row[name]: row["error"] for row in line_through(study, good, finest, name)}
         if len(line) > 1:
             values, errors = np.log(np.array(sorted(line.items()))).T
             slopes = np.diff(errors) / np.diff(values) * (1.0 if isinstance(next(iter(line)), float) else -1.0)
@@ -314,8 +337,13 @@ def orders(study: Study, rows: list[dict]) -> dict[str, float]:
     return result
 
 
+def line_through(study: Study, rows: list[dict], case: Mapping, name: str) -> list[dict]:
+    """Rows that differ from a case in no name of the grid but one."""
+    return [row for row in rows if all(row[other] == case[other] for other in study.grid if other != name)]
+
+
 def plot(study: Study, rows: list[dict], path: Path, title: str, unit: str) -> None:
-    """Error over time, a line a series, the scene's defaults marked; see `Study.series`."""
+    """Error over time, a line a series, the scene's defaults marked; see `Study.series` and `Study.one_by_one`."""
     try:
         from ddg_warp.run.figure import error_plot
     except ModuleNotFoundError as error:
@@ -323,6 +351,17 @@ def plot(study: Study, rows: list[dict], path: Path, title: str, unit: str) -> N
         return
     names = list(study.series or list(study.grid)[1:])
     label, across, up = " / ".join(names) or "scene", "time [s]", f"error [{unit}]" if unit else "error"
+    if study.one_by_one:
+        usual, label, over = next(row for row in rows if row["default"]), "varied", "setting over its default"
+        points = [
+            {over: row[name] / usual[name], across: row["seconds"], up: row["error"], label: name}
+            for name in study.grid
+            for row in line_through(study, rows, usual, name)
+        ]
+        marked = [{over: 1.0, across: usual["seconds"], up: usual["error"]}]
+        for x, where in ((across, path), (over, path.with_stem(f"{path.stem}_settings"))):
+            error_plot(where, points, x=x, y=up, series=label, title=title, marked=marked)
+        return
 
     def shown(row) -> dict:
         text = ", ".join(str(row[name]) if name in study.series else f"{name} {row[name]}" for name in names)

@@ -8,6 +8,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.compile.precision import largest_carried
 from ddg_warp.errors import SceneError
+from ddg_warp.kernels import outcome
 from ddg_warp.kernels.net import elements, frames, newton
 from ddg_warp.model.net import NetState
 from ddg_warp.scene import drag
@@ -207,11 +208,15 @@ class NetStep(PartStep):
         """What to do about a world that was given up: edges of its last good state that no step can start from, or advice."""
         x = state.net.q.numpy().reshape(self.model.worlds, -1, 3)[world]
         found = (self.dead_end(x[r.all_nodes], r.first, r.piece.kind, f" of rod {r.rod}") for r in self.net.host.rods)
-        return next(filter(None, found), "") or self._tightest(state) + self.advice(state)
+        return next(filter(None, found), "") or self._tightest(state, world) + self.advice(state)
 
-    def _tightest(self, state) -> str:
-        """The pair that is the closest in the last good state, where that may be why."""
+    def _tightest(self, state, world: int) -> str:
+        """The pair that is the closest in the last good state, where that may be why, and what lets it keep apart."""
         if not self.newton.contact:
             return ""
         gap, pair = self.newton.contact.touch.closest(state.net.q)
-        return f"the smallest gap, {gap:.3g} m, is between {pair}; " if gap < self.newton.contact.search.reach else ""
+        if gap >= self.newton.contact.search.reach:
+            return ""
+        stiffer = int(self.islands.reason.numpy()[world]) == outcome.NO_ROOM
+        remedy = "give their contact a larger stiffness or range, " if stiffer else ""
+        return f"the smallest gap, {gap:.3g} m, is between {pair}; {remedy}"

@@ -1,0 +1,265 @@
+"""Hard cases of contact: parallel and coincident edges, stacks, whips, stiff and soft, many contacts, long rest, crumpling."""
+
+import numpy as np
+import pytest
+from hard_cases import (
+    DENSITY,
+    MU,
+    RADIUS,
+    RANGE,
+    WEIGHT,
+    assert_no_energy_is_made,
+    energy,
+    forces_on,
+    heap_at_rest,
+    hold,
+    least_gap,
+    line,
+    mass_of_node,
+    rod,
+    run,
+)
+
+import ddg_warp as ddg
+from ddg_warp.geometry import meshes
+
+
+@pytest.mark.parametrize("law", ["barrier", "penalty"])
+@pytest.mark.parametrize("pull", [0.2, 0.6])
+def test_a_rod_in_the_groove_of_two_others_along_it(device, pull, law):
+    """Three parallel rods. Both normal forces are N / 2 = W / (2 cos a), and friction is up to mu N: the rod sticks, creeping by less
+    than the velocity of the law, or slides by T/m - mu N/m."""
+    length, velocity, dt = 0.1, 1e-4, 2e-3
+    scene = ddg.Scene()
+    for name, y in (("left", -1.3 * RADIUS), ("right", 1.3 * RADIUS)):
+        hold(scene, rod(scene, line(0.4, 40, middle=(0.1, y, 0.0)), name), 41)
+    height = np.sqrt(2.2**2 - 1.3**2) * RADIUS
+    upper = rod(scene, line(length, 10, middle=(0.0, 0.0, height)), "upper")
+    for node in range(11):
+        share = (0.5 if node in (0, 10) else 1.0) / 10.0
+        scene.add_force(upper, node, (pull * WEIGHT * length * share, 0.0, 0.0))
+    scene.contact(law=law, friction=MU, velocity=velocity)
+    model, integrator, states = run(scene, device, 100, dt, rtol=1e-8)
+    speeds = np.array([state.velocities()[82:].mean(0) for state in states])
+    if pull < MU:
+        assert 0.0 < speeds[-1, 0] < velocity
+    else:  # all of the friction is along the groove
+        forces = [forces_on(model.contacts(state), 2) / (WEIGHT * length) for state in states[51:]]
+        up = np.mean([force.sum(0)[2] for force in forces])
+        assert up - 1.0 == pytest.approx((speeds[-1, 2] - speeds[50, 2]) / (50 * dt) / 9.81, abs=1e-3)
+        normal = np.mean([np.linalg.norm(force, axis=1).sum() for force in forces])
+        found = (speeds[-1, 0] - speeds[50, 0]) / (50 * dt) / 9.81
+        assert found == pytest.approx(pull - MU * normal, rel=0.01)
+    assert np.abs(speeds[:, 1]).max() < 1e-9
+    if law == "barrier":
+        assert integrator.statistics()["contact"]["smallest_gap"] > 0.0
+        assert least_gap(model, states[-1]) > 0.0
+
+
+def pair(gap: float, shift: float = 0.0) -> ddg.Scene:
+    """Two equal parallel rods above each other."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    rod(scene, line(0.1, 10), "lower")
+    rod(scene, line(0.1, 10, middle=(shift, 0.0, 2.0 * RADIUS + gap)), "upper")
+    scene.contact(range=RANGE)
+    return scene
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.005, 0.0025])
+def test_parallel_edges_push_as_their_energy_says(device, shift):
+    """Node over node, over the middle of an edge, and between: F = -dE/dgap by central differences, and none at the range."""
+    gap, h = 0.4 * RANGE, 1e-7 * RANGE
+
+    def at(gap):
+        model = pair(gap, shift).build(device=device)
+        return model, model.contacts(model.state()), model.energies(model.state())["contact"]
+
+    force = forces_on(at(gap)[1], 1).sum(0)
+    slope = (at(gap + h)[2] - at(gap - h)[2]) / (2.0 * h)
+    np.testing.assert_allclose(force, [0.0, 0.0, -slope], rtol=1e-6, atol=1e-12 * abs(slope))
+    assert slope < 0.0
+    assert at(RANGE)[2] == 0.0
+    _, found, least = at(RANGE * (1.0 - 1e-9))
+    assert np.isfinite(found.force).all()
+    assert 0.0 <= least < 1e-18 * at(gap)[2]
+    _, _, states = run(pair(RANGE), device, 5, 0.01)
+    np.testing.assert_array_equal(states[-1].points(), states[0].points())
+
+
+def test_edges_in_the_same_place_are_refused(device):
+    model = pair(-2.0 * RADIUS).build(device=device)
+    with pytest.raises(ddg.SceneError, match=r"edge \d+ of rod 0 .* and edge \d+ of rod 1 .* overlap by 0.004 m"):
+        ddg.Integrator(model).step(model.state(), 0.01)
+
+
+def test_rods_in_one_line_meet_with_their_ends(device):
+    """They bounce along the line and never leave it; momentum is zero throughout."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    rod(scene, line(0.1, 10, middle=(-0.05 - 1.5 * RADIUS, 0.0, 0.0)), "left")
+    rod(scene, line(0.1, 10, middle=(0.05 + 1.5 * RADIUS, 0.0, 0.0)), "right")
+    scene.contact(friction=MU)
+    speed = np.repeat([[0.3, 0.0, 0.0], [-0.3, 0.0, 0.0]], 11, axis=0)
+    model, _, states = run(scene, device, 60, 1e-3, velocities=speed, rtol=1e-10)
+    assert max(len(model.contacts(state)) for state in states) == 1
+    assert min(least_gap(model, state) for state in states) > 0.0
+    left, right = states[-1].velocities().reshape(2, 11, 3).mean(1)
+    assert left[0] < -0.1
+    assert left[0] + right[0] == pytest.approx(0.0, abs=1e-9)
+    assert not states[-1].points()[:, 1:].any()
+    assert_no_energy_is_made(energy(model, states))
+
+
+@pytest.mark.parametrize("layers", [8, pytest.param(50, marks=pytest.mark.slow)])
+def test_a_stack_of_sheets(device, layers):
+    """Each carries all above it: (layers - 1 - k) m g between k and k + 1, and the floor carries all."""
+    thickness, gap, side = 1e-3, 2.5e-4, 0.02
+    scene = ddg.Scene(mass_damping=5.0)
+    material = ddg.Material(young=1e6, density=DENSITY, poisson=0.3)
+    for layer in range(layers):
+        points, triangles = meshes.rectangle(2, 2, (side, side), "alternating")
+        points = points + [0.0, 0.0, 0.5 * (thickness + gap) + layer * (thickness + 0.8 * gap)]
+        scene.add_shell(points, triangles, thickness=thickness, material=material, bending="hinge", name=f"{layer}")
+    scene.add_obstacle(ddg.Plane(), name="floor")
+    scene.contact(range=gap, friction=MU)
+    model, integrator, states = run(scene, device, 100, 0.02)
+    weight, found = DENSITY * thickness * side**2 * 9.81, model.contacts(states[-1])
+    assert (np.ptp(found.objects, axis=1) == 1).sum() + (found.objects.max(1) == layers).sum() >= len(found)
+    between = [found.objects.max(1) == layer + 1 for layer in range(layers - 1)]
+    carried = np.array([np.abs(found.force[rows, 2]).sum() for rows in between]) / weight
+    np.testing.assert_allclose(carried, np.arange(layers - 1, 0, -1), atol=1e-5 * layers)
+    np.testing.assert_allclose(forces_on(found, layers).sum(0) / weight, [0.0, 0.0, -layers], atol=1e-5 * layers)
+    heights = states[-1].points()[:, 2].reshape(layers, -1)
+    assert (heights[1:].min(1) - heights[:-1].max(1) > thickness).all()  # order and thickness kept
+    assert (np.diff(heights.mean(1)) < thickness + gap).all()
+    drift = states[-1].points()[:, :2] - states[0].points()[:, :2]
+    assert np.abs(drift).max() < 1e-3 * side
+    assert 0.0 < integrator.statistics()["contact"]["smallest_gap"]
+
+
+FAST, FRAME = 100.0, 1.0 / 60.0  # m/s, s
+WHIP = ddg.Material(young=1e8, density=DENSITY, poisson=0.5)
+
+
+def whip(device, target: str, retries: int):
+    """A rod of 0.5 m, clamped at one end, whose other end starts at 100 m/s towards something halfway along it."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    scene.clamp_end(rod(scene, line(0.5, 20, middle=(0.25, 0.0, 0.0)), "whip", WHIP), "first")
+    place = np.array([0.25, 0.05])
+    if target == "post":
+        scene.add_obstacle(ddg.Capsule((*place, -1.0), (*place, 1.0), 0.01), name="post")
+    elif target == "rod":
+        other = rod(scene, line(0.4, 20, (0.0, 0.0, 1.0), (*place, 0.0)), "string", WHIP)
+        for end in ("first", "last"):
+            scene.clamp_end(other, end)
+    else:  # out of the whip's reach, so that it passes by
+        scene.add_obstacle(ddg.Capsule((0.5, 0.5, -1.0), (0.5, 0.5, 1.0), 0.01), name="post")
+    scene.contact(friction=0.2)
+    model = scene.build(device=device)
+    speed = np.zeros_like(model.state().points())
+    speed[:21, 1] = FAST * np.linspace(0.0, 1.0, 21)
+    return run(scene, device, 20, FRAME, velocities=speed, retries=retries), place
+
+
+def winding(points: np.ndarray, place: np.ndarray) -> float:
+    """Angle [rad] by which a curve goes about an axis along z."""
+    away = points[:, :2] - place
+    step = np.diff(np.arctan2(away[:, 1], away[:, 0]))
+    return float(((step + np.pi) % (2.0 * np.pi) - np.pi).sum())
+
+
+def test_a_whip_winds_about_a_post(device):
+    """At 100 m/s, 1.7 m in a step: it goes about the post by a positive angle, by a negative one had it passed through."""
+    (model, integrator, states), place = whip(device, "post", retries=4)
+    angles = [winding(state.points()[:21], place) for state in states]
+    assert min(angles) > 0.0
+    assert max(angles) > 1.5 * np.pi
+    assert integrator.statistics()["contact"]["smallest_gap"] > 0.0
+    assert_no_energy_is_made(energy(model, states))
+    again = whip(device, "post", retries=4)[0][2]
+    np.testing.assert_array_equal(again[-1].points(), states[-1].points())
+
+
+def test_a_whip_hits_another_rod(device):
+    """Both bend; steps are taken in parts where lines would cross, which refuses them and says so."""
+    (model, integrator, states), _ = whip(device, "rod", retries=120)
+    assert integrator.statistics()["contact"]["smallest_gap"] > 0.0
+    assert min(least_gap(model, state) for state in states) > 0.0
+    moved = np.abs(states[1].points()[21:] - states[0].points()[21:]).max()
+    assert moved > 10.0 * RADIUS
+    assert_no_energy_is_made(energy(model, states))
+
+
+def test_a_rod_at_100_metres_a_second_flies_past(device):
+    """A gap beyond the range from an obstacle and from a rod along its way, 1.7 m in a step: nothing slows it."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    rod(scene, line(0.1, 10), "shot")
+    hold(scene, rod(scene, line(0.1, 10, (0.0, 1.0, 0.0), (3.0, 0.0, 3.1 * RADIUS)), "gate"), 11)
+    scene.add_obstacle(ddg.Capsule((2.0, -1.0, -0.0131), (2.0, 1.0, -0.0131), 0.01), name="rail")
+    scene.contact(range=RANGE, friction=MU)
+    speed = np.zeros((22, 3))
+    speed[:11, 0] = FAST
+    _, integrator, states = run(scene, device, 5, FRAME, velocities=speed)
+    way = states[-1].points()[:11] - states[0].points()[:11]
+    np.testing.assert_allclose(way, np.broadcast_to([5 * FAST * FRAME, 0.0, 0.0], way.shape), atol=1e-9)
+    assert integrator.statistics()["contact"]["contacts"] == {"mean": 0.0, "last": 0}
+
+
+@pytest.mark.parametrize("share", [1e-3, 1.0, 1e4])
+@pytest.mark.parametrize("young", [1e4, 1e6, 1e9])
+def test_stiff_contact_of_soft_rods_and_the_reverse(device, share, young):
+    """Stiffness of contact over m / dt^2, and Young's modulus: rods that fly at each other bounce, and lose energy only."""
+    dt = 1e-3
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    material = ddg.Material(young=young, density=DENSITY, poisson=0.5)
+    rod(scene, line(0.1, 10), "lower", material)
+    rod(scene, line(0.1, 10, (0.0, 1.0, 0.0), (0.0, 0.0, 2.8 * RADIUS)), "upper", material)
+    scene.contact(range=RANGE, stiffness=share * mass_of_node(10) / dt**2, friction=MU)
+    speed = np.repeat([[0.0, 0.0, 0.0], [0.05, 0.0, -0.3]], 11, axis=0)
+    model, integrator, states = run(scene, device, 60, dt, velocities=speed, rtol=1e-13)
+    mass = model.net.host.mass[:22, :1]
+    momenta = np.array([(mass * state.velocities()).sum(0) for state in states])
+    assert np.abs(momenta - momenta[0]).max() < 1e-9 * np.abs(momenta).max()
+    assert 0.0 < integrator.statistics()["contact"]["smallest_gap"] < RANGE
+    assert_no_energy_is_made(energy(model, states))
+    lower, upper = momenta[-1, 2], (mass * states[-1].velocities())[11:, 2].sum()
+    assert lower - upper < 0.0  # what the lower one has taken
+
+
+@pytest.mark.parametrize("share", [1e-3, 1e4])
+def test_stiff_and_soft_contact_carry_what_rests(device, share):
+    model, integrator, states = run(heap_at_rest(share, 2e-3), device, 300, 2e-3)
+    found = model.contacts(states[-1])
+    np.testing.assert_allclose(forces_on(found, 4).sum(0) / (WEIGHT * 0.1), [0.0, 0.0, -4.0], atol=1e-4)
+    assert 0.0 < integrator.statistics()["contact"]["smallest_gap"] <= found.gap.min() + 1e-12
+
+
+def test_contact_too_soft_for_what_it_carries_says_so(device):
+    """k range^2 / gap is less than the weight down to a thousandth of the range."""
+    with pytest.raises(
+        ddg.SolverError, match=r"no_room .* point \d+ of rod \d .* give their contact a larger stiffness"
+    ) as error:
+        run(heap_at_rest(1e-4, 2e-3), device, 300, 2e-3)
+    assert error.value.outcome == "no_room"
+    assert np.isfinite(error.value.state.points()).all()
+
+
+def test_a_rod_on_a_grating_of_sixty(device):
+    """Inner bars carry what lies between their neighbours, all together the whole load."""
+    bars, pitch = 60, 6.0 * RADIUS
+    scene = ddg.Scene(mass_damping=10.0)
+    for bar in range(bars):
+        hold(scene, rod(scene, line(0.04, 4, (0.0, 1.0, 0.0), ((bar + 1) * pitch, 0.0, 0.0)), "bar"), 5)
+    length, edges = (bars + 1) * pitch, 2 * (bars + 1)
+    upper = rod(scene, line(length, edges, middle=(0.5 * length, 0.0, 2.3 * RADIUS)), "upper")
+    pressed = 50.0 * WEIGHT * length / edges
+    for node in range(edges + 1):
+        scene.add_force(upper, node, (0.0, 0.0, -pressed))
+    scene.contact(range=RANGE, friction=MU)
+    model, integrator, states = run(scene, device, 150, 0.01)
+    found = model.contacts(states[-1])
+    carried = np.array([-forces_on(found, bar).sum(0)[2] for bar in range(bars)])
+    assert carried.min() > 0.0
+    # the ends hang down, so that friction on the last bars carries a little
+    assert carried.sum() == pytest.approx(WEIGHT * length + (edges + 1) * pressed, rel=2e-3)
+    np.testing.assert_allclose(carried[20:40], WEIGHT * pitch + 2.0 * pressed, rtol=1e-4)
+    assert integrator.statistics()["contact"]["smallest_gap"] > 0.0
