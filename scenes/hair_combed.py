@@ -1,4 +1,4 @@
-"""A comb is pulled down through curled hair: what it feels, and that every strand stays between its own teeth.
+"""A comb is pulled down through curled hair, and every strand stays between its own teeth.
 
 Strands hang from held roots, as helices that widen with the distance from them. Teeth of the comb stand between groups of strands, by
 the roots, and move down and out of the hair. They are closer than the curls are wide, and draw these straight as they pass. Roots and
@@ -136,9 +136,9 @@ def benchmark() -> ddg.bench.Study:
 
 
 def picture(result, frames) -> dict:
-    """The hair and the comb before, at two thirds, and at the end."""
+    """The hair and the comb before, halfway, and at the end."""
     times = sorted(frames)
-    times = times[0], times[2 * len(times) // 3], times[-1]
+    times = times[0], times[len(times) // 2], times[-1]
     return {
         "points_by_time": {t: frames[t] for t in times},
         "bodies": {t: _touching.colored_tubes(result.model, frames[t], t) for t in times},

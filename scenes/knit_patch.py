@@ -29,7 +29,7 @@ LASTS = 1.0  # s
 def build(
     rows: int = 6,
     columns: int = 6,
-    n: int = 24,
+    n: int = 32,
     stretch: float = 0.3,
     friction: float = 0.2,
     damping: float = 10.0,
@@ -129,9 +129,9 @@ def _checks(series, stretch: float, names) -> list[ddg.Check]:
 def benchmark() -> ddg.bench.Study:
     """The pull over edges of a stitch and steps."""
     return ddg.bench.Study(
-        {"n": (16, 24, 32), "dt": (0.02, 0.01)},
+        {"n": (16, 24, 32, 48), "dt": (0.02, 0.01)},
         lambda result: result.series["high"][-1],
-        {"n": 48, "dt": 0.005},
+        {"n": 64, "dt": 0.005},
         fixed={"rows": 3, "columns": 3},
         unit="N",
     )

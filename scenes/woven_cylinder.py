@@ -144,12 +144,12 @@ def check(result) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """The couple of the ends before rings buckle, over steps."""
+    """The couple of the ends before rings buckle, over nodes of strands and of rings."""
     return ddg.bench.Study(
-        {"dt": (0.04, 0.02, 0.01)},
+        {"nodes": (15, 31), "around": (24, 48)},
         lambda result: result.series["moment_high"][-1],
-        {"dt": 0.0025},
-        fixed={"strands": 8, "rings": 5, "turns": 0.08},
+        {"nodes": 63, "around": 96},
+        fixed={"strands": 8, "rings": 5, "turns": 0.08, "dt": 0.02},
         unit="N m",
     )
 
