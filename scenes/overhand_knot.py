@@ -45,7 +45,7 @@ def build(
 
     Args:
         n: turns, 1 or 2
-        friction: coefficient
+        friction: coefficient; without any, nothing keeps the knot from sliding along the rod and off its end
         tighter: by what R shrinks from 300 n^2 radii of the rod
         edge: length of an edge in the middle over n radii of the rod
         steps: time steps
@@ -53,6 +53,8 @@ def build(
     """
     if n not in SIGMA:
         raise ValueError(f"n = {n}; there are references for 1 and 2 turns")
+    if not friction > 0.0:
+        raise ValueError(f"friction = {friction}; a knot that nothing holds slides off the rod, give more than 0")
     if not tighter > 1.0:
         raise ValueError(f"tighter = {tighter}; R shrinks by more than 1")
     if not 0.0 < edge <= 8.0:
