@@ -49,8 +49,8 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     What holds an obstacle takes what is pushed against it, without friction.
     They balance the internal forces, without those of strain-rate damping, and the loads on held dofs, and hold the normals of
     clamped mesh edges and of planes of symmetry; the inertia of a held node itself is left out, and drag on it, which a moving
-    support would have to add. Of a ring, x is the radial force summed around it, and moments do not hold the direction of the meridian. A dof that several supports hold
-    counts with the first of them, so that the reactions add up.
+    support would have to add. Of a ring, x is the radial force summed around it, and moments do not hold the direction of the
+    meridian. A dof that several supports hold counts with the first of them, so that the reactions add up.
 
     Args:
         point: what moments are about (3,); by default the first node that a support holds.
