@@ -50,21 +50,16 @@ def weight(model) -> float:
 
 
 def checks(result, refused: int = 0) -> list[ddg.Check]:
-    """Converged, finite, nothing passed through anything, and nothing overlaps.
-
-    `refused`: pairs that may have seemed to pass, by the straight line between both ends of steps that were then taken in halves.
-    """
-    outcomes, contact = result.statistics["outcomes"], result.statistics["contact"]
+    """Converged, finite, and what `kept_apart` says."""
+    outcomes = result.statistics["outcomes"]
     failed = sum(number for name, number in outcomes.items() if not name.startswith("converged"))
     share = failed / max(1, sum(outcomes.values()))
     series = [np.array(values) for values in result.series.values()]
     finite = np.isfinite(result.state.points()).all() and all(np.isfinite(values).all() for values in series)
-    gap = contact["smallest_gap"]
     return [
         ddg.Check("solves taken again in halves, of all", share, 0.0, HALVED, "what was taken converged"),
         ddg.Check("values that are not finite", float(not finite), 0.0, 0.0),
-        ddg.Check("pairs that seemed to pass, in steps not taken", contact["refused_crossings"], 0.0, refused, CROWDED),
-        ddg.Check("overlap of surfaces [m]", max(0.0, -gap) if gap else np.nan, 0.0, 0.0, "the barrier"),
+        *kept_apart(result, refused),
     ]
 
 
@@ -109,14 +104,17 @@ def _masses(model) -> np.ndarray:
     return host.mass[:first, 0]
 
 
-def kept_apart(result) -> list[ddg.Check]:
-    """Nothing passed through anything, and surfaces that a barrier keeps apart never overlapped."""
+def kept_apart(result, refused: int = 0) -> list[ddg.Check]:
+    """Nothing passed through anything, and surfaces never overlapped.
+
+    `refused`: pairs that may have seemed to pass, by the straight line between both ends of steps that were then taken in halves.
+    """
     found = result.statistics["contact"]
-    checks = [ddg.Check("pairs that passed through each other", found["refused_crossings"], 0.0, 0.0)]
-    if result.model.scene.touching.law == "barrier":
-        overlap = max(0.0, -found["smallest_gap"])
-        checks.append(ddg.Check("largest overlap of surfaces [m]", overlap, 0.0, 0.0, "the barrier"))
-    return checks
+    gap, seemed = found["smallest_gap"], found["refused_crossings"]
+    return [
+        ddg.Check("pairs that seemed to pass, in steps not taken", seemed, 0.0, refused, CROWDED),
+        ddg.Check("largest overlap of surfaces [m]", max(0.0, -gap) if gap else np.nan, 0.0, 0.0, "the barrier"),
+    ]
 
 
 def jitter(shape: tuple, seed: int) -> np.ndarray:
