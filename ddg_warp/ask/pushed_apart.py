@@ -48,7 +48,7 @@ def pushed_apart(model, state, gap: float | None = None):
     x, free = start.copy(), np.tile(~host.fixed.astype(bool), (model.worlds, 1)).astype(float)
     for _ in range(ROUNDS):
         new.net.q.assign(x)
-        touch.at(new.net.q)
+        touch.find(new.net.q)
         steps, shares, closest = np.zeros_like(x), np.zeros(len(x)), np.inf
         for pairs in touch.search.lists:
             closest = min(closest, _part(pairs, new.net.q, free, least, steps, shares))

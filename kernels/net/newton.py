@@ -31,7 +31,7 @@ from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
 from ddg_warp.kernels.search import PLACE, STRAIGHT
 from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
 
-ON_THE_WAY, THERE = 2, 1  # what supports have done in the last step, if they moved: not arrived, arrived
+ON_THE_WAY, THERE = 2, 1  # worlds whose supports or predictor were held up: not there yet, there since the last step
 POLISH = 1e-3  # reduction to which a direction must have been solved before rounding excuses what it leaves
 STALLED = 8  # iterations without progress, where energies drown in rounding, that a world is given
 

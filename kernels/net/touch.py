@@ -100,15 +100,17 @@ def world_kernels(real):
         """
         w = wp.tid()
         length = scalars[STEP_LENGTH, w]
-        if modes[w] != wp.static(NONE) and (time[w] < real(1.0) or flags[HALVINGS, w] > 0) and projected[w] != 0:
+        moves = modes[w] != wp.static(NONE)
+        cut = moves and time[w] < real(1.0)
+        if projected[w] != 0 and (cut or (moves and flags[HALVINGS, w] > 0)):
             flags[CLAMPED, w] = 1
             if projected[w] == 1:
                 flags[DETOURS, w] = flags[DETOURS, w] - 1
                 projected[w] = 2
-        if modes[w] != wp.static(NONE) and time[w] < real(1.0) and length > real(0.0):
+        cut = cut and length > real(0.0)
+        if cut:
             scalars[DECREMENT, w] = wp.max(decrease[w], real(0.0)) / length
-            stalled[w] = 0
-        if flags[DRIVEN, w] != 0:
+        if cut or flags[DRIVEN, w] != 0:
             stalled[w] = 0
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -148,6 +150,7 @@ def world_kernels(real):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def short(modes: wp.array(dtype=int), time: wp.array(dtype=real), flags: wp.array2d(dtype=int)):
+        """Worlds whose predictor was cut are on their way."""
         w = wp.tid()
         if modes[w] != wp.static(NONE) and time[w] < real(1.0):
             flags[DRIVEN, w] = wp.static(ON_THE_WAY)
@@ -198,7 +201,7 @@ def block_kernels(real, linear, serial: bool):
         blocks: int,
         right: wp.array(dtype=H),
     ):
-        """Takes a product from the residual on free dofs of worlds."""
+        """Takes a product from the residual on free dofs of worlds that want a direction."""
         w, start = share(wp.tid(), blocks)
         if wanted[w] != 0:
             for k in range(start, until(start, blocks)):
@@ -285,7 +288,6 @@ def block_kernels(real, linear, serial: bool):
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def part(
         q: wp.array(dtype=V),
-        modes: wp.array(dtype=int),
         flags: wp.array2d(dtype=int),
         blocks: int,
         proposed: wp.array(dtype=V),

@@ -152,13 +152,7 @@ class BroadPhase:
         self._sweep(mark, x, [x, move, self.overflow], [self._seen, self._stale, self._searched, self.searches])
 
     def filter(
-        self,
-        base: wp.array,
-        q: wp.array,
-        unit: wp.array,
-        together: wp.array,
-        units: int,
-        keep: float = 1.0,
+        self, base: wp.array, q: wp.array, unit: wp.array, together: wp.array, units: int, keep: float = 1.0
     ) -> None:
         """Shorten the motion from `base` to q so that no two come as near as `keep` of their thickness, in place.
 

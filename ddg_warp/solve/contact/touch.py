@@ -64,11 +64,15 @@ class Touch:
         Raises:
             SolverError: names a node whose position is not finite.
         """
+        self.find(x)
+        self.terms.fit()
+        self.terms.evaluate(x)
+
+    def find(self, x: wp.array) -> None:
+        """Candidates at blocks x, all of them; `at` has to follow before energies are asked for. Not in a capture; raises as `at`."""
         self.search.rebuild(x)
         self.search.search(x)
         self.search.fit(x)
-        self.terms.fit()
-        self.terms.evaluate(x)
 
     def pairs(self, x: wp.array) -> dict[str, np.ndarray]:
         """Candidates at blocks x, after `at`.

@@ -162,7 +162,7 @@ class NetContact:
         self._launch(self._find_predicted, self.net.worlds, [newton.islands.arrays[0]], [self._modes])
         self._cut()
         self._launch(self._find_short, self.net.worlds, [self._modes, self.search.time], [newton.islands.arrays[0]])
-        self._go_on()
+        self._let_go()
 
     def evaluate(self) -> None:
         """Energies, forces and factors at the iterate."""
@@ -226,7 +226,7 @@ class NetContact:
         self._launch(self._find_modes, self.net.worlds, [newton.islands.arrays[0]], [self._modes])
         self._launch(self._depart, self.net.worlds, [self._modes], [newton.islands.arrays[0]])
         self._cut()
-        self._go_on()
+        self._let_go()
         inputs = [newton.right, newton.q, newton.base, self._modes, self.net.blocks]
         self._sweep(self._differ_gain, inputs, [newton.dots])
         self._sum(newton.dots, self._gain)
@@ -246,10 +246,10 @@ class NetContact:
             inputs = [self._nodes, self._aims, newton.fixed, self._modes, eps, self.net.blocks, newton.q]
             self._launch(self._arrive, (len(self._nodes), self.net.worlds), inputs, [newton.islands.arrays[0]])
 
-    def _go_on(self) -> None:
+    def _let_go(self) -> None:
         """Let go of what was proposed where nothing is on its way."""
         self._going.zero_()
-        inputs = [self.newton.q, self._modes, self.newton.islands.arrays[0], self.net.blocks]
+        inputs = [self.newton.q, self.newton.islands.arrays[0], self.net.blocks]
         self._sweep(self._part, inputs, [self.bound, self._going])
 
     def finish(self, before: wp.array) -> None:
