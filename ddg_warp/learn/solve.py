@@ -178,7 +178,9 @@ class DirectSolve:
             return
         self.system = AssembledNewton(*given, stored=linear)
         own = linear or real
-        self.solver = CyclicReduction(kind.block, *size, own, device) if few else Elimination(kind, *size, own, device)
+        self.solver = Elimination(kind, *size, own, device)
+        if few:
+            self.solver = CyclicReduction(kind.block, *size, own, device, repeated=linear is not None)
         self.failed = self.system.islands.bad
         if linear is not None:
             self._product = refine.product_kernel(kind, real)

@@ -6,6 +6,8 @@ import numpy as np
 # takes about 40 launches, and some ns a node of all rods together.
 LONG = 512  # nodes of a rod from which on cyclic reduction pays on a GPU ...
 FEW = 256  # ... if there are no more rods than this
+# Of one matrix and many right-hand sides, as in contact: a further one takes the sweep 1.3 us a node, and cyclic reduction one launch.
+LONG_REPEATED, FEW_REPEATED = 24, 2048
 
 LARGE = 4096  # nodes of a net, those of rods apart, from which on fewer, longer iterations of conjugate gradients pay
 
@@ -26,9 +28,13 @@ def automatic(group) -> str:
     return "partitioned" if long_and_few(group.nodes, group.columns, group.device) else "sweep"
 
 
-def long_and_few(nodes: int, columns: int, device) -> bool:
-    """Whether chains of at most as many nodes are solved by cyclic reduction, many threads a chain."""
-    return device.is_cuda and nodes >= LONG and columns <= FEW
+def long_and_few(nodes: int, columns: int, device, repeated: bool = False) -> bool:
+    """Whether chains of at most as many nodes are solved by cyclic reduction, many threads a chain.
+
+    `repeated`: whether for many right-hand sides of one matrix.
+    """
+    long, few = (LONG_REPEATED, FEW_REPEATED) if repeated else (LONG, FEW)
+    return device.is_cuda and nodes >= long and columns <= few
 
 
 # Nodes from which on equilibria of a net take conjugate gradients, without and with CUDA. Where membrane forces carry the loads these

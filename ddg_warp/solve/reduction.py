@@ -4,9 +4,10 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.kernels.matrix import block_band
-from ddg_warp.kernels.solve import cyclic_reduction, paired
+from ddg_warp.kernels.solve import cyclic_reduction, paired, reduction_again
 
 THREADS = 32  # of a block of threads that walk: few chains reach more multiprocessors
+MOST = 512  # threads of a block that has one chain
 
 
 class CyclicReduction:
@@ -14,9 +15,12 @@ class CyclicReduction:
 
     Args:
         tensions: how many dofs of a node are; with any, the system comes in the form of a level. See `kernels.solve.paired`.
+        repeated: whether there are further right-hand sides of the same matrix; see `kernels.solve.reduction_again`.
     """
 
-    def __init__(self, nb: int, nodes: int, columns: int, linear, device, tensions: int = 0):
+    def __init__(
+        self, nb: int, nodes: int, columns: int, linear, device, tensions: int = 0, repeated: bool = False
+    ):
         self.columns, self.device, self.dofs = columns, device, 2 * nb
         self.blocks = [-(-nodes // 2)]  # of every level
         while self.blocks[-1] > 1:
@@ -35,23 +39,43 @@ class CyclicReduction:
         ]
         self._last = cyclic_reduction.last_kernel(nb, linear, not tensions and levels == 0, tensions)
         self._expand = cyclic_reduction.expand_kernel(nb, linear)
+        self._packed = None
+        if repeated:
+            number = 1 + sum(blocks // 2 for blocks in self.blocks)
+            self._packed = wp.zeros((columns, number, 3 * self.dofs**2), dtype=linear, device=device)
+            self._rest, self._found = (
+                wp.zeros((columns, self.blocks[0], self.dofs), dtype=linear, device=device) for _ in range(2)
+            )
+            self._pack = [
+                reduction_again.pack_kernel(nb, linear, not tensions and level == 0, tensions)
+                for level in range(len(self.blocks))
+            ]
+            self._again = reduction_again.again_kernel(nb, linear)
+            self._threads = 1
+            if wp.get_device(device).is_cuda:
+                self._threads = min(MOST, -(-(self.blocks[0] + 1) // 2 * self.dofs // 32) * 32)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [*((kernel, 64) for kernel in self._reduce[:2]), (self._last, 32), self._expand]
+        own = [*((kernel, 64) for kernel in self._reduce[:2]), (self._last, 32), self._expand]
+        return own if self._packed is None else [*own, *self._pack[:2], (self._again, self._threads)]
 
     def solve(self, matrix, right, count, wanted, solution: wp.array, bad: wp.array, again: bool = False) -> None:
         """Solution of the wanted columns from the blocks of their nodes; adds the pivots they lose to `bad`.
 
-        `again` is for another right-hand side of the same matrix. The solution may take the place of the right-hand side.
+        `again` is for a further right-hand side of the same matrix. The solution may take the place of the right-hand side.
         """
+        if again:
+            self.again(right, count, wanted, 1, solution)
+            return
+        given = matrix
         for level, kernel in enumerate(self._reduce):
             outputs = [self.matrices[level], self.rights[level], self.kept[level]]
             wp.launch(
                 kernel,
-                (1 if again else 2 * self.dofs + 1, self.blocks[level + 1], self.columns),
-                [matrix, right, count, wanted, self.blocks[level], 2, self.dofs if again else 0],
+                (2 * self.dofs + 1, self.blocks[level + 1], self.columns),
+                [matrix, right, count, wanted, self.blocks[level], 2],
                 [*outputs, bad],
                 device=self.device,
                 block_dim=64,
@@ -73,6 +97,35 @@ class CyclicReduction:
                 [solution],
                 device=self.device,
             )
+        if self._packed is not None:
+            self._keep(given, count, wanted)
+
+    def _keep(self, matrix, count, wanted) -> None:
+        """What further right-hand sides need."""
+        at = 0
+        for level, kernel in enumerate(self._pack):
+            last = level == len(self.kept)
+            kept, number = (self.kept[0], 1) if last else (self.kept[level], self.blocks[level] // 2)
+            wp.launch(
+                kernel,
+                (self.columns, number, self.dofs),
+                [matrix, kept, count, wanted, self.blocks[level], int(not last), at],
+                [self._packed],
+                device=self.device,
+            )
+            at += number
+            matrix = None if last else self.matrices[level]
+
+    def again(self, right, count, wanted: wp.array, width: int, solution: wp.array) -> None:
+        """Solution of a further right-hand side, of the columns of which `wanted` is 1, of every `width` of them."""
+        wp.launch(
+            self._again,
+            self.columns * self._threads,
+            [self._packed, right, count, wanted, width, self.blocks[0], self._threads],
+            [self._rest, self._found, solution],
+            device=self.device,
+            block_dim=self._threads,
+        )
 
 
 class Elimination:

@@ -29,7 +29,7 @@ def level_rows(nb: int) -> tuple[int, int, int]:
 
 
 @cache
-def _block_functions(nb: int, linear, first: bool, tensions: int):
+def block_functions(nb: int, linear, first: bool, tensions: int):
     """factor, solve, own_column, right_side of diagonal blocks, and column, product of a coupling X, from nodes or a level.
 
     X is the coupling B_i, or its transpose where it is `turned`, so that one code serves both neighbours of a block.
@@ -169,7 +169,7 @@ def reduce_kernel(nb: int, linear, first: bool, tensions: int = 0):
     """
     nb2 = nb**2
     H = wp.types.vector(nb, linear)
-    factor, solve, own_column, right_side, column, product = _block_functions(nb, linear, first, tensions)
+    factor, solve, own_column, right_side, column, product = block_functions(nb, linear, first, tensions)
 
     @wp.func
     def put(A: wp.array3d(dtype=linear), row: int, stride: int, k: int, r: int, v: H):
@@ -184,15 +184,13 @@ def reduce_kernel(nb: int, linear, first: bool, tensions: int = 0):
         wanted: wp.array(dtype=int),
         blocks: int,
         neighbours: int,
-        start_column: int,
         matrix_out: wp.array3d(dtype=linear),
         right_out: wp.array3d(dtype=linear),
         kept_out: wp.array3d(dtype=linear),
         bad: wp.array(dtype=int),
     ):
-        """`blocks` of the level; `neighbours` is 2, which the compiler must not know. Threads begin at column `start_column`."""
+        """`blocks` of the level; `neighbours` is 2, which the compiler must not know."""
         c, j, r = wp.tid()
-        c += start_column
         if wanted[r] == 0:
             return
         n = blocks
@@ -257,7 +255,7 @@ def reduce_kernel(nb: int, linear, first: bool, tensions: int = 0):
 @cache
 def last_kernel(nb: int, linear, first: bool, tensions: int = 0):
     """Solution of the one block that is left: the first two nodes of a rod."""
-    factor, solve, _, right_side, *_ = _block_functions(nb, linear, first, tensions)
+    factor, solve, _, right_side, *_ = block_functions(nb, linear, first, tensions)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def last(

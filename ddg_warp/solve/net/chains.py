@@ -89,8 +89,9 @@ class Chains:
         block = plan.block
         self.factors = arrays.allocate((3 * block**2 + block, self.longest, self.columns), linear, device)
         self.reduction = None
-        if not self.split and long_and_few(self.longest, self.columns, wp.get_device(device)):
-            self.reduction = CyclicReduction(block, self.longest, self.columns, linear, device)
+        if not self.split and long_and_few(self.longest, self.columns, wp.get_device(device), self._contact):
+            repeated = not self.exact or len(plan.of_places[1]) > 0
+            self.reduction = CyclicReduction(block, self.longest, self.columns, linear, device, repeated=repeated)
             self._all = put(np.tile(plan.count, worlds))
             self._wanted, self._bad = (put(np.zeros(self.columns)) for _ in range(2))
             self.bands = self.factors
@@ -303,13 +304,14 @@ class Chains:
     def _reduce(self, values: wp.array, wanted: wp.array) -> None:
         """H_II^-1 of values by cyclic reduction, which eliminates anew once after every `prepare`."""
         spread, note = self._columns
-        self._launch(spread, self.columns, [wanted, self.width], [self._wanted])
         for first in range(0, values.shape[2], self.columns):
             part = values[:, :, first : first + self.columns]
-            given = self.eliminated, part, self._all, self._wanted, part, self._bad
-            self.reduction.solve(*given, again=self._reduced)
-            if not self._reduced:
-                self._launch(note, self.columns, [self.width], [self._bad, self._lost])
+            if self._reduced:
+                self.reduction.again(part, self._all, wanted, self.width, part)
+                continue
+            self._launch(spread, self.columns, [wanted, self.width], [self._wanted])
+            self.reduction.solve(self.eliminated, part, self._all, self._wanted, part, self._bad)
+            self._launch(note, self.columns, [self.width], [self._bad, self._lost])
             self._reduced = True
 
     def _elements(self, index: int, written: dict, real, linear):

@@ -1,0 +1,164 @@
+"""Further right-hand sides of a system that cyclic reduction has eliminated once, a block of threads a chain, in one launch.
+
+A level that eliminates the odd blocks u keeps K1 = A_u^-1 B_j^T and K2 = A_u^-1 B_u (see `cyclic_reduction`); with A_u^-1, which is
+added to them here, each level is a product of small matrices, up to the last block and down again:
+
+    r'_j = r_j - K2_l^T r_l - K1_u^T r_u ,    x_u = A_u^-1 r_u - K1_u x_j - K2_u x_j+2 .
+
+Threads of a block wait for each other between levels, which costs a microsecond or two where a launch takes four or more. What a chain
+needs lies together: of its odd blocks, level by level, and of the last one the rows of K1, of K2 and of A_u^-1.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.solve.cyclic_reduction import block_functions
+from ddg_warp.kernels.threads import CPU_OPTIONS
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+#endif
+""")
+def wait(): ...
+
+
+@cache
+def pack_kernel(nb: int, linear, first: bool, tensions: int = 0):
+    """pack(...) of the odd blocks of a level what it has kept, and their inverses: thread c of a block has column c.
+
+    Of the last block, which is even and has neighbours no more, it is the inverse alone (`odd` 0).
+    """
+    size = 2 * nb
+    H = wp.types.vector(nb, linear)
+    factor, solve, *_ = block_functions(nb, linear, first, tensions)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def pack(
+        matrix: wp.array3d(dtype=linear),
+        kept: wp.array3d(dtype=linear),
+        count: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        odd: int,
+        at: int,
+        packed: wp.array3d(dtype=linear),
+    ):
+        r, j, c = wp.tid()
+        if wanted[r] == 0:
+            return
+        n = blocks
+        if wp.static(first):
+            n = count[r]
+        a, b = H(), H()
+        for d in range(wp.static(nb)):
+            a[d] = wp.where(d == c, linear(1.0), linear(0.0))
+            b[d] = wp.where(d + wp.static(nb) == c, linear(1.0), linear(0.0))
+        L0, d0, Z, L1, d1, _lost = factor(matrix, 2 * j + odd, n, r)
+        a, b = solve(L0, d0, Z, L1, d1, a, b)
+        for d in range(wp.static(nb)):
+            packed[r, at + j, wp.static(2 * size**2) + d * wp.static(size) + c] = a[d]
+            packed[r, at + j, wp.static(2 * size**2) + (d + wp.static(nb)) * wp.static(size) + c] = b[d]
+        if odd == 1:
+            for row in range(wp.static(2 * size)):
+                packed[r, at + j, row * wp.static(size) + c] = kept[row * wp.static(size) + c, j, r]
+
+    return pack
+
+
+@cache
+def again_kernel(nb: int, linear):
+    """again(...): the solution of wanted chains for another right-hand side, by as many `threads` as a block has."""
+    size = 2 * nb
+    square = size**2
+
+    @wp.func
+    def times(packed: wp.array3d(dtype=linear), r: int, j: int, row: int, x: wp.array3d(dtype=linear), k: int):
+        """A row of a packed matrix times block k."""
+        total = linear(0.0)
+        for d in range(wp.static(size)):
+            total += packed[r, j, row + d] * x[r, k, d]
+        return total
+
+    @wp.func
+    def times_turned(packed: wp.array3d(dtype=linear), r: int, j: int, at: int, x: wp.array3d(dtype=linear), k: int):
+        """The same with a column."""
+        total = linear(0.0)
+        for d in range(wp.static(size)):
+            total += packed[r, j, at + d * wp.static(size)] * x[r, k, d]
+        return total
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def again(
+        packed: wp.array3d(dtype=linear),
+        right: wp.array3d(dtype=linear),
+        count: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        width: int,
+        blocks: int,
+        threads: int,
+        rest: wp.array3d(dtype=linear),
+        found: wp.array3d(dtype=linear),
+        solution: wp.array3d(dtype=linear),
+    ):
+        """`wanted` (1) of every `width` chains; rest and found (chains, blocks, 2 nb) are to work in."""
+        tid = wp.tid()
+        r = tid / threads
+        t = tid - r * threads
+        if wanted[r / width] != 1:
+            return
+        n = count[r]
+        for i in range(t, blocks * wp.static(size), threads):
+            j = i / wp.static(size)
+            c = i - j * wp.static(size)
+            half = c / wp.static(nb)
+            k = 2 * j + half
+            value = linear(0.0)
+            if k < n:
+                value = right[c - half * wp.static(nb), k, r]
+            rest[r, j, c] = value
+        wait()
+        number, apart, at = int(blocks), int(1), int(0)
+        while number > 1:
+            for i in range(t, (number + 1) / 2 * wp.static(size), threads):
+                j = i / wp.static(size)
+                c = i - j * wp.static(size)
+                value = rest[r, 2 * j * apart, c]
+                if j > 0:
+                    value -= times_turned(packed, r, at + j - 1, wp.static(square) + c, rest, (2 * j - 1) * apart)
+                if 2 * j + 1 < number:
+                    value -= times_turned(packed, r, at + j, c, rest, (2 * j + 1) * apart)
+                rest[r, 2 * j * apart, c] = value
+            wait()
+            at += number / 2
+            number = (number + 1) / 2
+            apart *= 2
+        for c in range(t, wp.static(size), threads):
+            found[r, 0, c] = times(packed, r, at, wp.static(2 * square) + c * wp.static(size), rest, 0)
+        wait()
+        while apart > 1:
+            apart /= 2
+            number = (blocks + apart - 1) / apart
+            at -= number / 2
+            for i in range(t, number / 2 * wp.static(size), threads):
+                j = i / wp.static(size)
+                c = i - j * wp.static(size)
+                k = (2 * j + 1) * apart
+                row = c * wp.static(size)
+                value = times(packed, r, at + j, wp.static(2 * square) + row, rest, k)
+                value -= times(packed, r, at + j, row, found, k - apart)
+                if 2 * j + 2 < number:
+                    value -= times(packed, r, at + j, wp.static(square) + row, found, k + apart)
+                found[r, k, c] = value
+            wait()
+        for i in range(t, blocks * wp.static(size), threads):
+            j = i / wp.static(size)
+            c = i - j * wp.static(size)
+            half = c / wp.static(nb)
+            k = 2 * j + half
+            if k < n:
+                solution[c - half * wp.static(nb), k, r] = found[r, j, c]
+
+    return again

@@ -1,0 +1,76 @@
+"""Further right-hand sides of what cyclic reduction has eliminated, against dense solves."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.solve.reduction import CyclicReduction
+
+COUNTS = (2, 3, 4, 5, 17, 31, 32, 33, 50, 64)
+
+
+def system(nb: int, rng) -> tuple[np.ndarray, list]:
+    """Bands (3 nb^2, nodes, columns) of definite matrices of chains of `COUNTS` nodes, and these matrices."""
+    bands, matrices = np.zeros((3, nb, nb, max(COUNTS), len(COUNTS))), []
+    for column, n in enumerate(COUNTS):
+        L = np.zeros((n, nb, n, nb))
+        for k in range(n):
+            for back in range(min(3, k + 1)):
+                L[k, :, k - back] = rng.normal(size=(nb, nb))
+        L = L.reshape(n * nb, n * nb)
+        H = (L @ L.T + 0.5 * np.eye(n * nb)).reshape(n, nb, n, nb)
+        matrices.append(H.reshape(n * nb, n * nb))
+        for k in range(n):
+            for ahead in range(min(3, n - k)):
+                bands[ahead, :, :, k, column] = H[k, :, k + ahead]
+    return bands.reshape(3 * nb**2, max(COUNTS), len(COUNTS)), matrices
+
+
+@pytest.mark.parametrize("nb", [3, 4])
+def test_further_right_hand_sides_are_dense_solves(device, nb):
+    """Of the first system and of one that takes its place; what is not wanted is left alone."""
+    rng, columns = np.random.default_rng(3), len(COUNTS)
+    reduction = CyclicReduction(nb, max(COUNTS), columns, wp.float64, device, repeated=True)
+    count, every = wp.array(COUNTS, dtype=int, device=device), wp.full(columns, 1, dtype=int, device=device)
+    bad, some = wp.zeros(columns, dtype=int, device=device), np.arange(columns) % 5 != 0
+    for _ in range(2):
+        bands, matrices = system(nb, rng)
+        matrix = arrays.upload(bands, wp.float64, device)
+        right = rng.normal(size=(2, nb, max(COUNTS), columns))
+        given = [arrays.upload(values, wp.float64, device) for values in right]
+        found = arrays.upload(np.full(right.shape[1:], 7.0), wp.float64, device)
+        reduction.solve(matrix, given[0], count, every, given[0], bad)
+        reduction.again(given[1], count, wp.array(np.where(some, 1, 2), dtype=int, device=device), 1, found)
+        assert (bad.numpy() == 0).all()
+        first, second = arrays.download(given[0]), arrays.download(found)
+        for column, (n, H) in enumerate(zip(COUNTS, matrices, strict=True)):
+            expected = np.linalg.solve(H, right[0, :, :n, column].T.ravel())
+            np.testing.assert_allclose(first[:, :n, column].T.ravel(), expected, rtol=0, atol=1e-11 * abs(expected).max())
+            if not some[column]:
+                assert (second[:, :, column] == 7.0).all()
+                continue
+            expected = np.linalg.solve(H, right[1, :, :n, column].T.ravel())
+            np.testing.assert_allclose(
+                second[:, :n, column].T.ravel(), expected, rtol=0, atol=1e-11 * abs(expected).max()
+            )
+            assert (second[:, n:, column] == 7.0).all()
+
+
+def test_in_place_and_by_world(device):
+    """Three chains of each of two worlds, of which the second wants nothing; the solution takes the place of the right-hand side."""
+    rng, nb, n = np.random.default_rng(4), 3, 40
+    H = np.zeros((3, nb, nb, n, 6))
+    H[0] = 10.0 * np.eye(nb)[:, :, None, None]
+    H[1:] = 0.5 * rng.normal(size=H[1:].shape)
+    reduction = CyclicReduction(nb, n, 6, wp.float64, device, repeated=True)
+    matrix = arrays.upload(H.reshape(3 * nb**2, n, 6), wp.float64, device)
+    count, every = wp.full(6, n, dtype=int, device=device), wp.full(6, 1, dtype=int, device=device)
+    right = rng.normal(size=(nb, n, 6))
+    found, bad = (arrays.upload(right, wp.float64, device) for _ in range(2)), wp.zeros(6, dtype=int, device=device)
+    first, second = found
+    reduction.solve(matrix, first, count, every, first, bad)
+    reduction.again(second, count, wp.array([1, 2], dtype=int, device=device), 3, second)
+    one, other = arrays.download(first), arrays.download(second)
+    np.testing.assert_allclose(other[..., :3], one[..., :3], rtol=1e-12, atol=1e-13)
+    assert (other[..., 3:] == right[..., 3:]).all()
