@@ -18,9 +18,7 @@ class CyclicReduction:
         repeated: whether there are further right-hand sides of the same matrix; see `kernels.solve.reduction_again`.
     """
 
-    def __init__(
-        self, nb: int, nodes: int, columns: int, linear, device, tensions: int = 0, repeated: bool = False
-    ):
+    def __init__(self, nb: int, nodes: int, columns: int, linear, device, tensions: int = 0, repeated: bool = False):
         self.columns, self.device, self.dofs = columns, device, 2 * nb
         self.blocks = [-(-nodes // 2)]  # of every level
         while self.blocks[-1] > 1:

@@ -370,7 +370,7 @@ def stiffen_kernel(twist: bool, linear):
         if e >= 0:
             E += wp.cw_mul(wide(between[e + w * edges]), wp.outer(f, free_of(layout.held[k + 1, c])))
         store(stiffer, wp.static(nb**2), k, r, E)
-        for row in range(wp.static(2 * nb**2), bands.shape[0]):
+        for row in range(wp.static(2 * nb**2), wp.static(3 * nb**2)):
             stiffer[row, k, r] = bands[row, k, r]
 
     return stiffen

@@ -1,9 +1,12 @@
 """Steps in which rods touch: nothing passes, momentum, balance, repeatability, and what refuses."""
 
+from importlib import import_module
+
 import numpy as np
 import pytest
 
 import ddg_warp as ddg
+from ddg_warp.solve.net import chains as net_chains
 
 RADIUS = 2e-3
 SOFT = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
@@ -169,3 +172,23 @@ def test_refusals(device):
             ddg.Integrator(model, **options)
     with pytest.raises(ddg.SceneError, match="contact: "):
         ddg.statics.solve(model)
+
+
+@pytest.mark.parametrize("name", ["noodles", "crossed_beams"])
+def test_chains_are_eliminated_by_one_thread_or_by_many(device, monkeypatch, name):
+    """Contact's part of the bands is in both: the same iterations, and the same motion but for rounding."""
+    found = []
+    for reduces in (False, True):
+        monkeypatch.setattr(net_chains, "long_and_few", lambda *_, reduces=reduces: reduces)
+        scene = import_module(f"ddg_warp.scenes.{name}").build()
+        model = scene.build(device, precision="float64")
+        integrator = ddg.Integrator(model)
+        state = model.state()
+        for _ in range(40):
+            state = integrator.step(state, scene.analysis.dt)
+        found.append((state.points(), integrator.statistics()))
+    (one, by_one), (many, by_many) = found
+    assert by_one["contact"]["contacts"]["mean"] > 0.0
+    assert by_many["newton_iterations"] == by_one["newton_iterations"]
+    assert abs(by_many["pcg_iterations"] - by_one["pcg_iterations"]) < 0.02 * by_one["pcg_iterations"]
+    np.testing.assert_allclose(many, one, rtol=0.0, atol=1e-7)

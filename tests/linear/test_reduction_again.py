@@ -46,7 +46,9 @@ def test_further_right_hand_sides_are_dense_solves(device, nb):
         first, second = arrays.download(given[0]), arrays.download(found)
         for column, (n, H) in enumerate(zip(COUNTS, matrices, strict=True)):
             expected = np.linalg.solve(H, right[0, :, :n, column].T.ravel())
-            np.testing.assert_allclose(first[:, :n, column].T.ravel(), expected, rtol=0, atol=1e-11 * abs(expected).max())
+            np.testing.assert_allclose(
+                first[:, :n, column].T.ravel(), expected, rtol=0, atol=1e-11 * abs(expected).max()
+            )
             if not some[column]:
                 assert (second[:, :, column] == 7.0).all()
                 continue
