@@ -4,25 +4,32 @@ import warp as wp
 
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
-PIECE = 64  # entries that a thread adds up
+TILE = 1024  # entries that a block of threads adds up
+THREADS = 256  # of it
+
+
+@wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+def add_tiles(values: wp.array(dtype=int), sums_out: wp.array(dtype=int)):
+    """Sums of `TILE` entries each."""
+    b = wp.tid()
+    tile = wp.tile_load(values, shape=wp.static(TILE), offset=b * wp.static(TILE))
+    wp.tile_store(sums_out, wp.tile_sum(tile), offset=b)
+
+
+@wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+def run_tiles(values: wp.array(dtype=int), starts: wp.array(dtype=int), sums_out: wp.array(dtype=int)):
+    """The sum of all entries before each one, from those before each tile; of one tile `starts` is a zero."""
+    b = wp.tid()
+    tile = wp.tile_scan_exclusive(wp.tile_load(values, shape=wp.static(TILE), offset=b * wp.static(TILE)))
+    before = wp.tile_full(shape=wp.static(TILE), value=starts[b], dtype=int)
+    wp.tile_store(sums_out, tile + before, offset=b * wp.static(TILE))
 
 
 @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-def add_pieces(values: wp.array(dtype=int), sums: wp.array(dtype=int)):
-    """Sums of `PIECE` entries each."""
-    i = wp.tid()
+def run(values: wp.array(dtype=int), sums_out: wp.array(dtype=int)):
+    """The same by one thread, for the CPU, which has one."""
     total = int(0)
-    for k in range(i * wp.static(PIECE), wp.min((i + 1) * wp.static(PIECE), values.shape[0])):
-        total += values[k]
-    sums[i] = total
-
-
-@wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-def run(values: wp.array(dtype=int), starts: wp.array(dtype=int), sums_out: wp.array(dtype=int)):
-    """Sums of all entries before each one, from those before each piece; of one piece `starts` is a zero."""
-    i = wp.tid()
-    total = starts[i]
-    for k in range(i * wp.static(PIECE), wp.min((i + 1) * wp.static(PIECE), values.shape[0])):
+    for k in range(values.shape[0]):
         value = values[k]
         sums_out[k] = total
         total += value

@@ -3,7 +3,7 @@
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.contact import gather, sums
+from ddg_warp.kernels.contact import gather
 from ddg_warp.kernels.contact.surfaces import Kind
 from ddg_warp.solve.contact.pairs import RunningSums
 
@@ -25,7 +25,7 @@ class NodeItems:
         self._running = RunningSums(self.numbers)
         self.places = self._running.starts
         self.name, self._number, self._fill, self._sort = gather.list_kernels(kind, real, arrays.serial(self.device))
-        self.kernels = [self.name, self._number, self._fill, self._sort, sums.add_pieces, sums.run]
+        self.kernels = [self.name, self._number, self._fill, self._sort, *self._running.kernels]
 
     def reserve(self, capacity: int) -> None:
         """Make room for the items of so many pairs."""

@@ -16,20 +16,30 @@ class RunningSums:
 
     def __init__(self, values: wp.array):
         self._levels = [values]
-        while len(self._levels[-1]) > sums.PIECE:
-            pieces = -(-len(self._levels[-1]) // sums.PIECE)
-            self._levels.append(wp.zeros(pieces, dtype=int, device=values.device))
+        self.kernels = [sums.run]
+        if values.device.is_cuda:
+            self.kernels = [(sums.add_tiles, sums.THREADS), (sums.run_tiles, sums.THREADS)]
+            while len(self._levels[-1]) > sums.TILE:
+                tiles = -(-len(self._levels[-1]) // sums.TILE)
+                self._levels.append(wp.zeros(tiles, dtype=int, device=values.device))
         self._starts = [wp.zeros_like(level) for level in self._levels]
         self._first = wp.zeros(1, dtype=int, device=values.device)
         self.starts = self._starts[0]
 
     def __call__(self) -> None:
-        for values, pieces in zip(self._levels, self._levels[1:], strict=False):
-            wp.launch(sums.add_pieces, len(pieces), [values], [pieces], device=values.device)
+        if not self.starts.device.is_cuda:
+            wp.launch(sums.run, 1, [self._levels[0]], [self.starts], device=self.starts.device)
+            return
+        for values, tiles in zip(self._levels, self._levels[1:], strict=False):
+            self._launch(sums.add_tiles, len(tiles), [values], [tiles])
         before = self._first
         for values, starts in zip(reversed(self._levels), reversed(self._starts), strict=True):
-            wp.launch(sums.run, len(before), [values, before], [starts], device=values.device)
+            self._launch(sums.run_tiles, len(before), [values, before], [starts])
             before = starts
+
+    def _launch(self, kernel, tiles: int, inputs: list, outputs: list) -> None:
+        device = self.starts.device
+        wp.launch_tiled(kernel, dim=tiles, inputs=inputs, outputs=outputs, block_dim=sums.THREADS, device=device)
 
 
 class PairList:
@@ -60,7 +70,7 @@ class PairList:
         self._find, self._fill = candidate_kernels(kind, grouped, real)
         self._gaps = gap_kernel(kind, real, arrays.serial(self.device))
         self.found, self.count, self.needed = (wp.zeros(1, dtype=int, device=self.device) for _ in range(3))
-        self.kernels = [self._find, self._fill, self._gaps, sums.add_pieces, sums.run]
+        self.kernels = [self._find, self._fill, self._gaps, *self._sums.kernels]
         self.reserve(max(1024, 4 * first.all))
 
     @property
