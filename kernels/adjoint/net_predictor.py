@@ -5,7 +5,6 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.adjoint.turns import excess_function, loose_function, unplace_function
-from ddg_warp.kernels.net.turns import walk_functions
 from ddg_warp.kernels.search import PLACE
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
@@ -33,7 +32,13 @@ def net_kernels(real, midpoint: bool):
         closed: int
         anchor: int
 
-    place_of, anchored = walk_functions(Rod)
+    @wp.func
+    def place_of(rod: Rod, j: int):
+        return rod.first + wp.where(j < rod.count, j, j - rod.count)
+
+    @wp.func
+    def anchored(rod: Rod, j: int):
+        return rod.anchored[place_of(rod, j)] != wp.uint8(0)
 
     @wp.func
     def by_shift(rod: Rod, j: int):

@@ -1,4 +1,7 @@
-"""Steps of a net that turn the edges of its rods: the storage of `kernels.turns`, and the predictors that need them."""
+"""Steps of a net that turn the edges of its rods, and the predictors that need them; see `kernels.turns`.
+
+Turned edges are summed along pieces of a rod, then over its pieces, then from anchors, so that a long rod has many threads.
+"""
 
 from functools import cache
 
@@ -6,56 +9,20 @@ import warp as wp
 
 from ddg_warp.kernels.islands import CAUTIOUS, RATE, STEP_LENGTH, TODO, TURN, TURNING
 from ddg_warp.kernels.search import PLACE
-from ddg_warp.kernels.threads import CPU_OPTIONS
-from ddg_warp.kernels.turns import edge_functions, onward_function, place_function
-
-
-def walk_functions(Rod):
-    """place_of(rod, j) and anchored(rod, j): where node j of a rod is among the places of all, and whether it is anchored there.
-
-    Args:
-        Rod: struct of a rod; its fields `first`, `count` and `anchored`, of all places. Nodes may be counted on past the last one.
-    """
-
-    @wp.func
-    def place_of(rod: Rod, j: int):
-        return rod.first + wp.where(j < rod.count, j, j - rod.count)
-
-    @wp.func
-    def anchored(rod: Rod, j: int):
-        return rod.anchored[place_of(rod, j)] != wp.uint8(0)
-
-    return place_of, anchored
+from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
+from ddg_warp.kernels.turns import edge_functions, onward_function
 
 
 @cache
-def turn_kernels(real, linear):
+def turn_kernels(real, linear, serial: bool):
     """What turns edges: bend(...) finds predictors that have to, aim(...) makes steps of them; turn(...) turns edges, a thread each,
-    turn_longer(...) those whose tensions say how much they lengthen; place(...) sums them along the rods of one level, a thread
-    each, and put(...) takes their nodes there.
+    turn_longer(...) those whose tensions say how much they lengthen; scan(...) sums them along pieces of rods and offset(...) from
+    piece to piece, a thread a piece; put(...) takes the nodes of one level there, a thread each. `serial`: see `until_function`.
     """
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     along_edge, excess_of = edge_functions(3, real)
     onward_of = onward_function(real)
-
-    @wp.struct
-    class Rod:
-        q: wp.array(dtype=V)
-        base: wp.array(dtype=V)
-        direction: wp.array(dtype=H)
-        nodes: wp.array(dtype=int)
-        anchored: wp.array(dtype=wp.uint8)
-        excess: wp.array2d(dtype=V)
-        shift: wp.array2d(dtype=V)
-        amount: real
-        first: int
-        world: int
-        blocks: int
-        count: int
-        closed: int
-        anchor: int
-
-    place_of, anchored = walk_functions(Rod)
+    share, until = share_function(serial), until_function(serial)
 
     @wp.func
     def move_of(direction: wp.array(dtype=H), block: int, amount: real):
@@ -63,22 +30,17 @@ def turn_kernels(real, linear):
         return V(real(d[0]), real(d[1]), real(d[2])) * amount
 
     @wp.func
-    def excess(rod: Rod, j: int):
-        return rod.excess[rod.world, place_of(rod, j)]
-
-    @wp.func
-    def added(rod: Rod, j: int):
-        p = place_of(rod, j)
-        if rod.anchored[p] == wp.uint8(0):
-            return rod.shift[rod.world, p]
-        block = rod.nodes[p] + rod.world * rod.blocks
-        return rod.q[block] - rod.base[block] - move_of(rod.direction, block, rod.amount)
-
-    @wp.func
-    def shift_by(rod: Rod, j: int, shift: V):
-        rod.shift[rod.world, place_of(rod, j)] = shift
-
-    place_rod = place_function(3, real, Rod, excess, anchored, added, shift_by)
+    def sum_before(
+        sums: wp.array2d(dtype=V),
+        offsets: wp.array3d(dtype=V),
+        piece: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
+        w: int,
+        p: int,
+    ):
+        """Of all edges of a rod before a place, less the mean over its places; see offset."""
+        c = piece[p]
+        return sums[w, p] + offsets[0, w, c] - offsets[1, w, c] * real(p - starts[c])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def bend(
@@ -175,50 +137,78 @@ def turn_kernels(real, linear):
         excess_out[w, p] = excess_of(edge, step, stretch, 0)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def place(
-        rods: wp.array(dtype=int),
-        start: wp.array(dtype=int),
+    def scan(
         nodes: wp.array(dtype=int),
-        anchored: wp.array(dtype=wp.uint8),
-        anchor: wp.array(dtype=int),
-        loops: wp.array(dtype=int),
-        q: wp.array(dtype=V),
-        base: wp.array(dtype=V),
-        direction: wp.array(dtype=H),
-        step_length: wp.array(dtype=real),
+        ahead: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
         todo: wp.array(dtype=int),
-        blocks: int,
-        excess: wp.array2d(dtype=V),
-        shift_out: wp.array2d(dtype=V),
+        sums: wp.array2d(dtype=V),
+        totals_out: wp.array3d(dtype=V),
     ):
-        """What nodes of the `rods` of one level have to move, once a straight step has been taken, beyond it."""
-        i, w = wp.tid()
+        """Replaces excesses by those summed from the start of their piece; of a piece, its total and that of these sums."""
+        count = starts.shape[0] - 1
+        w, start = share(wp.tid(), count)
         if todo[w] != wp.static(PLACE):
             return
-        r = rods[i]
-        rod = Rod()
-        rod.q = q
-        rod.base = base
-        rod.direction = direction
-        rod.nodes = nodes
-        rod.anchored = anchored
-        rod.excess = excess
-        rod.shift = shift_out
-        rod.amount = step_length[w]
-        rod.first = start[r]
-        rod.world = w
-        rod.blocks = blocks
-        rod.count = start[r + 1] - start[r]
-        rod.closed = loops[r]
-        rod.anchor = anchor[r]
-        place_rod(rod)
+        for c in range(start, until(start, count)):
+            running = V()
+            area = V()
+            for p in range(starts[c], starts[c + 1]):
+                here = V()
+                if ahead[p] != nodes[p]:
+                    here = sums[w, p]
+                sums[w, p] = running
+                area += running
+                running += here
+            totals_out[0, w, c] = running
+            totals_out[1, w, c] = area
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def offset(
+        starts: wp.array(dtype=int),
+        rod: wp.array(dtype=int),
+        pieces: wp.array(dtype=int),
+        loops: wp.array(dtype=int),
+        todo: wp.array(dtype=int),
+        totals: wp.array3d(dtype=V),
+        offsets_out: wp.array3d(dtype=V),
+    ):
+        """What to add to the sums of a piece, and what to take off them from place to place, so that those of a rod have no mean and,
+        if it is closed, close. Both are of no account to anchors: sums count from there, and what misses is spread evenly.
+        """
+        count = rod.shape[0]
+        w, start = share(wp.tid(), count)
+        if todo[w] != wp.static(PLACE):
+            return
+        for c in range(start, until(start, count)):
+            r = rod[c]
+            before = V()
+            running = V()
+            area = V()
+            for k in range(pieces[r], pieces[r + 1]):
+                if k == c:
+                    before = running
+                area += totals[1, w, k] + running * real(starts[k + 1] - starts[k])
+                running += totals[0, w, k]
+            first = starts[pieces[r]]
+            n = starts[pieces[r + 1]] - first
+            slope = V()
+            if loops[r] != 0:
+                slope = running / real(n)
+            offsets_out[0, w, c] = before - area / real(n) + slope * (real(0.5) * real(n - 1) - real(starts[c] - first))
+            offsets_out[1, w, c] = slope
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def put(
         places: wp.array(dtype=int),
         nodes: wp.array(dtype=int),
+        piece: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
+        anchors: wp.array2d(dtype=int),
+        between: wp.array(dtype=real),
         fixed: wp.array(dtype=wp.uint8),
-        shift: wp.array2d(dtype=V),
+        sums: wp.array2d(dtype=V),
+        offsets: wp.array3d(dtype=V),
         base: wp.array(dtype=V),
         direction: wp.array(dtype=H),
         step_length: wp.array(dtype=real),
@@ -226,17 +216,27 @@ def turn_kernels(real, linear):
         blocks: int,
         q: wp.array(dtype=V),
     ):
-        """The nodes at `places`, of which none is an anchor."""
-        i, w = wp.tid()
+        """The nodes at `places`, of which none is an anchor; of a rod without any the mean goes where the straight step takes it."""
+        w, first = share(wp.tid(), places.shape[0])
         if todo[w] != wp.static(PLACE):
             return
-        p = places[i]
-        mask = int(fixed[nodes[p]])
-        free = shift[w, p]
-        for d in range(3):
-            if ((mask >> d) & 1) == 1:
-                free[d] = real(0.0)
-        block = nodes[p] + w * blocks
-        q[block] = base[block] + move_of(direction, block, step_length[w]) + free
+        amount = step_length[w]
+        for i in range(first, until(first, places.shape[0])):
+            p = places[i]
+            free = sum_before(sums, offsets, piece, starts, w, p)
+            if anchors[0, p] >= 0:
+                for side in range(2):
+                    weight = wp.where(side == 0, real(1.0) - between[p], between[p])
+                    if weight > real(0.0):
+                        a = anchors[side, p]
+                        block = nodes[a] + w * blocks
+                        added = q[block] - base[block] - move_of(direction, block, amount)
+                        free += (added - sum_before(sums, offsets, piece, starts, w, a)) * weight
+            mask = int(fixed[nodes[p]])
+            for d in range(3):
+                if ((mask >> d) & 1) == 1:
+                    free[d] = real(0.0)
+            block = nodes[p] + w * blocks
+            q[block] = base[block] + move_of(direction, block, amount) + free
 
-    return bend, aim, turn, turn_longer, place, put
+    return bend, aim, turn, turn_longer, scan, offset, put

@@ -4,6 +4,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
+PIECE = 32  # least number of places of a rod that are summed in one go: a thread for fewer takes longer to start than to add
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Rods cut into C pieces, along which sums run side by side; P places, R rods.
+
+    Attributes:
+        starts: first place of each piece, and the end (C + 1,); of: piece of each place (P,).
+        rod: rod of each piece (C,); first: first piece of each rod, and the end (R + 1,).
+    """
+
+    starts: np.ndarray
+    of: np.ndarray
+    rod: np.ndarray
+    first: np.ndarray
+
 
 @dataclass(frozen=True)
 class Outwards:
@@ -31,6 +48,40 @@ class Outwards:
         """The last anchored node of every rod (R,), -1 where none is."""
         place = np.where(self.anchored, np.arange(len(self.nodes)), -1)
         return np.maximum(np.maximum.reduceat(place, self.start[:-1]) - self.start[:-1], -1)
+
+    def between(self, closed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The anchors that every place is between, along its rod or around it, and where between them; `closed` (R,).
+
+        Returns:
+            Anchored places before and after (2, P): twice the same beyond the first or last one of an open rod, -1 without any.
+            How far it is from the one to the other (P,), from 0 to 1: 0 where it is between no two.
+        """
+        count, place = np.diff(self.start), np.arange(len(self.nodes))
+        rod = np.repeat(np.arange(len(count)), count)
+        first, end, turn, loop = self.start[rod], self.start[rod + 1], count[rod], closed[rod] != 0
+        before = np.maximum.accumulate(np.where(self.anchored, place, -1))
+        after = np.minimum.accumulate(np.where(self.anchored, place, len(place))[::-1])[::-1]
+        last, least = before[end - 1], after[first]
+        none, early, late = last < first, before < first, after >= end
+        # a closed rod goes on beyond its ends with its last and its first anchor
+        before, after = (
+            np.where(early, np.where(loop, last - turn, after), before),
+            np.where(late, np.where(loop, least + turn, before), after),
+        )
+        apart = np.where(none, 0, after - before)
+        between = np.where(apart > 0, place - before, 0) / np.maximum(apart, 1)
+        anchors = np.stack([before + turn * (before < first), after - turn * (after >= end)])
+        return np.where(none, -1, anchors), between
+
+    def pieces(self) -> Pieces:
+        """Of about the root of the nodes of a rod, so that a sum over pieces is as long as one along a piece."""
+        count = np.diff(self.start)
+        width = np.maximum(PIECE, np.sqrt(count).astype(int))
+        number = -(-count // width)
+        rod, first = np.repeat(np.arange(len(count)), number), np.concatenate([[0], np.cumsum(number)])
+        starts = self.start[rod] + (np.arange(len(rod)) - first[rod]) * width[rod]
+        of = np.searchsorted(starts, np.arange(len(self.nodes)), side="right") - 1
+        return Pieces(np.append(starts, len(self.nodes)), of, rod, first)
 
 
 def outwards(rods: list[np.ndarray], held: np.ndarray) -> Outwards:

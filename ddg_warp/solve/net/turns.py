@@ -6,6 +6,8 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.kernels.net.turns import turn_kernels
 
+BLOCK = 32  # threads in a block, of pieces of rods: few, which read far apart
+
 
 class Turns:
     """Turned edges of a `NetNewton`: from what holds them, rods are placed outwards, level by level."""
@@ -18,28 +20,34 @@ class Turns:
         def put(values):
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
 
-        self._bend, self._aim, self._turn, self._turn_longer, *self._kernels = turn_kernels(newton.real, newton.linear)
+        made = turn_kernels(newton.real, newton.linear, arrays.serial(device))
+        self._bend, self._aim, self._turn, self._turn_longer, self._scan, self._offset, self._put = made
         loops = np.array([rod.piece.kind.closed for rod in host.rods], int)
         free = np.flatnonzero(~plan.anchored)
         rod = np.repeat(np.arange(len(loops)), np.diff(plan.start))
-        self._levels = [(put(level), put(free[np.isin(rod[free], level)])) for level in plan.levels]
+        self._levels = [put(free[np.isin(rod[free], level)]) for level in plan.levels]
         self._nodes, self._ahead = put(plan.nodes), put(plan.nodes[plan.ahead(loops)])
-        self._anchored = arrays.upload(plan.anchored.astype(np.uint8), wp.uint8, device)
-        self._rods = [put(plan.start), self._nodes, self._anchored, put(plan.last_anchors()), put(loops)]
+        pieces = plan.pieces()
+        self._starts, self._pieces = put(pieces.starts), [put(pieces.rod), put(pieces.first), put(loops)]
+        anchors, between = plan.between(loops)
+        between = wp.array(between, dtype=newton.real, device=device)
+        self._places = [self._nodes, put(pieces.of), self._starts, put(anchors), between]
         chains = newton.chains
         self._behind = []  # of every edge, the place that has its tension, and what tensions say
         if any(newton.split):
             self._behind = [put(chains.plan.places_ahead(rod)), chains.longer, chains.width]
         self._ends = put(np.concatenate([rod.ends for rod in host.rods]))
-        vector = wp.types.vector(3, newton.real)
-        self._excess, self._shift = (
-            wp.zeros((self.net.worlds, len(plan.nodes)), dtype=vector, device=device) for _ in range(2)
+        vector, worlds = wp.types.vector(3, newton.real), self.net.worlds
+        self._sums = wp.zeros((worlds, len(plan.nodes)), dtype=vector, device=device)
+        self._totals, self._offsets = (
+            wp.zeros((2, worlds, len(pieces.rod)), dtype=vector, device=device) for _ in range(2)
         )
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [self._bend, self._aim, self._turn, *([self._turn_longer] if self._behind else []), *self._kernels]
+        own = [self._bend, self._aim, self._turn, *([self._turn_longer] if self._behind else []), self._put]
+        return [*own, (self._scan, BLOCK), (self._offset, BLOCK)]
 
     def predict(self, v: wp.array, onward: bool) -> None:
         """Turn the edges of predictors by velocities v that turn them far, instead of stretching them.
@@ -69,14 +77,17 @@ class Turns:
     def place(self, onward: bool = False, predicted: bool = False) -> None:
         """Nodes of rods, once the straight step has moved everything; `onward`: see `predict`. Predictors have no tensions."""
         newton, net = self.newton, self.net
-        place, put = self._kernels
-        moved = [newton.base, newton.direction, newton.islands.step_length, newton.islands.todo]
+        device, worlds, todo = net.device, net.worlds, newton.islands.todo
+        moved = [newton.base, newton.direction, newton.islands.step_length, todo]
         turn, inputs = self._turn, [self._nodes, self._ahead, *moved, newton.islands.turn, int(onward), net.blocks]
         if self._behind and not predicted:
             turn, inputs = self._turn_longer, [self._nodes, self._ahead, *moved, net.blocks, *self._behind]
-        wp.launch(turn, (len(self._nodes), net.worlds), inputs, [self._excess], device=net.device)
-        for rods, places in self._levels:
-            inputs = [rods, *self._rods, newton.q, *moved, net.blocks, self._excess]
-            wp.launch(place, (len(rods), net.worlds), inputs, [self._shift], device=net.device)
-            inputs = [places, self._nodes, newton.held, self._shift, *moved, net.blocks]
-            wp.launch(put, (len(places), net.worlds), inputs, [newton.q], device=net.device)
+        wp.launch(turn, (len(self._nodes), worlds), inputs, [self._sums], device=device)
+        pieces = self._offsets.shape[2]
+        inputs = [self._nodes, self._ahead, self._starts, todo, self._sums]
+        arrays.sweep(self._scan, pieces, inputs, [self._totals], device, BLOCK, worlds)
+        inputs = [self._starts, *self._pieces, todo, self._totals]
+        arrays.sweep(self._offset, pieces, inputs, [self._offsets], device, BLOCK, worlds)
+        for places in self._levels:
+            inputs = [places, *self._places, newton.held, self._sums, self._offsets, *moved, net.blocks]
+            arrays.sweep(self._put, len(places), inputs, [newton.q], device, worlds=worlds)
