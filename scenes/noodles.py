@@ -17,6 +17,8 @@ GAP = 3e-3  # m, below which surfaces push each other
 CLEAR = 0.02  # m, between the bowl and the lowest ends
 BENDING, STRETCHING, MASS = 2.44e-3, 1e4, 1.0  # N m^2, N, kg/m
 FRICTION = 0.05
+CONTACT = 3e3  # N/m: strands that fall end first press on what they land on with a hundred times their weight
+SLIP = 1e-2  # m/s, from which on friction is all there
 WALL = 1e-3  # m, half the thickness of the bowl
 CELLS = 0.06  # m, about the sides of the bowl's triangles
 
@@ -72,7 +74,7 @@ def build(
         name="noodles",
     )
     cap, triangles = meshes.spherical_cap(max(8, round(0.5 * np.pi * bowl / CELLS)), bowl)
-    scene.contact(range=GAP, friction=FRICTION)
+    scene.contact(range=GAP, stiffness=CONTACT, friction=FRICTION, velocity=SLIP)
     scene.add_obstacle(ddg.Mesh(cap * [1.0, 1.0, -1.0], triangles, WALL), name="bowl")
     return scene
 

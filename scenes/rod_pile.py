@@ -17,6 +17,8 @@ RADIUS = 1e-3  # m; L / D = 50
 START = 1.0  # phi L / D before the fall: a rod that is placed at random meets 2 others
 NODES = 50
 RANDOM_CONTACT = 5.4  # phi L / D of long rods
+SOFT = 2e-6  # m, stiffness of contact over Young's modulus
+SLIP = 5e-3  # m/s, from which on friction is all there
 DENSEST = np.pi / np.sqrt(12.0)  # cylinders side by side in a hexagonal lattice
 PHILIPSE = "Philipse 1996, of stiff rods in all directions"
 
@@ -57,7 +59,8 @@ def build(
         material=ddg.Material(young=young, density=1000.0, poisson=0.5, viscosity=2e-3),
         name="rods",
     )
-    scene.contact(friction=friction)
+    # as fast as they fall, stiffer contact and friction take twice the iterations
+    scene.contact(stiffness=SOFT * young, friction=friction, velocity=SLIP)
     scene.add_obstacle(ddg.Plane(), name="floor")
     for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         wall = ddg.Plane((0.5 * width * (1 - x), 0.5 * width * (1 - y), 0.0), (x, y, 0.0))

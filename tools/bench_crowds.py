@@ -1,0 +1,177 @@
+"""Times large scenes of contact: noodles, woven_cylinder, rod_pile, and hair on a moving head; and what contact costs where nothing touches.
+
+    python tools/bench_crowds.py --device cuda:0 [--only noodles ...] [--limit SECONDS] [--out DIR]
+
+Prints a table; writes crowds_DEVICE.csv and .json, and crowds_apart_DEVICE. Each case runs to its end or for `limit` seconds of wall
+time; a row is a sixth of that, from start to the time `until`: seconds of wall time for each simulated one, means a step of solves
+(more than one where steps were taken in parts), of Newton and of conjugate gradient iterations and of searches, pairs in contact and
+the smallest gap over the range so far. `refused` are pairs that would have passed through each other in parts of steps that were not
+taken. What is said of errors: `rtol`, to which forces balance, over the weight of a rod; `gained`, the energy that was created over
+what was lost so far, of the scenes that nothing drives. `search_share` is what searches take of the wall time, from one that is timed
+at the end. Of scenes in which nothing touches, the ratio of a step with contact to one without.
+"""
+
+import argparse
+import sys
+import time
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+import ddg_warp as ddg
+from ddg_warp.run.summary import machine, table, write_table
+
+RTOL = 1e-3
+PARTS = 6  # rows of a case
+CASES = {  # scene, its arguments, step [s], duration [s], whether something drives it
+    "noodles": ("noodles", {"count": 121, "nodes": 961, "bowl": 1.1}, 1 / 960, 4.0, False),
+    "woven_cylinder": ("woven_cylinder", {"strands": 148, "rings": 175, "nodes": 256, "around": 444}, 1 / 240, 1.0, True),
+    "rod_pile_1000": ("rod_pile", {"count": 1_000}, 1 / 480, 0.5, False),
+    "rod_pile_10000": ("rod_pile", {"count": 10_000}, 1 / 480, 0.5, False),
+    "hair_512": ("strands", {"count": 512, "contact": True}, 1 / 240, 1.0, True),
+    "hair_10000": ("strands", {"count": 10_000, "contact": True}, 1 / 240, 1.0, True),
+}
+APART, NODES = (100, 1_000, 10_000), 50  # rods of so many nodes that do not touch
+WARM, TIMED = 5, 40  # steps
+
+
+def run(name: str, device, limit: float) -> list[dict]:
+    """Rows of a case."""
+    scene_name, given, dt, duration, driven = CASES[name]
+    scene = import_module(f"ddg_warp.scenes.{scene_name}").build(**given)
+    model = scene.build(device)
+    integrator = ddg.Integrator(model, check_every=1, rtol=RTOL)
+    state = scene.initial(model) if scene.initial else model.state()
+    contact = integrator._net.newton.contact  # for the time of a search, of which nothing public tells
+    state = integrator.step(state, dt)
+    wp.synchronize_device(device)
+    rows, energies = [], [sum(model.energies(state).values())]
+    began = mark = time.perf_counter()
+    before, since = integrator.statistics(), state.time
+    while state.time < duration - 0.5 * dt and time.perf_counter() - began < limit:
+        state = integrator.step(state, dt)
+        part = PARTS * max(state.time / duration, (time.perf_counter() - began) / limit)
+        if part < len(rows) + 1 and state.time < duration - 0.5 * dt:
+            continue
+        wp.synchronize_device(device)
+        wall, found, steps = time.perf_counter() - mark, integrator.statistics(), (state.time - since) / dt
+        energies.append(sum(model.energies(state).values()))
+        solves = _solves(found) - _solves(before)
+        newton = _newton(found) - _newton(before)
+        touching, earlier = found["contact"], before["contact"]
+        drop = np.ptp(energies)
+        rows.append(
+            {
+                "case": name,
+                "nodes": model.net.host.nodes,
+                "dt": dt,
+                "rtol": RTOL,
+                "until": state.time,
+                "wall_per_second": wall / (state.time - since),
+                "ms_per_step": 1e3 * wall / steps,
+                "solves": solves / steps,
+                "newton": newton / steps,
+                "cg": (found["pcg_iterations"] - before["pcg_iterations"]) / steps,
+                "searches": (touching["searches"] - earlier["searches"]) / steps,
+                "contacts": touching["contacts"]["last"],
+                "gap": touching["smallest_gap"] / contact.search.reach,
+                "refused": touching["refused_crossings"],
+                "gained": None if driven else float((energies - np.minimum.accumulate(energies)).max() / drop),
+                "search_share": 1e3 * _search(contact, state) * (touching["searches"] - earlier["searches"]) / (1e3 * wall),
+            }
+        )
+        print(table(rows[-1:]), file=sys.stderr, flush=True)
+        mark, before, since = time.perf_counter(), integrator.statistics(), state.time
+    return rows
+
+
+def _solves(statistics: dict) -> int:
+    return sum(statistics["outcomes"].values())
+
+
+def _newton(statistics: dict) -> float:
+    return statistics["newton_iterations"]["mean"] * _solves(statistics)
+
+
+def _search(contact, state) -> float:
+    """Seconds of a search at a state."""
+    search, device = contact.search, contact.search.device
+    times = []
+    for _ in range(4):
+        wp.synchronize_device(device)
+        began = time.perf_counter()
+        search.search(state.net.q)
+        wp.synchronize_device(device)
+        times.append(time.perf_counter() - began)
+    return min(times)
+
+
+def apart(rods: int, device) -> dict:
+    """A step of rods that do not touch, with contact and without."""
+    found = {"rods": rods, "nodes": rods * NODES}
+    for touching in (False, True):
+        model = _lattice(rods, touching).build(device)
+        integrator, state = ddg.Integrator(model, check_every=1), model.state()
+        for step in range(WARM + TIMED):
+            if step == WARM:
+                wp.synchronize_device(device)
+                began = time.perf_counter()
+            state = integrator.step(state, 1 / 240)
+        wp.synchronize_device(device)
+        found["ms_with" if touching else "ms_without"] = 1e3 * (time.perf_counter() - began) / TIMED
+        if not touching:
+            plain = state.points()
+    return found | {
+        "ratio": found["ms_with"] / found["ms_without"],
+        "difference": float(np.abs(state.points() - plain).max()),
+    }
+
+
+def _lattice(rods: int, touching: bool) -> ddg.Scene:
+    """Rods of 0.2 m, held at one end, 5 cm from each other."""
+    along, side = np.linspace(-0.1, 0.1, NODES), int(np.ceil(np.sqrt(rods)))
+    centres = np.stack([0.25 * (np.arange(rods) % side), 0.05 * (np.arange(rods) // side), np.zeros(rods)], axis=1)
+    shape = np.stack([along, 0.0 * along, 0.01 * np.cos(20.0 * along)], axis=1)
+    scene = ddg.Scene()
+    scene.add_rods(
+        centres[:, None] + shape,
+        section=ddg.Circle(radius=2e-3),
+        material=ddg.Material(young=1e6, density=1000.0, poisson=0.5, viscosity=1e-3),
+        natural="straight",
+    )
+    scene.clamp(range(rods), edges=[0])
+    if touching:
+        scene.contact(friction=0.3)
+    return scene
+
+
+def main() -> int:
+    """Run what the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", help="Warp device (default: CUDA if there is one)")
+    parser.add_argument("--only", nargs="+", choices=[*CASES, "apart"], default=[*CASES, "apart"])
+    parser.add_argument("--limit", type=float, default=60.0, help="seconds of wall time of a case")
+    parser.add_argument("--commit", default="", help="commit, where there is no git checkout")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    chosen = parser.parse_args()
+    device = wp.get_device(chosen.device)
+    own = "cuda" if device.is_cuda else "cpu"
+    command = " ".join(["python", "tools/bench_crowds.py", *sys.argv[1:]])
+    about = {"command": command, "device": str(device), "machine": machine(chosen.commit)}
+    rows = []
+    for name in (name for name in chosen.only if name != "apart"):
+        rows += run(name, device, chosen.limit)
+        write_table(chosen.out / f"crowds_{own}", rows, about)
+    if rows:
+        print(table(rows))
+    if "apart" in chosen.only:
+        rows = [apart(rods, device) for rods in APART]
+        write_table(chosen.out / f"crowds_apart_{own}", rows, about)
+        print(table(rows))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
