@@ -67,16 +67,18 @@ def motion_kernels(real, serial: bool):
         base: wp.array(dtype=X),
         q: wp.array(dtype=X),
         seen: wp.array(dtype=X),
+        placed: wp.array(dtype=wp.uint8),
         allowed: real,
         move: wp.array(dtype=X),
         stale: wp.array(dtype=int),
     ):
-        """Whether a node is farther than allowed from where it was seen; one that is no number is."""
+        """Whether a node that is a place is farther than allowed from where it was seen; one that is no number is."""
         tid = wp.tid()
         for i in range(tid, until(tid, q.shape[0])):
-            before, now = base[i] - seen[i], q[i] - seen[i]
-            if not (wp.dot(before, before) <= allowed * allowed and wp.dot(now, now) <= allowed * allowed):
-                stale[0] = 1
+            if placed[i % placed.shape[0]] != wp.uint8(0):
+                before, now = base[i] - seen[i], q[i] - seen[i]
+                if not (wp.dot(before, before) <= allowed * allowed and wp.dot(now, now) <= allowed * allowed):
+                    stale[0] = 1
             move[i] = q[i] - base[i]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

@@ -71,6 +71,10 @@ class BroadPhase:
         things = {size: Things(shapes, size, worlds, real, self.device, radius) for size in shapes.sizes}
         self._things = list(things.values())
         self._seen, self._still, self._move = (wp.zeros(len(x), dtype=x.dtype, device=self.device) for _ in range(3))
+        placed = np.zeros(nodes, np.uint8)  # what no thing has may be no place, as blocks of edges are not
+        for size in shapes.sizes:
+            placed[shapes.things(size)[0]] = 1
+        self._placed = wp.array(placed, dtype=wp.uint8, device=self.device)
         self._shift = wp.zeros(worlds, dtype=x.dtype, device=self.device)
         self._never, self._always = (wp.full(worlds, flag, dtype=int, device=self.device) for flag in (0, 1))
         self.overflow, self.searches, self._stale, self._searched, self._lost = (
@@ -131,7 +135,7 @@ class BroadPhase:
         By default q is `base`: nothing moves. Of a motion that is not filtered the candidates hold from q on.
         """
         watch, *_ = self._motion
-        inputs = [base, base if q is None else q, self._seen, 0.5 * self.margin]
+        inputs = [base, base if q is None else q, self._seen, self._placed, 0.5 * self.margin]
         self._searched.zero_()
         self._sweep(watch, base, inputs, [self._move, self._stale])
         wp.capture_if(self._stale, lambda: self.search(base, self._move, together))
