@@ -5,6 +5,12 @@ it; so the sides are as far apart as these ends are along any direction. The one
 the way, along which what does not move is as far apart as its distance. Where a world moves at one share, ways are what nodes move by
 beside the others of the pair, and boxes move with the world.
 
+Nodes may also be beside their ways, by `around`. Along any direction sides are then nearer by no more than twice that, and boxes are
+larger by it. So of what is no pair no two come within reach, wherever in the tubes around their ways their nodes are; and as tubes are
+convex, a straight motion between two places in them does not leave them. Half-spaces have boxes around all there is. Far from its three
+nodes, which go by one share, a plane moves by more than they do, by the weights that they have there: its pairs are judged by a bound
+on how far both sides come towards each other.
+
 Each thing notes its partners in a linked list, whose entries come from one counter; running sums then say where its part of the list
 of pairs starts. So two runs give the same list to the bit, whatever order threads run in, and a list that does not fit is left out
 whole: `overflow` says so, and `found` how long it would be.
@@ -43,16 +49,19 @@ def candidate_kernels(kind: Kind, grouped: bool, real):
     Sides, X, Y = sides_struct(real), wp.types.vector(3, real), wp.types.matrix((4, 3), real)
     slots, may_touch, thickness, closest = pair_functions(kind, real)
     begin, corners, relative = query_function(grouped, real), corners_function(real), relative_function(kind, real)
-    half, tiny = wp.constant(real(0.5)), wp.constant(real(1.0e-30))
+    half, two, tiny = wp.constant(real(0.5)), wp.constant(real(2.0)), wp.constant(real(1.0e-30))
 
     @wp.func
-    def apart(x: Y, p: Y):
-        """Distance that two keep whose nodes go any share of p."""
+    def apart(x: Y, p: Y, around: real):
+        """Distance that two keep whose nodes go any share of p, those of a half-space one, and then anywhere within `around`."""
         y = x + half * p
-        r, _ = closest(y)
+        r, w = closest(y)
         if wp.static(kind.endless):
-            _q, speed = relative(y, p)
-            return wp.length(r) - half * speed
+            near = half * (wp.length(p[0]) + wp.length(w[1] * p[1] + w[2] * p[2] + w[3] * p[3]))
+            near += around * (real(1.0) + wp.abs(w[1]) + wp.abs(w[2]) + wp.abs(w[3]))
+            turn = half * wp.max(wp.length(p[2] - p[1]), wp.length(p[3] - p[1])) + two * around
+            beside = half * (wp.length(p[0]) + wp.length(p[1])) + two * around
+            return wp.length(r) - near - two * turn * (beside + turn)
         n = r / wp.max(wp.length(r), tiny)
         first, second = real(wp.inf), real(-wp.inf)
         for k in range(4):
@@ -61,7 +70,7 @@ def candidate_kernels(kind: Kind, grouped: bool, real):
                 first = wp.min(first, at - off)
             else:
                 second = wp.max(second, at + off)
-        return first - second
+        return first - second - two * around
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def find(
@@ -70,13 +79,14 @@ def candidate_kernels(kind: Kind, grouped: bool, real):
         move: wp.array(dtype=X),
         together: wp.array(dtype=int),
         reach: real,
+        around: real,
         found: wp.array(dtype=int),
         partner: wp.array(dtype=int),
         before: wp.array(dtype=int),
         last: wp.array(dtype=int),
         partners: wp.array(dtype=int),
     ):
-        """Partners of a thing that may come as near as both radii and `reach` on their way."""
+        """Partners of a thing that may come as near as both radii and `reach` within `around` of their ways."""
         i = wp.tid()
         query, w, k = begin(sides, i)
         number, at, j = int(0), int(-1), int(0)
@@ -87,7 +97,7 @@ def candidate_kernels(kind: Kind, grouped: bool, real):
                 y, p = corners(x, nodes), corners(move, nodes)
                 if together[w] != 0:
                     p, _speed = relative(y, p)
-                if apart(y, p) <= thickness(sides, k, l, w) + reach:
+                if apart(y, p, around) <= thickness(sides, k, l, w) + reach:
                     slot = wp.atomic_add(found, 0, 1)
                     number += 1
                     if slot < partner.shape[0]:

@@ -1,9 +1,10 @@
-"""How far nodes have moved since a search, what of their motion is common, and the smallest gaps of pairs."""
+"""How far nodes are from the ways a search was made for, what of their motion is common, and the smallest gaps of pairs."""
 
 from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.contact.distance import distance_functions
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct, surface_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
@@ -61,42 +62,51 @@ def relative_function(kind: Kind, real):
 def motion_kernels(real, serial: bool):
     """watch(...) whether a search is out of date, mark(...) it, common(...) what of a motion is common."""
     X, Surface, until = wp.types.vector(3, real), surface_struct(real), until_function(serial)
+    _, _, beside, _ = distance_functions(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def watch(
         base: wp.array(dtype=X),
         q: wp.array(dtype=X),
-        seen: wp.array(dtype=X),
+        start: wp.array(dtype=X),
+        end: wp.array(dtype=X),
+        placed: wp.array(dtype=wp.uint8),
         allowed: real,
         move: wp.array(dtype=X),
         stale: wp.array(dtype=int),
     ):
-        """Whether a node is farther than allowed from where it was seen; one that is no number is."""
+        """Whether a node that is a place is farther than allowed from the way it was seen on; one that is no number is."""
         tid = wp.tid()
         for i in range(tid, until(tid, q.shape[0])):
-            before, now = base[i] - seen[i], q[i] - seen[i]
-            if not (wp.dot(before, before) <= allowed * allowed and wp.dot(now, now) <= allowed * allowed):
-                stale[0] = 1
+            if placed[i % placed.shape[0]] != wp.uint8(0):
+                before, _b = beside(start[i], end[i], base[i], base[i])
+                now, _n = beside(start[i], end[i], q[i], q[i])
+                if not (wp.dot(before, before) <= allowed * allowed and wp.dot(now, now) <= allowed * allowed):
+                    stale[0] = 1
             move[i] = q[i] - base[i]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def mark(
         x: wp.array(dtype=X),
         move: wp.array(dtype=X),
+        together: wp.array(dtype=int),
         overflow: wp.array(dtype=int),
-        seen: wp.array(dtype=X),
+        start: wp.array(dtype=X),
+        end: wp.array(dtype=X),
         stale: wp.array(dtype=int),
         searched: wp.array(dtype=int),
         searches: wp.array(dtype=int),
     ):
-        """Notes where nodes are to be after a search, which is out of date at once if pairs did not fit."""
+        """Notes the ways that a search was made for, of worlds that go by one share their ends; it is out of date at once if pairs
+        did not fit."""
         tid = wp.tid()
         if tid == 0:
             stale[0] = overflow[0]
             searched[0] = 1
             searches[0] += 1
         for i in range(tid, until(tid, x.shape[0])):
-            seen[i] = x[i] + move[i]
+            end[i] = x[i] + move[i]
+            start[i] = wp.where(together[i / (x.shape[0] / together.shape[0])] != 0, end[i], x[i])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def common(

@@ -154,10 +154,12 @@ def share_kernels(real, serial: bool):
         units: int,
         shares: wp.array(dtype=real),
         searched: wp.array(dtype=int),
+        together: wp.array(dtype=int),
         q: wp.array(dtype=X),
-        seen: wp.array(dtype=X),
+        start: wp.array(dtype=X),
+        end: wp.array(dtype=X),
     ):
-        """The motion itself, and where a search that was made for it has seen its end."""
+        """The motion itself and, of worlds that go by one share, where a search that was made for it has seen them."""
         tid = wp.tid()
         for i in range(tid, until(tid, q.shape[0])):
             w = i / unit.shape[0]
@@ -166,7 +168,8 @@ def share_kernels(real, serial: bool):
                 s = shares[w * units + of]
                 if s < real(1.0):
                     q[i] = base[i] + s * move[i]
-            if searched[0] != 0:
-                seen[i] = q[i]
+            if searched[0] != 0 and together[w] != 0:
+                start[i] = q[i]
+                end[i] = q[i]
 
     return start, turn, settle, finish, shorten

@@ -69,4 +69,5 @@ class Motion:
     def results(self) -> list[bytes]:
         """All that a filter writes, but for lists."""
         search = self.search
-        return [array.numpy().tobytes() for array in (self.q, search.shares, search.time, search.limited, search._seen)]
+        seen = search._start, search._end
+        return [array.numpy().tobytes() for array in (self.q, search.shares, search.time, search.limited, *seen)]

@@ -132,6 +132,20 @@ def test_candidates_hold_until_half_of_the_margin_is_used_up(device, excess):
     assert near(shapes, moved, 2, 2, REACH) <= {tuple(pair) for pair in listed(search)[0].tolist()}
 
 
+def test_what_no_thing_has_may_be_anywhere(device):
+    """Blocks that are no places, as twists of edges: they never ask for a search, whatever they are."""
+    points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    shapes = Shapes(points)
+    shapes.rod([0, 1], 0.01)
+    search = BroadPhase(shapes, upload(np.tile(points, (2, 1)), device), 2, reach=REACH, margin=MARGIN)
+    for node, more in ((2, 0), (5, 0), (1, 1), (4, 1)):
+        searches, x = search.searches.numpy()[0], np.tile(points, (2, 1))
+        x[node, 0] += 2.0 * MARGIN
+        search.update(upload(x, device))
+        assert search.searches.numpy()[0] == searches + more
+        search.search(upload(np.tile(points, (2, 1)), device))
+
+
 def test_a_captured_update_follows_motion_and_searches_only_where_it_must(device):
     shapes, points = scene(6, 0.5, rods=20, triangles=60)
     x = upload(points, device)

@@ -20,10 +20,12 @@ NONE = np.iinfo(np.int64).max
 class BroadPhase:
     """Pairs of `shapes` that are near, in each of some worlds.
 
-    All that is within thickness + `reach` is among the candidates as long as no node has moved by more than half of `margin` since they
-    were found. `update`, `filter`, `measure`, `impact` and `crossings` read nothing back and can be captured, `update`, `filter` and
-    `search` in conditional parts of graphs, too. `rebuild` can be captured, on CUDA outside of those alone; there every step should
-    begin with it. `fit` and `check` read, between launches of graphs; what is not finite touches nothing, until they name it.
+    All that is within thickness + `reach` is among the candidates as long as every node is within half of `margin` of where it was when
+    they were found or, of a search for a motion, of its way, each anywhere along it, the nodes of a half-space alike; where a world
+    goes by one share, of the place that it has come to. `update`, `filter`, `measure`, `impact` and `crossings` read nothing back and
+    can be captured, `update`, `filter` and `search` in conditional parts of graphs, too. `rebuild` can be captured, on CUDA outside of
+    those alone; there every step should begin with it. `fit` and `check` read, between launches of graphs; what is not finite touches
+    nothing, until they name it.
 
     Args:
         shapes: what may touch in one world.
@@ -70,7 +72,12 @@ class BroadPhase:
             radius = wp.array(np.tile(shapes.radii, (worlds, 1)), dtype=real, device=self.device)
         things = {size: Things(shapes, size, worlds, real, self.device, radius) for size in shapes.sizes}
         self._things = list(things.values())
-        self._seen, self._still, self._move = (wp.zeros(len(x), dtype=x.dtype, device=self.device) for _ in range(3))
+        blocks = [wp.zeros(len(x), dtype=x.dtype, device=self.device) for _ in range(4)]
+        self._start, self._end, self._still, self._move = blocks
+        placed = np.zeros(nodes, np.uint8)  # what no thing has may be no place, as blocks of edges are not
+        for size in shapes.sizes:
+            placed[shapes.things(size)[0]] = 1
+        self._placed = wp.array(placed, dtype=wp.uint8, device=self.device)
         self._shift = wp.zeros(worlds, dtype=x.dtype, device=self.device)
         self._never, self._always = (wp.full(worlds, flag, dtype=int, device=self.device) for flag in (0, 1))
         self.overflow, self.searches, self._stale, self._searched, self._lost = (
@@ -126,12 +133,12 @@ class BroadPhase:
             part.build()
 
     def update(self, base: wp.array, q: wp.array | None = None, together: wp.array | None = None) -> None:
-        """Search again along the motion from `base` to q if some node is, at either, farther than half of the margin from where it was.
+        """Search again along the motion from `base` to q if some node is, at either, farther than half of the margin from its way.
 
-        By default q is `base`: nothing moves. Of a motion that is not filtered the candidates hold from q on.
+        By default q is `base`: nothing moves. Of a motion by one share that is not filtered the candidates hold from q on.
         """
         watch, *_ = self._motion
-        inputs = [base, base if q is None else q, self._seen, 0.5 * self.margin]
+        inputs = [base, base if q is None else q, self._start, self._end, self._placed, 0.5 * self.margin]
         self._searched.zero_()
         self._sweep(watch, base, inputs, [self._move, self._stale])
         wp.capture_if(self._stale, lambda: self.search(base, self._move, together))
@@ -148,8 +155,9 @@ class BroadPhase:
         for part in self._trees:
             part.renew()
         for pairs in self.lists:
-            pairs.search(x, move, together, 2.0 * self._within)
-        self._sweep(mark, x, [x, move, self.overflow], [self._seen, self._stale, self._searched, self.searches])
+            pairs.search(x, move, together, self.reach, self._around)
+        outputs = [self._start, self._end, self._stale, self._searched, self.searches]
+        self._sweep(mark, x, [x, move, together, self.overflow], outputs)
 
     def filter(
         self, base: wp.array, q: wp.array, unit: wp.array, together: wp.array, units: int, keep: float = 1.0
@@ -171,7 +179,7 @@ class BroadPhase:
         _checked_keep(keep)
         self._filter.check(unit, together, units)
         self.update(base, q, together)
-        search = (self.overflow, self.time, self._searched, self._seen)
+        search = (self.overflow, self.time, self._searched, self._start, self._end)
         self._filter(base, self._move, q, unit, together, units, keep, self._room(keep), search)
 
     def fit(self, x: wp.array) -> bool:
@@ -255,9 +263,14 @@ class BroadPhase:
         return f"{one} and {other}" + (f" in world {world}" if self.worlds > 1 else "")
 
     @property
+    def _around(self) -> float:
+        """How far beside its way a node may be, and a little more."""
+        return 0.5 * (1.0 + SLACK) * self.margin
+
+    @property
     def _within(self) -> float:
         """Half of the gap up to which pairs are found."""
-        return 0.5 * (self.reach + (1.0 + SLACK) * self.margin)
+        return 0.5 * self.reach + self._around
 
     def _passing(self, kernels, x, move, keep: float, number, firsts) -> None:
         self._enclose(x, move, self._always, keep, 0.0)

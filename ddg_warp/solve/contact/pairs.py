@@ -83,13 +83,13 @@ class PairList:
         self.pairs = wp.zeros(capacity, dtype=wp.vec2i, device=self.device)
         self.needed.zero_()
 
-    def search(self, x, move, together, reach: float) -> None:
+    def search(self, x, move, together, reach: float, around: float) -> None:
         """Find and list the pairs; boxes have to be up to date; see `kernels.contact.candidates`."""
         self.found.zero_()
         wp.launch(
             self._find,
             self.first.all,
-            [self.sides, x, move, together, reach],
+            [self.sides, x, move, together, reach, around],
             [self.found, self._partner, self._before, self._last, self.partners],
             device=self.device,
         )
