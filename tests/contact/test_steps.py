@@ -190,5 +190,5 @@ def test_chains_are_eliminated_by_one_thread_or_by_many(device, monkeypatch, nam
     (one, by_one), (many, by_many) = found
     assert by_one["contact"]["contacts"]["mean"] > 0.0
     assert by_many["newton_iterations"] == by_one["newton_iterations"]
-    assert abs(by_many["pcg_iterations"] - by_one["pcg_iterations"]) < 0.02 * by_one["pcg_iterations"]
+    assert abs(by_many["pcg_iterations"] - by_one["pcg_iterations"]) < 0.1 * by_one["pcg_iterations"]
     np.testing.assert_allclose(many, one, rtol=0.0, atol=1e-7)
