@@ -18,6 +18,7 @@ CLEAR = 0.02  # m, between the bowl and the lowest ends
 BENDING, STRETCHING, MASS = 2.44e-3, 1e4, 1.0  # N m^2, N, kg/m
 FRICTION = 0.05
 CONTACT = 3e3  # N/m: strands that fall end first press on what they land on with a hundred times their weight
+RTOL = 1e-3  # of a rod's weight, to which forces balance in a step
 SLIP = 1e-2  # m/s, from which on friction is all there
 WALL = 1e-3  # m, half the thickness of the bowl
 CELLS = 0.06  # m, about the sides of the bowl's triangles
@@ -57,7 +58,7 @@ def build(
     bow = 0.2 * RADIUS * np.sin(np.linspace(0.0, 3.0 * np.pi, nodes))
     angle = np.pi * (3.0 - np.sqrt(5.0)) * number
     points[..., :2] += bow[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)[:, None]
-    scene = ddg.Scene(analysis=ddg.Dynamics(dt=dt, duration=duration))
+    scene = ddg.Scene(analysis=ddg.Dynamics(dt=dt, duration=duration, rtol=RTOL))
     scene.add_rods(
         points,
         section=ddg.Stiffness(

@@ -18,6 +18,7 @@ START = 1.0  # phi L / D before the fall: a rod that is placed at random meets 2
 NODES = 50
 RANDOM_CONTACT = 5.4  # phi L / D of long rods
 SOFT = 2e-6  # m, stiffness of contact over Young's modulus
+RTOL = 1e-3  # of a rod's weight, to which forces balance in a step
 SLIP = 5e-3  # m/s, from which on friction is all there
 DENSEST = np.pi / np.sqrt(12.0)  # cylinders side by side in a hexagonal lattice
 PHILIPSE = "Philipse 1996, of stiff rods in all directions"
@@ -51,7 +52,7 @@ def build(
     ends = _layouts.placed_apart(
         np.random.default_rng(seed), count, LENGTH, 1.5 * diameter, (width, width), max(box, 0.25 * LENGTH)
     )
-    scene = ddg.Scene(analysis=ddg.Dynamics(dt=dt, duration=duration))
+    scene = ddg.Scene(analysis=ddg.Dynamics(dt=dt, duration=duration, rtol=RTOL))
     s = np.linspace(0.0, 1.0, NODES)[:, None]
     scene.add_rods(
         (1.0 - s) * ends[:, None, 0] + s * ends[:, None, 1],

@@ -19,7 +19,8 @@ PERIOD = 1.0  # s, of the head's motion
 REST = 2.0  # s; the head has come to rest by then
 TURN = 0.9  # rad
 CROWD = 512  # strands, from which on they are thinner where they touch, so that they fill as much of the room
-FRICTION = 0.2
+RTOL = {False: 1e-6, True: 1e-3}  # of a strand's weight, to which forces balance in a step
+FRICTION, SLIP = 0.2, 1e-2  # and m/s, from which speed on friction is all there
 STEPS = {False: 60.0, True: 240.0}  # a second, without contact and with
 REFUSED = 100  # pairs: a strand that swings about its root moves along an arc
 BORNE = 3.0  # weights of a strand that push surfaces to some part of the range of contact, so that flying ones stop
@@ -48,7 +49,7 @@ def build(
         points = _layouts.pushed_apart(points, 2.0 * thin * (1.0 + CLEAR), held=2)
     scene = ddg.Scene(
         mass_damping=0.4,  # 1/s, drag of the air
-        analysis=ddg.Dynamics(dt=1.0 / STEPS[contact], duration=REST, scheme="implicit_euler"),
+        analysis=ddg.Dynamics(dt=1.0 / STEPS[contact], duration=REST, rtol=RTOL[contact]),
     )
     strands = scene.add_rods(
         points,
@@ -62,7 +63,9 @@ def build(
     if contact:
         center, size = _strands.ball(points[:, 0])
         weight = scene.batches[0].section.mass_per_length * _strands.edge_lengths(points[0]).sum() * _strands.GRAVITY
-        scene.contact(range=thin, stiffness=BORNE * weight / thin, friction=FRICTION, radius={"strands": thin})
+        scene.contact(
+            range=thin, stiffness=BORNE * weight / thin, friction=FRICTION, velocity=SLIP, radius={"strands": thin}
+        )
         scene.add_obstacle(ddg.Sphere(tuple(center), _strands.HEAD * size), motion=motion, name="head")
     return scene
 

@@ -103,3 +103,17 @@ def test_numbers_without_a_reference_are_skipped():
     (check,) = run("cantilever", 0.02, n=20)
     assert "50 and 100 nodes" in check.skipped
     assert np.isnan(check.measured) and isinstance(check, ddg.Check)
+
+
+def test_the_tolerance_of_a_scene_is_that_of_its_run(device):
+    """A looser one takes fewer iterations; options of the run come first."""
+    work, rubber = {}, ddg.Material(young=1e6, density=1000.0, poisson=0.5)
+    for rtol, options in ((1e-6, {}), (1e-1, {}), (1e-1, {"rtol": 1e-6})):
+        scene = ddg.Scene(analysis=ddg.Dynamics(dt=0.02, duration=0.2, rtol=rtol))
+        rod = scene.add_rod([[0.05 * i, 0.0, 0.0] for i in range(21)], section=ddg.Circle(5e-3), material=rubber)
+        scene.clamp(rod, edges=[0])
+        result = simulate(scene, device=device, options=options, progress=False)
+        work[rtol, bool(options)] = result.statistics["newton_iterations"]["mean"]
+    assert work[1e-1, False] < work[1e-6, False] == work[1e-1, True]
+    with pytest.raises(ddg.SceneError, match="Dynamics: rtol"):
+        ddg.Dynamics(rtol=0.0)

@@ -1,4 +1,4 @@
-"""Times large scenes of contact: noodles, woven_cylinder, rod_pile, and hair on a moving head; and what contact costs where nothing touches.
+"""Times large scenes of contact, noodles, woven_cylinder, rod_pile and hair on a moving head, and contact where nothing touches.
 
     python tools/bench_crowds.py --device cuda:0 [--only noodles ...] [--limit SECONDS] [--out DIR]
 
@@ -27,7 +27,13 @@ RTOL = 1e-3
 PARTS = 6  # rows of a case
 CASES = {  # scene, its arguments, step [s], duration [s], whether something drives it
     "noodles": ("noodles", {"count": 121, "nodes": 961, "bowl": 1.1}, 1 / 960, 4.0, False),
-    "woven_cylinder": ("woven_cylinder", {"strands": 148, "rings": 175, "nodes": 256, "around": 444}, 1 / 240, 1.0, True),
+    "woven_cylinder": (
+        "woven_cylinder",
+        {"strands": 148, "rings": 175, "nodes": 256, "around": 444},
+        1 / 240,
+        1.0,
+        True,
+    ),
     "rod_pile_1000": ("rod_pile", {"count": 1_000}, 1 / 480, 0.5, False),
     "rod_pile_10000": ("rod_pile", {"count": 10_000}, 1 / 480, 0.5, False),
     "hair_512": ("strands", {"count": 512, "contact": True}, 1 / 240, 1.0, True),
@@ -79,7 +85,10 @@ def run(name: str, device, limit: float) -> list[dict]:
                 "gap": touching["smallest_gap"] / contact.search.reach,
                 "refused": touching["refused_crossings"],
                 "gained": None if driven else float((energies - np.minimum.accumulate(energies)).max() / drop),
-                "search_share": 1e3 * _search(contact, state) * (touching["searches"] - earlier["searches"]) / (1e3 * wall),
+                "search_share": 1e3
+                * _search(contact, state)
+                * (touching["searches"] - earlier["searches"])
+                / (1e3 * wall),
             }
         )
         print(table(rows[-1:]), file=sys.stderr, flush=True)

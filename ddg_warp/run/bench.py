@@ -243,18 +243,15 @@ def defaults(module, study: Study, device: str | None) -> dict:
     """What the names of a study's grid are where nobody sets them."""
     import warp as wp
 
-    from ddg_warp.solve.chains.newton import NewtonOptions
     from ddg_warp.solve.statics import StaticsOptions
 
     known = parameters(module, {})
     analysis = module.build(**{name: value for name, value in study.fixed.items() if name in known}).analysis
-    options = NewtonOptions() if isinstance(analysis, Dynamics) else StaticsOptions()
     usual = {"precision": "mixed" if wp.get_device(device).is_cuda else "float64", "linear": "auto", "solver": "newton"}
-    usual["rtol"] = options.rtol
     if isinstance(analysis, Dynamics):
-        usual |= {"dt": analysis.dt, "duration": analysis.duration, "scheme": analysis.scheme}
+        usual |= {name: getattr(analysis, name) for name in ("dt", "duration", "scheme", "rtol")}
     else:
-        usual["solver"] = "auto"
+        usual |= {"solver": "auto", "rtol": StaticsOptions().rtol}
     return {name: {**usual, **known}[name] for name in study.grid}
 
 

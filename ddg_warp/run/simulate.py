@@ -128,7 +128,7 @@ def simulate(
         usd: Whether to record scene.usdc, too.
         observe: (model, state) -> values by name, taken at the start and after every step.
         provenance: Attributes of the trajectory: scene, parameters, command.
-        options: Keyword arguments of the `Integrator`, or of `StaticsOptions`: rtol and others.
+        options: Keyword arguments of the `Integrator`, or of `StaticsOptions`: rtol, in place of the scene's, and others.
         clock: Clock of `step_times` [s]; by default wall time, of finished work on CUDA.
         progress: Whether to say how far the run is: a bar on a terminal, a line every ten seconds elsewhere.
 
@@ -206,7 +206,8 @@ def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clo
     """Step to the end and `keep` each state. The scene's callbacks run inside of `integrator.step`."""
     from ddg_warp.solve.dynamics import Integrator
 
-    integrator = Integrator(result.model, scheme=result.scene.analysis.scheme, **options)
+    analysis = result.scene.analysis
+    integrator = Integrator(result.model, **{"scheme": analysis.scheme, "rtol": analysis.rtol} | options)
     state = result.state
     try:
         for _ in range(round(float(state.time) / result.dt), steps):

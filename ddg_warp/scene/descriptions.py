@@ -19,15 +19,20 @@ RUN = 2**16  # nodes
 
 @dataclass(frozen=True)
 class Dynamics:
-    """Advance in time: step dt [s] to duration [s] by `scheme` (`implicit_euler` or `implicit_midpoint`)."""
+    """Advance in time: step dt [s] to duration [s] by `scheme` (`implicit_euler` or `implicit_midpoint`).
+
+    In each step forces balance to `rtol` of the load of a rod or shell: its weight and what else it is given; see `Integrator`.
+    """
 
     dt: float = 0.01
     duration: float = 1.0
     scheme: str = "implicit_euler"
+    rtol: float = 1e-6
 
     def __post_init__(self):
         arguments.positive("Dynamics: dt", self.dt, "s")
         arguments.positive("Dynamics: duration", self.duration, "s")
+        arguments.positive("Dynamics: rtol", self.rtol)
         arguments.choice("Dynamics: scheme", self.scheme, ("implicit_euler", "implicit_midpoint"))
 
 
