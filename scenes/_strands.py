@@ -61,10 +61,8 @@ def checks(result, stretch: float, source: str) -> list[ddg.Check]:
     failed = sum(number for name, number in outcomes.items() if not name.startswith("converged"))
     series = {name: np.array(values) for name, values in result.series.items()}
     batch = result.model.scene.batches[0]
-    rest = edge_lengths(batch.points)
-    mass = batch.section.mass_per_length * rest.sum()
-    # What the roots and gravity can give: a strand that rides along at their top speed and falls by its own length.
-    bound = 0.5 * mass * fastest_root(result) ** 2 + mass * GRAVITY * rest.sum(axis=1).max()
+    mass = batch.section.mass_per_length * edge_lengths(batch.points).sum()
+    bound = 0.5 * mass * top_speed(result) ** 2
     finite = np.isfinite(result.state.points()).all() and all(np.isfinite(values).all() for values in series.values())
     return [
         ddg.Check("solves that did not converge", failed, 0.0, 0.0),
@@ -77,6 +75,18 @@ def checks(result, stretch: float, source: str) -> list[ddg.Check]:
             "kinetic energy over its bound", series["kinetic"].max() / bound, 0.0, 1.0, "work of roots and gravity"
         ),
     ]
+
+
+def top_speed(result) -> float:
+    """What roots and gravity can give [m/s]: of a strand that rides along with the fastest and falls by its own length."""
+    longest = edge_lengths(result.model.scene.batches[0].points).sum(axis=1).max()
+    return float(np.sqrt(fastest_root(result) ** 2 + 2.0 * GRAVITY * longest))
+
+
+def stopped(result) -> float:
+    """Momentum of the longest strand at its top speed [N s]."""
+    batch = result.model.scene.batches[0]
+    return batch.section.mass_per_length * edge_lengths(batch.points).sum(axis=1).max() * top_speed(result)
 
 
 def fastest_root(result) -> float:
