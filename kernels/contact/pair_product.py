@@ -40,7 +40,8 @@ def set_struct(linear):
 
 @cache
 def product_kernels(real, linear, serial: bool):
-    """multiply(...) the pairs; gather(...) or scatter(...) to nodes; settle(...), which gathers on free dofs, with dot products."""
+    """multiply(...) the pairs; gather(...) or scatter(...) to nodes; settle(...), which gathers on free dofs, with dot products, for
+    nodes in pairs, which meet(...) finds."""
     PairSet, until = set_struct(linear), until_function(serial)
     X, V = wp.types.vector(3, real), wp.types.vector(3, linear)
     bend = bend_function(linear)
@@ -104,8 +105,19 @@ def product_kernels(real, linear, serial: bool):
             out[node] = out[node] + total(sets, node)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def meet(sets: wp.array(dtype=PairSet), met_out: wp.array(dtype=wp.uint8)):
+        """Which nodes have items."""
+        tid = wp.tid()
+        for node in range(tid, until(tid, met_out.shape[0])):
+            number = int(0)
+            for s in range(sets.shape[0]):
+                number += sets[s].numbers[node]
+            met_out[node] = wp.uint8(wp.min(number, 1))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def settle(
         sets: wp.array(dtype=PairSet),
+        met: wp.array(dtype=wp.uint8),
         p: wp.array(dtype=V),
         fixed: wp.array(dtype=wp.uint8),
         busy: wp.array(dtype=int),
@@ -118,7 +130,10 @@ def product_kernels(real, linear, serial: bool):
             w = node / fixed.shape[0]
             if busy[w] == 1:
                 k = node - w * fixed.shape[0]
-                y = wp.cw_mul(out[node] + total(sets, node), free(fixed[k]))
+                y = out[node]
+                if met[node] != wp.uint8(0):
+                    y += total(sets, node)
+                y = wp.cw_mul(y, free(fixed[k]))
                 out[node] = y
                 dots_out[w, k] = wp.dot(p[node], y)
 
@@ -138,4 +153,4 @@ def product_kernels(real, linear, serial: bool):
                                 wp.atomic_add(out, node, own.parts[slot, p])
                             last = node
 
-    return multiply, gather, settle, scatter
+    return multiply, gather, meet, settle, scatter

@@ -17,8 +17,8 @@ class PairProduct:
         types = int, wp.types.vector(3, real)
         self._nothing = [wp.zeros(0, dtype=dtype, device=self._device) for dtype in types]
         made = product_kernels(real, linear, arrays.serial(self._device))
-        self._multiply, self._gather, self._settle, self._scatter = made
-        self.kernels = [self._multiply, self._settle, self._scatter if atomic else self._gather]
+        self._multiply, self._gather, self._meet, self._settle, self._scatter = made
+        self.kernels = [self._multiply, self._meet, self._settle, self._scatter if atomic else self._gather]
         self.kernels += [kernel for part in self._mollified for kernel in part.kernels]
         self.fit()
 
@@ -27,9 +27,13 @@ class PairProduct:
         self._sets = [self._set(part) for part in self._parts]  # an array of structures keeps nothing alive
         self.sets = wp.array(self._sets, dtype=set_struct(self._linear), device=self._device)
         self._most = max(part.found.capacity for part in self._parts)
+        self._met = wp.zeros(len(self._parts[0].numbers), dtype=wp.uint8, device=self._device)
 
-    def prepare(self, x: wp.array, wanted: wp.array) -> None:
-        """What products with what turns take at positions x, in the worlds that want it."""
+    def prepare(self, x: wp.array | None = None, wanted: wp.array | None = None) -> None:
+        """What `settle` takes, and products with what turns at positions x, in the worlds that want it."""
+        self._sweep(self._meet, len(self._met), [self.sets], [self._met])
+        if wanted is None:
+            return
         for part in self._mollified:
             part.differentiate(x, self._law, wanted)
 
@@ -44,7 +48,7 @@ class PairProduct:
     def settle(self, v, out, x, wanted, fixed: wp.array, busy: wp.array, dots: wp.array) -> None:
         """The same on free dofs in worlds that are busy, and v . out node by node."""
         self._write(v, x, wanted)
-        self._sweep(self._settle, len(out), [self.sets, v, fixed, busy], [out, dots])
+        self._sweep(self._settle, len(out), [self.sets, self._met, v, fixed, busy], [out, dots])
 
     def _write(self, v, x, wanted) -> None:
         given = self._nothing if wanted is None else [wanted, x]
