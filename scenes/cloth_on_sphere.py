@@ -26,6 +26,7 @@ def build(
     friction: float = 0.3,
     damping: float = 3.0,
     law: str = "barrier",
+    seed: int = -1,
 ) -> ddg.Scene:
     """The cloth a little above the ball.
 
@@ -36,11 +37,16 @@ def build(
         friction: Coulomb's coefficient everywhere
         damping: of masses, by the air [1/s]
         law: barrier or penalty
+        seed: of a jitter of the vertices at first, a fifth of the range of contact; none below 0
     """
     points, triangles = meshes.rectangle(cells, cells, (SIDE, SIDE), "alternating")
     points = points - [0.5 * SIDE, 0.5 * SIDE, 0.0]
     points[:, 2] = 2.0 * RADIUS + THICKNESS + 2.0 * RANGE
-    scene = ddg.Scene(mass_damping=damping, analysis=ddg.Dynamics(dt=dt, duration=duration))
+    scene = ddg.Scene(
+        mass_damping=damping,
+        analysis=ddg.Dynamics(dt=dt, duration=duration),
+        initial=lambda model: _touching.jittered(model, seed),
+    )
     scene.add_shell(points, triangles, thickness=THICKNESS, material=MATERIAL, bending="hinge", name="cloth")
     scene.contact(law=law, range=RANGE, friction=friction, velocity=1e-2)
     scene.add_obstacle(ddg.Sphere((0.0, 0.0, RADIUS), RADIUS), name="ball")

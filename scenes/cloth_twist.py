@@ -24,6 +24,7 @@ def build(
     dt: float = 1.0 / 200.0,
     friction: float = 0.2,
     law: str = "barrier",
+    seed: int = -1,
 ) -> ddg.Scene:
     """The cylinder about the axis z.
 
@@ -34,12 +35,18 @@ def build(
         dt: time step [s]
         friction: Coulomb's coefficient
         law: barrier or penalty
+        seed: of a jitter of the vertices at first, a fifth of the range of contact; none below 0
     """
     points, triangles = meshes.cylinder(around, along, RADIUS, LENGTH, "alternating")
     axis = int(np.argmin(np.abs(np.ptp(points, axis=0) - LENGTH)))
     points = np.roll(points, 2 - axis, axis=1)
     duration = round(turns * 2.0 * np.pi / RATE / dt) * dt
-    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), mass_damping=2.0, analysis=ddg.Dynamics(dt=dt, duration=duration))
+    scene = ddg.Scene(
+        gravity=(0.0, 0.0, 0.0),
+        mass_damping=2.0,
+        analysis=ddg.Dynamics(dt=dt, duration=duration),
+        initial=lambda model: _touching.jittered(model, seed),
+    )
     shell = scene.add_shell(points, triangles, thickness=THICKNESS, material=MATERIAL, bending="hinge", name="cloth")
     for end, sign in ((points[:, 2].min(), -1.0), (points[:, 2].max(), 1.0)):
         ring = np.flatnonzero(np.abs(points[:, 2] - end) < 1e-9)

@@ -31,6 +31,7 @@ def build(
     dt: float = 1.0 / 120.0,
     duration: float = 0.7,
     twist: bool = True,
+    seed: int = -1,
 ) -> ddg.Scene:
     """Strands on a square grid above the bowl.
 
@@ -41,6 +42,7 @@ def build(
         dt: time step [s]
         duration: of the run [s]; the large case takes 4 s
         twist: whether strands have twist, of which straight round ones with free ends feel nothing
+        seed: of a jitter of the nodes at first, a fifth of the range of contact; none below 0
     """
     side = int(np.ceil(np.sqrt(count)))
     number = np.arange(count)
@@ -58,7 +60,10 @@ def build(
     bow = 0.2 * RADIUS * np.sin(np.linspace(0.0, 3.0 * np.pi, nodes))
     angle = np.pi * (3.0 - np.sqrt(5.0)) * number
     points[..., :2] += bow[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)[:, None]
-    scene = ddg.Scene(analysis=ddg.Dynamics(dt=dt, duration=duration, rtol=RTOL))
+    scene = ddg.Scene(
+        analysis=ddg.Dynamics(dt=dt, duration=duration, rtol=RTOL),
+        initial=lambda model: _touching.jittered(model, seed),
+    )
     scene.add_rods(
         points,
         section=ddg.Stiffness(

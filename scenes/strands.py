@@ -24,6 +24,7 @@ FRICTION, SLIP = 0.2, 1e-2  # and m/s, from which speed on friction is all there
 STEPS = {False: 60.0, True: 240.0}  # a second, without contact and with
 REFUSED = 100  # pairs: a strand that swings about its root moves along an arc
 BORNE = 3.0  # weights of a strand that push surfaces to some part of the range of contact, so that flying ones stop
+HELD = 2  # nodes of each strand that its root holds
 CLEAR = 0.3  # of the radius, at least between strands that touch at the start
 
 
@@ -33,6 +34,7 @@ def build(
     young: float = 4.0e7,
     sway: float = 0.12,
     contact: bool = False,
+    seed: int = -1,
 ) -> ddg.Scene:
     """The groom on its moving head.
 
@@ -42,11 +44,14 @@ def build(
         young: Young's modulus [Pa]
         sway: sideways amplitude of the head [m]
         contact: whether strands touch each other and the head
+        seed: of a jitter of the shapes at rest, beyond what is held, a fifth of the range of contact; none below 0
     """
     points, radius = groom(path, count)
     thin = radius * min(1.0, np.sqrt(CROWD / count))
+    # strands jittered out of these shapes would stretch by tens of times what weight and motion do
+    points[:, HELD:] += 0.2 * thin * _touching.jitter(points[:, HELD:].shape, seed)
     if contact:
-        points = _layouts.pushed_apart(points, 2.0 * thin * (1.0 + CLEAR), held=2)
+        points = _layouts.pushed_apart(points, 2.0 * thin * (1.0 + CLEAR), held=HELD)
     scene = ddg.Scene(
         mass_damping=0.4,  # 1/s, drag of the air
         analysis=ddg.Dynamics(dt=1.0 / STEPS[contact], duration=REST, rtol=RTOL[contact]),
