@@ -3,6 +3,17 @@
 import numpy as np
 
 
+def random(seed: int):
+    """Random numbers of a seed.
+
+    Raises:
+        ValueError: the seed is negative.
+    """
+    if seed < 0:
+        raise ValueError(f"seed = {seed}; it is 0 or more")
+    return np.random.default_rng(seed)
+
+
 def placed_apart(rng, count: int, length: float, apart: float, size, height: float) -> np.ndarray:
     """Straight rods of random places and directions in a box, none closer to another than `apart` (random sequential addition).
 

@@ -10,7 +10,7 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.run.check import once_reached
-from ddg_warp.scenes import _touching
+from ddg_warp.scenes import _layouts, _touching
 
 LENGTH = 0.15  # m
 RADIUS = 1.5e-3  # m
@@ -44,7 +44,7 @@ def build(
     """
     if count < 7:
         raise ValueError(f"count = {count}; there are 7 worms at least, one and six about it")
-    phases = 2.0 * np.pi * np.random.default_rng(seed).uniform(size=(count, 1))
+    phases = 2.0 * np.pi * _layouts.random(seed).uniform(size=(count, 1))
     angle, radius, hand = bundle(count)
     tight = np.stack([COIL * hand**0, RISE * hand]) / (COIL**2 + RISE**2)
     slack = LAY / (1.0 + LAY**2) / np.maximum(radius, SPACING) * np.stack([LAY * hand**2, hand])

@@ -18,6 +18,7 @@ START = 1.0  # phi L / D before the fall: a rod that is placed at random meets 2
 NODES = 50
 RANDOM_CONTACT = 5.4  # phi L / D of long rods
 SOFT = 2e-6  # m, stiffness of contact over Young's modulus
+REFUSED = 50  # pairs: iterates may slip around the end of a rod to its other side; the straight way, which cuts it, is not taken
 RTOL = 1e-3  # of a rod's weight, to which forces balance in a step
 SLIP = 5e-3  # m/s, from which on friction is all there
 DENSEST = np.pi / np.sqrt(12.0)  # cylinders side by side in a hexagonal lattice
@@ -50,7 +51,7 @@ def build(
     diameter = 2.0 * RADIUS
     box = count * np.pi * RADIUS**2 * LENGTH / (START * diameter / LENGTH * width**2)
     ends = _layouts.placed_apart(
-        np.random.default_rng(seed), count, LENGTH, 1.5 * diameter, (width, width), max(box, 0.25 * LENGTH)
+        _layouts.random(seed), count, LENGTH, 1.5 * diameter, (width, width), max(box, 0.25 * LENGTH)
     )
     scene = ddg.Scene(analysis=ddg.Dynamics(dt=dt, duration=duration, rtol=RTOL))
     s = np.linspace(0.0, 1.0, NODES)[:, None]
@@ -85,7 +86,7 @@ def check(result) -> list[ddg.Check]:
     series = {name: values[-1] for name, values in result.series.items()}
     share = series["packing"] * 2.0 * RADIUS / LENGTH
     checks = [
-        *_touching.checks(result),
+        *_touching.checks(result, REFUSED),
         _touching.weight_check(result, 1e-3),
         _touching.energy_check(result),
         ddg.Check("rods outside of the box [m]", outside(result), 0.0, 0.0, "floor and walls"),
