@@ -10,7 +10,7 @@ def random(seed: int):
         ValueError: the seed is negative.
     """
     if seed < 0:
-        raise ValueError(f"seed = {seed}; it is 0 or more")
+        raise ValueError("random numbers have a seed of 0 or more")
     return np.random.default_rng(seed)
 
 
