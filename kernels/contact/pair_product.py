@@ -88,13 +88,15 @@ def product_kernels(real, linear, serial: bool):
     def total(sets: wp.array(dtype=PairSet), node: int):
         y = V()
         for s in range(sets.shape[0]):
-            own = sets[s]
-            start = own.places[node]
-            for k in range(start, start + own.numbers[node]):
-                item = own.items[k]
-                p = item / wp.static(SLOTS)
-                if own.used[p] != 0:
-                    y += own.parts[item - wp.static(SLOTS) * p, p]
+            number = sets[s].numbers[node]
+            if number > 0:  # few nodes are in pairs of a kind: the rest of the structure is not read
+                own = sets[s]
+                start = own.places[node]
+                for k in range(start, start + number):
+                    item = own.items[k]
+                    p = item / wp.static(SLOTS)
+                    if own.used[p] != 0:
+                        y += own.parts[item - wp.static(SLOTS) * p, p]
         return y
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
