@@ -132,8 +132,9 @@ class NetContact:
         return [*own, *self._sum.kernels, *self.search.kernels, *self.terms.kernels, *self.tally.kernels]
 
     def begin(self, before: wp.array) -> None:
-        """Start a step from positions: the trees of the search anew."""
-        self.search.rebuild(before)
+        """Start a step from positions: the trees of the search anew, where searches do not build their own."""
+        if self.newton.device.is_cuda:
+            self.search.rebuild(before)
         self.tally.begin()
 
     def start(self, before: wp.array) -> None:
