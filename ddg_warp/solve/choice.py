@@ -8,6 +8,9 @@ LONG = 512  # nodes of a rod from which on cyclic reduction pays on a GPU ...
 FEW = 256  # ... if there are no more rods than this
 # Of one matrix and many right-hand sides, as in contact: a further one takes the sweep 1.3 us a node, and cyclic reduction one launch.
 LONG_REPEATED, FEW_REPEATED = 24, 2048
+# Nodes up to which that launch, a block of threads a chain, takes less than to eliminate anew with all multiprocessors: 94 us of 121
+# chains of 961 nodes on an H200, growing with the nodes, where each of the 2 log2(n) launches takes 9 to 25.
+LONGEST_REPEATED = 8192
 
 LARGE = 4096  # nodes of a net, those of rods apart, from which on fewer, longer iterations of conjugate gradients pay
 

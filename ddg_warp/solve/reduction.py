@@ -54,17 +54,22 @@ class CyclicReduction:
                 self._threads = min(MOST, -(-(self.blocks[0] + 1) // 2 * self.dofs // 32) * 32)
 
     @property
+    def repeats(self) -> bool:
+        """Whether there are further right-hand sides."""
+        return self._packed is not None
+
+    @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         own = [*((kernel, 64) for kernel in self._reduce[:2]), (self._last, 32), self._expand]
-        return own if self._packed is None else [*own, *self._pack[:2], (self._again, self._threads)]
+        return [*own, *self._pack[:2], (self._again, self._threads)] if self.repeats else own
 
     def solve(self, matrix, right, count, wanted, solution: wp.array, bad: wp.array, again: bool = False) -> None:
         """Solution of the wanted columns from the blocks of their nodes; adds the pivots they lose to `bad`.
 
         `again` is for a further right-hand side of the same matrix. The solution may take the place of the right-hand side.
         """
-        if again:
+        if again and self.repeats:
             self.again(right, count, wanted, 1, solution)
             return
         given = matrix
@@ -95,7 +100,7 @@ class CyclicReduction:
                 [solution],
                 device=self.device,
             )
-        if self._packed is not None:
+        if self.repeats:
             self._keep(given, count, wanted)
 
     def _keep(self, matrix, count, wanted) -> None:

@@ -73,11 +73,12 @@ def dense(problem: Problem, world: int) -> np.ndarray:
     return np.where(np.outer(free, free), result, 0.0)
 
 
-@pytest.mark.parametrize("reduces", [False, True])
+@pytest.mark.parametrize("reduces", [False, True, "anew"])
 @pytest.mark.parametrize("scene", [branches, ring_and_spokes, frame_and_sheet])
 def test_is_the_elimination_of_chains_and_joints(device, monkeypatch, scene, reduces):
-    """Whether a thread walks along each chain, or many reduce it cyclically."""
-    monkeypatch.setattr(net_chains, "long_and_few", lambda *_: reduces)
+    """Whether a thread walks along each chain, or many reduce it cyclically, once or for every right-hand side."""
+    monkeypatch.setattr(net_chains, "long_and_few", lambda *_: bool(reduces))
+    monkeypatch.setattr(net_chains, "LONGEST_REPEATED", 1 if reduces == "anew" else 8192)
     problem = Problem(scene(), device, 1.02, preconditioner="chain")
     problem.newton.islands.clamped.fill_(1)
     problem.iterate(0.1)

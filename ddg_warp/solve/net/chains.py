@@ -13,7 +13,7 @@ from ddg_warp.kernels.matrix.sliced import SETS
 from ddg_warp.kernels.net.places import along_type, place_kernel
 from ddg_warp.kernels.solve import elimination, joints
 from ddg_warp.kernels.solve.walk import walk_kernel
-from ddg_warp.solve.choice import long_and_few
+from ddg_warp.solve.choice import LONGEST_REPEATED, long_and_few
 from ddg_warp.solve.net.plan import ChainPlan
 from ddg_warp.solve.reduction import CyclicReduction
 
@@ -90,7 +90,8 @@ class Chains:
         self.factors = arrays.allocate((3 * block**2 + block, self.longest, self.columns), linear, device)
         self.reduction = None
         if not self.split and long_and_few(self.longest, self.columns, wp.get_device(device), self._contact):
-            repeated = not self.exact or len(plan.of_places[1]) > 0
+            several = not self.exact or len(plan.of_places[1]) > 0
+            repeated = several and self.longest <= LONGEST_REPEATED
             self.reduction = CyclicReduction(block, self.longest, self.columns, linear, device, repeated=repeated)
             self._all = put(np.tile(plan.count, worlds))
             self._wanted, self._bad = (put(np.zeros(self.columns)) for _ in range(2))
@@ -302,11 +303,11 @@ class Chains:
         self._launch(kernel, solves // sides * self.columns, [self.factors, self.count, wanted], [values], SERIAL)
 
     def _reduce(self, values: wp.array, wanted: wp.array) -> None:
-        """H_II^-1 of values by cyclic reduction, which eliminates anew once after every `prepare`."""
+        """H_II^-1 of values by cyclic reduction, which eliminates anew after every `prepare`; of long chains every time."""
         spread, note = self._columns
         for first in range(0, values.shape[2], self.columns):
             part = values[:, :, first : first + self.columns]
-            if self._reduced:
+            if self._reduced and self.reduction.repeats:
                 self.reduction.again(part, self._all, wanted, self.width, part)
                 continue
             self._launch(spread, self.columns, [wanted, self.width], [self._wanted])
