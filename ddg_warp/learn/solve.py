@@ -15,7 +15,7 @@ from ddg_warp.solve.chains.assembled import AssembledNewton
 from ddg_warp.solve.chains.newton import ChainNewton, NewtonOptions
 from ddg_warp.solve.chains.pcg import PcgNewton
 from ddg_warp.solve.chains.tangent import ChainTangent
-from ddg_warp.solve.choice import LONGEST_REPEATED, automatic
+from ddg_warp.solve.choice import automatic
 from ddg_warp.solve.direct import SingularError, regular
 from ddg_warp.solve.reduction import CyclicReduction, Elimination
 
@@ -178,11 +178,10 @@ class DirectSolve:
             return
         self.system = AssembledNewton(*given, stored=linear)
         own = linear or real
-        self.solver = Elimination(kind, *size, own, device)
         if few:
-            self.solver = CyclicReduction(
-                kind.block, *size, own, device, repeated=linear is not None and group.nodes <= LONGEST_REPEATED
-            )
+            self.solver = CyclicReduction(kind.block, *size, own, device, repeated=linear is not None)
+        else:
+            self.solver = Elimination(kind, *size, own, device)
         self.failed = self.system.islands.bad
         if linear is not None:
             self._product = refine.product_kernel(kind, real)

@@ -5,6 +5,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.kernels.matrix import block_band
 from ddg_warp.kernels.solve import cyclic_reduction, paired, reduction_again
+from ddg_warp.solve.choice import LONGEST_REPEATED
 
 THREADS = 32  # of a block of threads that walk: few chains reach more multiprocessors
 MOST = 512  # threads of a block that has one chain
@@ -15,7 +16,8 @@ class CyclicReduction:
 
     Args:
         tensions: how many dofs of a node are; with any, the system comes in the form of a level. See `kernels.solve.paired`.
-        repeated: whether there are further right-hand sides of the same matrix; see `kernels.solve.reduction_again`.
+        repeated: whether there are further right-hand sides of the same matrix: chains that are not too long then keep what these
+            need; see `kernels.solve.reduction_again`.
     """
 
     def __init__(self, nb: int, nodes: int, columns: int, linear, device, tensions: int = 0, repeated: bool = False):
@@ -38,7 +40,7 @@ class CyclicReduction:
         self._last = cyclic_reduction.last_kernel(nb, linear, not tensions and levels == 0, tensions)
         self._expand = cyclic_reduction.expand_kernel(nb, linear)
         self._packed = None
-        if repeated:
+        if repeated and nodes <= LONGEST_REPEATED:
             number = 1 + sum(blocks // 2 for blocks in self.blocks)
             self._packed = wp.zeros((columns, number, 3 * self.dofs**2), dtype=linear, device=device)
             self._rest, self._found = (
@@ -55,7 +57,7 @@ class CyclicReduction:
 
     @property
     def repeats(self) -> bool:
-        """Whether there are further right-hand sides."""
+        """Whether it keeps what further right-hand sides need."""
         return self._packed is not None
 
     @property
@@ -108,7 +110,9 @@ class CyclicReduction:
         at = 0
         for level, kernel in enumerate(self._pack):
             last = level == len(self.kept)
-            kept, number = (self.kept[0], 1) if last else (self.kept[level], self.blocks[level] // 2)
+            kept, number = (
+                (matrix, 1) if last else (self.kept[level], self.blocks[level] // 2)
+            )  # the last keeps nothing
             wp.launch(
                 kernel,
                 (self.columns, number, self.dofs),

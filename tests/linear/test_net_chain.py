@@ -9,6 +9,7 @@ from net_problem import CABLE, SECTION, Problem, branches, frame_and_sheet, hing
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.scenes import gridshell_dome
+from ddg_warp.solve import reduction
 from ddg_warp.solve.choice import net_preconditioner
 from ddg_warp.solve.net import chains as net_chains
 
@@ -78,7 +79,7 @@ def dense(problem: Problem, world: int) -> np.ndarray:
 def test_is_the_elimination_of_chains_and_joints(device, monkeypatch, scene, reduces):
     """Whether a thread walks along each chain, or many reduce it cyclically, once or for every right-hand side."""
     monkeypatch.setattr(net_chains, "long_and_few", lambda *_: bool(reduces))
-    monkeypatch.setattr(net_chains, "LONGEST_REPEATED", 1 if reduces == "anew" else 8192)
+    monkeypatch.setattr(reduction, "LONGEST_REPEATED", 1 if reduces == "anew" else 8192)
     problem = Problem(scene(), device, 1.02, preconditioner="chain")
     problem.newton.islands.clamped.fill_(1)
     problem.iterate(0.1)

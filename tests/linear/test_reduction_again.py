@@ -76,3 +76,19 @@ def test_in_place_and_by_world(device):
     one, other = arrays.download(first), arrays.download(second)
     np.testing.assert_allclose(other[..., :3], one[..., :3], rtol=1e-12, atol=1e-13)
     assert (other[..., 3:] == right[..., 3:]).all()
+
+
+def test_chains_of_one_block(device):
+    """Of two nodes, which leave no level to reduce."""
+    rng, nb = np.random.default_rng(5), 3
+    L = rng.normal(size=(2 * nb, 2 * nb))
+    H, right = L @ L.T + np.eye(2 * nb), rng.normal(size=(2, 2 * nb))
+    bands = np.zeros((3, nb, nb, 2, 1))
+    bands[0, :, :, 0, 0], bands[0, :, :, 1, 0], bands[1, :, :, 0, 0] = H[:nb, :nb], H[nb:, nb:], H[:nb, nb:]
+    reduction = CyclicReduction(nb, 2, 1, wp.float64, device, repeated=True)
+    matrix = arrays.upload(bands.reshape(3 * nb**2, 2, 1), wp.float64, device)
+    count, wanted, bad = (wp.array([value], dtype=int, device=device) for value in (2, 1, 0))
+    for again, r in enumerate(right):
+        found = arrays.upload(r.reshape(2, nb).T[..., None], wp.float64, device)
+        reduction.solve(matrix, found, count, wanted, found, bad, again=again > 0)
+        np.testing.assert_allclose(arrays.download(found)[..., 0].T.ravel(), np.linalg.solve(H, r), rtol=1e-10)

@@ -13,7 +13,7 @@ from ddg_warp.kernels.matrix.sliced import SETS
 from ddg_warp.kernels.net.places import along_type, place_kernel
 from ddg_warp.kernels.solve import elimination, joints
 from ddg_warp.kernels.solve.walk import walk_kernel
-from ddg_warp.solve.choice import LONGEST_REPEATED, long_and_few
+from ddg_warp.solve.choice import long_and_few
 from ddg_warp.solve.net.plan import ChainPlan
 from ddg_warp.solve.reduction import CyclicReduction
 
@@ -90,8 +90,7 @@ class Chains:
         self.factors = arrays.allocate((3 * block**2 + block, self.longest, self.columns), linear, device)
         self.reduction = None
         if not self.split and long_and_few(self.longest, self.columns, wp.get_device(device), self._contact):
-            several = not self.exact or len(plan.of_places[1]) > 0
-            repeated = several and self.longest <= LONGEST_REPEATED
+            repeated = not self.exact or len(plan.of_places[1]) > 0
             self.reduction = CyclicReduction(block, self.longest, self.columns, linear, device, repeated=repeated)
             self._all = put(np.tile(plan.count, worlds))
             self._wanted, self._bad = (put(np.zeros(self.columns)) for _ in range(2))
