@@ -29,11 +29,12 @@ class PairProduct:
         self._most = max(part.found.capacity for part in self._parts)
         self._met = wp.zeros(len(self._parts[0].numbers), dtype=wp.uint8, device=self._device)
 
-    def prepare(self, x: wp.array | None = None, wanted: wp.array | None = None) -> None:
-        """What `settle` takes, and products with what turns at positions x, in the worlds that want it."""
+    def meet(self) -> None:
+        """Which nodes are in pairs, for `settle`."""
         self._sweep(self._meet, len(self._met), [self.sets], [self._met])
-        if wanted is None:
-            return
+
+    def prepare(self, x: wp.array, wanted: wp.array) -> None:
+        """What products with what turns take at positions x, in the worlds that want it."""
         for part in self._mollified:
             part.differentiate(x, self._law, wanted)
 

@@ -204,14 +204,16 @@ class PairTerms:
         if self._rub:
             self._rub(v, out)
 
-    def prepare(self, x: wp.array | None = None, wanted: wp.array | None = None) -> None:
-        """What `settle` takes of the last `evaluate`; and products that have at x what comes of pairs that turn, in worlds where
-        `wanted` (worlds,) is not zero.
-        """
+    def meet(self) -> None:
+        """What `settle` takes of the last `evaluate`: which nodes are in pairs."""
+        self._product.meet()
+
+    def prepare(self, x: wp.array, wanted: wp.array) -> None:
+        """What products take that have at x what comes of pairs that turn, in worlds where `wanted` (worlds,) is not zero."""
         self._product.prepare(x, wanted)
 
     def settle(self, v, out, x, wanted, fixed: wp.array, busy: wp.array, dots: wp.array) -> None:
-        """`product` on free dofs, in worlds that are `busy` (1), of which v . out is written node by node, too; after `prepare`.
+        """`product` on free dofs, in worlds that are `busy` (1), of which v . out is written node by node, too; after `meet`.
 
         Args:
             fixed: of each node of a world, bits of its held dofs; dots: (worlds, nodes).

@@ -187,7 +187,9 @@ class NetContact:
         newton = self.newton
         outputs = [self._curved, self._projected]
         self._launch(self._find_curved, self.net.worlds, [newton.islands.arrays[0], self._late], outputs)
-        self.terms.prepare(*((newton.q, self._curved) if self.bends else ()))
+        self.terms.meet()
+        if self.bends:
+            self.terms.prepare(newton.q, self._curved)
         if self._bands:
             self._bands(self.terms, newton.islands.arrays[0])
 
