@@ -4,6 +4,7 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.contact.motion import corners_function
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
@@ -12,7 +13,7 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 def look_kernel(kind: Kind, real):
     """Gap [m], the place between the closest points [m], and the force on the first thing [N] of each pair."""
     Sides, X = sides_struct(real), wp.types.vector(3, real)
-    slots, _, thickness, closest = pair_functions(kind, real)
+    (slots, _, thickness, closest), corners = pair_functions(kind, real), corners_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def look(
@@ -29,7 +30,7 @@ def look_kernel(kind: Kind, real):
         w = pairs[p][0] / sides.counts[0]
         i, j = pairs[p][0] - w * sides.counts[0], pairs[p][1] - w * sides.counts[1]
         nodes = slots(sides, i, j, w)
-        r, weights = closest(wp.matrix_from_rows(x[nodes[0]], x[nodes[1]], x[nodes[2]], x[nodes[3]]))
+        r, weights = closest(corners(x, nodes))
         gap_out[p] = wp.length(r) - thickness(sides, i, j, w)
         point = real(-0.5) * r
         force = X()
@@ -48,7 +49,7 @@ def closest_kernel(kind: Kind, real):
     """Of each pair the way from the second thing to the first between their closest points [m], the nodes, their shares of these
     points, negative on the second, and the thickness [m]."""
     Sides, X, W = sides_struct(real), wp.types.vector(3, real), wp.types.vector(4, real)
-    slots, _, thickness, closest = pair_functions(kind, real)
+    (slots, _, thickness, closest), corners = pair_functions(kind, real), corners_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def closest_points(
@@ -64,7 +65,7 @@ def closest_kernel(kind: Kind, real):
         w = pairs[p][0] / sides.counts[0]
         i, j = pairs[p][0] - w * sides.counts[0], pairs[p][1] - w * sides.counts[1]
         nodes = slots(sides, i, j, w)
-        way, shares = closest(wp.matrix_from_rows(x[nodes[0]], x[nodes[1]], x[nodes[2]], x[nodes[3]]))
+        way, shares = closest(corners(x, nodes))
         way_out[p] = way
         shares_out[p] = shares
         nodes_out[p] = nodes
