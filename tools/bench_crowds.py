@@ -8,7 +8,7 @@ time; a row is a sixth of that, from start to the time `until`: seconds of wall 
 the smallest gap over the range so far. `refused` are pairs that would have passed through each other in parts of steps that were not
 taken. What is said of errors: `rtol`, to which forces balance, over the weight of a rod; `gained`, the energy that was created over
 what was lost so far, of the scenes that nothing drives. `search_share` is what searches take of the wall time, from one that is timed
-at the end. Of scenes in which nothing touches, the ratio of a step with contact to one without.
+after them. Of scenes in which nothing touches, the ratio of a step with contact to one without.
 """
 
 import argparse
@@ -67,7 +67,6 @@ def run(name: str, device, limit: float) -> list[dict]:
         solves = _solves(found) - _solves(before)
         newton = _newton(found) - _newton(before)
         touching, earlier = found["contact"], before["contact"]
-        drop = np.ptp(energies)
         rows.append(
             {
                 "case": name,
@@ -84,11 +83,10 @@ def run(name: str, device, limit: float) -> list[dict]:
                 "contacts": touching["contacts"]["last"],
                 "gap": touching["smallest_gap"] / contact.search.reach,
                 "refused": touching["refused_crossings"],
-                "gained": None if driven else float((energies - np.minimum.accumulate(energies)).max() / drop),
-                "search_share": 1e3
-                * _search(contact, state)
-                * (touching["searches"] - earlier["searches"])
-                / (1e3 * wall),
+                "gained": None
+                if driven
+                else float((energies - np.minimum.accumulate(energies)).max() / np.ptp(energies)),
+                "search_share": _search(contact, state) * (touching["searches"] - earlier["searches"]) / wall,
             }
         )
         print(table(rows[-1:]), file=sys.stderr, flush=True)
