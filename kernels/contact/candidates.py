@@ -1,4 +1,8 @@
-"""Pairs that are near: found through a tree of boxes, judged by their distance, listed in the order of their indices.
+"""Pairs that are near: those whose boxes meet, by a tree; judged by their distance; and listed in the order of their indices.
+
+Walking the tree and judging pairs are kernels of their own on CUDA, too: a walk waits for memory, and takes so few registers that
+many threads wait at once; judging takes four times as many, and threads as many as there are pairs rather than as long as the longest
+walk.
 
 Of a motion those are found that may come near anywhere on the way. Whatever its share of its way, each node is between both ends of
 it; so the sides are as far apart as these ends are along any direction. The one asked is that of the closest points in the middle of
@@ -11,9 +15,9 @@ convex, a straight motion between two places in them does not leave them. Half-s
 nodes, which go by one share, a plane moves by more than they do, by the weights that they have there: its pairs are judged by a bound
 on how far both sides come towards each other.
 
-Each thing notes its partners in a linked list, whose entries come from one counter; running sums then say where its part of the list
-of pairs starts. So two runs give the same list to the bit, whatever order threads run in, and a list that does not fit is left out
-whole: `overflow` says so, and `found` how long it would be.
+Each thing notes its partners in a linked list, whose entries are the pairs whose boxes meet, in any order; running sums then say
+where its part of the list of pairs starts. So two runs give the same list to the bit, whatever order threads run in, and a list that
+does not fit is left out whole: `overflow` says so, and `needed` how long both would be.
 """
 
 from functools import cache
@@ -22,7 +26,7 @@ import warp as wp
 
 from ddg_warp.kernels.contact.motion import corners_function, relative_function
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
-from ddg_warp.kernels.threads import CPU_OPTIONS
+from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 MOST = 2**31 - 1  # pairs that can be counted; more are told as so many
 
@@ -44,11 +48,12 @@ def query_function(grouped: bool, real):
 
 
 @cache
-def candidate_kernels(kind: Kind, grouped: bool, real):
-    """find(...) partners and fill(...) the list of pairs."""
+def candidate_kernels(kind: Kind, grouped: bool, real, serial: bool):
+    """meet(...) of boxes, judge(...) by distance, and fill(...) the list of pairs."""
     Sides, X, Y = sides_struct(real), wp.types.vector(3, real), wp.types.matrix((4, 3), real)
     slots, may_touch, thickness, closest = pair_functions(kind, real)
-    begin, corners, relative = query_function(grouped, real), corners_function(real), relative_function(kind, real)
+    begin, until = query_function(grouped, real), until_function(serial)
+    corners, relative = corners_function(real), relative_function(kind, real)
     half, two, tiny = wp.constant(real(0.5)), wp.constant(real(2.0)), wp.constant(real(1.0e-30))
 
     @wp.func
@@ -73,7 +78,27 @@ def candidate_kernels(kind: Kind, grouped: bool, real):
         return first - second - two * around
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def find(
+    def meet(
+        sides: Sides,
+        found: wp.array(dtype=int),
+        met: wp.array(dtype=wp.vec2i),
+        last: wp.array(dtype=int),
+        partners: wp.array(dtype=int),
+    ):
+        """Pairs of things that may touch and whose boxes meet, as many as fit, and how many there are."""
+        i = wp.tid()
+        last[i] = -1
+        partners[i] = 0
+        query, w, k = begin(sides, i)
+        j = int(0)
+        while wp.bvh_query_next(query, j):
+            if may_touch(sides, k, j - w * sides.counts[1]):
+                slot = wp.atomic_add(found, 0, 1)
+                if slot < met.shape[0]:
+                    met[slot] = wp.vec2i(i, j)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def judge(
         sides: Sides,
         x: wp.array(dtype=X),
         move: wp.array(dtype=X),
@@ -81,51 +106,51 @@ def candidate_kernels(kind: Kind, grouped: bool, real):
         reach: real,
         around: real,
         found: wp.array(dtype=int),
-        partner: wp.array(dtype=int),
+        met: wp.array(dtype=wp.vec2i),
         before: wp.array(dtype=int),
         last: wp.array(dtype=int),
         partners: wp.array(dtype=int),
     ):
-        """Partners of a thing that may come as near as both radii and `reach` within `around` of their ways."""
-        i = wp.tid()
-        query, w, k = begin(sides, i)
-        number, at, j = int(0), int(-1), int(0)
-        while wp.bvh_query_next(query, j):
-            l = j - w * sides.counts[1]
-            if may_touch(sides, k, l):
-                nodes = slots(sides, k, l, w)
-                y, p = corners(x, nodes), corners(move, nodes)
-                if together[w] != 0:
-                    p, _speed = relative(y, p)
-                if apart(y, p, around) <= thickness(sides, k, l, w) + reach:
-                    slot = wp.atomic_add(found, 0, 1)
-                    number += 1
-                    if slot < partner.shape[0]:
-                        partner[slot] = j
-                        before[slot] = at
-                        at = slot
-        last[i] = at
-        partners[i] = number
+        """Which of them may come as near as both radii and `reach` within `around` of their ways: linked, and counted by thing."""
+        tid = wp.tid()
+        count = wp.min(found[0], met.shape[0])
+        if tid >= count:
+            return
+        for slot in range(tid, until(tid, count)):
+            i = met[slot][0]
+            w = i / sides.counts[0]
+            k, l = i - w * sides.counts[0], met[slot][1] - w * sides.counts[1]
+            nodes = slots(sides, k, l, w)
+            y, p = corners(x, nodes), corners(move, nodes)
+            if together[w] != 0:
+                p, _speed = relative(y, p)
+            if apart(y, p, around) <= thickness(sides, k, l, w) + reach:
+                before[slot] = wp.atomic_exch(last, i, slot)
+                wp.atomic_add(partners, i, 1)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def fill(
         found: wp.array(dtype=int),
-        partner: wp.array(dtype=int),
+        met: wp.array(dtype=wp.vec2i),
         before: wp.array(dtype=int),
         last: wp.array(dtype=int),
         starts: wp.array(dtype=int),
+        partners: wp.array(dtype=int),
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
         overflow: wp.array(dtype=int),
-        largest: wp.array(dtype=int),
+        needed: wp.array(dtype=int),
     ):
         """The pairs of a thing, sorted by insertion; lists are short."""
         i = wp.tid()
-        total = found[0]
-        fits = total >= 0 and total <= pairs.shape[0]
+        end = starts.shape[0] - 1
+        total = starts[end] + partners[end]
+        met_all = found[0] >= 0 and found[0] <= met.shape[0]
+        fits = met_all and total <= pairs.shape[0]
         if i == 0:
             count[0] = wp.where(fits, total, 0)
-            largest[0] = wp.max(largest[0], wp.where(total < 0, wp.static(MOST), total))
+            needed[0] = wp.max(needed[0], total)
+            needed[1] = wp.max(needed[1], wp.where(found[0] < 0, wp.static(MOST), found[0]))
             if not fits:
                 overflow[0] = 1
         if fits:
@@ -133,7 +158,7 @@ def candidate_kernels(kind: Kind, grouped: bool, real):
             end = start
             at = last[i]
             while at >= 0:
-                j = partner[at]
+                j = met[at][1]
                 k = end
                 while k > start and pairs[wp.max(k - 1, 0)][1] > j:
                     pairs[k] = pairs[k - 1]
@@ -142,4 +167,4 @@ def candidate_kernels(kind: Kind, grouped: bool, real):
                 end += 1
                 at = before[at]
 
-    return find, fill
+    return meet, judge, fill

@@ -193,13 +193,7 @@ class BroadPhase:
         while self.overflow.numpy()[0]:
             self.overflow.zero_()
             for pairs in self.lists:
-                needed = int(pairs.needed.numpy()[0])
-                if needed > pairs.capacity:
-                    if needed >= 2**31 - 1:
-                        raise SolverError(
-                            "more than 2^31 pairs are near; use a smaller margin or reach", outcome="too_many_pairs"
-                        )
-                    pairs.reserve(min(needed + needed // 2, 2**31 - 1))
+                pairs.fit()
             self.version += 1
             grown = True
             self.search(x)

@@ -1,8 +1,10 @@
 """Lists of pairs on a device, of fixed capacity; see `kernels.contact.candidates`."""
 
+import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
+from ddg_warp.errors import SolverError
 from ddg_warp.kernels.contact import sums
 from ddg_warp.kernels.contact.candidates import candidate_kernels
 from ddg_warp.kernels.contact.motion import gap_kernel
@@ -48,7 +50,7 @@ class PairList:
     Attributes:
         pairs: things (i, j) of both sides, counted over all worlds, sorted; the first `count` hold.
         starts, partners: of each first thing (first.all,), where its pairs start and how many they are, where all pairs fit.
-        count: of pairs, zero where they do not fit; needed: the most pairs of any search since the capacity was set.
+        count: of pairs, zero where they do not fit.
         sides: see `kernels.contact.surfaces`; overflow: shared with other lists; not zero once pairs did not fit.
     """
 
@@ -67,40 +69,53 @@ class PairList:
         self._last, self.partners = (wp.zeros(first.all, dtype=int, device=self.device) for _ in range(2))
         self._sums = RunningSums(self.partners)
         self.starts = self._sums.starts
-        self._find, self._fill = candidate_kernels(kind, grouped, real)
-        self._gaps = gap_kernel(kind, real, arrays.serial(self.device))
-        self.found, self.count, self.needed = (wp.zeros(1, dtype=int, device=self.device) for _ in range(3))
-        self.kernels = [self._find, self._fill, self._gaps, *self._sums.kernels]
-        self.reserve(max(1024, 4 * first.all))
+        serial = arrays.serial(self.device)
+        self._meet, self._judge, self._fill = candidate_kernels(kind, grouped, real, serial)
+        self._gaps = gap_kernel(kind, real, serial)
+        self.count, self._found = (wp.zeros(1, dtype=int, device=self.device) for _ in range(2))
+        # the most pairs of any search since there was room for so many, and those whose boxes met
+        self._needed = wp.zeros(2, dtype=int, device=self.device)
+        self.kernels = [self._meet, self._judge, self._fill, self._gaps, *self._sums.kernels]
+        self.reserve(max(1024, 4 * first.all), max(4096, 16 * first.all))
 
     @property
     def capacity(self) -> int:
         return len(self.pairs)
 
-    def reserve(self, capacity: int) -> None:
-        """Make room for so many pairs; what was captured with the list is to be captured anew."""
-        self._partner, self._before = (wp.zeros(capacity, dtype=int, device=self.device) for _ in range(2))
-        self.pairs = wp.zeros(capacity, dtype=wp.vec2i, device=self.device)
-        self.needed.zero_()
+    def reserve(self, pairs: int, met: int | None = None) -> None:
+        """Make room for so many pairs, and so many whose boxes meet, by default as many as there is room for."""
+        if met is not None:
+            self._met = wp.zeros(met, dtype=wp.vec2i, device=self.device)
+            self._before = wp.zeros(met, dtype=int, device=self.device)
+        self.pairs = wp.zeros(pairs, dtype=wp.vec2i, device=self.device)
+        self._needed.zero_()
+
+    def fit(self) -> None:
+        """Make room for pairs that did not fit; what was captured with the list is to be captured anew. Reads from the device.
+
+        Raises:
+            SolverError: there are more pairs than can be counted.
+        """
+        needed = self._needed.numpy().astype(np.int64)
+        if (needed >= 2**31 - 1).any():
+            raise SolverError("more than 2^31 pairs are near; use a smaller margin or reach", outcome="too_many_pairs")
+        now = np.array([self.capacity, len(self._met)])
+        if (needed > now).any():
+            self.reserve(*np.where(needed > now, np.minimum(needed + needed // 2, 2**31 - 1), now).tolist())
 
     def search(self, x, move, together, reach: float, around: float) -> None:
         """Find and list the pairs; boxes have to be up to date; see `kernels.contact.candidates`."""
-        self.found.zero_()
-        wp.launch(
-            self._find,
-            self.first.all,
-            [self.sides, x, move, together, reach, around],
-            [self.found, self._partner, self._before, self._last, self.partners],
-            device=self.device,
-        )
+        self._found.zero_()
+        met = [self._met, self._before, self._last]
+        self._launch(self._meet, [self.sides], [self._found, self._met, self._last, self.partners])
+        inputs = [self.sides, x, move, together, reach, around, self._found]
+        arrays.sweep(self._judge, len(self._met), inputs, [*met, self.partners], self.device)
         self._sums()
-        wp.launch(
-            self._fill,
-            self.first.all,
-            [self.found, self._partner, self._before, self._last, self.starts],
-            [self.pairs, self.count, self.overflow, self.needed],
-            device=self.device,
-        )
+        outputs = [self.pairs, self.count, self.overflow, self._needed]
+        self._launch(self._fill, [self._found, *met, self.starts, self.partners], outputs)
+
+    def _launch(self, kernel, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, self.first.all, inputs, outputs, device=self.device)
 
     def measure(self, x, gap) -> None:
         """Lower the smallest gaps of worlds to those of pairs."""
