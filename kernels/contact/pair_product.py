@@ -14,7 +14,8 @@ from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 def set_struct(linear):
     """A list of pairs: its factor (see `gather.factor_struct`), what it writes by slot, and the items of nodes.
 
-    kind: place in `pair_bend.KINDS`, -1 without `bend`; rows: of its factor; things: first things of pairs in one world.
+    marks, starts, columns: of pairs whose Hessians are kept, see `pair_terms.mollified_kernels`; empty where there are none. kind: place
+    in `pair_bend.KINDS`, -1 without `bend`; rows: of its factor; things: first things of pairs in one world.
     """
     V, W = wp.types.vector(3, linear), wp.types.vector(SLOTS, linear)
 
@@ -27,6 +28,9 @@ def set_struct(linear):
         direction: wp.array2d(dtype=V)
         weight: wp.array2d(dtype=W)
         bend: wp.array(dtype=linear)
+        marks: wp.array(dtype=int)
+        starts: wp.array(dtype=int)
+        columns: wp.array3d(dtype=V)
         parts: wp.array2d(dtype=V)
         places: wp.array(dtype=int)
         numbers: wp.array(dtype=int)
@@ -43,7 +47,7 @@ def product_kernels(real, linear, serial: bool):
     """multiply(...) the pairs; gather(...) or scatter(...) to nodes; settle(...), which gathers on free dofs, with dot products, for
     nodes in pairs, which meet(...) finds."""
     PairSet, until = set_struct(linear), until_function(serial)
-    X, V = wp.types.vector(3, real), wp.types.vector(3, linear)
+    X, V, Y = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.matrix((4, 3), linear)
     bend = bend_function(linear)
     _, free = product_functions(linear)
 
@@ -53,11 +57,30 @@ def product_kernels(real, linear, serial: bool):
         u = x - y
         return V(linear(u[0]), linear(u[1]), linear(u[2]))
 
+    @wp.func
+    def kept(own: PairSet, p: int):
+        """Place of the Hessian that is kept of a pair, -1 without."""
+        m = int(-1)
+        if own.marks.shape[0] > 0:
+            if own.marks[p] != 0 and own.starts[p] < own.columns.shape[2]:
+                m = own.starts[p]
+        return m
+
+    @wp.func
+    def times(columns: wp.array3d(dtype=V), m: int, u: Y):
+        """A Hessian that is kept times what is at the nodes; it is symmetric, and read by rows."""
+        y = Y()
+        for slot in range(wp.static(SLOTS)):
+            for d in range(3):
+                for k in range(wp.static(SLOTS)):
+                    y[slot, d] = y[slot, d] + wp.dot(columns[3 * slot + d, k, m], u[k])
+        return y
+
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def multiply(
         sets: wp.array(dtype=PairSet), wanted: wp.array(dtype=int), x: wp.array(dtype=X), v: wp.array(dtype=V)
     ):
-        """F^T F v of each pair, by slot, with that of `pair_bend` in the worlds that want it, if any are given."""
+        """F^T F v of each pair, by slot; in the worlds that want it, if any are given, with that of `pair_bend`, or of the Hessian kept."""
         tid = wp.tid()
         for s in range(sets.shape[0]):
             own = sets[s]
@@ -67,20 +90,26 @@ def product_kernels(real, linear, serial: bool):
                     if used != 0:
                         n = own.nodes[p]
                         u = wp.matrix_from_rows(v[n[0]], v[n[1]], v[n[2]], v[n[3]])
-                        y = wp.matrix(shape=(4, 3), dtype=linear)
-                        for k in range(own.rows):
-                            if (used >> (k + 1)) & 1 != 0:
-                                w = own.weight[k, p]
-                                along = own.direction[k, p]
-                                y += wp.outer(w, along * wp.dot(along, w * u))
-                        if wanted.shape[0] > 0 and own.kind >= 0:
-                            c = own.bend[p]
-                            if c != linear(0.0) and wanted[own.pairs[p][0] / own.things] != 0:
-                                o = x[n[0]]
-                                at = wp.matrix_from_rows(
-                                    V(), beside(x[n[1]], o), beside(x[n[2]], o), beside(x[n[3]], o)
-                                )
-                                y += bend(own.kind, at, own.weight[0, p], u) * c
+                        y = Y()
+                        m = int(-1)
+                        if wanted.shape[0] > 0:
+                            m = kept(own, p)
+                        if m >= 0:
+                            y = times(own.columns, m, u)
+                        else:
+                            for k in range(own.rows):
+                                if (used >> (k + 1)) & 1 != 0:
+                                    w = own.weight[k, p]
+                                    along = own.direction[k, p]
+                                    y += wp.outer(w, along * wp.dot(along, w * u))
+                            if wanted.shape[0] > 0 and own.kind >= 0:
+                                c = own.bend[p]
+                                if c != linear(0.0) and wanted[own.pairs[p][0] / own.things] != 0:
+                                    o = x[n[0]]
+                                    at = wp.matrix_from_rows(
+                                        V(), beside(x[n[1]], o), beside(x[n[2]], o), beside(x[n[3]], o)
+                                    )
+                                    y += bend(own.kind, at, own.weight[0, p], u) * c
                         for slot in range(wp.static(SLOTS)):
                             own.parts[slot, p] = y[slot]
 

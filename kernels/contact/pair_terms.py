@@ -185,7 +185,7 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: boo
 def mollified_kernels(density: Density, real, linear, serial: bool):
     """Exact Hessians of pairs of edges that `pair_bend` does not know, kept as long as there is room: those all but parallel.
 
-    mark(...) them, choose(...) lists them in order, differentiate(...) writes a column of each, a thread a column, multiply(...).
+    mark(...) them, choose(...) lists them in order, differentiate(...) writes a column of each, a thread a column.
     """
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
     X, *_ = shape_types(real)
@@ -216,11 +216,6 @@ def mollified_kernels(density: Density, real, linear, serial: bool):
             if marks[p] != 0 and starts[p] < chosen.shape[0]:
                 chosen[starts[p]] = p
 
-    @wp.func
-    def number(marks: wp.array(dtype=int), starts: wp.array(dtype=int), most: int):
-        last = marks.shape[0] - 1
-        return wp.min(starts[last] + marks[last], most)
-
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def differentiate(
         pairs: wp.array(dtype=wp.vec2i),
@@ -234,7 +229,8 @@ def mollified_kernels(density: Density, real, linear, serial: bool):
         columns: wp.array3d(dtype=L),
     ):
         tid = wp.tid()
-        total = 12 * number(marks, starts, chosen.shape[0])
+        last = marks.shape[0] - 1
+        total = 12 * wp.min(starts[last] + marks[last], chosen.shape[0])
         if tid >= total:
             return
         for i in range(tid, until(tid, total)):
@@ -248,32 +244,7 @@ def mollified_kernels(density: Density, real, linear, serial: bool):
             for slot in range(wp.static(SLOTS)):
                 columns[column, slot, m] = L(linear(dx[slot, 0]), linear(dx[slot, 1]), linear(dx[slot, 2]))
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def multiply(
-        factor: Factor,
-        marks: wp.array(dtype=int),
-        starts: wp.array(dtype=int),
-        chosen: wp.array(dtype=int),
-        columns: wp.array3d(dtype=L),
-        v: wp.array(dtype=L),
-        parts: wp.array2d(dtype=L),
-    ):
-        """By slot, as it is symmetric."""
-        tid = wp.tid()
-        total = number(marks, starts, chosen.shape[0])
-        if tid >= total:
-            return
-        for m in range(tid, until(tid, total)):
-            p = chosen[m]
-            n = factor.nodes[p]
-            for slot in range(wp.static(SLOTS)):
-                y = L()
-                for d in range(3):
-                    for k in range(wp.static(SLOTS)):
-                        y[d] += wp.dot(columns[3 * slot + d, k, m], v[n[k]])
-                parts[slot, p] = y
-
-    return mark, choose, differentiate, multiply
+    return mark, choose, differentiate
 
 
 @cache

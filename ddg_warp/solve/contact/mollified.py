@@ -1,4 +1,4 @@
-"""Exact Hessians of edges that are all but parallel; see `kernels.contact.pair_terms`."""
+"""Exact Hessians of edges that are all but parallel, for `PairProduct`; see `kernels.contact.pair_terms`."""
 
 import warp as wp
 
@@ -13,42 +13,41 @@ LEAST = 256  # pairs that there is room for
 
 
 class Mollified:
-    """Those among the `ContactElements` of edges with a law."""
+    """Those among the `ContactElements` of edges with a law, kept.
+
+    Attributes:
+        keeps: whether they are, so that `PairProduct` multiplies them beside all others.
+        marks, starts, columns: see `kernels.contact.pair_product.set_struct`.
+    """
+
+    keeps = True
 
     def __init__(self, elements, law: Density):
         self._of = elements
         serial = arrays.serial(elements.device)
         self.kernels = mollified_kernels(law, elements.real, elements.linear, serial)
-        self._mark, self._choose, self._differentiate, self._multiply = self.kernels
+        self._mark, self._choose, self._differentiate = self.kernels
 
     def reserve(self) -> None:
         """Make room, as `PairElements` do."""
         of, capacity = self._of, self._of.found.capacity
         room = max(LEAST, capacity // ROOM)
-        self._marks = wp.zeros(capacity, dtype=int, device=of.device)
-        self._running = RunningSums(self._marks)
+        self.marks = wp.zeros(capacity, dtype=int, device=of.device)
+        self._running = RunningSums(self.marks)
+        self.starts = self._running.starts
         self._chosen = wp.zeros(room, dtype=int, device=of.device)
         vector = wp.types.vector(3, of.linear)
-        self._columns = arrays.allocate((3 * SLOTS, SLOTS, room), vector, of.device)
+        self.columns = arrays.allocate((3 * SLOTS, SLOTS, room), vector, of.device)
 
     def differentiate(self, x: wp.array, law, wanted: wp.array) -> None:
         """Find them at positions x in worlds that want it, and their Hessians."""
         of = self._of
         inputs = [of.pairs, of.count, of.found.first.count, wanted, of.factor]
-        self._sweep(self._mark, len(self._marks), inputs, [self._marks])
+        self._sweep(self._mark, len(self.marks), inputs, [self.marks])
         self._running()
-        self._sweep(self._choose, len(self._marks), self._list[:2], [self._chosen])
-        inputs = [of.pairs, of.found.sides, law, x, of.factor, *self._list]
-        self._sweep(self._differentiate, 3 * SLOTS * len(self._chosen), inputs, [self._columns])
-
-    def multiply(self, v: wp.array) -> None:
-        """Write their products with v by slot."""
-        inputs = [self._of.factor, *self._list, self._columns, v]
-        self._sweep(self._multiply, len(self._chosen), inputs, [self._of.parts])
-
-    @property
-    def _list(self) -> list[wp.array]:
-        return [self._marks, self._running.starts, self._chosen]
+        self._sweep(self._choose, len(self.marks), [self.marks, self.starts], [self._chosen])
+        inputs = [of.pairs, of.found.sides, law, x, of.factor, self.marks, self.starts, self._chosen]
+        self._sweep(self._differentiate, 3 * SLOTS * len(self._chosen), inputs, [self.columns])
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
         arrays.sweep(kernel, count, inputs, outputs, self._of.device)
@@ -56,6 +55,8 @@ class Mollified:
 
 class Unkept:
     """The same of all of them, in every world, whose Hessians are not kept but found anew in every product."""
+
+    keeps = False
 
     def __init__(self, elements, law: Density):
         self._of = elements
@@ -72,7 +73,7 @@ class Unkept:
         self._at = x, law
 
     def multiply(self, v: wp.array) -> None:
-        """As of `Mollified`."""
+        """Write their products with v by slot."""
         of, (x, law) = self._of, self._at
         inputs = [of.pairs, of.count, of.found.sides, law, x, of.factor, v]
         arrays.sweep(self._multiply, of.found.capacity, inputs, [of.parts], of.device)

@@ -55,7 +55,8 @@ class PairProduct:
         given = self._nothing if wanted is None else [wanted, x]
         self._sweep(self._multiply, self._most, [self.sets, *given, v], [])
         for part in self._mollified if wanted is not None else ():
-            part.multiply(v)
+            if not part.keeps:
+                part.multiply(v)
 
     def _set(self, part):
         own = set_struct(self._linear)()
@@ -63,6 +64,8 @@ class PairProduct:
             setattr(own, name, getattr(part.factor, name))
         for name in ("pairs", "count", "parts", "places", "numbers", "items"):
             setattr(own, name, getattr(part, name))
+        for name in ("marks", "starts", "columns") if part.mollified and part.mollified.keeps else ():
+            setattr(own, name, getattr(part.mollified, name))
         own.kind = KINDS.index(part.found.kind) if isinstance(part, ContactElements) else -1
         own.rows, own.things = part.rows, part.found.first.count
         return own
