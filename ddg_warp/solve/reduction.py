@@ -21,7 +21,7 @@ class CyclicReduction:
     """
 
     def __init__(self, nb: int, nodes: int, columns: int, linear, device, tensions: int = 0, repeated: bool = False):
-        self.columns, self.device, self.dofs = columns, device, 2 * nb
+        self.columns, self.device, self.dofs, self._linear = columns, device, 2 * nb, linear
         self.blocks = [-(-nodes // 2)]  # of every level
         while self.blocks[-1] > 1:
             self.blocks.append(-(-self.blocks[-1] // 2))
@@ -122,6 +122,22 @@ class CyclicReduction:
             )
             at += number
             matrix = None if last else self.matrices[level]
+
+    def again_kernel_at_places(self, twist: bool):
+        """Kernel of `again_at_places`, and how many threads a block of it has."""
+        return reduction_again.again_at_places_kernel(twist, self._linear), self._threads
+
+    def again_at_places(self, twist: bool, residual, places, held, count, wanted, blocks: int, z, dots) -> None:
+        """As `again`, of the chains of a net with so many blocks in a world, see `reduction_again.again_at_places_kernel`."""
+        kernel, threads = self.again_kernel_at_places(twist)
+        wp.launch(
+            kernel,
+            self.columns * threads,
+            [self._packed, residual, places, held, count, wanted, blocks, self.blocks[0], threads],
+            [self._rest, self._found, z, dots],
+            device=self.device,
+            block_dim=threads,
+        )
 
     def again(self, right, count, wanted: wp.array, width: int, solution: wp.array) -> None:
         """Solution of a further right-hand side, of the columns of which `wanted` is 1, of every `width` of them."""

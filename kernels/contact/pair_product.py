@@ -14,8 +14,8 @@ from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 def set_struct(linear):
     """A list of pairs: its factor (see `gather.factor_struct`), what it writes by slot, and the items of nodes.
 
-    marks, starts, columns: of pairs whose Hessians are kept, see `pair_terms.mollified_kernels`; empty where there are none. kind: place
-    in `pair_bend.KINDS`, -1 without `bend`; rows: of its factor; things: first things of pairs in one world.
+    marks, starts, columns: of pairs whose Hessians are kept, see `pair_terms.mollified_kernels`; empty where there are none.
+    kind: place in `pair_bend.KINDS`, -1 without `bend`; rows: of its factor; things: first things of pairs in one world.
     """
     V, W = wp.types.vector(3, linear), wp.types.vector(SLOTS, linear)
 
@@ -80,7 +80,7 @@ def product_kernels(real, linear, serial: bool):
     def multiply(
         sets: wp.array(dtype=PairSet), wanted: wp.array(dtype=int), x: wp.array(dtype=X), v: wp.array(dtype=V)
     ):
-        """F^T F v of each pair, by slot; in the worlds that want it, if any are given, with that of `pair_bend`, or of the Hessian kept."""
+        """F^T F v of each pair, by slot; in the worlds that want it, if given, with that of `pair_bend`, or the Hessian kept."""
         tid = wp.tid()
         for s in range(sets.shape[0]):
             own = sets[s]

@@ -221,10 +221,13 @@ def solver_kernels(linear, indefinite: bool = False):
         residual: wp.array(dtype=H),
         z_out: wp.array(dtype=H),
         dots_out: wp.array2d(dtype=linear),
+        busy_out: wp.array(dtype=int),
     ):
-        """Step along p, new residual and its preconditioned form z, and r . z block by block."""
+        """Step along p, new residual and its preconditioned form z, and r . z block by block; `test` says who is busy after it."""
         i = wp.tid()
         w = i / blocks
+        if i == 0:
+            busy_out[0] = 0
         if wanted[w] != 1:
             return
         k = i - w * blocks

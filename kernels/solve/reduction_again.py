@@ -13,6 +13,7 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.matrix.chain_places import place_dofs, place_functions, value_function
 from ddg_warp.kernels.solve.cyclic_reduction import block_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
@@ -69,8 +70,8 @@ def pack_kernel(nb: int, linear, first: bool, tensions: int = 0):
 
 
 @cache
-def again_kernel(nb: int, linear):
-    """again(...): the solution of wanted chains for another right-hand side, by as many `threads` as a block has."""
+def again_functions(nb: int, linear):
+    """solve(packed, r, t, threads, blocks, rest, found) of chain r by the threads t of a block, all of which call it."""
     size = 2 * nb
     square = size**2
 
@@ -90,35 +91,17 @@ def again_kernel(nb: int, linear):
             total += packed[r, j, at + d * wp.static(size)] * x[r, k, d]
         return total
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def again(
+    @wp.func
+    def solve(
         packed: wp.array3d(dtype=linear),
-        right: wp.array3d(dtype=linear),
-        count: wp.array(dtype=int),
-        wanted: wp.array(dtype=int),
-        width: int,
-        blocks: int,
+        r: int,
+        t: int,
         threads: int,
+        blocks: int,
         rest: wp.array3d(dtype=linear),
         found: wp.array3d(dtype=linear),
-        solution: wp.array3d(dtype=linear),
     ):
-        """`wanted` (1) of every `width` chains; rest and found (chains, blocks, 2 nb) are to work in."""
-        tid = wp.tid()
-        r = tid / threads
-        t = tid - r * threads
-        if wanted[r / width] != 1:
-            return
-        n = count[r]
-        for i in range(t, blocks * wp.static(size), threads):
-            j = i / wp.static(size)
-            c = i - j * wp.static(size)
-            half = c / wp.static(nb)
-            k = 2 * j + half
-            value = linear(0.0)
-            if k < n:
-                value = right[c - half * wp.static(nb), k, r]
-            rest[r, j, c] = value
+        """From what is in `rest` (chains, blocks, 2 nb), which is worked in, to `found`; every thread may read that afterwards."""
         wait()
         number, apart, at = int(blocks), int(1), int(0)
         while number > 1:
@@ -153,6 +136,46 @@ def again_kernel(nb: int, linear):
                     value -= times(packed, r, at + j, wp.static(square) + row, found, k + apart)
                 found[r, k, c] = value
             wait()
+
+    return solve
+
+
+@cache
+def again_kernel(nb: int, linear):
+    """again(...): the solution of wanted chains for another right-hand side, by as many `threads` as a block has."""
+    size = 2 * nb
+    solve = again_functions(nb, linear)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def again(
+        packed: wp.array3d(dtype=linear),
+        right: wp.array3d(dtype=linear),
+        count: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        width: int,
+        blocks: int,
+        threads: int,
+        rest: wp.array3d(dtype=linear),
+        found: wp.array3d(dtype=linear),
+        solution: wp.array3d(dtype=linear),
+    ):
+        """`wanted` (1) of every `width` chains; rest and found (chains, blocks, 2 nb) are to work in."""
+        tid = wp.tid()
+        r = tid / threads
+        t = tid - r * threads
+        if wanted[r / width] != 1:
+            return
+        n = count[r]
+        for i in range(t, blocks * wp.static(size), threads):
+            j = i / wp.static(size)
+            c = i - j * wp.static(size)
+            half = c / wp.static(nb)
+            k = 2 * j + half
+            value = linear(0.0)
+            if k < n:
+                value = right[c - half * wp.static(nb), k, r]
+            rest[r, j, c] = value
+        solve(packed, r, t, threads, blocks, rest, found)
         for i in range(t, blocks * wp.static(size), threads):
             j = i / wp.static(size)
             c = i - j * wp.static(size)
@@ -160,5 +183,66 @@ def again_kernel(nb: int, linear):
             k = 2 * j + half
             if k < n:
                 solution[c - half * wp.static(nb), k, r] = found[r, j, c]
+
+    return again
+
+
+@cache
+def again_at_places_kernel(twist: bool, linear):
+    """The same of a net's chains, from the residual r of its blocks to z, and r . z block by block; see `matrix.chain_places`."""
+    nb = place_dofs(twist)
+    H, parts = wp.types.vector(3, linear), 1 + twist  # blocks of a place: its node, and the angle of the edge ahead
+    solve, value = again_functions(nb, linear), value_function(twist, linear)
+    free_of, _ = place_functions(twist, linear)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def again(
+        packed: wp.array3d(dtype=linear),
+        residual: wp.array(dtype=H),
+        places: wp.array3d(dtype=int),
+        held: wp.array2d(dtype=wp.uint8),
+        count: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        net_blocks: int,
+        blocks: int,
+        threads: int,
+        rest: wp.array3d(dtype=linear),
+        found: wp.array3d(dtype=linear),
+        z: wp.array(dtype=H),
+        dots_out: wp.array2d(dtype=linear),
+    ):
+        tid = wp.tid()
+        r = tid / threads
+        t = tid - r * threads
+        w = r / count.shape[0]
+        c = r - w * count.shape[0]
+        if wanted[w] != 1:
+            return
+        n = count[c]
+        first = w * net_blocks
+        for k in range(t, 2 * blocks, threads):
+            j = k / 2
+            at = (k - 2 * j) * wp.static(nb)
+            for d in range(wp.static(nb)):
+                rest[r, j, at + d] = linear(0.0)
+            if k < n:
+                u = value(residual, places, k, c, first)
+                if held[k, c] != wp.uint8(0):
+                    u = wp.cw_mul(u, free_of(held[k, c]))
+                for d in range(wp.static(nb)):
+                    rest[r, j, at + d] = u[d]
+        solve(packed, r, t, threads, blocks, rest, found)
+        for i in range(t, wp.static(parts) * n, threads):
+            k = i / wp.static(parts)
+            part = i - k * wp.static(parts)
+            block = places[part, k, c]
+            if block >= 0:
+                j = k / 2
+                at = (k - 2 * j) * wp.static(nb)
+                y = H(found[r, j, at + wp.static(nb - 1)], linear(0.0), linear(0.0))
+                if part == 0:
+                    y = H(found[r, j, at], found[r, j, at + 1], found[r, j, at + 2])
+                z[block + first] = y
+                dots_out[w, block] = wp.dot(residual[block + first], y)
 
     return again

@@ -76,7 +76,8 @@ class PairList:
         # the most pairs of any search since there was room for so many, and those whose boxes met
         self._needed = wp.zeros(2, dtype=int, device=self.device)
         self.kernels = [self._meet, self._judge, self._fill, self._gaps, *self._sums.kernels]
-        self.reserve(max(1024, 4 * first.all), max(4096, 16 * first.all))
+        # kernels have as many threads as there is room: more is made where there are more
+        self.reserve(max(1024, first.all), max(4096, 4 * first.all))
 
     @property
     def capacity(self) -> int:

@@ -105,6 +105,8 @@ class Chains:
         self.values = arrays.allocate((block, self.longest, self.columns), linear, device)
         self.responses = arrays.allocate((block, self.longest, plan.solves * self.columns), linear, device)
         self.coupled = len(plan.of_places[1]) > 0
+        # whether chains and what is at their places are all that there is to further right-hand sides
+        self._at_places = self.reduction is not None and self.reduction.repeats and not len(plan.pairs)
         self.met = None if plan.met is None else arrays.upload(plan.met.astype(np.int32), int, device)
         self.joints, self.joint_rows = len(plan.pairs), 2 * len(plan.pairs)
         self.joint_row, self.pairs, self.own = put(plan.joint_row), put(plan.pairs), put(plan.own)
@@ -150,6 +152,7 @@ class Chains:
         own += [self._finish] if self.joints or not self._walk else []
         if self.reduction:
             own += [*self._columns, *self.reduction.kernels]
+            own += [self.reduction.again_kernel_at_places(self.plan.twist)] if self._at_places else []
         else:
             own += [] if self._walk else [(self._factorise, SERIAL), (self._solve, SERIAL)]
             own += [(self._solve_all, SERIAL)] if self.coupled else []
@@ -236,6 +239,10 @@ class Chains:
 
     def apply(self, matrix, residual, wanted, z: wp.array, dots: wp.array) -> None:
         """z of the blocks of rods and joints from the residual, where block Jacobi has left its own, and r . z block by block."""
+        if self._at_places and self._reduced:
+            given = residual, self.places, self.held, self.count, wanted, self.net.blocks
+            self.reduction.again_at_places(self.plan.twist, *given, z, dots)
+            return
         self._eliminate(matrix, wanted, self.values, residual, None)
         self._apply_joints(matrix, residual, wanted, z, dots)
 

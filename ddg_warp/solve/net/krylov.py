@@ -93,7 +93,6 @@ class ConjugateGradients:
         newton = self.newton
         blocks, wanted, dots = newton.net.blocks, newton.islands.wanted, newton.krylov_dots
         _, advance, turn, test = self._cycle
-        self.busy.zero_()
         if newton.chains and newton.chains.banded:
             newton.chains.product(newton.matrix, self.p, newton.fixed, wanted, self.product, dots)
         else:
@@ -103,7 +102,7 @@ class ConjugateGradients:
         self._launch(
             advance,
             [self.p, self.product, self.inverse, self.rho, self.curvature, newton.iterations, wanted, blocks],
-            [newton.direction, self.rest, self.z, dots],
+            [newton.direction, self.rest, self.z, dots, self.busy],
         )
         self.precondition(self.z)
         self.sum(dots, self.total)
