@@ -39,9 +39,11 @@ FLAGS = (
     "bent",  # whether the predictor has to turn edges
     "moved",  # whether this part of it succeeded
     "driven",  # whether supports that contact holds up moved in the last step of the solve; see `kernels.net.touch`
-    # in the first column, whether any island is still active, and whether one turns the edges of a step or renews its frames
+    # in the first column, whether any island is still active, and whether one turns the edges of a step or renews its frames; of
+    # nets, whether one wants a direction
     "active",
     "turning",
+    "wanting",
 )
 SCALARS = (
     # the quadratic of inertia, coefficient * m |x - target|^2 / 2, and the reciprocal of the step that the solve is about
@@ -61,7 +63,7 @@ SCALARS = (
 )
 (STATUS, ITERATION, UNBALANCED, DROWNED, SLOT, HALVINGS, WANTED, TODO, PLACED, STALE) = range(10)
 (CLAMPED, LOST, BAD, DETOURS, PATIENCE, CAUTIOUS, RETRIES, REASON, BENT, MOVED, DRIVEN) = range(10, 21)
-ACTIVE, TURNING = range(21, len(FLAGS))
+ACTIVE, TURNING, WANTING = range(21, len(FLAGS))
 (COEFFICIENT, RATE, LOAD_SCALE, RESIDUAL, STEP_LENGTH, DECREMENT, MERIT, ANGLE_CHANGE) = range(8)
 CARRIED, TURN, PROGRESS, PORTION = range(8, len(SCALARS))
 DETOURS_ALLOWED, LEAST = 30, 0.125  # by parts of a time step that are larger than this
@@ -86,7 +88,7 @@ class Islands:
         self.turn.fill_(TURNED)
         self.patience.fill_(np.iinfo(np.int32).max)
         self.signals = self.arrays[0][ACTIVE:]
-        self.active, self.turning = (self.signals[row, :1] for row in range(2))
+        self.active, self.turning, self.wanting = (self.signals[row, :1] for row in range(3))
 
     def __len__(self) -> int:
         return self.arrays[0].shape[1]

@@ -25,6 +25,7 @@ from ddg_warp.kernels.islands import (
     TURNING,
     UNBALANCED,
     WANTED,
+    WANTING,
     attempt_functions,
 )
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
@@ -120,6 +121,7 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
                 eta = wp.min(eta, real(wp.static(POLISH)))
             forcing[w] = linear(eta)
             flags[WANTED, w] = 1
+            flags[WANTING, 0] = 1
             return
         flags[TODO, w] = what
         if wp.static(turns):

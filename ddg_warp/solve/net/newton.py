@@ -220,14 +220,22 @@ class NetNewton:
         self.evaluate(state)
         self.balance()
         self.judge()
-        self.assemble()
-        self.direct()
-        self.take()
+        wp.capture_if(self.islands.active, lambda: self._step(state))
+
+    def _step(self, state) -> None:
+        """The next iterate of active worlds."""
+        wp.capture_if(self.islands.wanting, self._aim)
         self.move()
         if self.turns:
             wp.capture_if(self.islands.turning, lambda: self.turns.turn(state))
         if self.contact:
             self.contact.hold()
+
+    def _aim(self) -> None:
+        """Directions, and how far along them, of worlds that do not shorten a step."""
+        self.assemble()
+        self.direct()
+        self.take()
 
     def evaluate(self, state) -> None:
         """Energies, gradients and factors of all elements at the iterate, `here`."""
