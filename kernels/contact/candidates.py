@@ -1,8 +1,7 @@
 """Pairs that are near: those whose boxes meet, by a tree; judged by their distance; and listed in the order of their indices.
 
-Walking the tree and judging pairs are kernels of their own on CUDA, too: a walk waits for memory, and takes so few registers that
-many threads wait at once; judging takes four times as many, and threads as many as there are pairs rather than as long as the longest
-walk.
+Walking the tree and judging pairs are kernels of their own. A walk waits for memory, and takes so few registers that many threads
+wait at once; what it finds in larger boxes serves several searches.
 
 Of a motion those are found that may come near anywhere on the way. Whatever its share of its way, each node is between both ends of
 it; so the sides are as far apart as these ends are along any direction. The one asked is that of the closest points in the middle of
@@ -82,13 +81,9 @@ def candidate_kernels(kind: Kind, grouped: bool, real, serial: bool):
         sides: Sides,
         found: wp.array(dtype=int),
         met: wp.array(dtype=wp.vec2i),
-        last: wp.array(dtype=int),
-        partners: wp.array(dtype=int),
     ):
         """Pairs of things that may touch and whose boxes meet, as many as fit, and how many there are."""
         i = wp.tid()
-        last[i] = -1
-        partners[i] = 0
         query, w, k = begin(sides, i)
         j = int(0)
         while wp.bvh_query_next(query, j):
@@ -157,7 +152,7 @@ def candidate_kernels(kind: Kind, grouped: bool, real, serial: bool):
             start = starts[i]
             end = start
             at = last[i]
-            while at >= 0:
+            for _partner in range(partners[i]):
                 j = met[at][1]
                 k = end
                 while k > start and pairs[wp.max(k - 1, 0)][1] > j:

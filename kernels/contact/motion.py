@@ -94,16 +94,16 @@ def motion_kernels(real, serial: bool):
         start: wp.array(dtype=X),
         end: wp.array(dtype=X),
         stale: wp.array(dtype=int),
-        searched: wp.array(dtype=int),
-        searches: wp.array(dtype=int),
+        done: wp.array(dtype=int),
+        number: wp.array(dtype=int),
     ):
-        """Notes the ways that a search was made for, of worlds that go by one share their ends; it is out of date at once if pairs
-        did not fit."""
+        """Notes the ways that something was found for, of worlds that go by one share their ends; it is out of date at once if not
+        all of it fitted."""
         tid = wp.tid()
         if tid == 0:
             stale[0] = overflow[0]
-            searched[0] = 1
-            searches[0] += 1
+            done[0] = 1
+            number[0] += 1
         for i in range(tid, until(tid, x.shape[0])):
             end[i] = x[i] + move[i]
             start[i] = wp.where(together[i / (x.shape[0] / together.shape[0])] != 0, end[i], x[i])

@@ -153,13 +153,13 @@ def share_kernels(real, serial: bool):
         unit: wp.array(dtype=int),
         units: int,
         shares: wp.array(dtype=real),
-        searched: wp.array(dtype=int),
+        done: wp.array(dtype=int),
         together: wp.array(dtype=int),
         q: wp.array(dtype=X),
-        start: wp.array(dtype=X),
-        end: wp.array(dtype=X),
+        start: wp.array2d(dtype=X),
+        end: wp.array2d(dtype=X),
     ):
-        """The motion itself and, of worlds that go by one share, where a search that was made for it has seen them."""
+        """The motion itself and, of worlds that go by one share, where what was `done` for it has seen them: boxes, and pairs."""
         tid = wp.tid()
         for i in range(tid, until(tid, q.shape[0])):
             w = i / unit.shape[0]
@@ -168,8 +168,10 @@ def share_kernels(real, serial: bool):
                 s = shares[w * units + of]
                 if s < real(1.0):
                     q[i] = base[i] + s * move[i]
-            if searched[0] != 0 and together[w] != 0:
-                start[i] = q[i]
-                end[i] = q[i]
+            if together[w] != 0:
+                for k in range(done.shape[0]):
+                    if done[k] != 0:
+                        start[k, i] = q[i]
+                        end[k, i] = q[i]
 
     return start, turn, settle, finish, shorten

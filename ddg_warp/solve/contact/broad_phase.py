@@ -14,7 +14,9 @@ from ddg_warp.solve.contact.shapes import BALLS, PLANES, Shapes
 from ddg_warp.solve.contact.tree import Things
 
 SLACK = 1e-3  # of the margin, by which a search goes beyond it, for rounding
+WIDE = 4.0  # margins that boxes are wide by, so that pairs whose boxes meet serve several searches
 NONE = np.iinfo(np.int64).max
+BOXES, PAIRS = range(2)
 
 
 class BroadPhase:
@@ -22,7 +24,8 @@ class BroadPhase:
 
     All that is within thickness + `reach` is among the candidates as long as every node is within half of `margin` of where it was when
     they were found or, of a search for a motion, of its way, each anywhere along it, the nodes of a half-space alike; where a world
-    goes by one share, of the place that it has come to. `update`, `filter`, `measure`, `impact` and `crossings` read nothing back and
+    goes by one share, of the place that it has come to. Pairs whose boxes meet are found as much farther apart, for several searches.
+    `update`, `filter`, `measure`, `impact` and `crossings` read nothing back and
     can be captured, `update`, `filter` and `search` in conditional parts of graphs, too. `rebuild` can be captured, on CUDA outside of
     those alone; there every step should begin with it. `fit` and `check` read, between launches of graphs; what is not finite touches
     nothing, until they name it.
@@ -72,17 +75,20 @@ class BroadPhase:
             radius = wp.array(np.tile(shapes.radii, (worlds, 1)), dtype=real, device=self.device)
         things = {size: Things(shapes, size, worlds, real, self.device, radius) for size in shapes.sizes}
         self._things = list(things.values())
-        blocks = [wp.zeros(len(x), dtype=x.dtype, device=self.device) for _ in range(4)]
-        self._start, self._end, self._still, self._move = blocks
+        self._still, self._move = (wp.zeros(len(x), dtype=x.dtype, device=self.device) for _ in range(2))
+        # ways that boxes, and pairs, were found for
+        self._starts, self._ends = (wp.zeros((2, len(x)), dtype=x.dtype, device=self.device) for _ in range(2))
         placed = np.zeros(nodes, np.uint8)  # what no thing has may be no place, as blocks of edges are not
         for size in shapes.sizes:
             placed[shapes.things(size)[0]] = 1
         self._placed = wp.array(placed, dtype=wp.uint8, device=self.device)
         self._shift = wp.zeros(worlds, dtype=x.dtype, device=self.device)
         self._never, self._always = (wp.full(worlds, flag, dtype=int, device=self.device) for flag in (0, 1))
-        self.overflow, self.searches, self._stale, self._searched, self._lost = (
+        self.overflow, self.searches, self._lost, self._fits, self._walks = (
             wp.zeros(1, dtype=int, device=self.device) for _ in range(5)
         )
+        # of boxes and of pairs, whether they are out of date, and whether the last `update` found them anew
+        self._stale, self._done = (wp.zeros(2, dtype=int, device=self.device) for _ in range(2))
         self._edges = things[2]
         self._trees = [things[size] for size in things if size != 1]
         self._motion = motion_kernels(real, arrays.serial(self.device))
@@ -137,27 +143,54 @@ class BroadPhase:
 
         By default q is `base`: nothing moves. Of a motion by one share that is not filtered the candidates hold from q on.
         """
-        watch, *_ = self._motion
-        inputs = [base, base if q is None else q, self._start, self._end, self._placed, 0.5 * self.margin]
-        self._searched.zero_()
-        self._sweep(watch, base, inputs, [self._move, self._stale])
-        wp.capture_if(self._stale, lambda: self.search(base, self._move, together))
+        self._done.zero_()
+        self._watch(PAIRS, base, base if q is None else q, 0.5 * self.margin)
+        wp.capture_if(self._stale[PAIRS:], lambda: self._renew(base, base if q is None else q, together))
 
     def search(self, x: wp.array, move: wp.array | None = None, together: wp.array | None = None) -> None:
         """Find all candidates at x or, with `move`, anywhere on the straight motion from x by it.
 
         Each node may go any share of its own way; in worlds where `together` (worlds,) is not zero, all go by one share.
         """
-        _, mark, _ = self._motion
         move = self._still if move is None else move
         together = self._never if together is None else together
+        self._meet(x, move, together)
+        self._judge(x, move, together)
+
+    def _renew(self, base: wp.array, q: wp.array, together: wp.array | None) -> None:
+        """Search again, among the pairs whose boxes meet where these are wide enough."""
+        together = self._never if together is None else together
+        self._watch(BOXES, base, q, 0.5 * (WIDE - 1.0) * self.margin)
+        wp.capture_if(self._stale[BOXES:PAIRS], lambda: self._meet(base, self._move, together))
+        self._judge(base, self._move, together)
+
+    def _watch(self, which: int, base: wp.array, q: wp.array, allowed: float) -> None:
+        """Whether boxes or pairs are out of date for a motion, where nodes may be so far from the ways that these were found for."""
+        watch, *_ = self._motion
+        inputs = [base, q, self._starts[which], self._ends[which], self._placed, allowed]
+        self._sweep(watch, base, inputs, [self._move, self._stale[which : which + 1]])
+
+    def _meet(self, x: wp.array, move: wp.array, together: wp.array) -> None:
+        """Find the pairs whose boxes meet."""
         self._enclose(x, move, together, 1.0, self._within)
         for part in self._trees:
             part.renew()
         for pairs in self.lists:
-            pairs.search(x, move, together, self.reach, self._around)
-        outputs = [self._start, self._end, self._stale, self._searched, self.searches]
-        self._sweep(mark, x, [x, move, together, self.overflow], outputs)
+            pairs.meet()
+        self._mark(BOXES, x, move, together, self._fits, self._walks)
+
+    def _judge(self, x: wp.array, move: wp.array, together: wp.array) -> None:
+        """List the pairs that are near."""
+        for pairs in self.lists:
+            pairs.judge(x, move, together, self.reach, 0.5 * (1.0 + SLACK) * self.margin)
+        self._mark(PAIRS, x, move, together, self.overflow, self.searches)
+
+    def _mark(self, which: int, x, move, together, overflow: wp.array, number: wp.array) -> None:
+        """Note for what motion boxes or pairs were found."""
+        _, mark, _ = self._motion
+        flags = (array[which : which + 1] for array in (self._stale, self._done))
+        outputs = [self._starts[which], self._ends[which], *flags, number]
+        self._sweep(mark, x, [x, move, together, overflow], outputs)
 
     def filter(
         self, base: wp.array, q: wp.array, unit: wp.array, together: wp.array, units: int, keep: float = 1.0
@@ -179,7 +212,7 @@ class BroadPhase:
         _checked_keep(keep)
         self._filter.check(unit, together, units)
         self.update(base, q, together)
-        search = (self.overflow, self.time, self._searched, self._start, self._end)
+        search = (self.overflow, self.time, self._done, self._starts, self._ends)
         self._filter(base, self._move, q, unit, together, units, keep, self._room(keep), search)
 
     def fit(self, x: wp.array) -> bool:
@@ -257,14 +290,9 @@ class BroadPhase:
         return f"{one} and {other}" + (f" in world {world}" if self.worlds > 1 else "")
 
     @property
-    def _around(self) -> float:
-        """How far beside its way a node may be, and a little more."""
-        return 0.5 * (1.0 + SLACK) * self.margin
-
-    @property
     def _within(self) -> float:
-        """Half of the gap up to which pairs are found."""
-        return 0.5 * self.reach + self._around
+        """By what boxes are larger: half of the gap up to which they meet."""
+        return 0.5 * self.reach + 0.5 * WIDE * (1.0 + SLACK) * self.margin
 
     def _passing(self, kernels, x, move, keep: float, number, firsts) -> None:
         self._enclose(x, move, self._always, keep, 0.0)

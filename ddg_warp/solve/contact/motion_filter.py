@@ -46,9 +46,9 @@ class MotionFilter:
         """Lower shares round by round, and shorten q to them.
 
         Args:
-            reach: gap in which surfaces matter [m]; search: (overflow, time, searched, start, end) of the candidates.
+            reach: gap in which surfaces matter [m]; search: (overflow, time, done, start, end) of a `BroadPhase`.
         """
-        overflow, time, searched, *seen = search
+        overflow, time, done, *seen = search
         shares, before, lowered = (array[: self._worlds * units] for array in self._all)
         self.shares = shares
         self._sweep(self._start, len(shares), [], [shares, before, lowered])
@@ -69,7 +69,7 @@ class MotionFilter:
         wp.capture_while(self._changed, lambda: go(self._later))
         outputs = [shares, time, self.limited]
         self._sweep(self._finish, len(shares), [self._earliest, self._open, overflow], outputs)
-        self._sweep(self._shorten, len(q), [base, move, unit, units, shares, searched, together], [q, *seen])
+        self._sweep(self._shorten, len(q), [base, move, unit, units, shares, done, together], [q, *seen])
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
         arrays.sweep(kernel, count, inputs, outputs, self._device)

@@ -104,11 +104,15 @@ class PairList:
         if (needed > now).any():
             self.reserve(*np.where(needed > now, np.minimum(needed + needed // 2, 2**31 - 1), now).tolist())
 
-    def search(self, x, move, together, reach: float, around: float) -> None:
-        """Find and list the pairs; boxes have to be up to date; see `kernels.contact.candidates`."""
+    def meet(self) -> None:
+        """Find the pairs whose boxes meet; see `kernels.contact.candidates`."""
         self._found.zero_()
+        self._launch(self._meet, [self.sides], [self._found, self._met])
+
+    def judge(self, x, move, together, reach: float, around: float) -> None:
+        """List those of them that are near, or may be on their way."""
         met = [self._met, self._before, self._last]
-        self._launch(self._meet, [self.sides], [self._found, self._met, self._last, self.partners])
+        self.partners.zero_()
         inputs = [self.sides, x, move, together, reach, around, self._found]
         arrays.sweep(self._judge, len(self._met), inputs, [*met, self.partners], self.device)
         self._sums()
