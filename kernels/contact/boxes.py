@@ -13,6 +13,18 @@ LEAST = 1e-30  # so that zero is rounded outwards, too [m]
 
 
 @cache
+def outward_function(real):
+    """outward(value, sign): in float32, down or up by the sign, no nearer than it is."""
+
+    @wp.func
+    def outward(value: real, sign: float):
+        v = wp.float32(value)
+        return v + sign * (wp.abs(v) * wp.static(wp.float32(ROUNDING)) + wp.static(wp.float32(LEAST)))
+
+    return outward
+
+
+@cache
 def box_kernel(size: int, endless: bool, real):
     """Boxes of things with `size` nodes, or around all there is if these are `endless`.
 
@@ -22,12 +34,7 @@ def box_kernel(size: int, endless: bool, real):
 
     Nodes that are no numbers are noted in `lost` as node + 1; a box around them is empty, at the origin.
     """
-    Surface, X = surface_struct(real), wp.types.vector(3, real)
-
-    @wp.func
-    def outward(value: real, sign: float):
-        v = wp.float32(value)
-        return v + sign * (wp.abs(v) * wp.static(wp.float32(ROUNDING)) + wp.static(wp.float32(LEAST)))
+    Surface, X, outward = surface_struct(real), wp.types.vector(3, real), outward_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def boxes(

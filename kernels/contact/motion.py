@@ -90,6 +90,7 @@ def motion_kernels(real, serial: bool):
         x: wp.array(dtype=X),
         move: wp.array(dtype=X),
         together: wp.array(dtype=int),
+        placed: wp.array(dtype=wp.uint8),
         overflow: wp.array(dtype=int),
         start: wp.array(dtype=X),
         end: wp.array(dtype=X),
@@ -105,8 +106,9 @@ def motion_kernels(real, serial: bool):
             done[0] = 1
             number[0] += 1
         for i in range(tid, until(tid, x.shape[0])):
-            end[i] = x[i] + move[i]
-            start[i] = wp.where(together[i / (x.shape[0] / together.shape[0])] != 0, end[i], x[i])
+            if placed[i % placed.shape[0]] != wp.uint8(0):
+                end[i] = x[i] + move[i]
+                start[i] = wp.where(together[i / (x.shape[0] / together.shape[0])] != 0, end[i], x[i])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def common(

@@ -10,6 +10,7 @@ from ddg_warp.kernels.contact.motion import motion_kernels
 from ddg_warp.kernels.contact.surfaces import EDGE_POINT, EDGES, POINT_PLANE, POINT_TRIANGLE
 from ddg_warp.solve.contact.motion_filter import MotionFilter
 from ddg_warp.solve.contact.pairs import PairList
+from ddg_warp.solve.contact.runs import Runs
 from ddg_warp.solve.contact.shapes import BALLS, PLANES, Shapes
 from ddg_warp.solve.contact.tree import Things
 
@@ -25,10 +26,9 @@ class BroadPhase:
     All that is within thickness + `reach` is among the candidates as long as every node is within half of `margin` of where it was when
     they were found or, of a search for a motion, of its way, each anywhere along it, the nodes of a half-space alike; where a world
     goes by one share, of the place that it has come to. Pairs whose boxes meet are found as much farther apart, for several searches.
-    `update`, `filter`, `measure`, `impact` and `crossings` read nothing back and
-    can be captured, `update`, `filter` and `search` in conditional parts of graphs, too. `rebuild` can be captured, on CUDA outside of
-    those alone; there every step should begin with it. `fit` and `check` read, between launches of graphs; what is not finite touches
-    nothing, until they name it.
+    `update`, `filter`, `measure`, `impact` and `crossings` read nothing back and can be captured, `update`, `filter` and `search` in
+    conditional parts of graphs, too. `rebuild` can be captured, on CUDA outside of those alone; there a step should begin with it,
+    every few at least. `fit` and `check` read, between launches of graphs; what is not finite touches nothing, until they name it.
 
     Args:
         shapes: what may touch in one world.
@@ -44,6 +44,7 @@ class BroadPhase:
         searches: (1,) how many there were.
         gap [m], time and crossed, of each world: see `measure`, `impact` and `crossings`.
         shares: (worlds times units,), limited: of each world, how many of them are below 1; see `filter`.
+        every: (worlds,) ones, of motions in which all nodes of every world go by one share.
         version: grows whenever arrays were replaced by larger ones, and graphs that hold them have to be captured anew.
 
     Raises:
@@ -83,13 +84,13 @@ class BroadPhase:
             placed[shapes.things(size)[0]] = 1
         self._placed = wp.array(placed, dtype=wp.uint8, device=self.device)
         self._shift = wp.zeros(worlds, dtype=x.dtype, device=self.device)
-        self._never, self._always = (wp.full(worlds, flag, dtype=int, device=self.device) for flag in (0, 1))
+        self._never, self.every = (wp.full(worlds, flag, dtype=int, device=self.device) for flag in (0, 1))
         self.overflow, self.searches, self._lost, self._fits, self._walks = (
             wp.zeros(1, dtype=int, device=self.device) for _ in range(5)
         )
         # of boxes and of pairs, whether they are out of date, and whether the last `update` found them anew
         self._stale, self._done = (wp.zeros(2, dtype=int, device=self.device) for _ in range(2))
-        self._edges = things[2]
+        self._edges, self._runs = things[2], None
         self._trees = [things[size] for size in things if size != 1]
         self._motion = motion_kernels(real, arrays.serial(self.device))
         self.rebuild(x)
@@ -119,6 +120,7 @@ class BroadPhase:
         """Kernels to load before a capture."""
         lists = [kernel for pairs in self.lists for kernel in pairs.kernels]
         boxes = [part.kernel for part in self._things]
+        lists += self._runs.kernels if self._runs else []
         return [*lists, *boxes, *self._motion, *self._impacts, *self._passes, *self._filter.kernels]
 
     @property
@@ -137,6 +139,15 @@ class BroadPhase:
         self._enclose(x, self._still, self._never, 1.0, self._within)
         for part in self._trees:
             part.build()
+        if self._runs:
+            self._runs.enclose(x, self._still, self._never, self._shift, self._apart)
+            self._runs.build()
+
+    def look_for_runs(self) -> None:
+        """From now on have `update` ask whether edges may be near at all, before it searches: for rods that touch little, where there
+        is nothing but rods and capsules."""
+        if self._runs is None and len(self.lists) == 1:
+            self._runs = Runs(self.lists[0], self.shapes, self.worlds, self.real, self.device)
 
     def update(self, base: wp.array, q: wp.array | None = None, together: wp.array | None = None) -> None:
         """Search again along the motion from `base` to q if some node is, at either, farther than half of the margin from its way.
@@ -160,9 +171,24 @@ class BroadPhase:
     def _renew(self, base: wp.array, q: wp.array, together: wp.array | None) -> None:
         """Search again, among the pairs whose boxes meet where these are wide enough."""
         together = self._never if together is None else together
-        self._watch(BOXES, base, q, 0.5 * (WIDE - 1.0) * self.margin)
-        wp.capture_if(self._stale[BOXES:PAIRS], lambda: self._meet(base, self._move, together))
-        self._judge(base, self._move, together)
+
+        def find() -> None:
+            self._watch(BOXES, base, q, 0.5 * (WIDE - 1.0) * self.margin)
+            wp.capture_if(self._stale[BOXES:PAIRS], lambda: self._meet(base, self._move, together))
+            self._judge(base, self._move, together)
+
+        if self._runs is None:
+            find()
+            return
+        self._find_common(self._move, together)
+        self._runs.look(base, self._move, together, self._shift, self._apart)
+        wp.capture_if(self._runs.near, find, lambda: self._clear(base, together))
+
+    def _clear(self, base: wp.array, together: wp.array) -> None:
+        """List no pairs."""
+        for pairs in self.lists:
+            pairs.clear()
+        self._mark(PAIRS, base, self._move, together, self.overflow, self.searches)
 
     def _watch(self, which: int, base: wp.array, q: wp.array, allowed: float) -> None:
         """Whether boxes or pairs are out of date for a motion, where nodes may be so far from the ways that these were found for."""
@@ -182,7 +208,7 @@ class BroadPhase:
     def _judge(self, x: wp.array, move: wp.array, together: wp.array) -> None:
         """List the pairs that are near."""
         for pairs in self.lists:
-            pairs.judge(x, move, together, self.reach, 0.5 * (1.0 + SLACK) * self.margin)
+            pairs.judge(x, move, together, self.reach, self._around)
         self._mark(PAIRS, x, move, together, self.overflow, self.searches)
 
     def _mark(self, which: int, x, move, together, overflow: wp.array, number: wp.array) -> None:
@@ -190,7 +216,7 @@ class BroadPhase:
         _, mark, _ = self._motion
         flags = (array[which : which + 1] for array in (self._stale, self._done))
         outputs = [self._starts[which], self._ends[which], *flags, number]
-        self._sweep(mark, x, [x, move, together, overflow], outputs)
+        self._sweep(mark, x, [x, move, together, self._placed, overflow], outputs)
 
     def filter(
         self, base: wp.array, q: wp.array, unit: wp.array, together: wp.array, units: int, keep: float = 1.0
@@ -272,6 +298,12 @@ class BroadPhase:
             first.fill_(NONE)
         self._passing(self._passes, x, move, 0.0, self.crossed, self._firsts)
 
+    def passing(self, base: wp.array) -> None:
+        """The same of candidates alone, which are all that may, in the motion from `base` that `update` was last told of."""
+        self.crossed.zero_()
+        for pairs in self.lists:
+            pairs.cross(base, self._move, self.crossed)
+
     def first_crossing(self) -> str:
         """The first of the pairs that passed through each other, by name, or nothing. Reads from the device."""
         for pairs, first in zip(self.lists, self._firsts, strict=True):
@@ -290,12 +322,22 @@ class BroadPhase:
         return f"{one} and {other}" + (f" in world {world}" if self.worlds > 1 else "")
 
     @property
+    def _around(self) -> float:
+        """How far beside its way a node may be, and a little more."""
+        return 0.5 * (1.0 + SLACK) * self.margin
+
+    @property
+    def _apart(self) -> float:
+        """Half of the gap up to which pairs are listed."""
+        return 0.5 * self.reach + self._around
+
+    @property
     def _within(self) -> float:
         """By what boxes are larger: half of the gap up to which they meet."""
         return 0.5 * self.reach + 0.5 * WIDE * (1.0 + SLACK) * self.margin
 
     def _passing(self, kernels, x, move, keep: float, number, firsts) -> None:
-        self._enclose(x, move, self._always, keep, 0.0)
+        self._enclose(x, move, self.every, keep, 0.0)
         for part in self._trees:
             part.tree.refit()
         for kernel, pairs, least in zip(kernels, self.lists, firsts, strict=True):
@@ -307,10 +349,13 @@ class BroadPhase:
         """The reach, in which gaps close step by step; none where they may close."""
         return self.reach if keep > 0.0 else 0.0
 
-    def _enclose(self, x, move, together, share: float, more: float) -> None:
+    def _find_common(self, move, together) -> None:
         *_, common = self._motion
         inputs = [self._edges.surface, self._edges.count, move, together]
         wp.launch(common, self.worlds, inputs, [self._shift], device=self.device)
+
+    def _enclose(self, x, move, together, share: float, more: float) -> None:
+        self._find_common(move, together)
         for part in self._things:
             part.enclose(x, move, self._shift, share, more, self._lost)
 

@@ -7,6 +7,7 @@ from ddg_warp import arrays
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.contact import sums
 from ddg_warp.kernels.contact.candidates import candidate_kernels
+from ddg_warp.kernels.contact.impact import passing_kernel
 from ddg_warp.kernels.contact.motion import gap_kernel
 from ddg_warp.kernels.contact.surfaces import Kind, sides_struct
 from ddg_warp.solve.contact.shapes import Shapes
@@ -71,11 +72,11 @@ class PairList:
         self.starts = self._sums.starts
         serial = arrays.serial(self.device)
         self._meet, self._judge, self._fill = candidate_kernels(kind, grouped, real, serial)
-        self._gaps = gap_kernel(kind, real, serial)
+        self._gaps, self._passing = gap_kernel(kind, real, serial), passing_kernel(kind, real, serial)
         self.count, self._found = (wp.zeros(1, dtype=int, device=self.device) for _ in range(2))
         # the most pairs of any search since there was room for so many, and those whose boxes met
         self._needed = wp.zeros(2, dtype=int, device=self.device)
-        self.kernels = [self._meet, self._judge, self._fill, self._gaps, *self._sums.kernels]
+        self.kernels = [self._meet, self._judge, self._fill, self._gaps, self._passing, *self._sums.kernels]
         # kernels have as many threads as there is room: more is made where there are more
         self.reserve(max(1024, first.all), max(4096, 4 * first.all))
 
@@ -122,7 +123,17 @@ class PairList:
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
         wp.launch(kernel, self.first.all, inputs, outputs, device=self.device)
 
+    def clear(self) -> None:
+        """No pairs."""
+        for numbers in (self.count, self.starts, self.partners):
+            numbers.zero_()
+
     def measure(self, x, gap) -> None:
         """Lower the smallest gaps of worlds to those of pairs."""
         inputs = [self.pairs, self.count, self.sides, x]
         arrays.sweep(self._gaps, self.capacity, inputs, [gap], self.device)
+
+    def cross(self, x, move, crossed) -> None:
+        """Count those that pass through each other in the motion from x, by world."""
+        inputs = [self.pairs, self.count, self.sides, x, move]
+        arrays.sweep(self._passing, self.capacity, inputs, [crossed], self.device)

@@ -18,6 +18,7 @@ class Shapes:
 
     Attributes:
         names, radii: of all objects [m]; obstacle: numbers of those that are still.
+        ignored_pairs: of objects that pass through each other, the smaller number first.
     """
 
     def __init__(self, points: np.ndarray):
@@ -28,7 +29,7 @@ class Shapes:
         self.radii: list[float] = []
         self.obstacle: set[int] = set()
         self._parts: dict[int, list] = {1: [], 2: [], 3: [], BALLS: [], PLANES: []}
-        self._ignored: set[tuple[int, int]] = set()
+        self.ignored_pairs: set[tuple[int, int]] = set()
 
     def rod(
         self,
@@ -131,12 +132,12 @@ class Shapes:
                 raise SceneError(
                     f"there is no object {number}; objects are 0 to {len(self.names) - 1}, in the order added"
                 )
-        self._ignored.add((min(first, second), max(first, second)))
+        self.ignored_pairs.add((min(first, second), max(first, second)))
 
     @property
     def ignored(self) -> np.ndarray:
         """Keys of pairs of objects (smaller number times all objects + larger), sorted."""
-        return np.array(sorted(a * len(self.names) + b for a, b in self._ignored), np.int64)
+        return np.array(sorted(a * len(self.names) + b for a, b in self.ignored_pairs), np.int64)
 
     @property
     def sizes(self) -> list[int]:
