@@ -123,8 +123,11 @@ class ChainGroup(Storage):
         return f"{what} {k - self.first[column]} of rod {self.rods[column]}"
 
 
-def compile_chains(scene: Scene) -> list[ChainGroup]:
+def compile_chains(scene: Scene, chosen: np.ndarray | None = None) -> list[ChainGroup]:
     """Groups of a scene's rods on their own, with what the scene puts on them.
+
+    Args:
+        chosen: of other rods instead, as if they were on their own (R,) bool.
 
     Raises:
         SceneError: the scene is no simulation; the message names the object and its index.
@@ -133,8 +136,9 @@ def compile_chains(scene: Scene) -> list[ChainGroup]:
         raise SceneError(
             "the scene has no rods and no shells; add some with scene.add_rods(points, section=..., material=...)"
         )
-    ghosts, laws, joined = Ghosts(scene), drag.Laws(scene), net_rods(scene)
-    parts = [part for batch in scene.batches for part in alike(scene.dimension, batch, ghosts, laws, ~joined)]
+    ghosts, laws = Ghosts(scene), drag.Laws(scene)
+    chosen = ~net_rods(scene) if chosen is None else chosen
+    parts = [part for batch in scene.batches for part in alike(scene.dimension, batch, ghosts, laws, chosen)]
     parts.sort(key=lambda part: (*part.kind.key, part.nodes))
     groups: list[list[Alike]] = []
     for part in parts:

@@ -324,7 +324,7 @@ class Model:
         if self.grips:
             shape = (6, self.worlds * len(self.grips))
             grips = GripState(wp.zeros(shape, dtype=self.types.real, device=self.wp_device))
-        return State(self, [self._group_state(group) for group in self.groups], net, grips=grips)
+        return State(self, [self.group_state(group) for group in self.groups], net, grips=grips)
 
     def restore(self, snapshot: dict[str, np.ndarray]) -> State:
         """The state that `State.snapshot` saved, bit by bit.
@@ -349,7 +349,8 @@ class Model:
         state.time = float(snapshot["time"])
         return state
 
-    def _group_state(self, group: Group) -> GroupState:
+    def group_state(self, group: Group) -> GroupState:
+        """Arrays of the state of a group of rods, not yet filled."""
         kind, real = group.kind, self.types.real
         vector = wp.types.vector(kind.dim, real)
         nodes = (group.nodes, group.columns)

@@ -108,6 +108,10 @@ class Motion:
         """Kernels to load before a capture."""
         return [self._nodes, *([self._angles] if len(self.angles) else []), *([self._grip] if self._grip else [])]
 
+    def go_by(self, other: "Motion") -> None:
+        """Have the poses that another part of the same model is handed."""
+        self.pose, self.stride, self._timed, self._grip = other.pose, other.stride, False, None
+
     def upload(self, t0: float, t1: float) -> None:
         """Poses between t0 and t1 of motions that are functions of time."""
         if self._timed:

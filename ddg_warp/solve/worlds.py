@@ -49,7 +49,7 @@ class Worlds:
             self._launch(self._note, len(part.islands), inputs, [self._any])
         wp.capture_if(self._any, lambda: self._rest(parts, before, after))
         if after.grips is not None:  # which go where they are told, but for worlds that rest
-            self._take_part(self.resting, before.grips, after.grips, before.model.worlds)
+            self.take_part(self.resting, before.grips, after.grips, before.model.worlds)
 
     def _rest(self, parts: list, before: State, after: State) -> None:
         self.take_over(self._failed, before, after)
@@ -61,10 +61,10 @@ class Worlds:
     def take_over(self, mask: wp.array, source: State, target: State) -> None:
         """Put everything of a state into another one, in worlds of a mask; a state of one world goes into each of them."""
         for name, part in target.parts().items():
-            self._take_part(mask, source.parts()[name], part, source.model.worlds)
+            self.take_part(mask, source.parts()[name], part, source.model.worlds)
 
-    def _take_part(self, mask: wp.array, source, target, worlds: int) -> None:
-        """The same of a part of a state, from one of so many worlds."""
+    def take_part(self, mask: wp.array, source, target, worlds: int) -> None:
+        """As `take_over`, of a part of a state, from one of so many worlds."""
         several, given = self.model.worlds, source.arrays()
         for name, array in target.arrays().items():
             if array.shape[-1] % several:

@@ -7,7 +7,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.islands import CAUTIOUS, RATE, STEP_LENGTH, TODO, TURN, TURNING
+from ddg_warp.kernels.islands import CAUTIOUS, MOVED, RATE, STEP_LENGTH, TODO, TURN, TURNING
 from ddg_warp.kernels.search import PLACE
 from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
 from ddg_warp.kernels.turns import edge_functions, onward_function
@@ -51,8 +51,10 @@ def turn_kernels(real, linear, serial: bool):
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
     ):
-        """Asks for the edges of worlds to be turned that a predictor q from `base` turns far."""
+        """Asks for the edges of worlds to be turned that a predictor q from `base` turns far; not of those that have finished."""
         i, w = wp.tid()
+        if flags[MOVED, w] == 0:
+            return
         a = ends[i, 0] + w * blocks
         b = ends[i, 1] + w * blocks
         e = base[b] - base[a]

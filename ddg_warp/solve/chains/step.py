@@ -33,7 +33,7 @@ class ChainStep(PartStep):
 
     def __init__(self, integrator, model, group, means=USUAL, counts_of=None):
         super().__init__(integrator, model, _newton(model, group, integrator, means), means, counts_of)
-        self.group, self.index = group, model.groups.index(group)
+        self.group = group
         kind, real = group.kind, model.types.real
         self._begin = step.begin_kernel(kind, real, self.midpoint)
         self._nodes = step.finish_nodes_kernel(kind, real, self.midpoint)
@@ -48,6 +48,11 @@ class ChainStep(PartStep):
         self.energy = energy.ChainEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.motion = Motion(model, group, self.midpoint) if group.host.moves else None
         self.drag = ChainDrag(model, group, self.midpoint) if kind.drag else None
+
+    @property
+    def index(self) -> int:
+        """Which of the model's groups it is."""
+        return self.model.groups.index(self.group)
 
     def attempt(self, before, after) -> None:
         """One solve of every rod that has not finished the step, from state `before` to `after`."""
