@@ -11,6 +11,7 @@ from ddg_warp.scene.obstacles import BALL, CAPSULE, MESH, PLANE
 from ddg_warp.scene.scene import Dynamics
 from ddg_warp.solve.chains.step import DIRECT
 from ddg_warp.solve.choice import automatic, net_preconditioner
+from ddg_warp.solve.net.alone import uncoupled
 from ddg_warp.solve.net.chains import Chains
 from ddg_warp.solve.net.system import NetSystem
 from ddg_warp.solve.step import Means, suited
@@ -130,6 +131,8 @@ def net_lines(model) -> list[str]:
         f"  solver: {solver}, one Newton loop a world, linear algebra in {linear.__name__}; "
         f"H: {table.entries} blocks of 3 x 3{bands}, {size / 1e6:.3g} MB"
     )
+    if uncoupled(model):
+        lines.append("  in steps in which nothing comes near: rods on their own, one Newton loop a rod")
     return lines + step_lines(
         model, lambda s: (host.rod_errors(s), host.split_errors(s) if split else np.array([np.inf]))
     )

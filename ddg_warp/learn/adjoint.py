@@ -50,6 +50,7 @@ class Adjoint:
 
     def __init__(self, integrator):
         self.integrator, self.model = integrator, integrator.model
+        integrator.step_whole()
         self.chains = [ChainAdjoint(self.model, group, integrator.scheme) for group in self.model.groups]
         self.net = NetAdjoint(self.model, integrator.scheme) if self.model.net is not None else None
         self._grips = self.model.empty_state().grips  # of derivatives by states; see `ddg_warp.learn.poses`

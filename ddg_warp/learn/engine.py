@@ -46,6 +46,7 @@ class Engine:
         self.model, self.device = model, str(wp.device_to_torch(model.wp_device))
         self.midpoint = scheme == "implicit_midpoint"
         self.integrator = Integrator(model, scheme, failures="flag", check_every=FOREVER, energy_bound=None, **options)
+        self.integrator.step_whole()
         self.adjoint = self.poses = self.by_poses = None
         self._equilibria = {}  # reverse of those that are given poses, and of others
         self.layout, self.tables = Layout(model), Tables(model)

@@ -22,6 +22,9 @@ from ddg_warp.threads import launches
 
 FAILURES = ("raise", "flag")
 SOLVERS = ("newton", "projective")
+# Steps by which trees of searches serve on CUDA, where they are refitted meanwhile: to make those of 100 rods anew takes a tenth of
+# a step in which they touch nothing.
+RENEWAL = 8
 SCHEMES = ("implicit_euler", "implicit_midpoint")
 
 
@@ -50,7 +53,8 @@ class Integrator:
             the chain preconditioner for closed ones), "sweep", "partitioned" (cyclic reduction), or PCG with "jacobi",
             "block_jacobi" or "chain" as preconditioner. Nets are solved by PCG alone, with "block_jacobi", "chain" (rods between
             their joints are eliminated), "multilevel" (fewer and longer iterations for large sheets), or "chain_multilevel",
-            both ("auto" by the nodes of rods between joints, and of everything else).
+            both ("auto" by the nodes of rods between joints, and of everything else). By "auto" rods that contact alone couples are
+            solved one by one, as if they were on their own, in steps in which nothing comes within its reach, world by world.
         rtol, max_iterations, ...: see `NewtonOptions`.
         retry_limit: how often in a row a rod's failed step is tried again: first from the last state instead of the predictor,
             then in halves, and so on, down to 2^-(retry_limit / 2) of the step.
@@ -65,6 +69,9 @@ class Integrator:
         failures: what becomes of a step that is given up: "raise" stops the run, as described; by "flag" nothing is read or raised.
             The world it is in then rests as it was before that step, all of it, until `reset` starts it anew, or the integrator is
             given a state that it has not made itself; the others go on, and `outcomes` tells which are which.
+
+    Attributes:
+        whole: whether rods that touch nothing are solved with their net all the same; see `step_whole`.
 
     Raises:
         SceneError: a free node has neither mass nor drag along and across its rod, the scheme does not exist, or implicit Euler is
@@ -100,7 +107,7 @@ class Integrator:
         validate.require_mass(model)
         self.given: Given | None = None  # loads that steps are given, once one is
         # the uniform magnetic field that they are given, in every world
-        self.field = None
+        self.field, self.whole = None, False
         if model.magnetic:
             self.field = wp.zeros((3, model.worlds), dtype=model.types.real, device=model.wp_device)
         self._chains = [ChainStep(self, model, group) for group in model.groups]
@@ -112,6 +119,7 @@ class Integrator:
         self._dt = wp.zeros(model.worlds, dtype=model.types.real, device=model.wp_device)
         self._dt_host = None
         self._longest, self._version = 0.0, model.version
+        self._since_renewal = 0  # steps since the trees of searches were made anew
 
     def step(self, state: State, dt: float, controls: Controls | None = None) -> State:
         """The state after a step of dt [s]. No state changes that is held: see `State`.
@@ -158,14 +166,16 @@ class Integrator:
         """A step from what one buffer holds, at the time `start`, to the other; `anew` where it is from elsewhere: see `forget`."""
         for part in self._parts:
             part.prescribe(start, start + dt)
+        renew = anew or self._since_renewal % RENEWAL == 0 or self.model.wp_device.is_cpu
+        self._since_renewal += 1
 
         def launch():
             if anew:
                 self.forget()
-            self._launch(source)
+            self._launch(source, renew)
 
         def replay():
-            self._graphs.replay((source, anew, self.given is not None and self.given.any), launch)
+            self._graphs.replay((source, anew, self.given is not None and self.given.any, renew), launch)
 
         replay()
         while self._net is not None and self._net.outgrown(self._buffers[source].own.net):
@@ -235,6 +245,7 @@ class Integrator:
         else:  # whose arrays may be gone by the next time
             launch()
         then.state.time, then.state.stable = state.time, None
+        self._since_renewal = 0
         return then.state
 
     def statistics(self) -> dict:
@@ -321,6 +332,8 @@ class Integrator:
         if self._net is not None and (means := self._net.suited(s)) != self._net.means:
             self._net = NetStep(self, self.model, means, counts_of=self._net)
             self._graphs.clear()
+        if self._net is not None and self._net.adapt(s):
+            self._graphs.clear()
 
     def _own(self, state: State) -> int:
         for i, buffer in enumerate(self._buffers):
@@ -329,9 +342,16 @@ class Integrator:
         self._vacate(0)
         self._buffers[0].state.assign(state)
         self.forget()
+        self._since_renewal = 0
         if self._net is not None and self._net.newton.contact:
             self._net.newton.contact.check(self._buffers[0].own.net.q)
         return 0
+
+    def step_whole(self) -> None:
+        """From now on solve rods that touch nothing with their net, too: gradients read what its solves leave."""
+        self.whole = True
+        if self._net is not None and self._net.adapt(self._longest):
+            self._graphs.clear()
 
     def forget(self) -> None:
         """Of a state that comes from elsewhere nothing is known: accounts of energy start anew, and worlds that rest."""
@@ -346,8 +366,8 @@ class Integrator:
         if self._buffers[index].vacate():
             self._graphs.clear()
 
-    def _launch(self, source: int) -> None:
-        """Launches of a step of all parts from one buffer to the other."""
+    def _launch(self, source: int, renew: bool) -> None:
+        """Launches of a step of all parts from one buffer to the other; `renew`: as of `NetContact.begin`."""
         before, after = self._buffers[source].own, self._buffers[1 - source].own
         for part in self._parts:
             if part.motion:
@@ -357,7 +377,7 @@ class Integrator:
         for chain in self._chains:
             chain.step(before.groups[chain.index], after.groups[chain.index])
         if self._net is not None:
-            self._net.step(before.net, after.net)
+            self._net.step(before.net, after.net, renew)
         if self.failures == "flag":
             self._worlds.settle(self._parts, before, after)
 

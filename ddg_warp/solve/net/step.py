@@ -17,6 +17,7 @@ from ddg_warp.solve.controls import ControlledLoads, NetScale
 from ddg_warp.solve.drag import NetDrag
 from ddg_warp.solve.energy import NetEnergy
 from ddg_warp.solve.loads import Loads
+from ddg_warp.solve.net.alone import Alone, rods_of, suits, uncoupled
 from ddg_warp.solve.net.newton import PRECONDITIONERS, NetNewton
 from ddg_warp.solve.net.prescribed import NetField, NetMotion
 from ddg_warp.solve.step import USUAL, PartStep
@@ -75,14 +76,61 @@ class NetStep(PartStep):
             self.loads = Loads(model, self.net, self.midpoint)
         self.field = NetField(model, self.midpoint, integrator.field)
         self._data = (self.motion.data if self.motion else {}) | self.field.data
+        self.alone, self._groups = None, counts_of and counts_of._groups
 
-    def step(self, before, after) -> None:
-        """Launch a whole step from one state to another."""
+    def step(self, before, after, renew: bool = True) -> None:
+        """Launch a whole step from one state to another; `renew`: as of `NetContact.begin`."""
         if self.newton.contact:
             for kept, array in zip(self._kept, self._counts, strict=True):
                 wp.copy(kept, array)
-            self.newton.contact.begin(before.q)
-        super().step(before, after)
+            self.newton.contact.begin(before.q, renew)
+        if self.alone is None:
+            super().step(before, after)
+            return
+        self._launch(self._start, len(self.islands), self.islands.arrays, [])
+        self.alone.step(before, after)
+        wp.capture_if(self.remaining, lambda: self._go_on(before, after))
+
+    def _go_on(self, before, after) -> None:
+        """Step the worlds that are left to the net; those that are done rest as they are."""
+        if self.net.worlds > 1:
+            self.integrator._worlds.take_part(self.alone.left, before, after, self.net.worlds)
+            wp.copy(self.newton.q, after.q)
+            before = after
+        self._try(before, after)
+        wp.capture_while(self.remaining, lambda: self._try(after, after))
+
+    def prescribe(self, t0: float, t1: float) -> None:
+        """As of `PartStep`."""
+        super().prescribe(t0, t1)
+        for chain in self._rods:
+            chain.prescribe(t0, t1)
+
+    def load_modules(self) -> None:
+        """As of `PartStep`."""
+        super().load_modules()
+        if self.alone is None:
+            return
+        arrays.load_kernels(self.alone.kernels, self.model.wp_device)
+        for chain in self._rods:
+            chain.load_modules()
+        if self.net.worlds > 1:
+            self.integrator._worlds.load_modules()
+
+    @property
+    def _rods(self) -> list:
+        """Steps of its rods on their own, where there are any."""
+        return self.alone.chains if self.alone else []
+
+    def adapt(self, s: float) -> bool:
+        """Step rods that touch nothing on their own where they can be, by what suits s [s]; whether that is another way than before."""
+        before = self.alone
+        if not (uncoupled(self.model) and suits(self.integrator)):
+            self.alone = None
+        elif self.alone is None:
+            self._groups = self._groups or rods_of(self.model)
+            self.alone = Alone(self, self._groups)
+        return self.alone is not before or (self.alone is not None and self.alone.adapt(s))
 
     def outgrown(self, before) -> bool:
         """Whether the last step, from a state `before`, had more pairs in contact than there was room for, and is to be done again.
@@ -186,6 +234,8 @@ class NetStep(PartStep):
     def straighten(self, s: float) -> None:
         """As of `PartStep`; and what float32 matrices carry, of the rod that is the softest."""
         super().straighten(s)
+        for chain in self._rods:
+            chain.straighten(s)
         if any(self.newton.split):
             self.islands.carried.fill_(float(largest_carried(self.net.host.rod_stiffnesses(s)[2].min())))
 

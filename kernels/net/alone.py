@@ -1,0 +1,286 @@
+"""Rods of a net that touch nothing, stepped as rods on their own: to their arrays, back to the net's, and what becomes of the worlds.
+
+A net numbers nodes, angles and elements of a rod evenly: the first one, and how far the next is from it, say where all are. These are
+the rows of `places` (8, R): of nodes, of angles among all blocks, of elements that span two edges, of those that span one.
+
+`told` (rows, worlds) is what is known of each world, its rows named here.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels import outcome
+from ddg_warp.kernels.chain import ChainKind
+from ddg_warp.kernels.contact.tally import LAST, PARTS
+from ddg_warp.kernels.islands import (
+    CAUTIOUS,
+    ITERATION,
+    LOST,
+    MOVED,
+    PORTION,
+    PROGRESS,
+    RETRIES,
+    STATUS,
+)
+from ddg_warp.kernels.threads import CPU_OPTIONS, first_of, share_function, until_function
+
+# whether the world was tried; the largest outcome, iterations and lost pivots of its rods; whether it is left to the net
+TRIED, WORST, MOST, PIVOTS, LEFT = range(5)
+TOLD = 5
+NODE, ANGLE, VERTEX, EDGE = 0, 2, 4, 6  # of `places`, where the two rows of each start
+
+
+@cache
+def rod_kernels(kind: ChainKind, real):
+    """gather(...) the rods of worlds that are tried from the blocks of a net, scatter(...) them to these; columns as of `Group`.
+
+    Of `last`, strains of the last step, those of elements that span two edges, then those that span one; of no term of this kind that
+    is damped, any array stands for them.
+    """
+    V, twist = wp.types.vector(3, real), kind.twist
+    until = until_function(kind.serial)
+    spans = {term.measure.span: (term, place[3]) for term, place in zip(kind.terms, kind.places(), strict=True)}
+    kept = {span: (len(t.measure.strains), row) for span, (t, row) in spans.items() if t.density.lagged}
+    (vertex_rows, vertex_row), (edge_rows, edge_row) = (kept.get(span, (0, 0)) for span in (2, 1))
+
+    @wp.func
+    def place(places: wp.array2d(dtype=int), what: int, r: int, k: int, shift: int):
+        return wp.max(places[what, r] + k * places[what + 1, r] + shift, 0)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def gather(
+        places: wp.array2d(dtype=int),
+        count: wp.array(dtype=int),
+        told: wp.array2d(dtype=int),
+        sizes: wp.vec4i,
+        nodes: int,
+        q: wp.array(dtype=V),
+        v: wp.array(dtype=V),
+        frame: wp.array2d(dtype=real),
+        lag: wp.array2d(dtype=real),
+        vertex_last: wp.array2d(dtype=real),
+        edge_last: wp.array2d(dtype=real),
+        x_out: wp.array2d(dtype=V),
+        v_out: wp.array2d(dtype=V),
+        theta_out: wp.array2d(dtype=real),
+        omega_out: wp.array2d(dtype=real),
+        frame_out: wp.array3d(dtype=real),
+        last_out: wp.array3d(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+    ):
+        """Starts the step of every rod: worlds that are not tried have nothing to do."""
+        start, c = wp.tid()
+        rods = places.shape[1]
+        w = c / rods
+        r, n = c - w * rods, count[c]
+        tried = told[wp.static(TRIED), w] != 0
+        if start == 0:
+            flags[CAUTIOUS, c] = 0
+            flags[RETRIES, c] = 0
+            flags[LOST, c] = 0
+            flags[STATUS, c] = wp.static(outcome.CONVERGED)
+            scalars[PORTION, c] = real(1.0)
+            scalars[PROGRESS, c] = wp.where(tried, real(0.0), real(1.0))
+        if not tried or start >= n:
+            return
+        for k in range(start, until(start, n)):
+            i = place(places, wp.static(NODE), r, k, first_of(w, sizes[0]))
+            x_out[k, c] = q[i]
+            v_out[k, c] = v[i]
+            if k < n - 1:
+                if wp.static(twist):
+                    j = place(places, wp.static(ANGLE), r, k, first_of(w, sizes[0]))
+                    theta_out[k, c] = q[j][0]
+                    omega_out[k, c] = v[j][0]
+                    f = place(places, wp.static(ANGLE), r, k, first_of(w, sizes[1]) - nodes)
+                    for d in range(6):
+                        frame_out[d, k, c] = frame[d, f]
+                if wp.static(edge_rows > 0):
+                    e = place(places, wp.static(EDGE), r, k, first_of(w, sizes[3]))
+                    for d in range(wp.static(edge_rows)):
+                        last_out[wp.static(edge_row) + d, k, c] = edge_last[d, e]
+            if k < n - 2:
+                e = place(places, wp.static(VERTEX), r, k, first_of(w, sizes[2]))
+                if wp.static(twist):
+                    frame_out[6, k, c] = lag[0, e]
+                for d in range(wp.static(vertex_rows)):
+                    last_out[wp.static(vertex_row) + d, k, c] = vertex_last[d, e]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def scatter(
+        places: wp.array2d(dtype=int),
+        count: wp.array(dtype=int),
+        sizes: wp.vec4i,
+        nodes: int,
+        x: wp.array2d(dtype=V),
+        v: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        omega: wp.array2d(dtype=real),
+        frame: wp.array3d(dtype=real),
+        last: wp.array3d(dtype=real),
+        flags: wp.array2d(dtype=int),
+        told: wp.array2d(dtype=int),
+        q_out: wp.array(dtype=V),
+        v_out: wp.array(dtype=V),
+        frame_out: wp.array2d(dtype=real),
+        lag_out: wp.array2d(dtype=real),
+        vertex_last: wp.array2d(dtype=real),
+        edge_last: wp.array2d(dtype=real),
+    ):
+        start, c = wp.tid()
+        rods = places.shape[1]
+        w = c / rods
+        r, n = c - w * rods, count[c]
+        if told[wp.static(TRIED), w] == 0 or start >= n:
+            return
+        if start == 0:
+            # few of many rods change what is known already
+            if told[wp.static(WORST), w] < flags[STATUS, c]:
+                wp.atomic_max(told, wp.static(WORST), w, flags[STATUS, c])
+            if told[wp.static(MOST), w] < flags[ITERATION, c]:
+                wp.atomic_max(told, wp.static(MOST), w, flags[ITERATION, c])
+            if flags[LOST, c] > 0:
+                wp.atomic_add(told, wp.static(PIVOTS), w, flags[LOST, c])
+        for k in range(start, until(start, n)):
+            i = place(places, wp.static(NODE), r, k, first_of(w, sizes[0]))
+            q_out[i] = x[k, c]
+            v_out[i] = v[k, c]
+            if k < n - 1:
+                if wp.static(twist):
+                    j = place(places, wp.static(ANGLE), r, k, first_of(w, sizes[0]))
+                    q_out[j] = V(theta[k, c], real(0.0), real(0.0))
+                    v_out[j] = V(omega[k, c], real(0.0), real(0.0))
+                    f = place(places, wp.static(ANGLE), r, k, first_of(w, sizes[1]) - nodes)
+                    for d in range(6):
+                        frame_out[d, f] = frame[d, k, c]
+                if wp.static(edge_rows > 0):
+                    e = place(places, wp.static(EDGE), r, k, first_of(w, sizes[3]))
+                    for d in range(wp.static(edge_rows)):
+                        edge_last[d, e] = last[wp.static(edge_row) + d, k, c]
+            if k < n - 2:
+                e = place(places, wp.static(VERTEX), r, k, first_of(w, sizes[2]))
+                if wp.static(twist):
+                    lag_out[0, e] = frame[6, k, c]
+                for d in range(wp.static(vertex_rows)):
+                    vertex_last[d, e] = last[wp.static(vertex_row) + d, k, c]
+
+    return gather, scatter
+
+
+@cache
+def world_kernels(real):
+    """hope(...) for worlds in which nothing is near, near(...) where pairs may be, judge(...) of what was tried; a thread a world."""
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def hope(
+        gap: wp.array(dtype=real),
+        reach: real,
+        overflow: wp.array(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        told: wp.array2d(dtype=int),
+        any_tried: wp.array(dtype=int),
+        some: wp.array(dtype=int),
+        remaining: wp.array(dtype=int),
+    ):
+        """Of `some`, whether pairs may come near, nothing is known yet."""
+        w = wp.tid()
+        some[0] = 0
+        tried = scalars[PROGRESS, w] < real(1.0) and gap[w] >= reach and overflow[0] == 0
+        told[wp.static(TRIED), w] = wp.where(tried, 1, 0)
+        told[wp.static(WORST), w] = 0
+        told[wp.static(MOST), w] = 0
+        told[wp.static(PIVOTS), w] = 0
+        told[wp.static(LEFT), w] = 1
+        if tried:
+            any_tried[0] = 1
+        else:
+            remaining[0] = 1
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def near(count: wp.array(dtype=int), some: wp.array(dtype=int)):
+        """Whether a list has any pair."""
+        if count[0] > 0:
+            some[0] = 1
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def judge(
+        some: wp.array(dtype=int),
+        gap: wp.array(dtype=real),
+        reach: real,
+        crossed: wp.array(dtype=int),
+        overflow: wp.array(dtype=int),
+        rounded: int,
+        told: wp.array2d(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        counts: wp.array2d(dtype=wp.int64),
+        tally: wp.array(dtype=wp.int64),
+        work: wp.array(dtype=wp.int64),
+        remaining: wp.array(dtype=int),
+    ):
+        """Ends the step of worlds in which all rods have converged and nothing came near, as one that the net has solved.
+
+        `counts` as of `kernels.contact.tally`, where nothing touches; `tally`, `work`, `rounded` as of `kernels.step.advance_kernel`.
+        """
+        w = wp.tid()
+        if told[wp.static(TRIED), w] == 0:
+            return
+        worst = told[wp.static(WORST), w]
+        done = worst <= wp.static(outcome.CONVERGED_TO_ROUNDING) and overflow[0] == 0
+        if some[0] != 0 and (gap[w] < reach or crossed[w] != 0):
+            done = False
+        if not done:
+            remaining[0] = 1
+            return
+        told[wp.static(LEFT), w] = 0
+        flags[STATUS, w] = worst
+        flags[ITERATION, w] = told[wp.static(MOST), w]
+        flags[MOVED, w] = 1
+        scalars[PROGRESS, w] = real(1.0)
+        counts[wp.static(PARTS), w] = counts[wp.static(PARTS), w] + wp.int64(1)
+        counts[wp.static(LAST), w] = wp.int64(0)
+        counted = worst
+        if worst == wp.static(outcome.CONVERGED_TO_ROUNDING):
+            counted = rounded
+        wp.atomic_add(tally, counted, wp.int64(1))
+        wp.atomic_add(work, 0, wp.int64(flags[ITERATION, w]))
+        wp.atomic_max(work, 1, wp.int64(flags[ITERATION, w]))
+        wp.atomic_add(work, 2, wp.int64(1))
+        wp.atomic_add(work, 4, wp.int64(told[wp.static(PIVOTS), w]))
+
+    return hope, near, judge
+
+
+@cache
+def place_kernels(real, serial: bool):
+    """wait(...) of worlds that are not tried; stay(...) of nodes of obstacles, follow(...) at the rate at which these were moved."""
+    V, share, until = wp.types.vector(3, real), share_function(serial), until_function(serial)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def wait(told: wp.array2d(dtype=int), blocks: int, q: wp.array(dtype=V), q_out: wp.array(dtype=V)):
+        w, start = share(wp.tid(), blocks)
+        if told[wp.static(TRIED), w] == 0:
+            for k in range(start, until(start, blocks)):
+                q_out[k + w * blocks] = q[k + w * blocks]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def stay(nodes: wp.array(dtype=int), blocks: int, q: wp.array(dtype=V), q_out: wp.array(dtype=V)):
+        i, w = wp.tid()
+        q_out[nodes[i] + w * blocks] = q[nodes[i] + w * blocks]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def follow(
+        nodes: wp.array(dtype=int),
+        blocks: int,
+        q0: wp.array(dtype=V),
+        q: wp.array(dtype=V),
+        dt: wp.array(dtype=real),
+        v_out: wp.array(dtype=V),
+    ):
+        i, w = wp.tid()
+        k = nodes[i] + w * blocks
+        v_out[k] = (q[k] - q0[k]) * (real(1.0) / dt[w])
+
+    return wait, stay, follow

@@ -1,0 +1,249 @@
+"""Rods of a net that touch nothing are stepped as rods on their own: the same motion, and what touches is the net's."""
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp.solve.net.alone import Alone
+
+RADIUS, DT = 2e-3, 1 / 240
+SOFT = ddg.Material(young=1e6, density=1000.0, poisson=0.5, viscosity=1e-3)
+STRAIGHT = np.linspace(-0.05, 0.05, 11)
+
+
+def rods(count: int = 4, contact: bool = True, material=SOFT, apart: float = 0.03, **scene) -> ddg.Scene:
+    """Curved rods beside each other, each held at an end."""
+    result = ddg.Scene(**scene)
+    points = np.stack([STRAIGHT, 5e-3 * np.sin(60.0 * STRAIGHT), 0.01 * np.cos(40.0 * STRAIGHT)], axis=1)
+    for i in range(count):
+        result.add_rod(points + [0.0, apart * i, 0.0], section=ddg.Circle(RADIUS), material=material, name=f"rod {i}")
+    result.clamp(range(count), edges=[0])
+    if contact:
+        result.contact(friction=0.3)
+    return result
+
+
+def falling(height: float = 0.02, speed: float = 0.0, **contact) -> tuple[ddg.Scene, np.ndarray]:
+    """A rod that falls across a beam, and velocities."""
+    scene = ddg.Scene()
+    scene.add_rod(np.stack([STRAIGHT, 0 * STRAIGHT, 0 * STRAIGHT], 1), section=ddg.Circle(RADIUS), material=SOFT)
+    points = np.stack([0 * STRAIGHT, STRAIGHT, 0 * STRAIGHT + height], 1)
+    scene.add_rod(points, section=ddg.Circle(RADIUS), material=SOFT, name="upper")
+    scene.clamp(0, edges=[0, -1])
+    scene.contact(friction=0.3, **contact)
+    velocities = np.zeros((22, 3))
+    velocities[11:, 2] = -speed
+    return scene, velocities
+
+
+def run(device, scene, steps: int, dt: float = DT, velocities=None, worlds: int = 1, **options):
+    model = scene.build(device=device, worlds=worlds)
+    integrator, state = ddg.Integrator(model, **options), model.state(velocities=velocities)
+    alone = []
+    for _ in range(steps):
+        state = integrator.step(state, dt)
+        own = integrator._net.alone if integrator._net else None
+        alone.append(own is not None and (own.left.numpy() == 0))
+    return state, integrator, np.array(alone)
+
+
+@pytest.mark.parametrize(
+    ("material", "scene"),
+    [
+        (SOFT, {}),
+        (ddg.Material(young=1e6, density=1000.0, poisson=0.5), {"mass_damping": 2.0}),
+    ],
+)
+def test_what_never_touches_moves_as_without_contact(device, material, scene):
+    """The same solver from the same arrays: only strains of the last step and frames may round otherwise."""
+    states = [run(device, rods(contact=contact, material=material, **scene), 30)[0] for contact in (False, True)]
+    for values in (ddg.State.points, ddg.State.velocities, ddg.State.angles, ddg.State.directors):
+        expected, found = map(values, states)
+        assert np.ptp(expected) > 0.0
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_a_rod_that_falls_on_another(device):
+    """As the net alone has it: alone until they are near, together while they touch, alone again when apart."""
+    scene, velocities = falling(speed=0.5)
+    options = {"rtol": 1e-10, "dt": 1 / 480, "velocities": velocities}
+    found, integrator, alone = run(device, scene, 90, **options)
+    expected, _, _ = run(device, scene, 90, linear="chain", **options)
+    assert alone[0] and alone[-1] and not alone.all()
+    assert integrator.statistics()["contact"]["smallest_gap"] < np.inf
+    np.testing.assert_allclose(found.points(), expected.points(), rtol=0.0, atol=1e-7 * 0.1)
+    np.testing.assert_allclose(found.velocities(), expected.velocities(), rtol=0.0, atol=1e-5)
+
+
+def test_what_would_pass_through_within_a_step_is_caught(device):
+    """A fast rod is far from the other at both ends of the step."""
+    scene, velocities = falling(height=0.02, speed=20.0)
+    options = {"dt": 2e-3, "velocities": velocities, "rtol": 1e-10}
+    found, _, alone = run(device, scene, 1, **options)
+    expected, _, _ = run(device, scene, 1, linear="chain", **options)
+    assert not alone.any()
+    z = found.points()[:, 2]
+    assert z[16] - z[5] > 2.0 * RADIUS
+    np.testing.assert_allclose(found.points(), expected.points(), rtol=0.0, atol=1e-7 * 0.1)
+
+
+def test_worlds_are_judged_one_by_one(device):
+    """One touches, the other does not: each moves as it does by itself."""
+    scene, velocities = falling(height=0.012)
+    given = np.stack([velocities, velocities])
+    given[0, 11:, 2] = -0.5
+    found, _, alone = run(device, scene, 24, velocities=given, worlds=2, rtol=1e-10)
+    assert alone[:, 1].sum() > alone[:, 0].sum() > 0 and not alone[:, 0].all()
+    for world in range(2):
+        expected, _, _ = run(device, scene, 24, velocities=given[world], rtol=1e-10)
+        np.testing.assert_allclose(found.points()[world], expected.points(), rtol=0.0, atol=1e-8 * 0.1)
+
+
+def test_obstacles_that_move_push_rods_and_are_where_they_have_to_be(device):
+    scene = rods(2)
+    lift = ddg.Motion(translation=lambda t: (0.0, 0.0, 0.5 * t))
+    scene.add_obstacle(ddg.Sphere((0.0, 0.0, -0.04), 0.01), motion=lift, name="ball")
+    scene.add_obstacle(ddg.Plane((0.0, 0.0, -1.0), (0.0, 0.0, 1.0)))
+    options = {"rtol": 1e-10, "steps": 40, "dt": 1 / 480}
+    found, _, alone = run(device, scene, **options)
+    expected, _, _ = run(device, scene, linear="chain", **options)
+    assert alone[0] and not alone.all()
+    np.testing.assert_allclose(found.points(), expected.points(), rtol=0.0, atol=1e-7 * 0.1)
+    np.testing.assert_allclose(found.obstacle_points(), expected.obstacle_points(), rtol=0.0, atol=1e-15)
+    first, _, alone = run(device, scene, **(options | {"steps": 3}))
+    np.testing.assert_allclose(first.net.v.numpy()[:, 2].max(), 0.5, rtol=1e-12)
+    assert alone.all()
+
+
+def test_drag_supports_that_move_and_loads(device):
+    """Whatever else acts on rods acts on them alone."""
+
+    def scene(contact: bool) -> ddg.Scene:
+        result = rods(3, contact=contact)
+        result.add_rod(
+            np.stack([STRAIGHT, 0 * STRAIGHT + 0.2, 0 * STRAIGHT], 1), section=ddg.Circle(RADIUS), material=SOFT
+        )
+        result.drag([1], tangential=0.02, normal=0.05, rotational=1e-6)
+        result.add_force(2, 10, (0.0, 0.0, 2e-3), amplitude=lambda t: np.sin(50.0 * t))
+        result.add_couple(0, -1, (1e-5, 0.0, 0.0))
+        turn = ddg.Motion(angle=lambda t: 3.0 * t, axis=(1.0, 0.0, 0.0), translation=lambda t: (0.0, 0.2 * t, 0.0))
+        result.clamp(3, edges=[0], motion=turn)
+        return result
+
+    expected, found = (run(device, scene(contact), 30)[0] for contact in (False, True))
+    np.testing.assert_allclose(found.points(), expected.points(), rtol=0.0, atol=1e-12)
+
+
+def test_rods_with_damping_and_without_in_one_set(device):
+    def scene(contact: bool) -> ddg.Scene:
+        result = rods(2, contact=contact)
+        stiff = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
+        result.add_rod(
+            np.stack([STRAIGHT, 0 * STRAIGHT + 0.2, 0 * STRAIGHT], 1), section=ddg.Circle(RADIUS), material=stiff
+        )
+        result.clamp(2, edges=[0])
+        return result
+
+    expected, (found, _, alone) = run(device, scene(False), 20)[0], run(device, scene(True), 20)
+    assert alone.all()
+    np.testing.assert_allclose(found.points(), expected.points(), rtol=0.0, atol=1e-12)
+    model = found.model  # what damping reads next
+    strains = [values.numpy().copy() for values in found.net.last]
+    model.net.update_strains(found.net)
+    for kept, now in zip(strains, found.net.last, strict=True):
+        np.testing.assert_allclose(kept, now.numpy(), rtol=0.0, atol=1e-12 * np.abs(kept).max())
+
+
+def test_grips_take_rods_along(device):
+    """In two worlds, each its own way."""
+    states = []
+    for contact in (False, True):
+        scene = rods(1, contact=contact)
+        scene.add_rod(
+            np.stack([STRAIGHT, 0 * STRAIGHT + 0.2, 0 * STRAIGHT], 1), section=ddg.Circle(RADIUS), material=SOFT
+        )
+        scene.clamp(1, edges=[0], motion=ddg.Grip())
+        integrator = ddg.Integrator(scene.build(device=device, worlds=2))
+        state = integrator.model.state()
+        for step in range(1, 20):
+            poses = np.zeros((2, 1, 6))
+            poses[:, 0, 1], poses[:, 0, 3] = 1e-3 * step * np.array([1.0, -0.5]), 0.02 * step
+            state = integrator.step(state, DT, ddg.Controls(poses=poses))
+        states.append(state)
+    assert (integrator._net.alone.left.numpy() == 0).all()
+    np.testing.assert_allclose(states[1].points(), states[0].points(), rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(states[1].angles(), states[0].angles(), rtol=0.0, atol=1e-10)
+
+
+def test_a_run_that_is_resumed_takes_the_same_steps(device):
+    """Bitwise, from whatever step: what decides is not what was searched for before."""
+    scene, velocities = falling(height=0.012, speed=0.5)
+    model = scene.build(device=device)
+    integrator, state = ddg.Integrator(model), model.state(velocities=velocities)
+    snapshots, ways = [], []
+    for _ in range(24):
+        snapshots.append(state.snapshot())
+        state = integrator.step(state, DT)
+        ways.append(bool(integrator._net.alone.left.numpy()[0]))
+    assert len(set(ways)) == 2
+    for start in (3, 6, 12, 20):
+        other, again = ddg.Integrator(model), model.restore(snapshots[start])
+        for _ in range(start, 24):
+            again = other.step(again, DT)
+        for name, values in again.snapshot().items():
+            np.testing.assert_array_equal(values, state.snapshot()[name], err_msg=name)
+
+
+def test_statistics_count_a_step_as_any_other(device):
+    state, integrator, alone = run(device, rods(3), 10)
+    assert alone.all()
+    found = integrator.statistics()
+    assert found["outcomes"] == {"converged": 10} and found["retries"] == 0 and found["pcg_iterations"] == 0
+    _, plain, _ = run(device, rods(3, contact=False), 10)
+    assert found["newton_iterations"]["max"] == plain.statistics()["newton_iterations"]["max"]
+    assert found["contact"]["contacts"] == {"mean": 0.0, "last": 0}
+    assert found["contact"]["smallest_gap"] == np.inf
+    model = state.model
+    assert "rods on their own" in model.report()
+    assert len(model.contacts(state)) == 0 and model.energies(state)["kinetic"] > 0.0
+
+
+def closed() -> ddg.Scene:
+    scene = ddg.Scene()
+    turn = np.linspace(0.0, 2 * np.pi, 17)[:-1]
+    scene.add_rod(
+        np.stack([0.05 * np.cos(turn), 0.05 * np.sin(turn), 0 * turn], 1),
+        section=ddg.Circle(RADIUS),
+        material=SOFT,
+        closed=True,
+    )
+    scene.contact()
+    return scene
+
+
+@pytest.mark.parametrize(
+    ("scene", "options"),
+    [(closed, {}), (rods, {"linear": "chain"}), (lambda: rods(contact=False), {})],
+)
+def test_where_it_does_not_apply_nothing_of_it_is_made(device, scene, options, monkeypatch):
+    def refuse(*_):
+        raise AssertionError("made")
+
+    monkeypatch.setattr(Alone, "__init__", refuse)
+    run(device, scene(), 2, **options)
+
+
+def test_what_gradients_and_controls_need_is_solved_with_the_net(device):
+    scene, _ = falling()
+    model = scene.build(device=device)
+    integrator, state = ddg.Integrator(model), model.state()
+    state = integrator.step(state, DT)
+    assert integrator._net.alone is not None
+    state = integrator.step(state, DT, ddg.Controls(gravity=(0.0, 0.0, -1.0)))
+    assert integrator._net.alone is None
+    model = scene.build(device=device)
+    integrator, state = ddg.Integrator(model), model.state()
+    state = integrator.step(state, DT)
+    model.set_parameter("rod_stretch", "stiffness", 10.0)
+    integrator.step(state, DT)
+    assert integrator._net.alone is None
