@@ -67,14 +67,12 @@ def product_kernels(real, linear, serial: bool):
         return m
 
     @wp.func
-    def times(columns: wp.array3d(dtype=V), m: int, u: Y):
-        """A Hessian that is kept times what is at the nodes; it is symmetric, and read by rows."""
-        y = Y()
-        for slot in range(wp.static(SLOTS)):
-            for d in range(3):
-                for k in range(wp.static(SLOTS)):
-                    y[slot, d] = y[slot, d] + wp.dot(columns[3 * slot + d, k, m], u[k])
-        return y
+    def row(columns: wp.array3d(dtype=V), m: int, i: int, u: Y):
+        """A row of a Hessian that is kept, a column as it is symmetric, times what is at the nodes."""
+        total = linear(0.0)
+        for k in range(wp.static(SLOTS)):
+            total += wp.dot(columns[i, k, m], u[k])
+        return total
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def multiply(
@@ -90,26 +88,31 @@ def product_kernels(real, linear, serial: bool):
                     if used != 0:
                         n = own.nodes[p]
                         u = wp.matrix_from_rows(v[n[0]], v[n[1]], v[n[2]], v[n[3]])
-                        y = Y()
                         m = int(-1)
                         if wanted.shape[0] > 0:
                             m = kept(own, p)
                         if m >= 0:
-                            y = times(own.columns, m, u)
-                        else:
-                            for k in range(own.rows):
-                                if (used >> (k + 1)) & 1 != 0:
-                                    w = own.weight[k, p]
-                                    along = own.direction[k, p]
-                                    y += wp.outer(w, along * wp.dot(along, w * u))
-                            if wanted.shape[0] > 0 and own.kind >= 0:
-                                c = own.bend[p]
-                                if c != linear(0.0) and wanted[own.pairs[p][0] / own.things] != 0:
-                                    o = x[n[0]]
-                                    at = wp.matrix_from_rows(
-                                        V(), beside(x[n[1]], o), beside(x[n[2]], o), beside(x[n[3]], o)
-                                    )
-                                    y += bend(own.kind, at, own.weight[0, p], u) * c
+                            for slot in range(own.columns.shape[1]):  # not unrolled, for the sake of registers
+                                own.parts[slot, p] = V(
+                                    row(own.columns, m, 3 * slot, u),
+                                    row(own.columns, m, 3 * slot + 1, u),
+                                    row(own.columns, m, 3 * slot + 2, u),
+                                )
+                            continue
+                        y = Y()
+                        for k in range(own.rows):
+                            if (used >> (k + 1)) & 1 != 0:
+                                w = own.weight[k, p]
+                                along = own.direction[k, p]
+                                y += wp.outer(w, along * wp.dot(along, w * u))
+                        if wanted.shape[0] > 0 and own.kind >= 0:
+                            c = own.bend[p]
+                            if c != linear(0.0) and wanted[own.pairs[p][0] / own.things] != 0:
+                                o = x[n[0]]
+                                at = wp.matrix_from_rows(
+                                    V(), beside(x[n[1]], o), beside(x[n[2]], o), beside(x[n[3]], o)
+                                )
+                                y += bend(own.kind, at, own.weight[0, p], u) * c
                         for slot in range(wp.static(SLOTS)):
                             own.parts[slot, p] = y[slot]
 

@@ -226,14 +226,11 @@ def mollified_kernels(density: Density, real, linear, serial: bool):
         marks: wp.array(dtype=int),
         starts: wp.array(dtype=int),
         chosen: wp.array(dtype=int),
+        threads: int,
         columns: wp.array3d(dtype=L),
     ):
-        tid = wp.tid()
         last = marks.shape[0] - 1
-        total = 12 * wp.min(starts[last] + marks[last], chosen.shape[0])
-        if tid >= total:
-            return
-        for i in range(tid, until(tid, total)):
+        for i in range(wp.tid(), 12 * wp.min(starts[last] + marks[last], chosen.shape[0]), threads):
             m = i / 12
             column = i - 12 * m
             pair = chosen[m]

@@ -10,6 +10,7 @@ from ddg_warp.solve.contact.pairs import RunningSums
 
 ROOM = 4  # one in so many pairs may be such a one; more keep the Gauss-Newton matrix, which takes iterations alone
 LEAST = 256  # pairs that there is room for
+MOST = 2**15  # threads that differentiate: with a thread for all there is room for, most would have nothing to do
 
 
 class Mollified:
@@ -46,8 +47,9 @@ class Mollified:
         self._sweep(self._mark, len(self.marks), inputs, [self.marks])
         self._running()
         self._sweep(self._choose, len(self.marks), [self.marks, self.starts], [self._chosen])
-        inputs = [of.pairs, of.found.sides, law, x, of.factor, self.marks, self.starts, self._chosen]
-        self._sweep(self._differentiate, 3 * SLOTS * len(self._chosen), inputs, [self.columns])
+        threads = arrays.takers(min(3 * SLOTS * len(self._chosen), MOST), of.device)
+        inputs = [of.pairs, of.found.sides, law, x, of.factor, self.marks, self.starts, self._chosen, threads]
+        wp.launch(self._differentiate, threads, inputs, [self.columns], device=of.device)
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
         arrays.sweep(kernel, count, inputs, outputs, self._of.device)
