@@ -146,12 +146,13 @@ def sum_kernels(size: int, real, serial: bool):
         """out += scale times the sum."""
         tid = wp.tid()
         for node in range(tid, until(tid, numbers.shape[0])):
-            total = V()
-            for k in range(starts[node], starts[node] + numbers[node]):
-                p = items[k] / wp.static(SLOTS)
-                if used[p] != 0:
-                    total += parts[items[k] - wp.static(SLOTS) * p, p]
-            out[node] = out[node] + total * scale
+            if numbers[node] > 0:
+                total = V()
+                for k in range(starts[node], starts[node] + numbers[node]):
+                    p = items[k] / wp.static(SLOTS)
+                    if used[p] != 0:
+                        total += parts[items[k] - wp.static(SLOTS) * p, p]
+                out[node] = out[node] + total * scale
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def scatter(
@@ -210,13 +211,14 @@ def block_kernels(kind: Kind, rows: int, real, linear, serial: bool):
     ):
         tid = wp.tid()
         for node in range(tid, until(tid, numbers.shape[0])):
-            total = M()
-            for k in range(starts[node], starts[node] + numbers[node]):
-                p = items[k] / wp.static(SLOTS)
-                slot = items[k] - wp.static(SLOTS) * p
-                if factor.used[p] != 0:
-                    total += block(factor, p, slot, slot)
-            out[node] = out[node] + total
+            if numbers[node] > 0:
+                total = M()
+                for k in range(starts[node], starts[node] + numbers[node]):
+                    p = items[k] / wp.static(SLOTS)
+                    slot = items[k] - wp.static(SLOTS) * p
+                    if factor.used[p] != 0:
+                        total += block(factor, p, slot, slot)
+                out[node] = out[node] + total
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def edges(
@@ -233,14 +235,15 @@ def block_kernels(kind: Kind, rows: int, real, linear, serial: bool):
         for i in range(tid, until(tid, out.shape[0])):
             w = i / sides.counts[0]
             node = sides.first.nodes[i - w * sides.counts[0], 0] + w * sides.first.nodes_a_world
-            total = M()
-            for k in range(starts[node], starts[node] + numbers[node]):
-                p = items[k] / wp.static(SLOTS)
-                slot = items[k] - wp.static(SLOTS) * p
-                if factor.used[p] != 0 and (slot == 0 or (wp.static(kind == EDGES) and slot == 2)):
-                    if pairs[p][slot / 2] == i:
-                        total += block(factor, p, slot, slot + 1)
-            out[i] = out[i] + total
+            if numbers[node] > 0:
+                total = M()
+                for k in range(starts[node], starts[node] + numbers[node]):
+                    p = items[k] / wp.static(SLOTS)
+                    slot = items[k] - wp.static(SLOTS) * p
+                    if factor.used[p] != 0 and (slot == 0 or (wp.static(kind == EDGES) and slot == 2)):
+                        if pairs[p][slot / 2] == i:
+                            total += block(factor, p, slot, slot + 1)
+                out[i] = out[i] + total
 
     return nodes, edges
 

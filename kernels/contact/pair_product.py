@@ -44,8 +44,11 @@ def set_struct(linear):
 
 @cache
 def product_kernels(real, linear, serial: bool):
-    """multiply(...) the pairs; gather(...) or scatter(...) to nodes; settle(...), which gathers on free dofs, with dot products, for
-    nodes in pairs, which meet(...) finds."""
+    """multiply(...) the pairs; scatter(...) to nodes or gather(...); settle(...), which does so on free dofs, with dot products, for
+    nodes in pairs, which meet(...) finds.
+
+    If `serial`, what gather(...) and settle(...) add was scattered to `sums`, in the order in which others gather it.
+    """
     PairSet, until = set_struct(linear), until_function(serial)
     X, V, Y = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.matrix((4, 3), linear)
     bend = bend_function(linear)
@@ -117,7 +120,7 @@ def product_kernels(real, linear, serial: bool):
                             own.parts[slot, p] = y[slot]
 
     @wp.func
-    def total(sets: wp.array(dtype=PairSet), node: int):
+    def gathered(sets: wp.array(dtype=PairSet), sums: wp.array(dtype=V), node: int):
         y = V()
         for s in range(sets.shape[0]):
             number = sets[s].numbers[node]
@@ -131,12 +134,18 @@ def product_kernels(real, linear, serial: bool):
                         y += own.parts[item - wp.static(SLOTS) * p, p]
         return y
 
+    @wp.func
+    def scattered(sets: wp.array(dtype=PairSet), sums: wp.array(dtype=V), node: int):
+        return sums[node]
+
+    total = scattered if serial else gathered
+
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def gather(sets: wp.array(dtype=PairSet), out: wp.array(dtype=V)):
+    def gather(sets: wp.array(dtype=PairSet), sums: wp.array(dtype=V), out: wp.array(dtype=V)):
         """Adds to the nodes."""
         tid = wp.tid()
         for node in range(tid, until(tid, out.shape[0])):
-            out[node] = out[node] + total(sets, node)
+            out[node] = out[node] + total(sets, sums, node)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def meet(sets: wp.array(dtype=PairSet), met_out: wp.array(dtype=wp.uint8)):
@@ -151,6 +160,7 @@ def product_kernels(real, linear, serial: bool):
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def settle(
         sets: wp.array(dtype=PairSet),
+        sums: wp.array(dtype=V),
         met: wp.array(dtype=wp.uint8),
         p: wp.array(dtype=V),
         fixed: wp.array(dtype=wp.uint8),
@@ -158,16 +168,13 @@ def product_kernels(real, linear, serial: bool):
         out: wp.array(dtype=V),
         dots_out: wp.array2d(dtype=linear),
     ):
-        """Adds to free dofs in worlds that are busy (1), and writes p . out node by node."""
+        """Adds to free dofs in worlds that are busy (1), and writes p . out node by node, where that has changed."""
         tid = wp.tid()
         for node in range(tid, until(tid, out.shape[0])):
             w = node / fixed.shape[0]
-            if busy[w] == 1:
+            if met[node] != wp.uint8(0) and busy[w] == 1:
                 k = node - w * fixed.shape[0]
-                y = out[node]
-                if met[node] != wp.uint8(0):
-                    y += total(sets, node)
-                y = wp.cw_mul(y, free(fixed[k]))
+                y = out[node] + wp.cw_mul(total(sets, sums, node), free(fixed[k]))
                 out[node] = y
                 dots_out[w, k] = wp.dot(p[node], y)
 

@@ -15,7 +15,7 @@ from ddg_warp.kernels.matrix.chain_places import behind_function, place_dofs, va
 from ddg_warp.kernels.matrix.sliced import product_functions
 from ddg_warp.kernels.net.places import along_type
 from ddg_warp.kernels.terms import Term
-from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
+from ddg_warp.kernels.threads import CPU_OPTIONS, first_of, until_function
 
 
 @cache
@@ -146,6 +146,73 @@ def band_kernels(
         dots_out[w, b] = wp.dot(p[i], y)
 
     return assemble, clear, product
+
+
+@cache
+def walk_kernel(twist: bool, span: int, linear, split: bool = False):
+    """walk(...): the same product by one thread, for the CPU: it reads each block once, and goes on with what its transpose adds."""
+    nb = place_dofs(twist, split)
+    H, B, M = wp.types.vector(3, linear), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
+    load, _, _, _ = block_functions(nb, linear)
+    times, free = product_functions(linear)
+    value = value_function(twist, linear, split)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def walk(
+        matrix: wp.array2d(dtype=linear),
+        columns: wp.array(dtype=int),
+        slices: wp.array(dtype=int),
+        fixed: wp.array(dtype=wp.uint8),
+        p: wp.array(dtype=H),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        positions: int,
+        bands: wp.array3d(dtype=linear),
+        places: wp.array3d(dtype=int),
+        where: wp.array(dtype=int),
+        count: wp.array(dtype=int),
+        nodes: int,
+        product_out: wp.array(dtype=H),
+        dots_out: wp.array2d(dtype=linear),
+    ):
+        for w in range(wanted.shape[0]):
+            if wanted[w] != 1:
+                continue
+            shift = first_of(w, blocks)
+            for b in range(blocks):
+                product_out[b + shift] = times(matrix, columns, slices, p, b, w * positions, shift)
+            for c in range(count.shape[0]):
+                r = w * count.shape[0] + c
+                n = count[c]
+                here, ahead = value(p, places, 0, c, shift), B()
+                if n > 1:
+                    ahead = value(p, places, 1, c, shift)
+                carried, carried_too = B(), B()
+                for k in range(n):
+                    beyond = B()
+                    if k + 2 < n:
+                        beyond = value(p, places, k + 2, c, shift)
+                    E = load(bands, wp.static(nb**2), k, r)
+                    u = carried + load(bands, 0, k, r) * here + E * ahead
+                    carried = carried_too + wp.transpose(E) * here
+                    if wp.static(span == 2):
+                        F = load(bands, wp.static(2 * nb**2), k, r)
+                        u += F * beyond
+                        carried_too = wp.transpose(F) * here
+                    here, ahead = ahead, beyond
+                    node = places[0, k, c]
+                    if node >= 0:
+                        product_out[node + shift] += H(u[0], u[1], u[2])
+                    if wp.static(twist):
+                        angle = places[1, k, c]
+                        if angle >= 0:
+                            product_out[angle + shift] += H(u[3], linear(0.0), linear(0.0))
+            for b in range(blocks):
+                y = wp.cw_mul(product_out[b + shift], free(fixed[b]))
+                product_out[b + shift] = y
+                dots_out[w, b] = wp.dot(p[b + shift], y)
+
+    return walk
 
 
 @cache

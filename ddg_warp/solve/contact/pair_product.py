@@ -16,9 +16,13 @@ class PairProduct:
         self._parts, self._linear, self._atomic, self._device = parts, linear, atomic, parts[0].device
         types = int, wp.types.vector(3, real)
         self._nothing = [wp.zeros(0, dtype=dtype, device=self._device) for dtype in types]
-        made = product_kernels(real, linear, arrays.serial(self._device))
+        self._serial, vector = arrays.serial(self._device), wp.types.vector(3, linear)
+        self._sums = wp.zeros(len(parts[0].numbers) if self._serial else 0, dtype=vector, device=self._device)
+        made = product_kernels(real, linear, self._serial)
         self._multiply, self._gather, self._meet, self._settle, self._scatter = made
-        self.kernels = [self._multiply, self._meet, self._settle, self._scatter if atomic else self._gather]
+        self.kernels = [self._multiply, self._meet, self._settle]
+        self.kernels += [self._scatter] if atomic or self._serial else []
+        self.kernels += [] if atomic else [self._gather]
         self.kernels += [kernel for part in self._mollified for kernel in part.kernels]
         self.fit()
 
@@ -44,12 +48,12 @@ class PairProduct:
         if self._atomic:
             self._sweep(self._scatter, self._most, [self.sets], [out])
         else:
-            self._sweep(self._gather, len(out), [self.sets], [out])
+            self._sweep(self._gather, len(out), [self.sets, self._gathered()], [out])
 
     def settle(self, v, out, x, wanted, fixed: wp.array, busy: wp.array, dots: wp.array) -> None:
-        """The same on free dofs in worlds that are busy, and v . out node by node."""
+        """The same on free dofs in worlds that are busy, and v . out of the nodes to which it adds."""
         self._write(v, x, wanted)
-        self._sweep(self._settle, len(out), [self.sets, self._met, v, fixed, busy], [out, dots])
+        self._sweep(self._settle, len(out), [self.sets, self._gathered(), self._met, v, fixed, busy], [out, dots])
 
     def _write(self, v, x, wanted) -> None:
         given = self._nothing if wanted is None else [wanted, x]
@@ -57,6 +61,13 @@ class PairProduct:
         for part in self._mollified if wanted is not None else ():
             if not part.keeps:
                 part.multiply(v)
+
+    def _gathered(self) -> wp.array:
+        """Sums of nodes, where one thread takes all pairs: it need not look for those of each node."""
+        if self._serial:
+            self._sums.zero_()
+            self._sweep(self._scatter, self._most, [self.sets], [self._sums])
+        return self._sums
 
     def _set(self, part):
         own = set_struct(self._linear)()

@@ -213,7 +213,7 @@ class PairTerms:
         self._product.prepare(x, wanted)
 
     def settle(self, v, out, x, wanted, fixed: wp.array, busy: wp.array, dots: wp.array) -> None:
-        """`product` on free dofs, in worlds that are `busy` (1), of which v . out is written node by node, too; after `meet`.
+        """`product` on free dofs, in worlds that are `busy` (1), of which v . out is written for nodes in pairs, too; after `meet`.
 
         Args:
             fixed: of each node of a world, bits of its held dofs; dots: (worlds, nodes).

@@ -7,7 +7,7 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.matrix.bands import band_kernels, lengthen_kernel
+from ddg_warp.kernels.matrix import bands
 from ddg_warp.kernels.matrix.chain_blocks import layout_type
 from ddg_warp.kernels.matrix.sliced import SETS
 from ddg_warp.kernels.net.places import along_type, place_kernel
@@ -120,9 +120,11 @@ class Chains:
         sets = self.along if self.banded else []
         terms = tuple(net.sets[i].term for i in sets)
         late = tuple(exact_from[i] for i in sets)
-        self._assemble, self._clear, self._product = band_kernels(
+        self._assemble, self._clear, self._product = bands.band_kernels(
             terms, plan.twist, plan.span, real, linear, late, drag, serial, self.split
         )
+        if serial:
+            self._product = bands.walk_kernel(plan.twist, plan.span, linear, self.split)
         self.layout = layout_type()()
         for name in ("places", "chain", "count", "held"):
             setattr(self.layout, name, getattr(self, name))
@@ -140,7 +142,7 @@ class Chains:
         self._walk = None
         if self.split:
             self.longer = arrays.allocate((2, self.longest, self.columns), linear, device)
-            self._lengthen = lengthen_kernel(terms, real, linear)
+            self._lengthen = bands.lengthen_kernel(terms, real, linear)
         if self.exact and serial and not (self.reduction or reuse or self.split):
             self._walk = walk_kernel(terms, plan.twist, plan.span, real, linear, late, drag, self.joints > 0)
 
@@ -198,7 +200,7 @@ class Chains:
         table, net = self.table, self.net
         self._launch(
             self._product,
-            net.worlds * net.blocks,
+            arrays.takers(net.worlds * net.blocks, self.device),
             [matrix, table.columns, table.slices, fixed, p, wanted, net.blocks, table.positions]
             + [self.bands, self.places, self.where, self.count, net.host.nodes],
             [product, dots],
