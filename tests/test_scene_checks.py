@@ -3,6 +3,7 @@ run cannot show is skipped by name."""
 
 import numpy as np
 import pytest
+import warp as wp
 
 import ddg_warp as ddg
 from ddg_warp.run.catalog import load_scene
@@ -103,6 +104,26 @@ def test_numbers_without_a_reference_are_skipped():
     (check,) = run("cantilever", 0.02, n=20)
     assert "50 and 100 nodes" in check.skipped
     assert np.isnan(check.measured) and isinstance(check, ddg.Check)
+
+
+def test_the_precision_of_a_scene_is_that_of_its_models(device):
+    """Unless one is asked for; without either it is what suits the device."""
+    usual = "mixed" if wp.get_device(device).is_cuda else "float64"
+    for own, asked, found in (
+        (None, None, usual),
+        ("float32", None, "float32"),
+        ("mixed", None, "mixed"),
+        ("mixed", "float64", "float64"),
+    ):
+        scene = ddg.Scene(analysis=ddg.Dynamics(precision=own))
+        scene.add_rod(
+            [[0.0, 0.0, 0.1 * i] for i in range(4)],
+            section=ddg.Circle(0.01),
+            material=ddg.Material(young=1e5, density=1e3, poisson=0.5),
+        )
+        assert scene.build(device, asked).precision == found
+    with pytest.raises(ddg.SceneError, match="Dynamics: precision"):
+        ddg.Dynamics(precision="double")
 
 
 def test_the_tolerance_of_a_scene_is_that_of_its_run(device):

@@ -45,7 +45,8 @@ class Model:
     ):
         self.scene = scene
         self.wp_device = _device(device)
-        self.types = choose(precision, self.wp_device)
+        asked = getattr(scene.analysis, "precision", None) if precision is None else precision
+        self.types = choose(asked, self.wp_device)
         self.worlds = worlds
         self.version = 0  # rises with every change of a constant array, so that captured steps are captured anew
         self.chains = compile_chains(scene)

@@ -250,6 +250,7 @@ def defaults(module, study: Study, device: str | None) -> dict:
     usual = {"precision": "mixed" if wp.get_device(device).is_cuda else "float64", "linear": "auto", "solver": "newton"}
     if isinstance(analysis, Dynamics):
         usual |= {name: getattr(analysis, name) for name in ("dt", "duration", "scheme", "rtol")}
+        usual["precision"] = analysis.precision or usual["precision"]
     else:
         usual |= {"solver": "auto", "rtol": StaticsOptions().rtol}
     return {name: {**usual, **known}[name] for name in study.grid}

@@ -136,7 +136,9 @@ def parser(arguments: list[str]) -> Parser:
 def add_settings(command: argparse.ArgumentParser) -> None:
     """Add the flags that say where and how accurately to compute."""
     command.add_argument("--device", help="Warp device, such as cpu or cuda:0 (default: CUDA if there is one)")
-    command.add_argument("--precision", choices=PRECISIONS, help="default: float64 on the CPU, mixed on CUDA")
+    command.add_argument(
+        "--precision", choices=PRECISIONS, help="default: the scene's, else float64 on the CPU, mixed on CUDA"
+    )
 
 
 def run_scene(chosen: argparse.Namespace) -> int:

@@ -117,7 +117,7 @@ def simulate(
     Args:
         scene: What to run.
         device: Warp device; by default CUDA if there is one.
-        precision: "float64", "mixed" or "float32"; by default what suits the device.
+        precision: "float64", "mixed" or "float32"; by default the scene's, else what suits the device.
         worlds: Independent copies.
         out: Directory for trajectory.h5 and scene.usdc; None records nothing.
         dt: Time step [s] instead of the scene's.

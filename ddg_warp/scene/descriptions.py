@@ -22,18 +22,22 @@ class Dynamics:
     """Advance in time: step dt [s] to duration [s] by `scheme` (`implicit_euler` or `implicit_midpoint`).
 
     In each step forces balance to `rtol` of the load of a rod or shell: its weight and what else it is given; see `Integrator`.
+    `precision` ("float64", "mixed" or "float32") is that of its models where `Scene.build` names none; by default what suits the device.
     """
 
     dt: float = 0.01
     duration: float = 1.0
     scheme: str = "implicit_euler"
     rtol: float = 1e-6
+    precision: str | None = None
 
     def __post_init__(self):
         arguments.positive("Dynamics: dt", self.dt, "s")
         arguments.positive("Dynamics: duration", self.duration, "s")
         arguments.positive("Dynamics: rtol", self.rtol)
         arguments.choice("Dynamics: scheme", self.scheme, ("implicit_euler", "implicit_midpoint"))
+        if self.precision is not None:
+            arguments.choice("Dynamics: precision", self.precision, ("float64", "mixed", "float32"))
 
 
 @dataclass(frozen=True)

@@ -310,7 +310,7 @@ class Scene(Structures):
 
         Args:
             device: Warp device, such as "cpu" or "cuda:0"; by default CUDA if there is one.
-            precision: "float64" (default on the CPU), "mixed" (default on CUDA) or "float32".
+            precision: "float64", "mixed" or "float32"; by default that of the analysis, else "mixed" on CUDA and "float64" on the CPU.
             worlds: independent copies that share their time; parameters, states, `Controls` and outcomes are each world's own.
             allow_rounding: step and solve in "float32" also where its rounding decides what comes out; counted as `lost_in_rounding`.
 
