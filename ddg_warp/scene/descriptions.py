@@ -22,7 +22,7 @@ class Dynamics:
     """Advance in time: step dt [s] to duration [s] by `scheme` (`implicit_euler` or `implicit_midpoint`).
 
     In each step forces balance to `rtol` of the load of a rod or shell: its weight and what else it is given; see `Integrator`.
-    `precision` ("float64", "mixed" or "float32") is that of its models where `Scene.build` names none; by default what suits the device.
+    `precision` ("float64", "mixed" or "float32") is that of models that are built without one; by default what suits the device.
     """
 
     dt: float = 0.01

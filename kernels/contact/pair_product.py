@@ -15,6 +15,7 @@ def set_struct(linear):
     """A list of pairs: its factor (see `gather.factor_struct`), what it writes by slot, and the items of nodes.
 
     marks, starts, columns: of pairs whose Hessians are kept, see `pair_terms.mollified_kernels`; empty where there are none.
+    listed (capacity,), number (1,): where one thread takes all, the pairs that are used and how many these are.
     kind: place in `pair_bend.KINDS`, -1 without `bend`; rows: of its factor; things: first things of pairs in one world.
     """
     V, W = wp.types.vector(3, linear), wp.types.vector(SLOTS, linear)
@@ -35,6 +36,8 @@ def set_struct(linear):
         places: wp.array(dtype=int)
         numbers: wp.array(dtype=int)
         items: wp.array(dtype=int)
+        listed: wp.array(dtype=int)
+        number: wp.array(dtype=int)
         kind: int
         rows: int
         things: int
@@ -44,8 +47,8 @@ def set_struct(linear):
 
 @cache
 def product_kernels(real, linear, serial: bool):
-    """multiply(...) the pairs; scatter(...) to nodes or gather(...); settle(...), which does so on free dofs, with dot products, for
-    nodes in pairs, which meet(...) finds.
+    """sift(...) and multiply(...) the pairs; scatter(...) to nodes or gather(...); settle(...), which does so on free dofs, with dot
+    products, for nodes in pairs, which meet(...) finds.
 
     If `serial`, what gather(...) and settle(...) add was scattered to `sums`, in the order in which others gather it.
     """
@@ -53,6 +56,33 @@ def product_kernels(real, linear, serial: bool):
     X, V, Y = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.matrix((4, 3), linear)
     bend = bend_function(linear)
     _, free = product_functions(linear)
+
+    @wp.func
+    def taken(own: PairSet):
+        """How many pairs are gone through."""
+        if wp.static(serial):
+            return own.number[0]
+        else:
+            return own.count[0]
+
+    @wp.func
+    def taken_as(own: PairSet, k: int):
+        """Which pair is the k-th of them."""
+        if wp.static(serial):
+            return own.listed[k]
+        else:
+            return k
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def sift(sets: wp.array(dtype=PairSet)):
+        """Lists those that are used, by one thread: others are in its way, as what comes next is not foreseen among them."""
+        for s in range(sets.shape[0]):
+            own = sets[s]
+            number = int(0)
+            for p in range(own.count[0]):
+                own.listed[number] = p
+                number += wp.where(own.used[p] != 0, 1, 0)
+            own.number[0] = number
 
     @wp.func
     def beside(x: X, y: X):
@@ -85,8 +115,9 @@ def product_kernels(real, linear, serial: bool):
         tid = wp.tid()
         for s in range(sets.shape[0]):
             own = sets[s]
-            if tid < own.count[0]:
-                for p in range(tid, until(tid, own.count[0])):
+            if tid < taken(own):
+                for i in range(tid, until(tid, taken(own))):
+                    p = taken_as(own, i)
                     used = own.used[p]
                     if used != 0:
                         n = own.nodes[p]
@@ -184,8 +215,9 @@ def product_kernels(real, linear, serial: bool):
         tid = wp.tid()
         for s in range(sets.shape[0]):
             own = sets[s]
-            if tid < own.count[0]:
-                for p in range(tid, until(tid, own.count[0])):
+            if tid < taken(own):
+                for i in range(tid, until(tid, taken(own))):
+                    p = taken_as(own, i)
                     if own.used[p] != 0:
                         last = int(-1)
                         for slot in range(wp.static(SLOTS)):
@@ -194,4 +226,4 @@ def product_kernels(real, linear, serial: bool):
                                 wp.atomic_add(out, node, own.parts[slot, p])
                             last = node
 
-    return multiply, gather, meet, settle, scatter
+    return sift, multiply, gather, meet, settle, scatter

@@ -149,10 +149,10 @@ def band_kernels(
 
 
 @cache
-def walk_kernel(twist: bool, span: int, linear, split: bool = False):
+def product_walk_kernel(twist: bool, span: int, linear, split: bool = False):
     """walk(...): the same product by one thread, for the CPU: it reads each block once, and goes on with what its transpose adds."""
     nb = place_dofs(twist, split)
-    H, B, M = wp.types.vector(3, linear), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
+    H, B = wp.types.vector(3, linear), wp.types.vector(nb, linear)
     load, _, _, _ = block_functions(nb, linear)
     times, free = product_functions(linear)
     value = value_function(twist, linear, split)

@@ -19,9 +19,10 @@ class PairProduct:
         self._serial, vector = arrays.serial(self._device), wp.types.vector(3, linear)
         self._sums = wp.zeros(len(parts[0].numbers) if self._serial else 0, dtype=vector, device=self._device)
         made = product_kernels(real, linear, self._serial)
-        self._multiply, self._gather, self._meet, self._settle, self._scatter = made
+        self._sift, self._multiply, self._gather, self._meet, self._settle, self._scatter = made
         self.kernels = [self._multiply, self._meet, self._settle]
         self.kernels += [self._scatter] if atomic or self._serial else []
+        self.kernels += [self._sift] if self._serial else []
         self.kernels += [] if atomic else [self._gather]
         self.kernels += [kernel for part in self._mollified for kernel in part.kernels]
         self.fit()
@@ -35,6 +36,7 @@ class PairProduct:
 
     def meet(self) -> None:
         """Which nodes are in pairs, for `settle`."""
+        self._list()
         self._sweep(self._meet, len(self._met), [self.sets], [self._met])
 
     def prepare(self, x: wp.array, wanted: wp.array) -> None:
@@ -44,6 +46,7 @@ class PairProduct:
 
     def __call__(self, v: wp.array, out: wp.array, x: wp.array | None = None, wanted: wp.array | None = None) -> None:
         """out += H v; with what turns at positions x in the worlds that want it."""
+        self._list()
         self._write(v, x, wanted)
         if self._atomic:
             self._sweep(self._scatter, self._most, [self.sets], [out])
@@ -62,6 +65,11 @@ class PairProduct:
             if not part.keeps:
                 part.multiply(v)
 
+    def _list(self) -> None:
+        """Pairs that are used, where one thread takes them all."""
+        if self._serial:
+            self._sweep(self._sift, 1, [self.sets], [])
+
     def _gathered(self) -> wp.array:
         """Sums of nodes, where one thread takes all pairs: it need not look for those of each node."""
         if self._serial:
@@ -77,6 +85,10 @@ class PairProduct:
             setattr(own, name, getattr(part, name))
         for name in ("marks", "starts", "columns") if part.mollified and part.mollified.keeps else ():
             setattr(own, name, getattr(part.mollified, name))
+        listed = part.found.capacity if self._serial else 0
+        own.listed, own.number = (
+            wp.zeros(size, dtype=int, device=self._device) for size in (listed, int(self._serial))
+        )
         own.kind = KINDS.index(part.found.kind) if isinstance(part, ContactElements) else -1
         own.rows, own.things = part.rows, part.found.first.count
         return own

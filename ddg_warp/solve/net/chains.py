@@ -124,7 +124,7 @@ class Chains:
             terms, plan.twist, plan.span, real, linear, late, drag, serial, self.split
         )
         if serial:
-            self._product = bands.walk_kernel(plan.twist, plan.span, linear, self.split)
+            self._product = bands.product_walk_kernel(plan.twist, plan.span, linear, self.split)
         self.layout = layout_type()()
         for name in ("places", "chain", "count", "held"):
             setattr(self.layout, name, getattr(self, name))
