@@ -152,10 +152,28 @@ def band_kernels(
 def product_walk_kernel(twist: bool, span: int, linear, split: bool = False):
     """walk(...): the same product by one thread, for the CPU: it reads each block once, and goes on with what its transpose adds."""
     nb = place_dofs(twist, split)
-    H, B = wp.types.vector(3, linear), wp.types.vector(nb, linear)
+    H, B, M = wp.types.vector(3, linear), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     load, _, _, _ = block_functions(nb, linear)
     times, free = product_functions(linear)
     value = value_function(twist, linear, split)
+
+    @wp.func
+    def along(m: M, u: B):
+        """Summed in the order of the kernel for many threads, so that both find the same."""
+        y = B()
+        for i in range(wp.static(nb)):
+            for j in range(wp.static(nb)):
+                y[i] = y[i] + m[i, j] * u[j]
+        return y
+
+    @wp.func
+    def back(m: M, u: B):
+        """The same of the transpose."""
+        y = B()
+        for i in range(wp.static(nb)):
+            for j in range(wp.static(nb)):
+                y[i] = y[i] + m[j, i] * u[j]
+        return y
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def walk(
@@ -187,18 +205,22 @@ def product_walk_kernel(twist: bool, span: int, linear, split: bool = False):
                 here, ahead = value(p, places, 0, c, shift), B()
                 if n > 1:
                     ahead = value(p, places, 1, c, shift)
-                carried, carried_too = B(), B()
+                before, before_too, later = B(), B(), B()  # what E and F of places behind add here, and F to the next
                 for k in range(n):
                     beyond = B()
                     if k + 2 < n:
                         beyond = value(p, places, k + 2, c, shift)
                     E = load(bands, wp.static(nb**2), k, r)
-                    u = carried + load(bands, 0, k, r) * here + E * ahead
-                    carried = carried_too + wp.transpose(E) * here
+                    u = along(load(bands, 0, k, r), here)
+                    u += along(E, ahead)
+                    u += before
+                    before = back(E, here)
                     if wp.static(span == 2):
                         F = load(bands, wp.static(2 * nb**2), k, r)
-                        u += F * beyond
-                        carried_too = wp.transpose(F) * here
+                        u += along(F, beyond)
+                        u += before_too
+                        before_too = later
+                        later = back(F, here)
                     here, ahead = ahead, beyond
                     node = places[0, k, c]
                     if node >= 0:
