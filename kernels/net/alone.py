@@ -184,9 +184,13 @@ def world_kernels(real):
         some: wp.array(dtype=int),
         remaining: wp.array(dtype=int),
     ):
-        """Of `some`, whether pairs may come near, nothing is known yet."""
+        """Of `some`, whether pairs may come near, nothing is known yet; where there are several worlds, `any_tried` and `remaining` are
+        zero."""
         w = wp.tid()
         some[0] = 0
+        if told.shape[1] == 1:
+            any_tried[0] = 0
+            remaining[0] = 0
         tried = scalars[PROGRESS, w] < real(1.0) and gap[w] >= reach and overflow[0] == 0
         told[wp.static(TRIED), w] = wp.where(tried, 1, 0)
         told[wp.static(WORST), w] = 0

@@ -329,7 +329,7 @@ def test_boxes_serve_several_searches(device):
             search.update(x)
             if not search.fit(x):
                 break
-        walks.append(int(search._walks.numpy()[0]))
+        walks.append(int(search.walks.numpy()[0]))
         for pairs, (first, second) in zip(search.lists, SIDES, strict=True):
             found = {tuple(pair) for pair in pairs.pairs.numpy()[: pairs.count.numpy()[0]].tolist()}
             assert near(shapes, points, first, second, REACH) <= found

@@ -41,7 +41,7 @@ class BroadPhase:
     Attributes:
         lists: a `PairList` for each kind of pairs that there can be.
         overflow: (1,), not zero once pairs did not fit: `fit` has to follow, and whatever came of the pairs is to be done again.
-        searches: (1,) how many there were.
+        searches: (1,) how many there were; walks: (1,) for how many of them boxes were met.
         gap [m], time and crossed, of each world: see `measure`, `impact` and `crossings`.
         shares: (worlds times units,), limited: of each world, how many of them are below 1; see `filter`.
         every: (worlds,) ones, of motions in which all nodes of every world go by one share.
@@ -85,9 +85,9 @@ class BroadPhase:
         self._placed = wp.array(placed, dtype=wp.uint8, device=self.device)
         self._shift = wp.zeros(worlds, dtype=x.dtype, device=self.device)
         self._never, self.every = (wp.full(worlds, flag, dtype=int, device=self.device) for flag in (0, 1))
-        self.overflow, self.searches, self._lost, self._fits, self._walks = (
-            wp.zeros(1, dtype=int, device=self.device) for _ in range(5)
-        )
+        self.searches, self._fits, self.walks = (wp.zeros(1, dtype=int, device=self.device) for _ in range(3))
+        self._read = wp.zeros(2, dtype=int, device=self.device)  # at once, after every step
+        self.overflow, self._lost = self._read[:1], self._read[1:]
         # of boxes and of pairs, whether they are out of date, and whether the last `update` found them anew
         self._stale, self._done = (wp.zeros(2, dtype=int, device=self.device) for _ in range(2))
         self._edges, self._runs = things[2], None
@@ -166,7 +166,7 @@ class BroadPhase:
         move = self._still if move is None else move
         together = self._never if together is None else together
         self._meet(x, move, together)
-        self._judge(x, move, together)
+        self.judge(x, move, together)
 
     def _renew(self, base: wp.array, q: wp.array, together: wp.array | None) -> None:
         """Search again, among the pairs whose boxes meet where these are wide enough."""
@@ -175,7 +175,7 @@ class BroadPhase:
         def find() -> None:
             self._watch(BOXES, base, q, 0.5 * (WIDE - 1.0) * self.margin)
             wp.capture_if(self._stale[BOXES:PAIRS], lambda: self._meet(base, self._move, together))
-            self._judge(base, self._move, together)
+            self.judge(base, self._move, together)
 
         if self._runs is None:
             find()
@@ -203,10 +203,12 @@ class BroadPhase:
             part.renew()
         for pairs in self.lists:
             pairs.meet()
-        self._mark(BOXES, x, move, together, self._fits, self._walks)
+        self._mark(BOXES, x, move, together, self._fits, self.walks)
 
-    def _judge(self, x: wp.array, move: wp.array, together: wp.array) -> None:
-        """List the pairs that are near."""
+    def judge(self, x: wp.array, move: wp.array | None = None, together: wp.array | None = None) -> None:
+        """As `search`, among pairs whose boxes met; these have to be up to date."""
+        move = self._still if move is None else move
+        together = self._never if together is None else together
         for pairs in self.lists:
             pairs.judge(x, move, together, self.reach, self._around)
         self._mark(PAIRS, x, move, together, self.overflow, self.searches)
@@ -247,9 +249,8 @@ class BroadPhase:
         Raises:
             SolverError: names a node whose position is not finite; or if there are more pairs than can be counted.
         """
-        self.check()
         grown = False
-        while self.overflow.numpy()[0]:
+        while self._checked():
             self.overflow.zero_()
             for pairs in self.lists:
                 pairs.fit()
@@ -264,7 +265,11 @@ class BroadPhase:
         Raises:
             SolverError: names the node and its world.
         """
-        node = int(self._lost.numpy()[0]) - 1
+        self._checked()
+
+    def _checked(self) -> bool:
+        """The same; whether pairs did not fit."""
+        overflow, node = (int(value) for value in self._read.numpy() - [0, 1])
         if node >= 0:
             self._lost.zero_()
             world, node = divmod(node, len(self.shapes.points))
@@ -272,6 +277,7 @@ class BroadPhase:
                 f"node {node} of world {world} has a position or displacement that is not finite; go back to the last good state",
                 outcome="not_finite",
             )
+        return overflow != 0
 
     def measure(self, x: wp.array) -> None:
         """The smallest gap of each world in `gap` [m], at most `reach`. Candidates have to be up to date."""

@@ -69,7 +69,7 @@ class Alone:
         search = step.newton.contact.search
         search.update(before.q)
         search.measure(before.q)
-        for signal in (step.remaining, self._tried):
+        for signal in (step.remaining, self._tried) if self.net.worlds > 1 else ():
             signal.zero_()
         inputs = [search.gap, search.reach, search.overflow, step.islands.arrays[1]]
         self._launch(self._hope, self.net.worlds, inputs, [self._told, self._tried, self._some, step.remaining])

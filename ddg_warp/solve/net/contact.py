@@ -131,11 +131,10 @@ class NetContact:
         own = [*self._kernels, *(self._bands.kernels if self._bands else [])]
         return [*own, *self._sum.kernels, *self.search.kernels, *self.terms.kernels, *self.tally.kernels]
 
-    def begin(self, before: wp.array, renew: bool = True) -> None:
-        """Start a step from positions; `renew`: with the trees of the search anew, where searches do not build their own."""
-        if renew and self.newton.device.is_cuda:
+    def renew(self, before: wp.array) -> None:
+        """Make the trees of the search anew at positions `before`, where searches do not build their own."""
+        if self.newton.device.is_cuda:
             self.search.rebuild(before)
-        self.tally.begin()
 
     def start(self, before: wp.array) -> None:
         """Start an attempt: candidates at positions `before`, and what friction takes from there."""

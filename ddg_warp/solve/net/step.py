@@ -79,11 +79,11 @@ class NetStep(PartStep):
         self.alone, self._groups = None, counts_of and counts_of._groups
 
     def step(self, before, after, renew: bool = True) -> None:
-        """Launch a whole step from one state to another; `renew`: as of `NetContact.begin`."""
-        if self.newton.contact:
-            for kept, array in zip(self._kept, self._counts, strict=True):
-                wp.copy(kept, array)
-            self.newton.contact.begin(before.q, renew)
+        """Launch a whole step from one state to another; `renew`: with the trees of searches for contact made anew."""
+        if self.newton.contact and renew:
+            self.newton.contact.renew(before.q)
+        if self.alone is None or self.net.worlds > 1:
+            self._keep()
         if self.alone is None:
             super().step(before, after)
             return
@@ -91,9 +91,19 @@ class NetStep(PartStep):
         self.alone.step(before, after)
         wp.capture_if(self.remaining, lambda: self._go_on(before, after))
 
+    def _keep(self) -> None:
+        """Remember what is counted before a step that may have to be done again."""
+        if not self.newton.contact:
+            return
+        for kept, array in zip(self._kept, self._counts, strict=True):
+            wp.copy(kept, array)
+        self.newton.contact.tally.begin()
+
     def _go_on(self, before, after) -> None:
         """Step the worlds that are left to the net; those that are done rest as they are."""
-        if self.net.worlds > 1:
+        if self.net.worlds == 1:  # of which nothing was counted yet
+            self._keep()
+        else:
             self.integrator._worlds.take_part(self.alone.left, before, after, self.net.worlds)
             wp.copy(self.newton.q, after.q)
             before = after
