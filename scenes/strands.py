@@ -18,7 +18,7 @@ GROOM = Path(__file__).resolve().parent / "data" / "strands.usdc"
 PERIOD = 1.0  # s, of the head's motion
 REST = 2.0  # s; the head has come to rest by then
 TURN = 0.9  # rad
-CROWD = 512  # strands, from which on they are thinner where they touch, so that they fill as much of the room
+CROWD = 512  # strands, from which on they are thinner where they touch, so that with their range they fill as much of the room
 RTOL = {False: 1e-6, True: 3e-2}  # of a strand's weight, to which forces balance in a step; see `noodles`
 # on the CPU float64 matrices take a sixth more time in contact; by them states differ by 1e-5 m at 0.5 s, by halved steps by 9e-3 m
 PRECISION = {False: None, True: "mixed"}
@@ -28,6 +28,7 @@ REFUSED = 100  # pairs: a strand that swings about its root moves along an arc
 BORNE = 3.0  # weights of a strand that push surfaces to some part of the range of contact, so that flying ones stop
 HELD = 2  # nodes of each strand that its root holds
 CLEAR = 0.3  # of the radius, at least between strands that touch at the start
+HAIR = 4e-5  # m, radius of a hair, the least that strands in a crowd have where they touch
 
 
 def build(
@@ -52,8 +53,9 @@ def build(
     thin = radius * min(1.0, np.sqrt(CROWD / count))
     # strands jittered out of these shapes would stretch by tens of times what weight and motion do
     points[:, HELD:] += 0.2 * thin * _touching.jitter(points[:, HELD:].shape, seed)
+    apart = 2.0 * thin * (1.0 + CLEAR)  # of the middles of strands at the start
     if contact:
-        points = _layouts.pushed_apart(points, 2.0 * thin * (1.0 + CLEAR), held=HELD)
+        points = _layouts.pushed_apart(points, apart, held=HELD)
     scene = ddg.Scene(
         mass_damping=0.4,  # 1/s, drag of the air
         analysis=ddg.Dynamics(dt=1.0 / STEPS[contact], duration=REST, rtol=RTOL[contact], precision=PRECISION[contact]),
@@ -70,8 +72,15 @@ def build(
     if contact:
         center, size = _strands.ball(points[:, 0])
         weight = scene.batches[0].section.mass_per_length * _strands.edge_lengths(points[0]).sum() * _strands.GRAVITY
+        # a range of contact that steps resolve: what room there is between thinner strands is that rather than their thickness
+        touched = max(HAIR, 0.5 * apart - CLEAR * radius)
+        reach = 0.5 * (apart - 2.0 * touched) / CLEAR
         scene.contact(
-            range=thin, stiffness=BORNE * weight / thin, friction=FRICTION, velocity=SLIP, radius={"strands": thin}
+            range=reach,
+            stiffness=BORNE * weight / reach,
+            friction=FRICTION,
+            velocity=SLIP,
+            radius={"strands": touched},
         )
         scene.add_obstacle(ddg.Sphere(tuple(center), _strands.HEAD * size), motion=motion, name="head")
     return scene
