@@ -35,9 +35,9 @@ CASES = {  # scene, its arguments, step [s], duration [s], whether something dri
         True,
     ),
     "rod_pile_1000": ("rod_pile", {"count": 1_000}, 1 / 480, 0.5, False),
-    "rod_pile_10000": ("rod_pile", {"count": 10_000}, 1 / 480, 0.5, False),
+    "rod_pile_10000": ("rod_pile", {"count": 10_000}, 1 / 960, 0.5, False),
     "hair_512": ("strands", {"count": 512, "contact": True}, 1 / 480, 1.0, True),
-    "hair_10000": ("strands", {"count": 10_000, "contact": True}, 1 / 480, 1.0, True),
+    "hair_10000": ("strands", {"count": 10_000, "contact": True}, 1 / 960, 1.0, True),
 }
 APART, NODES = (100, 1_000, 10_000), 50  # rods of so many nodes that do not touch
 WARM, TIMED, TURN = 5, 40, 5  # steps: before time counts, that are timed, and with contact and without in turn
