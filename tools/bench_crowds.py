@@ -2,13 +2,15 @@
 
     python tools/bench_crowds.py --device cuda:0 [--only noodles ...] [--limit SECONDS] [--out DIR]
 
-Prints a table; writes crowds_DEVICE.csv and .json, and crowds_apart_DEVICE. Each case runs to its end or for `limit` seconds of wall
-time; a row is a sixth of that, from start to the time `until`: seconds of wall time for each simulated one, means a step of solves
-(more than one where steps were taken in parts), of Newton and of conjugate gradient iterations and of searches, pairs in contact and
-the smallest gap over the range so far. `refused` are pairs that would have passed through each other in parts of steps that were not
-taken. What is said of errors: `rtol`, to which forces balance, over the weight of a rod; `gained`, the energy that was created over
-what was lost so far, of the scenes that nothing drives. `search_share` is what searches take of the wall time, from one that is timed
-after them. Of scenes in which nothing touches, the ratio of a step with contact to one without.
+Prints a table; writes crowds_DEVICE.csv and .json, crowds_apart_DEVICE, and crowds_tolerance_DEVICE. Each case runs to its end or
+for `limit` seconds of wall time; a row is a sixth of that, from start to the time `until`: seconds of wall time for each simulated
+one, means a step of solves (more than one where steps were taken in parts), of Newton and of conjugate gradient iterations and of
+searches, pairs in contact and the smallest gap over the range so far. `refused` are pairs that would have passed through each other
+in parts of steps that were not taken. What is said of errors: `rtol`, to which forces balance, over the weight of a rod; `gained`,
+the energy that was created over what was lost so far, of the scenes that nothing drives. `search_share` is what searches take of
+the wall time, from one that is timed after them. Of scenes in which nothing touches, the ratio of a step with contact to one
+without. Of tolerances, for noodles that land, how far nodes are from where the tightest one has them, and where steps half as long
+have them.
 """
 
 import argparse
@@ -39,6 +41,12 @@ CASES = {  # scene, its arguments, step [s], duration [s], whether something dri
     "hair_512": ("strands", {"count": 512, "contact": True}, 1 / 480, 1.0, True),
     "hair_10000": ("strands", {"count": 10_000, "contact": True}, 1 / 960, 1.0, True),
 }
+TOLERANCES = (1e-6, 1e-3, 1e-2, 3e-2, 1e-1)
+LANDING = (
+    {"count": 49, "nodes": 241, "bowl": 0.45},
+    420,
+    40,
+)  # noodles, steps of 1/960 s until they land, and that are compared
 APART, NODES = (100, 1_000, 10_000), 50  # rods of so many nodes that do not touch
 WARM, TIMED, TURN = 5, 40, 5  # steps: before time counts, that are timed, and with contact and without in turn
 
@@ -128,7 +136,12 @@ def _least(search, launch) -> float:
     return min(times)
 
 
-def apart(rods: int, device) -> dict:
+def apart(device) -> list[dict]:
+    """Steps of rods that do not touch."""
+    return [_apart(rods, device) for rods in APART]
+
+
+def _apart(rods: int, device) -> dict:
     """A step of rods that do not touch, with contact and without, in turn, so that what else a machine does slows both."""
     models = [_lattice(rods, touching).build(device) for touching in (False, True)]
     integrators, states = (
@@ -178,11 +191,49 @@ def _lattice(rods: int, touching: bool) -> ddg.Scene:
     return scene
 
 
+def tolerances(device) -> list[dict]:
+    """What the tolerance of steps costs and does to noodles that land, and what their length does."""
+    given, before, count = LANDING
+    scene = import_module("ddg_warp.scenes.noodles").build(**given)
+    model = scene.build(device)
+    start, dt = scene.initial(model), 1 / 960
+    integrator = ddg.Integrator(model, rtol=RTOL)
+    for _ in range(before):
+        start = integrator.step(start, dt)
+    rows, points = [], None
+    for rtol, parts in [*((rtol, 1) for rtol in TOLERANCES), (TOLERANCES[0], 2)]:
+        integrator, state = ddg.Integrator(model, rtol=rtol), start
+        wp.synchronize_device(device)
+        began = time.perf_counter()
+        for _ in range(count * parts):
+            state = integrator.step(state, dt / parts)
+        wp.synchronize_device(device)
+        wall, found = time.perf_counter() - began, integrator.statistics()
+        points = state.points() if points is None else points
+        off = np.linalg.norm(state.points() - points, axis=1)
+        rows.append(
+            {
+                "rtol": rtol,
+                "dt": dt / parts,
+                "wall": wall,
+                "newton": _newton(found) / (count * parts),
+                "cg": found["pcg_iterations"] / (count * parts),
+                "off_median": float(np.median(off)),
+                "off_99": float(np.percentile(off, 99)),
+                "off_largest": float(off.max()),
+            }
+        )
+    return rows
+
+
+OTHERS = {"apart": apart, "tolerance": tolerances}
+
+
 def main() -> int:
     """Run what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", help="Warp device (default: CUDA if there is one)")
-    parser.add_argument("--only", nargs="+", choices=[*CASES, "apart"], default=[*CASES, "apart"])
+    parser.add_argument("--only", nargs="+", choices=[*CASES, *OTHERS], default=[*CASES, *OTHERS])
     parser.add_argument("--limit", type=float, default=60.0, help="seconds of wall time of a case")
     parser.add_argument("--commit", default="", help="commit, where there is no git checkout")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
@@ -192,14 +243,14 @@ def main() -> int:
     command = " ".join(["python", "tools/bench_crowds.py", *sys.argv[1:]])
     about = {"command": command, "device": str(device), "machine": machine(chosen.commit)}
     rows = []
-    for name in (name for name in chosen.only if name != "apart"):
+    for name in (name for name in chosen.only if name in CASES):
         rows += run(name, device, chosen.limit)
         write_table(chosen.out / f"crowds_{own}", rows, about)
     if rows:
         print(table(rows))
-    if "apart" in chosen.only:
-        rows = [apart(rods, device) for rods in APART]
-        write_table(chosen.out / f"crowds_apart_{own}", rows, about)
+    for name in (name for name in chosen.only if name in OTHERS):
+        rows = OTHERS[name](device)
+        write_table(chosen.out / f"crowds_{name}_{own}", rows, about)
         print(table(rows))
     return 0
 

@@ -28,9 +28,61 @@ from ddg_warp.kernels.matrix.block_band import (
     substitute_all_function,
     substitute_function,
 )
-from ddg_warp.kernels.matrix.chain_places import place_dofs, place_functions
+from ddg_warp.kernels.matrix.chain_places import place_dofs, place_functions, value_function
 from ddg_warp.kernels.solve.joints import coupling_functions
-from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
+from ddg_warp.kernels.threads import CPU_OPTIONS, first_of, until_function
+
+
+@cache
+def walk_places_kernel(twist: bool, span: int, linear, split: bool = False):
+    """solve(...) of chains without joints by a thread each, for the CPU, which has one: load, solve and finish of `chain_kernels`."""
+    nb = place_dofs(twist, split)
+    H = wp.types.vector(3, linear)
+    _, _, vector, put = block_functions(nb, linear)
+    substitute = substitute_function(nb, span, linear, tensions=int(split))
+    free_of, _ = place_functions(twist, linear, split)
+    value = value_function(twist, linear, split)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def solve(
+        factors: wp.array3d(dtype=linear),
+        residual: wp.array(dtype=H),
+        places: wp.array3d(dtype=int),
+        held: wp.array2d(dtype=wp.uint8),
+        count: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        values: wp.array3d(dtype=linear),
+        z: wp.array(dtype=H),
+        dots_out: wp.array2d(dtype=linear),
+    ):
+        r = wp.tid()
+        w = r / count.shape[0]
+        c = r - w * count.shape[0]
+        if wanted[w] != 1:
+            return
+        n, first = count[c], first_of(w, blocks)
+        for k in range(n):
+            u = value(residual, places, k, c, first)
+            if held[k, c] != wp.uint8(0):
+                u = wp.cw_mul(u, free_of(held[k, c]))
+            put(values, 0, k, r, u)
+        _product = substitute(factors, values, values, n, r, r)
+        for k in range(n):
+            u = vector(values, 0, k, r)
+            node = places[0, k, c]
+            if node >= 0:
+                y = H(u[0], u[1], u[2])
+                z[node + first] = y
+                dots_out[w, node] = wp.dot(residual[node + first], y)
+            if wp.static(twist):
+                angle = places[1, k, c]
+                if angle >= 0:
+                    y = H(u[3], linear(0.0), linear(0.0))
+                    z[angle + first] = y
+                    dots_out[w, angle] = wp.dot(residual[angle + first], y)
+
+    return solve
 
 
 @cache

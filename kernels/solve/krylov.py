@@ -212,6 +212,7 @@ def solver_kernels(linear, indefinite: bool = False):
         p: wp.array(dtype=H),
         product: wp.array(dtype=H),
         inverse: wp.array(dtype=M),
+        diagonal: wp.array(dtype=int),
         rho: wp.array(dtype=linear),
         curvature: wp.array(dtype=linear),
         iterations: wp.array(dtype=int),
@@ -239,9 +240,10 @@ def solver_kernels(linear, indefinite: bool = False):
         solution[i] = solution[i] + alpha * p[i]
         r = residual[i] - alpha * product[i]
         residual[i] = r
-        z = inverse[i] * r
-        z_out[i] = z
-        dots_out[w, k] = wp.dot(r, z)
+        if diagonal[k] >= 0:  # chains see to the others
+            z = inverse[i] * r
+            z_out[i] = z
+            dots_out[w, k] = wp.dot(r, z)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def turn(

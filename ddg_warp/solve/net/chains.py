@@ -139,7 +139,9 @@ class Chains:
         made = elimination.chain_kernels(plan.twist, plan.span, linear, plan.size, serial, self.split)
         self._factorise, self._load, self._solve, self._solve_all, self._follow, self._finish, *self._columns = made
         self._measure, self._meet = joints.joint_kernels(linear) if self.joints else (None, None)
-        self._walk = None
+        self._walk = self._walk_places = None
+        if serial and not (self.joints or self.reduction):
+            self._walk_places = elimination.walk_places_kernel(plan.twist, plan.span, linear, self.split)
         if self.split:
             self.longer = arrays.allocate((2, self.longest, self.columns), linear, device)
             self._lengthen = bands.lengthen_kernel(terms, real, linear)
@@ -150,8 +152,11 @@ class Chains:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         own = [self._walk] if self._walk else [self._assemble]
-        own += [self._load] if self.coupled or not self._walk else []
-        own += [self._finish] if self.joints or not self._walk else []
+        if self._walk_places:
+            own += [] if self._walk else [(self._walk_places, SERIAL)]
+        else:
+            own += [self._load] if self.coupled or not self._walk else []
+            own += [self._finish] if self.joints or not self._walk else []
         if self.reduction:
             own += [*self._columns, *self.reduction.kernels]
             own += [self.reduction.again_kernel_at_places(self.plan.twist)] if self._at_places else []
@@ -241,6 +246,10 @@ class Chains:
 
     def apply(self, matrix, residual, wanted, z: wp.array, dots: wp.array) -> None:
         """z of the blocks of rods and joints from the residual, where block Jacobi has left its own, and r . z block by block."""
+        if self._walk_places:
+            inputs = [self.factors, residual, self.places, self.held, self.count, wanted, self.net.blocks]
+            self._launch(self._walk_places, self.columns, inputs, [self.values, z, dots], SERIAL)
+            return
         if self._at_places and self._reduced:
             given = residual, self.places, self.held, self.count, wanted, self.net.blocks
             self.reduction.again_at_places(self.plan.twist, *given, z, dots)

@@ -101,7 +101,8 @@ class ConjugateGradients:
         self.sum(dots, self.curvature)
         self._launch(
             advance,
-            [self.p, self.product, self.inverse, self.rho, self.curvature, newton.iterations, wanted, blocks],
+            [self.p, self.product, self.inverse, newton.system.diagonal, self.rho, self.curvature]
+            + [newton.iterations, wanted, blocks],
             [newton.direction, self.rest, self.z, dots, self.busy],
         )
         self.precondition(self.z)
