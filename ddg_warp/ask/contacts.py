@@ -9,7 +9,7 @@ from ddg_warp.threads import launches
 
 @launches
 def contacts(model, state) -> Contacts:
-    """What touches what at a state, `Contacts`: all pairs closer than the range of contact.
+    """What touches what at a state, `Contacts`: all pairs closer than the range of contact, and what rubs by its velocities.
 
     Raises:
         SceneError: the scene has no contact.
@@ -18,6 +18,8 @@ def contacts(model, state) -> Contacts:
     if touch is None:
         raise SceneError("contacts: this scene has no contact; add scene.contact()")
     touch.at(state.net.q)
+    if touch.terms.frictions:
+        touch.rub(state.net.q, state.net.v)
     found = touch.pairs(state.net.q)
     owners = {size: touch.shapes.things(size)[2] for size in touch.shapes.sizes}
     objects = np.zeros((len(found["gap"]), 2), int)
@@ -33,4 +35,5 @@ def contacts(model, state) -> Contacts:
         found["point"][near].astype(float),
         found["gap"][near].astype(float),
         found["force"][near].astype(float),
+        found["friction"][near].astype(float),
     )

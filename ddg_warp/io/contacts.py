@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-FIELDS = {"world": (), "objects": (2,), "point": (3,), "gap": (), "force": (3,)}  # of each pair, and their shapes
+# of each pair, and their shapes
+FIELDS = {"world": (), "objects": (2,), "point": (3,), "gap": (), "force": (3,), "friction": (3,)}
 LEAST, MOST = 1e-3, 10.0  # of the typical force, shares that are told apart
 WHOLE = ("world", "objects")  # those that are whole numbers
 
@@ -20,6 +21,8 @@ class Contacts:
         names: of rods, shells and obstacles that may touch, such as "rod 3".
         point: between the closest points (n, 3) [m]; gap: (n,) [m].
         force: of contact, without friction, on the first object (n, 3) [N]; the second has its opposite.
+        friction: on the first object (n, 3) [N], by the velocities of the state and its forces of contact; a step takes those forces
+            as they were at its start. Nothing rubs in a state at rest.
     """
 
     world: np.ndarray
@@ -28,6 +31,7 @@ class Contacts:
     point: np.ndarray
     gap: np.ndarray
     force: np.ndarray
+    friction: np.ndarray
 
     def __len__(self) -> int:
         return len(self.gap)

@@ -4,7 +4,7 @@
                   series/NAME (F,); with several worlds (F, B, P, 3) and (F, B, E, 3);
                   at_points/NAME (F, B P) and at_cells/NAME (F, B (R + T)), the rods of all worlds, which have none, then
                   their triangles: fields if wanted, of all worlds; obstacle_points (F, M, 3) or (F, B, M, 3) [m], nodes of
-                  obstacles that something moves; contacts/{world, objects, point, gap, force} (n, ...), pairs of all frames
+                  obstacles that something moves; contacts/{world, objects, point, gap, force, friction} (n, ...), pairs of all frames
                   one after the other if wanted, those of frame f up to contacts/ends[f]
     /model        curves/{counts, closed, radius, names, batch}, surfaces/{triangles, first, names, thickness} if there are
                   any, obstacles/{...}, see `Obstacles`, touching/{names, size, force}, see `Touching`, parameters/NAME,

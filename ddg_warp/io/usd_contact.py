@@ -59,20 +59,23 @@ class ContactsPrim(PointsPrim):
         prim = UsdGeom.Points.Define(stage, path)
         super().__init__(prim, np.zeros(0, int), np.array(CONTACT), None)
         prim.SetWidthsInterpolation(UsdGeom.Tokens.vertex)
-        names = (("force", Sdf.ValueTypeNames.Vector3fArray), ("gap", Sdf.ValueTypeNames.FloatArray))
-        self._values = [self._primvars.CreatePrimvar(name, kind, UsdGeom.Tokens.vertex) for name, kind in names]
+        kinds = {name: Sdf.ValueTypeNames.Vector3fArray for name in ("force", "friction")}
+        kinds |= {"gap": Sdf.ValueTypeNames.FloatArray}
+        vertex = UsdGeom.Tokens.vertex
+        self._values = [self._primvars.CreatePrimvar(name, kind, vertex) for name, kind in kinds.items()]
 
     def write(self, code: Usd.TimeCode, frame: Frame) -> None:
         found = frame.contacts
         points, widths = vectors(found.point), floats(self._touching.widths(found.force))
         prim = UsdGeom.Points(self._prim)
         extent = UsdGeom.Points.ComputeExtent(points, widths) if len(found) else vectors(np.zeros((2, 3)))
-        force, gap = self._values
+        force, friction, gap = self._values
         for attribute, value in (
             (prim.GetPointsAttr(), points),
             (prim.GetWidthsAttr(), widths),
             (prim.GetExtentAttr(), extent),
             (force.GetAttr(), vectors(found.force)),
+            (friction.GetAttr(), vectors(found.friction)),
             (gap.GetAttr(), floats(found.gap)),
         ):
             self._sample(attribute, value, code)

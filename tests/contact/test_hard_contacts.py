@@ -263,3 +263,37 @@ def test_a_rod_on_a_grating_of_sixty(device):
     assert carried.sum() == pytest.approx(WEIGHT * length + (edges + 1) * pressed, rel=2e-3)
     np.testing.assert_allclose(carried[20:40], WEIGHT * pitch + 2.0 * pressed, rtol=1e-4)
     assert integrator.statistics()["contact"]["smallest_gap"] > 0.0
+
+
+@pytest.mark.parametrize("speed", [0.0, 1e-3, 1.0])
+def test_what_rubs_is_told_by_the_velocities_of_a_state(device, speed):
+    """A rod on a floor in two ranges' reach that moves askew: mu N (2 / (1 + exp(-15 v / nu)) - 1) against it, with 30 degrees to x."""
+    velocity, way = 5e-3, np.array([np.cos(np.pi / 6.0), 0.5, 0.0])
+    scene = ddg.Scene()
+    points = line(0.1, 10, middle=(0.0, 0.0, RADIUS + 0.5 * RANGE))
+    rod(scene, points)
+    scene.add_obstacle(ddg.Plane((0.0, 0.0, 0.0)), name="floor")
+    scene.contact(range=RANGE, friction=MU, velocity=velocity)
+    model = scene.build(device=device)
+    found = model.contacts(model.state(velocities=np.tile(speed * way, (11, 1))))
+    on_rod = forces_on(found, 0)
+    assert (on_rod[:, 2] > 0.0).all() and len(found) == 11
+    sign = (found.objects == 0).astype(float) @ [1.0, -1.0]
+    share = 2.0 / (1.0 + np.exp(-15.0 * speed / velocity)) - 1.0
+    expected = -MU * share * on_rod[:, 2:] * way
+    np.testing.assert_allclose(sign[:, None] * found.friction, expected, rtol=1e-6, atol=1e-12)
+
+
+def test_friction_that_is_told_is_what_slows_a_rod(device):
+    """A rod that slides on a floor, settled on it: over a step of small length its momentum changes by friction alone."""
+    scene = ddg.Scene()
+    rod(scene, line(0.1, 10, middle=(0.0, 0.0, RADIUS + 0.6 * RANGE)))
+    scene.add_obstacle(ddg.Plane((0.0, 0.0, 0.0)), name="floor")
+    scene.contact(range=RANGE, friction=MU)
+    model, _, states = run(scene, device, 400, 1e-3, velocities=np.tile([2.0, 0.0, 0.0], (11, 1)), rtol=1e-8)
+    mass = WEIGHT * 0.1 / 9.81
+    found = model.contacts(states[-1])
+    sign = (found.objects == 0).astype(float) @ [1.0, -1.0]
+    slowed = mass * (states[-1].velocities()[:, 0].mean() - states[-2].velocities()[:, 0].mean()) / 1e-3
+    assert (sign * found.friction[:, 0]).sum() == pytest.approx(slowed, rel=0.02)
+    assert slowed == pytest.approx(-MU * mass * 9.81, rel=0.02)

@@ -102,7 +102,7 @@ def test_recorded_obstacles_and_contacts_read_back(device, tmp_path, worlds):
         for frame, state in enumerate(states):
             np.testing.assert_array_equal(reader.obstacle_points[frame], state.obstacle_points())
             found, expected = reader.contacts[frame], model.contacts(state)
-            for name in ("world", "objects", "point", "gap", "force"):
+            for name in ("world", "objects", "point", "gap", "force", "friction"):
                 np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
             assert found.names == expected.names
         assert len(reader.contacts[-1]) >= 9 * worlds

@@ -68,6 +68,12 @@ class Touch:
         self.terms.fit()
         self.terms.evaluate(x)
 
+    def rub(self, x: wp.array, v: wp.array) -> None:
+        """After `at`, friction at blocks x as of surfaces that move by v. Not in a capture."""
+        start = wp.array(x.numpy() - v.numpy(), dtype=x.dtype, device=x.device)  # slips of a second, whose rate is one
+        self.terms.lag(x)
+        self.terms.evaluate(x, wp.full(self.net.worlds, 1.0, dtype=self.net.real, device=x.device), start)
+
     def find(self, x: wp.array) -> None:
         """Candidates at blocks x, all of them; `at` has to follow before energies are asked for. Not in a capture; raises as `at`."""
         self.search.rebuild(x)
@@ -75,17 +81,24 @@ class Touch:
         self.search.fit(x)
 
     def pairs(self, x: wp.array) -> dict[str, np.ndarray]:
-        """Candidates at blocks x, after `at`.
+        """Candidates at blocks x, after `at`, and `rub` where friction is asked for.
 
         Returns:
             world: (n,); sizes, things: numbers of nodes of both (see `Shapes.things`), and what number they have in a world (n, 2).
-            gap: (n,) [m]; point: between the closest points (n, 3) [m]; force: on the first of both (n, 3) [N].
+            gap: (n,) [m]; point: between the closest points (n, 3) [m]; force, friction: on the first of both (n, 3) [N].
         """
-        found = [self._pairs(*each, x) for each in zip(self.search.lists, self.terms.lists, strict=True)]
+        rubs = self.terms.frictions or [None] * len(self.terms.lists)
+        found = [self._pairs(*each, x) for each in zip(self.search.lists, self.terms.lists, rubs, strict=True)]
         return {name: np.concatenate([own[name] for own in found]) for name in found[0]}
 
-    def _pairs(self, pairs, terms, x: wp.array) -> dict[str, np.ndarray]:
+    def _pairs(self, pairs, terms, rubs, x: wp.array) -> dict[str, np.ndarray]:
         count = int(pairs.count.numpy()[0])
+        friction = np.zeros((count, 3))
+        if (
+            rubs and count and int(rubs.count.numpy()[0]) == count
+        ):  # lists of friction are those of contact when it was lagged
+            used = np.flatnonzero(rubs.factor.used.numpy()[:count])
+            friction[used] = -rubs.gradient.numpy()[: pairs.kind.first, used].sum(0)
         gap = wp.zeros(count, dtype=self.net.real, device=x.device)
         point, force = (wp.zeros(count, dtype=x.dtype, device=x.device) for _ in range(2))
         if count:
@@ -100,6 +113,7 @@ class Touch:
             "gap": gap.numpy(),
             "point": point.numpy().reshape(-1, 3),
             "force": force.numpy().reshape(-1, 3),
+            "friction": friction,
         }
 
     def closest(self, x: wp.array) -> tuple[float, str]:
