@@ -46,7 +46,7 @@ def energies(model, state) -> dict:
 def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     """Force and moment of every support of the scene: of rods in the order they were added, then of shells, rings and obstacles.
 
-    What holds an obstacle takes what is pushed against it, without friction, which `contacts` tells of each pair.
+    What holds an obstacle takes what is pushed against it and what rubs on it, by the velocities of the state; see `contacts`.
     They balance the internal forces, without those of strain-rate damping, and the loads on held dofs, and hold the normals of
     clamped mesh edges and of planes of symmetry; the inertia of a held node itself is left out, and drag on it, which a moving
     support would have to add. Of a ring, x is the radial force summed around it, and moments do not hold the direction of the
@@ -58,7 +58,11 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     """
     tangent = Tangent(model)
     q = tangent.dofs(state)
-    force = tangent.back(np.where(tangent.free, 0.0, tangent.gradient(state) - tangent.loads(factor, q)))
+    gradient = tangent.gradient(state)
+    if model.touch and model.touch.terms.frictions:
+        rubbing = model.touch.friction(state.net.q, state.net.v)
+        Tangent.of(tangent.parts[-1], gradient)[:] -= rubbing.ravel()
+    force = tangent.back(np.where(tangent.free, 0.0, gradient - tangent.loads(factor, q)))
     q = tangent.back(q)
     scene = model.scene
     first, shells = len(scene.supports), len(scene.shell_supports)

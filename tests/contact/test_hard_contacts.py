@@ -297,3 +297,6 @@ def test_friction_that_is_told_is_what_slows_a_rod(device):
     slowed = mass * (states[-1].velocities()[:, 0].mean() - states[-2].velocities()[:, 0].mean()) / 1e-3
     assert (sign * found.friction[:, 0]).sum() == pytest.approx(slowed, rel=0.02)
     assert slowed == pytest.approx(-MU * mass * 9.81, rel=0.02)
+    floor = model.reactions(states[-1])[-1].force  # which holds what rests and rubs on it
+    np.testing.assert_allclose(floor, (found.force + found.friction).T @ sign, rtol=1e-9, atol=1e-12)
+    assert floor[0] < 0.0 < floor[2]

@@ -26,8 +26,8 @@ def _hits(kind, variant, velocities, gravity: float, motion=None, controls=None)
         close(pushed[:, 2], force[:, 2], rtol=1e-6, atol=1e-6 * mass.sum(), what="the floor carries what it stops")
         found = model.contacts(state)
         summed = np.zeros((variant.worlds, 3))
-        np.add.at(summed, found.world, found.force)  # floors come last: the first of each pair is pushed
-        close(summed, pushed, rtol=1e-9, atol=1e-12, what="contacts are what the floor pushes")
+        np.add.at(summed, found.world, found.force + found.friction)  # floors come last: the first is pushed
+        close(summed, pushed, rtol=1e-9, atol=1e-12, what="contacts are what the floor does")
         assert (found.gap > 0.0).all()
         energy = variant.each(model.energies(state)["contact"])
         assert ((energy > 0.0) == (pushed[:, 2] > 0.0)).all()

@@ -74,6 +74,13 @@ class Touch:
         self.terms.lag(x)
         self.terms.evaluate(x, wp.full(self.net.worlds, 1.0, dtype=self.net.real, device=x.device), start)
 
+    def friction(self, x: wp.array, v: wp.array) -> np.ndarray:
+        """Forces of friction on blocks (W N, 3) [N] that are at x and move by v. Not in a capture; raises as `at`."""
+        self.at(x)
+        pushed = self.terms.forces.numpy().astype(float)
+        self.rub(x, v)
+        return self.terms.forces.numpy() - pushed
+
     def find(self, x: wp.array) -> None:
         """Candidates at blocks x, all of them; `at` has to follow before energies are asked for. Not in a capture; raises as `at`."""
         self.search.rebuild(x)
