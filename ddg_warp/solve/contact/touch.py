@@ -87,23 +87,24 @@ class Touch:
         self.search.search(x)
         self.search.fit(x)
 
-    def pairs(self, x: wp.array) -> dict[str, np.ndarray]:
-        """Candidates at blocks x, after `at`, and `rub` where friction is asked for.
+    def pairs(self, x: wp.array, v: wp.array | None = None) -> dict[str, np.ndarray]:
+        """Candidates at blocks x, after `at`; with friction as of surfaces that move by v, if given.
 
         Returns:
             world: (n,); sizes, things: numbers of nodes of both (see `Shapes.things`), and what number they have in a world (n, 2).
             gap: (n,) [m]; point: between the closest points (n, 3) [m]; force, friction: on the first of both (n, 3) [N].
         """
-        rubs = self.terms.frictions or [None] * len(self.terms.lists)
+        rubs = [None] * len(self.terms.lists)
+        if v is not None and self.terms.frictions:
+            self.rub(x, v)
+            rubs = self.terms.frictions
         found = [self._pairs(*each, x) for each in zip(self.search.lists, self.terms.lists, rubs, strict=True)]
         return {name: np.concatenate([own[name] for own in found]) for name in found[0]}
 
     def _pairs(self, pairs, terms, rubs, x: wp.array) -> dict[str, np.ndarray]:
         count = int(pairs.count.numpy()[0])
         friction = np.zeros((count, 3))
-        if (
-            rubs and count and int(rubs.count.numpy()[0]) == count
-        ):  # lists of friction are those of contact when it was lagged
+        if rubs:  # whose pairs are those of contact, in their order
             used = np.flatnonzero(rubs.factor.used.numpy()[:count])
             friction[used] = -rubs.gradient.numpy()[: pairs.kind.first, used].sum(0)
         gap = wp.zeros(count, dtype=self.net.real, device=x.device)
