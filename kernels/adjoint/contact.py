@@ -34,7 +34,7 @@ def pull_kernel(kind: Kind, density: Density, real, serial: bool):
     """pull(...): what pairs bring by slot, and by their numbers (`NUMBERS`, capacity), zero of pairs that push nothing."""
     Law, Sides = law_struct(real), sides_struct(real)
     V, until = wp.types.vector(3, real), until_function(serial)
-    _, _, along = pair_energy_functions(kind, density, real)
+    *_, along = pair_energy_functions(kind, density, real)
     given, corners = read_functions(kind, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -78,7 +78,7 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, serial: bo
     X, W, P = shape_types(real)
     V, E = wp.types.vector(3, real), wp.types.vector(2, real)
     D, until = wp.types.vector(friction.parameter_size(2), real), until_function(serial)
-    evaluate, _, _ = pair_energy_functions(kind, density, real)
+    _, _, evaluate, _ = pair_energy_functions(kind, density, real)
     given, corners = read_functions(kind, real)
     tangents, groups, along_rod = basis(real), groups_function(real), directed_basis(real)
     slope_of = friction.laws(real, 2)[1]

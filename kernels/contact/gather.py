@@ -34,11 +34,25 @@ def factor_struct(linear):
     return Factor
 
 
-@wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-def compare_searches(searches: wp.array(dtype=int), listed: wp.array(dtype=int), stale: wp.array(dtype=int)):
-    """Whether there was a search since nodes were listed."""
-    stale[0] = wp.where(searches[0] != listed[0], 1, 0)
-    listed[0] = searches[0]
+@cache
+def begin_kernel(real):
+    """Whether there was a search since nodes were listed; and gaps of worlds before any is seen."""
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def begin(
+        searches: wp.array(dtype=int),
+        reach: real,
+        listed: wp.array(dtype=int),
+        stale: wp.array(dtype=int),
+        gap: wp.array(dtype=real),
+    ):
+        w = wp.tid()
+        gap[w] = reach
+        if w == 0:
+            stale[0] = wp.where(searches[0] != listed[0], 1, 0)
+            listed[0] = searches[0]
+
+    return begin
 
 
 @cache

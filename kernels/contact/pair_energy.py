@@ -226,8 +226,10 @@ def pair_energy_functions(kind: Kind, density: Density, real):
 
     `inner`, of the four nodes: 1/2 inside of a rod, 0 at its ends, -1 at edges of shells, against which no ends are counted.
 
-    evaluate(x, p, threshold, inner) -> (energy [J], gradient (4, 3) [N]); row(x, p, threshold, inner, k) -> (w, v), the k-th row
-    w_i v of the factor; along(x, v, p, threshold, inner): derivative along v, whose reverse is a row of the exact Hessian.
+    about(x, w, d, n, p, threshold, inner) -> (energy [J], gradient (4, 3) [N], m), of closest points (w, d, n) as `distance_function`
+    has them, with the mollifier m; row(x, w, d, n, m, p, inner, k) -> (w, v), the k-th row w_i v of the factor; evaluate(x, p,
+    threshold, inner) -> (energy, gradient); along(x, v, p, threshold, inner): derivative along v, whose reverse is a row of the exact
+    Hessian.
     """
     X, W, V = shape_types(real)
     E = wp.types.vector(1, real)
@@ -247,14 +249,12 @@ def pair_energy_functions(kind: Kind, density: Density, real):
         return wp.dot(normal, normal), wp.matrix_from_rows(-da, da, -db, db)
 
     @wp.func
-    def single(x: X, p: V, threshold: real, inner: W):
-        w, d, n = near(x)
+    def single(x: X, w: W, d: real, n: V, p: V, threshold: real, inner: W):
         f = slope_of(E(d), p)
-        return energy_of(E(d), p), wp.outer(w, n * f[0])
+        return energy_of(E(d), p), wp.outer(w, n * f[0]), real(1.0)
 
     @wp.func
-    def edges(x: X, p: V, threshold: real, inner: W):
-        w, d, n = near(x)
+    def edges(x: X, w: W, d: real, n: V, p: V, threshold: real, inner: W):
         square, turn = crossing(x)
         m, first, _second = mollify(square, threshold)
         e = energy_of(E(d), p)
@@ -271,19 +271,15 @@ def pair_energy_functions(kind: Kind, density: Density, real):
             total = (real(1.0) - m) * ends
             if m > real(0.0):
                 total += m * e
-        return total, g
+        return total, g, m
 
-    evaluate = edges if kind == EDGES else single
+    about = edges if kind == EDGES else single
 
     @wp.func
-    def row(x: X, p: V, threshold: real, inner: W, k: int):
-        w, d, n = near(x)
+    def row(x: X, w: W, d: real, n: V, m: real, p: V, inner: W, k: int):
         stiffness = curvature_of(E(d), p)
-        v = n * wp.sqrt(stiffness[0])
+        v = n * wp.sqrt(stiffness[0] * m)
         if wp.static(kind == EDGES):
-            square, _turn = crossing(x)
-            m, _first, _second = mollify(square, threshold)
-            v = v * wp.sqrt(m)
             if k > 0:
                 v = V()
                 if m < real(1.0):
@@ -292,8 +288,14 @@ def pair_energy_functions(kind: Kind, density: Density, real):
         return w, v
 
     @wp.func
+    def evaluate(x: X, p: V, threshold: real, inner: W):
+        w, d, n = near(x)
+        e, g, _m = about(x, w, d, n, p, threshold, inner)
+        return e, g
+
+    @wp.func
     def along(x: X, v: X, p: V, threshold: real, inner: W):
         _e, g = evaluate(x, p, threshold, inner)
         return wp.ddot(g, v)
 
-    return evaluate, row, along
+    return about, row, evaluate, along

@@ -113,11 +113,9 @@ def lag_kernel(kind: Kind, real, linear, serial: bool, directed: bool):
         ways: wp.array2d(dtype=V),
         contact: Factor,
         gradient: wp.array2d(dtype=V),
-        items: wp.array(dtype=int),
         pairs_out: wp.array(dtype=wp.vec2i),
         factor: Factor,
         lagged: Lagged,
-        items_out: wp.array(dtype=int),
         slip: wp.array2d(dtype=E),
         along: wp.array2d(dtype=E),
     ):
@@ -132,8 +130,6 @@ def lag_kernel(kind: Kind, real, linear, serial: bool, directed: bool):
                 along[row, p] = E()
             factor.nodes[p] = contact.nodes[p]
             factor.used[p] = 0
-            for k in range(wp.static(size)):
-                items_out[wp.static(size) * p + k] = items[wp.static(size) * p + k]
             lagged.bound[p] = real(0.0)
             if contact.used[p] != 0:
                 w, i, _j, a, b = groups(law, sides, pairs[p])

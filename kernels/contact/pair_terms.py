@@ -86,12 +86,12 @@ def read_functions(kind: Kind, real):
 
 @cache
 def evaluate_kernel(kind: Kind, density: Density, real, linear, serial: bool):
-    """Energy, gradient by slot and factor of each pair."""
+    """Energy, gradient by slot and factor of each pair; and the smallest gap [m] of each world, where it is below what `gap` has."""
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
     V, W4 = wp.types.vector(3, real), wp.types.vector(4, linear)
     L = wp.types.vector(3, linear)
     near = distance_function(kind, real)
-    evaluate_pair, row_of, _ = pair_energy_functions(kind, density, real)
+    about, row_of, *_ = pair_energy_functions(kind, density, real)
     bends = bend_function(kind, density, real)
     given, corners = read_functions(kind, real)
     until, rows = until_function(serial), rows_of(kind)
@@ -106,6 +106,7 @@ def evaluate_kernel(kind: Kind, density: Density, real, linear, serial: bool):
         factor: Factor,
         energy: wp.array(dtype=real),
         gradient: wp.array2d(dtype=V),
+        gap: wp.array(dtype=real),
     ):
         tid = wp.tid()
         if tid >= count[0]:
@@ -113,18 +114,21 @@ def evaluate_kernel(kind: Kind, density: Density, real, linear, serial: bool):
         for pair in range(tid, until(tid, count[0])):
             p, threshold, inner = given(law, sides, pairs[pair])
             at = corners(x, factor.nodes[pair])
-            _w, d, _n = near(at)
+            w, d, n = near(at)
+            world = pairs[pair][0] / sides.counts[0]
+            if d - p[2] < gap[world]:
+                wp.atomic_min(gap, world, d - p[2])
             factor.used[pair] = 0
             energy[pair] = real(0.0)
             # ends of edges are no nearer; what is no number shows in the energy
             if p[0] > real(0.0) and not (d >= p[1] + p[2]):
-                e, g = evaluate_pair(at, p, threshold, inner)
+                e, g, m = about(at, w, d, n, p, threshold, inner)
                 energy[pair] = e
                 for slot in range(wp.static(SLOTS)):
                     gradient[slot, pair] = g[slot]
                 used = int(1)
                 for k in range(wp.static(rows)):
-                    weight, v = row_of(at, p, threshold, inner, k)
+                    weight, v = row_of(at, w, d, n, m, p, inner, k)
                     if wp.dot(v, v) > real(0.0):
                         used |= 2 << k
                         factor.direction[k, pair] = L(linear(v[0]), linear(v[1]), linear(v[2]))
@@ -146,7 +150,7 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: boo
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
     X, *_ = shape_types(real)
     V, L, until = wp.types.vector(3, real), wp.types.vector(3, linear), until_function(serial)
-    _, _, along = pair_energy_functions(kind, density, real)
+    *_, along = pair_energy_functions(kind, density, real)
     given, corners = read_functions(kind, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -190,7 +194,7 @@ def mollified_kernels(density: Density, real, linear, serial: bool):
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
     X, *_ = shape_types(real)
     V, L, until = wp.types.vector(3, real), wp.types.vector(3, linear), until_function(serial)
-    _, _, along = pair_energy_functions(EDGES, density, real)
+    *_, along = pair_energy_functions(EDGES, density, real)
     given, corners = read_functions(EDGES, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -242,32 +246,3 @@ def mollified_kernels(density: Density, real, linear, serial: bool):
                 columns[column, slot, m] = L(linear(dx[slot, 0]), linear(dx[slot, 1]), linear(dx[slot, 2]))
 
     return mark, choose, differentiate
-
-
-@cache
-def energy_kernels(real):
-    """things(...) adds energies of pairs of each first thing, total(...) adds their sums to worlds."""
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def things(
-        count: wp.array(dtype=int),
-        starts: wp.array(dtype=int),
-        partners: wp.array(dtype=int),
-        energy: wp.array(dtype=real),
-        sums: wp.array2d(dtype=real),
-    ):
-        w, k = wp.tid()
-        i = w * sums.shape[1] + k
-        total = real(0.0)
-        if count[0] > 0:
-            for p in range(starts[i], starts[i] + partners[i]):
-                total += energy[p]
-        sums[w, k] = total
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def total(own: wp.array(dtype=real), overflow: wp.array(dtype=int), energy: wp.array(dtype=real)):
-        """Infinite while pairs do not fit."""
-        w = wp.tid()
-        energy[w] = wp.where(overflow[0] == 0, energy[w] + own[w], real(wp.inf))
-
-    return things, total

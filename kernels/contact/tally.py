@@ -6,36 +6,13 @@ import warp as wp
 
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.islands import MOVED, STATUS
-from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 SUM, PARTS, LAST = (
     0,
     1,
     2,
 )  # of the counts of each world: pairs over all parts of steps, how many these are, pairs of the last one
-
-
-@cache
-def count_kernel(serial: bool):
-    """count(...): the pairs of a list that push each other, by world; things: first things of pairs in one world."""
-    until = until_function(serial)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def count(
-        pairs: wp.array(dtype=wp.vec2i),
-        number: wp.array(dtype=int),
-        used: wp.array(dtype=int),
-        things: int,
-        touching: wp.array(dtype=int),
-    ):
-        tid = wp.tid()
-        if tid >= number[0]:
-            return
-        for p in range(tid, until(tid, number[0])):
-            if used[p] != 0:
-                wp.atomic_add(touching, pairs[p][0] / things, 1)
-
-    return count
 
 
 @cache

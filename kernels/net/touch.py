@@ -160,7 +160,7 @@ def world_kernels(real):
 
 @cache
 def block_kernels(real, linear, serial: bool):
-    """gain(...) by a motion, differ(...) of positions; lessen(...) the residual by a product; aim(...), push(...) and
+    """gain(...) by a motion; lessen(...) the residual by a product; aim(...), push(...) and
     arrive(...) of supports; stay(...) of worlds that do not move; part(...) with what was proposed; way(...) that is left, and
     add(...) it."""
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
@@ -186,12 +186,6 @@ def block_kernels(real, linear, serial: bool):
             r = right[i]
             total += wp.dot(V(real(r[0]), real(r[1]), real(r[2])), q[i] - base[i])
         dots_out[w, start] = total
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def differ(q: wp.array(dtype=V), base: wp.array(dtype=V), move_out: wp.array(dtype=V)):
-        tid = wp.tid()
-        for i in range(tid, until(tid, q.shape[0])):
-            move_out[i] = q[i] - base[i]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def lessen(
@@ -323,7 +317,7 @@ def block_kernels(real, linear, serial: bool):
             for k in range(start, until(start, blocks)):
                 direction[k + w * blocks] += way[k + w * blocks]
 
-    return gain, differ, lessen, aim, push, arrive, stay, part, way, add
+    return gain, lessen, aim, push, arrive, stay, part, way, add
 
 
 @cache

@@ -69,6 +69,7 @@ def move(result: PairTerms, at: wp.array, x: np.ndarray) -> None:
 def state(result: PairTerms) -> list[np.ndarray]:
     """Copies of energies, forces and blocks."""
     result.blocks()
+    result.join()
     return [of.numpy().copy() for of in (result.energy, result.forces, result.diagonal, result.between)]
 
 

@@ -49,7 +49,6 @@ def test_matrix_is_symmetric_and_positive(device, case, form):
 def test_friction_takes_energy_and_makes_no_resultant(device, case, form):
     for seed, slip in enumerate(SLIP * np.array([0.01, 0.3, 1.0, 10.0])):
         result, _, x, after = rubbed(case, device, form, slip, seed, **directed(case))
-        result.work()
         forces, taken = result.forces.numpy(), result.dissipated.numpy()[0]
         assert taken == pytest.approx(-(forces * (after - x)).sum(), rel=1e-10)
         assert 0.0 < result.energy.numpy()[0] < taken
@@ -107,7 +106,6 @@ def test_coulomb_law_by_direction(device, form, tilt):
         after[3:, :2] += 1e3 * SLIP * u
         at.assign(after)
         result.evaluate(at, rates(result))
-        result.work()
         force = result.forces.numpy()[3:].sum(0)
         size = np.sqrt(D2 @ u**2)
         assert force == pytest.approx([*(-normal * D2 * u / size), 0.0], rel=1e-9, abs=1e-12 * normal)

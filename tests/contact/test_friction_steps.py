@@ -17,7 +17,6 @@ from ddg_warp.solve.contact.pair_terms import PairTerms
 def test_two_runs_agree_to_the_bit_and_atomic_sums_to_rounding(device, case):
     def run(atomic):
         result, _, x, _ = rubbed(case, device, atomic=atomic)
-        result.work()
         return [*state(result), times(result, np.random.default_rng(3).normal(size=x.shape)), result.dissipated.numpy()]
 
     repeats(run)
@@ -35,7 +34,6 @@ def test_worlds_are_alone(device):
         result.lag(at)
         at.assign(x + slip)
         result.evaluate(at, rates(result, *rate))
-        result.work()
         return [*state(result), result.dissipated.numpy()]
 
     given = (RATE, 0.0, 3.0 * RATE)
@@ -111,14 +109,13 @@ def test_captured_steps(device, conditional):
         out.zero_()
         result.product(given, out)
         result.blocks()
-        result.work()
+        result.join()
     speed = 0.3 * MARGIN * np.random.default_rng(5).normal(size=x.shape)
     for step in range(4):
         move(plain, start, x + step * speed)
         plain.lag(start)
         move(plain, at, x + (step + 1) * speed)
         plain.evaluate(at, rate)
-        plain.work()
         wp.capture_launch(capture.graph)
         for one, other in zip(state(plain), state(result), strict=True):
             assert np.abs(one - other).max() <= 1e-13 * np.abs(one).max()
@@ -149,8 +146,6 @@ def test_all_in_single_precision(device, case):
     single.law.stiffness.zero_()
     at.assign(after)
     single.evaluate(at, rates(single))
-    for result in (whole, single):
-        result.work()
     v = np.random.default_rng(7).normal(size=x.shape)
     for value, exact in (
         (single.forces.numpy(), whole.forces.numpy()),

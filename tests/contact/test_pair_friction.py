@@ -102,7 +102,6 @@ def test_coulomb_law(device, scene, form, law):
         after[upper] += y * SLIP * direction + [0.0, 0.0, 3.0 * SLIP]  # along the normal there is none
         at.assign(after)
         result.evaluate(at, rates(result))
-        result.work()
         force = result.forces.numpy()[upper].sum(0)
         assert force == pytest.approx(-MU * push[2] * share(form, y) * direction, rel=1e-10, abs=1e-12 * normal)
         assert np.linalg.norm(force) <= MU * push[2] * (1.0 + 1e-14)
@@ -157,7 +156,6 @@ def test_friction_takes_energy(device, case, form):
     """The work of the forces since the start of the step, no less than the potential and no more than that of Coulomb's law."""
     for seed, slip in enumerate(SLIP * np.array([0.01, 0.3, 1.0, 10.0])):
         result, _, x, after = rubbed(case, device, form, slip, seed)
-        result.work()
         taken, energy = result.dissipated.numpy()[0], result.energy.numpy()[0]
         assert taken == pytest.approx(-(result.forces.numpy() * (after - x)).sum(), rel=1e-10)
         assert 0.0 < energy < taken
@@ -209,7 +207,6 @@ def test_no_friction_without_rate_or_coefficient(device):
     for rate in (None, rates(some, 0.0)):
         some.evaluate(at, rates(some))
         some.evaluate(at, rate)
-        some.work()
         assert all((a == b).all() for a, b in zip([*state(some), times(some, x)], wanted, strict=True))
         assert not some.dissipated.numpy().any()
     some.evaluate(at, rates(some))

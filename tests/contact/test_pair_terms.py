@@ -199,6 +199,7 @@ def test_a_captured_evaluation_follows_motion(device):
         out.zero_()
         result.product(given, out)
         result.blocks()
+        result.join()
     velocity = 0.3 * MARGIN * v / np.linalg.norm(v, axis=1, keepdims=True)
     searches = result.search.searches.numpy()[0]
     for step in range(1, 5):

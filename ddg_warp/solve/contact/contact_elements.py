@@ -21,7 +21,6 @@ class ContactElements(PairElements):
         found: PairList,
         law: Density,
         nodes: int,
-        worlds: int,
         real,
         linear,
         atomic: bool,
@@ -29,7 +28,7 @@ class ContactElements(PairElements):
         exact: bool,
     ):
         kind = found.kind
-        super().__init__(found, rows_of(kind), nodes, worlds, real, linear, atomic)
+        super().__init__(found, rows_of(kind), nodes, real, linear, atomic)
         serial = arrays.serial(self.device)
         self._listed = NodeItems(kind, nodes, real, silent)
         self._evaluate = evaluate_kernel(kind, law, real, linear, serial)
@@ -53,13 +52,16 @@ class ContactElements(PairElements):
         inputs = [self.pairs, self.count, self.found.sides]
         self._sweep(self._listed.name, self.found.capacity, inputs, [self.factor.nodes])
 
-    def evaluate(self, x: wp.array, law, forces: wp.array, energy: wp.array, overflow: wp.array) -> None:
-        """Write factors at x, and list the pairs of nodes; add to the forces on nodes and to the energies of worlds."""
+    def write(self, x: wp.array, law, gap: wp.array) -> None:
+        """Write energies, gradients and factors at x; lower the smallest gaps of worlds to those of pairs."""
         inputs = [self.pairs, self.count, self.found.sides, law, x]
-        self._sweep(self._evaluate, self.found.capacity, inputs, [self.factor, self._energy, self.gradient])
+        self._sweep(self._evaluate, self.found.capacity, inputs, [self.factor, self.energy, self.gradient, gap])
+
+    def evaluate(self, x: wp.array, law, forces: wp.array, gap: wp.array) -> None:
+        """The same; list the pairs of nodes, and add to the forces on these."""
+        self.write(x, law, gap)
         self._listed.list(self.count, self.factor.nodes, self.factor.used)
         self.add_up(self.gradient, -1.0, forces)
-        self._add_energies(self._energy, overflow, energy)
 
     def exact_product(self, v: wp.array, out: wp.array, x: wp.array, law) -> None:
         """Add the product of the exact Hessian at x, those of `evaluate`, with v."""

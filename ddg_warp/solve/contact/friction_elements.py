@@ -7,6 +7,7 @@ from ddg_warp import arrays
 from ddg_warp.kernels.contact.pair_friction import ROWS, friction_kernel, lag_kernel, lagged_struct
 from ddg_warp.kernels.densities import Density
 from ddg_warp.solve.contact.contact_elements import ContactElements
+from ddg_warp.solve.contact.node_items import NodeItems
 from ddg_warp.solve.contact.pair_elements import PairElements
 
 
@@ -14,13 +15,14 @@ class FrictionElements(PairElements):
     """Friction of the pairs of one list, with lists of their own, which later searches leave alone; see `PairTerms`.
 
     Args:
-        contact: of the same pairs.
+        contact: of the same pairs; silent: as of `NodeItems`.
         velocity: below which surfaces stick [m/s].
         directed: nodes beside first things (things, 2), and by groups coefficients over `friction` forwards, backwards and across
             (groups, groups, 3), see `lag_kernel`; None: it is the same all ways.
 
     Attributes:
         directions: both of `directed` on the device, None without.
+        work: of each pair (capacity,) [J], by the slip of the last `evaluate`.
     """
 
     def __init__(
@@ -30,12 +32,12 @@ class FrictionElements(PairElements):
         velocity: float,
         directed: tuple[np.ndarray, np.ndarray] | None,
         nodes: int,
-        worlds: int,
         real,
         linear,
         atomic: bool,
+        silent: wp.array,
     ):
-        super().__init__(contact.found, ROWS, nodes, worlds, real, linear, atomic)
+        super().__init__(contact.found, ROWS, nodes, real, linear, atomic)
         serial = arrays.serial(self.device)
         self._contact, self._velocity = contact, velocity
         self._lag = lag_kernel(self.found.kind, real, linear, serial, directed is not None)
@@ -46,8 +48,10 @@ class FrictionElements(PairElements):
             self._rows += 1
             ways = wp.array(ways, dtype=wp.types.vector(3, real), device=self.device)
             self.directions = arrays.upload(beside.astype(np.int32), wp.vec2i, self.device), ways
-        self.kernels += [self._lag, self._evaluate]
-        self._kept = ("count", "starts", "partners", "numbers", "places")
+        self._listed = NodeItems(self.found.kind, nodes, real, silent)
+        self.numbers, self.places = self._listed.numbers, self._listed.places
+        self.kernels += [self._lag, self._evaluate, *self._listed.kernels]
+        self._kept = ("count", "starts", "partners")
         for name in self._kept:
             setattr(self, name, wp.zeros_like(getattr(contact, name)))
         self.lagged = lagged_struct(real)()
@@ -58,12 +62,13 @@ class FrictionElements(PairElements):
         super().reserve()
         for name in self._kept:
             getattr(self, name).zero_()
+        self._listed.reserve(self.found.capacity)
+        self.items = self._listed.items
         capacity = self.found.capacity
-        self.items = wp.zeros(self.size * capacity, dtype=int, device=self.device)
         self.pairs = wp.zeros(capacity, dtype=wp.vec2i, device=self.device)
         pair = wp.types.vector(2, self.real)
         self._slip, self._along = (arrays.allocate((2, capacity), pair, self.device) for _ in range(2))
-        self._work, self.lagged.bound = (wp.zeros(capacity, dtype=self.real, device=self.device) for _ in range(2))
+        self.work, self.lagged.bound = (wp.zeros(capacity, dtype=self.real, device=self.device) for _ in range(2))
         self.lagged.weight = wp.zeros(capacity, dtype=wp.types.vector(4, self.real), device=self.device)
         self.lagged.tangent = arrays.allocate((self._rows, capacity), wp.types.vector(3, self.real), self.device)
 
@@ -71,23 +76,17 @@ class FrictionElements(PairElements):
         """Take the pairs of contact as it was evaluated last, at x."""
         of = self._contact
         inputs = [of.pairs, of.count, self.found.sides, law, x, *self.directions]
-        inputs += [of.factor, of.gradient, of.items]
-        outputs = [self.pairs, self.factor, self.lagged, self.items, self._slip, self._along]
+        inputs += [of.factor, of.gradient]
+        outputs = [self.pairs, self.factor, self.lagged, self._slip, self._along]
         self._sweep(self._lag, self.found.capacity, inputs, outputs)
         for name in self._kept:
             wp.copy(getattr(self, name), getattr(of, name))
+        self._listed.list(self.count, self.factor.nodes, of.factor.used)
 
-    def evaluate(
-        self, x, start, rate: wp.array, iterates: tuple, forces: wp.array, energy: wp.array, overflow: wp.array
-    ) -> None:
-        """Write factors at x by the slip since `start`; add to the forces on nodes and to the energies of worlds."""
+    def evaluate(self, x, start, rate: wp.array, iterates: tuple, forces: wp.array) -> None:
+        """Write energies, work and factors at x by the slip since `start`; add to the forces on nodes."""
         inputs = [self.pairs, self.count, self.found.first.count, self.lagged, self._velocity, rate, *iterates]
         inputs += [x, start]
-        outputs = [self._slip, self._along, self.factor, self._energy, self._work, self.gradient]
+        outputs = [self._slip, self._along, self.factor, self.energy, self.work, self.gradient]
         self._sweep(self._evaluate, self.found.capacity, inputs, outputs)
         self.add_up(self.gradient, -1.0, forces)
-        self._add_energies(self._energy, overflow, energy)
-
-    def work(self, overflow: wp.array, dissipated: wp.array) -> None:
-        """Add what friction takes by the slip of the last `evaluate` to that of worlds."""
-        self._add_energies(self._work, overflow, dissipated)

@@ -21,7 +21,8 @@ class NodeItems:
 
     def __init__(self, kind: Kind, nodes: int, real, silent: wp.array):
         self.device, self._size, self._silent = silent.device, kind.first + kind.second, silent
-        self.numbers, self._filled = (wp.zeros(nodes, dtype=int, device=self.device) for _ in range(2))
+        self._both = wp.zeros((2, nodes), dtype=int, device=self.device)  # zeroed at once
+        self.numbers, self._filled = self._both[0], self._both[1]
         self._running = RunningSums(self.numbers)
         self.places = self._running.starts
         self.name, self._number, self._fill, self._sort = gather.list_kernels(kind, real, arrays.serial(self.device))
@@ -34,8 +35,7 @@ class NodeItems:
 
     def list(self, count: wp.array, nodes: wp.array, used: wp.array) -> None:
         """Of the first `count` pairs with these nodes, those that are used."""
-        self.numbers.zero_()
-        self._filled.zero_()
+        self._both.zero_()
         inputs = [count, nodes, used, self._silent]
         self._sweep(self._number, len(nodes), inputs, [self.numbers])
         self._running()

@@ -5,9 +5,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.contact import gather
-from ddg_warp.kernels.contact.pair_terms import energy_kernels
 from ddg_warp.solve.contact.pairs import PairList
-from ddg_warp.solve.net.system import Sums
 
 MOST = 2**31 // gather.SLOTS  # pairs whose slots can be counted
 
@@ -17,11 +15,11 @@ class PairElements:
 
     Args:
         found: list of a search, whose kind of pairs and capacity these have.
-        nodes: of all worlds; worlds: how many.
+        nodes: of all worlds.
         linear: type of factors; atomic: whether sums are added atomically.
 
     Attributes:
-        factor: see `gather.factor_struct`.
+        factor: see `gather.factor_struct`; energy: of each pair (capacity,) [J].
         pairs, count, starts, partners: as those of a `PairList`; of the subclass.
         mollified: those whose matrices take more than a factor and what turns (`Mollified`); None without.
         numbers, places, items: of each node, how many items it has and where they start in `items`; of the subclass.
@@ -29,18 +27,14 @@ class PairElements:
 
     mollified = None
 
-    def __init__(self, found: PairList, rows: int, nodes: int, worlds: int, real, linear, atomic: bool):
+    def __init__(self, found: PairList, rows: int, nodes: int, real, linear, atomic: bool):
         self.found, self.device, self.rows, self.real, self.linear = found, found.device, rows, real, linear
         self._atomic, serial, kind = atomic, arrays.serial(self.device), found.kind
         self.size = kind.first + kind.second
         self._add = {dtype: gather.sum_kernels(self.size, dtype, serial)[int(atomic)] for dtype in (real, linear)}
         self._blocks = gather.block_kernels(kind, rows, real, linear, serial)
-        self._energies = energy_kernels(real)
-        self._of_things = wp.zeros((worlds, found.first.count), dtype=real, device=self.device)
-        self._sum = Sums(worlds, found.first.count, real, self.device)
-        self._of_worlds = wp.zeros(worlds, dtype=real, device=self.device)
         self.factor = gather.factor_struct(linear)()
-        self.kernels = [*self._add.values(), *self._blocks, *self._energies, *self._sum.kernels]
+        self.kernels = [*self._add.values(), *self._blocks]
 
     def reserve(self) -> None:
         """Make room for as many pairs as the list of the search has.
@@ -60,27 +54,23 @@ class PairElements:
         self.factor.bend = wp.zeros(capacity, dtype=linear, device=self.device)
         self.factor.direction = arrays.allocate((self.rows, capacity), vector, self.device)
         self.factor.weight = arrays.allocate((self.rows, capacity), wp.types.vector(4, linear), self.device)
-        self._energy = wp.zeros(capacity, dtype=self.real, device=self.device)
+        self.energy = wp.zeros(capacity, dtype=self.real, device=self.device)
         shape = (gather.SLOTS, capacity)
         self.parts = arrays.allocate(shape, vector, self.device)
         self.gradient = self.parts
         if linear is not self.real:
             self.gradient = arrays.allocate(shape, wp.types.vector(3, self.real), self.device)
 
-    def blocks(self, diagonal: wp.array, between: wp.array) -> None:
-        """Add the blocks of nodes, and those between the nodes of edges."""
-        lists, (nodes, edges) = [self.places, self.numbers, self.items], self._blocks
-        self._sweep(nodes, len(diagonal), [self.factor, *lists], [diagonal])
-        if self.found.kind.first == 2:
-            self._sweep(edges, len(between), [self.factor, self.pairs, self.found.sides, *lists], [between])
+    def blocks(self, diagonal: wp.array) -> None:
+        """Add the blocks of nodes."""
+        inputs = [self.factor, self.places, self.numbers, self.items]
+        self._sweep(self._blocks[0], len(diagonal), inputs, [diagonal])
 
-    def _add_energies(self, energies: wp.array, overflow: wp.array, out: wp.array) -> None:
-        """Add what pairs have written to that of worlds."""
-        things, total = self._energies
-        inputs = [self.count, self.starts, self.partners, energies]
-        wp.launch(things, self._of_things.shape, inputs, [self._of_things], device=self.device)
-        self._sum(self._of_things, self._of_worlds)
-        wp.launch(total, len(out), [self._of_worlds, overflow], [out], device=self.device)
+    def join(self, between: wp.array) -> None:
+        """Add the blocks between the nodes of edges."""
+        if self.found.kind.first == 2:
+            inputs = [self.factor, self.pairs, self.found.sides, self.places, self.numbers, self.items]
+            self._sweep(self._blocks[1], len(between), inputs, [between])
 
     def add_up(self, parts: wp.array, scale: float, out: wp.array, items=None) -> None:
         """Add what pairs that are used have written by slot (`SLOTS`, capacity) to nodes, by default those that have items."""

@@ -15,6 +15,7 @@ from ddg_warp.solve.contact.contact_elements import ContactElements
 from ddg_warp.solve.contact.friction_elements import FrictionElements
 from ddg_warp.solve.contact.law_tables import law_tables, table
 from ddg_warp.solve.contact.pair_product import PairProduct
+from ddg_warp.solve.contact.totals import Totals
 
 FRICTION = {"logistic": logistic_friction, "polynomial": polynomial_friction}
 
@@ -25,7 +26,7 @@ class PairTerms:
     Friction is that of the pairs that push each other when `lag` is called, at the start of a step, and of its normal forces; searches
     within the step leave it alone.
 
-    `lag`, `evaluate`, `product`, `blocks` and `work` read nothing back and can be captured, on the CPU too; graphs that hold them have
+    `lag`, `evaluate`, `product`, `blocks` and `join` read nothing back and can be captured, on the CPU too; graphs that hold them have
     to be captured anew whenever `version` of the search grows, after `fit` of the search and of this, beginning with `lag`. While pairs
     do not fit energies are infinite.
 
@@ -48,10 +49,10 @@ class PairTerms:
 
     Attributes:
         energy: (worlds,) [J], that of contact and the potential of friction; forces: (worlds times nodes,) [N].
-        dissipated: (worlds,) [J], see `work`.
+        gap: (worlds,) the smallest of all candidates [m], at most the reach of the search; touching, dissipated: see `Totals`.
         diagonal: (worlds times nodes,) blocks of the Gauss-Newton matrix at nodes, 3 x 3 [N/m]; between: (worlds times edges,) those
             between the first and the second node of edges, in the order of `shapes.things(2)`. Each pair's own part of rods, 6 x 6 for
-            an edge, is in both, positive semi-definite together. See `blocks`.
+            an edge, is in both, positive semi-definite together. See `blocks` and `join`.
         stiffness: (worlds times nodes,) [N/m], traces of `diagonal`.
         law: `law_struct`, on the device.
 
@@ -83,8 +84,8 @@ class PairTerms:
         given = {"stiffness": stiffness, "range": range, "thickness": thickness, "friction": friction}
         self.law, rubs = law_tables(search, given, groups, shared or {})
         nodes = len(search.shapes.points) * search.worlds
-        self.energy = wp.zeros(search.worlds, dtype=self.real, device=self.device)
-        self.dissipated, self._no_rate = wp.zeros_like(self.energy), wp.zeros_like(self.energy)
+        self.gap = wp.zeros(search.worlds, dtype=self.real, device=self.device)
+        self._no_rate = wp.zeros_like(self.gap)
         self.forces = wp.zeros(nodes, dtype=wp.types.vector(3, self.real), device=self.device)
         self.stiffness = wp.zeros(nodes, dtype=self.real, device=self.device)
         block = wp.types.matrix((3, 3), self.linear)
@@ -96,22 +97,28 @@ class PairTerms:
         self._listed = wp.full(1, -1, dtype=int, device=self.device)
         self._stale = wp.zeros(1, dtype=int, device=self.device)
         self.lists = [
-            ContactElements(pairs, law, nodes, search.worlds, self.real, self.linear, atomic, told_not, exact)
+            ContactElements(pairs, law, nodes, self.real, self.linear, atomic, told_not, exact)
             for pairs in search.lists
         ]
-        self._trace = gather.trace_kernel(self.real, self.linear)
+        self._trace, self._begin = gather.trace_kernel(self.real, self.linear), gather.begin_kernel(self.real)
         self._version, self._lagged = search.version, -1
-        self.frictions = self._with_friction(rubs, ways, friction_law, velocity, atomic)
+        self.frictions = self._with_friction(rubs, ways, friction_law, velocity, atomic, told_not)
         self._start = wp.zeros_like(self.forces)
         self._product = PairProduct(self._parts, self.law, self.real, self.linear, atomic)
         self._rub = PairProduct(self.frictions, self.law, self.real, self.linear, atomic) if self.frictions else None
+        self._totals = Totals(self.lists, self.frictions, search.worlds, self.real, self.device)
+        self.energy, self.touching, self.dissipated = (
+            self._totals.energy,
+            self._totals.touching,
+            self._totals.dissipated,
+        )
         self._no_iterates = (wp.zeros(0, dtype=int, device=self.device),) * 2
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         parts = [kernel for part in self._parts for kernel in part.kernels]
-        return [gather.compare_searches, self._trace, *self._product.kernels, *parts]
+        return [self._begin, self._trace, *self._product.kernels, *self._totals.kernels, *parts]
 
     @property
     def _parts(self) -> list:
@@ -128,12 +135,13 @@ class PairTerms:
             part.reserve()
         for product in filter(None, (self._product, self._rub)):
             product.fit()
+        self._totals.fit()
         self._listed.fill_(-1)
         self._version = self.search.version
         return True
 
     def lag(self, x: wp.array, again: bool = False) -> None:
-        """Evaluate contact at x, and take pairs, normal forces and tangents of friction from it, and x as where slip starts.
+        """Take pairs, normal forces and tangents of friction from contact at x, and x as where slip starts.
 
         Slip still starts from where it did if friction is lagged `again`. Does nothing where there is no friction.
 
@@ -142,9 +150,10 @@ class PairTerms:
         """
         if not self.frictions:
             return
-        self.evaluate(x)
-        for part in self.frictions:
-            part.lag(self.law, x)
+        self._start_anew()
+        for part, friction in zip(self.lists, self.frictions, strict=True):
+            part.write(x, self.law, self.gap)
+            friction.lag(self.law, x)
         if not again:
             wp.copy(self._start, x)
         self._lagged = self._version
@@ -156,7 +165,7 @@ class PairTerms:
         start: wp.array | None = None,
         iterates: tuple[wp.array, wp.array] | None = None,
     ) -> None:
-        """Energies, forces and factors at positions x; with rates, those of friction too.
+        """Energies, forces, factors and the smallest gaps at positions x; with rates, those of friction too.
 
         Args:
             rate: 1/h of each world (worlds,) [1/s]; no friction where it is 0.
@@ -167,27 +176,27 @@ class PairTerms:
         Raises:
             SolverError: if the lists of the search have grown since `fit`, or friction was not lagged since then, or rates do not fit.
         """
-        if self._version != self.search.version:
-            raise SolverError("the lists of pairs have grown; call fit() of these terms, and capture graphs anew")
         if rate is not None:
             self._check(rate)
-        wp.launch(gather.compare_searches, 1, [self.search.searches, self._listed], [self._stale], device=self.device)
-        wp.capture_if(self._stale, self._list)
-        self.energy.zero_()
+        self._start_anew()
         self.forces.zero_()
         for part in self.lists:
-            part.evaluate(x, self.law, self.forces, self.energy, self.search.overflow)
+            part.evaluate(x, self.law, self.forces, self.gap)
         start = self._start if start is None else start
         rate = self._no_rate if rate is None else rate
         iterates = self._no_iterates if iterates is None else iterates
         for part in self.frictions:
-            part.evaluate(x, start, rate, iterates, self.forces, self.energy, self.search.overflow)
+            part.evaluate(x, start, rate, iterates, self.forces)
+        self._totals(self.search.overflow)
 
-    def work(self) -> None:
-        """Write `dissipated`: what friction takes from its start to the last `evaluate`, the sum of its forces times slip [J]."""
-        self.dissipated.zero_()
-        for part in self.frictions:
-            part.work(self.search.overflow, self.dissipated)
+    def _start_anew(self) -> None:
+        """Name the nodes of pairs, if there was a search since; no gap was seen."""
+        if self._version != self.search.version:
+            raise SolverError("the lists of pairs have grown; call fit() of these terms, and capture graphs anew")
+        inputs = [self.search.searches, self.search.reach]
+        outputs = [self._listed, self._stale, self.gap]
+        wp.launch(self._begin, self.search.worlds, inputs, outputs, device=self.device)
+        wp.capture_if(self._stale, self._list)
 
     def product(self, v: wp.array, out: wp.array, x: wp.array | None = None, wanted: wp.array | None = None) -> None:
         """out += H v of the last `evaluate`, vectors of 3 (worlds times nodes,).
@@ -221,12 +230,17 @@ class PairTerms:
         self._product.settle(v, out, x, wanted, fixed, busy, dots)
 
     def blocks(self) -> None:
-        """Write `diagonal`, `between` and `stiffness` of the last `evaluate`."""
+        """Write `diagonal` and `stiffness` of the last `evaluate`."""
         self.diagonal.zero_()
+        for part in self._parts:
+            part.blocks(self.diagonal)
+        wp.launch(self._trace, len(self.stiffness), [self.diagonal], [self.stiffness], device=self.device)
+
+    def join(self) -> None:
+        """Write `between` of the last `evaluate`."""
         self.between.zero_()
         for part in self._parts:
-            part.blocks(self.diagonal, self.between)
-        wp.launch(self._trace, len(self.stiffness), [self.diagonal], [self.stiffness], device=self.device)
+            part.join(self.between)
 
     def _check(self, rate: wp.array) -> None:
         """Refuse rates that do not fit, and friction that was not lagged."""
@@ -238,7 +252,9 @@ class PairTerms:
         if self.frictions and self._lagged != self._version:
             raise SolverError("friction has no pairs of the step's start; call lag() there, anew after fit()")
 
-    def _with_friction(self, rubs: bool, ways, law: str, velocity: float, atomic: bool) -> list[FrictionElements]:
+    def _with_friction(
+        self, rubs: bool, ways, law: str, velocity: float, atomic: bool, silent
+    ) -> list[FrictionElements]:
         """Friction of each list, where there is any."""
         if law not in FRICTION:
             raise SceneError(f"friction_law = {law!r} of contact; it is one of {', '.join(FRICTION)}")
@@ -256,10 +272,10 @@ class PairTerms:
                 float(velocity),
                 None if same else (self.search.shapes.beside(part.found.kind.first), np.stack(ways, -1)),
                 len(self.forces),
-                self.search.worlds,
                 self.real,
                 self.linear,
                 atomic,
+                silent,
             )
             for part in self.lists
         ]

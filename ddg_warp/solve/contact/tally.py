@@ -2,8 +2,7 @@
 
 import warp as wp
 
-from ddg_warp import arrays
-from ddg_warp.kernels.contact.tally import LAST, PARTS, SUM, count_kernel, take_kernel
+from ddg_warp.kernels.contact.tally import LAST, PARTS, SUM, take_kernel
 from ddg_warp.solve.contact.pair_terms import PairTerms
 
 
@@ -17,11 +16,10 @@ class Tally:
     def __init__(self, terms: PairTerms):
         self.terms, self.device = terms, terms.device
         self._worlds = terms.search.worlds
-        self._touching = wp.zeros(self._worlds, dtype=int, device=self.device)
         self.counts = wp.zeros((3, self._worlds), dtype=wp.int64, device=self.device)
         self.work = wp.zeros(self._worlds, dtype=wp.float64, device=self.device)
         self._before = [wp.zeros_like(array) for array in self.arrays]
-        self._count, self._take = count_kernel(arrays.serial(self.device)), take_kernel(terms.real)
+        self._take = take_kernel(terms.real)
 
     @property
     def arrays(self) -> list[wp.array]:
@@ -31,7 +29,7 @@ class Tally:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [self._count, self._take]
+        return [self._take]
 
     def begin(self) -> None:
         """Remember what it is before a step, which may have to be done again."""
@@ -45,12 +43,7 @@ class Tally:
 
     def __call__(self, flags: wp.array) -> None:
         """Add the terms as they were evaluated last, in the worlds whose flags say that a part of a step is done."""
-        self._touching.zero_()
-        for part in self.terms.lists:
-            inputs = [part.pairs, part.count, part.factor.used, part.found.first.count]
-            arrays.sweep(self._count, part.found.capacity, inputs, [self._touching], self.device)
-        self.terms.work()
-        inputs = [self._touching, self.terms.dissipated, flags]
+        inputs = [self.terms.touching, self.terms.dissipated, flags]
         wp.launch(self._take, self._worlds, inputs, [self.counts, self.work], device=self.device)
 
     def statistics(self) -> dict:

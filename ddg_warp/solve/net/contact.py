@@ -90,7 +90,6 @@ class NetContact:
         made = kernels.block_kernels(real, linear, arrays.serial(device))
         (
             self._differ_gain,
-            self._differ,
             self._lessen,
             self._aim,
             self._push,
@@ -173,11 +172,10 @@ class NetContact:
         else:
             self.terms.evaluate(q)
         self.terms.blocks()
-        self.search.measure(q)
 
     def account(self, change: wp.array, noise: wp.array) -> None:
         """Add to the change of the energy of worlds, and to its rounding."""
-        inputs = [self.terms.energy, self.search.gap, self._least, self.search.overflow]
+        inputs = [self.terms.energy, self.terms.gap, self._least, self.search.overflow]
         inputs += [self.newton.islands.arrays[0], self._kept, change, noise]
         self._launch(self._account, self.net.worlds, inputs, [])
 
@@ -187,6 +185,7 @@ class NetContact:
         outputs = [self._curved, self._projected]
         self._launch(self._find_curved, self.net.worlds, [newton.islands.arrays[0], self._late], outputs)
         self.terms.meet()
+        self.terms.join()
         if self.bends:
             self.terms.prepare(newton.q, self._curved)
         if self._bands:
@@ -256,10 +255,9 @@ class NetContact:
     def finish(self, before: wp.array) -> None:
         """Take no part of a step in which things passed through each other."""
         newton = self.newton
-        arrays.sweep(self._differ, newton.all, [newton.q, before], [self._move], newton.device)
-        self.search.crossings(before, self._move)
-        self.search.measure(newton.q)
-        inputs = [self.search.crossed, self.search.gap, newton.islands.arrays[0]]
+        self.search.update(before, newton.q, self.search.every)
+        self.search.passing(before)
+        inputs = [self.search.crossed, self.terms.gap, newton.islands.arrays[0]]
         self._launch(self._refuse, self.net.worlds, inputs, [self.crossed, self.least])
         self.tally(newton.islands.arrays[0])
 

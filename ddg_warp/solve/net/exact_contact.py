@@ -45,6 +45,7 @@ class ExactContact:
         search.search(q)
         terms.evaluate(q, rate if terms.frictions else None)
         terms.blocks()
+        terms.join()
         terms.meet()
         terms.prepare(q, self.net.every)
         self._q = q
