@@ -8,7 +8,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.contact.surfaces import EDGES, Kind, pair_functions, sides_struct
+from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct, surface_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 SLOTS = 4  # nodes of a pair
@@ -32,6 +32,47 @@ def factor_struct(linear):
         bend: wp.array(dtype=linear)
 
     return Factor
+
+
+@cache
+def set_struct(real, linear):
+    """A list of pairs: its factor (see `factor_struct`) and gradients, the items of nodes, and what products write.
+
+    ranks: of each pair, the places of its items; parts: of products by slot, or `placed` by rank.
+    marks, starts, columns: of pairs whose Hessians are kept, see `pair_terms.mollified_kernels`; empty where there are none.
+    listed (capacity,), number (1,): where one thread takes all, the pairs that are used and how many these are.
+    kind: place in `pair_bend.KINDS`, -1 without `bend`; edges: how many of its things, the first ones, are edges; rows: of its factor;
+    things: first things of pairs in one world.
+    """
+    X, V, W = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.vector(SLOTS, linear)
+
+    @wp.struct
+    class PairSet:
+        pairs: wp.array(dtype=wp.vec2i)
+        count: wp.array(dtype=int)
+        nodes: wp.array(dtype=wp.vec4i)
+        used: wp.array(dtype=int)
+        direction: wp.array2d(dtype=V)
+        weight: wp.array2d(dtype=W)
+        bend: wp.array(dtype=linear)
+        gradient: wp.array2d(dtype=X)
+        marks: wp.array(dtype=int)
+        starts: wp.array(dtype=int)
+        columns: wp.array3d(dtype=V)
+        parts: wp.array2d(dtype=V)
+        placed: wp.array(dtype=V)
+        places: wp.array(dtype=int)
+        numbers: wp.array(dtype=int)
+        items: wp.array(dtype=int)
+        ranks: wp.array(dtype=wp.vec4i)
+        listed: wp.array(dtype=int)
+        number: wp.array(dtype=int)
+        kind: int
+        edges: int
+        rows: int
+        things: int
+
+    return PairSet
 
 
 @cache
@@ -123,12 +164,17 @@ def list_kernels(kind: Kind, real, serial: bool):
         numbers: wp.array(dtype=int),
         items: wp.array(dtype=int),
         ordered: wp.array(dtype=int),
+        ranks: wp.array(dtype=wp.vec4i),
     ):
-        """A thread a pair, as a thread a node would take thousands of steps where a node is in thousands of pairs."""
+        """A thread a pair, as a thread a node would take thousands of steps where a node is in thousands of pairs.
+
+        `ranks` are the places of a pair's items, -1 where it has none.
+        """
         tid = wp.tid()
         if tid >= count[0]:
             return
         for p in range(tid, until(tid, count[0])):
+            rank = wp.vec4i(-1, -1, -1, -1)
             for slot in range(wp.static(size)):
                 node = nodes[p][slot]
                 if used[p] != 0 and silent[node % silent.shape[0]] == wp.uint8(0):
@@ -138,13 +184,15 @@ def list_kernels(kind: Kind, real, serial: bool):
                     for k in range(start, start + numbers[node]):
                         smaller += wp.where(items[k] < item, 1, 0)
                     ordered[start + smaller] = item
+                    rank[slot] = start + smaller
+            ranks[p] = rank
 
     return name, number, fill, sort
 
 
 @cache
-def sum_kernels(size: int, real, serial: bool):
-    """gather(...) to nodes what pairs have written a slot, or scatter(...) it by atomic additions, in any order."""
+def sum_kernel(real, serial: bool):
+    """gather(...) to nodes what pairs have written a slot: out += scale times the sum."""
     V, until = wp.types.vector(3, real), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -157,7 +205,6 @@ def sum_kernels(size: int, real, serial: bool):
         scale: real,
         out: wp.array(dtype=V),
     ):
-        """out += scale times the sum."""
         tid = wp.tid()
         for node in range(tid, until(tid, numbers.shape[0])):
             if numbers[node] > 0:
@@ -168,108 +215,69 @@ def sum_kernels(size: int, real, serial: bool):
                         total += parts[items[k] - wp.static(SLOTS) * p, p]
                 out[node] = out[node] + total * scale
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def scatter(
-        count: wp.array(dtype=int),
-        parts: wp.array2d(dtype=V),
-        used: wp.array(dtype=int),
-        nodes: wp.array(dtype=wp.vec4i),
-        scale: real,
-        out: wp.array(dtype=V),
-    ):
-        tid = wp.tid()
-        if tid >= count[0]:
-            return
-        for p in range(tid, until(tid, count[0])):
-            if used[p] != 0:
-                for slot in range(wp.static(size)):
-                    wp.atomic_add(out, nodes[p][slot], parts[slot, p] * scale)
-
-    return gather, scatter
+    return gather
 
 
 @cache
-def block_function(rows: int, linear):
-    """block(factor, p, a, b): what pair p adds to the matrix between its nodes in slots a and b, 3 x 3 [N/m]."""
-    M, Factor = wp.types.matrix((3, 3), linear), factor_struct(linear)
+def collect_kernels(real, linear, serial: bool):
+    """collect(...) forces of all lists on nodes, and the blocks of H on its diagonal; join(...) those between the nodes of edges."""
+    PairSet, Surface, until = set_struct(real, linear), surface_struct(real), until_function(serial)
+    V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), linear)
 
     @wp.func
-    def block(factor: Factor, p: int, a: int, b: int):
+    def block(own: PairSet, p: int, a: int, b: int):
+        """What pair p adds to the matrix between its nodes in slots a and b [N/m]."""
         m = M()
-        for k in range(wp.static(rows)):
-            if (factor.used[p] >> (k + 1)) & 1 != 0:
-                v = factor.direction[k, p]
-                w = factor.weight[k, p]
+        for k in range(own.rows):
+            if (own.used[p] >> (k + 1)) & 1 != 0:
+                v = own.direction[k, p]
+                w = own.weight[k, p]
                 m += wp.outer(v, v) * (w[a] * w[b])
         return m
 
-    return block
-
-
-@cache
-def block_kernels(kind: Kind, rows: int, real, linear, serial: bool):
-    """nodes(...) adds the blocks of H on its diagonal, edges(...) those between the first and the second node of edges.
-
-    The latter is for kinds whose first things are edges.
-    """
-    M, Factor, Sides = wp.types.matrix((3, 3), linear), factor_struct(linear), sides_struct(real)
-    block, until = block_function(rows, linear), until_function(serial)
-
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def nodes(
-        factor: Factor,
-        starts: wp.array(dtype=int),
-        numbers: wp.array(dtype=int),
-        items: wp.array(dtype=int),
-        out: wp.array(dtype=M),
+    def collect(
+        sets: wp.array(dtype=PairSet),
+        forces: wp.array(dtype=V),
+        diagonal: wp.array(dtype=M),
+        stiffness: wp.array(dtype=real),
     ):
+        """`stiffness` are the traces of the blocks."""
         tid = wp.tid()
-        for node in range(tid, until(tid, numbers.shape[0])):
-            if numbers[node] > 0:
-                total = M()
-                for k in range(starts[node], starts[node] + numbers[node]):
-                    p = items[k] / wp.static(SLOTS)
-                    slot = items[k] - wp.static(SLOTS) * p
-                    if factor.used[p] != 0:
-                        total += block(factor, p, slot, slot)
-                out[node] = out[node] + total
+        for node in range(tid, until(tid, forces.shape[0])):
+            force, total = V(), M()
+            for s in range(sets.shape[0]):
+                number = sets[s].numbers[node]
+                if number > 0:
+                    own = sets[s]
+                    for k in range(own.places[node], own.places[node] + number):
+                        p = own.items[k] / wp.static(SLOTS)
+                        slot = own.items[k] - wp.static(SLOTS) * p
+                        if own.used[p] != 0:
+                            force -= own.gradient[slot, p]
+                            total += block(own, p, slot, slot)
+            forces[node] = force
+            diagonal[node] = total
+            stiffness[node] = real(wp.trace(total))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def edges(
-        factor: Factor,
-        pairs: wp.array(dtype=wp.vec2i),
-        sides: Sides,
-        starts: wp.array(dtype=int),
-        numbers: wp.array(dtype=int),
-        items: wp.array(dtype=int),
-        out: wp.array(dtype=M),
-    ):
+    def join(sets: wp.array(dtype=PairSet), edges: Surface, count: int, between: wp.array(dtype=M)):
         """Items of the first node that come from this edge, not from another one that begins there."""
         tid = wp.tid()
-        for i in range(tid, until(tid, out.shape[0])):
-            w = i / sides.counts[0]
-            node = sides.first.nodes[i - w * sides.counts[0], 0] + w * sides.first.nodes_a_world
-            if numbers[node] > 0:
-                total = M()
-                for k in range(starts[node], starts[node] + numbers[node]):
-                    p = items[k] / wp.static(SLOTS)
-                    slot = items[k] - wp.static(SLOTS) * p
-                    if factor.used[p] != 0 and (slot == 0 or (wp.static(kind == EDGES) and slot == 2)):
-                        if pairs[p][slot / 2] == i:
-                            total += block(factor, p, slot, slot + 1)
-                out[i] = out[i] + total
+        for i in range(tid, until(tid, between.shape[0])):
+            w = i / count
+            node = edges.nodes[i - w * count, 0] + w * edges.nodes_a_world
+            total = M()
+            for s in range(sets.shape[0]):
+                number = sets[s].numbers[node]
+                if number > 0 and sets[s].edges > 0:
+                    own = sets[s]
+                    for k in range(own.places[node], own.places[node] + number):
+                        p = own.items[k] / wp.static(SLOTS)
+                        slot = own.items[k] - wp.static(SLOTS) * p
+                        if own.used[p] != 0 and (slot == 0 or (slot == 2 and own.edges == 2)):
+                            if own.pairs[p][slot / 2] == i:
+                                total += block(own, p, slot, slot + 1)
+            between[i] = total
 
-    return nodes, edges
-
-
-@cache
-def trace_kernel(real, linear):
-    """Traces of blocks."""
-    M = wp.types.matrix((3, 3), linear)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def trace(blocks: wp.array(dtype=M), out: wp.array(dtype=real)):
-        i = wp.tid()
-        out[i] = real(wp.trace(blocks[i]))
-
-    return trace
+    return collect, join

@@ -4,55 +4,21 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.contact.gather import SLOTS
+from ddg_warp.kernels.contact.gather import SLOTS, set_struct
 from ddg_warp.kernels.contact.pair_bend import bend_function
 from ddg_warp.kernels.matrix.sliced import product_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 
 @cache
-def set_struct(linear):
-    """A list of pairs: its factor (see `gather.factor_struct`), what it writes by slot, and the items of nodes.
-
-    marks, starts, columns: of pairs whose Hessians are kept, see `pair_terms.mollified_kernels`; empty where there are none.
-    listed (capacity,), number (1,): where one thread takes all, the pairs that are used and how many these are.
-    kind: place in `pair_bend.KINDS`, -1 without `bend`; rows: of its factor; things: first things of pairs in one world.
-    """
-    V, W = wp.types.vector(3, linear), wp.types.vector(SLOTS, linear)
-
-    @wp.struct
-    class PairSet:
-        pairs: wp.array(dtype=wp.vec2i)
-        count: wp.array(dtype=int)
-        nodes: wp.array(dtype=wp.vec4i)
-        used: wp.array(dtype=int)
-        direction: wp.array2d(dtype=V)
-        weight: wp.array2d(dtype=W)
-        bend: wp.array(dtype=linear)
-        marks: wp.array(dtype=int)
-        starts: wp.array(dtype=int)
-        columns: wp.array3d(dtype=V)
-        parts: wp.array2d(dtype=V)
-        places: wp.array(dtype=int)
-        numbers: wp.array(dtype=int)
-        items: wp.array(dtype=int)
-        listed: wp.array(dtype=int)
-        number: wp.array(dtype=int)
-        kind: int
-        rows: int
-        things: int
-
-    return PairSet
-
-
-@cache
-def product_kernels(real, linear, serial: bool):
+def product_kernels(real, linear, serial: bool, ranked: bool):
     """sift(...) and multiply(...) the pairs; scatter(...) to nodes or gather(...); settle(...), which does so on free dofs, with dot
     products, for nodes in pairs, which meet(...) finds.
 
-    If `serial`, what gather(...) and settle(...) add was scattered to `sums`, in the order in which others gather it.
+    If `serial`, what gather(...) and settle(...) add was scattered to `sums`, in the order in which others gather it. If `ranked`,
+    pairs write what nodes gather where these read it one after the other.
     """
-    PairSet, until = set_struct(linear), until_function(serial)
+    PairSet, until = set_struct(real, linear), until_function(serial)
     X, V, Y = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.matrix((4, 3), linear)
     bend = bend_function(linear)
     _, free = product_functions(linear)
@@ -107,6 +73,16 @@ def product_kernels(real, linear, serial: bool):
             total += wp.dot(columns[i, k, m], u[k])
         return total
 
+    @wp.func
+    def put(own: PairSet, slot: int, p: int, value: V):
+        """What a pair brings to one of its nodes."""
+        if wp.static(ranked):
+            rank = own.ranks[p][slot]
+            if rank >= 0:
+                own.placed[rank] = value
+        else:
+            own.parts[slot, p] = value
+
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def multiply(
         sets: wp.array(dtype=PairSet), wanted: wp.array(dtype=int), x: wp.array(dtype=X), v: wp.array(dtype=V)
@@ -127,11 +103,12 @@ def product_kernels(real, linear, serial: bool):
                             m = kept(own, p)
                         if m >= 0:
                             for slot in range(own.columns.shape[1]):  # not unrolled, for the sake of registers
-                                own.parts[slot, p] = V(
+                                value = V(
                                     row(own.columns, m, 3 * slot, u),
                                     row(own.columns, m, 3 * slot + 1, u),
                                     row(own.columns, m, 3 * slot + 2, u),
                                 )
+                                put(own, slot, p, value)
                             continue
                         y = Y()
                         for k in range(own.rows):
@@ -148,7 +125,10 @@ def product_kernels(real, linear, serial: bool):
                                 )
                                 y += bend(own.kind, at, own.weight[0, p], u) * c
                         for slot in range(wp.static(SLOTS)):
-                            own.parts[slot, p] = y[slot]
+                            put(own, slot, p, y[slot])
+                    elif wp.static(ranked):  # nodes that list it read it
+                        for slot in range(wp.static(SLOTS)):
+                            put(own, slot, p, V())
 
     @wp.func
     def gathered(sets: wp.array(dtype=PairSet), sums: wp.array(dtype=V), node: int):
@@ -159,10 +139,13 @@ def product_kernels(real, linear, serial: bool):
                 own = sets[s]
                 start = own.places[node]
                 for k in range(start, start + number):
-                    item = own.items[k]
-                    p = item / wp.static(SLOTS)
-                    if own.used[p] != 0:
-                        y += own.parts[item - wp.static(SLOTS) * p, p]
+                    if wp.static(ranked):
+                        y += own.placed[k]
+                    else:
+                        item = own.items[k]
+                        p = item / wp.static(SLOTS)
+                        if own.used[p] != 0:
+                            y += own.parts[item - wp.static(SLOTS) * p, p]
         return y
 
     @wp.func
@@ -211,7 +194,7 @@ def product_kernels(real, linear, serial: bool):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def scatter(sets: wp.array(dtype=PairSet), out: wp.array(dtype=V)):
-        """Adds to the nodes in any order."""
+        """Adds to the nodes, by one thread."""
         tid = wp.tid()
         for s in range(sets.shape[0]):
             own = sets[s]

@@ -56,9 +56,9 @@ def test_friction_takes_energy_and_makes_no_resultant(device, case, form):
 
 
 @each_case
-def test_two_runs_agree_to_the_bit_and_atomic_sums_to_rounding(device, case):
-    def run(atomic):
-        result, _, x, _ = rubbed(case, device, atomic=atomic, **directed(case))
+def test_two_runs_agree_to_the_bit(device, case):
+    def run():
+        result, _, x, _ = rubbed(case, device, **directed(case))
         return [*state(result), times(result, np.random.default_rng(3).normal(size=x.shape))]
 
     repeats(run)

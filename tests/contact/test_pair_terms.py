@@ -129,12 +129,12 @@ def test_forces_have_no_resultant_and_no_moment(device, case, law):
 
 
 @each_case
-def test_two_runs_agree_to_the_bit_and_atomic_sums_to_rounding(device, case):
+def test_two_runs_agree_to_the_bit(device, case):
     shapes, x = CASES[case]()
     v = np.random.default_rng(3).normal(size=x.shape)
 
-    def run(atomic):
-        result, _ = terms(shapes, x, device, atomic=atomic)
+    def run():
+        result, _ = terms(shapes, x, device)
         return [*state(result), times(result, v)]
 
     repeats(run)
@@ -198,7 +198,6 @@ def test_a_captured_evaluation_follows_motion(device):
         result.evaluate(at)
         out.zero_()
         result.product(given, out)
-        result.blocks()
         result.join()
     velocity = 0.3 * MARGIN * v / np.linalg.norm(v, axis=1, keepdims=True)
     searches = result.search.searches.numpy()[0]

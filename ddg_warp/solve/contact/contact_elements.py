@@ -23,12 +23,11 @@ class ContactElements(PairElements):
         nodes: int,
         real,
         linear,
-        atomic: bool,
         silent: wp.array,
         exact: bool,
     ):
         kind = found.kind
-        super().__init__(found, rows_of(kind), nodes, real, linear, atomic)
+        super().__init__(found, rows_of(kind), nodes, real, linear)
         serial = arrays.serial(self.device)
         self._listed = NodeItems(kind, nodes, real, silent)
         self._evaluate = evaluate_kernel(kind, law, real, linear, serial)
@@ -43,7 +42,7 @@ class ContactElements(PairElements):
         super().reserve()
         self.pairs = self.found.pairs
         self._listed.reserve(self.found.capacity)
-        self.items = self._listed.items
+        self.items, self.ranks = self._listed.items, self._listed.ranks
         if self.mollified:
             self.mollified.reserve()
 
@@ -57,11 +56,10 @@ class ContactElements(PairElements):
         inputs = [self.pairs, self.count, self.found.sides, law, x]
         self._sweep(self._evaluate, self.found.capacity, inputs, [self.factor, self.energy, self.gradient, gap])
 
-    def evaluate(self, x: wp.array, law, forces: wp.array, gap: wp.array) -> None:
-        """The same; list the pairs of nodes, and add to the forces on these."""
+    def evaluate(self, x: wp.array, law, gap: wp.array) -> None:
+        """The same; and list the pairs of nodes."""
         self.write(x, law, gap)
         self._listed.list(self.count, self.factor.nodes, self.factor.used)
-        self.add_up(self.gradient, -1.0, forces)
 
     def exact_product(self, v: wp.array, out: wp.array, x: wp.array, law) -> None:
         """Add the product of the exact Hessian at x, those of `evaluate`, with v."""

@@ -34,10 +34,9 @@ class FrictionElements(PairElements):
         nodes: int,
         real,
         linear,
-        atomic: bool,
         silent: wp.array,
     ):
-        super().__init__(contact.found, ROWS, nodes, real, linear, atomic)
+        super().__init__(contact.found, ROWS, nodes, real, linear)
         serial = arrays.serial(self.device)
         self._contact, self._velocity = contact, velocity
         self._lag = lag_kernel(self.found.kind, real, linear, serial, directed is not None)
@@ -63,7 +62,7 @@ class FrictionElements(PairElements):
         for name in self._kept:
             getattr(self, name).zero_()
         self._listed.reserve(self.found.capacity)
-        self.items = self._listed.items
+        self.items, self.ranks = self._listed.items, self._listed.ranks
         capacity = self.found.capacity
         self.pairs = wp.zeros(capacity, dtype=wp.vec2i, device=self.device)
         pair = wp.types.vector(2, self.real)
@@ -83,10 +82,9 @@ class FrictionElements(PairElements):
             wp.copy(getattr(self, name), getattr(of, name))
         self._listed.list(self.count, self.factor.nodes, of.factor.used)
 
-    def evaluate(self, x, start, rate: wp.array, iterates: tuple, forces: wp.array) -> None:
-        """Write energies, work and factors at x by the slip since `start`; add to the forces on nodes."""
+    def evaluate(self, x, start, rate: wp.array, iterates: tuple) -> None:
+        """Write energies, work, gradients and factors at x by the slip since `start`."""
         inputs = [self.pairs, self.count, self.found.first.count, self.lagged, self._velocity, rate, *iterates]
         inputs += [x, start]
         outputs = [self._slip, self._along, self.factor, self.energy, self.work, self.gradient]
         self._sweep(self._evaluate, self.found.capacity, inputs, outputs)
-        self.add_up(self.gradient, -1.0, forces)

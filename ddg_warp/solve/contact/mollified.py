@@ -18,7 +18,7 @@ class Mollified:
 
     Attributes:
         keeps: whether they are, so that `PairProduct` multiplies them beside all others.
-        marks, starts, columns: see `kernels.contact.pair_product.set_struct`.
+        marks, starts, columns: see `kernels.contact.gather.set_struct`.
     """
 
     keeps = True

@@ -17,6 +17,7 @@ class NodeItems:
 
     Attributes:
         numbers, places: of each node, how many items it has and where they start in `items`.
+        ranks: of each pair, the places of its items, -1 where it has none; not where one thread lists all.
     """
 
     def __init__(self, kind: Kind, nodes: int, real, silent: wp.array):
@@ -31,7 +32,9 @@ class NodeItems:
     def reserve(self, capacity: int) -> None:
         """Make room for the items of so many pairs."""
         self.items = wp.zeros(self._size * capacity, dtype=int, device=self.device)
-        self._unordered = self.items if arrays.serial(self.device) else wp.zeros_like(self.items)
+        serial = arrays.serial(self.device)
+        self._unordered = self.items if serial else wp.zeros_like(self.items)
+        self.ranks = wp.zeros(0 if serial else capacity, dtype=wp.vec4i, device=self.device)
 
     def list(self, count: wp.array, nodes: wp.array, used: wp.array) -> None:
         """Of the first `count` pairs with these nodes, those that are used."""
@@ -42,7 +45,7 @@ class NodeItems:
         self._sweep(self._fill, len(nodes), [*inputs, self.places], [self._filled, self._unordered])
         if self._unordered is not self.items:
             inputs += [self.places, self.numbers, self._unordered]
-            self._sweep(self._sort, len(nodes), inputs, [self.items])
+            self._sweep(self._sort, len(nodes), inputs, [self.items, self.ranks])
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
         arrays.sweep(kernel, count, inputs, outputs, self.device)

@@ -16,25 +16,23 @@ class PairElements:
     Args:
         found: list of a search, whose kind of pairs and capacity these have.
         nodes: of all worlds.
-        linear: type of factors; atomic: whether sums are added atomically.
+        linear: type of factors.
 
     Attributes:
         factor: see `gather.factor_struct`; energy: of each pair (capacity,) [J].
         pairs, count, starts, partners: as those of a `PairList`; of the subclass.
         mollified: those whose matrices take more than a factor and what turns (`Mollified`); None without.
-        numbers, places, items: of each node, how many items it has and where they start in `items`; of the subclass.
+        numbers, places, items, ranks: as of `NodeItems`; of the subclass.
     """
 
     mollified = None
 
-    def __init__(self, found: PairList, rows: int, nodes: int, real, linear, atomic: bool):
+    def __init__(self, found: PairList, rows: int, nodes: int, real, linear):
         self.found, self.device, self.rows, self.real, self.linear = found, found.device, rows, real, linear
-        self._atomic, serial, kind = atomic, arrays.serial(self.device), found.kind
-        self.size = kind.first + kind.second
-        self._add = {dtype: gather.sum_kernels(self.size, dtype, serial)[int(atomic)] for dtype in (real, linear)}
-        self._blocks = gather.block_kernels(kind, rows, real, linear, serial)
+        self.size, serial = found.kind.first + found.kind.second, arrays.serial(self.device)
+        self._add = {dtype: gather.sum_kernel(dtype, serial) for dtype in (real, linear)}
         self.factor = gather.factor_struct(linear)()
-        self.kernels = [*self._add.values(), *self._blocks]
+        self.kernels = [*self._add.values()]
 
     def reserve(self) -> None:
         """Make room for as many pairs as the list of the search has.
@@ -61,26 +59,11 @@ class PairElements:
         if linear is not self.real:
             self.gradient = arrays.allocate(shape, wp.types.vector(3, self.real), self.device)
 
-    def blocks(self, diagonal: wp.array) -> None:
-        """Add the blocks of nodes."""
-        inputs = [self.factor, self.places, self.numbers, self.items]
-        self._sweep(self._blocks[0], len(diagonal), inputs, [diagonal])
-
-    def join(self, between: wp.array) -> None:
-        """Add the blocks between the nodes of edges."""
-        if self.found.kind.first == 2:
-            inputs = [self.factor, self.pairs, self.found.sides, self.places, self.numbers, self.items]
-            self._sweep(self._blocks[1], len(between), inputs, [between])
-
     def add_up(self, parts: wp.array, scale: float, out: wp.array, items=None) -> None:
         """Add what pairs that are used have written by slot (`SLOTS`, capacity) to nodes, by default those that have items."""
         kernel, of = self._add[out.dtype._wp_scalar_type_], items or self
-        if self._atomic:
-            inputs = [self.count, parts, self.factor.used, self.factor.nodes, scale]
-            self._sweep(kernel, self.found.capacity, inputs, [out])
-        else:
-            inputs = [parts, self.factor.used, of.places, of.numbers, of.items, scale]
-            self._sweep(kernel, len(out), inputs, [out])
+        inputs = [parts, self.factor.used, of.places, of.numbers, of.items, scale]
+        self._sweep(kernel, len(out), inputs, [out])
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
         arrays.sweep(kernel, count, inputs, outputs, self.device)

@@ -3,34 +3,40 @@
 import warp as wp
 
 from ddg_warp import arrays
+from ddg_warp.kernels.contact.gather import set_struct
 from ddg_warp.kernels.contact.pair_bend import KINDS
-from ddg_warp.kernels.contact.pair_product import product_kernels, set_struct
+from ddg_warp.kernels.contact.pair_product import product_kernels
+from ddg_warp.kernels.contact.surfaces import EDGES
 from ddg_warp.solve.contact.contact_elements import ContactElements
 
 
 class PairProduct:
-    """The product of the matrix of some lists of pair elements with a vector; `fit` follows whenever they have got more room."""
+    """The product of the matrix of some lists of pair elements with a vector; `fit` follows whenever they have got more room.
 
-    def __init__(self, parts: list, law, real, linear, atomic: bool):
+    Attributes:
+        sets: the lists, see `kernels.contact.gather.set_struct`.
+    """
+
+    def __init__(self, parts: list, law, real, linear):
         self._law, self._mollified = law, [part.mollified for part in parts if part.mollified]
-        self._parts, self._linear, self._atomic, self._device = parts, linear, atomic, parts[0].device
+        self._parts, self._real, self._linear, self._device = parts, real, linear, parts[0].device
         types = int, wp.types.vector(3, real)
         self._nothing = [wp.zeros(0, dtype=dtype, device=self._device) for dtype in types]
         self._serial, vector = arrays.serial(self._device), wp.types.vector(3, linear)
         self._sums = wp.zeros(len(parts[0].numbers) if self._serial else 0, dtype=vector, device=self._device)
-        made = product_kernels(real, linear, self._serial)
+        # Hessians that are found anew in every product are written by slot
+        self._ranked = not self._serial and all(part.keeps for part in self._mollified)
+        made = product_kernels(real, linear, self._serial, self._ranked)
         self._sift, self._multiply, self._gather, self._meet, self._settle, self._scatter = made
-        self.kernels = [self._multiply, self._meet, self._settle]
-        self.kernels += [self._scatter] if atomic or self._serial else []
-        self.kernels += [self._sift] if self._serial else []
-        self.kernels += [] if atomic else [self._gather]
+        self.kernels = [self._multiply, self._meet, self._settle, self._gather]
+        self.kernels += [self._scatter, self._sift] if self._serial else []
         self.kernels += [kernel for part in self._mollified for kernel in part.kernels]
         self.fit()
 
     def fit(self) -> None:
         """Take the arrays that the lists have now."""
         self._sets = [self._set(part) for part in self._parts]  # an array of structures keeps nothing alive
-        self.sets = wp.array(self._sets, dtype=set_struct(self._linear), device=self._device)
+        self.sets = wp.array(self._sets, dtype=set_struct(self._real, self._linear), device=self._device)
         self._most = max(part.found.capacity for part in self._parts)
         self._met = wp.zeros(len(self._parts[0].numbers), dtype=wp.uint8, device=self._device)
 
@@ -48,10 +54,7 @@ class PairProduct:
         """out += H v; with what turns at positions x in the worlds that want it."""
         self._list()
         self._write(v, x, wanted)
-        if self._atomic:
-            self._sweep(self._scatter, self._most, [self.sets], [out])
-        else:
-            self._sweep(self._gather, len(out), [self.sets, self._gathered()], [out])
+        self._sweep(self._gather, len(out), [self.sets, self._gathered()], [out])
 
     def settle(self, v, out, x, wanted, fixed: wp.array, busy: wp.array, dots: wp.array) -> None:
         """The same on free dofs in worlds that are busy, and v . out of the nodes to which it adds."""
@@ -78,10 +81,10 @@ class PairProduct:
         return self._sums
 
     def _set(self, part):
-        own = set_struct(self._linear)()
+        own, kind = set_struct(self._real, self._linear)(), part.found.kind
         for name in ("nodes", "used", "direction", "weight", "bend"):
             setattr(own, name, getattr(part.factor, name))
-        for name in ("pairs", "count", "parts", "places", "numbers", "items"):
+        for name in ("pairs", "count", "gradient", "parts", "places", "numbers", "items", "ranks"):
             setattr(own, name, getattr(part, name))
         for name in ("marks", "starts", "columns") if part.mollified and part.mollified.keeps else ():
             setattr(own, name, getattr(part.mollified, name))
@@ -89,7 +92,9 @@ class PairProduct:
         own.listed, own.number = (
             wp.zeros(size, dtype=int, device=self._device) for size in (listed, int(self._serial))
         )
-        own.kind = KINDS.index(part.found.kind) if isinstance(part, ContactElements) else -1
+        own.placed = wp.zeros(len(part.items) * self._ranked, dtype=part.parts.dtype, device=self._device)
+        own.kind = KINDS.index(kind) if isinstance(part, ContactElements) else -1
+        own.edges = (kind.first == 2) + (kind == EDGES)
         own.rows, own.things = part.rows, part.found.first.count
         return own
 

@@ -6,6 +6,7 @@ See `kernels.contact.pair_energy` and `kernels.contact.pair_friction`.
 import numpy as np
 import warp as wp
 
+from ddg_warp import arrays
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels.contact import gather
 from ddg_warp.kernels.densities import Density
@@ -26,7 +27,7 @@ class PairTerms:
     Friction is that of the pairs that push each other when `lag` is called, at the start of a step, and of its normal forces; searches
     within the step leave it alone.
 
-    `lag`, `evaluate`, `product`, `blocks` and `join` read nothing back and can be captured, on the CPU too; graphs that hold them have
+    `lag`, `evaluate`, `product` and `join` read nothing back and can be captured, on the CPU too; graphs that hold them have
     to be captured anew whenever `version` of the search grows, after `fit` of the search and of this, beginning with `lag`. While pairs
     do not fit energies are infinite.
 
@@ -42,7 +43,6 @@ class PairTerms:
         friction_law: "logistic" or "polynomial", see `densities.friction`.
         velocity: nu [m/s], positive: what sticks creeps with a share of it.
         linear: type of factors and of vectors of products, by default that of positions.
-        atomic: whether sums are added atomically, in an order that on CUDA differs from run to run.
         silent: nodes of a world that forces and products need not be told of, which may be in thousands of pairs.
         shared: by name of what is by groups, arrays (worlds, groups, groups) that the law has in place of its own.
         exact: whether products with what turns are exact for edges that are all but parallel, too, however many these are.
@@ -52,7 +52,7 @@ class PairTerms:
         gap: (worlds,) the smallest of all candidates [m], at most the reach of the search; touching, dissipated: see `Totals`.
         diagonal: (worlds times nodes,) blocks of the Gauss-Newton matrix at nodes, 3 x 3 [N/m]; between: (worlds times edges,) those
             between the first and the second node of edges, in the order of `shapes.things(2)`. Each pair's own part of rods, 6 x 6 for
-            an edge, is in both, positive semi-definite together. See `blocks` and `join`.
+            an edge, is in both, positive semi-definite together. See `join`.
         stiffness: (worlds times nodes,) [N/m], traces of `diagonal`.
         law: `law_struct`, on the device.
 
@@ -74,7 +74,6 @@ class PairTerms:
         friction_law: str = "logistic",
         velocity: float = 1e-3,
         linear=None,
-        atomic: bool = False,
         silent: np.ndarray | None = None,
         shared: dict[str, wp.array] | None = None,
         exact: bool = False,
@@ -97,15 +96,15 @@ class PairTerms:
         self._listed = wp.full(1, -1, dtype=int, device=self.device)
         self._stale = wp.zeros(1, dtype=int, device=self.device)
         self.lists = [
-            ContactElements(pairs, law, nodes, self.real, self.linear, atomic, told_not, exact)
-            for pairs in search.lists
+            ContactElements(pairs, law, nodes, self.real, self.linear, told_not, exact) for pairs in search.lists
         ]
-        self._trace, self._begin = gather.trace_kernel(self.real, self.linear), gather.begin_kernel(self.real)
+        self._begin = gather.begin_kernel(self.real)
+        self._collect, self._join = gather.collect_kernels(self.real, self.linear, arrays.serial(self.device))
         self._version, self._lagged = search.version, -1
-        self.frictions = self._with_friction(rubs, ways, friction_law, velocity, atomic, told_not)
+        self.frictions = self._with_friction(rubs, ways, friction_law, velocity, told_not)
         self._start = wp.zeros_like(self.forces)
-        self._product = PairProduct(self._parts, self.law, self.real, self.linear, atomic)
-        self._rub = PairProduct(self.frictions, self.law, self.real, self.linear, atomic) if self.frictions else None
+        self._product = PairProduct(self._parts, self.law, self.real, self.linear)
+        self._rub = PairProduct(self.frictions, self.law, self.real, self.linear) if self.frictions else None
         self._totals = Totals(self.lists, self.frictions, search.worlds, self.real, self.device)
         self.energy, self.touching, self.dissipated = (
             self._totals.energy,
@@ -118,7 +117,7 @@ class PairTerms:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         parts = [kernel for part in self._parts for kernel in part.kernels]
-        return [self._begin, self._trace, *self._product.kernels, *self._totals.kernels, *parts]
+        return [self._begin, self._collect, self._join, *self._product.kernels, *self._totals.kernels, *parts]
 
     @property
     def _parts(self) -> list:
@@ -179,14 +178,15 @@ class PairTerms:
         if rate is not None:
             self._check(rate)
         self._start_anew()
-        self.forces.zero_()
         for part in self.lists:
-            part.evaluate(x, self.law, self.forces, self.gap)
+            part.evaluate(x, self.law, self.gap)
         start = self._start if start is None else start
         rate = self._no_rate if rate is None else rate
         iterates = self._no_iterates if iterates is None else iterates
         for part in self.frictions:
-            part.evaluate(x, start, rate, iterates, self.forces)
+            part.evaluate(x, start, rate, iterates)
+        outputs = [self.forces, self.diagonal, self.stiffness]
+        arrays.sweep(self._collect, len(self.forces), [self._product.sets], outputs, self.device)
         self._totals(self.search.overflow)
 
     def _start_anew(self) -> None:
@@ -229,18 +229,11 @@ class PairTerms:
         """
         self._product.settle(v, out, x, wanted, fixed, busy, dots)
 
-    def blocks(self) -> None:
-        """Write `diagonal` and `stiffness` of the last `evaluate`."""
-        self.diagonal.zero_()
-        for part in self._parts:
-            part.blocks(self.diagonal)
-        wp.launch(self._trace, len(self.stiffness), [self.diagonal], [self.stiffness], device=self.device)
-
     def join(self) -> None:
         """Write `between` of the last `evaluate`."""
-        self.between.zero_()
-        for part in self._parts:
-            part.join(self.between)
+        edges = self.search.lists[0].first
+        inputs = [self._product.sets, edges.surface, edges.count]
+        arrays.sweep(self._join, len(self.between), inputs, [self.between], self.device)
 
     def _check(self, rate: wp.array) -> None:
         """Refuse rates that do not fit, and friction that was not lagged."""
@@ -252,9 +245,7 @@ class PairTerms:
         if self.frictions and self._lagged != self._version:
             raise SolverError("friction has no pairs of the step's start; call lag() there, anew after fit()")
 
-    def _with_friction(
-        self, rubs: bool, ways, law: str, velocity: float, atomic: bool, silent
-    ) -> list[FrictionElements]:
+    def _with_friction(self, rubs: bool, ways, law: str, velocity: float, silent) -> list[FrictionElements]:
         """Friction of each list, where there is any."""
         if law not in FRICTION:
             raise SceneError(f"friction_law = {law!r} of contact; it is one of {', '.join(FRICTION)}")
@@ -274,7 +265,6 @@ class PairTerms:
                 len(self.forces),
                 self.real,
                 self.linear,
-                atomic,
                 silent,
             )
             for part in self.lists

@@ -171,7 +171,6 @@ class NetContact:
             self.terms.evaluate(q, islands.rate, iterates=(islands.slot, islands.iteration))
         else:
             self.terms.evaluate(q)
-        self.terms.blocks()
 
     def account(self, change: wp.array, noise: wp.array) -> None:
         """Add to the change of the energy of worlds, and to its rounding."""
