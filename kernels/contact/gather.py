@@ -40,7 +40,7 @@ def set_struct(real, linear):
 
     ranks: of each pair, the places of its items; parts: of products by slot, or `placed` by rank.
     marks, starts, columns: of pairs whose Hessians are kept, see `pair_terms.mollified_kernels`; empty where there are none.
-    listed (capacity,), number (1,): where one thread takes all, the pairs that are used and how many these are.
+    listed, number (1,): pairs that may be used, all others are not, and how many these are.
     kind: place in `pair_bend.KINDS`, -1 without `bend`; edges: how many of its things, the first ones, are edges; rows: of its factor;
     things: first things of pairs in one world.
     """
@@ -100,7 +100,7 @@ def begin_kernel(real):
 def list_kernels(kind: Kind, real, serial: bool):
     """name(...) the nodes of pairs; number(...) and fill(...) the items of nodes, sort(...) each list into `ordered`.
 
-    Items are of pairs that are used, and of none of the nodes of a world that are `silent`, not zero.
+    Items are of pairs that are `listed`, so many, and of none of the nodes of a world that are `silent`, not zero.
     """
     Sides, until, size = sides_struct(real), until_function(serial), kind.first + kind.second
     slots, *_ = pair_functions(kind, real)
@@ -119,46 +119,47 @@ def list_kernels(kind: Kind, real, serial: bool):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def number(
-        count: wp.array(dtype=int),
+        listed: wp.array(dtype=int),
+        many: wp.array(dtype=int),
         nodes: wp.array(dtype=wp.vec4i),
-        used: wp.array(dtype=int),
         silent: wp.array(dtype=wp.uint8),
         numbers: wp.array(dtype=int),
     ):
         tid = wp.tid()
-        if tid >= count[0]:
+        if tid >= many[0]:
             return
-        for p in range(tid, until(tid, count[0])):
-            if used[p] != 0:
-                for slot in range(wp.static(size)):
-                    node = nodes[p][slot]
-                    if silent[node % silent.shape[0]] == wp.uint8(0):
-                        wp.atomic_add(numbers, node, 1)
+        for i in range(tid, until(tid, many[0])):
+            p = listed[i]
+            for slot in range(wp.static(size)):
+                node = nodes[p][slot]
+                if silent[node % silent.shape[0]] == wp.uint8(0):
+                    wp.atomic_add(numbers, node, 1)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def fill(
-        count: wp.array(dtype=int),
+        listed: wp.array(dtype=int),
+        many: wp.array(dtype=int),
         nodes: wp.array(dtype=wp.vec4i),
-        used: wp.array(dtype=int),
         silent: wp.array(dtype=wp.uint8),
         starts: wp.array(dtype=int),
         filled: wp.array(dtype=int),
         items: wp.array(dtype=int),
     ):
         tid = wp.tid()
-        if tid >= count[0]:
+        if tid >= many[0]:
             return
-        for p in range(tid, until(tid, count[0])):
+        for i in range(tid, until(tid, many[0])):
+            p = listed[i]
             for slot in range(wp.static(size)):
                 node = nodes[p][slot]
-                if used[p] != 0 and silent[node % silent.shape[0]] == wp.uint8(0):
+                if silent[node % silent.shape[0]] == wp.uint8(0):
                     items[starts[node] + wp.atomic_add(filled, node, 1)] = wp.static(SLOTS) * p + slot
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def sort(
-        count: wp.array(dtype=int),
+        listed: wp.array(dtype=int),
+        many: wp.array(dtype=int),
         nodes: wp.array(dtype=wp.vec4i),
-        used: wp.array(dtype=int),
         silent: wp.array(dtype=wp.uint8),
         starts: wp.array(dtype=int),
         numbers: wp.array(dtype=int),
@@ -171,13 +172,14 @@ def list_kernels(kind: Kind, real, serial: bool):
         `ranks` are the places of a pair's items, -1 where it has none.
         """
         tid = wp.tid()
-        if tid >= count[0]:
+        if tid >= many[0]:
             return
-        for p in range(tid, until(tid, count[0])):
+        for i in range(tid, until(tid, many[0])):
+            p = listed[i]
             rank = wp.vec4i(-1, -1, -1, -1)
             for slot in range(wp.static(size)):
                 node = nodes[p][slot]
-                if used[p] != 0 and silent[node % silent.shape[0]] == wp.uint8(0):
+                if silent[node % silent.shape[0]] == wp.uint8(0):
                     start = starts[node]
                     item = wp.static(SLOTS) * p + slot
                     smaller = int(0)

@@ -210,7 +210,8 @@ def friction_kernel(density: Density, real, linear, serial: bool, directed: bool
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def evaluate(
         pairs: wp.array(dtype=wp.vec2i),
-        count: wp.array(dtype=int),
+        listed: wp.array(dtype=int),
+        number: wp.array(dtype=int),
         things: int,
         lagged: Lagged,
         velocity: real,
@@ -227,9 +228,10 @@ def friction_kernel(density: Density, real, linear, serial: bool, directed: bool
         gradient: wp.array2d(dtype=V),
     ):
         tid = wp.tid()
-        if tid >= count[0]:
+        if tid >= number[0]:
             return
-        for p in range(tid, until(tid, count[0])):
+        for i in range(tid, until(tid, number[0])):
+            p = listed[i]
             world = pairs[p][0] / things
             inverse = rate[world]
             bound = lagged.bound[p]

@@ -12,7 +12,7 @@ from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 @cache
 def product_kernels(real, linear, serial: bool, ranked: bool):
-    """sift(...) and multiply(...) the pairs; scatter(...) to nodes or gather(...); settle(...), which does so on free dofs, with dot
+    """multiply(...) pairs; scatter(...) to nodes or gather(...); settle(...), which does so on free dofs, with dot
     products, for nodes in pairs, which meet(...) finds.
 
     If `serial`, what gather(...) and settle(...) add was scattered to `sums`, in the order in which others gather it. If `ranked`,
@@ -22,33 +22,6 @@ def product_kernels(real, linear, serial: bool, ranked: bool):
     X, V, Y = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.matrix((4, 3), linear)
     bend = bend_function(linear)
     _, free = product_functions(linear)
-
-    @wp.func
-    def taken(own: PairSet):
-        """How many pairs are gone through."""
-        if wp.static(serial):
-            return own.number[0]
-        else:
-            return own.count[0]
-
-    @wp.func
-    def taken_as(own: PairSet, k: int):
-        """Which pair is the k-th of them."""
-        if wp.static(serial):
-            return own.listed[k]
-        else:
-            return k
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def sift(sets: wp.array(dtype=PairSet)):
-        """Lists those that are used, by one thread: others are in its way, as what comes next is not foreseen among them."""
-        for s in range(sets.shape[0]):
-            own = sets[s]
-            number = int(0)
-            for p in range(own.count[0]):
-                own.listed[number] = p
-                number += wp.where(own.used[p] != 0, 1, 0)
-            own.number[0] = number
 
     @wp.func
     def beside(x: X, y: X):
@@ -91,9 +64,9 @@ def product_kernels(real, linear, serial: bool, ranked: bool):
         tid = wp.tid()
         for s in range(sets.shape[0]):
             own = sets[s]
-            if tid < taken(own):
-                for i in range(tid, until(tid, taken(own))):
-                    p = taken_as(own, i)
+            if tid < own.number[0]:
+                for i in range(tid, until(tid, own.number[0])):
+                    p = own.listed[i]
                     used = own.used[p]
                     if used != 0:
                         n = own.nodes[p]
@@ -198,9 +171,9 @@ def product_kernels(real, linear, serial: bool, ranked: bool):
         tid = wp.tid()
         for s in range(sets.shape[0]):
             own = sets[s]
-            if tid < taken(own):
-                for i in range(tid, until(tid, taken(own))):
-                    p = taken_as(own, i)
+            if tid < own.number[0]:
+                for i in range(tid, until(tid, own.number[0])):
+                    p = own.listed[i]
                     if own.used[p] != 0:
                         last = int(-1)
                         for slot in range(wp.static(SLOTS)):
@@ -209,4 +182,4 @@ def product_kernels(real, linear, serial: bool, ranked: bool):
                                 wp.atomic_add(out, node, own.parts[slot, p])
                             last = node
 
-    return sift, multiply, gather, meet, settle, scatter
+    return multiply, gather, meet, settle, scatter

@@ -85,8 +85,11 @@ def read_functions(kind: Kind, real):
 
 
 @cache
-def evaluate_kernel(kind: Kind, density: Density, real, linear, serial: bool):
-    """Energy, gradient by slot and factor of each pair; and the smallest gap [m] of each world, where it is below what `gap` has."""
+def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
+    """sieve(...) pairs for those that push each other, which choose(...) lists in order, and evaluate(...) these.
+
+    One thread alone lists them as it sieves.
+    """
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
     V, W4 = wp.types.vector(3, real), wp.types.vector(4, linear)
     L = wp.types.vector(3, linear)
@@ -97,48 +100,95 @@ def evaluate_kernel(kind: Kind, density: Density, real, linear, serial: bool):
     until, rows = until_function(serial), rows_of(kind)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def evaluate(
+    def sieve(
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
         sides: Sides,
         law: Law,
         x: wp.array(dtype=V),
         factor: Factor,
-        energy: wp.array(dtype=real),
-        gradient: wp.array2d(dtype=V),
+        listed: wp.array(dtype=int),
+        number: wp.array(dtype=int),
         gap: wp.array(dtype=real),
     ):
-        tid = wp.tid()
+        """Lowers the smallest gap [m] of each world to those of pairs, too."""
+        tid, found = wp.tid(), int(0)
         if tid >= count[0]:
+            if wp.static(serial):
+                number[0] = 0
             return
         for pair in range(tid, until(tid, count[0])):
-            p, threshold, inner = given(law, sides, pairs[pair])
-            at = corners(x, factor.nodes[pair])
-            w, d, n = near(at)
+            p, _threshold, _inner = given(law, sides, pairs[pair])
+            _w, d, _n = near(corners(x, factor.nodes[pair]))
             world = pairs[pair][0] / sides.counts[0]
             if d - p[2] < gap[world]:
                 wp.atomic_min(gap, world, d - p[2])
-            factor.used[pair] = 0
-            energy[pair] = real(0.0)
             # ends of edges are no nearer; what is no number shows in the energy
-            if p[0] > real(0.0) and not (d >= p[1] + p[2]):
-                e, g, m = about(at, w, d, n, p, threshold, inner)
-                energy[pair] = e
-                for slot in range(wp.static(SLOTS)):
-                    gradient[slot, pair] = g[slot]
-                used = int(1)
-                for k in range(wp.static(rows)):
-                    weight, v = row_of(at, w, d, n, m, p, inner, k)
-                    if wp.dot(v, v) > real(0.0):
-                        used |= 2 << k
-                        factor.direction[k, pair] = L(linear(v[0]), linear(v[1]), linear(v[2]))
-                        factor.weight[k, pair] = W4(
-                            linear(weight[0]), linear(weight[1]), linear(weight[2]), linear(weight[3])
-                        )
-                factor.used[pair] = used
-                factor.bend[pair] = linear(bends(at, p, threshold, d))
+            used = p[0] > real(0.0) and not (d >= p[1] + p[2])
+            factor.used[pair] = wp.where(used, 1, 0)
+            if wp.static(serial):
+                listed[found] = pair
+                found += wp.where(used, 1, 0)
+        if wp.static(serial):
+            number[0] = found
 
-    return evaluate
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def choose(
+        count: wp.array(dtype=int),
+        used: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
+        listed: wp.array(dtype=int),
+        number: wp.array(dtype=int),
+    ):
+        """`starts` are how many are used before each."""
+        pair = wp.tid()
+        if pair >= count[0]:
+            if pair == 0:
+                number[0] = 0
+            return
+        if used[pair] != 0:
+            listed[starts[pair]] = pair
+        if pair == count[0] - 1:
+            number[0] = starts[pair] + used[pair]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def evaluate(
+        pairs: wp.array(dtype=wp.vec2i),
+        listed: wp.array(dtype=int),
+        number: wp.array(dtype=int),
+        sides: Sides,
+        law: Law,
+        x: wp.array(dtype=V),
+        factor: Factor,
+        energy: wp.array(dtype=real),
+        gradient: wp.array2d(dtype=V),
+    ):
+        """Energy, gradient by slot and factor of each pair that is listed."""
+        tid = wp.tid()
+        if tid >= number[0]:
+            return
+        for i in range(tid, until(tid, number[0])):
+            pair = listed[i]
+            p, threshold, inner = given(law, sides, pairs[pair])
+            at = corners(x, factor.nodes[pair])
+            w, d, n = near(at)
+            e, g, m = about(at, w, d, n, p, threshold, inner)
+            energy[pair] = e
+            for slot in range(wp.static(SLOTS)):
+                gradient[slot, pair] = g[slot]
+            used = int(1)
+            for k in range(wp.static(rows)):
+                weight, v = row_of(at, w, d, n, m, p, inner, k)
+                if wp.dot(v, v) > real(0.0):
+                    used |= 2 << k
+                    factor.direction[k, pair] = L(linear(v[0]), linear(v[1]), linear(v[2]))
+                    factor.weight[k, pair] = W4(
+                        linear(weight[0]), linear(weight[1]), linear(weight[2]), linear(weight[3])
+                    )
+            factor.used[pair] = used
+            factor.bend[pair] = linear(bends(at, p, threshold, d))
+
+    return sieve, choose, evaluate
 
 
 @cache

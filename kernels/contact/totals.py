@@ -14,7 +14,7 @@ ROWS = 3
 def written_struct(real):
     """A list of pairs by first things (see `PairList`), `things` of them in a world, and what it has written of each pair.
 
-    used: of contact, empty of friction; work: the other way around.
+    used: not zero where it has; work: of friction, empty of contact.
     """
 
     @wp.struct
@@ -46,11 +46,12 @@ def total_kernels(real, serial: bool):
                     own = lists[s]
                     first = own.starts[k + w * own.things]
                     for p in range(first, first + own.partners[k + w * own.things]):
-                        energy += own.energy[p]
-                        if own.work.shape[0] > 0:
-                            work += own.work[p]
-                        if own.used.shape[0] > 0:
-                            touching += wp.where(own.used[p] != 0, 1, 0)
+                        if own.used[p] != 0:
+                            energy += own.energy[p]
+                            if own.work.shape[0] > 0:
+                                work += own.work[p]
+                            else:
+                                touching += 1
             sums[wp.static(ENERGY) * worlds + w, k] = energy
             sums[wp.static(TOUCHING) * worlds + w, k] = real(touching)
             sums[wp.static(WORK) * worlds + w, k] = work

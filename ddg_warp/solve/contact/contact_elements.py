@@ -4,13 +4,13 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.kernels.contact.pair_energy import rows_of
-from ddg_warp.kernels.contact.pair_terms import evaluate_kernel, exact_product_kernel
+from ddg_warp.kernels.contact.pair_terms import evaluate_kernels, exact_product_kernel
 from ddg_warp.kernels.contact.surfaces import EDGES
 from ddg_warp.kernels.densities import Density
 from ddg_warp.solve.contact.mollified import Mollified, Unkept
 from ddg_warp.solve.contact.node_items import NodeItems
 from ddg_warp.solve.contact.pair_elements import PairElements
-from ddg_warp.solve.contact.pairs import PairList
+from ddg_warp.solve.contact.pairs import PairList, RunningSums
 
 
 class ContactElements(PairElements):
@@ -29,37 +29,46 @@ class ContactElements(PairElements):
         kind = found.kind
         super().__init__(found, rows_of(kind), nodes, real, linear)
         serial = arrays.serial(self.device)
-        self._listed = NodeItems(kind, nodes, real, silent)
-        self._evaluate = evaluate_kernel(kind, law, real, linear, serial)
+        self._items = NodeItems(kind, nodes, real, silent)
+        self._sieve, self._choose, self._evaluate = evaluate_kernels(kind, law, real, linear, serial)
         self._exact = exact_product_kernel(kind, law, real, linear, serial)
-        self.kernels += [*self._listed.kernels, self._evaluate, self._exact]
+        self.kernels += [*self._items.kernels, self._sieve, self._evaluate, self._exact]
+        self.kernels += [] if serial else [self._choose]
         self.mollified = (Unkept if exact else Mollified)(self, law) if kind == EDGES else None
         self.count, self.starts, self.partners = found.count, found.starts, found.partners
-        self.numbers, self.places = self._listed.numbers, self._listed.places
+        self.numbers, self.places = self._items.numbers, self._items.places
         self.reserve()
 
     def reserve(self) -> None:
         super().reserve()
         self.pairs = self.found.pairs
-        self._listed.reserve(self.found.capacity)
-        self.items, self.ranks = self._listed.items, self._listed.ranks
+        self._running = RunningSums(self.factor.used)
+        self._items.reserve(self.found.capacity)
+        self.items, self.ranks = self._items.items, self._items.ranks
         if self.mollified:
             self.mollified.reserve()
 
     def list(self) -> None:
         """Name the nodes of pairs, after a search."""
         inputs = [self.pairs, self.count, self.found.sides]
-        self._sweep(self._listed.name, self.found.capacity, inputs, [self.factor.nodes])
+        self._sweep(self._items.name, self.found.capacity, inputs, [self.factor.nodes])
 
     def write(self, x: wp.array, law, gap: wp.array) -> None:
-        """Write energies, gradients and factors at x; lower the smallest gaps of worlds to those of pairs."""
-        inputs = [self.pairs, self.count, self.found.sides, law, x]
-        self._sweep(self._evaluate, self.found.capacity, inputs, [self.factor, self.energy, self.gradient, gap])
+        """List the pairs that push each other at x, and write what they do; lower the smallest gaps of worlds to those of pairs."""
+        pairs, used = [self.pairs, self.count], self.factor.used
+        lists = [self.listed, self.number]
+        inputs = [*pairs, self.found.sides, law, x, self.factor]
+        self._sweep(self._sieve, self.found.capacity, inputs, [*lists, gap])
+        if not arrays.serial(self.device):
+            self._running()
+            self._sweep(self._choose, self.found.capacity, [self.count, used, self._running.starts], lists)
+        inputs = [self.pairs, *lists, self.found.sides, law, x]
+        self._sweep(self._evaluate, self.found.capacity, inputs, [self.factor, self.energy, self.gradient])
 
     def evaluate(self, x: wp.array, law, gap: wp.array) -> None:
         """The same; and list the pairs of nodes."""
         self.write(x, law, gap)
-        self._listed.list(self.count, self.factor.nodes, self.factor.used)
+        self._items.list(self.listed, self.number, self.factor.nodes)
 
     def exact_product(self, v: wp.array, out: wp.array, x: wp.array, law) -> None:
         """Add the product of the exact Hessian at x, those of `evaluate`, with v."""

@@ -47,10 +47,10 @@ class FrictionElements(PairElements):
             self._rows += 1
             ways = wp.array(ways, dtype=wp.types.vector(3, real), device=self.device)
             self.directions = arrays.upload(beside.astype(np.int32), wp.vec2i, self.device), ways
-        self._listed = NodeItems(self.found.kind, nodes, real, silent)
-        self.numbers, self.places = self._listed.numbers, self._listed.places
-        self.kernels += [self._lag, self._evaluate, *self._listed.kernels]
-        self._kept = ("count", "starts", "partners")
+        self._items = NodeItems(self.found.kind, nodes, real, silent)
+        self.numbers, self.places = self._items.numbers, self._items.places
+        self.kernels += [self._lag, self._evaluate, *self._items.kernels]
+        self._kept = ("count", "starts", "partners", "number")
         for name in self._kept:
             setattr(self, name, wp.zeros_like(getattr(contact, name)))
         self.lagged = lagged_struct(real)()
@@ -61,8 +61,8 @@ class FrictionElements(PairElements):
         super().reserve()
         for name in self._kept:
             getattr(self, name).zero_()
-        self._listed.reserve(self.found.capacity)
-        self.items, self.ranks = self._listed.items, self._listed.ranks
+        self._items.reserve(self.found.capacity)
+        self.items, self.ranks = self._items.items, self._items.ranks
         capacity = self.found.capacity
         self.pairs = wp.zeros(capacity, dtype=wp.vec2i, device=self.device)
         pair = wp.types.vector(2, self.real)
@@ -78,13 +78,22 @@ class FrictionElements(PairElements):
         inputs += [of.factor, of.gradient]
         outputs = [self.pairs, self.factor, self.lagged, self._slip, self._along]
         self._sweep(self._lag, self.found.capacity, inputs, outputs)
-        for name in self._kept:
+        for name in (*self._kept, "listed"):
             wp.copy(getattr(self, name), getattr(of, name))
-        self._listed.list(self.count, self.factor.nodes, of.factor.used)
+        self._items.list(self.listed, self.number, self.factor.nodes)
 
     def evaluate(self, x, start, rate: wp.array, iterates: tuple) -> None:
         """Write energies, work, gradients and factors at x by the slip since `start`."""
-        inputs = [self.pairs, self.count, self.found.first.count, self.lagged, self._velocity, rate, *iterates]
+        inputs = [
+            self.pairs,
+            self.listed,
+            self.number,
+            self.found.first.count,
+            self.lagged,
+            self._velocity,
+            rate,
+            *iterates,
+        ]
         inputs += [x, start]
         outputs = [self._slip, self._along, self.factor, self.energy, self.work, self.gradient]
         self._sweep(self._evaluate, self.found.capacity, inputs, outputs)

@@ -36,10 +36,10 @@ class NodeItems:
         self._unordered = self.items if serial else wp.zeros_like(self.items)
         self.ranks = wp.zeros(0 if serial else capacity, dtype=wp.vec4i, device=self.device)
 
-    def list(self, count: wp.array, nodes: wp.array, used: wp.array) -> None:
-        """Of the first `count` pairs with these nodes, those that are used."""
+    def list(self, listed: wp.array, number: wp.array, nodes: wp.array) -> None:
+        """Of pairs with these nodes those that are listed, so many."""
         self._both.zero_()
-        inputs = [count, nodes, used, self._silent]
+        inputs = [listed, number, nodes, self._silent]
         self._sweep(self._number, len(nodes), inputs, [self.numbers])
         self._running()
         self._sweep(self._fill, len(nodes), [*inputs, self.places], [self._filled, self._unordered])

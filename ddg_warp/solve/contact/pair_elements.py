@@ -21,6 +21,7 @@ class PairElements:
     Attributes:
         factor: see `gather.factor_struct`; energy: of each pair (capacity,) [J].
         pairs, count, starts, partners: as those of a `PairList`; of the subclass.
+        listed, number: pairs that may be used, in order, and how many; of all others `factor.used` is zero.
         mollified: those whose matrices take more than a factor and what turns (`Mollified`); None without.
         numbers, places, items, ranks: as of `NodeItems`; of the subclass.
     """
@@ -32,6 +33,7 @@ class PairElements:
         self.size, serial = found.kind.first + found.kind.second, arrays.serial(self.device)
         self._add = {dtype: gather.sum_kernel(dtype, serial) for dtype in (real, linear)}
         self.factor = gather.factor_struct(linear)()
+        self.number = wp.zeros(1, dtype=int, device=self.device)
         self.kernels = [*self._add.values()]
 
     def reserve(self) -> None:
@@ -52,6 +54,7 @@ class PairElements:
         self.factor.bend = wp.zeros(capacity, dtype=linear, device=self.device)
         self.factor.direction = arrays.allocate((self.rows, capacity), vector, self.device)
         self.factor.weight = arrays.allocate((self.rows, capacity), wp.types.vector(4, linear), self.device)
+        self.listed = wp.zeros(capacity, dtype=int, device=self.device)
         self.energy = wp.zeros(capacity, dtype=self.real, device=self.device)
         shape = (gather.SLOTS, capacity)
         self.parts = arrays.allocate(shape, vector, self.device)

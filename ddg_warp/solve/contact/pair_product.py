@@ -27,9 +27,9 @@ class PairProduct:
         # Hessians that are found anew in every product are written by slot
         self._ranked = not self._serial and all(part.keeps for part in self._mollified)
         made = product_kernels(real, linear, self._serial, self._ranked)
-        self._sift, self._multiply, self._gather, self._meet, self._settle, self._scatter = made
+        self._multiply, self._gather, self._meet, self._settle, self._scatter = made
         self.kernels = [self._multiply, self._meet, self._settle, self._gather]
-        self.kernels += [self._scatter, self._sift] if self._serial else []
+        self.kernels += [self._scatter] if self._serial else []
         self.kernels += [kernel for part in self._mollified for kernel in part.kernels]
         self.fit()
 
@@ -42,7 +42,6 @@ class PairProduct:
 
     def meet(self) -> None:
         """Which nodes are in pairs, for `settle`."""
-        self._list()
         self._sweep(self._meet, len(self._met), [self.sets], [self._met])
 
     def prepare(self, x: wp.array, wanted: wp.array) -> None:
@@ -52,7 +51,6 @@ class PairProduct:
 
     def __call__(self, v: wp.array, out: wp.array, x: wp.array | None = None, wanted: wp.array | None = None) -> None:
         """out += H v; with what turns at positions x in the worlds that want it."""
-        self._list()
         self._write(v, x, wanted)
         self._sweep(self._gather, len(out), [self.sets, self._gathered()], [out])
 
@@ -68,11 +66,6 @@ class PairProduct:
             if not part.keeps:
                 part.multiply(v)
 
-    def _list(self) -> None:
-        """Pairs that are used, where one thread takes them all."""
-        if self._serial:
-            self._sweep(self._sift, 1, [self.sets], [])
-
     def _gathered(self) -> wp.array:
         """Sums of nodes, where one thread takes all pairs: it need not look for those of each node."""
         if self._serial:
@@ -84,14 +77,10 @@ class PairProduct:
         own, kind = set_struct(self._real, self._linear)(), part.found.kind
         for name in ("nodes", "used", "direction", "weight", "bend"):
             setattr(own, name, getattr(part.factor, name))
-        for name in ("pairs", "count", "gradient", "parts", "places", "numbers", "items", "ranks"):
+        for name in ("pairs", "count", "gradient", "parts", "places", "numbers", "items", "ranks", "listed", "number"):
             setattr(own, name, getattr(part, name))
         for name in ("marks", "starts", "columns") if part.mollified and part.mollified.keeps else ():
             setattr(own, name, getattr(part.mollified, name))
-        listed = part.found.capacity if self._serial else 0
-        own.listed, own.number = (
-            wp.zeros(size, dtype=int, device=self._device) for size in (listed, int(self._serial))
-        )
         own.placed = wp.zeros(len(part.items) * self._ranked, dtype=part.parts.dtype, device=self._device)
         own.kind = KINDS.index(kind) if isinstance(part, ContactElements) else -1
         own.edges = (kind.first == 2) + (kind == EDGES)

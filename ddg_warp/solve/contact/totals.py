@@ -44,9 +44,7 @@ class Totals:
     def _written(self, part):
         own = written_struct(self._real)()
         own.count, own.starts, own.partners = part.count, part.starts, part.partners
-        own.energy, own.things = part.energy, part.found.first.count
+        own.energy, own.used, own.things = part.energy, part.factor.used, part.found.first.count
         if part in self._frictions:
             own.work = part.work
-        else:
-            own.used = part.factor.used
         return own
