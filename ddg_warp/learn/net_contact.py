@@ -109,13 +109,13 @@ class ContactAdjoint:
             array.zero_()
         for i, (part, rub) in enumerate(zip(terms.lists, self._rubs, strict=True)):
             read, pairs = [part.pairs, part.count, part.found.sides, terms.law], part.found.capacity
-            self._items[i].list(part.count, part.factor.nodes, part.factor.used)
+            self._items[i].list(part.listed, part.number, part.factor.nodes)
             inputs = [*read, part.factor.nodes, part.factor.used, q, w]
             self._sweep(self._pull[i], pairs, inputs, [part.gradient, self._numbers])
             part.add_up(part.gradient, 1.0, by_q, self._items[i])
             self._sum(i, part)
             if rub:
-                self._items[i].list(rub.count, rub.factor.nodes, rub.factor.used)
+                self._items[i].list(rub.listed, rub.number, rub.factor.nodes)
                 read = [rub.pairs, rub.count, part.found.sides, terms.law, rub.factor.nodes, rub.factor.used]
                 inputs = [*read, before, q, w, self._velocity, rate, *rub.directions]
                 written = [rub.gradient, self._start_parts, self._numbers, self._by_direction]

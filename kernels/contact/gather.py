@@ -38,13 +38,16 @@ def factor_struct(linear):
 def set_struct(real, linear):
     """A list of pairs: its factor (see `factor_struct`) and gradients, the items of nodes, and what products write.
 
-    ranks: of each pair, the places of its items; parts: of products by slot, or `placed` by rank.
+    ranks: of each pair, the places of its items among all of the list, -1 where it has none; what pairs bring to nodes is `placed` by
+    these, so that nodes read it one after the other: of products, and with `push`, `own_block`, `next_block` and `edge` what `place`
+    says.
     marks, starts, columns: of pairs whose Hessians are kept, see `pair_terms.mollified_kernels`; empty where there are none.
     listed, number (1,): pairs that may be used, all others are not, and how many these are.
     kind: place in `pair_bend.KINDS`, -1 without `bend`; edges: how many of its things, the first ones, are edges; rows: of its factor;
     things: first things of pairs in one world.
     """
     X, V, W = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.vector(SLOTS, linear)
+    B = wp.types.vector(6, linear)
 
     @wp.struct
     class PairSet:
@@ -59,11 +62,13 @@ def set_struct(real, linear):
         marks: wp.array(dtype=int)
         starts: wp.array(dtype=int)
         columns: wp.array3d(dtype=V)
-        parts: wp.array2d(dtype=V)
         placed: wp.array(dtype=V)
+        push: wp.array(dtype=X)
+        own_block: wp.array(dtype=B)
+        next_block: wp.array(dtype=B)
+        edge: wp.array(dtype=int)
         places: wp.array(dtype=int)
         numbers: wp.array(dtype=int)
-        items: wp.array(dtype=int)
         ranks: wp.array(dtype=wp.vec4i)
         listed: wp.array(dtype=int)
         number: wp.array(dtype=int)
@@ -144,16 +149,22 @@ def list_kernels(kind: Kind, real, serial: bool):
         starts: wp.array(dtype=int),
         filled: wp.array(dtype=int),
         items: wp.array(dtype=int),
+        ranks: wp.array(dtype=wp.vec4i),
     ):
+        """One thread alone fills them in order: these are the ranks then."""
         tid = wp.tid()
         if tid >= many[0]:
             return
         for i in range(tid, until(tid, many[0])):
             p = listed[i]
+            rank = wp.vec4i(-1, -1, -1, -1)
             for slot in range(wp.static(size)):
                 node = nodes[p][slot]
                 if silent[node % silent.shape[0]] == wp.uint8(0):
-                    items[starts[node] + wp.atomic_add(filled, node, 1)] = wp.static(SLOTS) * p + slot
+                    rank[slot] = starts[node] + wp.atomic_add(filled, node, 1)
+                    items[rank[slot]] = wp.static(SLOTS) * p + slot
+            if wp.static(serial):
+                ranks[p] = rank
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def sort(
@@ -167,10 +178,7 @@ def list_kernels(kind: Kind, real, serial: bool):
         ordered: wp.array(dtype=int),
         ranks: wp.array(dtype=wp.vec4i),
     ):
-        """A thread a pair, as a thread a node would take thousands of steps where a node is in thousands of pairs.
-
-        `ranks` are the places of a pair's items, -1 where it has none.
-        """
+        """A thread a pair, as a thread a node would take thousands of steps where a node is in thousands of pairs."""
         tid = wp.tid()
         if tid >= many[0]:
             return
@@ -222,20 +230,51 @@ def sum_kernel(real, serial: bool):
 
 @cache
 def collect_kernels(real, linear, serial: bool):
-    """collect(...) forces of all lists on nodes, and the blocks of H on its diagonal; join(...) those between the nodes of edges."""
+    """place(...) what pairs bring to nodes, collect(...) forces of nodes and blocks of H on its diagonal, join(...) its blocks
+    between the nodes of edges."""
     PairSet, Surface, until = set_struct(real, linear), surface_struct(real), until_function(serial)
-    V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), linear)
+    V, M, B = wp.types.vector(3, real), wp.types.matrix((3, 3), linear), wp.types.vector(6, linear)
 
     @wp.func
     def block(own: PairSet, p: int, a: int, b: int):
-        """What pair p adds to the matrix between its nodes in slots a and b [N/m]."""
-        m = M()
+        """What pair p adds to the matrix between its nodes in slots a and b [N/m], which is symmetric."""
+        m = B()
         for k in range(own.rows):
             if (own.used[p] >> (k + 1)) & 1 != 0:
                 v = own.direction[k, p]
                 w = own.weight[k, p]
-                m += wp.outer(v, v) * (w[a] * w[b])
+                m += B(v[0] * v[0], v[0] * v[1], v[0] * v[2], v[1] * v[1], v[1] * v[2], v[2] * v[2]) * (w[a] * w[b])
         return m
+
+    @wp.func
+    def whole(b: B):
+        return M(b[0], b[1], b[2], b[1], b[3], b[4], b[2], b[4], b[5])
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def place(sets: wp.array(dtype=PairSet)):
+        """Of every item the gradient, the block of its node, and of the first one of an edge this edge and the block between its nodes.
+
+        `edge` is -1 elsewhere: another one may begin at that node.
+        """
+        tid = wp.tid()
+        for s in range(sets.shape[0]):
+            own = sets[s]
+            if tid < own.number[0]:
+                for i in range(tid, until(tid, own.number[0])):
+                    p = own.listed[i]
+                    used = own.used[p] != 0
+                    for slot in range(wp.static(SLOTS)):
+                        rank = own.ranks[p][slot]
+                        if rank >= 0:
+                            own.push[rank] = V()
+                            own.own_block[rank] = B()
+                            own.edge[rank] = -1
+                            if used:
+                                own.push[rank] = own.gradient[slot, p]
+                                own.own_block[rank] = block(own, p, slot, slot)
+                                if slot % 2 == 0 and slot / 2 < own.edges:
+                                    own.edge[rank] = own.pairs[p][slot / 2]
+                                    own.next_block[rank] = block(own, p, slot, slot + 1)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def collect(
@@ -247,39 +286,34 @@ def collect_kernels(real, linear, serial: bool):
         """`stiffness` are the traces of the blocks."""
         tid = wp.tid()
         for node in range(tid, until(tid, forces.shape[0])):
-            force, total = V(), M()
+            force, total = V(), B()
             for s in range(sets.shape[0]):
                 number = sets[s].numbers[node]
                 if number > 0:
                     own = sets[s]
-                    for k in range(own.places[node], own.places[node] + number):
-                        p = own.items[k] / wp.static(SLOTS)
-                        slot = own.items[k] - wp.static(SLOTS) * p
-                        if own.used[p] != 0:
-                            force -= own.gradient[slot, p]
-                            total += block(own, p, slot, slot)
+                    start = own.places[node]
+                    for k in range(start, start + number):
+                        force -= own.push[k]
+                        total += own.own_block[k]
             forces[node] = force
-            diagonal[node] = total
-            stiffness[node] = real(wp.trace(total))
+            diagonal[node] = whole(total)
+            stiffness[node] = real(total[0] + total[3] + total[5])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def join(sets: wp.array(dtype=PairSet), edges: Surface, count: int, between: wp.array(dtype=M)):
-        """Items of the first node that come from this edge, not from another one that begins there."""
         tid = wp.tid()
         for i in range(tid, until(tid, between.shape[0])):
             w = i / count
             node = edges.nodes[i - w * count, 0] + w * edges.nodes_a_world
-            total = M()
+            total = B()
             for s in range(sets.shape[0]):
                 number = sets[s].numbers[node]
-                if number > 0 and sets[s].edges > 0:
+                if number > 0:
                     own = sets[s]
-                    for k in range(own.places[node], own.places[node] + number):
-                        p = own.items[k] / wp.static(SLOTS)
-                        slot = own.items[k] - wp.static(SLOTS) * p
-                        if own.used[p] != 0 and (slot == 0 or (slot == 2 and own.edges == 2)):
-                            if own.pairs[p][slot / 2] == i:
-                                total += block(own, p, slot, slot + 1)
-            between[i] = total
+                    start = own.places[node]
+                    for k in range(start, start + number):
+                        if own.edge[k] == i:
+                            total += own.next_block[k]
+            between[i] = whole(total)
 
-    return collect, join
+    return place, collect, join

@@ -11,13 +11,9 @@ from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 
 @cache
-def product_kernels(real, linear, serial: bool, ranked: bool):
-    """multiply(...) pairs; scatter(...) to nodes or gather(...); settle(...), which does so on free dofs, with dot
-    products, for nodes in pairs, which meet(...) finds.
-
-    If `serial`, what gather(...) and settle(...) add was scattered to `sums`, in the order in which others gather it. If `ranked`,
-    pairs write what nodes gather where these read it one after the other.
-    """
+def product_kernels(real, linear, serial: bool):
+    """multiply(...) pairs; gather(...) to nodes; settle(...), which does so on free dofs, with dot products, for nodes in pairs, which
+    meet(...) finds."""
     PairSet, until = set_struct(real, linear), until_function(serial)
     X, V, Y = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.matrix((4, 3), linear)
     bend = bend_function(linear)
@@ -49,18 +45,15 @@ def product_kernels(real, linear, serial: bool, ranked: bool):
     @wp.func
     def put(own: PairSet, slot: int, p: int, value: V):
         """What a pair brings to one of its nodes."""
-        if wp.static(ranked):
-            rank = own.ranks[p][slot]
-            if rank >= 0:
-                own.placed[rank] = value
-        else:
-            own.parts[slot, p] = value
+        rank = own.ranks[p][slot]
+        if rank >= 0:
+            own.placed[rank] = value
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def multiply(
         sets: wp.array(dtype=PairSet), wanted: wp.array(dtype=int), x: wp.array(dtype=X), v: wp.array(dtype=V)
     ):
-        """F^T F v of each pair, by slot; in the worlds that want it, if given, with that of `pair_bend`, or the Hessian kept."""
+        """F^T F v of each pair, at its nodes; in the worlds that want it, if given, with that of `pair_bend`, or the Hessian kept."""
         tid = wp.tid()
         for s in range(sets.shape[0]):
             own = sets[s]
@@ -99,12 +92,12 @@ def product_kernels(real, linear, serial: bool, ranked: bool):
                                 y += bend(own.kind, at, own.weight[0, p], u) * c
                         for slot in range(wp.static(SLOTS)):
                             put(own, slot, p, y[slot])
-                    elif wp.static(ranked):  # nodes that list it read it
+                    else:  # nodes that list it read it
                         for slot in range(wp.static(SLOTS)):
                             put(own, slot, p, V())
 
     @wp.func
-    def gathered(sets: wp.array(dtype=PairSet), sums: wp.array(dtype=V), node: int):
+    def total(sets: wp.array(dtype=PairSet), node: int):
         y = V()
         for s in range(sets.shape[0]):
             number = sets[s].numbers[node]
@@ -112,27 +105,15 @@ def product_kernels(real, linear, serial: bool, ranked: bool):
                 own = sets[s]
                 start = own.places[node]
                 for k in range(start, start + number):
-                    if wp.static(ranked):
-                        y += own.placed[k]
-                    else:
-                        item = own.items[k]
-                        p = item / wp.static(SLOTS)
-                        if own.used[p] != 0:
-                            y += own.parts[item - wp.static(SLOTS) * p, p]
+                    y += own.placed[k]
         return y
 
-    @wp.func
-    def scattered(sets: wp.array(dtype=PairSet), sums: wp.array(dtype=V), node: int):
-        return sums[node]
-
-    total = scattered if serial else gathered
-
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def gather(sets: wp.array(dtype=PairSet), sums: wp.array(dtype=V), out: wp.array(dtype=V)):
+    def gather(sets: wp.array(dtype=PairSet), out: wp.array(dtype=V)):
         """Adds to the nodes."""
         tid = wp.tid()
         for node in range(tid, until(tid, out.shape[0])):
-            out[node] = out[node] + total(sets, sums, node)
+            out[node] = out[node] + total(sets, node)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def meet(sets: wp.array(dtype=PairSet), met_out: wp.array(dtype=wp.uint8)):
@@ -147,7 +128,6 @@ def product_kernels(real, linear, serial: bool, ranked: bool):
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def settle(
         sets: wp.array(dtype=PairSet),
-        sums: wp.array(dtype=V),
         met: wp.array(dtype=wp.uint8),
         p: wp.array(dtype=V),
         fixed: wp.array(dtype=wp.uint8),
@@ -161,25 +141,8 @@ def product_kernels(real, linear, serial: bool, ranked: bool):
             w = node / fixed.shape[0]
             if met[node] != wp.uint8(0) and busy[w] == 1:
                 k = node - w * fixed.shape[0]
-                y = out[node] + wp.cw_mul(total(sets, sums, node), free(fixed[k]))
+                y = out[node] + wp.cw_mul(total(sets, node), free(fixed[k]))
                 out[node] = y
                 dots_out[w, k] = wp.dot(p[node], y)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def scatter(sets: wp.array(dtype=PairSet), out: wp.array(dtype=V)):
-        """Adds to the nodes, by one thread."""
-        tid = wp.tid()
-        for s in range(sets.shape[0]):
-            own = sets[s]
-            if tid < own.number[0]:
-                for i in range(tid, until(tid, own.number[0])):
-                    p = own.listed[i]
-                    if own.used[p] != 0:
-                        last = int(-1)
-                        for slot in range(wp.static(SLOTS)):
-                            node = own.nodes[p][slot]
-                            if node != last:  # the last node is repeated where a pair has fewer
-                                wp.atomic_add(out, node, own.parts[slot, p])
-                            last = node
-
-    return multiply, gather, meet, settle, scatter
+    return multiply, gather, meet, settle

@@ -193,7 +193,7 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
 
 @cache
 def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: bool, unbent: bool = False):
-    """Product of the exact Hessian of each pair with v, by slot: the reverse of the derivative along v.
+    """Product of the exact Hessian of each pair with v, by rank (see `gather.set_struct`): the reverse of the derivative along v.
 
     `unbent`: of those pairs alone that `pair_bend` does not know.
     """
@@ -206,21 +206,24 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: boo
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def product(
         pairs: wp.array(dtype=wp.vec2i),
-        count: wp.array(dtype=int),
+        listed: wp.array(dtype=int),
+        number: wp.array(dtype=int),
         sides: Sides,
         law: Law,
         x: wp.array(dtype=V),
         factor: Factor,
         v: wp.array(dtype=L),
-        parts: wp.array2d(dtype=L),
+        ranks: wp.array(dtype=wp.vec4i),
+        placed: wp.array(dtype=L),
     ):
         tid = wp.tid()
-        if tid >= count[0]:
+        if tid >= number[0]:
             return
-        for pair in range(tid, until(tid, count[0])):
-            asked = factor.used[pair] != 0
+        for i in range(tid, until(tid, number[0])):
+            pair = listed[i]
+            asked = True
             if wp.static(unbent):
-                asked = asked and factor.bend[pair] == linear(0.0)
+                asked = factor.bend[pair] == linear(0.0)
             if asked:
                 p, threshold, inner = given(law, sides, pairs[pair])
                 nodes = factor.nodes[pair]
@@ -230,7 +233,8 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: boo
                         move[slot, d] = real(v[nodes[slot]][d])
                 dx, _dv, _dp, _dt, _ds = wp.grad(along)(corners(x, nodes), move, p, threshold, inner)
                 for slot in range(wp.static(SLOTS)):
-                    parts[slot, pair] = L(linear(dx[slot, 0]), linear(dx[slot, 1]), linear(dx[slot, 2]))
+                    if ranks[pair][slot] >= 0:
+                        placed[ranks[pair][slot]] = L(linear(dx[slot, 0]), linear(dx[slot, 1]), linear(dx[slot, 2]))
 
     return product
 

@@ -176,7 +176,8 @@ def test_refusals(device):
 
 @pytest.mark.parametrize("name", ["noodles", "crossed_beams"])
 def test_chains_are_eliminated_by_one_thread_or_by_many(device, monkeypatch, name):
-    """Contact's part of the bands is in both: the same iterations, and the same motion but for rounding."""
+    """Contact's part of the bands is in both: the same iterations and the same motion but for rounding, by which one of hundreds of
+    iterations may be more or less."""
     found = []
     for reduces in (False, True):
         monkeypatch.setattr(net_chains, "long_and_few", lambda *_, reduces=reduces: reduces)
@@ -189,6 +190,7 @@ def test_chains_are_eliminated_by_one_thread_or_by_many(device, monkeypatch, nam
         found.append((state.points(), integrator.statistics()))
     (one, by_one), (many, by_many) = found
     assert by_one["contact"]["contacts"]["mean"] > 0.0
-    assert by_many["newton_iterations"] == by_one["newton_iterations"]
+    newton = [by["newton_iterations"]["mean"] * sum(by["outcomes"].values()) for by in (by_one, by_many)]
+    assert abs(newton[1] - newton[0]) <= 1.0 + 1e-9
     assert abs(by_many["pcg_iterations"] - by_one["pcg_iterations"]) < 0.1 * by_one["pcg_iterations"]
     np.testing.assert_allclose(many, one, rtol=0.0, atol=1e-7)

@@ -70,8 +70,7 @@ class ContactElements(PairElements):
         self.write(x, law, gap)
         self._items.list(self.listed, self.number, self.factor.nodes)
 
-    def exact_product(self, v: wp.array, out: wp.array, x: wp.array, law) -> None:
-        """Add the product of the exact Hessian at x, those of `evaluate`, with v."""
-        inputs = [self.pairs, self.count, self.found.sides, law, x, self.factor, v]
-        self._sweep(self._exact, self.found.capacity, inputs, [self.parts])
-        self.add_up(self.parts, 1.0, out)
+    def exact_product(self, v: wp.array, x: wp.array, law) -> None:
+        """Place the product of the exact Hessian at x, those of `evaluate`, with v."""
+        inputs = [self.pairs, self.listed, self.number, self.found.sides, law, x, self.factor, v, self.ranks]
+        self._sweep(self._exact, self.found.capacity, inputs, [self.placed])

@@ -75,7 +75,7 @@ class Unkept:
         self._at = x, law
 
     def multiply(self, v: wp.array) -> None:
-        """Write their products with v by slot."""
+        """Write their products with v."""
         of, (x, law) = self._of, self._at
-        inputs = [of.pairs, of.count, of.found.sides, law, x, of.factor, v]
-        arrays.sweep(self._multiply, of.found.capacity, inputs, [of.parts], of.device)
+        inputs = [of.pairs, of.listed, of.number, of.found.sides, law, x, of.factor, v, of.ranks]
+        arrays.sweep(self._multiply, of.found.capacity, inputs, [of.placed], of.device)

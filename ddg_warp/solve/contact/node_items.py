@@ -17,7 +17,7 @@ class NodeItems:
 
     Attributes:
         numbers, places: of each node, how many items it has and where they start in `items`.
-        ranks: of each pair, the places of its items, -1 where it has none; not where one thread lists all.
+        ranks: of each pair that is listed, the places of its items, -1 where it has none.
     """
 
     def __init__(self, kind: Kind, nodes: int, real, silent: wp.array):
@@ -32,9 +32,8 @@ class NodeItems:
     def reserve(self, capacity: int) -> None:
         """Make room for the items of so many pairs."""
         self.items = wp.zeros(self._size * capacity, dtype=int, device=self.device)
-        serial = arrays.serial(self.device)
-        self._unordered = self.items if serial else wp.zeros_like(self.items)
-        self.ranks = wp.zeros(0 if serial else capacity, dtype=wp.vec4i, device=self.device)
+        self._unordered = self.items if arrays.serial(self.device) else wp.zeros_like(self.items)
+        self.ranks = wp.zeros(capacity, dtype=wp.vec4i, device=self.device)
 
     def list(self, listed: wp.array, number: wp.array, nodes: wp.array) -> None:
         """Of pairs with these nodes those that are listed, so many."""
@@ -42,7 +41,7 @@ class NodeItems:
         inputs = [listed, number, nodes, self._silent]
         self._sweep(self._number, len(nodes), inputs, [self.numbers])
         self._running()
-        self._sweep(self._fill, len(nodes), [*inputs, self.places], [self._filled, self._unordered])
+        self._sweep(self._fill, len(nodes), [*inputs, self.places], [self._filled, self._unordered, self.ranks])
         if self._unordered is not self.items:
             inputs += [self.places, self.numbers, self._unordered]
             self._sweep(self._sort, len(nodes), inputs, [self.items, self.ranks])

@@ -8,6 +8,7 @@ from ddg_warp.kernels.contact import gather
 from ddg_warp.solve.contact.pairs import PairList
 
 MOST = 2**31 // gather.SLOTS  # pairs whose slots can be counted
+PLACED = "placed", "push", "own_block", "next_block", "edge"  # what is written by rank
 
 
 class PairElements:
@@ -19,7 +20,8 @@ class PairElements:
         linear: type of factors.
 
     Attributes:
-        factor: see `gather.factor_struct`; energy: of each pair (capacity,) [J].
+        factor: see `gather.factor_struct`; energy: of each pair (capacity,) [J]; gradient: by slot (SLOTS, capacity) [N].
+        placed, push, own_block, next_block, edge: see `gather.set_struct`.
         pairs, count, starts, partners: as those of a `PairList`; of the subclass.
         listed, number: pairs that may be used, in order, and how many; of all others `factor.used` is zero.
         mollified: those whose matrices take more than a factor and what turns (`Mollified`); None without.
@@ -31,10 +33,10 @@ class PairElements:
     def __init__(self, found: PairList, rows: int, nodes: int, real, linear):
         self.found, self.device, self.rows, self.real, self.linear = found, found.device, rows, real, linear
         self.size, serial = found.kind.first + found.kind.second, arrays.serial(self.device)
-        self._add = {dtype: gather.sum_kernel(dtype, serial) for dtype in (real, linear)}
+        self._add = gather.sum_kernel(real, serial)
         self.factor = gather.factor_struct(linear)()
         self.number = wp.zeros(1, dtype=int, device=self.device)
-        self.kernels = [*self._add.values()]
+        self.kernels = [self._add]
 
     def reserve(self) -> None:
         """Make room for as many pairs as the list of the search has.
@@ -56,17 +58,15 @@ class PairElements:
         self.factor.weight = arrays.allocate((self.rows, capacity), wp.types.vector(4, linear), self.device)
         self.listed = wp.zeros(capacity, dtype=int, device=self.device)
         self.energy = wp.zeros(capacity, dtype=self.real, device=self.device)
-        shape = (gather.SLOTS, capacity)
-        self.parts = arrays.allocate(shape, vector, self.device)
-        self.gradient = self.parts
-        if linear is not self.real:
-            self.gradient = arrays.allocate(shape, wp.types.vector(3, self.real), self.device)
+        self.gradient = arrays.allocate((gather.SLOTS, capacity), wp.types.vector(3, self.real), self.device)
+        types = vector, wp.types.vector(3, self.real), wp.types.vector(6, linear), wp.types.vector(6, linear), int
+        for name, dtype in zip(PLACED, types, strict=True):
+            setattr(self, name, wp.zeros(self.size * capacity, dtype=dtype, device=self.device))
 
-    def add_up(self, parts: wp.array, scale: float, out: wp.array, items=None) -> None:
-        """Add what pairs that are used have written by slot (`SLOTS`, capacity) to nodes, by default those that have items."""
-        kernel, of = self._add[out.dtype._wp_scalar_type_], items or self
-        inputs = [parts, self.factor.used, of.places, of.numbers, of.items, scale]
-        self._sweep(kernel, len(out), inputs, [out])
+    def add_up(self, parts: wp.array, scale: float, out: wp.array, items) -> None:
+        """Add what pairs that are used have written by slot (`SLOTS`, capacity) to nodes that have items (`NodeItems`)."""
+        inputs = [parts, self.factor.used, items.places, items.numbers, items.items, scale]
+        self._sweep(self._add, len(out), inputs, [out])
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
         arrays.sweep(kernel, count, inputs, outputs, self.device)

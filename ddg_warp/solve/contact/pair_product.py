@@ -8,6 +8,7 @@ from ddg_warp.kernels.contact.pair_bend import KINDS
 from ddg_warp.kernels.contact.pair_product import product_kernels
 from ddg_warp.kernels.contact.surfaces import EDGES
 from ddg_warp.solve.contact.contact_elements import ContactElements
+from ddg_warp.solve.contact.pair_elements import PLACED
 
 
 class PairProduct:
@@ -22,14 +23,9 @@ class PairProduct:
         self._parts, self._real, self._linear, self._device = parts, real, linear, parts[0].device
         types = int, wp.types.vector(3, real)
         self._nothing = [wp.zeros(0, dtype=dtype, device=self._device) for dtype in types]
-        self._serial, vector = arrays.serial(self._device), wp.types.vector(3, linear)
-        self._sums = wp.zeros(len(parts[0].numbers) if self._serial else 0, dtype=vector, device=self._device)
-        # Hessians that are found anew in every product are written by slot
-        self._ranked = not self._serial and all(part.keeps for part in self._mollified)
-        made = product_kernels(real, linear, self._serial, self._ranked)
-        self._multiply, self._gather, self._meet, self._settle, self._scatter = made
-        self.kernels = [self._multiply, self._meet, self._settle, self._gather]
-        self.kernels += [self._scatter] if self._serial else []
+        made = product_kernels(real, linear, arrays.serial(self._device))
+        self._multiply, self._gather, self._meet, self._settle = made
+        self.kernels = [*made]
         self.kernels += [kernel for part in self._mollified for kernel in part.kernels]
         self.fit()
 
@@ -51,37 +47,34 @@ class PairProduct:
 
     def __call__(self, v: wp.array, out: wp.array, x: wp.array | None = None, wanted: wp.array | None = None) -> None:
         """out += H v; with what turns at positions x in the worlds that want it."""
-        self._write(v, x, wanted)
-        self._sweep(self._gather, len(out), [self.sets, self._gathered()], [out])
+        self.place(v, x, wanted)
+        self.gather(out)
+
+    def gather(self, out: wp.array) -> None:
+        """Add what is placed to nodes."""
+        self._sweep(self._gather, len(out), [self.sets], [out])
 
     def settle(self, v, out, x, wanted, fixed: wp.array, busy: wp.array, dots: wp.array) -> None:
         """The same on free dofs in worlds that are busy, and v . out of the nodes to which it adds."""
-        self._write(v, x, wanted)
-        self._sweep(self._settle, len(out), [self.sets, self._gathered(), self._met, v, fixed, busy], [out, dots])
+        self.place(v, x, wanted)
+        self._sweep(self._settle, len(out), [self.sets, self._met, v, fixed, busy], [out, dots])
 
-    def _write(self, v, x, wanted) -> None:
+    def place(self, v, x=None, wanted=None) -> None:
+        """What pairs bring to nodes, of products as above."""
         given = self._nothing if wanted is None else [wanted, x]
         self._sweep(self._multiply, self._most, [self.sets, *given, v], [])
         for part in self._mollified if wanted is not None else ():
             if not part.keeps:
                 part.multiply(v)
 
-    def _gathered(self) -> wp.array:
-        """Sums of nodes, where one thread takes all pairs: it need not look for those of each node."""
-        if self._serial:
-            self._sums.zero_()
-            self._sweep(self._scatter, self._most, [self.sets], [self._sums])
-        return self._sums
-
     def _set(self, part):
         own, kind = set_struct(self._real, self._linear)(), part.found.kind
         for name in ("nodes", "used", "direction", "weight", "bend"):
             setattr(own, name, getattr(part.factor, name))
-        for name in ("pairs", "count", "gradient", "parts", "places", "numbers", "items", "ranks", "listed", "number"):
+        for name in ("pairs", "count", "gradient", "places", "numbers", "ranks", "listed", "number", *PLACED):
             setattr(own, name, getattr(part, name))
         for name in ("marks", "starts", "columns") if part.mollified and part.mollified.keeps else ():
             setattr(own, name, getattr(part.mollified, name))
-        own.placed = wp.zeros(len(part.items) * self._ranked, dtype=part.parts.dtype, device=self._device)
         own.kind = KINDS.index(kind) if isinstance(part, ContactElements) else -1
         own.edges = (kind.first == 2) + (kind == EDGES)
         own.rows, own.things = part.rows, part.found.first.count

@@ -99,7 +99,8 @@ class PairTerms:
             ContactElements(pairs, law, nodes, self.real, self.linear, told_not, exact) for pairs in search.lists
         ]
         self._begin = gather.begin_kernel(self.real)
-        self._collect, self._join = gather.collect_kernels(self.real, self.linear, arrays.serial(self.device))
+        made = gather.collect_kernels(self.real, self.linear, arrays.serial(self.device))
+        self._place, self._collect, self._join = made
         self._version, self._lagged = search.version, -1
         self.frictions = self._with_friction(rubs, ways, friction_law, velocity, told_not)
         self._start = wp.zeros_like(self.forces)
@@ -117,7 +118,15 @@ class PairTerms:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         parts = [kernel for part in self._parts for kernel in part.kernels]
-        return [self._begin, self._collect, self._join, *self._product.kernels, *self._totals.kernels, *parts]
+        return [
+            self._begin,
+            self._place,
+            self._collect,
+            self._join,
+            *self._product.kernels,
+            *self._totals.kernels,
+            *parts,
+        ]
 
     @property
     def _parts(self) -> list:
@@ -185,6 +194,8 @@ class PairTerms:
         iterates = self._no_iterates if iterates is None else iterates
         for part in self.frictions:
             part.evaluate(x, start, rate, iterates)
+        most = max(part.found.capacity for part in self.lists)
+        arrays.sweep(self._place, most, [self._product.sets], [], self.device)
         outputs = [self.forces, self.diagonal, self.stiffness]
         arrays.sweep(self._collect, len(self.forces), [self._product.sets], outputs, self.device)
         self._totals(self.search.overflow)
@@ -209,9 +220,10 @@ class PairTerms:
             self._product(v, out, x, wanted)
             return
         for part in self.lists:
-            part.exact_product(v, out, x, self.law)
+            part.exact_product(v, x, self.law)
         if self._rub:
-            self._rub(v, out)
+            self._rub.place(v)
+        self._product.gather(out)
 
     def meet(self) -> None:
         """What `settle` takes of the last `evaluate`: which nodes are in pairs."""
