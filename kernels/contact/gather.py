@@ -38,13 +38,12 @@ def factor_struct(linear):
 def set_struct(real, linear):
     """A list of pairs: its factor (see `factor_struct`) and gradients, the items of nodes, and what products write.
 
-    ranks: of each pair, the places of its items among all of the list, -1 where it has none; what pairs bring to nodes is `placed` by
-    these, so that nodes read it one after the other: of products, and with `push`, `own_block`, `next_block` and `edge` what `place`
-    says.
+    ranks: of each pair, the places of its items among all of the list, -1 where it has none; what pairs bring to nodes is written by
+    these, so that nodes read it one after the other: `placed` of products; push, own_block, next_block and edge: see `place`.
     marks, starts, columns: of pairs whose Hessians are kept, see `pair_terms.mollified_kernels`; empty where there are none.
     listed, number (1,): pairs that may be used, all others are not, and how many these are.
-    kind: place in `pair_bend.KINDS`, -1 without `bend`; edges: how many of its things, the first ones, are edges; rows: of its factor;
-    things: first things of pairs in one world.
+    sides: 2, which the compiler must not know; kind: place in `pair_bend.KINDS`, -1 without `bend`; edges: how many of its things, the
+    first ones, are edges; rows: of its factor; things: first things of pairs in one world.
     """
     X, V, W = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.vector(SLOTS, linear)
     B = wp.types.vector(6, linear)
@@ -72,6 +71,7 @@ def set_struct(real, linear):
         ranks: wp.array(dtype=wp.vec4i)
         listed: wp.array(dtype=int)
         number: wp.array(dtype=int)
+        sides: int
         kind: int
         edges: int
         rows: int
@@ -234,17 +234,21 @@ def collect_kernels(real, linear, serial: bool):
     between the nodes of edges."""
     PairSet, Surface, until = set_struct(real, linear), surface_struct(real), until_function(serial)
     V, M, B = wp.types.vector(3, real), wp.types.matrix((3, 3), linear), wp.types.vector(6, linear)
+    H = wp.types.vector(3, linear)
 
     @wp.func
-    def block(own: PairSet, p: int, a: int, b: int):
-        """What pair p adds to the matrix between its nodes in slots a and b [N/m], which is symmetric."""
-        m = B()
-        for k in range(own.rows):
-            if (own.used[p] >> (k + 1)) & 1 != 0:
-                v = own.direction[k, p]
-                w = own.weight[k, p]
-                m += B(v[0] * v[0], v[0] * v[1], v[0] * v[2], v[1] * v[1], v[1] * v[2], v[2] * v[2]) * (w[a] * w[b])
-        return m
+    def square(v: H):
+        """v v^T, by its six entries."""
+        return B(v[0] * v[0], v[0] * v[1], v[0] * v[2], v[1] * v[1], v[1] * v[2], v[2] * v[2])
+
+    @wp.func
+    def put(own: PairSet, rank: int, push: V, own_block: B, next_block: B, edge: int):
+        if rank >= 0:
+            own.push[rank] = push
+            own.own_block[rank] = own_block
+            own.edge[rank] = edge
+            if edge >= 0:
+                own.next_block[rank] = next_block
 
     @wp.func
     def whole(b: B):
@@ -258,23 +262,27 @@ def collect_kernels(real, linear, serial: bool):
         """
         tid = wp.tid()
         for s in range(sets.shape[0]):
-            own = sets[s]
-            if tid < own.number[0]:
+            if tid < sets[s].number[0]:
+                own = sets[s]
                 for i in range(tid, until(tid, own.number[0])):
                     p = own.listed[i]
-                    used = own.used[p] != 0
-                    for slot in range(wp.static(SLOTS)):
-                        rank = own.ranks[p][slot]
-                        if rank >= 0:
-                            own.push[rank] = V()
-                            own.own_block[rank] = B()
-                            own.edge[rank] = -1
-                            if used:
-                                own.push[rank] = own.gradient[slot, p]
-                                own.own_block[rank] = block(own, p, slot, slot)
-                                if slot % 2 == 0 and slot / 2 < own.edges:
-                                    own.edge[rank] = own.pairs[p][slot / 2]
-                                    own.next_block[rank] = block(own, p, slot, slot + 1)
+                    rank, pair, used = own.ranks[p], own.pairs[p], own.used[p]
+                    for side in range(own.sides):  # not unrolled, for the sake of registers
+                        push, next_push = V(), V()
+                        own_block, block, next_block = B(), B(), B()
+                        if used != 0:
+                            push = push + own.gradient[2 * side, p]
+                            next_push = next_push + own.gradient[2 * side + 1, p]
+                            for k in range(own.rows):
+                                if (used >> (k + 1)) & 1 != 0:
+                                    w, b = own.weight[k, p], square(own.direction[k, p])
+                                    one, other = wp.where(side == 0, w[0], w[2]), wp.where(side == 0, w[1], w[3])
+                                    own_block += b * (one * one)
+                                    block += b * (one * other)
+                                    next_block += b * (other * other)
+                        edge = wp.where(side < own.edges, wp.where(side == 0, pair[0], pair[1]), -1)
+                        put(own, wp.where(side == 0, rank[0], rank[2]), push, own_block, block, edge)
+                        put(own, wp.where(side == 0, rank[1], rank[3]), next_push, next_block, block, -1)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def collect(

@@ -76,7 +76,7 @@ class PairProduct:
         for name in ("marks", "starts", "columns") if part.mollified and part.mollified.keeps else ():
             setattr(own, name, getattr(part.mollified, name))
         own.kind = KINDS.index(kind) if isinstance(part, ContactElements) else -1
-        own.edges = (kind.first == 2) + (kind == EDGES)
+        own.sides, own.edges = 2, (kind.first == 2) + (kind == EDGES)
         own.rows, own.things = part.rows, part.found.first.count
         return own
 
