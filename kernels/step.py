@@ -175,16 +175,27 @@ def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
 
 
 @cache
+def start_function(real):
+    """start(flags, scalars, i): starts a step of an island, which has all of it to do if it has not been given up."""
+
+    @wp.func
+    def start(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), i: int):
+        scalars[PORTION, i] = real(1.0)
+        flags[CAUTIOUS, i] = 0
+        flags[RETRIES, i] = 0
+        scalars[PROGRESS, i] = wp.where(flags[STATUS, i] == wp.static(outcome.GIVEN_UP), real(1.0), real(0.0))
+
+    return start
+
+
+@cache
 def start_kernel(real):
-    """Starts a step: every rod that has not been given up has all of it to do."""
+    """Starts a step of all islands."""
+    start_one = start_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def start(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real)):
-        r = wp.tid()
-        scalars[PORTION, r] = real(1.0)
-        flags[CAUTIOUS, r] = 0
-        flags[RETRIES, r] = 0
-        scalars[PROGRESS, r] = wp.where(flags[STATUS, r] == wp.static(outcome.GIVEN_UP), real(1.0), real(0.0))
+        start_one(flags, scalars, wp.tid())
 
     return start
 

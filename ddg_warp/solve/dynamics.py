@@ -22,8 +22,8 @@ from ddg_warp.threads import launches
 
 FAILURES = ("raise", "flag")
 SOLVERS = ("newton", "projective")
-# Steps by which trees of searches serve on CUDA, where they are refitted meanwhile: to make those of 100 rods anew takes a tenth of
-# a step in which they touch nothing.
+# Steps by which trees of searches serve on CUDA, where they are refitted meanwhile, if they are used at all: to make those of 100 rods
+# anew takes a tenth of a step in which they touch nothing.
 RENEWAL = 8
 SCHEMES = ("implicit_euler", "implicit_midpoint")
 
@@ -119,7 +119,8 @@ class Integrator:
         self._dt = wp.zeros(model.worlds, dtype=model.types.real, device=model.wp_device)
         self._dt_host = None
         self._longest, self._version = 0.0, model.version
-        self._since_renewal = 0  # steps since the trees of searches were made anew
+        # steps since the state came from elsewhere, and uses of trees of searches until they were made anew
+        self._since_renewal, self._uses = 0, 0
 
     def step(self, state: State, dt: float, controls: Controls | None = None) -> State:
         """The state after a step of dt [s]. No state changes that is held: see `State`.
@@ -166,8 +167,7 @@ class Integrator:
         """A step from what one buffer holds, at the time `start`, to the other; `anew` where it is from elsewhere: see `forget`."""
         for part in self._parts:
             part.prescribe(start, start + dt)
-        renew = anew or self._since_renewal % RENEWAL == 0 or self.model.wp_device.is_cpu
-        self._since_renewal += 1
+        renew = self._renews(anew)
 
         def launch():
             if anew:
@@ -181,6 +181,17 @@ class Integrator:
         while self._net is not None and self._net.outgrown(self._buffers[source].own.net):
             self._graphs.clear()
             replay()
+
+    def _renews(self, anew: bool) -> bool:
+        """Whether trees of searches are made anew at the start of a step: every few, if they have been used since the last time."""
+        if self._net is None or self.model.wp_device.is_cpu:
+            return True
+        used, due = self._net.uses != self._uses, self._since_renewal % RENEWAL == 0
+        renew = anew or self._since_renewal == 0 or (due and used)
+        self._since_renewal += 1
+        if renew:
+            self._uses = self._net.uses
+        return renew
 
     def check(self, state: State) -> None:
         """Read the outcomes of all steps since the last reading.
@@ -367,7 +378,7 @@ class Integrator:
             self._graphs.clear()
 
     def _launch(self, source: int, renew: bool) -> None:
-        """Launches of a step of all parts from one buffer to the other; `renew`: as of `NetContact.begin`."""
+        """Launches of a step of all parts from one buffer to the other; `renew`: as of `NetStep.step`."""
         before, after = self._buffers[source].own, self._buffers[1 - source].own
         for part in self._parts:
             if part.motion:

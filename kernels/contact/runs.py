@@ -1,82 +1,130 @@
 """Whether any two edges of rods may come near, without a look at each pair: rods by boxes around runs of edges, each along itself.
 
+Boxes around runs of edges that do not meet say that no two rods are near, as long as every edge stays in the box of its run; how it
+came there does not matter. So boxes are made for a motion and for more of it, in a frame that goes along with the mean of a world,
+and serve until something leaves them. Any place of the frame would do, as long as it is the same for all of a world.
+
 Midpoints of neighbouring edges are apart by no more than the longest edge of the rod. So where those of two edges are farther apart
 than these need to be, as many edges further along are, too, as that excess has of longest edges: what is straight takes some tests for
-each edge, their number growing with the logarithm of all.
+each edge, their number growing with the logarithm of all. A rod has some of the excess to `SPARE` for each edge between the two: as
+long as no edge differs by more from how it was seen, the rod need not be followed again.
 
-All nodes of a world are taken to go one share of their way. A world in which they go by shares of their own, and do not rest, may have
-anything near, as may what is found near by this bound: a search for pairs says whether there are any.
+What is found near by these bounds may be near: a search for pairs says whether it is. Rows of `known` (rows, worlds) are named here.
 """
 
 from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.contact.boxes import outward_function
+from ddg_warp.kernels.contact.boxes import FAR, outward_function
 from ddg_warp.kernels.contact.surfaces import EDGES, pair_functions, sides_struct
-from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
+from ddg_warp.kernels.threads import CPU_OPTIONS, first_of, share_function, until_function
+
+# whether a world may have anything near, and boxes that meet; how many times the motion at hand the next boxes are for, and how many
+# steps ago those that serve were made; the number of the step
+DOUBT, MEET, AHEAD, STEPS, TICK = range(5)
+KNOWN = 5
+MOST = 16  # times the motion that boxes are made for; twice as many each time, a quarter where they meet
+ROOM = 0.5  # margins by which boxes are wider, for each time the motion
+SPARE = 0.2  # of the longest edge of a rod, by which edges may differ from how they were seen
+STRETCH = 1.03125  # of the longest edges, what they may become meanwhile
+ROUNDING = 3e-7  # more than that of float32, of a frame's coordinates
 
 
 @cache
 def run_kernels(grouped: bool, real, serial: bool):
-    """enclose(...) the edges of runs on their way; meet(...) of these boxes; follow(...) every rod along itself."""
+    """clear(...) the longest edges; enclose(...) the edges of runs on their way; meet(...) of these boxes; settle(...) whether they do,
+    world by world; hold(...): whether edges stay in their boxes; follow(...) rods along themselves.
+
+    All are about worlds that are `tried` (worlds,), and a straight motion from x to y, of which all nodes go one share; `mean`,
+    `mean_after` are means of nodes at its ends, their difference by what frames go on in a step.
+    """
     Sides, X = sides_struct(real), wp.types.vector(3, real)
     _, may_touch, thickness, _ = pair_functions(EDGES, real)
     outward, share, until = outward_function(real), share_function(serial), until_function(serial)
     half = wp.constant(real(0.5))
+
+    @wp.func
+    def corner(x: X, frame: X, reach: real, sign: float):
+        """Of a box around all that is within reach of x, seen from the frame."""
+        found = wp.vec3()
+        for d in range(3):
+            more = reach + real(ROUNDING) * (wp.abs(x[d]) + wp.abs(frame[d]))
+            found[d] = outward(x[d] - frame[d] + real(sign) * more, sign)
+        return found
+
+    @wp.func
+    def inside(x: X, frame: X, reach: real, lower: wp.vec3, upper: wp.vec3):
+        down, up = corner(x, frame, reach, wp.float32(-1.0)), corner(x, frame, reach, wp.float32(1.0))
+        if not (down[0] >= lower[0] and down[1] >= lower[1] and down[2] >= lower[2]):
+            return False  # as is what is no number
+        return up[0] <= upper[0] and up[1] <= upper[1] and up[2] <= upper[2]
+
+    @wp.func
+    def asked(tried: wp.array(dtype=int), known: wp.array2d(dtype=int), w: int):
+        return tried[w] != 0 and known[DOUBT, w] != 0
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def clear(tried: wp.array(dtype=int), known: wp.array2d(dtype=int), longest: wp.array2d(dtype=real)):
+        w, object = wp.tid()
+        if asked(tried, known, w):
+            longest[w, object] = real(0.0)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def enclose(
         sides: Sides,
         runs: wp.array2d(dtype=int),
         x: wp.array(dtype=X),
-        move: wp.array(dtype=X),
-        together: wp.array(dtype=int),
-        shift: wp.array(dtype=X),
-        within: real,
+        y: wp.array(dtype=X),
+        mean: wp.array(dtype=X),
+        mean_after: wp.array(dtype=X),
+        near: real,
+        margin: real,
+        tried: wp.array(dtype=int),
+        known: wp.array2d(dtype=int),
         lower: wp.array(dtype=wp.vec3),
         upper: wp.array(dtype=wp.vec3),
-        middle: wp.array2d(dtype=X),
-        turn: wp.array2d(dtype=X),
         longest: wp.array2d(dtype=real),
-        near: wp.array(dtype=int),
     ):
-        """A thread has a run (first edge, edge after its last) of a world; `longest` is the longest edge of a rod on its way.
-
-        Of every edge, twice where its midpoint is in the middle of the way, and how far this then goes.
-        """
+        """A thread has a run (first edge, edge after its last) of a world; `longest` is the longest edge of a rod."""
         i = wp.tid()
         w = i / runs.shape[0]
+        if not asked(tried, known, w):
+            return
         first, last = runs[i - w * runs.shape[0], 0], runs[i - w * runs.shape[0], 1]
-        offset = w * sides.first.nodes_a_world
-        a = x[sides.first.nodes[first, 0] + offset]
-        p = move[sides.first.nodes[first, 0] + offset]
-        low, high = wp.min(a, a + p - shift[w]), wp.max(a, a + p - shift[w])
-        length, speed = real(0.0), wp.length_sq(p)
-        for k in range(first, last):
-            b = x[sides.first.nodes[k, 1] + offset]
-            q = move[sides.first.nodes[k, 1] + offset]
-            low = wp.min(low, wp.min(b, b + q - shift[w]))
-            high = wp.max(high, wp.max(b, b + q - shift[w]))
-            length = wp.max(length, wp.max(wp.length_sq(b - a), wp.length_sq(b + q - a - p)))
-            speed = wp.max(speed, wp.length_sq(q))
-            way = half * (p + q)
-            middle[w, k] = a + b + way
-            turn[w, k] = way
-            a = b
-            p = q
-        if not (wp.isfinite(low) and wp.isfinite(high)) or (together[w] == 0 and speed > real(0.0)):
-            near[0] = 1
-            low, high = X(), X()
+        offset = first_of(w, sides.first.nodes_a_world)
         object = sides.first.object[first]
-        wp.atomic_max(longest, w, object, wp.sqrt(length))
-        reach = sides.first.radius[w, object] + within
-        down, up = wp.vec3(), wp.vec3()
-        for d in range(3):
-            down[d] = outward(low[d] - reach, wp.float32(-1.0))
-            up[d] = outward(high[d] + reach, wp.float32(1.0))
-        lower[i] = down
-        upper[i] = up
+        ahead = real(known[AHEAD, w])
+        here, drift = X(), mean_after[w] - mean[w]
+        reach = sides.first.radius[w, object] + near
+        wide = reach + ahead * real(ROOM) * margin
+        far = wp.float32(FAR)
+        low, high = wp.vec3(far, far, far), wp.vec3(-far, -far, -far)
+        a, b, length = X(), X(), real(0.0)
+        for k in range(first, last + 1):
+            node = sides.first.nodes[wp.min(k, last - 1), wp.where(k < last, 0, 1)] + offset
+            p, q = x[node], y[node]
+            if k > first:
+                length = wp.max(length, wp.max(wp.length_sq(p - a), wp.length_sq(q - b)))
+            a = p
+            b = q
+            beyond = q - drift + ahead * (q - drift - p)
+            if not (wp.isfinite(p) and wp.isfinite(beyond)):
+                wp.atomic_max(known, MEET, w, 1)
+                beyond = X()
+            low = wp.min(
+                low, wp.min(corner(p, here, reach, wp.float32(-1.0)), corner(q, drift, reach, wp.float32(-1.0)))
+            )
+            high = wp.max(
+                high, wp.max(corner(p, here, reach, wp.float32(1.0)), corner(q, drift, reach, wp.float32(1.0)))
+            )
+            low = wp.min(low, corner(beyond, here, wide, wp.float32(-1.0)))
+            high = wp.max(high, corner(beyond, here, wide, wp.float32(1.0)))
+        if not (wp.isfinite(low) and wp.isfinite(high)):
+            low, high = wp.vec3(), wp.vec3()
+        wp.atomic_max(longest, w, object, real(STRETCH) * wp.sqrt(length))
+        lower[i] = low
+        upper[i] = high
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def meet(
@@ -85,13 +133,14 @@ def run_kernels(grouped: bool, real, serial: bool):
         lower: wp.array(dtype=wp.vec3),
         upper: wp.array(dtype=wp.vec3),
         tree: wp.uint64,
-        near: wp.array(dtype=int),
+        tried: wp.array(dtype=int),
+        known: wp.array2d(dtype=int),
     ):
         """Whether boxes of runs of two rods that may touch meet; a thread has a run of a world."""
         i = wp.tid()
-        if near[0] != 0:
-            return
         w = i / runs.shape[0]
+        if not asked(tried, known, w) or known[MEET, w] != 0:
+            return
         root = int(-1)
         if wp.static(grouped):
             root = wp.bvh_get_group_root(tree, w)
@@ -101,37 +150,127 @@ def run_kernels(grouped: bool, real, serial: bool):
             l = runs[j - w * runs.shape[0], 0]
             if j > i and sides.first.object[k] != sides.first.object[l]:
                 if may_touch(sides, k, l):
-                    near[0] = 1
+                    known[MEET, w] = 1
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def settle(
+        mean: wp.array(dtype=X),
+        mean_after: wp.array(dtype=X),
+        tried: wp.array(dtype=int),
+        known: wp.array2d(dtype=int),
+        drift: wp.array(dtype=X),
+        again: wp.array(dtype=int),
+        looks: wp.array(dtype=int),
+    ):
+        """Nothing is in doubt where boxes do not meet; where they do, smaller ones are to be tried `again`, if there are any."""
+        w = wp.tid()
+        if w == 0:
+            looks[0] += 1
+        if not asked(tried, known, w):
+            return
+        ahead = known[AHEAD, w]
+        if known[MEET, w] != 0:
+            known[MEET, w] = 0
+            known[AHEAD, w] = ahead / 4
+            if ahead > 0:
+                again[0] = 1
+            return
+        known[DOUBT, w] = 0
+        known[AHEAD, w] = wp.clamp(2 * ahead, 1, MOST)
+        known[STEPS, w] = 0
+        drift[w] = mean_after[w] - mean[w]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def hold(
+        sides: Sides,
+        run_of: wp.array(dtype=int),
+        runs: int,
+        x: wp.array(dtype=X),
+        y: wp.array(dtype=X),
+        near: real,
+        drift: wp.array(dtype=X),
+        lower: wp.array(dtype=wp.vec3),
+        upper: wp.array(dtype=wp.vec3),
+        longest: wp.array2d(dtype=real),
+        seen: wp.array2d(dtype=X),
+        tried: wp.array(dtype=int),
+        known: wp.array2d(dtype=int),
+        loose: wp.array2d(dtype=int),
+    ):
+        """Puts worlds in doubt in which an edge leaves the box of its run, and has rods loose of which one is not as it was `seen`."""
+        w, start = share(wp.tid(), sides.counts[0])
+        if tried[w] == 0:
+            return
+        frame = real(known[STEPS, w]) * drift[w]
+        after = frame + drift[w]
+        offset = first_of(w, sides.first.nodes_a_world)
+        for k in range(start, until(start, sides.counts[0])):
+            if known[DOUBT, w] != 0:
+                return
+            run, object = run_of[k], sides.first.object[k]
+            box = first_of(w, runs) + run
+            reach, length = sides.first.radius[w, object] + near, longest[w, object]
+            i, j = sides.first.nodes[k, 0] + offset, sides.first.nodes[k, 1] + offset
+            a, b, p, q = x[i], x[j], y[i], y[j]
+            sound = inside(b, frame, reach, lower[box], upper[box]) and inside(q, after, reach, lower[box], upper[box])
+            if k == 0 or run_of[wp.max(k - 1, 0)] != run:
+                sound = sound and inside(a, frame, reach, lower[box], upper[box])
+                sound = sound and inside(p, after, reach, lower[box], upper[box])
+            if not sound or wp.max(wp.length_sq(b - a), wp.length_sq(q - p)) > length * length:
+                known[DOUBT, w] = 1
+                return
+            spare, then = real(SPARE) * length, seen[w, k]
+            if not wp.max(wp.length_sq(b - a - then), wp.length_sq(q - p - then)) <= spare * spare:
+                loose[w, object] = known[TICK, w]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def follow(
         sides: Sides,
         ahead: wp.array2d(dtype=int),
-        middle: wp.array2d(dtype=X),
-        turn: wp.array2d(dtype=X),
-        reach: real,
+        x: wp.array(dtype=X),
+        y: wp.array(dtype=X),
+        near: real,
         longest: wp.array2d(dtype=real),
-        near: wp.array(dtype=int),
+        loose: wp.array2d(dtype=int),
+        tried: wp.array(dtype=int),
+        known: wp.array2d(dtype=int),
+        seen: wp.array2d(dtype=X),
     ):
-        """Whether edges of one rod may come near; `ahead` (edges, 2): the first that each may touch, and the one after the last."""
+        """Puts worlds in doubt in which edges of one rod may come near, of rods that are loose, and of all of them where boxes are new.
+
+        Of every edge, the first of its rod that it may touch, and the one after the last: `ahead` (edges, 2).
+        """
         w, start = share(wp.tid(), sides.counts[0])
+        if tried[w] == 0:
+            return
+        offset = first_of(w, sides.first.nodes_a_world)
         for k in range(start, until(start, sides.counts[0])):
-            if near[0] != 0:
+            if known[DOUBT, w] != 0:
                 return
-            l, end = int(ahead[k, 0]), ahead[k, 1]
-            if l < end:
-                length = longest[w, sides.first.object[k]]
-                least = thickness(sides, k, k, w) + reach + length
-                here, way, shorter = middle[w, k], turn[w, k], real(1.0) / length
+            object = sides.first.object[k]
+            if known[STEPS, w] == 0 or loose[w, object] == known[TICK, w]:
+                i, j = sides.first.nodes[k, 0] + offset, sides.first.nodes[k, 1] + offset
+                # twice where midpoints are in the middle of the way, and how far they then go
+                here, way = half * (x[i] + x[j] + (y[i] + y[j])), half * (y[i] + y[j] - (x[i] + x[j]))
+                then, length = half * (x[j] - x[i] + (y[j] - y[i])), longest[w, object]
+                spare, least = real(SPARE) * length, thickness(sides, k, k, w) + real(2.0) * near + length
+                shorter = real(1.0) / (length + spare)
+                l, end = int(ahead[k, 0]), ahead[k, 1]
                 while l < end:
-                    between, relative = middle[w, wp.max(l, 0)] - here, turn[w, wp.max(l, 0)] - way
-                    excess = half * (wp.length(between) - wp.length(relative)) - least
+                    i, j = sides.first.nodes[l, 0] + offset, sides.first.nodes[l, 1] + offset
+                    before, now = x[i] + x[j], y[i] + y[j]
+                    between, relative = half * (before + now) - here, half * (now - before) - way
+                    excess = half * (wp.length(between) - wp.length(relative)) - least - real(l - k) * spare
                     if excess > real(0.0):
                         l += 1 + int(wp.min(excess * shorter, real(end)))
+                    elif spare > real(0.0):  # near enough to be looked at every time
+                        spare = real(0.0)
+                        then = X(real(FAR), real(FAR), real(FAR))
                     elif may_touch(sides, k, l):
-                        near[0] = 1
-                        l = end
+                        known[DOUBT, w] = 1
+                        return
                     else:
                         l += 1
+                seen[w, k] = then
 
-    return enclose, meet, follow
+    return clear, enclose, meet, settle, hold, follow

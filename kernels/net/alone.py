@@ -12,6 +12,7 @@ import warp as wp
 
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.chain import ChainKind
+from ddg_warp.kernels.contact.runs import DOUBT, STEPS, TICK
 from ddg_warp.kernels.contact.tally import LAST, PARTS
 from ddg_warp.kernels.islands import (
     CAUTIOUS,
@@ -23,6 +24,7 @@ from ddg_warp.kernels.islands import (
     RETRIES,
     STATUS,
 )
+from ddg_warp.kernels.step import start_function
 from ddg_warp.kernels.threads import CPU_OPTIONS, first_of, share_function, until_function
 
 # whether the world was tried; the largest outcome, iterations and lost pivots of its rods; whether it is left to the net
@@ -171,7 +173,35 @@ def rod_kernels(kind: ChainKind, real):
 
 @cache
 def world_kernels(real):
-    """hope(...) for worlds in which nothing is near, near(...) where pairs may be, judge(...) of what was tried; a thread a world."""
+    """begin(...) a step, in worlds that are in no doubt, hope(...) for others in which nothing is near, near(...) where pairs may be,
+    judge(...) of what was tried; a thread a world, but of near. Where a world is not done, `remaining` says so."""
+    restart = start_function(real)
+
+    @wp.func
+    def enter(told: wp.array2d(dtype=int), w: int, tried: bool):
+        told[wp.static(TRIED), w] = wp.where(tried, 1, 0)
+        told[wp.static(WORST), w] = 0
+        told[wp.static(MOST), w] = 0
+        told[wp.static(PIVOTS), w] = 0
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def begin(
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        told: wp.array2d(dtype=int),
+        known: wp.array2d(dtype=int),
+        remaining: wp.array(dtype=int),
+        again: wp.array(dtype=int),
+    ):
+        """`known` as of `kernels.contact.runs`."""
+        w = wp.tid()
+        remaining[0] = 0
+        again[0] = 0
+        restart(flags, scalars, w)
+        for row in range(wp.static(STEPS), wp.static(TICK + 1)):
+            known[row, w] = known[row, w] + 1
+        enter(told, w, scalars[PROGRESS, w] < real(1.0) and known[DOUBT, w] == 0)
+        told[wp.static(LEFT), w] = 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def hope(
@@ -181,25 +211,15 @@ def world_kernels(real):
         scalars: wp.array2d(dtype=real),
         told: wp.array2d(dtype=int),
         any_tried: wp.array(dtype=int),
-        some: wp.array(dtype=int),
         remaining: wp.array(dtype=int),
     ):
-        """Of `some`, whether pairs may come near, nothing is known yet; where there are several worlds, `any_tried` and `remaining` are
-        zero."""
+        """`any_tried` and `remaining` are zero before."""
         w = wp.tid()
-        some[0] = 0
-        if told.shape[1] == 1:
-            any_tried[0] = 0
-            remaining[0] = 0
         tried = scalars[PROGRESS, w] < real(1.0) and gap[w] >= reach and overflow[0] == 0
-        told[wp.static(TRIED), w] = wp.where(tried, 1, 0)
-        told[wp.static(WORST), w] = 0
-        told[wp.static(MOST), w] = 0
-        told[wp.static(PIVOTS), w] = 0
-        told[wp.static(LEFT), w] = 1
+        enter(told, w, tried)
         if tried:
             any_tried[0] = 1
-        else:
+        elif told[wp.static(LEFT), w] != 0:
             remaining[0] = 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -210,12 +230,14 @@ def world_kernels(real):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def judge(
+        searched: int,
         some: wp.array(dtype=int),
         gap: wp.array(dtype=real),
         reach: real,
         crossed: wp.array(dtype=int),
         overflow: wp.array(dtype=int),
         rounded: int,
+        known: wp.array2d(dtype=int),
         told: wp.array2d(dtype=int),
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
@@ -223,17 +245,22 @@ def world_kernels(real):
         tally: wp.array(dtype=wp.int64),
         work: wp.array(dtype=wp.int64),
         remaining: wp.array(dtype=int),
+        again: wp.array(dtype=int),
     ):
         """Ends the step of worlds in which all rods have converged and nothing came near, as one that the net has solved.
 
+        What came near is what is in doubt or, once it was `searched` for, what was found; `again` says that it is not known yet.
         `counts` as of `kernels.contact.tally`, where nothing touches; `tally`, `work`, `rounded` as of `kernels.step.advance_kernel`.
         """
         w = wp.tid()
-        if told[wp.static(TRIED), w] == 0:
+        if told[wp.static(LEFT), w] == 0:
             return
         worst = told[wp.static(WORST), w]
-        done = worst <= wp.static(outcome.CONVERGED_TO_ROUNDING) and overflow[0] == 0
-        if some[0] != 0 and (gap[w] < reach or crossed[w] != 0):
+        done = told[wp.static(TRIED), w] != 0 and worst <= wp.static(outcome.CONVERGED_TO_ROUNDING)
+        if done and searched == 0 and known[DOUBT, w] != 0:
+            again[0] = 1
+            done = False
+        if searched != 0 and (overflow[0] != 0 or (some[0] != 0 and (gap[w] < reach or crossed[w] != 0))):
             done = False
         if not done:
             remaining[0] = 1
@@ -254,29 +281,38 @@ def world_kernels(real):
         wp.atomic_add(work, 2, wp.int64(1))
         wp.atomic_add(work, 4, wp.int64(told[wp.static(PIVOTS), w]))
 
-    return hope, near, judge
+    return begin, hope, near, judge
 
 
 @cache
 def place_kernels(real, serial: bool):
-    """wait(...) of worlds that are not tried; stay(...) of nodes of obstacles, follow(...) at the rate at which these were moved."""
+    """wait(...) of worlds that are left and not tried; of those that are, stay(...) of nodes of obstacles, follow(...) at the rate at
+    which these were moved."""
     V, share, until = wp.types.vector(3, real), share_function(serial), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def wait(told: wp.array2d(dtype=int), blocks: int, q: wp.array(dtype=V), q_out: wp.array(dtype=V)):
         w, start = share(wp.tid(), blocks)
-        if told[wp.static(TRIED), w] == 0:
+        if told[wp.static(TRIED), w] == 0 and told[wp.static(LEFT), w] != 0:
             for k in range(start, until(start, blocks)):
                 q_out[k + w * blocks] = q[k + w * blocks]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def stay(nodes: wp.array(dtype=int), blocks: int, q: wp.array(dtype=V), q_out: wp.array(dtype=V)):
+    def stay(
+        nodes: wp.array(dtype=int),
+        told: wp.array2d(dtype=int),
+        blocks: int,
+        q: wp.array(dtype=V),
+        q_out: wp.array(dtype=V),
+    ):
         i, w = wp.tid()
-        q_out[nodes[i] + w * blocks] = q[nodes[i] + w * blocks]
+        if told[wp.static(TRIED), w] != 0:
+            q_out[nodes[i] + w * blocks] = q[nodes[i] + w * blocks]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def follow(
         nodes: wp.array(dtype=int),
+        told: wp.array2d(dtype=int),
         blocks: int,
         q0: wp.array(dtype=V),
         q: wp.array(dtype=V),
@@ -285,6 +321,7 @@ def place_kernels(real, serial: bool):
     ):
         i, w = wp.tid()
         k = nodes[i] + w * blocks
-        v_out[k] = (q[k] - q0[k]) * (real(1.0) / dt[w])
+        if told[wp.static(TRIED), w] != 0:
+            v_out[k] = (q[k] - q0[k]) * (real(1.0) / dt[w])
 
     return wait, stay, follow

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import warp as wp
 
 import ddg_warp as ddg
 from ddg_warp.solve.net.alone import Alone
@@ -192,6 +193,130 @@ def test_a_run_that_is_resumed_takes_the_same_steps(device):
             again = other.step(again, DT)
         for name, values in again.snapshot().items():
             np.testing.assert_array_equal(values, state.snapshot()[name], err_msg=name)
+
+
+def shot(kick: float = 0.0, rods: int = 1, gap: float = 0.15, **contact) -> tuple[ddg.Scene, np.ndarray]:
+    """Rods above a beam that creep towards it, each at its own pace, without gravity, until at 0.2 s they are driven; velocities."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    scene.add_rod(np.stack([STRAIGHT, 0 * STRAIGHT, 0 * STRAIGHT], 1), section=ddg.Circle(RADIUS), material=SOFT)
+    velocities = np.zeros((11 * (rods + 1), 3))
+    for r in range(rods):
+        x = 0.02 * (r - 0.5 * (rods - 1))
+        points = np.stack([0 * STRAIGHT + x, STRAIGHT, 0 * STRAIGHT + gap], 1)
+        scene.add_rod(points, section=ddg.Circle(RADIUS), material=SOFT, name=f"shot {r}")
+        velocities[11 * (r + 1) : 11 * (r + 2), 2] = -0.02 * (r + 1)
+        if kick:
+            for node in range(11):
+                scene.add_force(r + 1, node, (0.0, 0.0, -kick), amplitude=lambda t: float(0.2 < t < 0.25))
+    scene.clamp(0, edges=[0, -1])
+    scene.contact(friction=0.3, **contact)
+    return scene, velocities
+
+
+def looks(integrator) -> int:
+    return int(integrator._net.newton.contact.search.looks.numpy()[0])
+
+
+def test_what_was_quiet_for_long_is_seen_when_it_is_driven_at_another(device):
+    """Boxes made for a slow motion serve for long; then rods are driven out of them, by centimetres in a step, into the beam."""
+    scene, velocities = shot(kick=0.01, rods=2)
+    options = {"rtol": 1e-10, "dt": 1 / 480, "velocities": velocities}
+    found, integrator, alone = run(device, scene, 150, **options)
+    expected, other, _ = run(device, scene, 150, linear="chain", **options)
+    first = int(np.argmin(alone[:, 0]))
+    assert alone[:first].all() and first > 96 and looks(integrator) < 40
+    gaps = [each.statistics()["contact"]["smallest_gap"] for each in (integrator, other)]
+    assert 0.0 < gaps[1] < np.inf and gaps[0] == pytest.approx(gaps[1], rel=1e-3)
+    np.testing.assert_allclose(found.points(), expected.points(), rtol=0.0, atol=1e-6 * 0.1)
+
+
+def test_worlds_share_no_boxes(device):
+    """Of three worlds one touches from early on, one late, one never: each moves as it does by itself."""
+    scene, velocities = falling(height=0.03)
+    scene.gravity = (0.0, 0.0, 0.0)
+    speeds, steps = (0.5, 0.2, 0.0), 60
+    given = np.stack([velocities] * 3)
+    given[:, 11:, 2] = -np.array(speeds)[:, None]
+    found, _, alone = run(device, scene, steps, velocities=given, worlds=3, rtol=1e-10)
+    first = [int(np.argmin(alone[:, world])) if not alone[:, world].all() else steps for world in range(3)]
+    assert 0 < first[0] < first[1] < first[2] == steps
+    for world in range(3):
+        expected, _, own = run(device, scene, steps, velocities=given[world], rtol=1e-10)
+        np.testing.assert_array_equal(alone[:, world], own[:, 0])
+        np.testing.assert_allclose(found.points()[world], expected.points(), rtol=0.0, atol=1e-8 * 0.1)
+
+
+def test_a_capsule_that_is_swung_at_rods_is_seen(device):
+    """It rests for long, then comes by centimetres in a step, as the net alone has it."""
+    scene = rods(3, gravity=(0.0, 0.0, 0.0))
+    swing = ddg.Motion(translation=lambda t: (0.0, 0.0, 3.0 * max(0.0, t - 0.1)))
+    scene.add_obstacle(ddg.Capsule((0.04, -0.1, -0.15), (0.04, 0.2, -0.15), 0.005), motion=swing, name="bat")
+    options = {"rtol": 1e-10, "dt": 1 / 480}
+    found, integrator, alone = run(device, scene, 78, **options)
+    expected, _, _ = run(device, scene, 78, linear="chain", **options)
+    first = int(np.argmin(alone[:, 0]))
+    assert 60 < first < 78 and looks(integrator) < 24
+    np.testing.assert_allclose(found.points(), expected.points(), rtol=0.0, atol=1e-6 * 0.1)
+    np.testing.assert_allclose(found.obstacle_points(), expected.obstacle_points(), rtol=0.0, atol=1e-15)
+
+
+def test_worlds_that_start_anew_within_reach_are_seen(device):
+    """A reset puts rods where boxes of the same world did not see them."""
+    scene, _ = falling(height=0.05)
+    scene.gravity = (0.0, 0.0, 0.0)
+    model, near = scene.build(device=device, worlds=2), falling(height=2.2 * RADIUS, speed=0.5)
+    integrator, state = ddg.Integrator(model, rtol=1e-10), model.state()
+    for _ in range(5):
+        state = integrator.step(state, DT)
+    to = state.points()
+    to[:, 11:, 2] = 2.2 * RADIUS
+    state = integrator.reset(state, np.array([True, False]), model.state(points=to, velocities=np.stack([near[1]] * 2)))
+    state = integrator.step(state, DT)
+    assert integrator._net.alone.left.numpy().tolist() == [1, 0]
+    assert state.points()[0, 16, 2] - state.points()[0, 5, 2] > 2.0 * RADIUS
+    assert 0.0 < integrator.statistics()["contact"]["smallest_gap"] < 1e-3
+
+
+def test_a_quiet_run_that_is_resumed_takes_the_same_steps(device):
+    """Bitwise, whatever boxes it had: from within their time, from when they are left, and until something touches."""
+    scene, velocities = shot(kick=0.01, rods=2)
+    model = scene.build(device=device)
+    integrator, state = ddg.Integrator(model), model.state(velocities=velocities)
+    snapshots, ways, seen = [], [], []
+    for _ in range(130):
+        snapshots.append(state.snapshot())
+        state = integrator.step(state, 1 / 480)
+        ways.append(bool(integrator._net.alone.left.numpy()[0]))
+        seen.append(looks(integrator))
+    assert len(set(ways)) == 2
+    left = int(np.flatnonzero(np.diff(seen))[2])
+    for start in (left - 1, left, left + 1, left + 2, 90, ways.index(True) - 1, ways.index(True) + 1):
+        other, again = ddg.Integrator(model), model.restore(snapshots[start])
+        for _ in range(start, 130):
+            again = other.step(again, 1 / 480)
+        for name, values in again.snapshot().items():
+            np.testing.assert_array_equal(values, state.snapshot()[name], err_msg=name)
+
+
+def test_a_quiet_step_launches_little_more_than_one_without_contact(device, monkeypatch):
+    """Four kernels of its own, the states of rods there and back among them, and no condition but those of any step."""
+    counts = {}
+    for contact in (False, True):
+        state, integrator, _ = run(device, rods(contact=contact), 10)
+        source, log = integrator._own(state), []
+
+        def logged(name: str, launch, log: list = log):
+            return lambda *given, **named: (log.append(name), launch(*given, **named))[1]
+
+        with monkeypatch.context() as patch:
+            for where, names in ((wp, ("launch", "capture_if", "capture_while")), (wp.array, ("zero_", "fill_"))):
+                for name in names:
+                    patch.setattr(where, name, logged(name, getattr(where, name)))
+            integrator._launch(source, False)
+        counts[contact] = {name: log.count(name) for name in set(log)}
+    own, other = counts[True], counts[False]
+    assert own["capture_while"] == 1 and own["capture_if"] == 1 and other["capture_while"] == 2
+    assert own["launch"] - other["launch"] <= 4 and own["zero_"] == 1 and "fill_" not in own
 
 
 def test_statistics_count_a_step_as_any_other(device):

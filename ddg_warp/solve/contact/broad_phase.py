@@ -10,12 +10,12 @@ from ddg_warp.kernels.contact.motion import motion_kernels
 from ddg_warp.kernels.contact.surfaces import EDGE_POINT, EDGES, POINT_PLANE, POINT_TRIANGLE
 from ddg_warp.solve.contact.motion_filter import MotionFilter
 from ddg_warp.solve.contact.pairs import PairList
-from ddg_warp.solve.contact.runs import Runs
 from ddg_warp.solve.contact.shapes import BALLS, PLANES, Shapes
 from ddg_warp.solve.contact.tree import Things
 
 SLACK = 1e-3  # of the margin, by which a search goes beyond it, for rounding
 WIDE = 4.0  # margins that boxes are wide by, so that pairs whose boxes meet serve several searches
+LOOKS = 8  # at runs, after which their tree, which is small, may be made anew
 NONE = np.iinfo(np.int64).max
 BOXES, PAIRS = range(2)
 
@@ -28,7 +28,8 @@ class BroadPhase:
     goes by one share, of the place that it has come to. Pairs whose boxes meet are found as much farther apart, for several searches.
     `update`, `filter`, `measure`, `impact` and `crossings` read nothing back and can be captured, `update`, `filter` and `search` in
     conditional parts of graphs, too. `rebuild` can be captured, on CUDA outside of those alone; there a step should begin with it,
-    every few at least. `fit` and `check` read, between launches of graphs; what is not finite touches nothing, until they name it.
+    every few at least where trees were used since. `fit` and `check` read, between launches of graphs; what is not finite touches
+    nothing, until they name it.
 
     Args:
         shapes: what may touch in one world.
@@ -41,7 +42,8 @@ class BroadPhase:
     Attributes:
         lists: a `PairList` for each kind of pairs that there can be.
         overflow: (1,), not zero once pairs did not fit: `fit` has to follow, and whatever came of the pairs is to be done again.
-        searches: (1,) how many there were; walks: (1,) for how many of them boxes were met.
+        searches: (1,) how many there were; walks: (1,) for how many of them boxes were met; looks: (1,) how many times those of `Runs`.
+        uses: of trees, as of the last `fit` or `check`, so many looks as `LOOKS` taken for one.
         gap [m], time and crossed, of each world: see `measure`, `impact` and `crossings`.
         shares: (worlds times units,), limited: of each world, how many of them are below 1; see `filter`.
         every: (worlds,) ones, of motions in which all nodes of every world go by one share.
@@ -85,12 +87,13 @@ class BroadPhase:
         self._placed = wp.array(placed, dtype=wp.uint8, device=self.device)
         self._shift = wp.zeros(worlds, dtype=x.dtype, device=self.device)
         self._never, self.every = (wp.full(worlds, flag, dtype=int, device=self.device) for flag in (0, 1))
-        self.searches, self._fits, self.walks = (wp.zeros(1, dtype=int, device=self.device) for _ in range(3))
-        self._read = wp.zeros(2, dtype=int, device=self.device)  # at once, after every step
-        self.overflow, self._lost = self._read[:1], self._read[1:]
+        self.searches, self._fits = (wp.zeros(1, dtype=int, device=self.device) for _ in range(2))
+        self._read = wp.zeros(4, dtype=int, device=self.device)  # at once, after every step
+        self.overflow, self._lost, self.walks, self.looks = (self._read[k : k + 1] for k in range(4))
+        self.uses = 0
         # of boxes and of pairs, whether they are out of date, and whether the last `update` found them anew
         self._stale, self._done = (wp.zeros(2, dtype=int, device=self.device) for _ in range(2))
-        self._edges, self._runs = things[2], None
+        self._edges = things[2]
         self._trees = [things[size] for size in things if size != 1]
         self._motion = motion_kernels(real, arrays.serial(self.device))
         self.rebuild(x)
@@ -120,7 +123,6 @@ class BroadPhase:
         """Kernels to load before a capture."""
         lists = [kernel for pairs in self.lists for kernel in pairs.kernels]
         boxes = [part.kernel for part in self._things]
-        lists += self._runs.kernels if self._runs else []
         return [*lists, *boxes, *self._motion, *self._impacts, *self._passes, *self._filter.kernels]
 
     @property
@@ -139,15 +141,6 @@ class BroadPhase:
         self._enclose(x, self._still, self._never, 1.0, self._within)
         for part in self._trees:
             part.build()
-        if self._runs:
-            self._runs.enclose(x, self._still, self._never, self._shift, self._apart)
-            self._runs.build()
-
-    def look_for_runs(self) -> None:
-        """From now on have `update` ask whether edges may be near at all, before it searches: for rods that touch little, where there
-        is nothing but rods and capsules."""
-        if self._runs is None and len(self.lists) == 1:
-            self._runs = Runs(self.lists[0], self.shapes, self.worlds, self.real, self.device)
 
     def update(self, base: wp.array, q: wp.array | None = None, together: wp.array | None = None) -> None:
         """Search again along the motion from `base` to q if some node is, at either, farther than half of the margin from its way.
@@ -171,24 +164,9 @@ class BroadPhase:
     def _renew(self, base: wp.array, q: wp.array, together: wp.array | None) -> None:
         """Search again, among the pairs whose boxes meet where these are wide enough."""
         together = self._never if together is None else together
-
-        def find() -> None:
-            self._watch(BOXES, base, q, 0.5 * (WIDE - 1.0) * self.margin)
-            wp.capture_if(self._stale[BOXES:PAIRS], lambda: self._meet(base, self._move, together))
-            self.judge(base, self._move, together)
-
-        if self._runs is None:
-            find()
-            return
-        self._find_common(self._move, together)
-        self._runs.look(base, self._move, together, self._shift, self._apart)
-        wp.capture_if(self._runs.near, find, lambda: self._clear(base, together))
-
-    def _clear(self, base: wp.array, together: wp.array) -> None:
-        """List no pairs."""
-        for pairs in self.lists:
-            pairs.clear()
-        self._mark(PAIRS, base, self._move, together, self.overflow, self.searches)
+        self._watch(BOXES, base, q, 0.5 * (WIDE - 1.0) * self.margin)
+        wp.capture_if(self._stale[BOXES:PAIRS], lambda: self._meet(base, self._move, together))
+        self.judge(base, self._move, together)
 
     def _watch(self, which: int, base: wp.array, q: wp.array, allowed: float) -> None:
         """Whether boxes or pairs are out of date for a motion, where nodes may be so far from the ways that these were found for."""
@@ -269,7 +247,8 @@ class BroadPhase:
 
     def _checked(self) -> bool:
         """The same; whether pairs did not fit."""
-        overflow, node = (int(value) for value in self._read.numpy() - [0, 1])
+        overflow, node, walks, looks = (int(value) for value in self._read.numpy() - [0, 1, 0, 0])
+        self.uses = walks + looks // LOOKS
         if node >= 0:
             self._lost.zero_()
             world, node = divmod(node, len(self.shapes.points))
@@ -331,11 +310,6 @@ class BroadPhase:
     def _around(self) -> float:
         """How far beside its way a node may be, and a little more."""
         return 0.5 * (1.0 + SLACK) * self.margin
-
-    @property
-    def _apart(self) -> float:
-        """Half of the gap up to which pairs are listed."""
-        return 0.5 * self.reach + self._around
 
     @property
     def _within(self) -> float:

@@ -123,11 +123,6 @@ class PairList:
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
         wp.launch(kernel, self.first.all, inputs, outputs, device=self.device)
 
-    def clear(self) -> None:
-        """No pairs."""
-        for numbers in (self.count, self.starts, self.partners):
-            numbers.zero_()
-
     def measure(self, x, gap) -> None:
         """Lower the smallest gaps of worlds to those of pairs."""
         inputs = [self.pairs, self.count, self.sides, x]

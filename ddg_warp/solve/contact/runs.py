@@ -1,69 +1,106 @@
-"""Whether any edges of rods may be near, before pairs are searched for; see `kernels.contact.runs`."""
+"""Whether any edges of rods may be near, without a search for pairs; see `kernels.contact.runs`."""
 
 import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.contact.runs import run_kernels
-from ddg_warp.solve.contact.pairs import PairList
+from ddg_warp.kernels.contact.motion import motion_kernels
+from ddg_warp.kernels.contact.runs import AHEAD, DOUBT, KNOWN, run_kernels
 from ddg_warp.solve.contact.tree import Boxes
 
 EDGES = 64  # of a run, at most
-ROUNDING = 1e-5  # of arc lengths, relative, more than that of float32
+LONGER = 1e-5  # of arc lengths, relative, more than the rounding of float32
+SLACK = 1e-3  # of the reach, by which more is asked for than it
+FIRST = 4  # times the motion that the first boxes are for
 
 
 class Runs:
-    """Runs of edges of the rods of `shapes`, which have no triangles, with boxes.
+    """Runs of edges of rods and capsules with boxes, which serve as long as nothing leaves them, however far that is or how long.
 
     Args:
-        pairs: the list of pairs of edges, whose things these are.
+        search: a `BroadPhase`, in which there is nothing but edges.
 
     Attributes:
-        near: (1,), whether any pair may be near; see `look`.
+        known (rows, worlds): see `kernels.contact.runs`; doubt: of it, whether anything may be near in a world (worlds,).
     """
 
-    def __init__(self, pairs: PairList, shapes, worlds: int, real, device):
+    def __init__(self, search):
+        shapes, worlds, device, real = search.shapes, search.worlds, search.device, search.real
         _, _, owner, span = shapes.things(2)
-        self._sides, self._worlds, self._edges = pairs.sides, worlds, len(owner)
+        self._sides, self._search, self._edges = search.lists[0].sides, search, len(owner)
         starts = np.flatnonzero(np.diff(owner, prepend=-1))
         ends = np.append(starts[1:], len(owner))
         first = [np.arange(start, end, EDGES) for start, end in zip(starts, ends, strict=True)]
         last = [np.append(each[1:], end) for each, end in zip(first, ends, strict=True)]
         runs = np.column_stack([np.concatenate(first), np.concatenate(last)]).astype(np.int32)
+        run_of = np.repeat(np.arange(len(runs)), np.diff(runs)[:, 0]).astype(np.int32)
         ahead = np.repeat(np.column_stack([ends, ends]), ends - starts, axis=0).astype(np.int32)
         whole = np.isin(owner[starts], [*shapes.obstacle, *(a for a, b in shapes.ignored_pairs if a == b)])
         for start, end in zip(starts[~whole], ends[~whole], strict=True):
-            apart = (span[start:end, 1] + span[start:end, 3]) * (1.0 - ROUNDING)
+            apart = (span[start:end, 1] + span[start:end, 3]) * (1.0 - LONGER)
             ahead[start:end, 0] = start + np.searchsorted(span[start:end, 0], apart)
-        self._runs, self._ahead = (wp.array(values, dtype=int, device=device) for values in (runs, ahead))
-        vector = wp.types.vector(3, real)
-        self._middle, self._turn = (wp.zeros((worlds, self._edges), dtype=vector, device=device) for _ in range(2))
+        self._runs, self._run_of, self._ahead = (
+            wp.array(values, dtype=int, device=device) for values in (runs, run_of, ahead)
+        )
         self._boxes = Boxes(len(runs), worlds, device)
-        self._longest = wp.zeros((worlds, len(shapes.names)), dtype=real, device=device)
-        self.near = wp.zeros(1, dtype=int, device=device)
-        self._enclose, self._meet, self._follow = run_kernels(worlds > 1, real, arrays.serial(device))
         self._boxes.build()
-        self.kernels = [self._enclose, self._meet, self._follow]
-
-    def enclose(self, x: wp.array, move: wp.array, together: wp.array, shift: wp.array, within: float) -> None:
-        """Boxes around the motion from x by `move`, the latter less `shift` of the world, inflated by the radius and `within` [m]."""
-        self.near.zero_()
-        self._longest.zero_()
-        boxes = self._boxes
-        outputs = [boxes.lower, boxes.upper, self._middle, self._turn, self._longest, self.near]
-        inputs = [self._sides, self._runs, x, move, together, shift, within]
-        wp.launch(self._enclose, boxes.all, inputs, outputs, device=boxes.device)
+        self._longest = wp.zeros((worlds, len(shapes.names)), dtype=real, device=device)
+        vector = wp.types.vector(3, real)
+        self._seen = wp.full((worlds, self._edges), vector(np.inf), dtype=vector, device=device)
+        self._loose = wp.zeros((worlds, len(shapes.names)), dtype=int, device=device)
+        self._mean, self._mean_after, self._drift = (wp.zeros(worlds, dtype=vector, device=device) for _ in range(3))
+        self._near = 0.5 * (1.0 + SLACK) * search.reach
+        self.known = wp.zeros((KNOWN, worlds), dtype=int, device=device)
+        self.doubt = self.known[DOUBT]
+        self.doubt.fill_(1)
+        self.known[AHEAD].fill_(FIRST)
+        self._again = wp.zeros(1, dtype=int, device=device)
+        serial = arrays.serial(device)
+        *_, self._common = motion_kernels(real, serial)
+        made = run_kernels(worlds > 1, real, serial)
+        self._clear, self._enclose, self._meet, self._settle, self._hold, self._follow = made
+        self.kernels = [self._common, *made]
 
     def build(self) -> None:
-        """The tree anew, as of `Boxes`."""
+        """The tree of boxes anew, as of `Boxes.build`."""
         self._boxes.build()
 
-    def look(self, x: wp.array, move: wp.array, together: wp.array, shift: wp.array, within: float) -> None:
-        """Whether any pair may come nearer than its thickness and twice `within` in the motion from x by `move`, as of `enclose`."""
-        self.enclose(x, move, together, shift, within)
-        boxes = self._boxes
+    def hold(self, x: wp.array, y: wp.array, tried: wp.array) -> None:
+        """Put worlds in doubt in which boxes do not tell that no gap is below the reach anywhere in the straight motion from x to y.
+
+        Args:
+            x, y: positions of the nodes of all worlds; tried: (worlds,), not zero for those that are asked for.
+        """
+        boxes, where, about = self._boxes, [x, y, self._near], [tried, self.known]
+        inputs = [self._sides, self._run_of, boxes.count, *where, self._drift, boxes.lower, boxes.upper]
+        self._sweep(self._hold, [*inputs, self._longest, self._seen, *about], [self._loose])
+        inputs = [self._sides, self._ahead, *where, self._longest, self._loose, *about]
+        self._sweep(self._follow, inputs, [self._seen])
+
+    def look(self, x: wp.array, y: wp.array, tried: wp.array) -> None:
+        """Make boxes for the motion and as much more of it as can be, in worlds that are in doubt, and see what is in doubt then."""
+        for positions, mean in ((x, self._mean), (y, self._mean_after)):
+            surface = self._sides.first
+            self._launch(self._common, len(mean), [surface, self._edges, positions, self._search.every], [mean])
+        self._again.fill_(1)
+        wp.capture_while(self._again, lambda: self._try(x, y, tried))
+        self.hold(x, y, tried)
+
+    def _try(self, x: wp.array, y: wp.array, tried: wp.array) -> None:
+        boxes, runs, means = self._boxes, [self._sides, self._runs], [self._mean, self._mean_after]
+        about = [tried, self.known]
+        corners = [boxes.lower, boxes.upper]
+        self._again.zero_()
+        self._launch(self._clear, self._longest.shape, about, [self._longest])
+        inputs = [*runs, x, y, *means, self._near, self._search.margin, *about]
+        self._launch(self._enclose, boxes.all, inputs, [*corners, self._longest])
         boxes.renew()
-        inputs = [self._sides, self._runs, boxes.lower, boxes.upper, boxes.tree.id]
-        wp.launch(self._meet, boxes.all, inputs, [self.near], device=boxes.device)
-        inputs = [self._sides, self._ahead, self._middle, self._turn, 2.0 * within, self._longest]
-        arrays.sweep(self._follow, self._edges, inputs, [self.near], boxes.device, worlds=self._worlds)
+        self._launch(self._meet, boxes.all, [*runs, *corners, boxes.tree.id, tried], [self.known])
+        self._launch(self._settle, len(self._drift), [*means, *about], [self._drift, self._again, self._search.looks])
+
+    def _sweep(self, kernel, inputs: list, outputs: list) -> None:
+        """Over the edges of every world."""
+        arrays.sweep(kernel, self._edges, inputs, outputs, self._boxes.device, worlds=self._search.worlds)
+
+    def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim, inputs, outputs, device=self._boxes.device)

@@ -4,6 +4,9 @@ Where rods are coupled by contact alone and no pair is within its reach, the equ
 step is tried that way, in worlds in which nothing is near at its start. If nothing came near on the way either, no force of contact and
 no friction act in it, and it is the solution of the whole: else the world is left to the net, from the start of the step. What decides
 depends on the positions at both ends alone, not on what was searched for before, so that a run that is resumed takes the same steps.
+
+As long as rods stay in boxes that do not meet, that is known without a search, which is all below one condition then: the step is tried
+before anything is asked, by boxes first, and where these leave it in doubt once more, by pairs.
 """
 
 import numpy as np
@@ -12,9 +15,11 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.compile.chains import ChainGroup, compile_chains
 from ddg_warp.compile.rods import net_rods
+from ddg_warp.kernels.contact.runs import KNOWN
 from ddg_warp.kernels.net import alone as kernels
 from ddg_warp.model.group import Group
 from ddg_warp.solve.chains.step import ChainStep
+from ddg_warp.solve.contact.runs import Runs
 
 
 class Alone:
@@ -22,6 +27,7 @@ class Alone:
 
     Attributes:
         chains: their steps, a group each.
+        runs: boxes that may tell that nothing is near; None where there are things but rods and capsules.
         left: which worlds of the last step are left to the net (worlds,).
     """
 
@@ -32,12 +38,15 @@ class Alone:
         self._states = [self.model.group_state(group) for group in groups]
         self._places = [Places(self.net, group) for group in groups]
         self._kernels = [kernels.rod_kernels(group.kind, real) for group in groups]
-        step.newton.contact.search.look_for_runs()
-        self._hope, self._near, self._judge = kernels.world_kernels(real)
+        self._search = step.newton.contact.search
+        self.runs = Runs(self._search) if len(self._search.lists) == 1 else None
+        # of the worlds, all in doubt, where there are no runs
+        self._known = self.runs.known if self.runs else wp.full((KNOWN, worlds), 1, dtype=int, device=device)
+        self._begin, self._hope, self._near, self._judge = kernels.world_kernels(real)
         self._wait, self._stay, self._follow = kernels.place_kernels(real, arrays.serial(device))
         self._told = wp.zeros((kernels.TOLD, worlds), dtype=int, device=device)
-        self.left = self._told[kernels.LEFT]
-        self._tried, self._some = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
+        self.left, self._tried = (self._told[row] for row in (kernels.LEFT, kernels.TRIED))
+        self._any_tried, self._some, self._again = (wp.zeros(1, dtype=int, device=device) for _ in range(3))
         obstacles = np.concatenate([np.zeros(0, int), *self.net.host.obstacles]).astype(np.int32)
         self._obstacles = wp.array(obstacles, dtype=int, device=device)
         self._mixed = not all(places.whole for places in self._places)
@@ -51,7 +60,8 @@ class Alone:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture, without those of the chains."""
-        own = [self._hope, self._near, self._judge, *(kernel for each in self._kernels for kernel in each)]
+        own = [self._begin, self._hope, self._near, self._judge, *(kernel for each in self._kernels for kernel in each)]
+        own += self.runs.kernels if self.runs else []
         own += [self._wait] if self.net.worlds > 1 else []
         return own + ([self._stay, self._follow] if len(self._obstacles) else [])
 
@@ -63,25 +73,68 @@ class Alone:
                 self.chains[i], changed = self._chain(chain.group, means=means, counts_of=chain), True
         return changed
 
+    def renew(self) -> None:
+        """Make the tree of runs anew, where looks do not make their own."""
+        if self.runs and self.model.wp_device.is_cuda:
+            self.runs.build()
+
     def step(self, before, after) -> None:
-        """Launch the step in worlds in which nothing is near, and leave what remains to be done in `remaining` of the `NetStep`."""
+        """Launch the step, of worlds in which anything is near by the net."""
         step = self.step_of
-        search = step.newton.contact.search
+        inputs = [*step.islands.arrays, self._told, self._known]
+        self._launch(self._begin, self.net.worlds, inputs, [step.remaining, self._again])
+        if self.runs is None:
+            self._by_pairs(before, after)
+            wp.capture_if(step.remaining, lambda: step.go_on(before, after))
+            return
+        self._try(before, after)
+        self.runs.hold(before.q, after.q, self._tried)
+        self._judge_by(0)
+        wp.capture_if(step.remaining, lambda: self._ask(before, after))
+
+    def _ask(self, before, after) -> None:
+        """Of worlds that are not done: whether other boxes tell that nothing came near, else whether pairs did."""
+        step = self.step_of
+        wp.capture_if(self._again, lambda: self._look(before, after))
+        wp.capture_if(step.remaining, lambda: self._by_pairs(before, after))
+        wp.capture_if(step.remaining, lambda: step.go_on(before, after))
+
+    def _look(self, before, after) -> None:
+        self.step_of.remaining.zero_()
+        self.runs.look(before.q, after.q, self._tried)
+        self._judge_by(0)
+
+    def _by_pairs(self, before, after) -> None:
+        """The step in worlds that are not done and in which no pair is near, at its start, on the way and at its end."""
+        step, search = self.step_of, self._search
+        for signal in (step.remaining, self._any_tried, self._some):
+            signal.zero_()
         search.update(before.q)
         search.measure(before.q)
-        for signal in (step.remaining, self._tried) if self.net.worlds > 1 else ():
-            signal.zero_()
-        inputs = [search.gap, search.reach, search.overflow, step.islands.arrays[1]]
-        self._launch(self._hope, self.net.worlds, inputs, [self._told, self._tried, self._some, step.remaining])
-        wp.capture_if(self._tried, lambda: self._try(before, after))
+        inputs = [search.gap, search.reach, search.overflow, step.islands.arrays[1], self._told]
+        self._launch(self._hope, self.net.worlds, inputs, [self._any_tried, step.remaining])
+        wp.capture_if(self._any_tried, lambda: self._try_and_search(before, after))
+
+    def _try_and_search(self, before, after) -> None:
+        worlds, blocks, search = self.net.worlds, self.net.blocks, self._search
+        self._try(before, after)
+        if worlds > 1:
+            arrays.sweep(self._wait, blocks, [self._told, blocks, before.q], [after.q], self.net.device, worlds=worlds)
+        search.update(before.q, after.q, search.every)
+        for pairs in search.lists:
+            self._launch(self._near, 1, [pairs.count], [self._some])
+        wp.capture_if(self._some, lambda: self._measure(before, after))
+        self._judge_by(1)
+        if self.runs:
+            self.runs.look(before.q, after.q, self._tried)
 
     def _try(self, before, after) -> None:
+        """One solve of the rods of worlds that are tried."""
         for each in zip(self.chains, self._states, self._places, self._kernels, strict=True):
             self._solve(before, after, *each)
         if self._mixed:
             self.net.update_strains(after)
         self._move(before, after)
-        self._check(before, after)
 
     def _solve(self, before, after, chain, state, places, own) -> None:
         """One solve of the rods of a group."""
@@ -97,36 +150,27 @@ class Alone:
         self._launch(scatter, group.node_threads, inputs, [told, after.q, after.v, *places.lagged(after)])
 
     def _move(self, before, after) -> None:
-        """Put obstacles where they are after the step, and all of worlds that are not tried where it is."""
-        step, blocks, worlds = self.step_of, self.net.blocks, self.net.worlds
-        if worlds > 1:
-            arrays.sweep(self._wait, blocks, [self._told, blocks, before.q], [after.q], self.net.device, worlds=worlds)
+        """Put obstacles where they are after the step."""
+        step, blocks = self.step_of, self.net.blocks
         if not len(self._obstacles):
             return
-        dim = len(self._obstacles), worlds
-        self._launch(self._stay, dim, [self._obstacles, blocks, before.q], [after.q])
+        dim, inputs = (len(self._obstacles), self.net.worlds), [self._obstacles, self._told, blocks, before.q]
+        self._launch(self._stay, dim, inputs, [after.q])
         if step.motion:
             step.motion.place(step.islands, after.q)
-        inputs = [self._obstacles, blocks, before.q, after.q, step.integrator._dt]
-        self._launch(self._follow, dim, inputs, [after.v])
+        self._launch(self._follow, dim, [*inputs, after.q, step.integrator._dt], [after.v])
 
-    def _check(self, before, after) -> None:
-        """End the step of worlds in which nothing came near."""
-        step = self.step_of
-        contact = step.newton.contact
-        search = contact.search
-        search.update(before.q, after.q, search.every)
-        for pairs in search.lists:
-            self._launch(self._near, 1, [pairs.count], [self._some])
-        wp.capture_if(self._some, lambda: self._measure(before, after))
-        inputs = [self._some, search.gap, search.reach, search.crossed, search.overflow, step.rounded, self._told]
-        outputs = [*step.islands.arrays, contact.tally.counts, step.tally, step.work, step.remaining]
+    def _judge_by(self, searched: int) -> None:
+        """End the step of worlds in which nothing came near, as far as boxes tell or what was searched for."""
+        step, search = self.step_of, self._search
+        inputs = [searched, self._some, search.gap, search.reach, search.crossed, search.overflow, step.rounded]
+        inputs += [self._known, self._told, *step.islands.arrays, step.newton.contact.tally.counts]
+        outputs = [step.tally, step.work, step.remaining, self._again]
         self._launch(self._judge, self.net.worlds, inputs, outputs)
 
     def _measure(self, before, after) -> None:
-        search = self.step_of.newton.contact.search
-        search.passing(before.q)
-        search.measure(after.q)
+        self._search.passing(before.q)
+        self._search.measure(after.q)
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)

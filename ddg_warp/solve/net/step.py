@@ -82,14 +82,14 @@ class NetStep(PartStep):
         """Launch a whole step from one state to another; `renew`: with the trees of searches for contact made anew."""
         if self.newton.contact and renew:
             self.newton.contact.renew(before.q)
+            if self.alone:
+                self.alone.renew()
         if self.alone is None or self.net.worlds > 1:
             self._keep()
         if self.alone is None:
             super().step(before, after)
             return
-        self._launch(self._start, len(self.islands), self.islands.arrays, [])
         self.alone.step(before, after)
-        wp.capture_if(self.remaining, lambda: self._go_on(before, after))
 
     def _keep(self) -> None:
         """Remember what is counted before a step that may have to be done again."""
@@ -99,8 +99,8 @@ class NetStep(PartStep):
             wp.copy(kept, array)
         self.newton.contact.tally.begin()
 
-    def _go_on(self, before, after) -> None:
-        """Step the worlds that are left to the net; those that are done rest as they are."""
+    def go_on(self, before, after) -> None:
+        """Step the worlds that `alone` has left to the net; those that are done rest as they are."""
         if self.net.worlds == 1:  # of which nothing was counted yet
             self._keep()
         else:
@@ -141,6 +141,11 @@ class NetStep(PartStep):
             self._groups = self._groups or rods_of(self.model)
             self.alone = Alone(self, self._groups)
         return self.alone is not before or (self.alone is not None and self.alone.adapt(s))
+
+    @property
+    def uses(self) -> int:
+        """How many times trees of searches were used, as of the last `outgrown`."""
+        return self.newton.contact.search.uses if self.newton.contact else 0
 
     def outgrown(self, before) -> bool:
         """Whether the last step, from a state `before`, had more pairs in contact than there was room for, and is to be done again.
