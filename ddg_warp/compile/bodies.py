@@ -54,6 +54,16 @@ class Touching:
         return named | {"radius": np.array([body.radius for body in self.bodies])}
 
     @property
+    def meeting(self) -> tuple[np.ndarray, np.ndarray]:
+        """Two groups each, of which something may touch."""
+        moving = np.zeros(len(self.names), bool)
+        moving[self.group[[not body.still for body in self.bodies]]] = True
+        meet = np.triu(moving[:, None] | moving)
+        for g, h in self.ignored:
+            meet[min(g, h), max(g, h)] = False
+        return np.nonzero(meet)
+
+    @property
     def reach(self) -> float:
         """Largest range [m]."""
         return float(self.range.max())

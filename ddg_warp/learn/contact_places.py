@@ -20,7 +20,7 @@ def contact_elements(model, name: str) -> list:
         return []
     if name == RADIUS:
         return [given.bodies[i].label for i in _round(given)]
-    return [(given.names[g], given.names[h]) for g, h in zip(*_meeting(given), strict=True)]
+    return [(given.names[g], given.names[h]) for g, h in zip(*given.meeting, strict=True)]
 
 
 def sized(model, shells: bool) -> dict[int, int]:
@@ -38,17 +38,6 @@ def _round(given) -> np.ndarray:
     return np.flatnonzero(given.numbers["radius"] > 0.0)
 
 
-def _meeting(given) -> tuple[np.ndarray, np.ndarray]:
-    """Two groups each, of which something may touch."""
-    count = len(given.names)
-    moving = np.zeros(count, bool)
-    moving[given.group[[not body.still for body in given.bodies]]] = True
-    meet = np.triu(moving[:, None] | moving)
-    for g, h in given.ignored:
-        meet[min(g, h), max(g, h)] = False
-    return np.nonzero(meet)
-
-
 class ContactPlace:
     """A number of contact, in the arrays that all searches and terms of a net read; attributes as of `TermPlace`."""
 
@@ -60,7 +49,7 @@ class ContactPlace:
         own = name.partition(".")[2]
         self._view, usual = view(net.touching[own]), given.numbers[own]
         self._reach = given.reach * (1.0 + ROUNDING)
-        at = (_round(given),) if name == RADIUS else _meeting(given)
+        at = (_round(given),) if name == RADIUS else given.meeting
         self._usual = np.tile(usual[at], (model.worlds, 1))
         self._at = [torch.as_tensor(index, device=self._view.device) for index in at]
 

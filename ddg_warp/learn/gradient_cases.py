@@ -165,13 +165,21 @@ class Case:
         return Input(name, size, lambda x: self.loss(self.end(self.simulator, values(x))))
 
     def _parameter(self, name: str) -> Input:
-        usual = self.engine.tables.value(name)
+        usual, values = self.engine.tables.value(name), None
         if name == "contact.range":  # which goes no farther than searches do
             usual = 0.9 * usual
+            values = self._begun(name, usual)
         size = float(usual.abs().max()) or self._size_of_family(name)
         direction = 0.5 + torch.rand(usual.shape, generator=self.random, dtype=REAL, device="cpu").to(self.place)
 
-        return Input(name, size, lambda x: self.loss(self.end(self.simulator, None, {name: usual + x * direction})))
+        return Input(name, size, lambda x: self.loss(self.end(self.simulator, values, {name: usual + x * direction})))
+
+    def _begun(self, name: str, value: torch.Tensor) -> tuple | None:
+        """Where an equilibrium begins, at one with another value of a parameter, as angles depend on the way from there."""
+        if not self.statics:
+            return None
+        with torch.no_grad():
+            return self.end(self.simulator, None, {name: value}).values
 
     def _size_of_family(self, name: str) -> float:
         """Of the largest of a family, such as the components of a metric; one where all are zero."""

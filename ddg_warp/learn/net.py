@@ -87,7 +87,7 @@ class NetAdjoint:
         self.predictor = NetPredictor.of(model, net, motion, scheme)
         self._shares = Shares(model)
         self.drag = NetDragAdjoint(model, net, midpoint, self._shares.gather) if drag else None
-        self.contact = ContactAdjoint(net) if host.touching and scheme else None
+        self.contact = ContactAdjoint(net) if host.touching else None
         self.solve = NetSolve(model, self.drag, self.contact and self.contact.system, scheme is not None)
         self.gravity = wp.array(np.tile(model.scene.gravity, (net.worlds, 1)), dtype=net.vector, device=self.device)
         self._damping = wp.array([model.scene.mass_damping], dtype=real, device=self.device)

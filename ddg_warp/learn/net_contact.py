@@ -1,4 +1,4 @@
-"""Reverse of contact in the steps of a net; see `ddg_warp.kernels.adjoint.contact`."""
+"""Reverse of contact in the steps of a net and in its equilibria; see `ddg_warp.kernels.adjoint.contact`."""
 
 import numpy as np
 import warp as wp
@@ -20,8 +20,9 @@ PIECES, LEAST = 256, 64  # of the first things of a world, at most, and what one
 class ContactAdjoint:
     """Of the contact of a `DeviceNet`, friction included; derivatives by obstacles are those by their nodes.
 
-    What is differentiated is a step solved exactly: by positions at its end and, with friction, at its start, where this takes normal
-    forces, directions and slip from; by the numbers of pairs; by the length of the step. Against differences it errs by 1e-9 to 1e-7.
+    What is differentiated is a step, or an equilibrium, solved exactly: by positions at its end and, with friction, at its start, where
+    this takes normal forces, directions and slip from; by the numbers of pairs; by the length of the step. Against differences it errs
+    by 1e-9 to 1e-7.
 
     At kinks gradients are those of one side: where closest points go over an end of an edge or a side of a triangle, whose second
     derivatives jump there; where a pair begins to push, beyond the second derivative of a barrier, and with 1e-14 of the force of a

@@ -18,7 +18,7 @@ class NetSolve:
 
     Args:
         drag: `NetDragAdjoint`, None without drag.
-        contact: `ExactContact`, which is where the solution is; None without contact.
+        contact: `ExactContact`, which is where the solution of a step is; None without contact.
         steps: whether of steps.
 
     Attributes:
@@ -60,7 +60,8 @@ class NetSolve:
             factors: solve on the host, as conjugate gradients have failed.
 
         Raises:
-            SolverError: H is singular; on the host alone, see `failed`. Or there is contact, which the host knows not.
+            SolverError: H is singular; on the host alone, see `failed`. Or it is of a step in contact, which
+                the host knows not.
         """
         coefficient = rate * (rate + self.model.scene.mass_damping)
         if self.system and not factors:

@@ -239,7 +239,7 @@ class Simulator(torch.nn.Module):
         """The equilibrium of every world, with gradients by parameters and controls.
 
         Angles are measured from frames that the search carries along, so that they depend on its way; their gradients are those of
-        a search that begins in the equilibrium. Positions do not.
+        a search that begins in the equilibrium. Positions do not. Contact is part of it, without friction.
 
         Args:
             parameters: as of `step`.

@@ -33,6 +33,21 @@ def refuse_curved_membranes(model) -> None:
             )
 
 
+def refuse_friction(model) -> None:
+    """Refuse contact with friction, of whose many equilibria the way there decides, where an equilibrium is asked about."""
+    given = model.net.host.touching if model.net is not None else None
+    pairs = zip(*given.meeting, strict=True) if given is not None else ()
+    rough = next(((g, h) for g, h in pairs if given.friction[g, h] > 0.0), None)
+    if rough is None:
+        return
+    one, other = (given.names[g] for g in rough)
+    raise SceneError(
+        f"contact: equilibria, stability and paths know no friction, and it is {given.friction[rough]:g} between {one!r} and "
+        f"{other!r}, where the way there decides which equilibrium is found; set friction=0, or step "
+        "the scene in time, damped, until it rests"
+    )
+
+
 def require_mass(model) -> None:
     """Refuse free nodes of rods on their own that nothing gives an equation of motion."""
     for group in model.groups:

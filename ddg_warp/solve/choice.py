@@ -48,19 +48,24 @@ LARGE_STATIC = {False: 50_000, True: 4_000}
 
 
 def static_solver(model) -> str:
-    """Name of the solver of equilibria: "pcg" for large nets that it can serve, else "direct"."""
+    """Name of the solver of equilibria: "pcg" for contact and for large nets that it can serve, else "direct"."""
     net = model.net
+    if net is not None and net.host.touching:
+        return "pcg"
     if net is None or why_not_pcg(model):
         return "direct"
-    return "pcg" if net.host.nodes * net.worlds >= LARGE_STATIC[model.wp_device.is_cuda] else "direct"
+    return "pcg" if large_static(model) else "direct"
+
+
+def large_static(model) -> bool:
+    """Whether a net is too large for factors of its tangent."""
+    return model.net.host.nodes * model.net.worlds >= LARGE_STATIC[model.wp_device.is_cuda]
 
 
 def why_not_pcg(model) -> str:
     """What keeps equilibria of a model from being found by conjugate gradients; empty where nothing does."""
     if model.net is None or model.groups:
         return "it is for shells and joined rods alone, and the model has rods on their own"
-    if model.net.host.touching:
-        return "it does not serve contact"
     return ""
 
 

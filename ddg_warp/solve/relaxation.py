@@ -9,7 +9,7 @@ from afar, and closes in on it slowly: let `statics.solve` finish.
 
 import numpy as np
 
-from ddg_warp.errors import SolverError
+from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.model.state import State
 from ddg_warp.solve.statics import Equilibrium, StaticsOptions
 
@@ -34,8 +34,11 @@ def relax(
         rotation_cap: largest turn of an edge in a step [rad].
 
     Raises:
+        SceneError: there is contact.
         SolverError: `max_steps` or `non_finite`; carries the state that was reached.
     """
+    if model.touch:
+        raise SceneError("contact: relaxation keeps nothing apart; take statics.solve, which does")
     equilibrium = Equilibrium(model, StaticsOptions())
     tangent = equilibrium.tangent
     state = tangent.with_prescribed((state or model.state()).copy(), at)

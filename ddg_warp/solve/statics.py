@@ -7,6 +7,10 @@ mode "minimise" end at a saddle, it goes on from beside it, along the direction 
 stable (`State.stable`). Shells try Newton with stresses
 of its own first (`ddg_warp.solve.mixed`), which takes fewer iterations, and fall back on this search. Large nets are solved on
 the device by conjugate gradients instead (`ddg_warp.solve.net.statics`).
+
+So is what touches, at any size: its search cuts every iterate before anything passes through anything. Where nets are small its
+equilibria are judged by the factored tangent, saddles are left, and what conjugate gradients are slow to finish, without second
+derivatives of shells' bending, is finished by this search, its steps cut alike. There is no friction in equilibria.
 """
 
 from dataclasses import dataclass
@@ -22,7 +26,7 @@ from ddg_warp.model.controls import Controls, checked
 from ddg_warp.model.state import State
 from ddg_warp.scene import validate as scene_validate
 from ddg_warp.solve import mixed, stability
-from ddg_warp.solve.choice import static_solver, why_not_pcg
+from ddg_warp.solve.choice import large_static, static_solver, why_not_pcg
 from ddg_warp.solve.direct import Factorisation, SingularError
 from ddg_warp.solve.motion import jump_between, poses_between
 from ddg_warp.solve.net.statics import NetEquilibrium
@@ -50,7 +54,8 @@ class StaticsOptions:
         max_cuts: how often a load increment is halved before the search is given up; after one that succeeds the next is doubled,
             up to its first size.
         solver: "direct": the exact tangent and its factors, on the host. "pcg": conjugate gradients on the device, for nets that are
-            too large for factors; in mode "minimise" alone, and without a count of unstable directions. "auto": by size.
+            too large for factors, and for contact; in mode "minimise" alone, and of large nets without a count of unstable directions.
+            "auto": by size, and in contact "pcg".
     """
 
     rtol: float = 1e-10
@@ -91,7 +96,8 @@ def solve(
         state: where to begin; the rest state by default. It is not changed. What a `Grip` holds stays where it is, without `poses`.
         controls: forces, moments, gravity and magnetic field, world by world, which the load parameter scales as it does those of the
             scene; and poses of grips at `end`, which move there straight from where the state has them.
-        load_steps: increments; one that fails is halved.
+        load_steps: increments; one that fails is halved. In contact supports and obstacles may go any way in one: they stop where
+            something is in their way, and go on once it has yielded.
         start, end: load parameter, which scales gravity and loads and is the time of motions and amplitudes.
         options: see `StaticsOptions`.
 
@@ -99,10 +105,12 @@ def solve(
         The equilibrium. Its `stable` says whether the tangent stiffness is positive but for rigid modes: True, False (in mode
         "follow" alone, or by conjugate gradients), or None where it was not asked: by conjugate gradients, which only notice what
         is unstable, and under loads without a potential. Then `ddg_warp.solve.stability.spectrum` tells.
+        In contact where a body ends along what neither supports, loads nor what it touches decide is arbitrary.
 
     Raises:
         SolverError: no equilibrium was found, or in mode "minimise" none that is stable; carries the last good state.
-        SceneError: nothing holds the rods, or controls do not fit the model.
+        SceneError: nothing holds the rods, controls do not fit the model, or in contact there is friction, surfaces overlap where
+            the search begins, or the mode or solver keeps nothing apart.
     """
     validate.check_model("statics", model)
     if state is not None:
@@ -121,11 +129,12 @@ class Equilibrium:
     Attributes:
         tangent: energy, gradient and Hessian of the model; residuals: what is small against what, of it.
         net: what solves by conjugate gradients, if that is the solver.
+        factors: whether the tangent at what it finds is factored, to tell whether that is stable.
         mixed: whether Newton with stresses of its own is tried first; where it can be, by default.
         iterations: Newton iterations so far.
         shift: of the last tangent, over its diagonal, that made it definite; 0 where it was.
         outcome: of the last solve, `converged` or `converged_to_rounding`.
-        stiffness: the tangent at the last equilibrium (size, size), None by conjugate gradients.
+        stiffness: the tangent at the last equilibrium (size, size), None without `factors`.
     """
 
     def __init__(self, model, options: StaticsOptions | None = None):
@@ -137,6 +146,7 @@ class Equilibrium:
         lost_in_rounding(model)
         scene_validate.warn_of_massless(model)
         self.net = NetEquilibrium(self) if self._solver() == "pcg" else None
+        self.factors = self.net is None or (model.touch is not None and not large_static(model))
         self.mixed = self.tangent.shells_alone and self.net is None
         self.iterations, self.shift = 0, 0.0
         self.outcome, self.stiffness = "", None
@@ -149,11 +159,30 @@ class Equilibrium:
     def _solver(self) -> str:
         """The solver that the options ask for, if it can serve this model."""
         solver, obstacle = self.options.solver, why_not_pcg(self.model)
+        if self.model.touch:
+            self._check_contact(obstacle)
+            return "pcg"
         if solver == "pcg" and obstacle:
             raise SceneError(f"statics solver 'pcg': {obstacle}; take solver='direct'")
         if solver == "auto":
             return "direct" if self.options.mode == "follow" else static_solver(self.model)
         return solver
+
+    def _check_contact(self, obstacle: str) -> None:
+        """Refuse what does not keep apart what touches; `obstacle`: to conjugate gradients."""
+        validate.refuse_friction(self.model)
+        if self.options.mode == "follow":
+            raise SceneError(
+                "contact: mode 'follow' and paths by continuation step along tangents, which do not tell when something will touch; "
+                "take mode='minimise' and load steps"
+            )
+        if self.options.solver == "direct":
+            raise SceneError("contact: statics solver 'direct' keeps nothing apart; take solver='auto' or 'pcg'")
+        if obstacle:
+            raise SceneError(
+                "contact: an equilibrium needs all rods among the objects that touch, and some are on their own; leave objects out of "
+                "scene.contact(), and let them pass by contact_between(..., ignore=True)"
+            )
 
     def load(
         self,
@@ -165,6 +194,8 @@ class Equilibrium:
     ) -> State:
         """Load stepping; see `solve`."""
         found = checked(controls, self.model, "statics")
+        if self.model.touch and self.model.touch.keep:  # by a penalty equilibria may overlap
+            self.net.newton.contact.check(state.net.q)
         self.tangent.give(found)
         self.tangent.poses = poses_between(state, found["poses"], start, end) if "poses" in found else None
         if start == end:
@@ -206,10 +237,10 @@ class Equilibrium:
         if self.mixed and (found := mixed.newton(self, state, before, at)) is not None:
             state = found
         else:
-            state = self._with_supports_moved(state, before, at)
-            if self.net:
-                return self.net.solve(state, at)
-            state = self._descend(state, at)
+            moved = self._with_supports_moved(state, before, at)
+            state = self._minimum(moved, at, state)
+            if not self.factors:
+                return state
         for _ in range(DESCENTS):
             state.stable = stability.stable(tangent, state, self.stiffness)
             if state.stable is not False or self.options.mode == "follow":
@@ -218,13 +249,26 @@ class Equilibrium:
             if beside is None:
                 state.stable = None
                 return state
-            state = self._descend(beside, at)
+            state = self._minimum(beside, at, state)
         raise SolverError(
             f"no stable equilibrium at load parameter {at:g}: saddle, {DESCENTS} descents from saddles led to others; begin from a "
             "state without symmetry, or take mode='follow' to accept what is unstable",
             state=state,
             outcome="saddle",
         )
+
+    def _minimum(self, state: State, at: float, before: State) -> State:
+        """The equilibrium at load parameter `at` from a state with its supports in place; in contact, on a way from `before`."""
+        if not self.net:
+            return self._descend(state, at)
+        try:
+            state = self.net.solve(state, at, before)
+        except SolverError as error:
+            if not (self.factors and error.outcome == "max_iterations" and self.net.arrived):
+                raise
+            return self._descend(error.state, at)  # with second derivatives that conjugate gradients leave out
+        self.stiffness = self.tangent.stiffness(state, at) if self.factors else None
+        return state
 
     def _beside(self, state: State, at: float) -> State | None:
         """A state of less energy beside a saddle, along its lowest mode; None if rounding leaves no such difference."""
@@ -270,6 +314,9 @@ class Equilibrium:
             merit = np.linalg.norm(self.residuals.scaled(residual)[free])
             for _ in range(30):
                 trial = tangent.retract(q, taken * direction)
+                if self.net:
+                    share = self.net.share(q, trial)
+                    taken, trial = share * taken, q + share * (trial - q)
                 candidate = state.copy()
                 tangent.assign(candidate, trial)
                 new_gradient = tangent.gradient(candidate)
@@ -342,7 +389,7 @@ class Equilibrium:
         follow = tangent.advance(state, step + direction, at)
 
         def potential(candidate):
-            return tangent.element_energies(candidate).sum() - tangent.loads(at, q) @ (tangent.dofs(candidate) - q)
+            return tangent.elastic_energy(candidate) - tangent.loads(at, q) @ (tangent.dofs(candidate) - q)
 
         overturned = tangent.turned_over(q, tangent.dofs(alone))
         better = overturned or not potential(alone) <= potential(follow)

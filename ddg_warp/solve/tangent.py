@@ -56,6 +56,10 @@ class Tangent:
         """Elastic energies of all elements [J], for differences free of cancellation."""
         return np.concatenate([values.ravel() for part in self.parts for _, values in part.energies(state)])
 
+    def elastic_energy(self, state) -> float:
+        """That of all worlds without what touches [J]."""
+        return float(sum(v.sum() for part in self.parts for name, v in part.energies(state) if name != "contact"))
+
     def gradient(self, state) -> np.ndarray:
         """Derivative of the elastic energy (size,) [N, N m]; minus the internal force."""
         return np.concatenate([part.gradient(state) for part in self.parts])

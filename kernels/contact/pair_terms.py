@@ -240,39 +240,13 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: boo
 
 
 @cache
-def mollified_kernels(density: Density, real, linear, serial: bool):
-    """Exact Hessians of pairs of edges that `pair_bend` does not know, kept as long as there is room: those all but parallel.
-
-    mark(...) them, choose(...) lists them in order, differentiate(...) writes a column of each, a thread a column.
-    """
+def columns_kernel(kind: Kind, density: Density, real, linear):
+    """Columns of the exact Hessians of the chosen pairs, a thread some columns; of as many as `starts` and `marks` end in."""
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
     X, *_ = shape_types(real)
-    V, L, until = wp.types.vector(3, real), wp.types.vector(3, linear), until_function(serial)
-    *_, along = pair_energy_functions(EDGES, density, real)
-    given, corners = read_functions(EDGES, real)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def mark(
-        pairs: wp.array(dtype=wp.vec2i),
-        count: wp.array(dtype=int),
-        things: int,
-        wanted: wp.array(dtype=int),
-        factor: Factor,
-        marks: wp.array(dtype=int),
-    ):
-        tid = wp.tid()
-        for p in range(tid, until(tid, marks.shape[0])):
-            marks[p] = 0
-            if p < count[0]:
-                if factor.used[p] != 0 and factor.bend[p] == linear(0.0) and wanted[pairs[p][0] / things] != 0:
-                    marks[p] = 1
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def choose(marks: wp.array(dtype=int), starts: wp.array(dtype=int), chosen: wp.array(dtype=int)):
-        tid = wp.tid()
-        for p in range(tid, until(tid, marks.shape[0])):
-            if marks[p] != 0 and starts[p] < chosen.shape[0]:
-                chosen[starts[p]] = p
+    V, L = wp.types.vector(3, real), wp.types.vector(3, linear)
+    *_, along = pair_energy_functions(kind, density, real)
+    given, corners = read_functions(kind, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def differentiate(
@@ -299,4 +273,38 @@ def mollified_kernels(density: Density, real, linear, serial: bool):
             for slot in range(wp.static(SLOTS)):
                 columns[column, slot, m] = L(linear(dx[slot, 0]), linear(dx[slot, 1]), linear(dx[slot, 2]))
 
-    return mark, choose, differentiate
+    return differentiate
+
+
+@cache
+def mollified_kernels(density: Density, real, linear, serial: bool):
+    """Exact Hessians of pairs of edges that `pair_bend` does not know, kept as long as there is room: those all but parallel.
+
+    mark(...) them, choose(...) lists them in order; and their `columns_kernel`.
+    """
+    Factor, until = factor_struct(linear), until_function(serial)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def mark(
+        pairs: wp.array(dtype=wp.vec2i),
+        count: wp.array(dtype=int),
+        things: int,
+        wanted: wp.array(dtype=int),
+        factor: Factor,
+        marks: wp.array(dtype=int),
+    ):
+        tid = wp.tid()
+        for p in range(tid, until(tid, marks.shape[0])):
+            marks[p] = 0
+            if p < count[0]:
+                if factor.used[p] != 0 and factor.bend[p] == linear(0.0) and wanted[pairs[p][0] / things] != 0:
+                    marks[p] = 1
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def choose(marks: wp.array(dtype=int), starts: wp.array(dtype=int), chosen: wp.array(dtype=int)):
+        tid = wp.tid()
+        for p in range(tid, until(tid, marks.shape[0])):
+            if marks[p] != 0 and starts[p] < chosen.shape[0]:
+                chosen[starts[p]] = p
+
+    return mark, choose, columns_kernel(EDGES, density, real, linear)

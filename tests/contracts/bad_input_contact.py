@@ -7,6 +7,7 @@ from bad_inputs import DOME, INF, NAN, RUBBER, built, dome, each, refuse, rods
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.learn.adjoint import Adjoint
+from ddg_warp.solve.relaxation import relax
 
 TURN = np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
 FLAT = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, -1.0], [2.0, 0.0, -1.0]])
@@ -141,12 +142,23 @@ refuse("obstacles", {
     ),
 })
 
+
+def _rough():
+    return built(touching(friction=0.2))
+
+
 _CALLS = {
-    "statics": lambda: ddg.statics.solve(built(touching())),
-    "continuation": lambda: ddg.continuation.Continuation(built(touching()), {"z": ddg.Displacement.of(-1, "z")}).trace(),
-    "spectrum": lambda: (model := built(touching()), ddg.stability.spectrum(model, model.state())),
+    "statics": lambda: ddg.statics.solve(_rough()),
+    "continuation": lambda: ddg.continuation.Continuation(_rough(), {"z": ddg.Displacement.of(-1, "z")}).trace(),
+    "spectrum": lambda: (model := _rough(), ddg.stability.spectrum(model, model.state())),
 }
-refuse("contact", {name: (call, "contact: equilibria", "step the scene in time") for name, call in _CALLS.items()} | {
+refuse("contact", {
+    name: (call, "contact: equilibria", "it is 0.2 between", "friction=0", "step the scene in time") for name, call in _CALLS.items()
+} | {
+    "follows": (lambda: ddg.statics.solve(built(touching()), mode="follow"), "contact: ", "'follow'", "mode='minimise'"),
+    "factors": (lambda: ddg.statics.solve(built(touching()), solver="direct"), "contact: ", "'direct'", "solver='auto'"),
+    "path": (lambda: ddg.continuation.Continuation(built(touching())), "contact: ", "continuation", "load steps"),
+    "relaxation": (lambda: relax(built(touching())), "contact: ", "relaxation", "statics.solve"),
     "midpoint": (lambda: stepped(touching(), scheme="implicit_midpoint"), "contact: ", "implicit_euler"),
     "projective": (lambda: stepped(touching(), solver="projective"), "contact: ", "'newton'"),
     "asked without": (lambda: (model := built(scene()), model.contacts(model.state())), "contacts: ", "add scene.contact()"),

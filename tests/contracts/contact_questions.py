@@ -1,10 +1,11 @@
 """What is asked of objects in contact: questions as those of `questions`."""
 
 import numpy as np
-from objects import over_floor
+from objects import over_floor, pass_each_other
 from questions import Variant, _mass, close
 
 import ddg_warp as ddg
+from ddg_warp import statics
 
 STEP, COUNT = 2e-3, 8
 
@@ -65,4 +66,35 @@ def moved_obstacle(kind, variant):
         close(points, alone.points(), atol=1e-8)
 
 
-CONTACT_QUESTIONS = {"contact": contact, "moved obstacle": moved_obstacle}
+def rests(kind, variant):
+    """What hangs down onto a ball rests on it: supports and ball carry its weight, in every world as alone."""
+    weighed = {"gravity": (0.0, 0.0, -0.5)}
+    free, _ = kind.scene(**weighed)
+    model = variant.build(free)
+    rest = variant.each(model.state().points())[0]
+    sag = variant.each(statics.solve(model).points())[0] - rest
+    row = int(np.argmin(sag[:, 2]))
+    scene, _ = kind.scene(**weighed)
+    thick = [np.max(batch.section.radius) for batch in scene.batches]
+    apart = 0.005 + max(thick + [0.5 * np.max(shell.thickness) for shell in scene.shells], default=0.0)
+    centre = rest[row] + np.array([0.0, 0.0, 0.95 * sag[row, 2] - apart])
+    scene.add_obstacle(ddg.Sphere(tuple(centre), 0.005), name="ball")
+    scene.contact(range=-0.2 * sag[row, 2])
+    pass_each_other(scene)
+    model = variant.build(scene)
+    state = statics.solve(model)
+    found, forces = model.contacts(state), [variant.each(reaction.force) for reaction in model.reactions(state)]
+    pushed, weight = np.zeros((variant.worlds, 3)), 0.5 * _mass(model).sum()
+    first = found.objects[:, :1] == len(found.names) - 1  # the ball, whose force is the opposite
+    np.add.at(pushed, found.world, np.where(first, -found.force, found.force))
+    assert (found.gap > 0.0).all()
+    assert (pushed[:, 2] > 1e-3 * weight).all()
+    close(pushed, forces[-1], rtol=1e-9, atol=1e-12, what="contacts are what the ball does")
+    close(sum(forces)[:, 2], weight, rtol=1e-5, what="supports and the ball carry the weight")
+    assert (variant.each(model.energies(state)["contact"]) > 0.0).all()
+    alone = scene.build(variant.device, variant.precision)
+    heights = variant.each(state.points())[..., 2]  # a chain that stands may lean any way
+    close(heights, np.tile(statics.solve(alone).points()[:, 2], (variant.worlds, 1)), atol=1e-8)
+
+
+CONTACT_QUESTIONS = {"contact": contact, "moved obstacle": moved_obstacle, "rests": rests}

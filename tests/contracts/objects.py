@@ -215,11 +215,16 @@ def over_floor(scene, gap: float, motion=None) -> float:
     height = min(low, default=0.0) - gap
     scene.add_obstacle(ddg.Plane((0.0, 0.0, height)), motion=motion, name="floor")
     scene.contact(range=RANGE, friction=0.2)
+    pass_each_other(scene)
+    return height
+
+
+def pass_each_other(scene) -> None:
+    """Let rods and shells pass through each other."""
     names = sorted({part.name for part in (*scene.batches, *scene.shells)})
     for i, one in enumerate(names):
         for other in names[i:]:
             scene.contact_between(one, other, ignore=True)
-    return height
 
 
 UP = (0.0, 1.0, 0.0)  # the axis that turns within the plane of x and z

@@ -74,13 +74,16 @@ for _question in ("contact", "moved obstacle"):
         **dict.fromkeys(IN_CONTACT, ("has contact already", "use contact_between")),
         "shell, curved membrane": ("shell 0", "'curved'", "statics", "membrane='flat'"),
     }
+REFUSED["rests"] = REFUSED["contact"] | dict.fromkeys(IN_CONTACT, ("contact: equilibria", "friction", "set friction=0"))
+del REFUSED["rests"]["shell, curved membrane"]
 for _question in (
     *("reactions", "motion", "turned clamp", "load", "couple", "pressure", "grip"),
     *("equilibrium", "spectrum", "continuation"),
 ):
     REFUSED.setdefault(_question, {})
     REFUSED[_question] = (
-        dict.fromkeys(IN_CONTACT, ("contact: equilibria", "step the scene in time")) | REFUSED[_question]
+        dict.fromkeys(IN_CONTACT, ("contact: equilibria", "friction", "set friction=0", "step the scene in time"))
+        | REFUSED[_question]
     )
 REFUSED["implicit midpoint"] |= dict.fromkeys(IN_CONTACT, ("contact: ", "use 'implicit_euler'"))
 REFUSED["failure"] |= dict.fromkeys(IN_CONTACT, ("contact: ", "'ball'", "overlap", "move them apart"))

@@ -172,8 +172,26 @@ def test_what_does_not_fit_is_refused():
     state = lagged.step(lagged.initial_state(velocities=velocities))
     with pytest.raises(SceneError, match=r"friction that is lagged 2 times in a step has no gradient"):
         state.positions.sum().backward()
-    with pytest.raises(SceneError, match=r"contact: equilibria"):
-        own.equilibrium()
+    with pytest.raises(SceneError, match=r"contact: equilibria.* know no friction"):
+        lagged.equilibrium()
+
+
+def test_an_equilibrium_by_numbers_of_every_world():
+    """Two worlds with numbers of their own, of a rod that its weight presses on a ball."""
+    scene = ddg.Scene(gravity=(1.0, 0.7, -40.0))
+    scene.clamp(bar(scene, RADIUS + 0.8 * RANGE), edges=[0, -1])
+    scene.add_obstacle(ddg.Sphere((0.001, 0.002, -0.1), 0.1), name="obstacle")
+    scene.contact(range=RANGE, stiffness=50.0)
+    own = Simulator(scene.build(device=differences.DEVICE, precision="float64", worlds=2), DT)
+    factor = torch.tensor([[1.0], [0.8]], dtype=torch.float64)
+    stiffness, radius = (own.parameter(f"contact.{name}", 2) for name in ("stiffness", "radius"))
+
+    def loss(**given):
+        given = {name.replace("_", "."): value for name, value in given.items()}
+        return weighed(own.equilibrium(given, batch=2, rtol=1e-13))
+
+    given = {"contact_stiffness": factor * stiffness, "contact_radius": radius}
+    check(loss, given, {"contact_stiffness": 1e-4 * 50.0, "contact_radius": 1e-6 * RADIUS})
 
 
 @pytest.mark.parametrize(

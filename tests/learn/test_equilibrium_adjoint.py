@@ -74,6 +74,11 @@ def test_an_equilibrium_by_its_loads(name):
     else:
         host, place = model.net.host, model.net.host.nodes - 1
         found = inputs[-1].load.numpy()[place]
+    check_load(host, place, found, difference)
+
+
+def check_load(host, place: int, found: np.ndarray, difference: Difference) -> None:
+    """Derivatives by the components of a dead force at a place."""
     force = np.where(found < 0.0, -1.0, 1.0)
     host.add_load(np.array([place]), 0.0 * force, None)
     del host.constant  # made anew, with it

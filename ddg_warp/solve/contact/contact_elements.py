@@ -14,7 +14,11 @@ from ddg_warp.solve.contact.pairs import PairList, RunningSums
 
 
 class ContactElements(PairElements):
-    """Contact of the pairs of one list; see `PairTerms` and, for arguments, `PairElements`."""
+    """Contact of the pairs of one list; see `PairTerms` and, for arguments, `PairElements`.
+
+    Attributes:
+        density: the law.
+    """
 
     def __init__(
         self,
@@ -28,6 +32,7 @@ class ContactElements(PairElements):
     ):
         kind = found.kind
         super().__init__(found, rows_of(kind), nodes, real, linear)
+        self.density = law
         serial = arrays.serial(self.device)
         self._items = NodeItems(kind, nodes, real, silent)
         self._sieve, self._choose, self._evaluate = evaluate_kernels(kind, law, real, linear, serial)

@@ -14,6 +14,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.compile.conditions import pose_starts
 from ddg_warp.errors import SceneError
+from ddg_warp.kernels import outcome
 from ddg_warp.kernels.net import touch as kernels
 from ddg_warp.solve.chains.newton import EARLY
 from ddg_warp.solve.contact.tally import Tally
@@ -141,6 +142,12 @@ class NetContact:
         if self.rubs:
             self.terms.lag(before)
 
+    def rest(self) -> None:
+        """Nothing is on its way: what is proposed is where it is."""
+        wp.copy(self.bound, self.newton.q)
+        self.newton.islands.driven.zero_()
+        self._going.zero_()
+
     def lag_again(self) -> None:
         """Take friction anew from where the solve has come to, for worlds that have converged."""
         self.search.update(self.newton.q)
@@ -245,6 +252,17 @@ class NetContact:
             inputs = [self._nodes, self._aims, newton.fixed, self._modes, eps, self.net.blocks, newton.q]
             self._launch(self._arrive, (len(self._nodes), self.net.worlds), inputs, [newton.islands.arrays[0]])
 
+    def share(self, before: np.ndarray, after: np.ndarray) -> float:
+        """The part of a motion (3 W N,) of all worlds in which nothing passes through anything. Not in a capture."""
+        newton = self.newton
+        base, q = (wp.array(x.reshape(-1, 3), dtype=self.net.vector, device=newton.device) for x in (before, after))
+        self._modes.fill_(kernels.WHOLE)
+        self.search.fit(base)
+        self.search.filter(base, q, self._unit, self._modes, self._units, self.touch.keep)
+        if self.search.fit(base):
+            self.search.filter(base, q, self._unit, self._modes, self._units, self.touch.keep)
+        return float(self.search.time.numpy().min())
+
     def _let_go(self) -> None:
         """Let go of what was proposed where nothing is on its way."""
         self._going.zero_()
@@ -290,6 +308,17 @@ class NetContact:
                 f"contact: {pair} overlap by {-gap:.3g} m at the start; move them apart, as model.pushed_apart(state) does, give "
                 "them a smaller radius, or let them pass by contact_between(..., ignore=True)"
             )
+
+    def tightest(self, x: wp.array, reason: int) -> str:
+        """The pair that is the closest at positions x, which may be why a solve has failed by an outcome, and what keeps it apart.
+
+        Empty where nothing is near. Reads from the device.
+        """
+        gap, pair = self.touch.closest(x)
+        if gap >= self.search.reach:
+            return ""
+        remedy = "give their contact a larger stiffness or range, " if reason == outcome.NO_ROOM else ""
+        return f"the smallest gap, {gap:.3g} m, is between {pair}; {remedy}"
 
     def outgrown(self, x: wp.array) -> bool:
         """Whether pairs did not fit, for which there is room then. Reads from the device."""

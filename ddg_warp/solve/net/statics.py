@@ -1,12 +1,14 @@
 """Equilibria of large nets: Newton by preconditioned conjugate gradients on the device, without any factorisation.
 
 The loop is that of a time step without its inertia: energies fall, and the matrix is Gauss-Newton's with the stiffness of the
-stresses. Loads follow every iterate and do the work of their mean along a step; their own stiffness is left out of the
-matrix, which costs iterations and no accuracy. No pivot is seen, so that a saddle on which nothing pushes off is not told from a
-minimum: `ddg_warp.solve.stability` tells.
+stresses; in contact with second derivatives, too, as in a time step. Loads follow every iterate and do the work of their mean along a
+step; their own stiffness is left out of the matrix, which costs iterations and no accuracy. No pivot is seen, so that a saddle on which
+nothing pushes off is not told from a minimum: `ddg_warp.solve.stability` tells.
 """
 
 import math
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -23,6 +25,7 @@ from ddg_warp.solve.loads import StaticLoads
 from ddg_warp.solve.net.newton import NetNewton
 
 FORCING = 1e-4  # smallest reduction of the residual that a direction is solved to: Gauss-Newton errs by more
+ADRIFT = 1e3  # of the size of the net, from which on what moves goes nowhere
 FAR = 4.0  # turns of a direction, over the cap of a step, at which it is far enough
 
 
@@ -36,7 +39,8 @@ class StaticNewton(NetNewton):
         self._whole = False  # whether directions may go as far as they like
         self.gravity.zero_()  # a load like others: `begin` scales them all
         self.loads = StaticLoads(model, self.net, midpoint=False) if self.net.host.followers else None
-        self._there = wp.zeros_like(self.load)
+        self._there, self._before = wp.zeros_like(self.load), wp.zeros_like(self.q)
+        self.islands.moved.fill_(1)
         self._follow, self._less, self._far = newton.static_kernels(self.real, self.linear)
 
     @property
@@ -44,12 +48,20 @@ class StaticNewton(NetNewton):
         """Kernels to load before a capture."""
         return [*super().kernels, self._follow, self._less, self._far, *(self.loads.kernels if self.loads else [])]
 
-    def begin(self, q: np.ndarray, dead: np.ndarray, at: float, scale: np.ndarray) -> None:
-        """Set out from dofs `q` under dead loads (worlds, 3 blocks), with those that follow at `at`; load scales of bodies."""
+    def begin(
+        self, q: np.ndarray, dead: np.ndarray, at: float, scale: np.ndarray, before: np.ndarray | None = None
+    ) -> None:
+        """Set out from dofs `q` under dead loads (worlds, 3 blocks), with those that follow at `at`; load scales of bodies.
+
+        In contact q is what is proposed to what is at dofs `before`.
+        """
         for name in ("status", "iteration", "halvings", "unbalanced", "drowned", "clamped", "stale"):
             getattr(self.islands, name).zero_()
-        for array in (self.q, self.base):
-            array.assign(q.reshape(-1, 3))
+        self.q.assign(q.reshape(-1, 3))
+        self.base.assign((q if before is None else before).reshape(-1, 3))
+        if self.contact:
+            wp.copy(self._before, self.base)
+            self.contact.rest()
         for load in (self.load, self._there):
             load.assign(dead.reshape(-1, 3))
         if self.loads:
@@ -60,17 +72,29 @@ class StaticNewton(NetNewton):
     def balance(self) -> None:
         """Residuals under the loads on the iterate, which do the work of their mean along a step."""
         if self.loads:
-            for q, load in ((self.q, self.load), (self.base, self._there)):
+            for q, load in ((self.here, self.load), (self.base, self._there)):
                 self.loads.apply(self.net.points(q), self.net.points(load), self.net.angles(load))
         super().balance()
         if self.loads:
             wp.launch(
                 self._follow,
                 self.all,
-                [self.q, self.base, self.load, self._there, self.islands.status, self.net.blocks],
+                [self.here, self.base, self.load, self._there, self.islands.status, self.net.blocks],
                 [self.change],
                 device=self.device,
             )
+
+    def search(self, state) -> None:
+        """From where `begin` has set out, with the lagged data of `state`; can be captured."""
+        if self.contact:
+            self.contact.renew(self._before)
+            self.contact.start(self._before)
+            self.contact.place()
+        self.solve(state)
+
+    def outgrown(self) -> bool:
+        """Whether pairs did not fit, for which there is room then, so that all is to be done again. Reads from the device."""
+        return self.contact is not None and self.contact.outgrown(self._before)
 
     def watch(self) -> None:
         """Directions grow with every iteration: one that would be cut to a fraction is far enough.
@@ -116,9 +140,11 @@ class NetEquilibrium:
                 max_iterations=options.max_iterations,
                 rotation_cap=options.rotation_cap,
                 linear_rtol=FORCING,
-                psd="gauss_newton",
+                psd="progressive" if model.net.host.touching else "gauss_newton",
             ),
         )
+        self._rest = self.tangent.dofs(model.state())
+        self._size = float(np.ptp(model.net.host.rest[: model.net.host.nodes], axis=0).max())
         self._start = model.net.empty()  # lagged data of a solve
         self._step = wp.zeros(self.newton.all, dtype=self.newton.right.dtype, device=model.wp_device)
         self._graphs = Graphs(model, lambda: arrays.load_kernels(self.newton.kernels, model.wp_device))
@@ -129,17 +155,22 @@ class NetEquilibrium:
 
     def following(self, state: State, step: np.ndarray, at: float) -> np.ndarray | None:
         """How the free dofs follow held ones that make a `step` (size,), by the tangent; None if there is no answer."""
-        self._begin(state, at)
+
+        def begin():
+            self._begin(state, at)
+            self.newton.islands.wanted.fill_(1)
+            self.newton.forcing.fill_(FORCING)
+            self.newton.goal.fill_(math.inf)
+
         self._step.assign(step.reshape(-1, 3))
-        self.newton.islands.wanted.fill_(1)
-        self.newton.forcing.fill_(FORCING)
-        self.newton.goal.fill_(math.inf)
-        self._graphs.replay("follow", lambda: self.newton.follow(self._start, self._step))
+        self._replay("follow", begin, lambda: self.newton.follow(self._start, self._step))
         direction = self.newton.direction.numpy().astype(np.float64).ravel()
         return direction if np.isfinite(direction).all() else None
 
-    def solve(self, state: State, at: float) -> State:
+    def solve(self, state: State, at: float, before: State) -> State:
         """The equilibrium at load parameter `at` from a state with its supports in place.
+
+        In contact things go there from the state `before`, as far as nothing is in their way.
 
         Raises:
             SolverError: it was not found; names the outcome.
@@ -147,8 +178,8 @@ class NetEquilibrium:
         state, owner = state.copy(), self.owner
         again = self.net.edges or self.model.motions  # what is found is judged by its own frames and forces on supports
         for _ in range(2 if again else 1):
-            self._begin(state, at)
-            self._graphs.replay("solve", lambda: self.newton.solve(self._start))
+            self._replay("solve", partial(self._begin, state, at, before), lambda: self.newton.search(self._start))
+            before = state
             owner.iterations += int(self.newton.islands.iteration.numpy().sum())
             wp.copy(state.net.q, self.newton.q)
             for name in ("frame", *(f"lag_{i}" for i in range(len(self.net.sets)))):
@@ -156,19 +187,58 @@ class NetEquilibrium:
             self.model.carry_frames(state)
             status = int(self.newton.islands.status.numpy().max())
             q = self.tangent.dofs(state)
+            if self.newton.contact:
+                self._refuse_drifting(state, q, at)
             outer = self.tangent.loads(at, q)
             residual = outer - self.tangent.gradient(state)
             if status > outcome.CONVERGED_TO_ROUNDING:
                 name = outcome.NAMES[status]
-                raise SolverError(owner.residuals.where(name, residual, at), state=state, outcome=name)
+                tightest = self.newton.contact.tightest(state.net.q, status) if self.newton.contact else ""
+                raise SolverError(owner.residuals.where(name, residual, at, tightest), state=state, outcome=name)
         owner.outcome = outcome.NAMES[status]
         state.stable = False if self.newton.islands.clamped.numpy().any() else None
         return owner.found(state, outer, residual, at)
 
-    def _begin(self, state: State, at: float) -> None:
+    def _refuse_drifting(self, state: State, q: np.ndarray, at: float) -> None:
+        """Refuse what loads carry away, as neither supports nor contact hold it."""
+        way = np.where(self.tangent.angle, 0.0, np.abs(q - self._rest))
+        farthest = int(np.argmax(way))
+        if way[farthest] > ADRIFT * self._size:
+            raise SolverError(
+                f"no equilibrium at load parameter {at:g}: adrift, {self.tangent.where(farthest)} is carried away, as neither "
+                "supports nor contact hold it; hold it, or put something in its way",
+                state=state,
+                outcome="adrift",
+            )
+
+    @property
+    def arrived(self) -> bool:
+        """Whether the supports of all worlds are where the last solve was to put them."""
+        return not self.newton.islands.driven.numpy().any()
+
+    def share(self, before: np.ndarray, after: np.ndarray) -> float:
+        """The part of a motion from dofs `before` to `after` in which nothing passes through anything."""
+        return self.newton.contact.share(self.tangent.back(before), self.tangent.back(after))
+
+    def _replay(self, name: str, begin: Callable[[], None], launch: Callable[[], None]) -> None:
+        """Launch what is captured under a name, again from its beginning while there is no room for what touches."""
+        while True:
+            begin()
+            self._graphs.replay(name, launch)
+            if not self.newton.outgrown():
+                return
+            self._graphs.clear()
+
+    def _begin(self, state: State, at: float, before: State | None = None) -> None:
         tangent, part = self.tangent, self.tangent.parts[-1]
         q = tangent.dofs(state)
-        outer, gradient = tangent.loads(at, q), tangent.gradient(state)
-        self.newton.begin(tangent.back(q), part.dead_loads(at), at, self.owner.residuals.load_scale(outer, gradient))
+        start = q if before is None else self._beside(q, tangent.dofs(before))
+        outer, gradient = tangent.loads(at, q), part.elastic_gradient(state)
+        scale = self.owner.residuals.load_scale(outer, gradient)
+        self.newton.begin(tangent.back(q), part.dead_loads(at), at, scale, tangent.back(start))
         for name, array in self._start.arrays().items():
             wp.copy(array, state.net.arrays()[name])
+
+    def _beside(self, q: np.ndarray, before: np.ndarray) -> np.ndarray:
+        """Dofs q with the positions of those `before`: angles, which are about other frames, take no way."""
+        return np.where(self.tangent.angle, q, before)

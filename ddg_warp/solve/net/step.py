@@ -8,7 +8,6 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.compile.precision import largest_carried
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import outcome
 from ddg_warp.kernels.net import elements, frames, newton
 from ddg_warp.model.net import NetState
 from ddg_warp.scene import drag
@@ -279,9 +278,4 @@ class NetStep(PartStep):
         """The pair that is the closest in the last good state, where that may be why, and what lets it keep apart."""
         if not self.newton.contact:
             return ""
-        gap, pair = self.newton.contact.touch.closest(state.net.q)
-        if gap >= self.newton.contact.search.reach:
-            return ""
-        stiffer = int(self.islands.reason.numpy()[world]) == outcome.NO_ROOM
-        remedy = "give their contact a larger stiffness or range, " if stiffer else ""
-        return f"the smallest gap, {gap:.3g} m, is between {pair}; {remedy}"
+        return self.newton.contact.tightest(state.net.q, int(self.islands.reason.numpy()[world]))

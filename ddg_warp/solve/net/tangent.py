@@ -7,10 +7,11 @@ import warp as wp
 from scipy import sparse
 
 from ddg_warp.compile.tolerance import largest_excess
-from ddg_warp.errors import SceneError
 from ddg_warp.geometry.turning import turned
 from ddg_warp.kernels.net import elements
+from ddg_warp.model import validate
 from ddg_warp.scene.grip import Grip
+from ddg_warp.solve.contact import assembled
 from ddg_warp.solve.net.planes import HostPlanes
 from ddg_warp.solve.net.prescribed import NetMotion
 from ddg_warp.solve.part import Part
@@ -63,15 +64,20 @@ class NetTangent(Part):
             yield "contact", self.model.touch.terms.energy.numpy().astype(np.float64)[:, None]
 
     def gradient(self, state) -> np.ndarray:
+        elastic = self.elastic_gradient(state)
+        if not self.model.touch:
+            return elastic
+        self.model.touch.at(state.net.q)
+        return elastic - self.into(self.model.touch.terms.forces.numpy().astype(np.float64).ravel())
+
+    def elastic_gradient(self, state) -> np.ndarray:
+        """The same without what touches."""
         result = np.zeros((self.size // 3, 3))
         for i, part in enumerate(self.net.sets):
             slots, forces = part.host.slots, self.forces(state, i)
             index = _tiled(slots, self.host.blocks, self.net.worlds).ravel()
             for d in range(3):
                 result[:, d] += np.bincount(index, forces[..., d].ravel(), len(result))
-        if self.model.touch:
-            self.model.touch.at(state.net.q)
-            result -= self.model.touch.terms.forces.numpy()
         return self.into(result.ravel())
 
     def into(self, values: np.ndarray) -> np.ndarray:
@@ -93,10 +99,7 @@ class NetTangent(Part):
         return out.numpy().astype(np.float64)
 
     def hessian(self, state, stress: list | None = None) -> sparse.csc_matrix:
-        if self.model.touch:
-            raise SceneError(
-                "contact: equilibria, stability and paths have no matrix of what touches yet; step the scene in time, damped"
-            )
+        validate.refuse_friction(self.model)
         scatter, rows, starts = self._pattern
         total = np.zeros(len(rows))
         for i, part in enumerate(self.net.sets):
@@ -111,7 +114,11 @@ class NetTangent(Part):
             to_local, places = scatter[i]
             spread = np.matmul(to_local.T, (values.reshape(-1, size) @ to_local).reshape(count, size, -1))
             total += np.bincount(places, spread.ravel(), len(total))
-        return self.matrix(sparse.csc_matrix((total, rows, starts), shape=(self.size, self.size)))
+        elastic = sparse.csc_matrix((total, rows, starts), shape=(self.size, self.size))
+        if self.model.touch:
+            self.model.touch.at(state.net.q)
+            elastic = elastic + assembled.hessian(self.model.touch.terms, state.net.q)
+        return self.matrix(elastic)
 
     def linear_stress(self, state, step: np.ndarray) -> list:
         """Stresses (strains, elements) of every set that the strains e + J step have."""
@@ -205,7 +212,10 @@ class NetTangent(Part):
     def body_loads(self, outer: np.ndarray, gradient: np.ndarray) -> np.ndarray:
         """Sum of the outer forces on every body, or its largest support force if that is more (worlds bodies,) [N]."""
         bodies, shape = self.host.bodies, (self.net.worlds, self.host.blocks, 3)
-        result = []
+        gradient = np.array(gradient).reshape(shape)
+        for nodes in self.host.obstacles:  # of no body
+            gradient[:, nodes] = 0.0
+        gradient, result = gradient.ravel(), []
         for own, force in zip(
             np.where(self.free & ~self.angle, np.abs(outer), 0.0).reshape(shape),
             np.where(~self.free & ~self.angle, gradient, 0.0).reshape(shape),

@@ -1,0 +1,43 @@
+"""The exact Hessian of contact as a sparse matrix on the host, for tangents of equilibria."""
+
+import numpy as np
+import warp as wp
+from scipy import sparse
+
+from ddg_warp import arrays
+from ddg_warp.kernels.contact.gather import SLOTS
+from ddg_warp.kernels.contact.pair_terms import columns_kernel
+
+COLUMNS = 3 * SLOTS
+
+
+def hessian(terms, x: wp.array) -> sparse.csc_matrix:
+    """Second derivative of the energy of `PairTerms` at positions x (W N,), those of its last `evaluate` (3 W N, 3 W N) [N/m].
+
+    Without friction. Reads from the device.
+    """
+    size = 3 * len(x)
+    total = sparse.csc_matrix((size, size))
+    for elements in terms.lists:
+        rows, columns, values = _entries(elements, terms.law, x)
+        total += sparse.csc_matrix((values, (rows, columns)), shape=(size, size))
+    return 0.5 * (total + total.T)
+
+
+def _entries(elements, law, x: wp.array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows, columns and values of the Hessians of all pairs of `ContactElements` that push each other."""
+    used = np.flatnonzero(elements.factor.used.numpy()[: int(elements.count.numpy()[0])])
+    if not used.size:
+        return np.zeros(0, int), np.zeros(0, int), np.zeros(0)
+    chosen = wp.array(used.astype(np.int32), dtype=int, device=x.device)
+    none, every = (wp.full(1, n, dtype=int, device=x.device) for n in (0, len(used)))
+    out = arrays.allocate((COLUMNS, SLOTS, len(used)), wp.types.vector(3, elements.linear), x.device)
+    threads = arrays.takers(COLUMNS * len(used), x.device)
+    kernel = columns_kernel(elements.found.kind, elements.density, elements.real, elements.linear)
+    inputs = [elements.pairs, elements.found.sides, law, x, elements.factor, every, none, chosen, threads]
+    wp.launch(kernel, threads, inputs, [out], device=x.device)
+    values = arrays.download(out).astype(float).transpose(2, 0, 1, 3).reshape(len(used), COLUMNS, COLUMNS)
+    nodes = elements.factor.nodes.numpy()[used]
+    dofs = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(used), COLUMNS)
+    columns, rows = (np.broadcast_to(v, values.shape) for v in (dofs[:, :, None], dofs[:, None, :]))
+    return rows.ravel(), columns.ravel(), values.ravel()

@@ -1,0 +1,338 @@
+"""Equilibria in contact: beams by closed forms, what rests on obstacles, the end of damped motion, stability, and what is refused."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp import statics
+from ddg_warp.geometry import meshes
+from ddg_warp.scenes import crossed_beams
+from ddg_warp.solve import continuation, relaxation, stability
+from ddg_warp.solve.tangent import Tangent
+from tests.contact.brute_force import edge_edge
+from tests.learn.contact_cases import SCENES, scene_of, touching
+from tests.learn.differences import built
+
+RUBBER = ddg.Material(young=1e7, density=1000.0, poisson=0.5)
+G = 9.81  # m/s^2
+each_law = pytest.mark.parametrize("law", ["barrier", "penalty"])
+
+
+def line(start, end, n: int) -> np.ndarray:
+    return np.linspace(np.array(start, float), np.array(end, float), n + 1)
+
+
+def stiffness(scene) -> float:
+    """EI of the first rod [N m^2]."""
+    return float(np.max(scene.batches[0].section.EI1))
+
+
+def forces(model, state) -> np.ndarray:
+    return np.array([reaction.force for reaction in model.reactions(state)])
+
+
+def weight(model) -> float:
+    tangent = Tangent(model)
+    return -float(tangent.loads(1.0, tangent.dofs(model.state())).sum())
+
+
+def pressed(n: int, law: str, at: float, both: bool):
+    """A beam of 1 m along x, clamped at one end or both, on which a ball comes down."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    rod = scene.add_rod(line((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), n), section=ddg.Circle(0.01), material=RUBBER)
+    for end in ("first", "last")[: 1 + both]:
+        scene.clamp_end(rod, end)
+    ball = ddg.Sphere((at, 0.0, 0.1101), 0.1)
+    scene.add_obstacle(ball, motion=ddg.Motion(lambda t: (0.0, 0.0, -3e-4 * t)), name="ball")
+    scene.contact(law=law, range=2e-5, stiffness=1e4 * stiffness(scene))
+    return scene
+
+
+@each_law
+@pytest.mark.parametrize("load_steps", [1, 3])
+def test_crossed_beams_are_springs(device, law, load_steps):
+    """Two of 192 EI / L^3 in series: each takes half of the overlap, and they push each other with 96 EI of it over L^3."""
+    scene = crossed_beams.build(law=law, dt=1.0 / crossed_beams.SPEED_UP)  # clamps are down at load parameter 1
+    model = scene.build(device, precision="float64")
+    state = statics.solve(model, load_steps=load_steps)
+    points, found, force = state.points(), model.contacts(state), forces(model, state)[:, 2]
+    assert state.stable
+    middle = len(points) // 4
+    overlap = 2.0 * crossed_beams.RADIUS + found.gap.min() - points[len(points) // 2, 2]
+    np.testing.assert_allclose(force[:2].sum(), 96.0 * stiffness(scene) * overlap, rtol=6e-3)
+    np.testing.assert_allclose(-points[middle, 2], 0.5 * overlap, rtol=1e-5)
+    np.testing.assert_allclose(force[2:].sum(), -force[:2].sum(), rtol=1e-9)
+    if law == "barrier":
+        assert (found.gap > 0.0).all()
+
+
+@each_law
+@pytest.mark.parametrize(("at", "both", "spring"), [(0.5, True, 192.0), (1.0, False, 3.0)])
+def test_a_ball_pressed_on_a_beam(device, law, at, both, spring):
+    """F = 192 EI w / L^3 in the middle of a clamped beam, 3 EI w / L^3 at the tip of a cantilever (Euler and Bernoulli)."""
+    errors = []
+    for n in (16, 32, 64):
+        scene = pressed(n, law, at, both)
+        model = scene.build(device, precision="float64")
+        state = statics.solve(model)
+        deflection = state.points()[round(at * n), 2]
+        assert deflection < -1.5e-4
+        errors.append(forces(model, state)[-1, 2] / (spring * stiffness(scene) * deflection) - 1.0)
+    assert np.abs(errors[-1]) < 2e-3, errors
+    np.testing.assert_allclose((errors[0] - errors[1]) / (errors[1] - errors[2]), 4.0, rtol=0.1, err_msg=str(errors))
+
+
+@each_law
+def test_a_heavy_rod_is_lifted_off_the_floor(device, law):
+    """An end is raised by h and kept level; the rod leaves the floor over l = (72 EI h / w)^(1/4).
+
+    From where it leaves, y = F s^3 / 6 EI - w s^4 / 24 EI: height, slope and curvature are zero there, and the floor has a force F.
+    With y' = 0 at l, F = w l / 3, so that y(l) = w l^4 / 72 EI, and what holds the end carries 2 w l / 3.
+    """
+    lift, errors = 2e-3, []
+    for n in (50, 100, 200):
+        scene = ddg.Scene(gravity=(0.0, 0.0, -G))
+        rod = scene.add_rod(
+            line((0.0, 0.0, 0.004019), (1.0, 0.0, 0.004019), n), section=ddg.Circle(0.004), material=RUBBER
+        )
+        scene.clamp_end(rod, "first", motion=ddg.Motion(lambda t: (0.0, 0.0, lift * t)))
+        scene.add_obstacle(ddg.Plane(), name="floor")
+        scene.contact(law=law, range=2e-5)
+        model = scene.build(device, precision="float64")
+        state = statics.solve(model)
+        points, found, force = state.points(), model.contacts(state), forces(model, state)[:, 2]
+        assert state.stable
+        np.testing.assert_allclose(force.sum(), weight(model), rtol=1e-8)
+        np.testing.assert_allclose(found.force[:, 2].sum(), force[-1], rtol=1e-9)
+        w = weight(model)  # of a metre
+        h = points[0, 2] - np.median(points[n // 2 :, 2])
+        length = (72.0 * stiffness(scene) * h / w) ** 0.25
+        errors.append(force[0] / (2.0 * w * length / 3.0) - 1.0)
+        pushed = found.force[:, 2] > 0.1 * w / n
+        assert abs(found.point[pushed, 0].min() - length) < 2.5 / n
+    assert np.abs(errors[-1]) < 1.5e-3, errors
+    assert abs(errors[0]) > 2.5 * abs(errors[1]) > 5.0 * abs(errors[2]), errors
+
+
+def chain_over_a_bar():
+    scene = ddg.Scene(gravity=(0.0, 0.0, -G))
+    soft = ddg.Material(young=1e5, density=1000.0)
+    rod = scene.add_rod(line((-0.4, 0.0, 0.0), (0.4, 0.0, 0.0), 40), section=ddg.Circle(0.004), material=soft)
+    for node, side in ((0, 1.0), (-1, -1.0)):
+        scene.fix(rod, [node], motion=ddg.Motion(lambda t, side=side: (0.1 * side * t, 0.0, -0.1 * t)))
+    scene.add_obstacle(ddg.Capsule((0.0, -0.2, -0.1), (0.0, 0.2, -0.1), 0.08), name="bar")
+    scene.contact(range=1e-3)
+    return scene
+
+
+def sheet_on_a_ball():
+    scene = ddg.Scene(gravity=(0.0, 0.0, -G))
+    points, triangles = meshes.rectangle(8, 8, (1.0, 1.0), "alternating")
+    points = points - [0.5, 0.5, 0.0]
+    scene.add_shell(points, triangles, thickness=4e-3, material=ddg.Material(young=1e6, density=500.0, poisson=0.3))
+    scene.hold(0, [int(np.argmin(np.linalg.norm(points, axis=1)))], "xy")
+    scene.add_obstacle(ddg.Sphere((0.0, 0.0, -0.305), 0.3), name="ball")  # beyond the range of contact: it falls there
+    scene.contact(range=1e-3)
+    return scene
+
+
+@pytest.mark.parametrize("scene", [chain_over_a_bar, sheet_on_a_ball])
+def test_reactions_carry_the_weight(device, scene):
+    model = scene().build(device, precision="float64")
+    state = statics.solve(model)
+    force, found = forces(model, state), model.contacts(state)
+    np.testing.assert_allclose(force.sum(0), [0.0, 0.0, weight(model)], atol=1e-8 * weight(model))
+    assert force[-1, 2] > 0.2 * weight(model)
+    assert state.stable
+    assert (found.gap > 0.0).all()
+    assert model.energies(state)["contact"] > 0.0
+    again = statics.solve(model)
+    np.testing.assert_array_equal(again.points(), state.points())
+
+
+def test_a_rod_rests_in_a_groove(device):
+    """Nothing holds it but two planes, which carry its weight, each across itself."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, -G))
+    scene.add_rod(line((0.01, -0.1, 0.05), (0.01, 0.1, 0.05), 8), section=ddg.Circle(0.005), material=RUBBER)
+    for side in (1.0, -1.0):
+        scene.add_obstacle(ddg.Plane((0.0, 0.0, 0.0), (side, 0.0, 1.0)), name="groove")
+    scene.contact()
+    model = scene.build(device, precision="float64")
+    state = statics.solve(model)
+    half = 0.5 * weight(model)
+    np.testing.assert_allclose(forces(model, state), [[half, 0.0, half], [-half, 0.0, half]], atol=1e-7 * half)
+
+
+def test_an_equilibrium_is_where_damped_motion_ends(device):
+    """A rod that two supports hold lies across another one and a ball."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, -G), mass_damping=20.0)
+    soft = ddg.Material(young=3e8, density=1000.0)
+    scene.clamp(
+        scene.add_rod(line((-0.2, 0.0, 0.0), (0.2, 0.01, 0.0), 12), section=ddg.Circle(0.005), material=soft),
+        edges=[0, -1],
+    )
+    upper = scene.add_rod(line((0.03, -0.2, 0.0105), (0.05, 0.2, 0.0105), 12), section=ddg.Circle(0.005), material=soft)
+    scene.clamp_end(upper, "first")
+    scene.add_obstacle(ddg.Sphere((0.05, 0.15, -0.0452), 0.05), name="ball")
+    scene.contact(range=1e-3)
+    model = scene.build(device, precision="float64")
+    integrator, moved = ddg.Integrator(model, rtol=1e-10), model.state()
+    for _ in range(400):
+        moved = integrator.step(moved, 0.02)
+    assert np.abs(moved.velocities()).max() < 1e-10
+    rest = statics.solve(model)
+    np.testing.assert_allclose(rest.points(), moved.points(), atol=1e-8)
+    found, ended = model.contacts(rest), model.contacts(moved)
+    assert {tuple(pair) for pair in found.objects} == {(0, 1), (1, 2)}
+    np.testing.assert_allclose(found.force, ended.force, atol=1e-6 * weight(model))
+
+
+def over(lower: np.ndarray, upper: np.ndarray) -> float:
+    """How high above one row of edges another one is where they cross as seen from above [m], the least."""
+    heights = []
+    for a, b in pairwise(lower):
+        for c, d in pairwise(upper):
+            s, t = np.linalg.solve(np.stack([(b - a)[:2], (c - d)[:2]], 1), (c - a)[:2])
+            if 0.0 <= s <= 1.0 and 0.0 <= t <= 1.0:
+                heights.append(c[2] + t * (d - c)[2] - a[2] - s * (b - a)[2])
+    return min(heights)
+
+
+@each_law
+@pytest.mark.parametrize("both", [True, False])
+def test_nothing_is_pushed_through_anything(device, law, both):
+    """Clamps go 0.25 m beyond a beam in one load step, and in ten: the rods never cross, and end alike."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    s = np.linspace(-0.5, 0.5, 17)
+    for name, points in (("lower", [s, 0.0 * s, 0.0 * s]), ("upper", [0.0 * s + 0.02, s, 0.0 * s + 0.05])):
+        scene.add_rod(np.stack(points, 1), section=ddg.Circle(0.01), material=RUBBER, name=name)
+    down = ddg.Motion(lambda t: (0.0, 0.0, -0.3 * t))
+    for rod, motion, ends in ((0, None, 1 + both), (1, down, 2)):
+        for end in ("first", "last")[:ends]:
+            scene.clamp_end(rod, end, motion=motion)
+    scene.contact(law=law)
+    model = scene.build(device, precision="float64")
+    once, state = statics.solve(model), model.state()
+    for k in range(10):
+        state = statics.solve(model, state, start=0.1 * k, end=0.1 * (k + 1))
+        lower, upper = state.points()[:17], state.points()[17:]
+        a, b = np.repeat(np.arange(16), 16), np.tile(np.arange(16), 16)
+        apart = edge_edge(lower[a], lower[a + 1], upper[b], upper[b + 1]).min()
+        assert apart > (0.02 if law == "barrier" else 1e-3)
+        assert over(lower, upper) > 0.0
+    np.testing.assert_allclose(state.points(), once.points(), atol=1e-8)
+
+
+def test_worlds_are_as_alone(device):
+    """Each under its own gravity, which presses a cantilever on a floor."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    rod = scene.add_rod(line((0.0, 0.0, 0.03), (0.5, 0.0, 0.03), 16), section=ddg.Circle(0.004), material=RUBBER)
+    scene.clamp(rod)
+    scene.add_obstacle(ddg.Plane(), name="floor")
+    scene.contact()
+    down = np.outer([5.0, 10.0, 20.0], (0.0, 0.0, -1.0))
+    model = scene.build(device, precision="float64", worlds=3)
+    state = statics.solve(model, controls=ddg.Controls(gravity=down))
+    assert state.stable
+    assert set(model.contacts(state).world) == {0, 1, 2}
+    alone = scene.build(device, precision="float64")
+    for world, gravity in enumerate(down):
+        found = statics.solve(alone, controls=ddg.Controls(gravity=gravity))
+        np.testing.assert_allclose(state.points()[world], found.points(), atol=1e-9)
+
+
+@each_law
+@pytest.mark.parametrize("name", SCENES)
+def test_the_tangent_of_what_touches(name, law):
+    """Against central differences of forces, along a direction in which all free dofs move."""
+    model = built(scene_of(name, law))
+    state, tangent = touching(model), Tangent(model)
+    assert len(model.contacts(state))
+    q = tangent.dofs(state)
+    direction = np.where(tangent.free, np.random.default_rng(1).normal(size=tangent.size), 0.0)
+    direction *= np.where(tangent.angle, 1e-2, 1e-5)
+    found = tangent.stiffness(state) @ direction
+
+    def forces_at(x):
+        there = state.copy()
+        there.net.q.assign((q + x * direction).reshape(-1, 3))  # in the frames of the state
+        return tangent.gradient(there)
+
+    step = 1e-3
+    one, two = ((forces_at(s * step) - forces_at(-s * step)) / (2.0 * s * step) for s in (1.0, 2.0))
+    reference = (4.0 * one - two) / 3.0
+    assert np.abs(found - reference)[tangent.free].max() < 1e-6 * np.abs(reference[tangent.free]).max()
+
+
+@each_law
+def test_what_lies_on_a_floor_swings_upon_it(device, law):
+    """Up and down at omega^2 = (dW / dz) / m, from equilibria under a little more and less weight; it is all but rigid."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, -G))
+    rod = scene.add_rod(
+        line((0.0, 0.0, 0.0052), (0.02, 0.0, 0.0052), 2),
+        section=ddg.Circle(0.005),
+        material=ddg.Material(young=1e12, density=1000.0),
+    )
+    scene.fix(rod, [0], components="xy")
+    scene.add_obstacle(ddg.Plane(), name="floor")
+    scene.contact(law=law, range=5e-4)
+    model = scene.build(device, precision="float64")
+    state, change = statics.solve(model), 1e-4
+    heights = [
+        statics.solve(model, state, controls=ddg.Controls(gravity=(0.0, 0.0, -G * f))).points()[:, 2].mean()
+        for f in (1.0 - change, 1.0 + change)
+    ]
+    square = 2.0 * change * G / (heights[0] - heights[1])
+    values = stability.spectrum(model, state, 8).eigenvalues
+    assert np.abs(values / square - 1.0).min() < 1e-5
+
+
+def rods_with(friction: float = 0.0, objects=None):
+    scene = ddg.Scene(gravity=(0.0, 0.0, -G))
+    for name, height in (("one", 0.02), ("other", 0.1)):
+        rod = scene.add_rod(
+            line((0.0, 0.0, height), (0.2, 0.0, height), 6), section=ddg.Circle(0.005), material=RUBBER, name=name
+        )
+        scene.clamp(rod)
+    scene.add_obstacle(ddg.Plane(), name="floor")
+    scene.contact(friction=friction, objects=objects)
+    return scene
+
+
+def test_what_equilibria_refuse(device):
+    def model_of(scene):
+        return scene.build(device, precision="float64")
+
+    rough, smooth, partly = (model_of(rods_with(**given)) for given in ({"friction": 0.3}, {}, {"objects": ["one"]}))
+    for ask in (statics.solve, continuation.Continuation, lambda m: stability.spectrum(m, m.state())):
+        with pytest.raises(
+            ddg.SceneError, match=r"know no friction, and it is 0.3 between 'floor' and 'one'.*set friction=0"
+        ):
+            ask(rough)
+    for given, words in (
+        ({"mode": "follow"}, "mode 'follow' .* take mode='minimise'"),
+        ({"solver": "direct"}, "'direct' keeps nothing apart; take solver='auto'"),
+    ):
+        with pytest.raises(ddg.SceneError, match=words):
+            statics.solve(smooth, **given)
+    with pytest.raises(ddg.SceneError, match=r"paths by continuation .* take mode='minimise' and load steps"):
+        continuation.Continuation(smooth)
+    with pytest.raises(ddg.SceneError, match=r"relaxation keeps nothing apart; take statics\.solve"):
+        relaxation.relax(smooth)
+    with pytest.raises(ddg.SceneError, match="some are on their own; leave objects out"):
+        statics.solve(partly)
+    state = smooth.state()
+    state = smooth.state(points=state.points() - [0.0, 0.0, 0.016])
+    with pytest.raises(ddg.SceneError, match=r"of rod 0 .*'floor'.* overlap by 0.001 m at the start"):
+        statics.solve(smooth, state)
+
+
+def test_what_nothing_holds_is_carried_away(device):
+    scene = ddg.Scene(gravity=(0.0, 0.0, -G))
+    scene.add_rod(line((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), 6), section=ddg.Circle(0.005), material=RUBBER)
+    scene.add_obstacle(ddg.Sphere((1.0, 0.0, 0.0), 0.1), name="ball")
+    scene.contact()
+    with pytest.raises(ddg.SolverError, match=r"adrift, node \d of rod 0 is carried away.*hold it"):
+        statics.solve(scene.build(device, precision="float64"))
