@@ -38,15 +38,14 @@ def factor_struct(linear):
 def set_struct(real, linear):
     """A list of pairs: its factor (see `factor_struct`) and gradients, the items of nodes, and what products write.
 
-    ranks: of each pair, the places of its items among all of the list, -1 where it has none; what pairs bring to nodes is written by
-    these, so that nodes read it one after the other: `placed` of products; push, own_block, next_block and edge: see `place`.
+    ranks: of each pair, the places of its items among all of the list, -1 where it has none; `placed` by these is what products bring
+    to nodes, which read it one after the other.
     marks, starts, columns: of pairs whose Hessians are kept, see `pair_terms.mollified_kernels`; empty where there are none.
     listed, number (1,): pairs that may be used, all others are not, and how many these are.
-    sides: 2, which the compiler must not know; kind: place in `pair_bend.KINDS`, -1 without `bend`; edges: how many of its things, the
-    first ones, are edges; rows: of its factor; things: first things of pairs in one world.
+    kind: place in `pair_bend.KINDS`, -1 without `bend`; edges: how many of its things, the first ones, are edges; rows: of its factor;
+    things: first things of pairs in one world.
     """
     X, V, W = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.vector(SLOTS, linear)
-    B = wp.types.vector(6, linear)
 
     @wp.struct
     class PairSet:
@@ -62,16 +61,12 @@ def set_struct(real, linear):
         starts: wp.array(dtype=int)
         columns: wp.array3d(dtype=V)
         placed: wp.array(dtype=V)
-        push: wp.array(dtype=X)
-        own_block: wp.array(dtype=B)
-        next_block: wp.array(dtype=B)
-        edge: wp.array(dtype=int)
         places: wp.array(dtype=int)
         numbers: wp.array(dtype=int)
+        items: wp.array(dtype=int)
         ranks: wp.array(dtype=wp.vec4i)
         listed: wp.array(dtype=int)
         number: wp.array(dtype=int)
-        sides: int
         kind: int
         edges: int
         rows: int
@@ -230,59 +225,24 @@ def sum_kernel(real, serial: bool):
 
 @cache
 def collect_kernels(real, linear, serial: bool):
-    """place(...) what pairs bring to nodes, collect(...) forces of nodes and blocks of H on its diagonal, join(...) its blocks
-    between the nodes of edges."""
+    """collect(...) forces of all lists on nodes, and the blocks of H on its diagonal; join(...) those between the nodes of edges."""
     PairSet, Surface, until = set_struct(real, linear), surface_struct(real), until_function(serial)
     V, M, B = wp.types.vector(3, real), wp.types.matrix((3, 3), linear), wp.types.vector(6, linear)
-    H = wp.types.vector(3, linear)
 
     @wp.func
-    def square(v: H):
-        """v v^T, by its six entries."""
-        return B(v[0] * v[0], v[0] * v[1], v[0] * v[2], v[1] * v[1], v[1] * v[2], v[2] * v[2])
-
-    @wp.func
-    def put(own: PairSet, rank: int, push: V, own_block: B, next_block: B, edge: int):
-        if rank >= 0:
-            own.push[rank] = push
-            own.own_block[rank] = own_block
-            own.edge[rank] = edge
-            if edge >= 0:
-                own.next_block[rank] = next_block
+    def block(own: PairSet, p: int, a: int, b: int):
+        """What pair p adds to the matrix between its nodes in slots a and b [N/m], symmetric, by its six entries."""
+        m, used = B(), own.used[p]
+        for k in range(own.rows):
+            if (used >> (k + 1)) & 1 != 0:
+                v = own.direction[k, p]
+                w = own.weight[k, p]
+                m += B(v[0] * v[0], v[0] * v[1], v[0] * v[2], v[1] * v[1], v[1] * v[2], v[2] * v[2]) * (w[a] * w[b])
+        return m
 
     @wp.func
     def whole(b: B):
         return M(b[0], b[1], b[2], b[1], b[3], b[4], b[2], b[4], b[5])
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def place(sets: wp.array(dtype=PairSet)):
-        """Of every item the gradient, the block of its node, and of the first one of an edge this edge and the block between its nodes.
-
-        `edge` is -1 elsewhere: another one may begin at that node.
-        """
-        tid = wp.tid()
-        for s in range(sets.shape[0]):
-            if tid < sets[s].number[0]:
-                own = sets[s]
-                for i in range(tid, until(tid, own.number[0])):
-                    p = own.listed[i]
-                    rank, pair, used = own.ranks[p], own.pairs[p], own.used[p]
-                    for side in range(own.sides):  # not unrolled, for the sake of registers
-                        push, next_push = V(), V()
-                        own_block, block, next_block = B(), B(), B()
-                        if used != 0:
-                            push = push + own.gradient[2 * side, p]
-                            next_push = next_push + own.gradient[2 * side + 1, p]
-                            for k in range(own.rows):
-                                if (used >> (k + 1)) & 1 != 0:
-                                    w, b = own.weight[k, p], square(own.direction[k, p])
-                                    one, other = wp.where(side == 0, w[0], w[2]), wp.where(side == 0, w[1], w[3])
-                                    own_block += b * (one * one)
-                                    block += b * (one * other)
-                                    next_block += b * (other * other)
-                        edge = wp.where(side < own.edges, wp.where(side == 0, pair[0], pair[1]), -1)
-                        put(own, wp.where(side == 0, rank[0], rank[2]), push, own_block, block, edge)
-                        put(own, wp.where(side == 0, rank[1], rank[3]), next_push, next_block, block, -1)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def collect(
@@ -299,16 +259,19 @@ def collect_kernels(real, linear, serial: bool):
                 number = sets[s].numbers[node]
                 if number > 0:
                     own = sets[s]
-                    start = own.places[node]
-                    for k in range(start, start + number):
-                        force -= own.push[k]
-                        total += own.own_block[k]
+                    for k in range(own.places[node], own.places[node] + number):
+                        p = own.items[k] / wp.static(SLOTS)
+                        slot = own.items[k] - wp.static(SLOTS) * p
+                        if own.used[p] != 0:
+                            force -= own.gradient[slot, p]
+                            total += block(own, p, slot, slot)
             forces[node] = force
             diagonal[node] = whole(total)
             stiffness[node] = real(total[0] + total[3] + total[5])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def join(sets: wp.array(dtype=PairSet), edges: Surface, count: int, between: wp.array(dtype=M)):
+        """Items of the first node that come from this edge, not from another one that begins there."""
         tid = wp.tid()
         for i in range(tid, until(tid, between.shape[0])):
             w = i / count
@@ -318,10 +281,12 @@ def collect_kernels(real, linear, serial: bool):
                 number = sets[s].numbers[node]
                 if number > 0:
                     own = sets[s]
-                    start = own.places[node]
-                    for k in range(start, start + number):
-                        if own.edge[k] == i:
-                            total += own.next_block[k]
+                    for k in range(own.places[node], own.places[node] + number):
+                        p = own.items[k] / wp.static(SLOTS)
+                        slot = own.items[k] - wp.static(SLOTS) * p
+                        if slot % 2 == 0 and slot / 2 < own.edges and own.used[p] != 0:
+                            if own.pairs[p][slot / 2] == i:
+                                total += block(own, p, slot, slot + 1)
             between[i] = whole(total)
 
-    return place, collect, join
+    return collect, join

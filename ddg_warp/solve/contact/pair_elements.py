@@ -8,7 +8,6 @@ from ddg_warp.kernels.contact import gather
 from ddg_warp.solve.contact.pairs import PairList
 
 MOST = 2**31 // gather.SLOTS  # pairs whose slots can be counted
-PLACED = "placed", "push", "own_block", "next_block", "edge"  # what is written by rank
 
 
 class PairElements:
@@ -21,7 +20,7 @@ class PairElements:
 
     Attributes:
         factor: see `gather.factor_struct`; energy: of each pair (capacity,) [J]; gradient: by slot (SLOTS, capacity) [N].
-        placed, push, own_block, next_block, edge: see `gather.set_struct`.
+        placed: see `gather.set_struct`.
         pairs, count, starts, partners: as those of a `PairList`; of the subclass.
         listed, number: pairs that may be used, in order, and how many; of all others `factor.used` is zero.
         mollified: those whose matrices take more than a factor and what turns (`Mollified`); None without.
@@ -59,9 +58,7 @@ class PairElements:
         self.listed = wp.zeros(capacity, dtype=int, device=self.device)
         self.energy = wp.zeros(capacity, dtype=self.real, device=self.device)
         self.gradient = arrays.allocate((gather.SLOTS, capacity), wp.types.vector(3, self.real), self.device)
-        types = vector, wp.types.vector(3, self.real), wp.types.vector(6, linear), wp.types.vector(6, linear), int
-        for name, dtype in zip(PLACED, types, strict=True):
-            setattr(self, name, wp.zeros(self.size * capacity, dtype=dtype, device=self.device))
+        self.placed = wp.zeros(self.size * capacity, dtype=vector, device=self.device)
 
     def add_up(self, parts: wp.array, scale: float, out: wp.array, items) -> None:
         """Add what pairs that are used have written by slot (`SLOTS`, capacity) to nodes that have items (`NodeItems`)."""

@@ -8,7 +8,6 @@ from ddg_warp.kernels.contact.pair_bend import KINDS
 from ddg_warp.kernels.contact.pair_product import product_kernels
 from ddg_warp.kernels.contact.surfaces import EDGES
 from ddg_warp.solve.contact.contact_elements import ContactElements
-from ddg_warp.solve.contact.pair_elements import PLACED
 
 
 class PairProduct:
@@ -71,12 +70,13 @@ class PairProduct:
         own, kind = set_struct(self._real, self._linear)(), part.found.kind
         for name in ("nodes", "used", "direction", "weight", "bend"):
             setattr(own, name, getattr(part.factor, name))
-        for name in ("pairs", "count", "gradient", "places", "numbers", "ranks", "listed", "number", *PLACED):
+        for name in ("pairs", "count", "gradient", "placed", "places", "numbers", "items", "ranks"):
             setattr(own, name, getattr(part, name))
+        own.listed, own.number = part.listed, part.number
         for name in ("marks", "starts", "columns") if part.mollified and part.mollified.keeps else ():
             setattr(own, name, getattr(part.mollified, name))
         own.kind = KINDS.index(kind) if isinstance(part, ContactElements) else -1
-        own.sides, own.edges = 2, (kind.first == 2) + (kind == EDGES)
+        own.edges = (kind.first == 2) + (kind == EDGES)
         own.rows, own.things = part.rows, part.found.first.count
         return own
 

@@ -99,8 +99,7 @@ class PairTerms:
             ContactElements(pairs, law, nodes, self.real, self.linear, told_not, exact) for pairs in search.lists
         ]
         self._begin = gather.begin_kernel(self.real)
-        made = gather.collect_kernels(self.real, self.linear, arrays.serial(self.device))
-        self._place, self._collect, self._join = made
+        self._collect, self._join = gather.collect_kernels(self.real, self.linear, arrays.serial(self.device))
         self._version, self._lagged = search.version, -1
         self.frictions = self._with_friction(rubs, ways, friction_law, velocity, told_not)
         self._start = wp.zeros_like(self.forces)
@@ -120,7 +119,6 @@ class PairTerms:
         parts = [kernel for part in self._parts for kernel in part.kernels]
         return [
             self._begin,
-            self._place,
             self._collect,
             self._join,
             *self._product.kernels,
@@ -194,8 +192,6 @@ class PairTerms:
         iterates = self._no_iterates if iterates is None else iterates
         for part in self.frictions:
             part.evaluate(x, start, rate, iterates)
-        most = max(part.found.capacity for part in self.lists)
-        arrays.sweep(self._place, most, [self._product.sets], [], self.device)
         outputs = [self.forces, self.diagonal, self.stiffness]
         arrays.sweep(self._collect, len(self.forces), [self._product.sets], outputs, self.device)
         self._totals(self.search.overflow)
