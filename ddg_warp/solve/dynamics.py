@@ -16,14 +16,14 @@ from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.chains.step import NET_ONLY, ChainStep
 from ddg_warp.solve.controls import LOADS, Given
 from ddg_warp.solve.graphs import Graphs
-from ddg_warp.solve.net.step import NetStep
+from ddg_warp.solve.net.step import RUNS, TREES, NetStep
 from ddg_warp.solve.worlds import Worlds, outcomes
 from ddg_warp.threads import launches
 
 FAILURES = ("raise", "flag")
 SOLVERS = ("newton", "projective")
-# Steps by which trees of searches serve on CUDA, where they are refitted meanwhile, if they are used at all: to make those of 100 rods
-# anew takes a tenth of a step in which they touch nothing.
+# Steps by which trees serve on CUDA, where they are refitted meanwhile: to make those of searches anew, of 100 rods, takes a tenth of a
+# step in which they touch nothing.
 RENEWAL = 8
 SCHEMES = ("implicit_euler", "implicit_midpoint")
 
@@ -119,8 +119,8 @@ class Integrator:
         self._dt = wp.zeros(model.worlds, dtype=model.types.real, device=model.wp_device)
         self._dt_host = None
         self._longest, self._version = 0.0, model.version
-        # steps since the state came from elsewhere, and uses of trees of searches until they were made anew
-        self._since_renewal, self._uses = 0, 0
+        # steps since the state came from elsewhere, and walks of trees of searches until they were made anew
+        self._since_renewal, self._walked = 0, 0
 
     def step(self, state: State, dt: float, controls: Controls | None = None) -> State:
         """The state after a step of dt [s]. No state changes that is held: see `State`.
@@ -182,16 +182,17 @@ class Integrator:
             self._graphs.clear()
             replay()
 
-    def _renews(self, anew: bool) -> bool:
-        """Whether trees of searches are made anew at the start of a step: every few, if they have been used since the last time."""
+    def _renews(self, anew: bool) -> int:
+        """What a step makes anew, see `NetStep.step`: every few steps runs, and trees of searches if they were walked since."""
         if self._net is None or self.model.wp_device.is_cpu:
-            return True
-        used, due = self._net.uses != self._uses, self._since_renewal % RENEWAL == 0
-        renew = anew or self._since_renewal == 0 or (due and used)
+            return TREES
+        due = anew or self._since_renewal % RENEWAL == 0
+        walked = anew or self._since_renewal == 0 or self._net.walked != self._walked
         self._since_renewal += 1
-        if renew:
-            self._uses = self._net.uses
-        return renew
+        if due and walked:
+            self._walked = self._net.walked
+            return TREES
+        return RUNS if due else 0
 
     def check(self, state: State) -> None:
         """Read the outcomes of all steps since the last reading.
@@ -377,7 +378,7 @@ class Integrator:
         if self._buffers[index].vacate():
             self._graphs.clear()
 
-    def _launch(self, source: int, renew: bool) -> None:
+    def _launch(self, source: int, renew: int) -> None:
         """Launches of a step of all parts from one buffer to the other; `renew`: as of `NetStep.step`."""
         before, after = self._buffers[source].own, self._buffers[1 - source].own
         for part in self._parts:

@@ -214,7 +214,7 @@ def shot(kick: float = 0.0, rods: int = 1, gap: float = 0.15, **contact) -> tupl
 
 
 def looks(integrator) -> int:
-    return int(integrator._net.newton.contact.search.looks.numpy()[0])
+    return int(integrator._net.alone.runs.looks.numpy()[0])
 
 
 def test_what_was_quiet_for_long_is_seen_when_it_is_driven_at_another(device):

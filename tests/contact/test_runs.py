@@ -40,9 +40,9 @@ class Asked:
         self.runs.hold(x, y, tried)
         assert (self.runs.doubt.numpy() >= before).all()
         if (self.runs.doubt.numpy() * tried.numpy()).any():
-            looks = self.search.looks.numpy()[0]
+            looks = self.runs.looks.numpy()[0]
             self.runs.look(x, y, tried)
-            self.looked = self.search.looks.numpy()[0] - looks
+            self.looked = self.runs.looks.numpy()[0] - looks
         return self.runs.doubt.numpy()
 
     def _upload(self, points: np.ndarray) -> wp.array:

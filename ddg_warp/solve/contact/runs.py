@@ -21,6 +21,7 @@ class Runs:
         search: a `BroadPhase`, in which there is nothing but edges.
 
     Attributes:
+        looks: (1,) how many times boxes were made.
         known (rows, worlds): see `kernels.contact.runs`; doubt: of it, whether anything may be near in a world (worlds,).
     """
 
@@ -43,6 +44,12 @@ class Runs:
             wp.array(values, dtype=int, device=device) for values in (runs, run_of, ahead)
         )
         self._boxes = Boxes(len(runs), worlds, device)
+        nodes = shapes.points[shapes.things(2)[0]]  # at rest, for a first tree
+        for corner, most, ends in (
+            (self._boxes.lower, np.minimum, nodes.min(1)),
+            (self._boxes.upper, np.maximum, nodes.max(1)),
+        ):
+            corner.assign(np.tile(most.reduceat(ends, runs[:, 0]), (worlds, 1)))
         self._boxes.build()
         self._longest = wp.zeros((worlds, len(shapes.names)), dtype=real, device=device)
         vector = wp.types.vector(3, real)
@@ -54,7 +61,7 @@ class Runs:
         self.doubt = self.known[DOUBT]
         self.doubt.fill_(1)
         self.known[AHEAD].fill_(FIRST)
-        self._again = wp.zeros(1, dtype=int, device=device)
+        self._again, self.looks = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
         serial = arrays.serial(device)
         *_, self._common = motion_kernels(real, serial)
         made = run_kernels(worlds > 1, real, serial)
@@ -96,7 +103,7 @@ class Runs:
         self._launch(self._enclose, boxes.all, inputs, [*corners, self._longest])
         boxes.renew()
         self._launch(self._meet, boxes.all, [*runs, *corners, boxes.tree.id, tried], [self.known])
-        self._launch(self._settle, len(self._drift), [*means, *about], [self._drift, self._again, self._search.looks])
+        self._launch(self._settle, len(self._drift), [*means, *about], [self._drift, self._again, self.looks])
 
     def _sweep(self, kernel, inputs: list, outputs: list) -> None:
         """Over the edges of every world."""

@@ -22,6 +22,8 @@ from ddg_warp.solve.net.prescribed import NetField, NetMotion
 from ddg_warp.solve.step import USUAL, PartStep
 from ddg_warp.solve.tangent import Tangent
 
+RUNS, TREES = 1, 2  # what a step makes anew
+
 
 class NetStep(PartStep):
     """Steps a model's net in all worlds, each an island. Arguments as of `ChainStep`."""
@@ -77,12 +79,12 @@ class NetStep(PartStep):
         self._data = (self.motion.data if self.motion else {}) | self.field.data
         self.alone, self._groups = None, counts_of and counts_of._groups
 
-    def step(self, before, after, renew: bool = True) -> None:
-        """Launch a whole step from one state to another; `renew`: with the trees of searches for contact made anew."""
-        if self.newton.contact and renew:
+    def step(self, before, after, renew: int = TREES) -> None:
+        """Launch a whole step from one state to another; `renew`: with trees of searches anew, `TREES`, or of `RUNS` alone."""
+        if self.newton.contact and renew == TREES:
             self.newton.contact.renew(before.q)
-            if self.alone:
-                self.alone.renew()
+        if self.alone and renew:
+            self.alone.renew()
         if self.alone is None or self.net.worlds > 1:
             self._keep()
         if self.alone is None:
@@ -142,9 +144,9 @@ class NetStep(PartStep):
         return self.alone is not before or (self.alone is not None and self.alone.adapt(s))
 
     @property
-    def uses(self) -> int:
-        """How many times trees of searches were used, as of the last `outgrown`."""
-        return self.newton.contact.search.uses if self.newton.contact else 0
+    def walked(self) -> int:
+        """How many times trees of searches were walked, as of the last `outgrown`."""
+        return self.newton.contact.search.walked if self.newton.contact else 0
 
     def outgrown(self, before) -> bool:
         """Whether the last step, from a state `before`, had more pairs in contact than there was room for, and is to be done again.
