@@ -37,6 +37,10 @@ from ddg_warp.threads import launches
 
 SOLVERS = ("auto", "direct", "pcg")
 DESCENTS = 8  # from saddles, in one solve
+UNFINISHED = (
+    "max_iterations",
+    "line_search_failed",
+)  # in contact by conjugate gradients; the latter where what is left is rounding
 FIRST_TURN = 0.1  # rad, by which a search leaves a saddle
 
 
@@ -264,7 +268,7 @@ class Equilibrium:
         try:
             state = self.net.solve(state, at, before)
         except SolverError as error:
-            if not (self.factors and error.outcome == "max_iterations" and self.net.arrived):
+            if not (self.factors and error.outcome in UNFINISHED and self.net.arrived):
                 raise
             return self._descend(error.state, at)  # with second derivatives that conjugate gradients leave out
         self.stiffness = self.tangent.stiffness(state, at) if self.factors else None
