@@ -25,8 +25,8 @@ import warp as wp
 import ddg_warp as ddg
 from ddg_warp.run.summary import machine, table, write_table
 
-RTOL = {"noodles": 1e-1}  # of the weight of a rod, see `tolerances`; by steps of 1/120 s it is too much, where things then seem to pass
-OTHERWISE = 3e-2
+# Of the weight of a rod, see `tolerances`. By steps of 1/120 s the first is too much: noodles then seem to pass.
+RTOL, OTHERWISE = {"noodles": 1e-1}, 3e-2
 PARTS = 6  # rows of a case
 CASES = {  # scene, its arguments, step [s], duration [s], whether something drives it
     "noodles": ("noodles", {"count": 121, "nodes": 961, "bowl": 1.1}, 1 / 960, 4.0, False),

@@ -16,8 +16,11 @@ class CyclicReduction:
 
     Args:
         tensions: how many dofs of a node are; with any, the system comes in the form of a level. See `kernels.solve.paired`.
-        repeated: whether there are further right-hand sides of the same matrix: chains that are not too long then keep what these
+        repeated: whether there are many right-hand sides of the same matrix: chains that are not too long then keep what these
             need; see `kernels.solve.reduction_again`.
+
+    Attributes:
+        repeats: whether it keeps that.
     """
 
     def __init__(self, nb: int, nodes: int, columns: int, linear, device, tensions: int = 0, repeated: bool = False):
@@ -30,61 +33,52 @@ class CyclicReduction:
         def vectors(rows, blocks):
             return arrays.allocate((rows, blocks, columns), linear, device)
 
+        self.repeats = repeated and nodes <= LONGEST_REPEATED
+        levels = len(self.blocks) - 1
         self.matrices = [vectors(matrix_rows, blocks) for blocks in self.blocks[1:]]
-        self.rights = [vectors(right_rows, blocks) for blocks in self.blocks[1:]]
-        self.kept = [vectors(kept_rows, blocks // 2) for blocks in self.blocks[:-1]]
-        levels = len(self.kept)
         self._reduce = [
-            cyclic_reduction.reduce_kernel(nb, linear, not tensions and level == 0, tensions) for level in range(levels)
+            cyclic_reduction.reduce_kernel(nb, linear, not tensions and level == 0, tensions, self.repeats)
+            for level in range(levels)
         ]
-        self._last = cyclic_reduction.last_kernel(nb, linear, not tensions and levels == 0, tensions)
-        self._expand = cyclic_reduction.expand_kernel(nb, linear)
-        self._packed = None
-        if repeated and nodes <= LONGEST_REPEATED:
-            number = 1 + sum(blocks // 2 for blocks in self.blocks)
-            self._packed = wp.zeros((columns, number, 3 * self.dofs**2), dtype=linear, device=device)
-            self._rest, self._found = (
-                wp.zeros((columns, self.blocks[0], self.dofs), dtype=linear, device=device) for _ in range(2)
-            )
-            self._pack = [
-                reduction_again.pack_kernel(nb, linear, not tensions and level == 0, tensions)
-                for level in range(len(self.blocks))
-            ]
-            self._again = reduction_again.again_kernel(nb, linear)
-            self._threads = 1
-            if wp.get_device(device).is_cuda:
-                self._threads = min(MOST, -(-(self.blocks[0] + 1) // 2 * self.dofs // 32) * 32)
-
-    @property
-    def repeats(self) -> bool:
-        """Whether it keeps what further right-hand sides need."""
-        return self._packed is not None
+        if not self.repeats:
+            self.rights = [vectors(right_rows, blocks) for blocks in self.blocks[1:]]
+            self.kept = [vectors(kept_rows, blocks // 2) for blocks in self.blocks[:-1]]
+            self._last = cyclic_reduction.last_kernel(nb, linear, not tensions and levels == 0, tensions)
+            self._expand = cyclic_reduction.expand_kernel(nb, linear)
+            return
+        number = 1 + sum(blocks // 2 for blocks in self.blocks)
+        self._packed = wp.zeros((columns, number, 3 * self.dofs**2), dtype=linear, device=device)
+        self._rest, self._found = (
+            wp.zeros((columns, self.blocks[0], self.dofs), dtype=linear, device=device) for _ in range(2)
+        )
+        self._none = wp.zeros((0, 0, 0), dtype=linear, device=device)
+        self._pack = reduction_again.pack_kernel(nb, linear, not tensions and levels == 0, tensions)
+        self._again = reduction_again.again_kernel(nb, linear)
+        self._threads = 1
+        if wp.get_device(device).is_cuda:
+            self._threads = min(MOST, -(-(self.blocks[0] + 1) // 2 * self.dofs // 32) * 32)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [*((kernel, 64) for kernel in self._reduce[:2]), (self._last, 32), self._expand]
-        return [*own, *self._pack[:2], (self._again, self._threads)] if self.repeats else own
+        own = [(kernel, 64) for kernel in self._reduce[:2]]
+        if self.repeats:
+            return [*own, self._pack, (self._again, self._threads)]
+        return [*own, (self._last, 32), self._expand]
 
     def solve(self, matrix, right, count, wanted, solution: wp.array, bad: wp.array, again: bool = False) -> None:
         """Solution of the wanted columns from the blocks of their nodes; adds the pivots they lose to `bad`.
 
         `again` is for a further right-hand side of the same matrix. The solution may take the place of the right-hand side.
         """
-        if again and self.repeats:
+        if self.repeats:
+            if not again:
+                self.factorise(matrix, count, wanted, bad)
             self.again(right, count, wanted, 1, solution)
             return
-        given = matrix
         for level, kernel in enumerate(self._reduce):
             outputs = [self.matrices[level], self.rights[level], self.kept[level]]
-            wp.launch(
-                kernel,
-                (2 * self.dofs + 1, self.blocks[level + 1], self.columns),
-                [matrix, right, count, wanted, self.blocks[level], 2],
-                [*outputs, bad],
-                device=self.device,
-                block_dim=64,
-            )
+            self._eliminate(level, kernel, 2 * self.dofs + 1, [matrix, right, count, wanted], 0, outputs, bad)
             matrix, right = outputs[:2]
         wp.launch(
             self._last,
@@ -102,26 +96,27 @@ class CyclicReduction:
                 [solution],
                 device=self.device,
             )
-        if self.repeats:
-            self._keep(given, count, wanted)
 
-    def _keep(self, matrix, count, wanted) -> None:
-        """What further right-hand sides need."""
+    def factorise(self, matrix, count, wanted, bad: wp.array) -> None:
+        """What `again` needs of the wanted columns, where this `repeats`; adds the pivots they lose to `bad`."""
         at = 0
-        for level, kernel in enumerate(self._pack):
-            last = level == len(self.kept)
-            kept, number = (
-                (matrix, 1) if last else (self.kept[level], self.blocks[level] // 2)
-            )  # the last keeps nothing
-            wp.launch(
-                kernel,
-                (self.columns, number, self.dofs),
-                [matrix, kept, count, wanted, self.blocks[level], int(not last), at],
-                [self._packed],
-                device=self.device,
-            )
-            at += number
-            matrix = None if last else self.matrices[level]
+        for level, kernel in enumerate(self._reduce):
+            outputs = [self.matrices[level], self._none, self._packed]
+            self._eliminate(level, kernel, 2 * self.dofs, [matrix, self._none, count, wanted], at, outputs, bad)
+            at += self.blocks[level] // 2
+            matrix = self.matrices[level]
+        inputs = [matrix, count, wanted, at]
+        wp.launch(self._pack, (self.columns, self.dofs), inputs, [self._packed, bad], device=self.device)
+
+    def _eliminate(self, level: int, kernel, threads: int, inputs: list, at: int, outputs: list, bad: wp.array) -> None:
+        wp.launch(
+            kernel,
+            (threads, self.blocks[level + 1], self.columns),
+            [*inputs, self.blocks[level], 2, at],
+            [*outputs, bad],
+            device=self.device,
+            block_dim=64,
+        )
 
     def again_kernel_at_places(self, twist: bool):
         """Kernel of `again_at_places`, and how many threads a block of it has."""
@@ -140,7 +135,7 @@ class CyclicReduction:
         )
 
     def again(self, right, count, wanted: wp.array, width: int, solution: wp.array) -> None:
-        """Solution of a further right-hand side, of the columns of which `wanted` is 1, of every `width` of them."""
+        """Solution, once factors are there, of the columns of which `wanted` is 1, of every `width` of them."""
         wp.launch(
             self._again,
             self.columns * self._threads,

@@ -130,7 +130,7 @@ def motion_kernels(real, serial: bool):
 
 @cache
 def gap_kernel(kind: Kind, real, serial: bool):
-    """The smallest gap [m] of each world."""
+    """The smallest gap [m] of each world; or one below `enough`, where there is any: others are not looked for then."""
     Sides, X = sides_struct(real), wp.types.vector(3, real)
     slots, _, thickness, closest = pair_functions(kind, real)
     corners, until = corners_function(real), until_function(serial)
@@ -141,6 +141,7 @@ def gap_kernel(kind: Kind, real, serial: bool):
         count: wp.array(dtype=int),
         sides: Sides,
         x: wp.array(dtype=X),
+        enough: real,
         gap: wp.array(dtype=real),
     ):
         tid = wp.tid()
@@ -148,8 +149,9 @@ def gap_kernel(kind: Kind, real, serial: bool):
             return
         for p in range(tid, until(tid, count[0])):
             w = pairs[p][0] / sides.counts[0]
-            i, j = pairs[p][0] - w * sides.counts[0], pairs[p][1] - w * sides.counts[1]
-            r, _ = closest(corners(x, slots(sides, i, j, w)))
-            wp.atomic_min(gap, w, wp.length(r) - thickness(sides, i, j, w))
+            if gap[w] >= enough:
+                i, j = pairs[p][0] - w * sides.counts[0], pairs[p][1] - w * sides.counts[1]
+                r, _ = closest(corners(x, slots(sides, i, j, w)))
+                wp.atomic_min(gap, w, wp.length(r) - thickness(sides, i, j, w))
 
     return gaps

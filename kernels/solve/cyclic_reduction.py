@@ -160,14 +160,16 @@ def block_functions(nb: int, linear, first: bool, tensions: int):
 
 
 @cache
-def reduce_kernel(nb: int, linear, first: bool, tensions: int = 0):
+def reduce_kernel(nb: int, linear, first: bool, tensions: int = 0, packs: bool = False):
     """One level: the even blocks take what the odd ones leave, and keep what the odd ones' solution needs.
 
     The first one reads blocks of nodes; of the dofs of a node the last ones may be `tensions`, with negative pivots.
     Thread c of a block has column c of its matrix, then the right-hand side, then the columns of its coupling. Each factors both
     neighbours for itself, one after the other in a loop that is not unrolled: that keeps them in registers.
+
+    If it `packs` there is no right-hand side, and what is kept goes to its place for many, see `reduction_again`.
     """
-    nb2 = nb**2
+    nb2, sides = nb**2, 1 - packs
     H = wp.types.vector(nb, linear)
     factor, solve, own_column, right_side, column, product = block_functions(nb, linear, first, tensions)
 
@@ -175,6 +177,17 @@ def reduce_kernel(nb: int, linear, first: bool, tensions: int = 0):
     def put(A: wp.array3d(dtype=linear), row: int, stride: int, k: int, r: int, v: H):
         for d in range(wp.static(nb)):
             A[row + d * stride, k, r] = v[d]
+
+    @wp.func
+    def keep(A: wp.array3d(dtype=linear), row: int, stride: int, k: int, at: int, r: int, v: H, w: H):
+        """Both halves of a column."""
+        for d in range(wp.static(nb)):
+            if wp.static(packs):
+                A[r, at + k, row + d * stride] = v[d]
+                A[r, at + k, row + (d + wp.static(nb)) * stride] = w[d]
+            else:
+                A[row + d * stride, k, r] = v[d]
+                A[row + (d + wp.static(nb)) * stride, k, r] = w[d]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def reduce(
@@ -184,12 +197,13 @@ def reduce_kernel(nb: int, linear, first: bool, tensions: int = 0):
         wanted: wp.array(dtype=int),
         blocks: int,
         neighbours: int,
+        at_kept: int,
         matrix_out: wp.array3d(dtype=linear),
         right_out: wp.array3d(dtype=linear),
         kept_out: wp.array3d(dtype=linear),
         bad: wp.array(dtype=int),
     ):
-        """`blocks` of the level; `neighbours` is 2, which the compiler must not know."""
+        """`blocks` of the level; `neighbours` is 2, which the compiler must not know; `at_kept`: odd blocks that are packed before."""
         c, j, r = wp.tid()
         if wanted[r] == 0:
             return
@@ -198,10 +212,10 @@ def reduce_kernel(nb: int, linear, first: bool, tensions: int = 0):
             n = count[r]
         i = 2 * j
         own = c < wp.static(2 * nb)
-        outer = c == wp.static(2 * nb)
+        outer = wp.static(sides) == 1 and c == wp.static(2 * nb)
         at = c
-        if c > wp.static(2 * nb):
-            at = c - wp.static(2 * nb + 1)
+        if not (own or outer):
+            at = c - wp.static(2 * nb + sides)
         q = at // wp.static(nb)
         at -= q * wp.static(nb)
         o0 = H()
@@ -236,8 +250,14 @@ def reduce_kernel(nb: int, linear, first: bool, tensions: int = 0):
                     stride = wp.static(2 * nb)
                     if not own:
                         row += wp.static(4 * nb2)
-                put(kept_out, row, stride, j, r, y0)
-                put(kept_out, row + wp.static(nb) * stride, stride, j, r, y1)
+                keep(kept_out, row, stride, j, at_kept, r, y0, y1)
+                if wp.static(packs):
+                    if own:
+                        for d in range(wp.static(nb)):
+                            v0[d] = wp.where(q == 0 and d == at, linear(1.0), linear(0.0))
+                            v1[d] = wp.where(q == 1 and d == at, linear(1.0), linear(0.0))
+                        y0, y1 = solve(L0, d0, Z, L1, d1, v0, v1)
+                        keep(kept_out, wp.static(8 * nb2) + row, stride, j, at_kept, r, y0, y1)
         if own:
             put(matrix_out, q * wp.static(nb2) + at, wp.static(nb), j, r, o0)
             if q == 1:

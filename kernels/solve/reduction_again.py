@@ -1,7 +1,7 @@
-"""Further right-hand sides of a system that cyclic reduction has eliminated once, a block of threads a chain, in one launch.
+"""Right-hand sides of a system that cyclic reduction has eliminated, a block of threads a chain, in one launch each.
 
-A level that eliminates the odd blocks u keeps K1 = A_u^-1 B_j^T and K2 = A_u^-1 B_u (see `cyclic_reduction`); with A_u^-1, which is
-added to them here, each level is a product of small matrices, up to the last block and down again:
+A level that eliminates the odd blocks u keeps K1 = A_u^-1 B_j^T, K2 = A_u^-1 B_u and A_u^-1 (see `cyclic_reduction`). So each level is
+a product of small matrices, up to the last block and down again:
 
     r'_j = r_j - K2_l^T r_l - K1_u^T r_u ,    x_u = A_u^-1 r_u - K1_u x_j - K2_u x_j+2 .
 
@@ -28,10 +28,7 @@ def wait(): ...
 
 @cache
 def pack_kernel(nb: int, linear, first: bool, tensions: int = 0):
-    """pack(...) of the odd blocks of a level what it has kept, and their inverses: thread c of a block has column c.
-
-    Of the last block, which is even and has neighbours no more, it is the inverse alone (`odd` 0).
-    """
+    """pack(...) the inverse of the last block, which has neighbours no more: thread c of it has column c."""
     size = 2 * nb
     H = wp.types.vector(nb, linear)
     factor, solve, *_ = block_functions(nb, linear, first, tensions)
@@ -39,32 +36,29 @@ def pack_kernel(nb: int, linear, first: bool, tensions: int = 0):
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pack(
         matrix: wp.array3d(dtype=linear),
-        kept: wp.array3d(dtype=linear),
         count: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
-        blocks: int,
-        odd: int,
         at: int,
         packed: wp.array3d(dtype=linear),
+        bad: wp.array(dtype=int),
     ):
-        r, j, c = wp.tid()
+        r, c = wp.tid()
         if wanted[r] == 0:
             return
-        n = blocks
+        n = int(1)
         if wp.static(first):
             n = count[r]
         a, b = H(), H()
         for d in range(wp.static(nb)):
             a[d] = wp.where(d == c, linear(1.0), linear(0.0))
             b[d] = wp.where(d + wp.static(nb) == c, linear(1.0), linear(0.0))
-        L0, d0, Z, L1, d1, _lost = factor(matrix, 2 * j + odd, n, r)
+        L0, d0, Z, L1, d1, lost = factor(matrix, 0, n, r)
         a, b = solve(L0, d0, Z, L1, d1, a, b)
         for d in range(wp.static(nb)):
-            packed[r, at + j, wp.static(2 * size**2) + d * wp.static(size) + c] = a[d]
-            packed[r, at + j, wp.static(2 * size**2) + (d + wp.static(nb)) * wp.static(size) + c] = b[d]
-        if odd == 1:
-            for row in range(wp.static(2 * size)):
-                packed[r, at + j, row * wp.static(size) + c] = kept[row * wp.static(size) + c, j, r]
+            packed[r, at, wp.static(2 * size**2) + d * wp.static(size) + c] = a[d]
+            packed[r, at, wp.static(2 * size**2) + (d + wp.static(nb)) * wp.static(size) + c] = b[d]
+        if c == 0 and lost > 0:
+            wp.atomic_add(bad, r, lost)
 
     return pack
 

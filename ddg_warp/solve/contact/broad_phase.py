@@ -1,5 +1,7 @@
 """Candidates of contact on a device, how long they hold, and how far everything may move; see `kernels.contact`."""
 
+import math
+
 import numpy as np
 import warp as wp
 
@@ -256,11 +258,11 @@ class BroadPhase:
             )
         return overflow != 0
 
-    def measure(self, x: wp.array) -> None:
-        """The smallest gap of each world in `gap` [m], at most `reach`. Candidates have to be up to date."""
+    def measure(self, x: wp.array, enough: float = -math.inf) -> None:
+        """The smallest gap of each world in `gap` [m], at most `reach`, or any below `enough`. Candidates have to be up to date."""
         self.gap.fill_(self.reach)
         for pairs in self.lists:
-            pairs.measure(x, self.gap)
+            pairs.measure(x, self.gap, enough)
 
     def impact(self, x: wp.array, move: wp.array, keep: float = 1.0) -> None:
         """When in the motion from x by `move` two come as near as `keep` of their thickness, in `time` of each world; never late.

@@ -123,9 +123,9 @@ class PairList:
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
         wp.launch(kernel, self.first.all, inputs, outputs, device=self.device)
 
-    def measure(self, x, gap) -> None:
-        """Lower the smallest gaps of worlds to those of pairs."""
-        inputs = [self.pairs, self.count, self.sides, x]
+    def measure(self, x, gap, enough: float) -> None:
+        """Lower the smallest gaps of worlds to those of pairs, until they are below `enough`."""
+        inputs = [self.pairs, self.count, self.sides, x, enough]
         arrays.sweep(self._gaps, self.capacity, inputs, [gap], self.device)
 
     def cross(self, x, move, crossed) -> None:

@@ -110,7 +110,7 @@ class Alone:
         for signal in (step.remaining, self._any_tried, self._some):
             signal.zero_()
         search.update(before.q)
-        search.measure(before.q)
+        search.measure(before.q, enough=search.reach)
         inputs = [search.gap, search.reach, search.overflow, step.islands.arrays[1], self._told]
         self._launch(self._hope, self.net.worlds, inputs, [self._any_tried, step.remaining])
         wp.capture_if(self._any_tried, lambda: self._try_and_search(before, after))
@@ -170,7 +170,7 @@ class Alone:
 
     def _measure(self, before, after) -> None:
         self._search.passing(before.q)
-        self._search.measure(after.q)
+        self._search.measure(after.q, enough=self._search.reach)
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)

@@ -236,8 +236,12 @@ class Chains:
 
     def prepare(self, matrix: wp.array, fixed: wp.array, wanted: wp.array, lost: wp.array) -> None:
         """Factors of chains and joints of the worlds that want a direction; raises `lost` where one of them is indefinite."""
-        self._lost, self._reduced = lost, False
-        if not self.reduction:
+        self._lost = lost
+        if self.reduction and self.reduction.repeats:
+            self._spread(wanted)
+            self.reduction.factorise(self.eliminated, self._all, self._wanted, self._bad)
+            self._note()
+        elif not self.reduction:
             self._launch(
                 self._factorise, self.columns, [self.eliminated, self.count, wanted], [self.factors, lost], SERIAL
             )
@@ -250,7 +254,7 @@ class Chains:
             inputs = [self.factors, residual, self.places, self.held, self.count, wanted, self.net.blocks]
             self._launch(self._walk_places, self.columns, inputs, [self.values, z, dots], SERIAL)
             return
-        if self._at_places and self._reduced:
+        if self._at_places:
             given = residual, self.places, self.held, self.count, wanted, self.net.blocks
             self.reduction.again_at_places(self.plan.twist, *given, z, dots)
             return
@@ -320,17 +324,23 @@ class Chains:
         self._launch(kernel, solves // sides * self.columns, [self.factors, self.count, wanted], [values], SERIAL)
 
     def _reduce(self, values: wp.array, wanted: wp.array) -> None:
-        """H_II^-1 of values by cyclic reduction, which eliminates anew after every `prepare`; of long chains every time."""
-        spread, note = self._columns
+        """H_II^-1 of values by cyclic reduction, which eliminates long chains anew every time."""
         for first in range(0, values.shape[2], self.columns):
             part = values[:, :, first : first + self.columns]
-            if self._reduced and self.reduction.repeats:
+            if self.reduction.repeats:
                 self.reduction.again(part, self._all, wanted, self.width, part)
                 continue
-            self._launch(spread, self.columns, [wanted, self.width], [self._wanted])
+            self._spread(wanted)
             self.reduction.solve(self.eliminated, part, self._all, self._wanted, part, self._bad)
-            self._launch(note, self.columns, [self.width], [self._bad, self._lost])
-            self._reduced = True
+            self._note()
+
+    def _spread(self, wanted: wp.array) -> None:
+        """Which chains are wanted, of the worlds that are."""
+        self._launch(self._columns[0], self.columns, [wanted, self.width], [self._wanted])
+
+    def _note(self) -> None:
+        """Raise what is lost of worlds by what their chains lose."""
+        self._launch(self._columns[1], self.columns, [self.width], [self._bad, self._lost])
 
     def _elements(self, index: int, written: dict, real, linear):
         """What the elements of a set write, and where they are."""
