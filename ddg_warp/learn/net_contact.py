@@ -113,7 +113,7 @@ class ContactAdjoint:
             self._items[i].list(part.listed, part.number, part.factor.nodes)
             inputs = [*read, part.factor.nodes, part.factor.used, q, w]
             self._sweep(self._pull[i], pairs, inputs, [part.gradient, self._numbers])
-            part.add_up(part.gradient, 1.0, by_q, self._items[i])
+            part.add_up(part.gradient, by_q, self._items[i])
             self._sum(i, part)
             if rub:
                 self._items[i].list(rub.listed, rub.number, rub.factor.nodes)
@@ -121,8 +121,8 @@ class ContactAdjoint:
                 inputs = [*read, before, q, w, self._velocity, rate, *rub.directions]
                 written = [rub.gradient, self._start_parts, self._numbers, self._by_direction]
                 self._sweep(self._rub[i], pairs, inputs, written)
-                rub.add_up(rub.gradient, 1.0, by_q, self._items[i])
-                rub.add_up(self._start_parts, 1.0, by_before, self._items[i])
+                rub.add_up(rub.gradient, by_q, self._items[i])
+                rub.add_up(self._start_parts, by_before, self._items[i])
                 self._sum(i, rub)
                 self._lead(i, rub, by_before)
         for size, found in self._things.items():

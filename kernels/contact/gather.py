@@ -50,7 +50,6 @@ def set_struct(real, linear):
     @wp.struct
     class PairSet:
         pairs: wp.array(dtype=wp.vec2i)
-        count: wp.array(dtype=int)
         nodes: wp.array(dtype=wp.vec4i)
         used: wp.array(dtype=int)
         direction: wp.array2d(dtype=V)
@@ -197,7 +196,7 @@ def list_kernels(kind: Kind, real, serial: bool):
 
 @cache
 def sum_kernel(real, serial: bool):
-    """gather(...) to nodes what pairs have written a slot: out += scale times the sum."""
+    """gather(...) to nodes what pairs have written by slot."""
     V, until = wp.types.vector(3, real), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -207,7 +206,6 @@ def sum_kernel(real, serial: bool):
         starts: wp.array(dtype=int),
         numbers: wp.array(dtype=int),
         items: wp.array(dtype=int),
-        scale: real,
         out: wp.array(dtype=V),
     ):
         tid = wp.tid()
@@ -218,7 +216,7 @@ def sum_kernel(real, serial: bool):
                     p = items[k] / wp.static(SLOTS)
                     if used[p] != 0:
                         total += parts[items[k] - wp.static(SLOTS) * p, p]
-                out[node] = out[node] + total * scale
+                out[node] = out[node] + total
 
     return gather
 

@@ -26,10 +26,10 @@ def hessian(terms, x: wp.array) -> sparse.csc_matrix:
 
 def _entries(elements, law, x: wp.array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows, columns and values of the Hessians of all pairs of `ContactElements` that push each other."""
-    used = np.flatnonzero(elements.factor.used.numpy()[: int(elements.count.numpy()[0])])
+    used = elements.listed.numpy()[: int(elements.number.numpy()[0])]
     if not used.size:
         return np.zeros(0, int), np.zeros(0, int), np.zeros(0)
-    chosen = wp.array(used.astype(np.int32), dtype=int, device=x.device)
+    chosen = wp.array(used, dtype=int, device=x.device)
     none, every = (wp.full(1, n, dtype=int, device=x.device) for n in (0, len(used)))
     out = arrays.allocate((COLUMNS, SLOTS, len(used)), wp.types.vector(3, elements.linear), x.device)
     threads = arrays.takers(COLUMNS * len(used), x.device)

@@ -31,7 +31,7 @@ class ContactElements(PairElements):
         exact: bool,
     ):
         kind = found.kind
-        super().__init__(found, rows_of(kind), nodes, real, linear)
+        super().__init__(found, rows_of(kind), real, linear)
         self.density = law
         serial = arrays.serial(self.device)
         self._items = NodeItems(kind, nodes, real, silent)
@@ -47,7 +47,7 @@ class ContactElements(PairElements):
     def reserve(self) -> None:
         super().reserve()
         self.pairs = self.found.pairs
-        self._running = RunningSums(self.factor.used)
+        self._running = None if arrays.serial(self.device) else RunningSums(self.factor.used)
         self._items.reserve(self.found.capacity)
         self.items, self.ranks = self._items.items, self._items.ranks
         if self.mollified:
@@ -60,15 +60,12 @@ class ContactElements(PairElements):
 
     def write(self, x: wp.array, law, gap: wp.array) -> None:
         """List the pairs that push each other at x, and write what they do; lower the smallest gaps of worlds to those of pairs."""
-        pairs, used = [self.pairs, self.count], self.factor.used
-        lists = [self.listed, self.number]
-        inputs = [*pairs, self.found.sides, law, x, self.factor]
-        self._sweep(self._sieve, self.found.capacity, inputs, [*lists, gap])
-        if not arrays.serial(self.device):
+        lists, given, room = [self.listed, self.number], [self.found.sides, law, x], self.found.capacity
+        self._sweep(self._sieve, room, [self.pairs, self.count, *given, self.factor], [*lists, gap])
+        if self._running:
             self._running()
-            self._sweep(self._choose, self.found.capacity, [self.count, used, self._running.starts], lists)
-        inputs = [self.pairs, *lists, self.found.sides, law, x]
-        self._sweep(self._evaluate, self.found.capacity, inputs, [self.factor, self.energy, self.gradient])
+            self._sweep(self._choose, room, [self.count, self.factor.used, self._running.starts], lists)
+        self._sweep(self._evaluate, room, [self.pairs, *lists, *given], [self.factor, self.energy, self.gradient])
 
     def evaluate(self, x: wp.array, law, gap: wp.array) -> None:
         """The same; and list the pairs of nodes."""

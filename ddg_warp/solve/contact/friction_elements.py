@@ -36,7 +36,7 @@ class FrictionElements(PairElements):
         linear,
         silent: wp.array,
     ):
-        super().__init__(contact.found, ROWS, nodes, real, linear)
+        super().__init__(contact.found, ROWS, real, linear)
         serial = arrays.serial(self.device)
         self._contact, self._velocity = contact, velocity
         self._lag = lag_kernel(self.found.kind, real, linear, serial, directed is not None)

@@ -15,7 +15,6 @@ class PairElements:
 
     Args:
         found: list of a search, whose kind of pairs and capacity these have.
-        nodes: of all worlds.
         linear: type of factors.
 
     Attributes:
@@ -29,10 +28,10 @@ class PairElements:
 
     mollified = None
 
-    def __init__(self, found: PairList, rows: int, nodes: int, real, linear):
+    def __init__(self, found: PairList, rows: int, real, linear):
         self.found, self.device, self.rows, self.real, self.linear = found, found.device, rows, real, linear
-        self.size, serial = found.kind.first + found.kind.second, arrays.serial(self.device)
-        self._add = gather.sum_kernel(real, serial)
+        self.size = found.kind.first + found.kind.second
+        self._add = gather.sum_kernel(real, arrays.serial(self.device))
         self.factor = gather.factor_struct(linear)()
         self.number = wp.zeros(1, dtype=int, device=self.device)
         self.kernels = [self._add]
@@ -60,9 +59,9 @@ class PairElements:
         self.gradient = arrays.allocate((gather.SLOTS, capacity), wp.types.vector(3, self.real), self.device)
         self.placed = wp.zeros(self.size * capacity, dtype=vector, device=self.device)
 
-    def add_up(self, parts: wp.array, scale: float, out: wp.array, items) -> None:
+    def add_up(self, parts: wp.array, out: wp.array, items) -> None:
         """Add what pairs that are used have written by slot (`SLOTS`, capacity) to nodes that have items (`NodeItems`)."""
-        inputs = [parts, self.factor.used, items.places, items.numbers, items.items, scale]
+        inputs = [parts, self.factor.used, items.places, items.numbers, items.items]
         self._sweep(self._add, len(out), inputs, [out])
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:

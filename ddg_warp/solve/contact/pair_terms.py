@@ -105,26 +105,16 @@ class PairTerms:
         self._start = wp.zeros_like(self.forces)
         self._product = PairProduct(self._parts, self.law, self.real, self.linear)
         self._rub = PairProduct(self.frictions, self.law, self.real, self.linear) if self.frictions else None
-        self._totals = Totals(self.lists, self.frictions, search.worlds, self.real, self.device)
-        self.energy, self.touching, self.dissipated = (
-            self._totals.energy,
-            self._totals.touching,
-            self._totals.dissipated,
-        )
+        self._totals = told = Totals(self.lists, self.frictions, search.worlds, self.real, self.device)
+        self.energy, self.touching, self.dissipated = told.energy, told.touching, told.dissipated
         self._no_iterates = (wp.zeros(0, dtype=int, device=self.device),) * 2
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         parts = [kernel for part in self._parts for kernel in part.kernels]
-        return [
-            self._begin,
-            self._collect,
-            self._join,
-            *self._product.kernels,
-            *self._totals.kernels,
-            *parts,
-        ]
+        own = [self._begin, self._collect, self._join]
+        return [*own, *self._product.kernels, *self._totals.kernels, *parts]
 
     @property
     def _parts(self) -> list:
