@@ -7,9 +7,11 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp import statics
+from ddg_warp.errors import SolverError
 from ddg_warp.geometry import meshes
 from ddg_warp.scenes import crossed_beams
 from ddg_warp.solve import continuation, relaxation, stability
+from ddg_warp.solve.net.statics import NetEquilibrium
 from ddg_warp.solve.tangent import Tangent
 from tests.contact.brute_force import edge_edge
 from tests.learn.contact_cases import SCENES, scene_of, touching
@@ -336,3 +338,21 @@ def test_what_nothing_holds_is_carried_away(device):
     scene.contact()
     with pytest.raises(ddg.SolverError, match=r"adrift, node \d of rod 0 is carried away.*hold it"):
         statics.solve(scene.build(device, precision="float64"))
+
+
+@pytest.mark.parametrize("outcome", ["max_iterations", "line_search_failed"])
+def test_what_the_device_does_not_finish_the_host_does(monkeypatch, outcome):
+    """From near the end, where rounding may keep the device from one: the same equilibrium."""
+    model = pressed(16, "barrier", 0.5, True).build("cpu", precision="float64")
+    finished, solve = statics.solve(model), NetEquilibrium.solve
+
+    def unfinished(self, state, at, before):
+        found = solve(self, state, at, before)
+        moved = self.tangent.dofs(found)
+        self.tangent.assign(found, moved - 1e-9 * self.tangent.free * np.cos(np.arange(len(moved))))
+        raise SolverError("not finished", state=found, outcome=outcome)
+
+    monkeypatch.setattr(NetEquilibrium, "solve", unfinished)
+    state = statics.solve(model)
+    assert state.stable
+    np.testing.assert_allclose(state.points(), finished.points(), rtol=0.0, atol=1e-13)
