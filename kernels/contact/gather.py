@@ -223,7 +223,10 @@ def sum_kernel(real, serial: bool):
 
 @cache
 def collect_kernels(real, linear, serial: bool):
-    """collect(...) forces of all lists on nodes, and the blocks of H on its diagonal; join(...) those between the nodes of edges."""
+    """collect(...) forces of all lists on nodes, and the blocks of H on its diagonal; join(...) those between the nodes of edges.
+
+    One thread alone adds pair by pair, in the order in which others gather node by node.
+    """
     PairSet, Surface, until = set_struct(real, linear), surface_struct(real), until_function(serial)
     V, M, B = wp.types.vector(3, real), wp.types.matrix((3, 3), linear), wp.types.vector(6, linear)
 
@@ -242,6 +245,43 @@ def collect_kernels(real, linear, serial: bool):
     def whole(b: B):
         return M(b[0], b[1], b[2], b[1], b[3], b[4], b[2], b[4], b[5])
 
+    @wp.func
+    def add_all(
+        sets: wp.array(dtype=PairSet),
+        forces: wp.array(dtype=V),
+        diagonal: wp.array(dtype=M),
+        stiffness: wp.array(dtype=real),
+    ):
+        for node in range(forces.shape[0]):
+            forces[node] = V()
+            diagonal[node] = M()
+        for s in range(sets.shape[0]):
+            own = sets[s]
+            for i in range(own.number[0]):
+                p = own.listed[i]
+                if own.used[p] != 0:
+                    for slot in range(wp.static(SLOTS)):
+                        if own.ranks[p][slot] >= 0:
+                            node = own.nodes[p][slot]
+                            forces[node] = forces[node] - own.gradient[slot, p]
+                            diagonal[node] = diagonal[node] + whole(block(own, p, slot, slot))
+        for node in range(forces.shape[0]):
+            stiffness[node] = real(wp.trace(diagonal[node]))
+
+    @wp.func
+    def join_all(sets: wp.array(dtype=PairSet), between: wp.array(dtype=M)):
+        for i in range(between.shape[0]):
+            between[i] = M()
+        for s in range(sets.shape[0]):
+            own = sets[s]
+            for i in range(own.number[0]):
+                p = own.listed[i]
+                if own.used[p] != 0:
+                    for side in range(own.edges):
+                        if own.ranks[p][2 * side] >= 0:
+                            edge = own.pairs[p][side]
+                            between[edge] = between[edge] + whole(block(own, p, 2 * side, 2 * side + 1))
+
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def collect(
         sets: wp.array(dtype=PairSet),
@@ -251,6 +291,9 @@ def collect_kernels(real, linear, serial: bool):
     ):
         """`stiffness` are the traces of the blocks."""
         tid = wp.tid()
+        if wp.static(serial):
+            add_all(sets, forces, diagonal, stiffness)
+            return
         for node in range(tid, until(tid, forces.shape[0])):
             force, total = V(), B()
             for s in range(sets.shape[0]):
@@ -271,6 +314,9 @@ def collect_kernels(real, linear, serial: bool):
     def join(sets: wp.array(dtype=PairSet), edges: Surface, count: int, between: wp.array(dtype=M)):
         """Items of the first node that come from this edge, not from another one that begins there."""
         tid = wp.tid()
+        if wp.static(serial):
+            join_all(sets, between)
+            return
         for i in range(tid, until(tid, between.shape[0])):
             w = i / count
             node = edges.nodes[i - w * count, 0] + w * edges.nodes_a_world
