@@ -126,6 +126,22 @@ def test_what_slides_past_close_by_has_not_crossed(device, distance):
         assert search.crossed.numpy()[0] == (distance == 0.0)
 
 
+def test_crossings_are_found_whether_candidates_hold_or_not(device):
+    """A rod that falls past another, within half of the margin and farther; nothing is searched for anew."""
+    points = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 3e-3], [0.0, 1.0, 3e-3]])
+    shapes = Shapes(points)
+    shapes.rod([0, 1], 1e-4)
+    shapes.rod([2, 3], 1e-4)
+    x = upload(points, device)
+    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    searches = search.searches.numpy()[0]
+    for fall in (2.9e-3, 3.1e-3, 4.9e-3, 5.1e-3, 2.0):
+        search.check_crossings(x, upload(points - np.outer([0, 0, 1, 1], [0.0, 0.0, fall]), device))
+        assert search.crossed.numpy()[0] == (fall > 3e-3)
+    search.update(x)
+    assert search.searches.numpy()[0] == searches
+
+
 def test_crossings_of_random_motion_are_those_of_signed_volumes(device):
     """Pairs pass where the volume of their nodes changes its sign while the closest points lie inside: roots of a cubic."""
     rng = np.random.default_rng(3)

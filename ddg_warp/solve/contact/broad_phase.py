@@ -88,7 +88,7 @@ class BroadPhase:
         self._placed = wp.array(placed, dtype=wp.uint8, device=self.device)
         self._shift = wp.zeros(worlds, dtype=x.dtype, device=self.device)
         self._never, self.every = (wp.full(worlds, flag, dtype=int, device=self.device) for flag in (0, 1))
-        self.searches, self._fits = (wp.zeros(1, dtype=int, device=self.device) for _ in range(2))
+        self.searches, self._fits, self._beyond = (wp.zeros(1, dtype=int, device=self.device) for _ in range(3))
         self._read = wp.zeros(3, dtype=int, device=self.device)  # at once, after every step
         self.overflow, self._lost, self.walks = (self._read[k : k + 1] for k in range(3))
         self.walked = 0
@@ -169,11 +169,15 @@ class BroadPhase:
         wp.capture_if(self._stale[BOXES:PAIRS], lambda: self._meet(base, self._move, together))
         self.judge(base, self._move, together)
 
-    def _watch(self, which: int, base: wp.array, q: wp.array, allowed: float) -> None:
-        """Whether boxes or pairs are out of date for a motion, where nodes may be so far from the ways that these were found for."""
+    def _watch(self, which: int, base: wp.array, q: wp.array, allowed: float, stale: wp.array | None = None) -> None:
+        """Whether boxes or pairs are out of date for a motion, where nodes may be so far from the ways that these were found for.
+
+        Notes it for the next `update`, or in `stale` (1,).
+        """
         watch, *_ = self._motion
         inputs = [base, q, self._starts[which], self._ends[which], self._placed, allowed]
-        self._sweep(watch, base, inputs, [self._move, self._stale[which : which + 1]])
+        stale = self._stale[which : which + 1] if stale is None else stale
+        self._sweep(watch, base, inputs, [self._move, stale])
 
     def _meet(self, x: wp.array, move: wp.array, together: wp.array) -> None:
         """Find the pairs whose boxes meet."""
@@ -283,8 +287,14 @@ class BroadPhase:
             first.fill_(NONE)
         self._passing(self._passes, x, move, 0.0, self.crossed, self._firsts)
 
+    def check_crossings(self, base: wp.array, q: wp.array) -> None:
+        """`crossings` in the motion from `base` to q; of candidates alone where these are all that may, which takes less."""
+        self._beyond.zero_()
+        self._watch(PAIRS, base, q, 0.5 * self.margin, self._beyond)
+        wp.capture_if(self._beyond, lambda: self.crossings(base, self._move), lambda: self.passing(base))
+
     def passing(self, base: wp.array) -> None:
-        """The same of candidates alone, which are all that may, in the motion from `base` that `update` was last told of."""
+        """The same of candidates alone, which are all that may, in the motion from `base` that was told of last."""
         self.crossed.zero_()
         for pairs in self.lists:
             pairs.cross(base, self._move, self.crossed)

@@ -272,8 +272,7 @@ class NetContact:
     def finish(self, before: wp.array) -> None:
         """Take no part of a step in which things passed through each other."""
         newton = self.newton
-        self.search.update(before, newton.q, self.search.every)
-        self.search.passing(before)
+        self.search.check_crossings(before, newton.q)
         inputs = [self.search.crossed, self.terms.gap, newton.islands.arrays[0]]
         self._launch(self._refuse, self.net.worlds, inputs, [self.crossed, self.least])
         self.tally(newton.islands.arrays[0])
