@@ -180,10 +180,10 @@ class EquilibriumAdjoint:
             inputs += _copied(self.model.empty_state(), [own.pull(kept, at, by, np.inf, (state, state))[1]])[1]
         if self.net:
             kept = NetKept(state.net, state.net, None, time=state.time)
-            while True:
-                read = self.net.pull(kept, state.net, given.net, np.inf, (state, state))[1]
-                if not self.net.outgrown(state.net.q):
-                    break
+            asked = kept, state.net, given.net, np.inf, (state, state)
+            read = self.net.pull(*asked)[1]
+            while self.net.outgrown(state.net.q):
+                read = self.net.pull(*asked)[1]
             inputs += _copied(self.model.empty_state(), [read])[1]
         for own in inputs:
             for array in (own.gravity, own.mass):

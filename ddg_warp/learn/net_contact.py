@@ -7,7 +7,7 @@ from ddg_warp import arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.adjoint import contact_sums
 from ddg_warp.kernels.adjoint.contact import NUMBERS, RATE, pull_kernel, rub_kernel
-from ddg_warp.kernels.contact.gather import SLOTS
+from ddg_warp.kernels.contact.gather import SLOTS, sum_kernel
 from ddg_warp.solve.contact.node_items import NodeItems
 from ddg_warp.solve.contact.pair_terms import FRICTION
 from ddg_warp.solve.contact.touch import LAWS
@@ -58,7 +58,7 @@ class ContactAdjoint:
         self._leads = [self._led(search.shapes.beside(kind.first)) for kind in kinds if directed]
         self._sides = [contact_sums.side_kernels(kind, real) for kind in kinds]
         self._group, self._bodies = contact_sums.group_kernels(real), contact_sums.body_kernel(real)
-        self._items = [NodeItems(kind, nodes, real, every) for kind in kinds]
+        self._items, self._add = [NodeItems(kind, nodes, real, every) for kind in kinds], sum_kernel(real, serial)
         self.by_groups = self._zeros(NUMBERS, *terms.law.stiffness.shape)
         self.by_radius = self._zeros(*net.touching["radius"].shape)
         self._things, self._starts = {}, {}
@@ -74,7 +74,7 @@ class ContactAdjoint:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [*self._pull, *self._rub, *self._group, self._bodies, *self._direct]
+        own = [*self._pull, *self._rub, self._add, *self._group, self._bodies, *self._direct]
         return [*own, *(k for pair in self._sides for k in pair), *(k for items in self._items for k in items.kernels)]
 
     @property
@@ -113,7 +113,7 @@ class ContactAdjoint:
             self._items[i].list(part.listed, part.number, part.factor.nodes)
             inputs = [*read, part.factor.nodes, part.factor.used, q, w]
             self._sweep(self._pull[i], pairs, inputs, [part.gradient, self._numbers])
-            part.add_up(part.gradient, by_q, self._items[i])
+            self._add_up(i, part, part.gradient, by_q)
             self._sum(i, part)
             if rub:
                 self._items[i].list(rub.listed, rub.number, rub.factor.nodes)
@@ -121,13 +121,19 @@ class ContactAdjoint:
                 inputs = [*read, before, q, w, self._velocity, rate, *rub.directions]
                 written = [rub.gradient, self._start_parts, self._numbers, self._by_direction]
                 self._sweep(self._rub[i], pairs, inputs, written)
-                rub.add_up(rub.gradient, by_q, self._items[i])
-                rub.add_up(self._start_parts, by_before, self._items[i])
+                self._add_up(i, rub, rub.gradient, by_q)
+                self._add_up(i, rub, self._start_parts, by_before)
                 self._sum(i, rub)
                 self._lead(i, rub, by_before)
         for size, found in self._things.items():
             starts, things = self._starts[size], len(found) // self.net.worlds
             self._launch(self._bodies, self.by_radius.shape, [found, starts, things], [self.by_radius])
+
+    def _add_up(self, index: int, part, written: wp.array, out: wp.array) -> None:
+        """Add what pairs that are used have written by slot to nodes."""
+        items = self._items[index]
+        inputs = [written, part.factor.used, items.places, items.numbers, items.items]
+        self._sweep(self._add, len(out), inputs, [out])
 
     def _sum(self, index: int, part) -> None:
         """Add what the pairs of elements have by their numbers to that of groups and things."""

@@ -227,7 +227,7 @@ def collect_kernels(real, linear, serial: bool):
 
     One thread alone adds pair by pair, in the order in which others gather node by node.
     """
-    PairSet, Surface, until = set_struct(real, linear), surface_struct(real), until_function(serial)
+    PairSet, Surface = set_struct(real, linear), surface_struct(real)
     V, M, B = wp.types.vector(3, real), wp.types.matrix((3, 3), linear), wp.types.vector(6, linear)
 
     @wp.func
@@ -290,47 +290,45 @@ def collect_kernels(real, linear, serial: bool):
         stiffness: wp.array(dtype=real),
     ):
         """`stiffness` are the traces of the blocks."""
-        tid = wp.tid()
+        node = wp.tid()
         if wp.static(serial):
             add_all(sets, forces, diagonal, stiffness)
             return
-        for node in range(tid, until(tid, forces.shape[0])):
-            force, total = V(), B()
-            for s in range(sets.shape[0]):
-                number = sets[s].numbers[node]
-                if number > 0:
-                    own = sets[s]
-                    for k in range(own.places[node], own.places[node] + number):
-                        p = own.items[k] / wp.static(SLOTS)
-                        slot = own.items[k] - wp.static(SLOTS) * p
-                        if own.used[p] != 0:
-                            force -= own.gradient[slot, p]
-                            total += block(own, p, slot, slot)
-            forces[node] = force
-            diagonal[node] = whole(total)
-            stiffness[node] = real(total[0] + total[3] + total[5])
+        force, total = V(), B()
+        for s in range(sets.shape[0]):
+            number = sets[s].numbers[node]
+            if number > 0:
+                own = sets[s]
+                for k in range(own.places[node], own.places[node] + number):
+                    p = own.items[k] / wp.static(SLOTS)
+                    slot = own.items[k] - wp.static(SLOTS) * p
+                    if own.used[p] != 0:
+                        force -= own.gradient[slot, p]
+                        total += block(own, p, slot, slot)
+        forces[node] = force
+        diagonal[node] = whole(total)
+        stiffness[node] = real(total[0] + total[3] + total[5])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def join(sets: wp.array(dtype=PairSet), edges: Surface, count: int, between: wp.array(dtype=M)):
         """Items of the first node that come from this edge, not from another one that begins there."""
-        tid = wp.tid()
+        i = wp.tid()
         if wp.static(serial):
             join_all(sets, between)
             return
-        for i in range(tid, until(tid, between.shape[0])):
-            w = i / count
-            node = edges.nodes[i - w * count, 0] + w * edges.nodes_a_world
-            total = B()
-            for s in range(sets.shape[0]):
-                number = sets[s].numbers[node]
-                if number > 0:
-                    own = sets[s]
-                    for k in range(own.places[node], own.places[node] + number):
-                        p = own.items[k] / wp.static(SLOTS)
-                        slot = own.items[k] - wp.static(SLOTS) * p
-                        if slot % 2 == 0 and slot / 2 < own.edges and own.used[p] != 0:
-                            if own.pairs[p][slot / 2] == i:
-                                total += block(own, p, slot, slot + 1)
-            between[i] = whole(total)
+        w = i / count
+        node = edges.nodes[i - w * count, 0] + w * edges.nodes_a_world
+        total = B()
+        for s in range(sets.shape[0]):
+            number = sets[s].numbers[node]
+            if number > 0:
+                own = sets[s]
+                for k in range(own.places[node], own.places[node] + number):
+                    p = own.items[k] / wp.static(SLOTS)
+                    slot = own.items[k] - wp.static(SLOTS) * p
+                    if slot % 2 == 0 and slot / 2 < own.edges and own.used[p] != 0:
+                        if own.pairs[p][slot / 2] == i:
+                            total += block(own, p, slot, slot + 1)
+        between[i] = whole(total)
 
     return collect, join

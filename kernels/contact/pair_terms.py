@@ -86,10 +86,8 @@ def read_functions(kind: Kind, real):
 
 @cache
 def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
-    """sieve(...) pairs for those that push each other, which choose(...) lists in order, and evaluate(...) these.
-
-    One thread alone lists them as it sieves.
-    """
+    """sieve(...) pairs for those that push each other, and evaluate(...) these, once they are listed: by one thread alone as it sieves,
+    else by `sums.choose_kernel`."""
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
     V, W4 = wp.types.vector(3, real), wp.types.vector(4, linear)
     L = wp.types.vector(3, linear)
@@ -133,25 +131,6 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
             number[0] = found
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def choose(
-        count: wp.array(dtype=int),
-        used: wp.array(dtype=int),
-        starts: wp.array(dtype=int),
-        listed: wp.array(dtype=int),
-        number: wp.array(dtype=int),
-    ):
-        """`starts` are how many are used before each."""
-        pair = wp.tid()
-        if pair >= count[0]:
-            if pair == 0:
-                number[0] = 0
-            return
-        if used[pair] != 0:
-            listed[starts[pair]] = pair
-        if pair == count[0] - 1:
-            number[0] = starts[pair] + used[pair]
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def evaluate(
         pairs: wp.array(dtype=wp.vec2i),
         listed: wp.array(dtype=int),
@@ -188,7 +167,7 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
             factor.used[pair] = used
             factor.bend[pair] = linear(bends(at, p, threshold, d))
 
-    return sieve, choose, evaluate
+    return sieve, evaluate
 
 
 @cache
@@ -241,7 +220,7 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: boo
 
 @cache
 def columns_kernel(kind: Kind, density: Density, real, linear):
-    """Columns of the exact Hessians of the chosen pairs, a thread some columns; of as many as `starts` and `marks` end in."""
+    """Columns of the exact Hessians of the pairs that are chosen, so many, a thread some columns."""
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
     X, *_ = shape_types(real)
     V, L = wp.types.vector(3, real), wp.types.vector(3, linear)
@@ -255,14 +234,12 @@ def columns_kernel(kind: Kind, density: Density, real, linear):
         law: Law,
         x: wp.array(dtype=V),
         factor: Factor,
-        marks: wp.array(dtype=int),
-        starts: wp.array(dtype=int),
         chosen: wp.array(dtype=int),
+        number: wp.array(dtype=int),
         threads: int,
         columns: wp.array3d(dtype=L),
     ):
-        last = marks.shape[0] - 1
-        for i in range(wp.tid(), 12 * wp.min(starts[last] + marks[last], chosen.shape[0]), threads):
+        for i in range(wp.tid(), 12 * number[0], threads):
             m = i / 12
             column = i - 12 * m
             pair = chosen[m]
@@ -277,11 +254,8 @@ def columns_kernel(kind: Kind, density: Density, real, linear):
 
 
 @cache
-def mollified_kernels(density: Density, real, linear, serial: bool):
-    """Exact Hessians of pairs of edges that `pair_bend` does not know, kept as long as there is room: those all but parallel.
-
-    mark(...) them, choose(...) lists them in order; and their `columns_kernel`.
-    """
+def mark_kernel(linear, serial: bool):
+    """mark(...) pairs of edges that `pair_bend` does not know, in the worlds that want it: those all but parallel."""
     Factor, until = factor_struct(linear), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -294,17 +268,10 @@ def mollified_kernels(density: Density, real, linear, serial: bool):
         marks: wp.array(dtype=int),
     ):
         tid = wp.tid()
-        for p in range(tid, until(tid, marks.shape[0])):
-            marks[p] = 0
-            if p < count[0]:
-                if factor.used[p] != 0 and factor.bend[p] == linear(0.0) and wanted[pairs[p][0] / things] != 0:
-                    marks[p] = 1
+        if tid >= count[0]:
+            return
+        for p in range(tid, until(tid, count[0])):
+            asked = factor.used[p] != 0 and factor.bend[p] == linear(0.0) and wanted[pairs[p][0] / things] != 0
+            marks[p] = wp.where(asked, 1, 0)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def choose(marks: wp.array(dtype=int), starts: wp.array(dtype=int), chosen: wp.array(dtype=int)):
-        tid = wp.tid()
-        for p in range(tid, until(tid, marks.shape[0])):
-            if marks[p] != 0 and starts[p] < chosen.shape[0]:
-                chosen[starts[p]] = p
-
-    return mark, choose, columns_kernel(EDGES, density, real, linear)
+    return mark

@@ -29,12 +29,10 @@ def _entries(elements, law, x: wp.array) -> tuple[np.ndarray, np.ndarray, np.nda
     used = elements.listed.numpy()[: int(elements.number.numpy()[0])]
     if not used.size:
         return np.zeros(0, int), np.zeros(0, int), np.zeros(0)
-    chosen = wp.array(used, dtype=int, device=x.device)
-    none, every = (wp.full(1, n, dtype=int, device=x.device) for n in (0, len(used)))
     out = arrays.allocate((COLUMNS, SLOTS, len(used)), wp.types.vector(3, elements.linear), x.device)
     threads = arrays.takers(COLUMNS * len(used), x.device)
     kernel = columns_kernel(elements.found.kind, elements.density, elements.real, elements.linear)
-    inputs = [elements.pairs, elements.found.sides, law, x, elements.factor, every, none, chosen, threads]
+    inputs = [elements.pairs, elements.found.sides, law, x, elements.factor, elements.listed, elements.number, threads]
     wp.launch(kernel, threads, inputs, [out], device=x.device)
     values = arrays.download(out).astype(float).transpose(2, 0, 1, 3).reshape(len(used), COLUMNS, COLUMNS)
     nodes = elements.factor.nodes.numpy()[used]

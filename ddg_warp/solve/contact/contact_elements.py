@@ -5,10 +5,10 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.kernels.contact.pair_energy import rows_of
 from ddg_warp.kernels.contact.pair_terms import evaluate_kernels, exact_product_kernel
+from ddg_warp.kernels.contact.sums import choose_kernel
 from ddg_warp.kernels.contact.surfaces import EDGES
 from ddg_warp.kernels.densities import Density
 from ddg_warp.solve.contact.mollified import Mollified, Unkept
-from ddg_warp.solve.contact.node_items import NodeItems
 from ddg_warp.solve.contact.pair_elements import PairElements
 from ddg_warp.solve.contact.pairs import PairList, RunningSums
 
@@ -31,25 +31,22 @@ class ContactElements(PairElements):
         exact: bool,
     ):
         kind = found.kind
-        super().__init__(found, rows_of(kind), real, linear)
+        super().__init__(found, rows_of(kind), nodes, real, linear, silent)
         self.density = law
         serial = arrays.serial(self.device)
-        self._items = NodeItems(kind, nodes, real, silent)
-        self._sieve, self._choose, self._evaluate = evaluate_kernels(kind, law, real, linear, serial)
+        self._sieve, self._evaluate = evaluate_kernels(kind, law, real, linear, serial)
+        self._choose = choose_kernel(serial)
         self._exact = exact_product_kernel(kind, law, real, linear, serial)
-        self.kernels += [*self._items.kernels, self._sieve, self._evaluate, self._exact]
+        self.kernels += [self._sieve, self._evaluate, self._exact]
         self.kernels += [] if serial else [self._choose]
         self.mollified = (Unkept if exact else Mollified)(self, law) if kind == EDGES else None
         self.count, self.starts, self.partners = found.count, found.starts, found.partners
-        self.numbers, self.places = self._items.numbers, self._items.places
         self.reserve()
 
     def reserve(self) -> None:
         super().reserve()
         self.pairs = self.found.pairs
         self._running = None if arrays.serial(self.device) else RunningSums(self.factor.used)
-        self._items.reserve(self.found.capacity)
-        self.items, self.ranks = self._items.items, self._items.ranks
         if self.mollified:
             self.mollified.reserve()
 

@@ -7,7 +7,6 @@ from ddg_warp import arrays
 from ddg_warp.kernels.contact.pair_friction import ROWS, friction_kernel, lag_kernel, lagged_struct
 from ddg_warp.kernels.densities import Density
 from ddg_warp.solve.contact.contact_elements import ContactElements
-from ddg_warp.solve.contact.node_items import NodeItems
 from ddg_warp.solve.contact.pair_elements import PairElements
 
 
@@ -15,7 +14,7 @@ class FrictionElements(PairElements):
     """Friction of the pairs of one list, with lists of their own, which later searches leave alone; see `PairTerms`.
 
     Args:
-        contact: of the same pairs; silent: as of `NodeItems`.
+        contact: of the same pairs; nodes, silent: as of `PairElements`.
         velocity: below which surfaces stick [m/s].
         directed: nodes beside first things (things, 2), and by groups coefficients over `friction` forwards, backwards and across
             (groups, groups, 3), see `lag_kernel`; None: it is the same all ways.
@@ -36,7 +35,7 @@ class FrictionElements(PairElements):
         linear,
         silent: wp.array,
     ):
-        super().__init__(contact.found, ROWS, real, linear)
+        super().__init__(contact.found, ROWS, nodes, real, linear, silent)
         serial = arrays.serial(self.device)
         self._contact, self._velocity = contact, velocity
         self._lag = lag_kernel(self.found.kind, real, linear, serial, directed is not None)
@@ -47,9 +46,7 @@ class FrictionElements(PairElements):
             self._rows += 1
             ways = wp.array(ways, dtype=wp.types.vector(3, real), device=self.device)
             self.directions = arrays.upload(beside.astype(np.int32), wp.vec2i, self.device), ways
-        self._items = NodeItems(self.found.kind, nodes, real, silent)
-        self.numbers, self.places = self._items.numbers, self._items.places
-        self.kernels += [self._lag, self._evaluate, *self._items.kernels]
+        self.kernels += [self._lag, self._evaluate]
         self._kept = ("count", "starts", "partners", "number")
         for name in self._kept:
             setattr(self, name, wp.zeros_like(getattr(contact, name)))
@@ -61,8 +58,6 @@ class FrictionElements(PairElements):
         super().reserve()
         for name in self._kept:
             getattr(self, name).zero_()
-        self._items.reserve(self.found.capacity)
-        self.items, self.ranks = self._items.items, self._items.ranks
         capacity = self.found.capacity
         self.pairs = wp.zeros(capacity, dtype=wp.vec2i, device=self.device)
         pair = wp.types.vector(2, self.real)
@@ -84,16 +79,7 @@ class FrictionElements(PairElements):
 
     def evaluate(self, x, start, rate: wp.array, iterates: tuple) -> None:
         """Write energies, work, gradients and factors at x by the slip since `start`."""
-        inputs = [
-            self.pairs,
-            self.listed,
-            self.number,
-            self.found.first.count,
-            self.lagged,
-            self._velocity,
-            rate,
-            *iterates,
-        ]
-        inputs += [x, start]
+        inputs = [self.pairs, self.listed, self.number, self.found.first.count]
+        inputs += [self.lagged, self._velocity, rate, *iterates, x, start]
         outputs = [self._slip, self._along, self.factor, self.energy, self.work, self.gradient]
         self._sweep(self._evaluate, self.found.capacity, inputs, outputs)

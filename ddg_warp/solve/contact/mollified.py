@@ -4,7 +4,9 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.kernels.contact.gather import SLOTS
-from ddg_warp.kernels.contact.pair_terms import exact_product_kernel, mollified_kernels
+from ddg_warp.kernels.contact.pair_terms import columns_kernel, exact_product_kernel, mark_kernel
+from ddg_warp.kernels.contact.sums import choose_kernel
+from ddg_warp.kernels.contact.surfaces import EDGES
 from ddg_warp.kernels.densities import Density
 from ddg_warp.solve.contact.pairs import RunningSums
 
@@ -26,8 +28,10 @@ class Mollified:
     def __init__(self, elements, law: Density):
         self._of = elements
         serial = arrays.serial(elements.device)
-        self.kernels = mollified_kernels(law, elements.real, elements.linear, serial)
-        self._mark, self._choose, self._differentiate = self.kernels
+        self._mark, self._choose = mark_kernel(elements.linear, serial), choose_kernel(serial)
+        self._differentiate = columns_kernel(EDGES, law, elements.real, elements.linear)
+        self.kernels = [self._mark, self._choose, self._differentiate]
+        self._number = wp.zeros(1, dtype=int, device=elements.device)
 
     def reserve(self) -> None:
         """Make room, as `PairElements` do."""
@@ -46,9 +50,10 @@ class Mollified:
         inputs = [of.pairs, of.count, of.found.first.count, wanted, of.factor]
         self._sweep(self._mark, len(self.marks), inputs, [self.marks])
         self._running()
-        self._sweep(self._choose, len(self.marks), [self.marks, self.starts], [self._chosen])
+        chosen = [self._chosen, self._number]
+        self._sweep(self._choose, len(self.marks), [of.count, self.marks, self.starts], chosen)
         threads = arrays.takers(min(3 * SLOTS * len(self._chosen), MOST), of.device)
-        inputs = [of.pairs, of.found.sides, law, x, of.factor, self.marks, self.starts, self._chosen, threads]
+        inputs = [of.pairs, of.found.sides, law, x, of.factor, *chosen, threads]
         wp.launch(self._differentiate, threads, inputs, [self.columns], device=of.device)
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:

@@ -5,6 +5,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.contact import gather
+from ddg_warp.solve.contact.node_items import NodeItems
 from ddg_warp.solve.contact.pairs import PairList
 
 MOST = 2**31 // gather.SLOTS  # pairs whose slots can be counted
@@ -15,6 +16,7 @@ class PairElements:
 
     Args:
         found: list of a search, whose kind of pairs and capacity these have.
+        nodes: of all worlds; silent: those of a world that are told of nothing.
         linear: type of factors.
 
     Attributes:
@@ -23,18 +25,18 @@ class PairElements:
         pairs, count, starts, partners: as those of a `PairList`; of the subclass.
         listed, number: pairs that may be used, in order, and how many; of all others `factor.used` is zero.
         mollified: those whose matrices take more than a factor and what turns (`Mollified`); None without.
-        numbers, places, items, ranks: as of `NodeItems`; of the subclass.
+        numbers, places, items, ranks: as of `NodeItems`, which the subclass has list the pairs.
     """
 
     mollified = None
 
-    def __init__(self, found: PairList, rows: int, real, linear):
+    def __init__(self, found: PairList, rows: int, nodes: int, real, linear, silent: wp.array):
         self.found, self.device, self.rows, self.real, self.linear = found, found.device, rows, real, linear
-        self.size = found.kind.first + found.kind.second
-        self._add = gather.sum_kernel(real, arrays.serial(self.device))
+        self._items = NodeItems(found.kind, nodes, real, silent)
+        self.numbers, self.places = self._items.numbers, self._items.places
         self.factor = gather.factor_struct(linear)()
         self.number = wp.zeros(1, dtype=int, device=self.device)
-        self.kernels = [self._add]
+        self.kernels = [*self._items.kernels]
 
     def reserve(self) -> None:
         """Make room for as many pairs as the list of the search has.
@@ -57,12 +59,9 @@ class PairElements:
         self.listed = wp.zeros(capacity, dtype=int, device=self.device)
         self.energy = wp.zeros(capacity, dtype=self.real, device=self.device)
         self.gradient = arrays.allocate((gather.SLOTS, capacity), wp.types.vector(3, self.real), self.device)
-        self.placed = wp.zeros(self.size * capacity, dtype=vector, device=self.device)
-
-    def add_up(self, parts: wp.array, out: wp.array, items) -> None:
-        """Add what pairs that are used have written by slot (`SLOTS`, capacity) to nodes that have items (`NodeItems`)."""
-        inputs = [parts, self.factor.used, items.places, items.numbers, items.items]
-        self._sweep(self._add, len(out), inputs, [out])
+        self._items.reserve(capacity)
+        self.items, self.ranks = self._items.items, self._items.ranks
+        self.placed = wp.zeros(len(self.items), dtype=vector, device=self.device)
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
         arrays.sweep(kernel, count, inputs, outputs, self.device)

@@ -191,7 +191,6 @@ class NetContact:
         outputs = [self._curved, self._projected]
         self._launch(self._find_curved, self.net.worlds, [newton.islands.arrays[0], self._late], outputs)
         self.terms.meet()
-        self.terms.join()
         if self.bends:
             self.terms.prepare(newton.q, self._curved)
         if self._bands:

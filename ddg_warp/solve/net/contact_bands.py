@@ -22,6 +22,7 @@ class ContactBands:
 
     def __call__(self, terms, flags: wp.array) -> None:
         """Write it from the bands and the blocks of `PairTerms`, of the worlds whose flags want it."""
+        terms.join()
         chains = self.chains
         inputs = [chains.bands, chains.layout, self._ahead, self._edges, flags, chains.net.blocks]
         inputs += [terms.diagonal, terms.between]

@@ -44,7 +44,6 @@ class ExactContact:
             terms.lag(before)
         search.search(q)
         terms.evaluate(q, rate if terms.frictions else None)
-        terms.join()
         terms.meet()
         terms.prepare(q, self.net.every)
         self._q = q
