@@ -17,6 +17,7 @@ from ddg_warp import arrays
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.net import newton
+from ddg_warp.kernels.net.touch import SPARED
 from ddg_warp.model.state import State
 from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.choice import net_preconditioner
@@ -196,7 +197,10 @@ class NetEquilibrium:
                 tightest = self.newton.contact.tightest(state.net.q, status) if self.newton.contact else ""
                 raise SolverError(owner.residuals.where(name, residual, at, tightest), state=state, outcome=name)
         owner.outcome = outcome.NAMES[status]
-        state.stable = False if self.newton.islands.clamped.numpy().any() else None
+        indefinite = self.newton.islands.clamped.numpy() != 0
+        if self.newton.contact:  # what was not tried tells nothing
+            indefinite &= self.newton.contact.matrix.numpy() != SPARED
+        state.stable = False if indefinite.any() else None
         return owner.found(state, outer, residual, at)
 
     def _refuse_drifting(self, state: State, q: np.ndarray, at: float) -> None:
