@@ -13,7 +13,6 @@ from ddg_warp.kernels.islands import (
     DRIVEN,
     HALVINGS,
     ITERATION,
-    MERIT,
     MOVED,
     SLOT,
     STATUS,
@@ -30,9 +29,10 @@ from ddg_warp.kernels.search import PLACE, RELAG, STRAIGHT
 from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
 
 WHOLE, UNITS, NONE = 1, 0, -1  # how a world moves: with one share, unit by unit, not at all
-# the matrix of a world: as it is, found indefinite, and projected then, or projected without a trial
-EXACT, INDEFINITE, SPARED = range(3)
-NEARER = 0.01  # of the square of the residual at which the exact matrix was indefinite, from which on it is tried again
+EXACT, PROJECTED, NEXT = range(
+    3
+)  # the matrix of a world: as it is, without what may be negative, and so in the next iterate, too
+UNTRIED = 2  # iterates that are not tried with the exact matrix after one in which it was indefinite
 
 
 @cache
@@ -96,25 +96,24 @@ def world_kernels(real):
         scalars: wp.array2d(dtype=real),
         stalled: wp.array(dtype=int),
         matrix: wp.array(dtype=int),
-        tried: wp.array(dtype=real),
+        untried: wp.array(dtype=int),
     ):
         """What a step that was cut is expected to gain, over its length. If that drowns in rounding, it is not for being near.
 
         Where the matrix was indefinite and the step is not whole, things are not yet where the exact one is of use: the next iterate
-        does without it at once, and it was no detour (`kernels.islands.patience_function`). Nor is it tried before the residual is
-        much less than where it was `tried`: of many things some are always where it is indefinite, and each trial is a whole solve.
+        does without it at once, and it was no detour (`kernels.islands.patience_function`). Nor is it tried in the next few: of many
+        things some are always where it is indefinite, and each trial is a whole solve.
         """
         w = wp.tid()
         length = scalars[STEP_LENGTH, w]
         moves = modes[w] != wp.static(NONE)
         cut = moves and time[w] < real(1.0)
         short = cut or (moves and flags[HALVINGS, w] > 0)
-        if matrix[w] == wp.static(INDEFINITE) and short:
+        if matrix[w] == wp.static(PROJECTED) and short:
             flags[DETOURS, w] = flags[DETOURS, w] - 1
-        far = moves and scalars[MERIT, w] > real(wp.static(NEARER)) * tried[w]
-        if matrix[w] != wp.static(EXACT) and (short or far):
+        if matrix[w] != wp.static(EXACT) and (short or (moves and untried[w] < wp.static(UNTRIED))):
             flags[CLAMPED, w] = 1
-            matrix[w] = wp.static(SPARED)
+            matrix[w] = wp.static(NEXT)
         cut = cut and length > real(0.0)
         if cut:
             scalars[DECREMENT, w] = wp.max(decrease[w], real(0.0)) / length
@@ -141,22 +140,19 @@ def world_kernels(real):
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def curve(
         flags: wp.array2d(dtype=int),
-        scalars: wp.array2d(dtype=real),
         late: int,
         curved: wp.array(dtype=int),
         matrix: wp.array(dtype=int),
-        tried: wp.array(dtype=real),
+        untried: wp.array(dtype=int),
     ):
-        """Where the matrix has what comes of pairs that turn, which one it is, and the square of the residual where it was tried."""
+        """Where the matrix has what comes of pairs that turn, which one it is, and how many iterates were not tried exactly."""
         w = wp.tid()
         if flags[WANTED, w] != 0:
             if flags[CLAMPED, w] == 0:
                 matrix[w] = wp.static(EXACT)
-            elif matrix[w] == wp.static(SPARED):
-                flags[DETOURS, w] = flags[DETOURS, w] - 1
             else:
-                matrix[w] = wp.static(INDEFINITE)
-                tried[w] = scalars[MERIT, w]
+                untried[w] = wp.where(matrix[w] == wp.static(NEXT), untried[w] + 1, int(0))
+                matrix[w] = wp.static(PROJECTED)
         curved[w] = wp.where(flags[WANTED, w] != 0 and flags[ITERATION, w] > late and flags[CLAMPED, w] == 0, 1, 0)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

@@ -17,7 +17,7 @@ from ddg_warp import arrays
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.net import newton
-from ddg_warp.kernels.net.touch import SPARED
+from ddg_warp.kernels.net.touch import NEXT
 from ddg_warp.model.state import State
 from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.choice import net_preconditioner
@@ -199,7 +199,7 @@ class NetEquilibrium:
         owner.outcome = outcome.NAMES[status]
         indefinite = self.newton.islands.clamped.numpy() != 0
         if self.newton.contact:  # what was not tried tells nothing
-            indefinite &= self.newton.contact.matrix.numpy() != SPARED
+            indefinite &= self.newton.contact.matrix.numpy() != NEXT
         state.stable = False if indefinite.any() else None
         return owner.found(state, outer, residual, at)
 
