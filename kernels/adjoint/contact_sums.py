@@ -5,7 +5,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.adjoint.contact import NUMBERS, THICKNESS
-from ddg_warp.kernels.contact.gather import SLOTS
+from ddg_warp.kernels.contact.gather import taken_apart
 from ddg_warp.kernels.contact.pair_terms import groups_function, law_struct
 from ddg_warp.kernels.contact.surfaces import Kind, sides_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS
@@ -94,8 +94,8 @@ def side_kernels(kind: Kind, real):
         node = sides.second.nodes[j - w * sides.counts[1], 0] + w * sides.first.nodes_a_world
         own = real(0.0)
         for k in range(places[node], places[node] + number[node]):
-            p = items[k] / wp.static(SLOTS)
-            if items[k] - wp.static(SLOTS) * p == wp.static(kind.first) and pairs[p][1] == j:
+            p, slot = taken_apart(items[k])
+            if slot == wp.static(kind.first) and pairs[p][1] == j:
                 own += numbers[wp.static(THICKNESS), p]
         out[j] = out[j] + own
 

@@ -14,6 +14,13 @@ from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 SLOTS = 4  # nodes of a pair
 
 
+@wp.func
+def taken_apart(item: int):
+    """The pair of an item, and the slot."""
+    p = item / wp.static(SLOTS)
+    return p, item - wp.static(SLOTS) * p
+
+
 @cache
 def factor_struct(linear):
     """Rows of the factors of pairs: where bit k + 1 of used[p] is set, row k of p has weight[k, p][i] direction[k, p] for its node i.
@@ -213,9 +220,9 @@ def sum_kernel(real, serial: bool):
             if numbers[node] > 0:
                 total = V()
                 for k in range(starts[node], starts[node] + numbers[node]):
-                    p = items[k] / wp.static(SLOTS)
+                    p, slot = taken_apart(items[k])
                     if used[p] != 0:
-                        total += parts[items[k] - wp.static(SLOTS) * p, p]
+                        total += parts[slot, p]
                 out[node] = out[node] + total
 
     return gather
@@ -300,8 +307,7 @@ def collect_kernels(real, linear, serial: bool):
             if number > 0:
                 own = sets[s]
                 for k in range(own.places[node], own.places[node] + number):
-                    p = own.items[k] / wp.static(SLOTS)
-                    slot = own.items[k] - wp.static(SLOTS) * p
+                    p, slot = taken_apart(own.items[k])
                     if own.used[p] != 0:
                         force -= own.gradient[slot, p]
                         total += block(own, p, slot, slot)
@@ -324,8 +330,7 @@ def collect_kernels(real, linear, serial: bool):
             if number > 0:
                 own = sets[s]
                 for k in range(own.places[node], own.places[node] + number):
-                    p = own.items[k] / wp.static(SLOTS)
-                    slot = own.items[k] - wp.static(SLOTS) * p
+                    p, slot = taken_apart(own.items[k])
                     if slot % 2 == 0 and slot / 2 < own.edges and own.used[p] != 0:
                         if own.pairs[p][slot / 2] == i:
                             total += block(own, p, slot, slot + 1)

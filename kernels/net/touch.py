@@ -29,9 +29,6 @@ from ddg_warp.kernels.search import PLACE, RELAG, STRAIGHT
 from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
 
 WHOLE, UNITS, NONE = 1, 0, -1  # how a world moves: with one share, unit by unit, not at all
-EXACT, PROJECTED, NEXT = range(
-    3
-)  # the matrix of a world: as it is, without what may be negative, and so in the next iterate, too
 UNTRIED = 2  # iterates that are not tried with the exact matrix after one in which it was indefinite
 
 
@@ -95,8 +92,7 @@ def world_kernels(real):
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         stalled: wp.array(dtype=int),
-        matrix: wp.array(dtype=int),
-        untried: wp.array(dtype=int),
+        projected: wp.array(dtype=int),
     ):
         """What a step that was cut is expected to gain, over its length. If that drowns in rounding, it is not for being near.
 
@@ -109,11 +105,10 @@ def world_kernels(real):
         moves = modes[w] != wp.static(NONE)
         cut = moves and time[w] < real(1.0)
         short = cut or (moves and flags[HALVINGS, w] > 0)
-        if matrix[w] == wp.static(PROJECTED) and short:
-            flags[DETOURS, w] = flags[DETOURS, w] - 1
-        if matrix[w] != wp.static(EXACT) and (short or (moves and untried[w] < wp.static(UNTRIED))):
+        if projected[w] > 0 and flags[CLAMPED, w] == 0 and (short or (moves and projected[w] <= wp.static(UNTRIED))):
             flags[CLAMPED, w] = 1
-            matrix[w] = wp.static(NEXT)
+            if short:
+                flags[DETOURS, w] = flags[DETOURS, w] - 1
         cut = cut and length > real(0.0)
         if cut:
             scalars[DECREMENT, w] = wp.max(decrease[w], real(0.0)) / length
@@ -138,21 +133,11 @@ def world_kernels(real):
                 wp.atomic_min(least, 0, gap[w])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def curve(
-        flags: wp.array2d(dtype=int),
-        late: int,
-        curved: wp.array(dtype=int),
-        matrix: wp.array(dtype=int),
-        untried: wp.array(dtype=int),
-    ):
-        """Where the matrix has what comes of pairs that turn, which one it is, and how many iterates were not tried exactly."""
+    def curve(flags: wp.array2d(dtype=int), late: int, curved: wp.array(dtype=int), projected: wp.array(dtype=int)):
+        """Where the matrix has what comes of pairs that turn, and in how many iterates in a row it is the projected one."""
         w = wp.tid()
         if flags[WANTED, w] != 0:
-            if flags[CLAMPED, w] == 0:
-                matrix[w] = wp.static(EXACT)
-            else:
-                untried[w] = wp.where(matrix[w] == wp.static(NEXT), untried[w] + 1, int(0))
-                matrix[w] = wp.static(PROJECTED)
+            projected[w] = wp.where(flags[CLAMPED, w] != 0, projected[w] + 1, int(0))
         curved[w] = wp.where(flags[WANTED, w] != 0 and flags[ITERATION, w] > late and flags[CLAMPED, w] == 0, 1, 0)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

@@ -35,7 +35,6 @@ class NetContact:
         forces (W N,) [N], stiffness (W N,) [N/m]: what pushes nodes, and a bound on how stiff that is.
         diagonal: (W N,) blocks of its matrix at nodes.
         bound: (W N,) where iterates of worlds on their way are bound for, and where those of others are.
-        matrix: (W,) with which one the last direction was found, `EXACT`, `PROJECTED` or `NEXT` of `kernels.net.touch`.
         bends: whether its matrix has what comes of pairs that turn, once the search is near; see `kernels.contact.pair_bend`.
         crossed: (1,) pairs that would have passed through each other in all steps so far; least: (1,) the smallest gap [m].
     """
@@ -62,7 +61,7 @@ class NetContact:
         def make(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=device)
 
-        self._modes, self._curved, self.matrix, self._untried = (make(worlds, int) for _ in range(4))
+        self._modes, self._curved, self._projected = (make(worlds, int) for _ in range(3))
         self.bends, self._late = newton.psd != "gauss_newton", 0 if newton.psd == "none" else EARLY
         self._kept, self._gain = make((2, worlds), real), make(worlds, real)
         self._move = make(newton.all, net.vector)
@@ -189,7 +188,7 @@ class NetContact:
     def assemble(self) -> None:
         """Its own part in the preconditioner."""
         newton = self.newton
-        outputs = [self._curved, self.matrix, self._untried]
+        outputs = [self._curved, self._projected]
         self._launch(self._find_curved, self.net.worlds, [newton.islands.arrays[0], self._late], outputs)
         self.terms.meet()
         if self.bends:
@@ -237,7 +236,7 @@ class NetContact:
         self._sweep(self._differ_gain, inputs, [newton.dots])
         self._sum(newton.dots, self._gain)
         inputs = [self._modes, self.search.time, self._gain]
-        outputs = [*newton.islands.arrays, newton.stalled, self.matrix, self._untried]
+        outputs = [*newton.islands.arrays, newton.stalled, self._projected]
         self._launch(self._expect, self.net.worlds, inputs, outputs)
 
     def _cut(self) -> None:

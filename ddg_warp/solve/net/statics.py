@@ -17,7 +17,6 @@ from ddg_warp import arrays
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.net import newton
-from ddg_warp.kernels.net.touch import NEXT
 from ddg_warp.model.state import State
 from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.choice import net_preconditioner
@@ -197,10 +196,9 @@ class NetEquilibrium:
                 tightest = self.newton.contact.tightest(state.net.q, status) if self.newton.contact else ""
                 raise SolverError(owner.residuals.where(name, residual, at, tightest), state=state, outcome=name)
         owner.outcome = outcome.NAMES[status]
-        indefinite = self.newton.islands.clamped.numpy() != 0
-        if self.newton.contact:  # what was not tried tells nothing
-            indefinite &= self.newton.contact.matrix.numpy() != NEXT
-        state.stable = False if indefinite.any() else None
+        # in contact the last matrix may be the projected one without a trial of the exact one, which tells nothing
+        indefinite = self.newton.contact is None and self.newton.islands.clamped.numpy().any()
+        state.stable = False if indefinite else None
         return owner.found(state, outer, residual, at)
 
     def _refuse_drifting(self, state: State, q: np.ndarray, at: float) -> None:
