@@ -58,7 +58,7 @@ class ContactAdjoint:
         self._leads = [self._led(search.shapes.beside(kind.first)) for kind in kinds if directed]
         self._sides = [contact_sums.side_kernels(kind, real) for kind in kinds]
         self._group, self._bodies = contact_sums.group_kernels(real), contact_sums.body_kernel(real)
-        self._items, self._add = [NodeItems(kind, nodes, real, every) for kind in kinds], sum_kernel(real, serial)
+        self._items, self._add = [NodeItems(kind, nodes, every) for kind in kinds], sum_kernel(real, serial)
         self.by_groups = self._zeros(NUMBERS, *terms.law.stiffness.shape)
         self.by_radius = self._zeros(*net.touching["radius"].shape)
         self._things, self._starts = {}, {}
@@ -110,13 +110,13 @@ class ContactAdjoint:
             array.zero_()
         for i, (part, rub) in enumerate(zip(terms.lists, self._rubs, strict=True)):
             read, pairs = [part.pairs, part.count, part.found.sides, terms.law], part.found.capacity
-            self._items[i].list(part.listed, part.number, part.factor.nodes)
-            inputs = [*read, part.factor.nodes, part.factor.used, q, w]
+            self._items[i].list(part.count, part.factor.nodes)
+            inputs = [*read, part.factor.nodes, q, w]
             self._sweep(self._pull[i], pairs, inputs, [part.gradient, self._numbers])
             self._add_up(i, part, part.gradient, by_q)
             self._sum(i, part)
             if rub:
-                self._items[i].list(rub.listed, rub.number, rub.factor.nodes)
+                self._items[i].list(rub.count, rub.factor.nodes)
                 read = [rub.pairs, rub.count, part.found.sides, terms.law, rub.factor.nodes, rub.factor.used]
                 inputs = [*read, before, q, w, self._velocity, rate, *rub.directions]
                 written = [rub.gradient, self._start_parts, self._numbers, self._by_direction]

@@ -119,8 +119,8 @@ class Integrator:
         self._dt = wp.zeros(model.worlds, dtype=model.types.real, device=model.wp_device)
         self._dt_host = None
         self._longest, self._version = 0.0, model.version
-        # steps since the state came from elsewhere, and walks of trees of searches until they were made anew
-        self._since_renewal, self._walked = 0, 0
+        # steps since the state came from elsewhere, and walks of trees, of searches and of runs, until they were made anew
+        self._since_renewal, self._sought = 0, (0, 0)
 
     def step(self, state: State, dt: float, controls: Controls | None = None) -> State:
         """The state after a step of dt [s]. No state changes that is held: see `State`.
@@ -183,16 +183,20 @@ class Integrator:
             replay()
 
     def _renews(self, anew: bool) -> int:
-        """What a step makes anew, see `NetStep.step`: every few steps runs, and trees of searches if they were walked since."""
+        """What a step makes anew, see `NetStep.step`: every few steps the trees that were walked since."""
         if self._net is None or self.model.wp_device.is_cpu:
             return TREES
         due = anew or self._since_renewal % RENEWAL == 0
-        walked = anew or self._since_renewal == 0 or self._net.walked != self._walked
+        fresh = anew or self._since_renewal == 0
         self._since_renewal += 1
-        if due and walked:
-            self._walked = self._net.walked
+        (walks, looks), before = self._net.sought, self._sought
+        if due and (fresh or walks != before[0]):
+            self._sought = walks, looks
             return TREES
-        return RUNS if due else 0
+        if due and looks != before[1]:
+            self._sought = before[0], looks
+            return RUNS
+        return 0
 
     def check(self, state: State) -> None:
         """Read the outcomes of all steps since the last reading.

@@ -7,8 +7,10 @@ from ddg_warp.kernels.matrix import block_band
 from ddg_warp.kernels.solve import cyclic_reduction, paired, reduction_again
 from ddg_warp.solve.choice import LONGEST_REPEATED
 
+REDUCING = 128  # threads of a block in a level of the reduction
 THREADS = 32  # of a block of threads that walk: few chains reach more multiprocessors
 MOST = 512  # threads of a block that has one chain
+TOGETHER = 8  # neighbouring chains in a block of threads, which read 32 bytes at a time
 
 
 class CyclicReduction:
@@ -61,7 +63,7 @@ class CyclicReduction:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [(kernel, 64) for kernel in self._reduce[:2]]
+        own = [(kernel, REDUCING) for kernel in self._reduce[:2]]
         if self.repeats:
             return [*own, self._pack, (self._again, self._threads)]
         return [*own, (self._last, 32), self._expand]
@@ -109,13 +111,14 @@ class CyclicReduction:
         wp.launch(self._pack, (self.columns, self.dofs), inputs, [self._packed, bad], device=self.device)
 
     def _eliminate(self, level: int, kernel, threads: int, inputs: list, at: int, outputs: list, bad: wp.array) -> None:
+        together = min(TOGETHER, self.columns)
         wp.launch(
             kernel,
-            (threads, self.blocks[level + 1], self.columns),
-            [*inputs, self.blocks[level], 2, at],
+            (self.blocks[level + 1], -(-self.columns // together), threads, together),
+            [*inputs, self.blocks[level], 2, at, together],
             [*outputs, bad],
             device=self.device,
-            block_dim=64,
+            block_dim=REDUCING,
         )
 
     def again_kernel_at_places(self, twist: bool):

@@ -31,7 +31,7 @@ NUMBERS = 5  # of a pair, that derivatives are by
 
 @cache
 def pull_kernel(kind: Kind, density: Density, real, serial: bool):
-    """pull(...): what pairs bring by slot, and by their numbers (`NUMBERS`, capacity), zero of pairs that push nothing."""
+    """pull(...): what pairs bring by slot, and by their numbers (`NUMBERS`, capacity)."""
     Law, Sides = law_struct(real), sides_struct(real)
     V, until = wp.types.vector(3, real), until_function(serial)
     *_, along = pair_energy_functions(kind, density, real)
@@ -44,7 +44,6 @@ def pull_kernel(kind: Kind, density: Density, real, serial: bool):
         sides: Sides,
         law: Law,
         nodes: wp.array(dtype=wp.vec4i),
-        used: wp.array(dtype=int),
         x: wp.array(dtype=V),
         w: wp.array(dtype=V),
         parts: wp.array2d(dtype=V),
@@ -54,16 +53,15 @@ def pull_kernel(kind: Kind, density: Density, real, serial: bool):
         if tid >= count[0]:
             return
         for pair in range(tid, until(tid, count[0])):
+            p, threshold, inner = given(law, sides, pairs[pair])
+            n = nodes[pair]
+            dx, _dv, dp, _dt, _ds = wp.grad(along)(corners(x, n), -corners(w, n), p, threshold, inner)
+            for slot in range(wp.static(SLOTS)):
+                parts[slot, pair] = V(dx[slot, 0], dx[slot, 1], dx[slot, 2])
             for i in range(wp.static(NUMBERS)):
                 numbers[i, pair] = real(0.0)
-            if used[pair] != 0:
-                p, threshold, inner = given(law, sides, pairs[pair])
-                n = nodes[pair]
-                dx, _dv, dp, _dt, _ds = wp.grad(along)(corners(x, n), -corners(w, n), p, threshold, inner)
-                for slot in range(wp.static(SLOTS)):
-                    parts[slot, pair] = V(dx[slot, 0], dx[slot, 1], dx[slot, 2])
-                for i in range(3):
-                    numbers[i, pair] = dp[i]
+            for i in range(3):
+                numbers[i, pair] = dp[i]
 
     return pull
 

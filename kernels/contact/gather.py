@@ -8,7 +8,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct, surface_struct
+from ddg_warp.kernels.contact.surfaces import Kind, surface_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 SLOTS = 4  # nodes of a pair
@@ -48,9 +48,8 @@ def set_struct(real, linear):
     ranks: of each pair, the places of its items among all of the list, -1 where it has none; `placed` by these is what products bring
     to nodes, which read it one after the other.
     marks, starts, columns: of pairs whose Hessians are kept, see `pair_terms.mollified_kernels`; empty where there are none.
-    listed, number (1,): pairs that may be used, all others are not, and how many these are.
-    kind: place in `pair_bend.KINDS`, -1 without `bend`; edges: how many of its things, the first ones, are edges; rows: of its factor;
-    things: first things of pairs in one world.
+    count (1,): how many pairs there are; kind: place in `pair_bend.KINDS`, -1 without `bend`; edges: how many of its things, the
+    first ones, are edges; rows: of its factor; things: first things of pairs in one world.
     """
     X, V, W = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.vector(SLOTS, linear)
 
@@ -71,8 +70,7 @@ def set_struct(real, linear):
         numbers: wp.array(dtype=int)
         items: wp.array(dtype=int)
         ranks: wp.array(dtype=wp.vec4i)
-        listed: wp.array(dtype=int)
-        number: wp.array(dtype=int)
+        count: wp.array(dtype=int)
         kind: int
         edges: int
         rows: int
@@ -82,60 +80,24 @@ def set_struct(real, linear):
 
 
 @cache
-def begin_kernel(real):
-    """Whether there was a search since nodes were listed; and gaps of worlds before any is seen."""
+def list_kernels(kind: Kind, serial: bool):
+    """number(...) and fill(...) the items of nodes, sort(...) each list into `ordered`.
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def begin(
-        searches: wp.array(dtype=int),
-        reach: real,
-        listed: wp.array(dtype=int),
-        stale: wp.array(dtype=int),
-        gap: wp.array(dtype=real),
-    ):
-        w = wp.tid()
-        gap[w] = reach
-        if w == 0:
-            stale[0] = wp.where(searches[0] != listed[0], 1, 0)
-            listed[0] = searches[0]
-
-    return begin
-
-
-@cache
-def list_kernels(kind: Kind, real, serial: bool):
-    """name(...) the nodes of pairs; number(...) and fill(...) the items of nodes, sort(...) each list into `ordered`.
-
-    Items are of pairs that are `listed`, so many, and of none of the nodes of a world that are `silent`, not zero.
+    Items are of as many pairs as `count` says, and of none of the nodes of a world that are `silent`, not zero.
     """
-    Sides, until, size = sides_struct(real), until_function(serial), kind.first + kind.second
-    slots, *_ = pair_functions(kind, real)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def name(
-        pairs: wp.array(dtype=wp.vec2i), count: wp.array(dtype=int), sides: Sides, nodes_out: wp.array(dtype=wp.vec4i)
-    ):
-        tid = wp.tid()
-        if tid >= count[0]:
-            return
-        for p in range(tid, until(tid, count[0])):
-            w = pairs[p][0] / sides.counts[0]
-            nodes = slots(sides, pairs[p][0] - w * sides.counts[0], pairs[p][1] - w * sides.counts[1], w)
-            nodes_out[p] = wp.vec4i(nodes[0], nodes[1], nodes[2], nodes[3])
+    until, size = until_function(serial), kind.first + kind.second
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def number(
-        listed: wp.array(dtype=int),
-        many: wp.array(dtype=int),
+        count: wp.array(dtype=int),
         nodes: wp.array(dtype=wp.vec4i),
         silent: wp.array(dtype=wp.uint8),
         numbers: wp.array(dtype=int),
     ):
         tid = wp.tid()
-        if tid >= many[0]:
+        if tid >= count[0]:
             return
-        for i in range(tid, until(tid, many[0])):
-            p = listed[i]
+        for p in range(tid, until(tid, count[0])):
             for slot in range(wp.static(size)):
                 node = nodes[p][slot]
                 if silent[node % silent.shape[0]] == wp.uint8(0):
@@ -143,8 +105,7 @@ def list_kernels(kind: Kind, real, serial: bool):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def fill(
-        listed: wp.array(dtype=int),
-        many: wp.array(dtype=int),
+        count: wp.array(dtype=int),
         nodes: wp.array(dtype=wp.vec4i),
         silent: wp.array(dtype=wp.uint8),
         starts: wp.array(dtype=int),
@@ -154,10 +115,9 @@ def list_kernels(kind: Kind, real, serial: bool):
     ):
         """One thread alone fills them in order: these are the ranks then."""
         tid = wp.tid()
-        if tid >= many[0]:
+        if tid >= count[0]:
             return
-        for i in range(tid, until(tid, many[0])):
-            p = listed[i]
+        for p in range(tid, until(tid, count[0])):
             rank = wp.vec4i(-1, -1, -1, -1)
             for slot in range(wp.static(size)):
                 node = nodes[p][slot]
@@ -169,8 +129,7 @@ def list_kernels(kind: Kind, real, serial: bool):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def sort(
-        listed: wp.array(dtype=int),
-        many: wp.array(dtype=int),
+        count: wp.array(dtype=int),
         nodes: wp.array(dtype=wp.vec4i),
         silent: wp.array(dtype=wp.uint8),
         starts: wp.array(dtype=int),
@@ -181,10 +140,9 @@ def list_kernels(kind: Kind, real, serial: bool):
     ):
         """A thread a pair, as a thread a node would take thousands of steps where a node is in thousands of pairs."""
         tid = wp.tid()
-        if tid >= many[0]:
+        if tid >= count[0]:
             return
-        for i in range(tid, until(tid, many[0])):
-            p = listed[i]
+        for p in range(tid, until(tid, count[0])):
             rank = wp.vec4i(-1, -1, -1, -1)
             for slot in range(wp.static(size)):
                 node = nodes[p][slot]
@@ -198,7 +156,7 @@ def list_kernels(kind: Kind, real, serial: bool):
                     rank[slot] = start + smaller
             ranks[p] = rank
 
-    return name, number, fill, sort
+    return number, fill, sort
 
 
 @cache
@@ -264,8 +222,7 @@ def collect_kernels(real, linear, serial: bool):
             diagonal[node] = M()
         for s in range(sets.shape[0]):
             own = sets[s]
-            for i in range(own.number[0]):
-                p = own.listed[i]
+            for p in range(own.count[0]):
                 if own.used[p] != 0:
                     for slot in range(wp.static(SLOTS)):
                         if own.ranks[p][slot] >= 0:
@@ -281,8 +238,7 @@ def collect_kernels(real, linear, serial: bool):
             between[i] = M()
         for s in range(sets.shape[0]):
             own = sets[s]
-            for i in range(own.number[0]):
-                p = own.listed[i]
+            for p in range(own.count[0]):
                 if own.used[p] != 0:
                     for side in range(own.edges):
                         if own.ranks[p][2 * side] >= 0:

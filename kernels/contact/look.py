@@ -1,4 +1,4 @@
-"""What pairs in contact look like: gaps, places and forces, for whoever asks."""
+"""What pairs in contact look like: gaps and places, for whoever asks."""
 
 from functools import cache
 
@@ -11,7 +11,7 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 
 @cache
 def look_kernel(kind: Kind, real):
-    """Gap [m], the place between the closest points [m], and the force on the first thing [N] of each pair."""
+    """Gap [m] of each pair, and the place between its closest points [m]."""
     Sides, X = sides_struct(real), wp.types.vector(3, real)
     (slots, _, thickness, closest), corners = pair_functions(kind, real), corners_function(real)
 
@@ -20,11 +20,8 @@ def look_kernel(kind: Kind, real):
         pairs: wp.array(dtype=wp.vec2i),
         sides: Sides,
         x: wp.array(dtype=X),
-        used: wp.array(dtype=int),
-        gradient: wp.array2d(dtype=X),
         gap_out: wp.array(dtype=real),
         point_out: wp.array(dtype=X),
-        force_out: wp.array(dtype=X),
     ):
         p = wp.tid()
         w = pairs[p][0] / sides.counts[0]
@@ -33,13 +30,9 @@ def look_kernel(kind: Kind, real):
         r, weights = closest(corners(x, nodes))
         gap_out[p] = wp.length(r) - thickness(sides, i, j, w)
         point = real(-0.5) * r
-        force = X()
         for k in range(wp.static(kind.first)):
             point += x[nodes[k]] * weights[k]
-            if used[p] != 0:
-                force -= gradient[k, p]
         point_out[p] = point
-        force_out[p] = force
 
     return look
 

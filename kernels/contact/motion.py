@@ -8,7 +8,7 @@ from ddg_warp.kernels.contact.distance import distance_functions
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct, surface_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
-SAMPLES = 64  # edges of a world whose motion says what is common
+SAMPLES = 16  # edges of a world whose motion says what is common
 
 
 @cache

@@ -131,34 +131,31 @@ def lag_kernel(kind: Kind, real, linear, serial: bool, directed: bool):
             factor.nodes[p] = contact.nodes[p]
             factor.used[p] = 0
             lagged.bound[p] = real(0.0)
-            if contact.used[p] != 0:
-                w, i, _j, a, b = groups(law, sides, pairs[p])
-                mu = law.friction[w, a, b]
-                push = V()
-                for slot in range(wp.static(kind.first)):
-                    push += gradient[slot, p]
-                normal = wp.length(push)
-                # what is no number shows in the energy
-                if not (mu * normal <= real(0.0)):
-                    n = push / normal
-                    if wp.static(directed):
-                        first = w * sides.first.nodes_a_world
-                        d = x[beside[i][1] + first] - x[beside[i][0] + first]
-                        t1, t2, back = along_rod(n, d, ways[a, b])
-                        lagged.tangent[2, p] = back
-                    else:
-                        t1, t2 = tangents(n)
-                    weight = W()
-                    for slot in range(wp.static(size)):
-                        weight[slot] = wp.dot(gradient[slot, p], n) / normal
-                    lagged.bound[p] = mu * normal
-                    lagged.weight[p] = weight
-                    lagged.tangent[0, p] = t1
-                    lagged.tangent[1, p] = t2
-                    for k in range(wp.static(ROWS)):
-                        factor.weight[k, p] = L(
-                            linear(weight[0]), linear(weight[1]), linear(weight[2]), linear(weight[3])
-                        )
+            w, i, _j, a, b = groups(law, sides, pairs[p])
+            mu = law.friction[w, a, b]
+            push = V()
+            for slot in range(wp.static(kind.first)):
+                push += gradient[slot, p]
+            normal = wp.length(push)
+            # what is no number shows in the energy
+            if not (mu * normal <= real(0.0)):
+                n = push / normal
+                if wp.static(directed):
+                    first = w * sides.first.nodes_a_world
+                    d = x[beside[i][1] + first] - x[beside[i][0] + first]
+                    t1, t2, back = along_rod(n, d, ways[a, b])
+                    lagged.tangent[2, p] = back
+                else:
+                    t1, t2 = tangents(n)
+                weight = W()
+                for slot in range(wp.static(size)):
+                    weight[slot] = wp.dot(gradient[slot, p], n) / normal
+                lagged.bound[p] = mu * normal
+                lagged.weight[p] = weight
+                lagged.tangent[0, p] = t1
+                lagged.tangent[1, p] = t2
+                for k in range(wp.static(ROWS)):
+                    factor.weight[k, p] = L(linear(weight[0]), linear(weight[1]), linear(weight[2]), linear(weight[3]))
 
     return lag
 
@@ -210,8 +207,7 @@ def friction_kernel(density: Density, real, linear, serial: bool, directed: bool
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def evaluate(
         pairs: wp.array(dtype=wp.vec2i),
-        listed: wp.array(dtype=int),
-        number: wp.array(dtype=int),
+        count: wp.array(dtype=int),
         things: int,
         lagged: Lagged,
         velocity: real,
@@ -228,10 +224,9 @@ def friction_kernel(density: Density, real, linear, serial: bool, directed: bool
         gradient: wp.array2d(dtype=V),
     ):
         tid = wp.tid()
-        if tid >= number[0]:
+        if tid >= count[0]:
             return
-        for i in range(tid, until(tid, number[0])):
-            p = listed[i]
+        for p in range(tid, until(tid, count[0])):
             world = pairs[p][0] / things
             inverse = rate[world]
             bound = lagged.bound[p]

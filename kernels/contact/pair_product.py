@@ -57,9 +57,8 @@ def product_kernels(real, linear, serial: bool):
         tid = wp.tid()
         for s in range(sets.shape[0]):
             own = sets[s]
-            if tid < own.number[0]:
-                for i in range(tid, until(tid, own.number[0])):
-                    p = own.listed[i]
+            if tid < own.count[0]:
+                for p in range(tid, until(tid, own.count[0])):
                     used = own.used[p]
                     if used != 0:
                         n = own.nodes[p]

@@ -86,8 +86,11 @@ def read_functions(kind: Kind, real):
 
 @cache
 def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
-    """sieve(...) pairs for those that push each other, and evaluate(...) these, once they are listed: by one thread alone as it sieves,
-    else by `sums.choose_kernel`."""
+    """sieve(...) candidates for those that push each other; pack(...) these, one after the other, in their order; and evaluate(...).
+
+    One thread alone packs as it sieves. Packed are pairs, their nodes, and of each first thing where its pairs start and how many they
+    are, as of the candidates.
+    """
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
     V, W4 = wp.types.vector(3, real), wp.types.vector(4, linear)
     L = wp.types.vector(3, linear)
@@ -96,6 +99,13 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
     bends = bend_function(kind, density, real)
     given, corners = read_functions(kind, real)
     until, rows = until_function(serial), rows_of(kind)
+    slots, *_ = pair_functions(kind, real)
+
+    @wp.func
+    def nodes_of(sides: Sides, pair: wp.vec2i):
+        w = pair[0] / sides.counts[0]
+        n = slots(sides, pair[0] - w * sides.counts[0], pair[1] - w * sides.counts[1], w)
+        return wp.vec4i(n[0], n[1], n[2], n[3])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def sieve(
@@ -104,37 +114,79 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
         sides: Sides,
         law: Law,
         x: wp.array(dtype=V),
-        factor: Factor,
-        listed: wp.array(dtype=int),
-        number: wp.array(dtype=int),
+        marks: wp.array(dtype=int),
         gap: wp.array(dtype=real),
+        pairs_out: wp.array(dtype=wp.vec2i),
+        nodes_out: wp.array(dtype=wp.vec4i),
+        starts_out: wp.array(dtype=int),
+        partners_out: wp.array(dtype=int),
+        count_out: wp.array(dtype=int),
     ):
-        """Lowers the smallest gap [m] of each world to those of pairs, too."""
+        """Lowers the smallest gap [m] of each world to those of candidates, too; `partners_out` are zero before one thread packs."""
         tid, found = wp.tid(), int(0)
         if tid >= count[0]:
             if wp.static(serial):
-                number[0] = 0
+                count_out[0] = 0
             return
-        for pair in range(tid, until(tid, count[0])):
-            p, _threshold, _inner = given(law, sides, pairs[pair])
-            _w, d, _n = near(corners(x, factor.nodes[pair]))
-            world = pairs[pair][0] / sides.counts[0]
+        for k in range(tid, until(tid, count[0])):
+            pair = pairs[k]
+            p, _threshold, _inner = given(law, sides, pair)
+            nodes = nodes_of(sides, pair)
+            _w, d, _n = near(corners(x, nodes))
+            world = pair[0] / sides.counts[0]
             if d - p[2] < gap[world]:
                 wp.atomic_min(gap, world, d - p[2])
             # ends of edges are no nearer; what is no number shows in the energy
-            used = p[0] > real(0.0) and not (d >= p[1] + p[2])
-            factor.used[pair] = wp.where(used, 1, 0)
+            pushes = p[0] > real(0.0) and not (d >= p[1] + p[2])
             if wp.static(serial):
-                listed[found] = pair
-                found += wp.where(used, 1, 0)
+                if pushes:
+                    pairs_out[found] = pair
+                    nodes_out[found] = nodes
+                    if partners_out[pair[0]] == 0:
+                        starts_out[pair[0]] = found
+                    partners_out[pair[0]] = partners_out[pair[0]] + 1
+                    found += 1
+            else:
+                marks[k] = wp.where(pushes, 1, 0)
         if wp.static(serial):
-            number[0] = found
+            count_out[0] = found
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def pack(
+        pairs: wp.array(dtype=wp.vec2i),
+        count: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
+        partners: wp.array(dtype=int),
+        sides: Sides,
+        marks: wp.array(dtype=int),
+        before: wp.array(dtype=int),
+        pairs_out: wp.array(dtype=wp.vec2i),
+        nodes_out: wp.array(dtype=wp.vec4i),
+        starts_out: wp.array(dtype=int),
+        partners_out: wp.array(dtype=int),
+        count_out: wp.array(dtype=int),
+    ):
+        """Thread k has candidate k and first thing k; `before` each candidate so many are marked."""
+        k = wp.tid()
+        most = count[0]
+        if k < most and marks[k] != 0:
+            pairs_out[before[k]] = pairs[k]
+            nodes_out[before[k]] = nodes_of(sides, pairs[k])
+        if k < starts.shape[0]:
+            start, number = int(0), int(0)
+            if most > 0 and partners[k] > 0:
+                last = starts[k] + partners[k] - 1
+                start = before[starts[k]]
+                number = before[last] + marks[last] - start
+            starts_out[k] = start
+            partners_out[k] = number
+        if k == 0:
+            count_out[0] = wp.where(most > 0, before[wp.max(most - 1, 0)] + marks[wp.max(most - 1, 0)], 0)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def evaluate(
         pairs: wp.array(dtype=wp.vec2i),
-        listed: wp.array(dtype=int),
-        number: wp.array(dtype=int),
+        count: wp.array(dtype=int),
         sides: Sides,
         law: Law,
         x: wp.array(dtype=V),
@@ -142,12 +194,11 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
         energy: wp.array(dtype=real),
         gradient: wp.array2d(dtype=V),
     ):
-        """Energy, gradient by slot and factor of each pair that is listed."""
+        """Energy, gradient by slot and factor of each pair."""
         tid = wp.tid()
-        if tid >= number[0]:
+        if tid >= count[0]:
             return
-        for i in range(tid, until(tid, number[0])):
-            pair = listed[i]
+        for pair in range(tid, until(tid, count[0])):
             p, threshold, inner = given(law, sides, pairs[pair])
             at = corners(x, factor.nodes[pair])
             w, d, n = near(at)
@@ -167,7 +218,7 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
             factor.used[pair] = used
             factor.bend[pair] = linear(bends(at, p, threshold, d))
 
-    return sieve, evaluate
+    return sieve, pack, evaluate
 
 
 @cache
@@ -185,8 +236,7 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: boo
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def product(
         pairs: wp.array(dtype=wp.vec2i),
-        listed: wp.array(dtype=int),
-        number: wp.array(dtype=int),
+        count: wp.array(dtype=int),
         sides: Sides,
         law: Law,
         x: wp.array(dtype=V),
@@ -196,10 +246,9 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: boo
         placed: wp.array(dtype=L),
     ):
         tid = wp.tid()
-        if tid >= number[0]:
+        if tid >= count[0]:
             return
-        for i in range(tid, until(tid, number[0])):
-            pair = listed[i]
+        for pair in range(tid, until(tid, count[0])):
             asked = True
             if wp.static(unbent):
                 asked = factor.bend[pair] == linear(0.0)

@@ -165,7 +165,8 @@ def reduce_kernel(nb: int, linear, first: bool, tensions: int = 0, packs: bool =
 
     The first one reads blocks of nodes; of the dofs of a node the last ones may be `tensions`, with negative pivots.
     Thread c of a block has column c of its matrix, then the right-hand side, then the columns of its coupling. Each factors both
-    neighbours for itself, one after the other in a loop that is not unrolled: that keeps them in registers.
+    neighbours for itself, one after the other in a loop that is not unrolled: that keeps them in registers. All of them read the same
+    blocks: so those of as many chains as fill what memory brings at once are neighbours, and find them in the cache.
 
     If it `packs` there is no right-hand side, and what is kept goes to its place for many, see `reduction_again`.
     """
@@ -198,14 +199,18 @@ def reduce_kernel(nb: int, linear, first: bool, tensions: int = 0, packs: bool =
         blocks: int,
         neighbours: int,
         at_kept: int,
+        together: int,
         matrix_out: wp.array3d(dtype=linear),
         right_out: wp.array3d(dtype=linear),
         kept_out: wp.array3d(dtype=linear),
         bad: wp.array(dtype=int),
     ):
-        """`blocks` of the level; `neighbours` is 2, which the compiler must not know; `at_kept`: odd blocks that are packed before."""
-        c, j, r = wp.tid()
-        if wanted[r] == 0:
+        """`blocks` of the level; `neighbours` is 2, which the compiler must not know; `at_kept`: odd blocks that are packed before;
+        `together`: chains of threads that are neighbours.
+        """
+        j, group, c, r = wp.tid()
+        r += group * together
+        if r >= count.shape[0] or wanted[r] == 0:
             return
         n = blocks
         if wp.static(first):

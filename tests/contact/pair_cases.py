@@ -88,6 +88,11 @@ def assembled(result: PairTerms, n: int, at=None) -> np.ndarray:
     return np.stack([times(result, v, at) for v in unit], -1).reshape(n, 3, n, 3)
 
 
+def used_of(part) -> np.ndarray:
+    """Places of the pairs of an element list that are used."""
+    return np.flatnonzero(part.factor.used.numpy()[: int(part.count.numpy()[0])])
+
+
 def repeats(run) -> None:
     """Whether two runs agree to the bit, of what is not all zero."""
     for first, again in zip(run(), run(), strict=True):

@@ -48,11 +48,11 @@ def test_searches_within_a_step_leave_friction_alone(device):
     """Lists of contact change, then change back; and slip may count from elsewhere."""
     result, at, x, _ = rubbed("crossing", device)
     before = state(result)
-    number = [part.count.numpy()[0] for part in result.lists]
+    number = [pairs.count.numpy()[0] for pairs in result.search.lists]
     away = upload(x + 2.0 * MARGIN * np.random.default_rng(2).normal(size=x.shape), device)
     result.search.search(away)
     result.evaluate(away)
-    assert [part.count.numpy()[0] for part in result.lists] != number
+    assert [pairs.count.numpy()[0] for pairs in result.search.lists] != number
     result.evaluate(at, rates(result))
     assert all((a == b).all() for a, b in zip(state(result), before, strict=True))
     result.evaluate(at, rates(result), upload(x, device))

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 from friction_cases import MU, SLIP, SLIPS, VELOCITY, each_case, each_form, hold_to_differences, rates, rubbed
-from pair_cases import LAWS, assembled, bundle, central, psi, state, terms, times
+from pair_cases import LAWS, assembled, bundle, central, psi, state, terms, times, used_of
 
 from ddg_warp.solve.contact.shapes import Shapes
 
 
 def shares_of(part) -> np.ndarray:
     """Friction of pairs over mu N, where there is any."""
-    used = part.factor.used.numpy() != 0
+    used = used_of(part)
     force = part.gradient.numpy()[: part.found.kind.first, used].sum(0)
     return np.linalg.norm(force, axis=1) / part.lagged.bound.numpy()[used]
 
@@ -24,7 +24,7 @@ def share(form: str, y):
 @each_form
 def test_forces_and_products_are_differences(device, case, form):
     result, at, _, after = rubbed(case, device, form)
-    assert all((part.factor.used.numpy() != 0).sum() > 5 for part in result.frictions)
+    assert all(len(used_of(part)) > 5 for part in result.frictions)
     shares = np.concatenate([shares_of(part) for part in result.frictions])
     assert (shares < 0.8).sum() > 5 and (shares > 0.95).sum() > 5
     hold_to_differences(result, at, after)
@@ -120,7 +120,7 @@ def test_no_resultant_and_the_moment_of_the_offsets(device, case):
     assert np.abs(forces.sum(0)).max() < 1e-14 * largest
     moment, most = np.zeros(3), 0.0
     for part in result.frictions:
-        used = part.factor.used.numpy() != 0
+        used = used_of(part)
         weight, bound = part.lagged.weight.numpy()[used], part.lagged.bound.numpy()[used]
         nodes, pull = part.factor.nodes.numpy()[used], -part.gradient.numpy()[:, used]
         first = part.found.kind.first
@@ -145,7 +145,7 @@ def test_nodes_of_edges_in_line_are_held_by_no_more_than_what_pushes_them(device
     at.assign(x + SLIP * np.random.default_rng(1).normal(size=x.shape))
     result.evaluate(at, rates(result))
     for part, bound in zip(result.frictions, most, strict=True):
-        used = part.factor.used.numpy() != 0
+        used = used_of(part)
         force = np.linalg.norm(part.gradient.numpy(), axis=-1)
         assert (force <= bound * (1.0 + 1e-9))[:, used].all() and (force > 0.1 * bound)[:, used].any()
 
@@ -161,7 +161,7 @@ def test_friction_takes_energy(device, case, form):
         assert 0.0 < energy < taken
         most = 0.0
         for part in result.frictions:
-            used = part.factor.used.numpy() != 0
+            used = used_of(part)
             moved = (after - x)[part.factor.nodes.numpy()[used]]
             length = np.linalg.norm(np.einsum("ps,psd->pd", part.lagged.weight.numpy()[used], moved), axis=1)
             most += (part.lagged.bound.numpy()[used] * length).sum()
@@ -211,6 +211,6 @@ def test_no_friction_without_rate_or_coefficient(device):
         assert not some.dissipated.numpy().any()
     some.evaluate(at, rates(some))
     for part, sizes in zip(some.frictions, ((2, 2), (1, 3)), strict=True):
-        pairs = part.pairs.numpy()[part.factor.used.numpy() != 0]
+        pairs = part.pairs.numpy()[used_of(part)]
         one, other = (groups[shapes.things(size)[2][pairs[:, side]]] for side, size in enumerate(sizes))
         assert len(pairs) > 5 and (one != other).all()

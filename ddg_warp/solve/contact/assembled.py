@@ -26,16 +26,16 @@ def hessian(terms, x: wp.array) -> sparse.csc_matrix:
 
 def _entries(elements, law, x: wp.array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows, columns and values of the Hessians of all pairs of `ContactElements` that push each other."""
-    used = elements.listed.numpy()[: int(elements.number.numpy()[0])]
-    if not used.size:
+    number = int(elements.count.numpy()[0])
+    if not number:
         return np.zeros(0, int), np.zeros(0, int), np.zeros(0)
-    out = arrays.allocate((COLUMNS, SLOTS, len(used)), wp.types.vector(3, elements.linear), x.device)
-    threads = arrays.takers(COLUMNS * len(used), x.device)
+    out = arrays.allocate((COLUMNS, SLOTS, number), wp.types.vector(3, elements.linear), x.device)
+    threads, every = arrays.takers(COLUMNS * number, x.device), wp.array(np.arange(number), dtype=int, device=x.device)
     kernel = columns_kernel(elements.found.kind, elements.density, elements.real, elements.linear)
-    inputs = [elements.pairs, elements.found.sides, law, x, elements.factor, elements.listed, elements.number, threads]
+    inputs = [elements.pairs, elements.found.sides, law, x, elements.factor, every, elements.count, threads]
     wp.launch(kernel, threads, inputs, [out], device=x.device)
-    values = arrays.download(out).astype(float).transpose(2, 0, 1, 3).reshape(len(used), COLUMNS, COLUMNS)
-    nodes = elements.factor.nodes.numpy()[used]
-    dofs = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(used), COLUMNS)
+    values = arrays.download(out).astype(float).transpose(2, 0, 1, 3).reshape(number, COLUMNS, COLUMNS)
+    nodes = elements.factor.nodes.numpy()[:number]
+    dofs = (3 * nodes[:, :, None] + np.arange(3)).reshape(number, COLUMNS)
     columns, rows = (np.broadcast_to(v, values.shape) for v in (dofs[:, :, None], dofs[:, None, :]))
     return rows.ravel(), columns.ravel(), values.ravel()

@@ -43,8 +43,8 @@ class BroadPhase:
     Attributes:
         lists: a `PairList` for each kind of pairs that there can be.
         overflow: (1,), not zero once pairs did not fit: `fit` has to follow, and whatever came of the pairs is to be done again.
-        searches: (1,) how many there were; walks: (1,) for how many of them boxes were met; walked: as of the last `fit`
-            or `check`.
+        searches: (1,) how many there were; walks: (1,) for how many of them boxes were met; looks: (1,), see `Runs`;
+            sought: walks and looks as of the last `fit` or `check`.
         gap [m], time and crossed, of each world: see `measure`, `impact` and `crossings`.
         shares: (worlds times units,), limited: of each world, how many of them are below 1; see `filter`.
         every: (worlds,) ones, of motions in which all nodes of every world go by one share.
@@ -89,9 +89,9 @@ class BroadPhase:
         self._shift = wp.zeros(worlds, dtype=x.dtype, device=self.device)
         self._never, self.every = (wp.full(worlds, flag, dtype=int, device=self.device) for flag in (0, 1))
         self.searches, self._fits, self._beyond = (wp.zeros(1, dtype=int, device=self.device) for _ in range(3))
-        self._read = wp.zeros(3, dtype=int, device=self.device)  # at once, after every step
-        self.overflow, self._lost, self.walks = (self._read[k : k + 1] for k in range(3))
-        self.walked = 0
+        self._read = wp.zeros(4, dtype=int, device=self.device)  # at once, after every step
+        self.overflow, self._lost, self.walks, self.looks = (self._read[k : k + 1] for k in range(4))
+        self.sought = (0, 0)
         # of boxes and of pairs, whether they are out of date, and whether the last `update` found them anew
         self._stale, self._done = (wp.zeros(2, dtype=int, device=self.device) for _ in range(2))
         self._edges = things[2]
@@ -252,7 +252,8 @@ class BroadPhase:
 
     def _checked(self) -> bool:
         """The same; whether pairs did not fit."""
-        overflow, node, self.walked = (int(value) for value in self._read.numpy() - [0, 1, 0])
+        overflow, lost, *sought = self._read.numpy().tolist()
+        self.sought, node = tuple(sought), lost - 1
         if node >= 0:
             self._lost.zero_()
             world, node = divmod(node, len(self.shapes.points))

@@ -47,9 +47,7 @@ class FrictionElements(PairElements):
             ways = wp.array(ways, dtype=wp.types.vector(3, real), device=self.device)
             self.directions = arrays.upload(beside.astype(np.int32), wp.vec2i, self.device), ways
         self.kernels += [self._lag, self._evaluate]
-        self._kept = ("count", "starts", "partners", "number")
-        for name in self._kept:
-            setattr(self, name, wp.zeros_like(getattr(contact, name)))
+        self._kept = ("count", "starts", "partners")
         self.lagged = lagged_struct(real)()
         self.reserve()
 
@@ -59,7 +57,6 @@ class FrictionElements(PairElements):
         for name in self._kept:
             getattr(self, name).zero_()
         capacity = self.found.capacity
-        self.pairs = wp.zeros(capacity, dtype=wp.vec2i, device=self.device)
         pair = wp.types.vector(2, self.real)
         self._slip, self._along = (arrays.allocate((2, capacity), pair, self.device) for _ in range(2))
         self.work, self.lagged.bound = (wp.zeros(capacity, dtype=self.real, device=self.device) for _ in range(2))
@@ -73,13 +70,13 @@ class FrictionElements(PairElements):
         inputs += [of.factor, of.gradient]
         outputs = [self.pairs, self.factor, self.lagged, self._slip, self._along]
         self._sweep(self._lag, self.found.capacity, inputs, outputs)
-        for name in (*self._kept, "listed"):
+        for name in self._kept:
             wp.copy(getattr(self, name), getattr(of, name))
-        self._items.list(self.listed, self.number, self.factor.nodes)
+        self._items.list(self.count, self.factor.nodes)
 
     def evaluate(self, x, start, rate: wp.array, iterates: tuple) -> None:
         """Write energies, work, gradients and factors at x by the slip since `start`."""
-        inputs = [self.pairs, self.listed, self.number, self.found.first.count]
+        inputs = [self.pairs, self.count, self.found.first.count]
         inputs += [self.lagged, self._velocity, rate, *iterates, x, start]
         outputs = [self._slip, self._along, self.factor, self.energy, self.work, self.gradient]
         self._sweep(self._evaluate, self.found.capacity, inputs, outputs)

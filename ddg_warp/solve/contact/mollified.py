@@ -82,5 +82,5 @@ class Unkept:
     def multiply(self, v: wp.array) -> None:
         """Write their products with v."""
         of, (x, law) = self._of, self._at
-        inputs = [of.pairs, of.listed, of.number, of.found.sides, law, x, of.factor, v, of.ranks]
+        inputs = [of.pairs, of.count, of.found.sides, law, x, of.factor, v, of.ranks]
         arrays.sweep(self._multiply, of.found.capacity, inputs, [of.placed], of.device)

@@ -17,17 +17,17 @@ class NodeItems:
 
     Attributes:
         numbers, places: of each node, how many items it has and where they start in `items`.
-        ranks: of each pair that is listed, the places of its items, -1 where it has none.
+        ranks: of each pair, the places of its items, -1 where it has none.
     """
 
-    def __init__(self, kind: Kind, nodes: int, real, silent: wp.array):
+    def __init__(self, kind: Kind, nodes: int, silent: wp.array):
         self.device, self._size, self._silent = silent.device, kind.first + kind.second, silent
         self._both = wp.zeros((2, nodes), dtype=int, device=self.device)  # zeroed at once
         self.numbers, self._filled = self._both[0], self._both[1]
         self._running = RunningSums(self.numbers)
         self.places = self._running.starts
-        self.name, self._number, self._fill, self._sort = gather.list_kernels(kind, real, arrays.serial(self.device))
-        self.kernels = [self.name, self._number, self._fill, self._sort, *self._running.kernels]
+        self._number, self._fill, self._sort = gather.list_kernels(kind, arrays.serial(self.device))
+        self.kernels = [self._number, self._fill, self._sort, *self._running.kernels]
 
     def reserve(self, capacity: int) -> None:
         """Make room for the items of so many pairs."""
@@ -35,10 +35,10 @@ class NodeItems:
         self._unordered = self.items if arrays.serial(self.device) else wp.zeros_like(self.items)
         self.ranks = wp.zeros(capacity, dtype=wp.vec4i, device=self.device)
 
-    def list(self, listed: wp.array, number: wp.array, nodes: wp.array) -> None:
-        """Of pairs with these nodes those that are listed, so many."""
+    def list(self, count: wp.array, nodes: wp.array) -> None:
+        """Of so many pairs, with these nodes."""
         self._both.zero_()
-        inputs = [listed, number, nodes, self._silent]
+        inputs = [count, nodes, self._silent]
         self._sweep(self._number, len(nodes), inputs, [self.numbers])
         self._running()
         self._sweep(self._fill, len(nodes), [*inputs, self.places], [self._filled, self._unordered, self.ranks])

@@ -22,8 +22,7 @@ class PairElements:
     Attributes:
         factor: see `gather.factor_struct`; energy: of each pair (capacity,) [J]; gradient: by slot (SLOTS, capacity) [N].
         placed: see `gather.set_struct`.
-        pairs, count, starts, partners: as those of a `PairList`; of the subclass.
-        listed, number: pairs that may be used, in order, and how many; of all others `factor.used` is zero.
+        pairs, count, starts, partners: as those of a `PairList`.
         mollified: those whose matrices take more than a factor and what turns (`Mollified`); None without.
         numbers, places, items, ranks: as of `NodeItems`, which the subclass has list the pairs.
     """
@@ -32,10 +31,11 @@ class PairElements:
 
     def __init__(self, found: PairList, rows: int, nodes: int, real, linear, silent: wp.array):
         self.found, self.device, self.rows, self.real, self.linear = found, found.device, rows, real, linear
-        self._items = NodeItems(found.kind, nodes, real, silent)
+        self._items = NodeItems(found.kind, nodes, silent)
         self.numbers, self.places = self._items.numbers, self._items.places
         self.factor = gather.factor_struct(linear)()
-        self.number = wp.zeros(1, dtype=int, device=self.device)
+        self.count = wp.zeros(1, dtype=int, device=self.device)
+        self.starts, self.partners = (wp.zeros(found.first.all, dtype=int, device=self.device) for _ in range(2))
         self.kernels = [*self._items.kernels]
 
     def reserve(self) -> None:
@@ -51,12 +51,12 @@ class PairElements:
                 outcome="too_many_pairs",
             )
         vector = wp.types.vector(3, linear)
+        self.pairs = wp.zeros(capacity, dtype=wp.vec2i, device=self.device)
         self.factor.nodes = wp.zeros(capacity, dtype=wp.vec4i, device=self.device)
         self.factor.used = wp.zeros(capacity, dtype=int, device=self.device)
         self.factor.bend = wp.zeros(capacity, dtype=linear, device=self.device)
         self.factor.direction = arrays.allocate((self.rows, capacity), vector, self.device)
         self.factor.weight = arrays.allocate((self.rows, capacity), wp.types.vector(4, linear), self.device)
-        self.listed = wp.zeros(capacity, dtype=int, device=self.device)
         self.energy = wp.zeros(capacity, dtype=self.real, device=self.device)
         self.gradient = arrays.allocate((gather.SLOTS, capacity), wp.types.vector(3, self.real), self.device)
         self._items.reserve(capacity)

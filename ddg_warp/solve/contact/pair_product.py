@@ -70,9 +70,8 @@ class PairProduct:
         own, kind = set_struct(self._real, self._linear)(), part.found.kind
         for name in ("nodes", "used", "direction", "weight", "bend"):
             setattr(own, name, getattr(part.factor, name))
-        for name in ("pairs", "gradient", "placed", "places", "numbers", "items", "ranks"):
+        for name in ("pairs", "count", "gradient", "placed", "places", "numbers", "items", "ranks"):
             setattr(own, name, getattr(part, name))
-        own.listed, own.number = part.listed, part.number
         for name in ("marks", "starts", "columns") if part.mollified and part.mollified.keeps else ():
             setattr(own, name, getattr(part.mollified, name))
         own.kind = KINDS.index(kind) if isinstance(part, ContactElements) else -1

@@ -93,12 +93,9 @@ class PairTerms:
         told_not = np.zeros(len(search.shapes.points), np.uint8)
         told_not[[] if silent is None else silent] = 1
         told_not = wp.array(told_not, dtype=wp.uint8, device=self.device)
-        self._listed = wp.full(1, -1, dtype=int, device=self.device)
-        self._stale = wp.zeros(1, dtype=int, device=self.device)
         self.lists = [
             ContactElements(pairs, law, nodes, self.real, self.linear, told_not, exact) for pairs in search.lists
         ]
-        self._begin = gather.begin_kernel(self.real)
         self._collect, self._join = gather.collect_kernels(self.real, self.linear, arrays.serial(self.device))
         self._version, self._lagged = search.version, -1
         self.frictions = self._with_friction(rubs, ways, friction_law, velocity, told_not)
@@ -113,7 +110,7 @@ class PairTerms:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         parts = [kernel for part in self._parts for kernel in part.kernels]
-        own = [self._begin, self._collect, self._join]
+        own = [self._collect, self._join]
         return [*own, *self._product.kernels, *self._totals.kernels, *parts]
 
     @property
@@ -132,7 +129,6 @@ class PairTerms:
         for product in filter(None, (self._product, self._rub)):
             product.fit()
         self._totals.fit()
-        self._listed.fill_(-1)
         self._version = self.search.version
         return True
 
@@ -187,13 +183,10 @@ class PairTerms:
         self._totals(self.search.overflow)
 
     def _start_anew(self) -> None:
-        """Name the nodes of pairs, if there was a search since; no gap was seen."""
+        """No gap was seen yet."""
         if self._version != self.search.version:
             raise SolverError("the lists of pairs have grown; call fit() of these terms, and capture graphs anew")
-        inputs = [self.search.searches, self.search.reach]
-        outputs = [self._listed, self._stale, self.gap]
-        wp.launch(self._begin, self.search.worlds, inputs, outputs, device=self.device)
-        wp.capture_if(self._stale, self._list)
+        self.gap.fill_(self.search.reach)
 
     def product(self, v: wp.array, out: wp.array, x: wp.array | None = None, wanted: wp.array | None = None) -> None:
         """out += H v of the last `evaluate`, vectors of 3 (worlds times nodes,).
@@ -267,7 +260,3 @@ class PairTerms:
             )
             for part in self.lists
         ]
-
-    def _list(self) -> None:
-        for part in self.lists:
-            part.list()

@@ -61,7 +61,7 @@ class Runs:
         self.doubt = self.known[DOUBT]
         self.doubt.fill_(1)
         self.known[AHEAD].fill_(FIRST)
-        self._again, self.looks = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
+        self._again, self.looks = wp.zeros(1, dtype=int, device=device), search.looks
         serial = arrays.serial(device)
         *_, self._common = motion_kernels(real, serial)
         made = run_kernels(worlds > 1, real, serial)

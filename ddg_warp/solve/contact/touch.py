@@ -103,24 +103,20 @@ class Touch:
 
     def _pairs(self, pairs, terms, rubs, x: wp.array) -> dict[str, np.ndarray]:
         count = int(pairs.count.numpy()[0])
-        friction = np.zeros((count, 3))
-        if rubs:  # whose pairs are those of contact, in their order
-            used = np.flatnonzero(rubs.factor.used.numpy()[:count])
-            friction[used] = -rubs.gradient.numpy()[: pairs.kind.first, used].sum(0)
         gap = wp.zeros(count, dtype=self.net.real, device=x.device)
-        point, force = (wp.zeros(count, dtype=x.dtype, device=x.device) for _ in range(2))
+        point = wp.zeros(count, dtype=x.dtype, device=x.device)
         if count:
-            inputs = [pairs.pairs, pairs.sides, x, terms.factor.used, terms.gradient]
             kernel = look_kernel(pairs.kind, self.net.real)
-            wp.launch(kernel, count, inputs, [gap, point, force], device=x.device)
+            wp.launch(kernel, count, [pairs.pairs, pairs.sides, x], [gap, point], device=x.device)
         i, j = pairs.pairs.numpy()[:count].reshape(-1, 2).T
+        force, friction = (_of_first(part, pairs) for part in (terms, rubs))
         return {
             "world": i // pairs.first.count,
             "sizes": np.broadcast_to([pairs.first.size, pairs.second.size], (count, 2)),
             "things": np.column_stack([i % pairs.first.count, j % pairs.second.count]),
             "gap": gap.numpy(),
             "point": point.numpy().reshape(-1, 3),
-            "force": force.numpy().reshape(-1, 3),
+            "force": force,
             "friction": friction,
         }
 
@@ -136,6 +132,20 @@ class Touch:
         )
         world = f" in world {found['world'][k]}" if self.net.worlds > 1 else ""
         return float(found["gap"][k]), f"{one} and {other}{world}"
+
+
+def _of_first(part, pairs) -> np.ndarray:
+    """Forces of `PairElements` on the first things of candidates (count, 3) [N], none where `part` is None."""
+    count = int(pairs.count.numpy()[0])
+    forces, own = np.zeros((count, 3)), 0 if part is None else int(part.count.numpy()[0])
+    if own:
+        used = np.flatnonzero(part.factor.used.numpy()[:own])
+        every, those = (
+            of.pairs.numpy()[:number].astype(np.int64) @ [pairs.second.all, 1]
+            for of, number in ((pairs, count), (part, own))
+        )  # sorted, both
+        forces[np.searchsorted(every, those[used])] = -part.gradient.numpy()[: pairs.kind.first, used].sum(0)
+    return forces
 
 
 def shapes_of(host) -> Shapes:

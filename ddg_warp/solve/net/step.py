@@ -144,9 +144,9 @@ class NetStep(PartStep):
         return self.alone is not before or (self.alone is not None and self.alone.adapt(s))
 
     @property
-    def walked(self) -> int:
-        """How many times trees of searches were walked, as of the last `outgrown`."""
-        return self.newton.contact.search.walked if self.newton.contact else 0
+    def sought(self) -> tuple[int, int]:
+        """How many times trees of searches were walked, and that of runs, as of the last `outgrown`."""
+        return self.newton.contact.search.sought if self.newton.contact else (0, 0)
 
     def outgrown(self, before) -> bool:
         """Whether the last step, from a state `before`, had more pairs in contact than there was room for, and is to be done again.
