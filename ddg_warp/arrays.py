@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 THREADS = 256  # in a block, where a launch does not say
+MOST = 2**18  # threads that take turns: about as many as a large GPU has at once
 
 
 def allocate(shape: tuple[int, ...], dtype, device) -> wp.array:
@@ -75,6 +76,15 @@ def serial(device) -> bool:
 def takers(count: int, device) -> int:
     """How many threads take `count` things."""
     return min(1, count) if serial(device) else count
+
+
+def take_turns(kernel, count: int, inputs: list, outputs: list, device) -> None:
+    """Launch a kernel that goes over a list on the device with room for `count` things, of which there may be far fewer.
+
+    Its first argument is the number of threads, each of which takes one of so many things; others would start for nothing.
+    """
+    threads = min(takers(count, device), MOST)
+    wp.launch(kernel, threads, [threads, *inputs], outputs, device=device)
 
 
 def sweep(kernel, count: int, inputs: list, outputs: list, device, threads: int = THREADS, worlds: int = 1) -> None:

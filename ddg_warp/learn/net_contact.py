@@ -51,9 +51,9 @@ class ContactAdjoint:
         self._rubs, self._velocity = terms.frictions or [None] * len(terms.lists), given.law.velocity
         law, friction = LAWS[given.law.law], FRICTION[given.law.friction_law]
         kinds = [pairs.kind for pairs in search.lists]
-        self._pull = [pull_kernel(kind, law, real, serial) for kind in kinds]
+        self._pull = [pull_kernel(kind, law, real) for kind in kinds]
         directed = bool(terms.frictions) and terms.frictions[0].directions[0] is not None
-        self._rub = [rub_kernel(kind, law, friction, real, serial, directed) for kind in kinds if terms.frictions]
+        self._rub = [rub_kernel(kind, law, friction, real, directed) for kind in kinds if terms.frictions]
         self._direct = contact_sums.direction_kernels(real) if directed else ()
         self._leads = [self._led(search.shapes.beside(kind.first)) for kind in kinds if directed]
         self._sides = [contact_sums.side_kernels(kind, real) for kind in kinds]
@@ -112,7 +112,7 @@ class ContactAdjoint:
             read, pairs = [part.pairs, part.count, part.found.sides, terms.law], part.found.capacity
             self._items[i].list(part.count, part.factor.nodes)
             inputs = [*read, part.factor.nodes, q, w]
-            self._sweep(self._pull[i], pairs, inputs, [part.gradient, self._numbers])
+            self._take_turns(self._pull[i], pairs, inputs, [part.gradient, self._numbers])
             self._add_up(i, part, part.gradient, by_q)
             self._sum(i, part)
             if rub:
@@ -120,7 +120,7 @@ class ContactAdjoint:
                 read = [rub.pairs, rub.count, part.found.sides, terms.law, rub.factor.nodes, rub.factor.used]
                 inputs = [*read, before, q, w, self._velocity, rate, *rub.directions]
                 written = [rub.gradient, self._start_parts, self._numbers, self._by_direction]
-                self._sweep(self._rub[i], pairs, inputs, written)
+                self._take_turns(self._rub[i], pairs, inputs, written)
                 self._add_up(i, rub, rub.gradient, by_q)
                 self._add_up(i, rub, self._start_parts, by_before)
                 self._sum(i, rub)
@@ -173,6 +173,9 @@ class ContactAdjoint:
 
     def _zeros(self, *shape: int) -> wp.array:
         return wp.zeros(shape, dtype=self.net.real, device=self.net.device)
+
+    def _take_turns(self, kernel, count: int, inputs: list, outputs: list) -> None:
+        arrays.take_turns(kernel, count, inputs, outputs, self.net.device)
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
         arrays.sweep(kernel, count, inputs, outputs, self.net.device)

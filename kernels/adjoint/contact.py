@@ -23,22 +23,23 @@ from ddg_warp.kernels.contact.pair_terms import groups_function, law_struct, rea
 from ddg_warp.kernels.contact.surfaces import Kind, sides_struct
 from ddg_warp.kernels.densities import Density
 from ddg_warp.kernels.measures.slip import basis
-from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 STIFFNESS, RANGE, THICKNESS, FRICTION, RATE = range(5)
 NUMBERS = 5  # of a pair, that derivatives are by
 
 
 @cache
-def pull_kernel(kind: Kind, density: Density, real, serial: bool):
+def pull_kernel(kind: Kind, density: Density, real):
     """pull(...): what pairs bring by slot, and by their numbers (`NUMBERS`, capacity)."""
     Law, Sides = law_struct(real), sides_struct(real)
-    V, until = wp.types.vector(3, real), until_function(serial)
+    V = wp.types.vector(3, real)
     *_, along = pair_energy_functions(kind, density, real)
     given, corners = read_functions(kind, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pull(
+        threads: int,
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
         sides: Sides,
@@ -49,10 +50,7 @@ def pull_kernel(kind: Kind, density: Density, real, serial: bool):
         parts: wp.array2d(dtype=V),
         numbers: wp.array2d(dtype=real),
     ):
-        tid = wp.tid()
-        if tid >= count[0]:
-            return
-        for pair in range(tid, until(tid, count[0])):
+        for pair in range(wp.tid(), count[0], threads):
             p, threshold, inner = given(law, sides, pairs[pair])
             n = nodes[pair]
             dx, _dv, dp, _dt, _ds = wp.grad(along)(corners(x, n), -corners(w, n), p, threshold, inner)
@@ -67,7 +65,7 @@ def pull_kernel(kind: Kind, density: Density, real, serial: bool):
 
 
 @cache
-def rub_kernel(kind: Kind, density: Density, friction: Density, real, serial: bool, directed: bool):
+def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: bool):
     """rub(...): what friction brings by slot of the solution and of the start, and by the numbers of pairs, as `pull_kernel` has it.
 
     Where it is `directed`, by the directions of rods (capacity,), too, from `beside` by `ways` as of `pair_friction.lag_kernel`.
@@ -75,7 +73,7 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, serial: bo
     Law, Sides = law_struct(real), sides_struct(real)
     X, W, P = shape_types(real)
     V, E = wp.types.vector(3, real), wp.types.vector(2, real)
-    D, until = wp.types.vector(friction.parameter_size(2), real), until_function(serial)
+    D = wp.types.vector(friction.parameter_size(2), real)
     _, _, evaluate, _ = pair_energy_functions(kind, density, real)
     given, corners = read_functions(kind, real)
     tangents, groups, along_rod = basis(real), groups_function(real), directed_basis(real)
@@ -107,6 +105,7 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, serial: bo
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def rub(
+        threads: int,
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
         sides: Sides,
@@ -125,10 +124,7 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, serial: bo
         numbers: wp.array2d(dtype=real),
         directions: wp.array(dtype=V),
     ):
-        tid = wp.tid()
-        if tid >= count[0]:
-            return
-        for pair in range(tid, until(tid, count[0])):
+        for pair in range(wp.tid(), count[0], threads):
             for i in range(wp.static(NUMBERS)):
                 numbers[i, pair] = real(0.0)
             if wp.static(directed):

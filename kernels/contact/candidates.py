@@ -25,7 +25,7 @@ import warp as wp
 
 from ddg_warp.kernels.contact.motion import corners_function, relative_function
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
-from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 MOST = 2**31 - 1  # pairs that can be counted; more are told as so many
 
@@ -47,11 +47,11 @@ def query_function(grouped: bool, real):
 
 
 @cache
-def candidate_kernels(kind: Kind, grouped: bool, real, serial: bool):
+def candidate_kernels(kind: Kind, grouped: bool, real):
     """meet(...) of boxes, judge(...) by distance, and fill(...) the list of pairs."""
     Sides, X, Y = sides_struct(real), wp.types.vector(3, real), wp.types.matrix((4, 3), real)
     slots, may_touch, thickness, closest = pair_functions(kind, real)
-    begin, until = query_function(grouped, real), until_function(serial)
+    begin = query_function(grouped, real)
     corners, relative = corners_function(real), relative_function(kind, real)
     half, two, tiny = wp.constant(real(0.5)), wp.constant(real(2.0)), wp.constant(real(1.0e-30))
 
@@ -94,6 +94,7 @@ def candidate_kernels(kind: Kind, grouped: bool, real, serial: bool):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def judge(
+        threads: int,
         sides: Sides,
         x: wp.array(dtype=X),
         move: wp.array(dtype=X),
@@ -107,11 +108,7 @@ def candidate_kernels(kind: Kind, grouped: bool, real, serial: bool):
         partners: wp.array(dtype=int),
     ):
         """Which of them may come as near as both radii and `reach` within `around` of their ways: linked, and counted by thing."""
-        tid = wp.tid()
-        count = wp.min(found[0], met.shape[0])
-        if tid >= count:
-            return
-        for slot in range(tid, until(tid, count)):
+        for slot in range(wp.tid(), wp.min(found[0], met.shape[0]), threads):
             i = met[slot][0]
             w = i / sides.counts[0]
             k, l = i - w * sides.counts[0], met[slot][1] - w * sides.counts[1]

@@ -85,19 +85,17 @@ def list_kernels(kind: Kind, serial: bool):
 
     Items are of as many pairs as `count` says, and of none of the nodes of a world that are `silent`, not zero.
     """
-    until, size = until_function(serial), kind.first + kind.second
+    size = kind.first + kind.second
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def number(
+        threads: int,
         count: wp.array(dtype=int),
         nodes: wp.array(dtype=wp.vec4i),
         silent: wp.array(dtype=wp.uint8),
         numbers: wp.array(dtype=int),
     ):
-        tid = wp.tid()
-        if tid >= count[0]:
-            return
-        for p in range(tid, until(tid, count[0])):
+        for p in range(wp.tid(), count[0], threads):
             for slot in range(wp.static(size)):
                 node = nodes[p][slot]
                 if silent[node % silent.shape[0]] == wp.uint8(0):
@@ -105,6 +103,7 @@ def list_kernels(kind: Kind, serial: bool):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def fill(
+        threads: int,
         count: wp.array(dtype=int),
         nodes: wp.array(dtype=wp.vec4i),
         silent: wp.array(dtype=wp.uint8),
@@ -114,10 +113,7 @@ def list_kernels(kind: Kind, serial: bool):
         ranks: wp.array(dtype=wp.vec4i),
     ):
         """One thread alone fills them in order: these are the ranks then."""
-        tid = wp.tid()
-        if tid >= count[0]:
-            return
-        for p in range(tid, until(tid, count[0])):
+        for p in range(wp.tid(), count[0], threads):
             rank = wp.vec4i(-1, -1, -1, -1)
             for slot in range(wp.static(size)):
                 node = nodes[p][slot]
@@ -129,6 +125,7 @@ def list_kernels(kind: Kind, serial: bool):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def sort(
+        threads: int,
         count: wp.array(dtype=int),
         nodes: wp.array(dtype=wp.vec4i),
         silent: wp.array(dtype=wp.uint8),
@@ -139,10 +136,7 @@ def list_kernels(kind: Kind, serial: bool):
         ranks: wp.array(dtype=wp.vec4i),
     ):
         """A thread a pair, as a thread a node would take thousands of steps where a node is in thousands of pairs."""
-        tid = wp.tid()
-        if tid >= count[0]:
-            return
-        for p in range(tid, until(tid, count[0])):
+        for p in range(wp.tid(), count[0], threads):
             rank = wp.vec4i(-1, -1, -1, -1)
             for slot in range(wp.static(size)):
                 node = nodes[p][slot]

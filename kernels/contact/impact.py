@@ -13,7 +13,7 @@ import warp as wp
 from ddg_warp.kernels.contact.candidates import query_function
 from ddg_warp.kernels.contact.motion import corners_function, relative_function
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
-from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 REST, NEAR = 0.1, 0.5  # of the gap: what is left of wide ones; of narrow ones, and of the reach
 PARTS = 1000  # in which a motion is followed; where that does not do, the time reached so far is safe, too
@@ -129,15 +129,16 @@ def impact_kernel(kind: Kind, grouped: bool, passing: bool, real):
 
 
 @cache
-def passing_kernel(kind: Kind, real, serial: bool):
+def passing_kernel(kind: Kind, real):
     """How many of the pairs of a list pass through each other."""
     Sides, X = sides_struct(real), wp.types.vector(3, real)
     slots, *_ = pair_functions(kind, real)
     _, meet = impact_functions(kind, real)
-    corners, until = corners_function(real), until_function(serial)
+    corners = corners_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def passing(
+        threads: int,
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
         sides: Sides,
@@ -145,10 +146,7 @@ def passing_kernel(kind: Kind, real, serial: bool):
         move: wp.array(dtype=X),
         number: wp.array(dtype=int),
     ):
-        tid = wp.tid()
-        if tid >= count[0]:
-            return
-        for p in range(tid, until(tid, count[0])):
+        for p in range(wp.tid(), count[0], threads):
             w = pairs[p][0] / sides.counts[0]
             i, j = pairs[p][0] - w * sides.counts[0], pairs[p][1] - w * sides.counts[1]
             nodes = slots(sides, i, j, w)

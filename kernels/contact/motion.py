@@ -129,14 +129,15 @@ def motion_kernels(real, serial: bool):
 
 
 @cache
-def gap_kernel(kind: Kind, real, serial: bool):
+def gap_kernel(kind: Kind, real):
     """The smallest gap [m] of each world; or one below `enough`, where there is any: others are not looked for then."""
     Sides, X = sides_struct(real), wp.types.vector(3, real)
     slots, _, thickness, closest = pair_functions(kind, real)
-    corners, until = corners_function(real), until_function(serial)
+    corners = corners_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def gaps(
+        threads: int,
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
         sides: Sides,
@@ -144,10 +145,7 @@ def gap_kernel(kind: Kind, real, serial: bool):
         enough: real,
         gap: wp.array(dtype=real),
     ):
-        tid = wp.tid()
-        if tid >= count[0]:
-            return
-        for p in range(tid, until(tid, count[0])):
+        for p in range(wp.tid(), count[0], threads):
             w = pairs[p][0] / sides.counts[0]
             if gap[w] >= enough:
                 i, j = pairs[p][0] - w * sides.counts[0], pairs[p][1] - w * sides.counts[1]

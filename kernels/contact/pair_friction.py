@@ -41,7 +41,7 @@ from ddg_warp.kernels.contact.pair_terms import groups_function, law_struct
 from ddg_warp.kernels.contact.surfaces import Kind, sides_struct
 from ddg_warp.kernels.densities import Density
 from ddg_warp.kernels.measures.slip import basis
-from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 ROWS = 2  # directions of the slip
 
@@ -90,7 +90,7 @@ def directed_basis(real):
 
 
 @cache
-def lag_kernel(kind: Kind, real, linear, serial: bool, directed: bool):
+def lag_kernel(kind: Kind, real, linear, directed: bool):
     """Keep pairs, their nodes and the items of nodes, and what is lagged of friction, from factors and gradients of contact.
 
     x: lagged positions; beside (things,): the two nodes that say where the rod of a first thing of one world leads; ways: by groups,
@@ -99,11 +99,12 @@ def lag_kernel(kind: Kind, real, linear, serial: bool, directed: bool):
     Law, Sides, Factor, Lagged = law_struct(real), sides_struct(real), factor_struct(linear), lagged_struct(real)
     V, W, L = wp.types.vector(3, real), wp.types.vector(SLOTS, real), wp.types.vector(SLOTS, linear)
     E = wp.types.vector(2, real)
-    tangents, groups, until, size = basis(real), groups_function(real), until_function(serial), kind.first + kind.second
+    tangents, groups, size = basis(real), groups_function(real), kind.first + kind.second
     along_rod = directed_basis(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def lag(
+        threads: int,
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
         sides: Sides,
@@ -120,10 +121,7 @@ def lag_kernel(kind: Kind, real, linear, serial: bool, directed: bool):
         along: wp.array2d(dtype=E),
     ):
         """Of pairs that were others before, slips and directions of iterates are forgotten."""
-        tid = wp.tid()
-        if tid >= count[0]:
-            return
-        for p in range(tid, until(tid, count[0])):
+        for p in range(wp.tid(), count[0], threads):
             pairs_out[p] = pairs[p]
             for row in range(2):
                 slip[row, p] = E()
@@ -161,7 +159,7 @@ def lag_kernel(kind: Kind, real, linear, serial: bool, directed: bool):
 
 
 @cache
-def friction_kernel(density: Density, real, linear, serial: bool, directed: bool):
+def friction_kernel(density: Density, real, linear, directed: bool):
     """Energy, work, gradient by slot and factor of each pair at positions x, by its slip since `start`.
 
     things: first things of pairs in one world; velocity: nu [m/s]; rate (worlds,): 1/h [1/s]; accepted, iteration (worlds,): which of
@@ -172,7 +170,6 @@ def friction_kernel(density: Density, real, linear, serial: bool, directed: bool
     E, M = wp.types.vector(2, real), wp.types.matrix((2, 2), real)
     P = wp.types.vector(density.parameter_size(2), real)
     energy_of, slope_of, curvature_of = density.laws(real, 2)
-    until = until_function(serial)
     one, half, tiny = wp.constant(real(1.0)), wp.constant(real(0.5)), wp.constant(real(1.0e-30))
 
     @wp.func
@@ -206,6 +203,7 @@ def friction_kernel(density: Density, real, linear, serial: bool, directed: bool
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def evaluate(
+        threads: int,
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
         things: int,
@@ -223,10 +221,7 @@ def friction_kernel(density: Density, real, linear, serial: bool, directed: bool
         work: wp.array(dtype=real),
         gradient: wp.array2d(dtype=V),
     ):
-        tid = wp.tid()
-        if tid >= count[0]:
-            return
-        for p in range(tid, until(tid, count[0])):
+        for p in range(wp.tid(), count[0], threads):
             world = pairs[p][0] / things
             inverse = rate[world]
             bound = lagged.bound[p]

@@ -51,49 +51,49 @@ def product_kernels(real, linear, serial: bool):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def multiply(
-        sets: wp.array(dtype=PairSet), wanted: wp.array(dtype=int), x: wp.array(dtype=X), v: wp.array(dtype=V)
+        threads: int,
+        sets: wp.array(dtype=PairSet),
+        wanted: wp.array(dtype=int),
+        x: wp.array(dtype=X),
+        v: wp.array(dtype=V),
     ):
         """F^T F v of each pair, at its nodes; in the worlds that want it, if given, with that of `pair_bend`, or the Hessian kept."""
-        tid = wp.tid()
         for s in range(sets.shape[0]):
             own = sets[s]
-            if tid < own.count[0]:
-                for p in range(tid, until(tid, own.count[0])):
-                    used = own.used[p]
-                    if used != 0:
-                        n = own.nodes[p]
-                        u = wp.matrix_from_rows(v[n[0]], v[n[1]], v[n[2]], v[n[3]])
-                        m = int(-1)
-                        if wanted.shape[0] > 0:
-                            m = kept(own, p)
-                        if m >= 0:
-                            for slot in range(own.columns.shape[1]):  # not unrolled, for the sake of registers
-                                value = V(
-                                    row(own.columns, m, 3 * slot, u),
-                                    row(own.columns, m, 3 * slot + 1, u),
-                                    row(own.columns, m, 3 * slot + 2, u),
-                                )
-                                put(own, slot, p, value)
-                            continue
-                        y = Y()
-                        for k in range(own.rows):
-                            if (used >> (k + 1)) & 1 != 0:
-                                w = own.weight[k, p]
-                                along = own.direction[k, p]
-                                y += wp.outer(w, along * wp.dot(along, w * u))
-                        if wanted.shape[0] > 0 and own.kind >= 0:
-                            c = own.bend[p]
-                            if c != linear(0.0) and wanted[own.pairs[p][0] / own.things] != 0:
-                                o = x[n[0]]
-                                at = wp.matrix_from_rows(
-                                    V(), beside(x[n[1]], o), beside(x[n[2]], o), beside(x[n[3]], o)
-                                )
-                                y += bend(own.kind, at, own.weight[0, p], u) * c
-                        for slot in range(wp.static(SLOTS)):
-                            put(own, slot, p, y[slot])
-                    else:  # nodes that list it read it
-                        for slot in range(wp.static(SLOTS)):
-                            put(own, slot, p, V())
+            for p in range(wp.tid(), own.count[0], threads):
+                used = own.used[p]
+                if used != 0:
+                    n = own.nodes[p]
+                    u = wp.matrix_from_rows(v[n[0]], v[n[1]], v[n[2]], v[n[3]])
+                    m = int(-1)
+                    if wanted.shape[0] > 0:
+                        m = kept(own, p)
+                    if m >= 0:
+                        for slot in range(own.columns.shape[1]):  # not unrolled, for the sake of registers
+                            value = V(
+                                row(own.columns, m, 3 * slot, u),
+                                row(own.columns, m, 3 * slot + 1, u),
+                                row(own.columns, m, 3 * slot + 2, u),
+                            )
+                            put(own, slot, p, value)
+                        continue
+                    y = Y()
+                    for k in range(own.rows):
+                        if (used >> (k + 1)) & 1 != 0:
+                            w = own.weight[k, p]
+                            along = own.direction[k, p]
+                            y += wp.outer(w, along * wp.dot(along, w * u))
+                    if wanted.shape[0] > 0 and own.kind >= 0:
+                        c = own.bend[p]
+                        if c != linear(0.0) and wanted[own.pairs[p][0] / own.things] != 0:
+                            o = x[n[0]]
+                            at = wp.matrix_from_rows(V(), beside(x[n[1]], o), beside(x[n[2]], o), beside(x[n[3]], o))
+                            y += bend(own.kind, at, own.weight[0, p], u) * c
+                    for slot in range(wp.static(SLOTS)):
+                        put(own, slot, p, y[slot])
+                else:  # nodes that list it read it
+                    for slot in range(wp.static(SLOTS)):
+                        put(own, slot, p, V())
 
     @wp.func
     def total(sets: wp.array(dtype=PairSet), node: int):

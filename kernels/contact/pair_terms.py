@@ -15,7 +15,7 @@ from ddg_warp.kernels.contact.pair_energy import (
 from ddg_warp.kernels.contact.surfaces import EDGES, Kind, pair_functions, sides_struct
 from ddg_warp.kernels.densities import Density
 from ddg_warp.kernels.densities.contact import SHARE
-from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 
 @cache
@@ -98,8 +98,7 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
     about, row_of, *_ = pair_energy_functions(kind, density, real)
     bends = bend_function(kind, density, real)
     given, corners = read_functions(kind, real)
-    until, rows = until_function(serial), rows_of(kind)
-    slots, *_ = pair_functions(kind, real)
+    (slots, *_), rows = pair_functions(kind, real), rows_of(kind)
 
     @wp.func
     def nodes_of(sides: Sides, pair: wp.vec2i):
@@ -109,6 +108,7 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def sieve(
+        threads: int,
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
         sides: Sides,
@@ -123,12 +123,8 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
         count_out: wp.array(dtype=int),
     ):
         """Lowers the smallest gap [m] of each world to those of candidates, too; `partners_out` are zero before one thread packs."""
-        tid, found = wp.tid(), int(0)
-        if tid >= count[0]:
-            if wp.static(serial):
-                count_out[0] = 0
-            return
-        for k in range(tid, until(tid, count[0])):
+        found = int(0)
+        for k in range(wp.tid(), count[0], threads):
             pair = pairs[k]
             p, _threshold, _inner = given(law, sides, pair)
             nodes = nodes_of(sides, pair)
@@ -153,6 +149,7 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pack(
+        threads: int,
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
         starts: wp.array(dtype=int),
@@ -166,13 +163,13 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
         partners_out: wp.array(dtype=int),
         count_out: wp.array(dtype=int),
     ):
-        """Thread k has candidate k and first thing k; `before` each candidate so many are marked."""
-        k = wp.tid()
+        """Of candidates those that are marked, `before` each of which so many are; and of first things."""
         most = count[0]
-        if k < most and marks[k] != 0:
-            pairs_out[before[k]] = pairs[k]
-            nodes_out[before[k]] = nodes_of(sides, pairs[k])
-        if k < starts.shape[0]:
+        for k in range(wp.tid(), most, threads):
+            if marks[k] != 0:
+                pairs_out[before[k]] = pairs[k]
+                nodes_out[before[k]] = nodes_of(sides, pairs[k])
+        for k in range(wp.tid(), starts.shape[0], threads):
             start, number = int(0), int(0)
             if most > 0 and partners[k] > 0:
                 last = starts[k] + partners[k] - 1
@@ -180,11 +177,12 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
                 number = before[last] + marks[last] - start
             starts_out[k] = start
             partners_out[k] = number
-        if k == 0:
+        if wp.tid() == 0:
             count_out[0] = wp.where(most > 0, before[wp.max(most - 1, 0)] + marks[wp.max(most - 1, 0)], 0)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def evaluate(
+        threads: int,
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
         sides: Sides,
@@ -195,10 +193,7 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
         gradient: wp.array2d(dtype=V),
     ):
         """Energy, gradient by slot and factor of each pair."""
-        tid = wp.tid()
-        if tid >= count[0]:
-            return
-        for pair in range(tid, until(tid, count[0])):
+        for pair in range(wp.tid(), count[0], threads):
             p, threshold, inner = given(law, sides, pairs[pair])
             at = corners(x, factor.nodes[pair])
             w, d, n = near(at)
@@ -222,19 +217,20 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
 
 
 @cache
-def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: bool, unbent: bool = False):
+def exact_product_kernel(kind: Kind, density: Density, real, linear, unbent: bool = False):
     """Product of the exact Hessian of each pair with v, by rank (see `gather.set_struct`): the reverse of the derivative along v.
 
     `unbent`: of those pairs alone that `pair_bend` does not know.
     """
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
     X, *_ = shape_types(real)
-    V, L, until = wp.types.vector(3, real), wp.types.vector(3, linear), until_function(serial)
+    V, L = wp.types.vector(3, real), wp.types.vector(3, linear)
     *_, along = pair_energy_functions(kind, density, real)
     given, corners = read_functions(kind, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def product(
+        threads: int,
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
         sides: Sides,
@@ -245,10 +241,7 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, serial: boo
         ranks: wp.array(dtype=wp.vec4i),
         placed: wp.array(dtype=L),
     ):
-        tid = wp.tid()
-        if tid >= count[0]:
-            return
-        for pair in range(tid, until(tid, count[0])):
+        for pair in range(wp.tid(), count[0], threads):
             asked = True
             if wp.static(unbent):
                 asked = factor.bend[pair] == linear(0.0)
@@ -303,12 +296,13 @@ def columns_kernel(kind: Kind, density: Density, real, linear):
 
 
 @cache
-def mark_kernel(linear, serial: bool):
+def mark_kernel(linear):
     """mark(...) pairs of edges that `pair_bend` does not know, in the worlds that want it: those all but parallel."""
-    Factor, until = factor_struct(linear), until_function(serial)
+    Factor = factor_struct(linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def mark(
+        threads: int,
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
         things: int,
@@ -316,10 +310,7 @@ def mark_kernel(linear, serial: bool):
         factor: Factor,
         marks: wp.array(dtype=int),
     ):
-        tid = wp.tid()
-        if tid >= count[0]:
-            return
-        for p in range(tid, until(tid, count[0])):
+        for p in range(wp.tid(), count[0], threads):
             asked = factor.used[p] != 0 and factor.bend[p] == linear(0.0) and wanted[pairs[p][0] / things] != 0
             marks[p] = wp.where(asked, 1, 0)
 

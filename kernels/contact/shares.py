@@ -22,15 +22,15 @@ ROUNDS = 50  # what falls on what has stopped stops layer by layer, one in a rou
 
 
 @cache
-def limit_kernel(kind: Kind, real, serial: bool):
+def limit_kernel(kind: Kind, real):
     """Lowers the shares of units whose pairs hit, and the earliest `time` of their worlds."""
     Sides, X, W = sides_struct(real), wp.types.vector(3, real), wp.types.vector(4, real)
     slots, _, thickness, _ = pair_functions(kind, real)
     corners, (impact, _) = corners_function(real), impact_functions(kind, real)
-    until = until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def limit(
+        threads: int,
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
         sides: Sides,
@@ -45,10 +45,7 @@ def limit_kernel(kind: Kind, real, serial: bool):
         lowered: wp.array(dtype=real),
         time: wp.array(dtype=real),
     ):
-        tid = wp.tid()
-        if tid >= count[0]:
-            return
-        for pair in range(tid, until(tid, count[0])):
+        for pair in range(wp.tid(), count[0], threads):
             w = pairs[pair][0] / sides.counts[0]
             i, j = pairs[pair][0] - w * sides.counts[0], pairs[pair][1] - w * sides.counts[1]
             nodes = slots(sides, i, j, w)

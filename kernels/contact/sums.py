@@ -1,10 +1,8 @@
 """Running sums of integers, level by level: kernels only, so that conditional parts of CUDA graphs may have them."""
 
-from functools import cache
-
 import warp as wp
 
-from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
+from ddg_warp.kernels.threads import CPU_OPTIONS
 
 TILE = 1024  # entries that a block of threads adds up
 THREADS = 256  # of it
@@ -37,31 +35,23 @@ def run(values: wp.array(dtype=int), sums_out: wp.array(dtype=int)):
         total += value
 
 
-@cache
-def choose_kernel(serial: bool):
-    """choose(...): which of the first `count` are marked (0 or 1), in order, as many as there is room for, and how many these are.
+@wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+def choose(
+    threads: int,
+    count: wp.array(dtype=int),
+    marks: wp.array(dtype=int),
+    starts: wp.array(dtype=int),
+    chosen: wp.array(dtype=int),
+    number: wp.array(dtype=int),
+):
+    """Which of the first `count` are marked (0 or 1), in order, as many as there is room for, and how many these are.
 
     `starts` are how many are marked before each.
     """
-    until = until_function(serial)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def choose(
-        count: wp.array(dtype=int),
-        marks: wp.array(dtype=int),
-        starts: wp.array(dtype=int),
-        chosen: wp.array(dtype=int),
-        number: wp.array(dtype=int),
-    ):
-        tid = wp.tid()
-        if tid >= count[0]:
-            if tid == 0:
-                number[0] = 0
-            return
-        for k in range(tid, until(tid, count[0])):
-            if marks[k] != 0 and starts[k] < chosen.shape[0]:
-                chosen[starts[k]] = k
-            if k == count[0] - 1:
-                number[0] = wp.min(starts[k] + marks[k], chosen.shape[0])
-
-    return choose
+    if wp.tid() == 0 and count[0] == 0:
+        number[0] = 0
+    for k in range(wp.tid(), count[0], threads):
+        if marks[k] != 0 and starts[k] < chosen.shape[0]:
+            chosen[starts[k]] = k
+        if k == count[0] - 1:
+            number[0] = wp.min(starts[k] + marks[k], chosen.shape[0])

@@ -75,6 +75,6 @@ def test_items_in_any_order_are_sorted(device, kind):
     ordered = wp.zeros(len(items), dtype=int, device=device)
     ranks = wp.zeros(count, dtype=wp.vec4i, device=device)
     *_, sort = gather.list_kernels(kind, False)
-    wp.launch(sort, count, inputs, [ordered, ranks], device=device)
+    wp.launch(sort, count, [count, *inputs], [ordered, ranks], device=device)
     assert (ordered.numpy() == wanted).all()
     assert (wanted[ranks.numpy()[:, :size]].ravel() == items).all()

@@ -34,7 +34,7 @@ class ContactElements(PairElements):
         self.density = law
         serial = arrays.serial(self.device)
         self._sieve, self._pack, self._evaluate = evaluate_kernels(kind, law, real, linear, serial)
-        self._exact = exact_product_kernel(kind, law, real, linear, serial)
+        self._exact = exact_product_kernel(kind, law, real, linear)
         self.kernels += [self._sieve, self._evaluate, self._exact]
         self.kernels += [] if serial else [self._pack]
         self.mollified = (Unkept if exact else Mollified)(self, law) if kind == EDGES else None
@@ -54,14 +54,14 @@ class ContactElements(PairElements):
         lists = [self.pairs, self.factor.nodes, self.starts, self.partners, self.count]
         if not self._running:
             self.partners.zero_()
-        self._sweep(self._sieve, found.capacity, [found.pairs, found.count, *given], [self._marks, gap, *lists])
+        self._take_turns(self._sieve, found.capacity, [found.pairs, found.count, *given], [self._marks, gap, *lists])
         if self._running:
             self._running()
             inputs = [found.pairs, found.count, found.starts, found.partners, found.sides]
             room = max(found.capacity, len(found.starts))
-            self._sweep(self._pack, room, [*inputs, self._marks, self._running.starts], lists)
+            self._take_turns(self._pack, room, [*inputs, self._marks, self._running.starts], lists)
         outputs = [self.factor, self.energy, self.gradient]
-        self._sweep(self._evaluate, found.capacity, [self.pairs, self.count, *given], outputs)
+        self._take_turns(self._evaluate, found.capacity, [self.pairs, self.count, *given], outputs)
 
     def evaluate(self, x: wp.array, law, gap: wp.array) -> None:
         """The same; and list the pairs of nodes."""
@@ -71,4 +71,4 @@ class ContactElements(PairElements):
     def exact_product(self, v: wp.array, x: wp.array, law) -> None:
         """Place the product of the exact Hessian at x, those of `evaluate`, with v."""
         inputs = [self.pairs, self.count, self.found.sides, law, x, self.factor, v, self.ranks]
-        self._sweep(self._exact, self.found.capacity, inputs, [self.placed])
+        self._take_turns(self._exact, self.found.capacity, inputs, [self.placed])

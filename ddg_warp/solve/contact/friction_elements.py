@@ -36,10 +36,9 @@ class FrictionElements(PairElements):
         silent: wp.array,
     ):
         super().__init__(contact.found, ROWS, nodes, real, linear, silent)
-        serial = arrays.serial(self.device)
         self._contact, self._velocity = contact, velocity
-        self._lag = lag_kernel(self.found.kind, real, linear, serial, directed is not None)
-        self._evaluate = friction_kernel(density, real, linear, serial, directed is not None)
+        self._lag = lag_kernel(self.found.kind, real, linear, directed is not None)
+        self._evaluate = friction_kernel(density, real, linear, directed is not None)
         self._rows, self.directions = ROWS, (None, None)
         if directed is not None:
             beside, ways = directed
@@ -69,7 +68,7 @@ class FrictionElements(PairElements):
         inputs = [of.pairs, of.count, self.found.sides, law, x, *self.directions]
         inputs += [of.factor, of.gradient]
         outputs = [self.pairs, self.factor, self.lagged, self._slip, self._along]
-        self._sweep(self._lag, self.found.capacity, inputs, outputs)
+        self._take_turns(self._lag, self.found.capacity, inputs, outputs)
         for name in self._kept:
             wp.copy(getattr(self, name), getattr(of, name))
         self._items.list(self.count, self.factor.nodes)
@@ -79,4 +78,4 @@ class FrictionElements(PairElements):
         inputs = [self.pairs, self.count, self.found.first.count]
         inputs += [self.lagged, self._velocity, rate, *iterates, x, start]
         outputs = [self._slip, self._along, self.factor, self.energy, self.work, self.gradient]
-        self._sweep(self._evaluate, self.found.capacity, inputs, outputs)
+        self._take_turns(self._evaluate, self.found.capacity, inputs, outputs)

@@ -5,7 +5,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.kernels.contact.gather import SLOTS
 from ddg_warp.kernels.contact.pair_terms import columns_kernel, exact_product_kernel, mark_kernel
-from ddg_warp.kernels.contact.sums import choose_kernel
+from ddg_warp.kernels.contact.sums import choose
 from ddg_warp.kernels.contact.surfaces import EDGES
 from ddg_warp.kernels.densities import Density
 from ddg_warp.solve.contact.pairs import RunningSums
@@ -27,10 +27,9 @@ class Mollified:
 
     def __init__(self, elements, law: Density):
         self._of = elements
-        serial = arrays.serial(elements.device)
-        self._mark, self._choose = mark_kernel(elements.linear, serial), choose_kernel(serial)
+        self._mark = mark_kernel(elements.linear)
         self._differentiate = columns_kernel(EDGES, law, elements.real, elements.linear)
-        self.kernels = [self._mark, self._choose, self._differentiate]
+        self.kernels = [self._mark, choose, self._differentiate]
         self._number = wp.zeros(1, dtype=int, device=elements.device)
 
     def reserve(self) -> None:
@@ -51,13 +50,13 @@ class Mollified:
         self._sweep(self._mark, len(self.marks), inputs, [self.marks])
         self._running()
         chosen = [self._chosen, self._number]
-        self._sweep(self._choose, len(self.marks), [of.count, self.marks, self.starts], chosen)
+        self._sweep(choose, len(self.marks), [of.count, self.marks, self.starts], chosen)
         threads = arrays.takers(min(3 * SLOTS * len(self._chosen), MOST), of.device)
         inputs = [of.pairs, of.found.sides, law, x, of.factor, *chosen, threads]
         wp.launch(self._differentiate, threads, inputs, [self.columns], device=of.device)
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
-        arrays.sweep(kernel, count, inputs, outputs, self._of.device)
+        arrays.take_turns(kernel, count, inputs, outputs, self._of.device)
 
 
 class Unkept:
@@ -67,9 +66,7 @@ class Unkept:
 
     def __init__(self, elements, law: Density):
         self._of = elements
-        self._multiply = exact_product_kernel(
-            elements.found.kind, law, elements.real, elements.linear, arrays.serial(elements.device), unbent=True
-        )
+        self._multiply = exact_product_kernel(elements.found.kind, law, elements.real, elements.linear, unbent=True)
         self.kernels = [self._multiply]
 
     def reserve(self) -> None:
@@ -83,4 +80,4 @@ class Unkept:
         """Write their products with v."""
         of, (x, law) = self._of, self._at
         inputs = [of.pairs, of.count, of.found.sides, law, x, of.factor, v, of.ranks]
-        arrays.sweep(self._multiply, of.found.capacity, inputs, [of.placed], of.device)
+        arrays.take_turns(self._multiply, of.found.capacity, inputs, [of.placed], of.device)

@@ -20,7 +20,7 @@ class MotionFilter:
     def __init__(self, lists: list, nodes: int, worlds: int, real, device):
         self._lists, self._nodes, self._worlds, self._device = lists, nodes, worlds, device
         serial = arrays.serial(device)
-        self._limits = [limit_kernel(pairs.kind, real, serial) for pairs in lists]
+        self._limits = [limit_kernel(pairs.kind, real) for pairs in lists]
         self._start, self._turn, self._settle, self._finish, self._shorten = share_kernels(real, serial)
         self.kernels = [*self._limits, self._start, self._turn, self._settle, self._finish, self._shorten]
         self._all = [wp.zeros(worlds * nodes, dtype=real, device=device) for _ in range(3)]
@@ -61,7 +61,8 @@ class MotionFilter:
             wp.launch(self._turn, self._worlds, [], [self._open, self._changed, self._rounds], device=self._device)
             for kernel, pairs in zip(self._limits, self._lists, strict=True):
                 inputs = [pairs.pairs, pairs.count, pairs.sides, base, move, keep, reach, unit, units]
-                self._sweep(kernel, pairs.capacity, inputs, [shares, before, lowered, times])
+                outputs = [shares, before, lowered, times]
+                arrays.take_turns(kernel, pairs.capacity, inputs, outputs, self._device)
             inputs = [together, self._earliest, lowered, self._rounds]
             self._sweep(self._settle, len(shares), inputs, [shares, before, self._open, self._changed])
 

@@ -39,12 +39,12 @@ class NodeItems:
         """Of so many pairs, with these nodes."""
         self._both.zero_()
         inputs = [count, nodes, self._silent]
-        self._sweep(self._number, len(nodes), inputs, [self.numbers])
+        self._take_turns(self._number, len(nodes), inputs, [self.numbers])
         self._running()
-        self._sweep(self._fill, len(nodes), [*inputs, self.places], [self._filled, self._unordered, self.ranks])
+        self._take_turns(self._fill, len(nodes), [*inputs, self.places], [self._filled, self._unordered, self.ranks])
         if self._unordered is not self.items:
             inputs += [self.places, self.numbers, self._unordered]
-            self._sweep(self._sort, len(nodes), inputs, [self.items, self.ranks])
+            self._take_turns(self._sort, len(nodes), inputs, [self.items, self.ranks])
 
-    def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
-        arrays.sweep(kernel, count, inputs, outputs, self.device)
+    def _take_turns(self, kernel, count: int, inputs: list, outputs: list) -> None:
+        arrays.take_turns(kernel, count, inputs, outputs, self.device)

@@ -63,5 +63,5 @@ class PairElements:
         self.items, self.ranks = self._items.items, self._items.ranks
         self.placed = wp.zeros(len(self.items), dtype=vector, device=self.device)
 
-    def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
-        arrays.sweep(kernel, count, inputs, outputs, self.device)
+    def _take_turns(self, kernel, count: int, inputs: list, outputs: list) -> None:
+        arrays.take_turns(kernel, count, inputs, outputs, self.device)

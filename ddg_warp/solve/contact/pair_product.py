@@ -61,7 +61,7 @@ class PairProduct:
     def place(self, v, x=None, wanted=None) -> None:
         """What pairs bring to nodes, of products as above."""
         given = self._nothing if wanted is None else [wanted, x]
-        self._sweep(self._multiply, self._most, [self.sets, *given, v], [])
+        arrays.take_turns(self._multiply, self._most, [self.sets, *given, v], [], self._device)
         for part in self._mollified if wanted is not None else ():
             if not part.keeps:
                 part.multiply(v)

@@ -70,9 +70,8 @@ class PairList:
         self._last, self.partners = (wp.zeros(first.all, dtype=int, device=self.device) for _ in range(2))
         self._sums = RunningSums(self.partners)
         self.starts = self._sums.starts
-        serial = arrays.serial(self.device)
-        self._meet, self._judge, self._fill = candidate_kernels(kind, grouped, real, serial)
-        self._gaps, self._passing = gap_kernel(kind, real, serial), passing_kernel(kind, real, serial)
+        self._meet, self._judge, self._fill = candidate_kernels(kind, grouped, real)
+        self._gaps, self._passing = gap_kernel(kind, real), passing_kernel(kind, real)
         self.count, self._found = (wp.zeros(1, dtype=int, device=self.device) for _ in range(2))
         # the most pairs of any search since there was room for so many, and those whose boxes met
         self._needed = wp.zeros(2, dtype=int, device=self.device)
@@ -115,7 +114,7 @@ class PairList:
         met = [self._met, self._before, self._last]
         self.partners.zero_()
         inputs = [self.sides, x, move, together, reach, around, self._found]
-        arrays.sweep(self._judge, len(self._met), inputs, [*met, self.partners], self.device)
+        arrays.take_turns(self._judge, len(self._met), inputs, [*met, self.partners], self.device)
         self._sums()
         outputs = [self.pairs, self.count, self.overflow, self._needed]
         self._launch(self._fill, [self._found, *met, self.starts, self.partners], outputs)
@@ -126,9 +125,9 @@ class PairList:
     def measure(self, x, gap, enough: float) -> None:
         """Lower the smallest gaps of worlds to those of pairs, until they are below `enough`."""
         inputs = [self.pairs, self.count, self.sides, x, enough]
-        arrays.sweep(self._gaps, self.capacity, inputs, [gap], self.device)
+        arrays.take_turns(self._gaps, self.capacity, inputs, [gap], self.device)
 
     def cross(self, x, move, crossed) -> None:
         """Count those that pass through each other in the motion from x, by world."""
         inputs = [self.pairs, self.count, self.sides, x, move]
-        arrays.sweep(self._passing, self.capacity, inputs, [crossed], self.device)
+        arrays.take_turns(self._passing, self.capacity, inputs, [crossed], self.device)
