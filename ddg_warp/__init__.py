@@ -33,6 +33,7 @@ if TYPE_CHECKING:  # what editors and type checkers read; at run time see `_HOME
     from ddg_warp.scene.scene import Scene
     from ddg_warp.solve import continuation, stability, statics
     from ddg_warp.solve.dynamics import Integrator
+    from ddg_warp.solve.step_control import StepControl
 
 __version__ = "0.1.0"
 __all__ = [
@@ -63,6 +64,7 @@ __all__ = [
     "Sphere",
     "State",
     "Statics",
+    "StepControl",
     "Stiffness",
     "Stop",
     "Trace",
@@ -105,6 +107,7 @@ _HOME = {
     "Sphere": "scene.obstacles",
     "State": "model.state",
     "Statics": "scene.descriptions",
+    "StepControl": "solve.step_control",
     "Stiffness": "scene.material",
     "Stop": "scene.path",
     "Trace": "scene.descriptions",

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 THREADS = 256  # in a block, where a launch does not say
-MOST = 2**18  # threads that take turns: about as many as a large GPU has at once
+MOST = 2**20  # threads that take turns: with fewer, those that wait for memory do not keep a large GPU busy
 
 
 def allocate(shape: tuple[int, ...], dtype, device) -> wp.array:

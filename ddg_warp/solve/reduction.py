@@ -10,7 +10,7 @@ from ddg_warp.solve.choice import LONGEST_REPEATED
 REDUCING = 128  # threads of a block in a level of the reduction
 THREADS = 32  # of a block of threads that walk: few chains reach more multiprocessors
 MOST = 512  # threads of a block that has one chain
-TOGETHER = 8  # neighbouring chains in a block of threads, which read 32 bytes at a time
+TOGETHER = 4  # neighbouring chains in a block of threads, which read 16 bytes at a time
 
 
 class CyclicReduction:
