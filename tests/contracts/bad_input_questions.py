@@ -8,6 +8,7 @@ import ddg_warp as ddg
 from ddg_warp.ask import inquiry
 from ddg_warp.model import rest_shapes
 
+
 # --- Integrator and step ---
 def _controlled(**options) -> ddg.StepControl:
     return ddg.StepControl(ddg.Integrator(model(), **options), 1e-3)
