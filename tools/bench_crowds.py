@@ -68,7 +68,7 @@ def run(name: str, device, limit: float) -> list[dict]:
     wp.synchronize_device(device)
     rows, energies, astray = [], [sum(model.energies(state).values())], 0.0
     began = mark = time.perf_counter()
-    before, since, walks, taken = integrator.statistics(), state.time, _walks(contact), steps.lengths.total()
+    before, since, taken = integrator.statistics(), state.time, steps.lengths.total()
     while state.time < duration - 0.5 * dt and time.perf_counter() - began < limit:
         state, astray = steps.advance(state, dt), max(astray, steps.estimate)
         part = PARTS * max(state.time / duration, (time.perf_counter() - began) / limit)
@@ -100,14 +100,11 @@ def run(name: str, device, limit: float) -> list[dict]:
                 "gained": None
                 if driven
                 else float((energies - np.minimum.accumulate(energies)).max() / np.ptp(energies)),
-                "search_share": _searching(
-                    contact, state, _walks(contact) - walks, touching["searches"] - earlier["searches"]
-                )
-                / wall,
+                "search_share": (touching["searches"] - earlier["searches"]) * _search_time(contact, state) / wall,
             }
         )
         print(table(rows[-1:]), file=sys.stderr, flush=True)
-        mark, before, since, walks = time.perf_counter(), integrator.statistics(), state.time, _walks(contact)
+        mark, before, since = time.perf_counter(), integrator.statistics(), state.time
         taken, astray = steps.lengths.total(), 0.0
     return rows
 
@@ -120,24 +117,13 @@ def _newton(statistics: dict) -> float:
     return statistics["newton_iterations"]["mean"] * _solves(statistics)
 
 
-def _walks(contact) -> int:
-    return int(contact.search.walks.numpy()[0])
-
-
-def _searching(contact, state, walks: int, searches: int) -> float:
-    """Seconds of so many searches as at a state, of which some meet boxes anew."""
-    search, x = contact.search, state.net.q
-    whole, judged = _least(search, lambda: search.search(x)), _least(search, lambda: search.judge(x))
-    return walks * (whole - judged) + searches * judged
-
-
-def _least(search, launch) -> float:
-    """Seconds of a launch, the least of some."""
-    times = []
+def _search_time(contact, state) -> float:
+    """Seconds of a search, the least of some."""
+    search, times = contact.search, []
     for _ in range(4):
         wp.synchronize_device(search.device)
         began = time.perf_counter()
-        launch()
+        search.search(state.net.q)
         wp.synchronize_device(search.device)
         times.append(time.perf_counter() - began)
     return min(times)

@@ -119,7 +119,7 @@ class Integrator:
         self._dt = wp.zeros(model.worlds, dtype=model.types.real, device=model.wp_device)
         self._dt_host = None
         self._longest, self._version = 0.0, model.version
-        # steps since the state came from elsewhere, and walks of trees, of searches and of runs, until they were made anew
+        # steps since the state came from elsewhere, and searches and looks at runs, until their trees were made anew
         self._since_renewal, self._sought = 0, (0, 0)
 
     def step(self, state: State, dt: float, controls: Controls | None = None) -> State:
@@ -183,15 +183,15 @@ class Integrator:
             replay()
 
     def _renews(self, anew: bool) -> int:
-        """What a step makes anew, see `NetStep.step`: every few steps the trees that were walked since."""
+        """What a step makes anew, see `NetStep.step`: every few steps the trees that were used since."""
         if self._net is None or self.model.wp_device.is_cpu:
             return TREES
         due = anew or self._since_renewal % RENEWAL == 0
         fresh = anew or self._since_renewal == 0
         self._since_renewal += 1
-        (walks, looks), before = self._net.sought, self._sought
-        if due and (fresh or walks != before[0]):
-            self._sought = walks, looks
+        (searches, looks), before = self._net.sought, self._sought
+        if due and (fresh or searches != before[0]):
+            self._sought = searches, looks
             return TREES
         if due and looks != before[1]:
             self._sought = before[0], looks

@@ -1,7 +1,8 @@
 """Pairs that are near: those whose boxes meet, by a tree; judged by their distance; and listed in the order of their indices.
 
 Walking the tree and judging pairs are kernels of their own. A walk waits for memory, and takes so few registers that many threads
-wait at once; what it finds in larger boxes serves several searches.
+wait at once. (Larger boxes whose pairs serve several searches were tried: what falls leaves them in a step, and what rests gains
+nothing, as many more of them meet.)
 
 Of a motion those are found that may come near anywhere on the way. Whatever its share of its way, each node is between both ends of
 it; so the sides are as far apart as these ends are along any direction. The one asked is that of the closest points in the middle of

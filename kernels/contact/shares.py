@@ -153,10 +153,10 @@ def share_kernels(real, serial: bool):
         done: wp.array(dtype=int),
         together: wp.array(dtype=int),
         q: wp.array(dtype=X),
-        start: wp.array2d(dtype=X),
-        end: wp.array2d(dtype=X),
+        start: wp.array(dtype=X),
+        end: wp.array(dtype=X),
     ):
-        """The motion itself and, of worlds that go by one share, where what was `done` for it has seen them: boxes, and pairs."""
+        """The motion itself and, of worlds that go by one share, where a search that was `done` for it has seen them."""
         tid = wp.tid()
         for i in range(tid, until(tid, q.shape[0])):
             w = i / unit.shape[0]
@@ -165,10 +165,8 @@ def share_kernels(real, serial: bool):
                 s = shares[w * units + of]
                 if s < real(1.0):
                     q[i] = base[i] + s * move[i]
-            if together[w] != 0:
-                for k in range(done.shape[0]):
-                    if done[k] != 0:
-                        start[k, i] = q[i]
-                        end[k, i] = q[i]
+            if together[w] != 0 and done[0] != 0:
+                start[i] = q[i]
+                end[i] = q[i]
 
     return start, turn, settle, finish, shorten

@@ -69,5 +69,5 @@ class Motion:
     def results(self) -> list[bytes]:
         """All that a filter writes, but for lists."""
         search = self.search
-        seen = search._starts, search._ends
+        seen = search._start, search._end
         return [array.numpy().tobytes() for array in (self.q, search.shares, search.time, search.limited, *seen)]

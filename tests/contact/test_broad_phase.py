@@ -315,22 +315,3 @@ POINTS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0,
 def test_what_can_not_be_searched_is_refused_by_name(describe, message):
     with pytest.raises(SceneError, match=message):
         describe(Shapes(POINTS))
-
-
-def test_boxes_serve_several_searches(device):
-    """On a walk of a third of the margin a step boxes are met anew once in several searches, and no pair is missed."""
-    shapes, points = scene(11, 0.3)
-    search = BroadPhase(shapes, upload(points, device), reach=REACH, margin=MARGIN)
-    rng, walks = np.random.default_rng(3), []
-    for _ in range(24):
-        points = points + rng.normal(size=3) * MARGIN / 3.0 + rng.normal(size=points.shape) * MARGIN / 6.0
-        x = upload(points, device)
-        while True:
-            search.update(x)
-            if not search.fit(x):
-                break
-        walks.append(int(search.walks.numpy()[0]))
-        for pairs, (first, second) in zip(search.lists, SIDES, strict=True):
-            found = {tuple(pair) for pair in pairs.pairs.numpy()[: pairs.count.numpy()[0]].tolist()}
-            assert near(shapes, points, first, second, REACH) <= found
-    assert 1 < walks[-1] < 0.5 * search.searches.numpy()[0]

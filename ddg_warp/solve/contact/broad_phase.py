@@ -16,9 +16,7 @@ from ddg_warp.solve.contact.shapes import BALLS, PLANES, Shapes
 from ddg_warp.solve.contact.tree import Things
 
 SLACK = 1e-3  # of the margin, by which a search goes beyond it, for rounding
-WIDE = 4.0  # margins that boxes are wide by, so that pairs whose boxes meet serve several searches
 NONE = np.iinfo(np.int64).max
-BOXES, PAIRS = range(2)
 
 
 class BroadPhase:
@@ -26,7 +24,7 @@ class BroadPhase:
 
     All that is within thickness + `reach` is among the candidates as long as every node is within half of `margin` of where it was when
     they were found or, of a search for a motion, of its way, each anywhere along it, the nodes of a half-space alike; where a world
-    goes by one share, of the place that it has come to. Pairs whose boxes meet are found as much farther apart, for several searches.
+    goes by one share, of the place that it has come to.
     `update`, `filter`, `measure`, `impact` and `crossings` read nothing back and can be captured, `update`, `filter` and `search` in
     conditional parts of graphs, too. `rebuild` can be captured, on CUDA outside of those alone; there a step should begin with it,
     every few at least where trees were used since. `fit` and `check` read, between launches of graphs; what is not finite touches
@@ -43,8 +41,7 @@ class BroadPhase:
     Attributes:
         lists: a `PairList` for each kind of pairs that there can be.
         overflow: (1,), not zero once pairs did not fit: `fit` has to follow, and whatever came of the pairs is to be done again.
-        searches: (1,) how many there were; walks: (1,) for how many of them boxes were met; looks: (1,), see `Runs`;
-            sought: walks and looks as of the last `fit` or `check`.
+        searches: (1,) how many there were; looks: (1,), see `Runs`; sought: both as of the last `fit` or `check`.
         gap [m], time and crossed, of each world: see `measure`, `impact` and `crossings`.
         shares: (worlds times units,), limited: of each world, how many of them are below 1; see `filter`.
         every: (worlds,) ones, of motions in which all nodes of every world go by one share.
@@ -80,20 +77,18 @@ class BroadPhase:
         things = {size: Things(shapes, size, worlds, real, self.device, radius) for size in shapes.sizes}
         self._things = list(things.values())
         self._still, self._move = (wp.zeros(len(x), dtype=x.dtype, device=self.device) for _ in range(2))
-        # ways that boxes, and pairs, were found for
-        self._starts, self._ends = (wp.zeros((2, len(x)), dtype=x.dtype, device=self.device) for _ in range(2))
+        self._start, self._end = (wp.zeros_like(x) for _ in range(2))  # ways that pairs were found for
         placed = np.zeros(nodes, np.uint8)  # what no thing has may be no place, as blocks of edges are not
         for size in shapes.sizes:
             placed[shapes.things(size)[0]] = 1
         self._placed = wp.array(placed, dtype=wp.uint8, device=self.device)
         self._shift = wp.zeros(worlds, dtype=x.dtype, device=self.device)
         self._never, self.every = (wp.full(worlds, flag, dtype=int, device=self.device) for flag in (0, 1))
-        self.searches, self._fits, self._beyond = (wp.zeros(1, dtype=int, device=self.device) for _ in range(3))
         self._read = wp.zeros(4, dtype=int, device=self.device)  # at once, after every step
-        self.overflow, self._lost, self.walks, self.looks = (self._read[k : k + 1] for k in range(4))
+        self.overflow, self._lost, self.searches, self.looks = (self._read[k : k + 1] for k in range(4))
         self.sought = (0, 0)
-        # of boxes and of pairs, whether they are out of date, and whether the last `update` found them anew
-        self._stale, self._done = (wp.zeros(2, dtype=int, device=self.device) for _ in range(2))
+        # whether pairs are out of date, or were for the check of a whole step; whether the last `update` found them anew
+        self._stale, self._beyond, self._done = (wp.zeros(1, dtype=int, device=self.device) for _ in range(3))
         self._edges = things[2]
         self._trees = [things[size] for size in things if size != 1]
         self._motion = motion_kernels(real, arrays.serial(self.device))
@@ -149,8 +144,8 @@ class BroadPhase:
         By default q is `base`: nothing moves. Of a motion by one share that is not filtered the candidates hold from q on.
         """
         self._done.zero_()
-        self._watch(PAIRS, base, base if q is None else q, 0.5 * self.margin)
-        wp.capture_if(self._stale[PAIRS:], lambda: self._renew(base, base if q is None else q, together))
+        self._watch(base, base if q is None else q, self._stale)
+        wp.capture_if(self._stale, lambda: self.search(base, self._move, together))
 
     def search(self, x: wp.array, move: wp.array | None = None, together: wp.array | None = None) -> None:
         """Find all candidates at x or, with `move`, anywhere on the straight motion from x by it.
@@ -159,49 +154,21 @@ class BroadPhase:
         """
         move = self._still if move is None else move
         together = self._never if together is None else together
-        self._meet(x, move, together)
-        self.judge(x, move, together)
-
-    def _renew(self, base: wp.array, q: wp.array, together: wp.array | None) -> None:
-        """Search again, among the pairs whose boxes meet where these are wide enough."""
-        together = self._never if together is None else together
-        self._watch(BOXES, base, q, 0.5 * (WIDE - 1.0) * self.margin)
-        wp.capture_if(self._stale[BOXES:PAIRS], lambda: self._meet(base, self._move, together))
-        self.judge(base, self._move, together)
-
-    def _watch(self, which: int, base: wp.array, q: wp.array, allowed: float, stale: wp.array | None = None) -> None:
-        """Whether boxes or pairs are out of date for a motion, where nodes may be so far from the ways that these were found for.
-
-        Notes it for the next `update`, or in `stale` (1,).
-        """
-        watch, *_ = self._motion
-        inputs = [base, q, self._starts[which], self._ends[which], self._placed, allowed]
-        stale = self._stale[which : which + 1] if stale is None else stale
-        self._sweep(watch, base, inputs, [self._move, stale])
-
-    def _meet(self, x: wp.array, move: wp.array, together: wp.array) -> None:
-        """Find the pairs whose boxes meet."""
         self._enclose(x, move, together, 1.0, self._within)
         for part in self._trees:
             part.renew()
         for pairs in self.lists:
             pairs.meet()
-        self._mark(BOXES, x, move, together, self._fits, self.walks)
-
-    def judge(self, x: wp.array, move: wp.array | None = None, together: wp.array | None = None) -> None:
-        """As `search`, among pairs whose boxes met; these have to be up to date."""
-        move = self._still if move is None else move
-        together = self._never if together is None else together
-        for pairs in self.lists:
             pairs.judge(x, move, together, self.reach, self._around)
-        self._mark(PAIRS, x, move, together, self.overflow, self.searches)
-
-    def _mark(self, which: int, x, move, together, overflow: wp.array, number: wp.array) -> None:
-        """Note for what motion boxes or pairs were found."""
         _, mark, _ = self._motion
-        flags = (array[which : which + 1] for array in (self._stale, self._done))
-        outputs = [self._starts[which], self._ends[which], *flags, number]
-        self._sweep(mark, x, [x, move, together, self._placed, overflow], outputs)
+        outputs = [self._start, self._end, self._stale, self._done, self.searches]
+        self._sweep(mark, x, [x, move, together, self._placed, self.overflow], outputs)
+
+    def _watch(self, base: wp.array, q: wp.array, stale: wp.array) -> None:
+        """Note whether pairs are `stale` (1,) for a motion, which this tells of; see the class."""
+        watch, *_ = self._motion
+        inputs = [base, q, self._start, self._end, self._placed, 0.5 * self.margin]
+        self._sweep(watch, base, inputs, [self._move, stale])
 
     def filter(
         self, base: wp.array, q: wp.array, unit: wp.array, together: wp.array, units: int, keep: float = 1.0
@@ -223,7 +190,7 @@ class BroadPhase:
         _checked_keep(keep)
         self._filter.check(unit, together, units)
         self.update(base, q, together)
-        search = (self.overflow, self.time, self._done, self._starts, self._ends)
+        search = (self.overflow, self.time, self._done, self._start, self._end)
         self._filter(base, self._move, q, unit, together, units, keep, self._room(keep), search)
 
     def fit(self, x: wp.array) -> bool:
@@ -291,7 +258,7 @@ class BroadPhase:
     def check_crossings(self, base: wp.array, q: wp.array) -> None:
         """`crossings` in the motion from `base` to q; of candidates alone where these are all that may, which takes less."""
         self._beyond.zero_()
-        self._watch(PAIRS, base, q, 0.5 * self.margin, self._beyond)
+        self._watch(base, q, self._beyond)
         wp.capture_if(self._beyond, lambda: self.crossings(base, self._move), lambda: self.passing(base))
 
     def passing(self, base: wp.array) -> None:
@@ -325,7 +292,7 @@ class BroadPhase:
     @property
     def _within(self) -> float:
         """By what boxes are larger: half of the gap up to which they meet."""
-        return 0.5 * self.reach + 0.5 * WIDE * (1.0 + SLACK) * self.margin
+        return 0.5 * self.reach + self._around
 
     def _passing(self, kernels, x, move, keep: float, number, firsts) -> None:
         self._enclose(x, move, self.every, keep, 0.0)

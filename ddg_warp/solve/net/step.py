@@ -145,7 +145,7 @@ class NetStep(PartStep):
 
     @property
     def sought(self) -> tuple[int, int]:
-        """How many times trees of searches were walked, and that of runs, as of the last `outgrown`."""
+        """How many searches there were, and looks at runs, as of the last `outgrown`."""
         return self.newton.contact.search.sought if self.newton.contact else (0, 0)
 
     def outgrown(self, before) -> bool:
