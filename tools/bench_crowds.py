@@ -29,7 +29,8 @@ from ddg_warp.run.summary import machine, table, write_table
 # Of the weight of a rod, see `tolerances`: nodes err by a fifth of what steps half as long change, or less. By steps of 1/120 s 1e-1
 # is too much: noodles then seem to pass.
 RTOL, OTHERWISE = {"noodles": 3e-1, "hair_10000": 1e-1}, 3e-2
-ERROR, HALVINGS = 5e-3, {"noodles": 2}  # of `StepControl` [m/s]; steps of other cases are all of one length
+# of `StepControl`, error [m/s] and halvings; steps of other cases are all of one length
+CONTROL, ONE_LENGTH = {"noodles": (5e-3, 2)}, (5e-3, 0)
 PARTS = 6  # rows of a case
 CASES = {  # scene, its arguments, longest step [s], duration [s], whether something drives it
     "noodles": ("noodles", {"count": 121, "nodes": 961, "bowl": 1.1}, 1 / 240, 4.0, False),
@@ -61,7 +62,7 @@ def run(name: str, device, limit: float) -> list[dict]:
     scene, rtol = import_module(f"ddg_warp.scenes.{scene_name}").build(**given), RTOL.get(name, OTHERWISE)
     model = scene.build(device)
     integrator = ddg.Integrator(model, check_every=1, rtol=rtol)
-    steps = ddg.StepControl(integrator, ERROR, HALVINGS.get(name, 0))
+    steps = ddg.StepControl(integrator, *CONTROL.get(name, ONE_LENGTH))
     state = scene.initial(model) if scene.initial else model.state()
     contact = integrator._net.newton.contact  # for the time of a search, of which nothing public tells
     state = integrator.step(state, dt / 2**steps.halvings)
@@ -200,7 +201,7 @@ def tolerances(device) -> list[dict]:
         (RTOL["noodles"], 4 * dt, 2),
     ]:
         integrator, state = ddg.Integrator(model, rtol=rtol), start
-        steps = ddg.StepControl(integrator, ERROR, halvings)
+        steps = ddg.StepControl(integrator, CONTROL["noodles"][0], halvings)
         wp.synchronize_device(device)
         began = time.perf_counter()
         for _ in range(round(count * dt / length)):

@@ -125,13 +125,13 @@ class CyclicReduction:
         """Kernel of `again_at_places`, and how many threads a block of it has."""
         return reduction_again.again_at_places_kernel(twist, self._linear), self._threads
 
-    def again_at_places(self, twist: bool, residual, places, held, count, wanted, blocks: int, z, dots) -> None:
+    def again_at_places(self, twist: bool, residual, places, held, count, idle, wanted, blocks: int, z, dots) -> None:
         """As `again`, of the chains of a net with so many blocks in a world, see `reduction_again.again_at_places_kernel`."""
         kernel, threads = self.again_kernel_at_places(twist)
         wp.launch(
             kernel,
             self.columns * threads,
-            [self._packed, residual, places, held, count, wanted, blocks, self.blocks[0], threads],
+            [self._packed, residual, places, held, count, idle, wanted, blocks, self.blocks[0], threads],
             [self._rest, self._found, z, dots],
             device=self.device,
             block_dim=threads,

@@ -29,6 +29,7 @@ from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
 MOST = 2**31 - 1  # pairs that can be counted; more are told as so many
+AT_ONCE = 8  # pairs of a thing that are given places together: all threads wait for the one counter of places
 
 
 @cache
@@ -51,6 +52,7 @@ def query_function(grouped: bool, real):
 def candidate_kernels(kind: Kind, grouped: bool, real):
     """meet(...) of boxes, judge(...) by distance, and fill(...) the list of pairs."""
     Sides, X, Y = sides_struct(real), wp.types.vector(3, real), wp.types.matrix((4, 3), real)
+    Few = wp.types.vector(AT_ONCE, int)
     slots, may_touch, thickness, closest = pair_functions(kind, real)
     begin = query_function(grouped, real)
     corners, relative = corners_function(real), relative_function(kind, real)
@@ -77,6 +79,13 @@ def candidate_kernels(kind: Kind, grouped: bool, real):
                 second = wp.max(second, at + off)
         return first - second - two * around
 
+    @wp.func
+    def put(found: wp.array(dtype=int), met: wp.array(dtype=wp.vec2i), i: int, few: Few, number: int):
+        first = wp.atomic_add(found, 0, number)
+        for n in range(number):
+            if first + n < met.shape[0]:
+                met[first + n] = wp.vec2i(i, few[n])
+
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def meet(
         sides: Sides,
@@ -86,12 +95,17 @@ def candidate_kernels(kind: Kind, grouped: bool, real):
         """Pairs of things that may touch and whose boxes meet, as many as fit, and how many there are."""
         i = wp.tid()
         query, w, k = begin(sides, i)
+        few, number = Few(), int(0)
         j = int(0)
         while wp.bvh_query_next(query, j):
             if may_touch(sides, k, j - w * sides.counts[1]):
-                slot = wp.atomic_add(found, 0, 1)
-                if slot < met.shape[0]:
-                    met[slot] = wp.vec2i(i, j)
+                few[number] = j
+                number += 1
+                if number == wp.static(AT_ONCE):
+                    put(found, met, i, few, number)
+                    number = 0
+        if number > 0:
+            put(found, met, i, few, number)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def judge(

@@ -48,6 +48,7 @@ def set_struct(real, linear):
     ranks: of each pair, the places of its items among all of the list, -1 where it has none; `placed` by these is what products bring
     to nodes, which read it one after the other.
     marks, starts, columns: of pairs whose Hessians are kept, see `pair_terms.mollified_kernels`; empty where there are none.
+    idle: of each pair, not zero where products leave out what it brings to nodes, which nobody reads then.
     count (1,): how many pairs there are; kind: place in `pair_bend.KINDS`, -1 without `bend`; edges: how many of its things, the
     first ones, are edges; rows: of its factor; things: first things of pairs in one world.
     """
@@ -71,6 +72,7 @@ def set_struct(real, linear):
         items: wp.array(dtype=int)
         ranks: wp.array(dtype=wp.vec4i)
         count: wp.array(dtype=int)
+        idle: wp.array(dtype=wp.uint8)
         kind: int
         edges: int
         rows: int

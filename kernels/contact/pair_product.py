@@ -6,14 +6,14 @@ import warp as wp
 
 from ddg_warp.kernels.contact.gather import SLOTS, set_struct
 from ddg_warp.kernels.contact.pair_bend import bend_function
-from ddg_warp.kernels.matrix.sliced import product_functions
+from ddg_warp.kernels.matrix.sliced import BARRED, product_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 
 @cache
 def product_kernels(real, linear, serial: bool):
-    """multiply(...) pairs; gather(...) to nodes; settle(...), which does so on free dofs, with dot products, for nodes in pairs, which
-    meet(...) finds."""
+    """multiply(...) pairs; gather(...) to nodes; settle(...), which does so on dofs that are not barred, with dot products, for nodes
+    in pairs, which meet(...) finds."""
     PairSet, until = set_struct(real, linear), until_function(serial)
     X, V, Y = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.matrix((4, 3), linear)
     bend = bend_function(linear)
@@ -61,6 +61,8 @@ def product_kernels(real, linear, serial: bool):
         for s in range(sets.shape[0]):
             own = sets[s]
             for p in range(wp.tid(), own.count[0], threads):
+                if own.idle[p] != wp.uint8(0):
+                    continue
                 used = own.used[p]
                 if used != 0:
                     n = own.nodes[p]
@@ -129,19 +131,18 @@ def product_kernels(real, linear, serial: bool):
         sets: wp.array(dtype=PairSet),
         met: wp.array(dtype=wp.uint8),
         p: wp.array(dtype=V),
-        fixed: wp.array(dtype=wp.uint8),
+        barred: wp.array(dtype=wp.uint8),
         busy: wp.array(dtype=int),
         out: wp.array(dtype=V),
         dots_out: wp.array2d(dtype=linear),
     ):
-        """Adds to free dofs in worlds that are busy (1), and writes p . out node by node, where that has changed."""
+        """Adds to dofs that are not barred in worlds that are busy (1), and writes p . out node by node, where that has changed."""
         tid = wp.tid()
         for node in range(tid, until(tid, out.shape[0])):
-            w = node / fixed.shape[0]
-            if met[node] != wp.uint8(0) and busy[w] == 1:
-                k = node - w * fixed.shape[0]
-                y = out[node] + wp.cw_mul(total(sets, node), free(fixed[k]))
+            w = node / dots_out.shape[1]
+            if met[node] != wp.uint8(0) and barred[node] != BARRED and busy[w] == 1:
+                y = out[node] + wp.cw_mul(total(sets, node), free(barred[node]))
                 out[node] = y
-                dots_out[w, k] = wp.dot(p[node], y)
+                dots_out[w, node - w * dots_out.shape[1]] = wp.dot(p[node], y)
 
     return multiply, gather, meet, settle

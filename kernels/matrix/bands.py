@@ -12,7 +12,7 @@ from ddg_warp.kernels.islands import CARRIED, WANTED
 from ddg_warp.kernels.matrix.block_band import block_functions
 from ddg_warp.kernels.matrix.chain_blocks import blocks_function, layout_type
 from ddg_warp.kernels.matrix.chain_places import behind_function, place_dofs, value_function
-from ddg_warp.kernels.matrix.sliced import product_functions
+from ddg_warp.kernels.matrix.sliced import BARRED, product_functions
 from ddg_warp.kernels.net.places import along_type
 from ddg_warp.kernels.terms import Term
 from ddg_warp.kernels.threads import CPU_OPTIONS, first_of, until_function
@@ -31,7 +31,7 @@ def band_kernels(
     split: bool = False,
 ):
     """assemble(...): blocks of places, see `blocks_function`; clear(...): positions of H that they took over; product(...): H p on
-    free dofs, and p . H p block by block.
+    dofs that are not barred, and p . H p block by block.
     """
     nb = place_dofs(twist, split)
     H, B = wp.types.vector(3, linear), wp.types.vector(nb, linear)
@@ -60,7 +60,7 @@ def band_kernels(
         w = r / layout.count.shape[0]
         c = r - w * layout.count.shape[0]
         n = layout.count[c]
-        if flags[WANTED, w] == 0 or start >= n:
+        if flags[WANTED, w] == 0 or layout.idle[r] != 0 or start >= n:
             return
         for k in range(start, until(start, n)):
             D, E, F = blocks_at(matrix, mass, flags, scalars, layout, own0, own1, own2, own3, own4, own5, k, c, w)
@@ -103,7 +103,7 @@ def band_kernels(
         matrix: wp.array2d(dtype=linear),
         columns: wp.array(dtype=int),
         slices: wp.array(dtype=int),
-        fixed: wp.array(dtype=wp.uint8),
+        barred: wp.array(dtype=wp.uint8),
         p: wp.array(dtype=H),
         wanted: wp.array(dtype=int),
         blocks: int,
@@ -112,6 +112,7 @@ def band_kernels(
         places: wp.array3d(dtype=int),
         where: wp.array(dtype=int),
         count: wp.array(dtype=int),
+        idle: wp.array(dtype=int),
         nodes: int,
         product_out: wp.array(dtype=H),
         dots_out: wp.array2d(dtype=linear),
@@ -121,6 +122,10 @@ def band_kernels(
         if wanted[w] != 1:
             return
         b = i - w * blocks
+        if barred[i] == BARRED:
+            product_out[i] = H()
+            dots_out[w, b] = linear(0.0)
+            return
         shift = w * blocks
         y = times(matrix, columns, slices, p, b, w * positions, shift)
         at = where[b]
@@ -141,7 +146,7 @@ def band_kernels(
                     y += along(bands, wp.static(2 * nb**2), first, size, k, r, value(p, places, k + 2, c, shift))
                 if k > 1:
                     y += back(bands, wp.static(2 * nb**2), first, size, k - 2, r, value(p, places, k - 2, c, shift))
-        y = wp.cw_mul(y, free(fixed[b]))
+        y = wp.cw_mul(y, free(barred[i]))
         product_out[i] = y
         dots_out[w, b] = wp.dot(p[i], y)
 
@@ -180,7 +185,7 @@ def product_walk_kernel(twist: bool, span: int, linear, split: bool = False):
         matrix: wp.array2d(dtype=linear),
         columns: wp.array(dtype=int),
         slices: wp.array(dtype=int),
-        fixed: wp.array(dtype=wp.uint8),
+        barred: wp.array(dtype=wp.uint8),
         p: wp.array(dtype=H),
         wanted: wp.array(dtype=int),
         blocks: int,
@@ -189,6 +194,7 @@ def product_walk_kernel(twist: bool, span: int, linear, split: bool = False):
         places: wp.array3d(dtype=int),
         where: wp.array(dtype=int),
         count: wp.array(dtype=int),
+        idle: wp.array(dtype=int),
         nodes: int,
         product_out: wp.array(dtype=H),
         dots_out: wp.array2d(dtype=linear),
@@ -198,9 +204,14 @@ def product_walk_kernel(twist: bool, span: int, linear, split: bool = False):
                 continue
             shift = first_of(w, blocks)
             for b in range(blocks):
-                product_out[b + shift] = times(matrix, columns, slices, p, b, w * positions, shift)
+                y = H()
+                if barred[b + shift] != BARRED:
+                    y = times(matrix, columns, slices, p, b, w * positions, shift)
+                product_out[b + shift] = y
             for c in range(count.shape[0]):
                 r = w * count.shape[0] + c
+                if idle[r] != 0:
+                    continue
                 n = count[c]
                 here, ahead = value(p, places, 0, c, shift), B()
                 if n > 1:
@@ -230,7 +241,7 @@ def product_walk_kernel(twist: bool, span: int, linear, split: bool = False):
                         if angle >= 0:
                             product_out[angle + shift] += H(u[3], linear(0.0), linear(0.0))
             for b in range(blocks):
-                y = wp.cw_mul(product_out[b + shift], free(fixed[b]))
+                y = wp.cw_mul(product_out[b + shift], free(barred[b + shift]))
                 product_out[b + shift] = y
                 dots_out[w, b] = wp.dot(p[b + shift], y)
 

@@ -127,7 +127,7 @@ def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tupl
 
 @cache
 def layout_type():
-    """Where the blocks of chains are: of places, see `ChainPlan`, and the positions of H_ii of blocks."""
+    """Where the blocks of chains are: of places, see `ChainPlan`, and the positions of H_ii of blocks; `idle`: see `Chains`."""
 
     @wp.struct
     class Layout:
@@ -135,6 +135,7 @@ def layout_type():
         chain: wp.array2d(dtype=int)
         count: wp.array(dtype=int)
         held: wp.array2d(dtype=wp.uint8)
+        idle: wp.array(dtype=int)
         diagonal: wp.array(dtype=int)
         positions: int
 

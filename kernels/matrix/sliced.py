@@ -17,6 +17,7 @@ from ddg_warp.kernels.terms import Term
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 SLICE = 32  # rows of a slice of H
+BARRED = wp.constant(wp.uint8(7))  # bits of a block none of whose dofs takes part in a direction
 
 
 @cache
@@ -157,6 +158,7 @@ def inertia_function(real, linear, drag: bool):
     return inertia_of
 
 
+BARRED = wp.constant(wp.uint8(7))  # bits of a block none of whose dofs takes part in a direction
 SETS = 6  # sets that one launch sums
 
 

@@ -353,7 +353,7 @@ def stiffen_kernel(twist: bool, linear):
         k, r = wp.tid()
         w = r / layout.count.shape[0]
         c = r - w * layout.count.shape[0]
-        if flags[WANTED, w] == 0 or k >= layout.count[c]:
+        if flags[WANTED, w] == 0 or layout.idle[r] != 0 or k >= layout.count[c]:
             return
         f = free_of(layout.held[k, c])
         D = load(bands, 0, k, r)

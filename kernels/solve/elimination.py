@@ -29,6 +29,7 @@ from ddg_warp.kernels.matrix.block_band import (
     substitute_function,
 )
 from ddg_warp.kernels.matrix.chain_places import place_dofs, place_functions, value_function
+from ddg_warp.kernels.matrix.sliced import BARRED
 from ddg_warp.kernels.solve.joints import coupling_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS, first_of, until_function
 
@@ -50,6 +51,7 @@ def walk_places_kernel(twist: bool, span: int, linear, split: bool = False):
         places: wp.array3d(dtype=int),
         held: wp.array2d(dtype=wp.uint8),
         count: wp.array(dtype=int),
+        idle: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
         blocks: int,
         values: wp.array3d(dtype=linear),
@@ -59,7 +61,7 @@ def walk_places_kernel(twist: bool, span: int, linear, split: bool = False):
         r = wp.tid()
         w = r / count.shape[0]
         c = r - w * count.shape[0]
-        if wanted[w] != 1:
+        if wanted[w] != 1 or idle[r] != 0:
             return
         n, first = count[c], first_of(w, blocks)
         for k in range(n):
@@ -107,6 +109,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
     def factorise(
         blocks: wp.array3d(dtype=linear),
         count: wp.array(dtype=int),
+        idle: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
         factors: wp.array3d(dtype=linear),
         lost: wp.array(dtype=int),
@@ -114,7 +117,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
         """Lost and negative pivots become positive ones, so that the solves stay definite, and are noted."""
         r = wp.tid()
         w = r / count.shape[0]
-        if wanted[w] != 0:
+        if wanted[w] != 0 and idle[r] == 0:
             if factor(blocks, factors, count[r - w * count.shape[0]], r) > 0:
                 lost[w] = 1
 
@@ -124,6 +127,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
         columns: wp.array(dtype=int),
         places: wp.array3d(dtype=int),
         count: wp.array(dtype=int),
+        idle: wp.array(dtype=int),
         held: wp.array2d(dtype=wp.uint8),
         starts: wp.array(dtype=int),
         items: wp.array(dtype=int),
@@ -145,7 +149,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
         r = s - q * worlds * count.shape[0]
         w = r / count.shape[0]
         c = r - w * count.shape[0]
-        if wanted[w] != 1 or start >= count[c]:
+        if wanted[w] != 1 or idle[r] != 0 or start >= count[c]:
             return
         for k in range(start, until(start, count[c])):
             u = B()
@@ -173,6 +177,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
     def solve(
         factors: wp.array3d(dtype=linear),
         count: wp.array(dtype=int),
+        idle: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
         values: wp.array3d(dtype=linear),
     ):
@@ -181,14 +186,14 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
         columns = wanted.shape[0] * count.shape[0]
         r = s - s / columns * columns
         w = r / count.shape[0]
-        if wanted[w] == 1:
+        if wanted[w] == 1 and idle[r] == 0:
             _product = substitute(factors, values, values, count[r - w * count.shape[0]], r, s)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def spread(wanted: wp.array(dtype=int), columns: int, wanted_out: wp.array(dtype=int)):
+    def spread(wanted: wp.array(dtype=int), idle: wp.array(dtype=int), columns: int, wanted_out: wp.array(dtype=int)):
         """For `kernels.solve.cyclic_reduction`: which columns are wanted."""
         r = wp.tid()
-        wanted_out[r] = wp.where(wanted[r / columns] == 1, 1, 0)
+        wanted_out[r] = wp.where(wanted[r / columns] == 1 and idle[r] == 0, 1, 0)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def note(columns: int, bad: wp.array(dtype=int), lost: wp.array(dtype=int)):
@@ -202,6 +207,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
     def solve_all(
         factors: wp.array3d(dtype=linear),
         count: wp.array(dtype=int),
+        idle: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
         values: wp.array3d(dtype=linear),
     ):
@@ -211,7 +217,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
         colour = s / columns
         r = s - colour * columns
         w = r / count.shape[0]
-        if wanted[w] == 1:
+        if wanted[w] == 1 and idle[r] == 0:
             first = colour * wp.static(sides) * columns + r
             substitute_all(factors, values, count[r - w * count.shape[0]], r, first, columns)
 
@@ -253,6 +259,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
         joint_row: wp.array(dtype=int),
         joint_rows: int,
         moved: wp.array(dtype=H),
+        barred: wp.array(dtype=wp.uint8),
         wanted: wp.array(dtype=int),
         blocks: int,
         nodes: int,
@@ -263,7 +270,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
         start = wp.tid()
         for i in range(start, until(start, z.shape[0])):
             w = i / blocks
-            if wanted[w] != 1:
+            if wanted[w] != 1 or barred[i] == BARRED:
                 continue
             b = i - w * blocks
             at = where[b]

@@ -9,7 +9,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.matrix.sliced import product_functions
+from ddg_warp.kernels.matrix.sliced import BARRED, product_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
 TILE = 4096  # entries that one block of threads sums
@@ -109,7 +109,7 @@ def solver_kernels(linear, indefinite: bool = False):
     def invert(
         matrix: wp.array2d(dtype=linear),
         diagonal: wp.array(dtype=int),
-        fixed: wp.array(dtype=wp.uint8),
+        barred: wp.array(dtype=wp.uint8),
         wanted: wp.array(dtype=int),
         blocks: int,
         positions: int,
@@ -122,11 +122,11 @@ def solver_kernels(linear, indefinite: bool = False):
         if wanted[w] == 0:
             return
         k = i - w * blocks
-        if diagonal[k] < 0:  # chains see to it
+        if diagonal[k] < 0 or barred[i] == BARRED:  # chains see to it, or nobody
             inverse_out[i] = M()
             return
         p = diagonal[k] + w * positions
-        f = free(fixed[k])
+        f = free(barred[i])
         m = M()
         for r in range(3):
             for c in range(3):
@@ -143,6 +143,7 @@ def solver_kernels(linear, indefinite: bool = False):
     def start(
         right: wp.array(dtype=H),
         inverse: wp.array(dtype=M),
+        barred: wp.array(dtype=wp.uint8),
         wanted: wp.array(dtype=int),
         blocks: int,
         residual_out: wp.array(dtype=H),
@@ -154,7 +155,9 @@ def solver_kernels(linear, indefinite: bool = False):
         w = i / blocks
         if wanted[w] == 0:
             return
-        r = right[i]
+        r = H()
+        if barred[i] != BARRED:
+            r = right[i]
         z = inverse[i] * r
         residual_out[i] = r
         solution_out[i] = H()
@@ -189,7 +192,7 @@ def solver_kernels(linear, indefinite: bool = False):
         matrix: wp.array2d(dtype=linear),
         columns: wp.array(dtype=int),
         slices: wp.array(dtype=int),
-        fixed: wp.array(dtype=wp.uint8),
+        barred: wp.array(dtype=wp.uint8),
         p: wp.array(dtype=H),
         wanted: wp.array(dtype=int),
         blocks: int,
@@ -197,13 +200,15 @@ def solver_kernels(linear, indefinite: bool = False):
         product_out: wp.array(dtype=H),
         dots_out: wp.array2d(dtype=linear),
     ):
-        """H p on free dofs, and p . H p block by block."""
+        """H p on dofs that are not barred, and p . H p block by block."""
         i = wp.tid()
         w = i / blocks
         if wanted[w] != 1:
             return
         k = i - w * blocks
-        y = wp.cw_mul(times(matrix, columns, slices, p, k, w * positions, w * blocks), free(fixed[k]))
+        y = H()
+        if barred[i] != BARRED:
+            y = wp.cw_mul(times(matrix, columns, slices, p, k, w * positions, w * blocks), free(barred[i]))
         product_out[i] = y
         dots_out[w, k] = wp.dot(p[i], y)
 
@@ -213,6 +218,7 @@ def solver_kernels(linear, indefinite: bool = False):
         product: wp.array(dtype=H),
         inverse: wp.array(dtype=M),
         diagonal: wp.array(dtype=int),
+        barred: wp.array(dtype=wp.uint8),
         rho: wp.array(dtype=linear),
         curvature: wp.array(dtype=linear),
         iterations: wp.array(dtype=int),
@@ -229,7 +235,7 @@ def solver_kernels(linear, indefinite: bool = False):
         w = i / blocks
         if i == 0:
             busy_out[0] = 0
-        if wanted[w] != 1:
+        if wanted[w] != 1 or barred[i] == BARRED:
             return
         k = i - w * blocks
         if ends(curvature[w], rho[w]):
@@ -250,6 +256,7 @@ def solver_kernels(linear, indefinite: bool = False):
         z: wp.array(dtype=H),
         total: wp.array(dtype=linear),
         rho: wp.array(dtype=linear),
+        barred: wp.array(dtype=wp.uint8),
         wanted: wp.array(dtype=int),
         blocks: int,
         p: wp.array(dtype=H),
@@ -257,7 +264,7 @@ def solver_kernels(linear, indefinite: bool = False):
         """The next direction."""
         i = wp.tid()
         w = i / blocks
-        if wanted[w] == 1:
+        if wanted[w] == 1 and barred[i] != BARRED:
             p[i] = z[i] + (total[w] / rho[w]) * p[i]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

@@ -144,7 +144,7 @@ def level_kernels(linear):
         residual: wp.array(dtype=H),
         correction: wp.array(dtype=H),
         group: wp.array(dtype=int),
-        fixed: wp.array(dtype=wp.uint8),
+        barred: wp.array(dtype=wp.uint8),
         groups: int,
         blocks: int,
         wanted: wp.array(dtype=int),
@@ -160,7 +160,7 @@ def level_kernels(linear):
         y = z[i]
         g = group[k]
         if g >= 0:
-            y += wp.cw_mul(correction[g + w * groups], free(fixed[k]))
+            y += wp.cw_mul(correction[g + w * groups], free(barred[i]))
         z[i] = y
         dots_out[w, k] = wp.dot(residual[i], y)
 

@@ -196,6 +196,7 @@ def again_at_places_kernel(twist: bool, linear):
         places: wp.array3d(dtype=int),
         held: wp.array2d(dtype=wp.uint8),
         count: wp.array(dtype=int),
+        idle: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
         net_blocks: int,
         blocks: int,
@@ -210,7 +211,7 @@ def again_at_places_kernel(twist: bool, linear):
         t = tid - r * threads
         w = r / count.shape[0]
         c = r - w * count.shape[0]
-        if wanted[w] != 1:
+        if wanted[w] != 1 or idle[r] != 0:
             return
         n = count[c]
         first = w * net_blocks

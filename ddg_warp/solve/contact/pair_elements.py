@@ -21,7 +21,7 @@ class PairElements:
 
     Attributes:
         factor: see `gather.factor_struct`; energy: of each pair (capacity,) [J]; gradient: by slot (SLOTS, capacity) [N].
-        placed: see `gather.set_struct`.
+        placed, idle: see `gather.set_struct`.
         pairs, count, starts, partners: as those of a `PairList`.
         mollified: those whose matrices take more than a factor and what turns (`Mollified`); None without.
         numbers, places, items, ranks: as of `NodeItems`, which the subclass has list the pairs.
@@ -61,6 +61,7 @@ class PairElements:
         self.gradient = arrays.allocate((gather.SLOTS, capacity), wp.types.vector(3, self.real), self.device)
         self._items.reserve(capacity)
         self.items, self.ranks = self._items.items, self._items.ranks
+        self.idle = wp.zeros(capacity, dtype=wp.uint8, device=self.device)
         self.placed = wp.zeros(len(self.items), dtype=vector, device=self.device)
 
     def _take_turns(self, kernel, count: int, inputs: list, outputs: list) -> None:

@@ -14,7 +14,7 @@ class PairProduct:
     """The product of the matrix of some lists of pair elements with a vector; `fit` follows whenever they have got more room.
 
     Attributes:
-        sets: the lists, see `kernels.contact.gather.set_struct`.
+        sets: the lists, see `kernels.contact.gather.set_struct`; most: the most pairs that one has room for.
     """
 
     def __init__(self, parts: list, law, real, linear):
@@ -32,7 +32,7 @@ class PairProduct:
         """Take the arrays that the lists have now."""
         self._sets = [self._set(part) for part in self._parts]  # an array of structures keeps nothing alive
         self.sets = wp.array(self._sets, dtype=set_struct(self._real, self._linear), device=self._device)
-        self._most = max(part.found.capacity for part in self._parts)
+        self.most = max(part.found.capacity for part in self._parts)
         self._met = wp.zeros(len(self._parts[0].numbers), dtype=wp.uint8, device=self._device)
 
     def meet(self) -> None:
@@ -53,15 +53,15 @@ class PairProduct:
         """Add what is placed to nodes."""
         self._sweep(self._gather, len(out), [self.sets], [out])
 
-    def settle(self, v, out, x, wanted, fixed: wp.array, busy: wp.array, dots: wp.array) -> None:
-        """The same on free dofs in worlds that are busy, and v . out of the nodes to which it adds."""
+    def settle(self, v, out, x, wanted, barred: wp.array, busy: wp.array, dots: wp.array) -> None:
+        """The same on dofs that are not barred in worlds that are busy, and v . out of the nodes to which it adds."""
         self.place(v, x, wanted)
-        self._sweep(self._settle, len(out), [self.sets, self._met, v, fixed, busy], [out, dots])
+        self._sweep(self._settle, len(out), [self.sets, self._met, v, barred, busy], [out, dots])
 
     def place(self, v, x=None, wanted=None) -> None:
         """What pairs bring to nodes, of products as above."""
         given = self._nothing if wanted is None else [wanted, x]
-        arrays.take_turns(self._multiply, self._most, [self.sets, *given, v], [], self._device)
+        arrays.take_turns(self._multiply, self.most, [self.sets, *given, v], [], self._device)
         for part in self._mollified if wanted is not None else ():
             if not part.keeps:
                 part.multiply(v)
@@ -70,7 +70,7 @@ class PairProduct:
         own, kind = set_struct(self._real, self._linear)(), part.found.kind
         for name in ("nodes", "used", "direction", "weight", "bend"):
             setattr(own, name, getattr(part.factor, name))
-        for name in ("pairs", "count", "gradient", "placed", "places", "numbers", "items", "ranks"):
+        for name in ("pairs", "count", "gradient", "placed", "places", "numbers", "items", "ranks", "idle"):
             setattr(own, name, getattr(part, name))
         for name in ("marks", "starts", "columns") if part.mollified and part.mollified.keeps else ():
             setattr(own, name, getattr(part.mollified, name))

@@ -54,7 +54,7 @@ class PairTerms:
             between the first and the second node of edges, in the order of `shapes.things(2)`. Each pair's own part of rods, 6 x 6 for
             an edge, is in both, positive semi-definite together. See `join`.
         stiffness: (worlds times nodes,) [N/m], traces of `diagonal`.
-        law: `law_struct`, on the device.
+        law: `law_struct`, on the device; products: the `PairProduct` of all lists.
 
     Raises:
         SceneError: names the parameter, the pair of objects where there is one, and the remedy.
@@ -100,7 +100,7 @@ class PairTerms:
         self._version, self._lagged = search.version, -1
         self.frictions = self._with_friction(rubs, ways, friction_law, velocity, told_not)
         self._start = wp.zeros_like(self.forces)
-        self._product = PairProduct(self._parts, self.law, self.real, self.linear)
+        self.products = PairProduct(self._parts, self.law, self.real, self.linear)
         self._rub = PairProduct(self.frictions, self.law, self.real, self.linear) if self.frictions else None
         self._totals = told = Totals(self.lists, self.frictions, search.worlds, self.real, self.device)
         self.energy, self.touching, self.dissipated = told.energy, told.touching, told.dissipated
@@ -111,7 +111,7 @@ class PairTerms:
         """Kernels to load before a capture."""
         parts = [kernel for part in self._parts for kernel in part.kernels]
         own = [self._collect, self._join]
-        return [*own, *self._product.kernels, *self._totals.kernels, *parts]
+        return [*own, *self.products.kernels, *self._totals.kernels, *parts]
 
     @property
     def _parts(self) -> list:
@@ -126,7 +126,7 @@ class PairTerms:
             return False
         for part in self._parts:
             part.reserve()
-        for product in filter(None, (self._product, self._rub)):
+        for product in filter(None, (self.products, self._rub)):
             product.fit()
         self._totals.fit()
         self._version = self.search.version
@@ -179,7 +179,7 @@ class PairTerms:
         for part in self.frictions:
             part.evaluate(x, start, rate, iterates)
         outputs = [self.forces, self.diagonal, self.stiffness]
-        arrays.sweep(self._collect, len(self.forces), [self._product.sets], outputs, self.device)
+        arrays.sweep(self._collect, len(self.forces), [self.products.sets], outputs, self.device)
         self._totals(self.search.overflow)
 
     def _start_anew(self) -> None:
@@ -196,34 +196,34 @@ class PairTerms:
         (`kernels.contact.pair_bend`), in worlds where that is not zero, once `prepare` was called there.
         """
         if x is None or wanted is not None:
-            self._product(v, out, x, wanted)
+            self.products(v, out, x, wanted)
             return
         for part in self.lists:
             part.exact_product(v, x, self.law)
         if self._rub:
             self._rub.place(v)
-        self._product.gather(out)
+        self.products.gather(out)
 
     def meet(self) -> None:
         """What `settle` takes of the last `evaluate`: which nodes are in pairs."""
-        self._product.meet()
+        self.products.meet()
 
     def prepare(self, x: wp.array, wanted: wp.array) -> None:
         """What products take that have at x what comes of pairs that turn, in worlds where `wanted` (worlds,) is not zero."""
-        self._product.prepare(x, wanted)
+        self.products.prepare(x, wanted)
 
-    def settle(self, v, out, x, wanted, fixed: wp.array, busy: wp.array, dots: wp.array) -> None:
-        """`product` on free dofs, in worlds that are `busy` (1), of which v . out is written for nodes in pairs, too; after `meet`.
+    def settle(self, v, out, x, wanted, barred: wp.array, busy: wp.array, dots: wp.array) -> None:
+        """`product` on dofs that are not barred, in worlds that are `busy` (1), and v . out for nodes in pairs; after `meet`.
 
         Args:
-            fixed: of each node of a world, bits of its held dofs; dots: (worlds, nodes).
+            barred: of each node, bits of the dofs whose product is not asked for; dots: (worlds, nodes).
         """
-        self._product.settle(v, out, x, wanted, fixed, busy, dots)
+        self.products.settle(v, out, x, wanted, barred, busy, dots)
 
     def join(self) -> None:
         """Write `between` of the last `evaluate`."""
         edges = self.search.lists[0].first
-        inputs = [self._product.sets, edges.surface, edges.count]
+        inputs = [self.products.sets, edges.surface, edges.count]
         arrays.sweep(self._join, len(self.between), inputs, [self.between], self.device)
 
     def _check(self, rate: wp.array) -> None:

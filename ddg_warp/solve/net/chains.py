@@ -29,6 +29,7 @@ class Chains:
         split: whether tensions of edges are unknowns, see `kernels.solve.tension`; where `splits` says that they can be.
 
     Attributes:
+        idle: chains of all worlds (columns,) that take no part in a direction are not zero, see `Resting`; zero without it.
         exact: whether the preconditioner is the inverse of H, so that a direction takes no conjugate gradients; see `bind`.
         longer (2, longest, columns): if `split`, slack and lengthening of the edges behind places by the last direction.
 
@@ -86,6 +87,7 @@ class Chains:
         self.held = arrays.upload(plan.held(net.host), wp.uint8, device)
         self.longest, self.width = plan.chain.shape
         self.columns = worlds * self.width
+        self.idle = wp.zeros(self.columns, dtype=int, device=device)
         block = plan.block
         self.factors = arrays.allocate((3 * block**2 + block, self.longest, self.columns), linear, device)
         self.reduction = None
@@ -126,7 +128,7 @@ class Chains:
         if serial:
             self._product = bands.product_walk_kernel(plan.twist, plan.span, linear, self.split)
         self.layout = layout_type()()
-        for name in ("places", "chain", "count", "held"):
+        for name in ("places", "chain", "count", "held", "idle"):
             setattr(self.layout, name, getattr(self, name))
         self.layout.diagonal, self.layout.positions = table.diagonal, table.positions
         own = [self._elements(i, written[i], real, linear) for i in sets] or [along_type(real, linear)()]
@@ -200,18 +202,18 @@ class Chains:
             inputs = [self.taken, islands.wanted, self.table.positions]
             self._launch(self._clear, (self.taken.size, self.net.worlds), inputs, [matrix])
 
-    def product(self, matrix, p: wp.array, fixed, wanted, product: wp.array, dots: wp.array) -> None:
+    def product(self, matrix, p: wp.array, barred, wanted, product: wp.array, dots: wp.array) -> None:
         """H p with what the bands make of p, and p . H p block by block."""
         table, net = self.table, self.net
         self._launch(
             self._product,
             arrays.takers(net.worlds * net.blocks, self.device),
-            [matrix, table.columns, table.slices, fixed, p, wanted, net.blocks, table.positions]
-            + [self.bands, self.places, self.where, self.count, net.host.nodes],
+            [matrix, table.columns, table.slices, barred, p, wanted, net.blocks, table.positions]
+            + [self.bands, self.places, self.where, self.count, self.idle, net.host.nodes],
             [product, dots],
         )
 
-    def direct(self, matrix, mass, islands, anew, fixed, right, lost: wp.array, z: wp.array, dots: wp.array) -> None:
+    def direct(self, matrix, mass, islands, anew, fixed, barred, right, lost: wp.array, z: wp.array, dots) -> None:
         """H^-1 r of the worlds that want a direction, where this is exact; raises `lost` where H is indefinite.
 
         H is new in the islands `anew`.
@@ -219,7 +221,7 @@ class Chains:
         if not self._walk:
             self.assemble(matrix, mass, anew)
             self.prepare(matrix, fixed, anew.wanted, lost)
-            self.apply(matrix, right, islands.wanted, z, dots)
+            self.apply(matrix, right, barred, islands.wanted, z, dots)
             if self.split:
                 inputs = [*islands.arrays, self.layout, *self._own, self.values]
                 self._launch(self._lengthen, (self.longest, self.columns), inputs, [self.longer])
@@ -232,7 +234,7 @@ class Chains:
         )
         if self.joints:
             self._prepare_joints(matrix, fixed, islands.wanted, lost)
-            self._apply_joints(matrix, right, islands.wanted, z, dots)
+            self._apply_joints(matrix, right, barred, islands.wanted, z, dots)
 
     def prepare(self, matrix: wp.array, fixed: wp.array, wanted: wp.array, lost: wp.array) -> None:
         """Factors of chains and joints of the worlds that want a direction; raises `lost` where one of them is indefinite."""
@@ -243,23 +245,30 @@ class Chains:
             self._note()
         elif not self.reduction:
             self._launch(
-                self._factorise, self.columns, [self.eliminated, self.count, wanted], [self.factors, lost], SERIAL
+                self._factorise,
+                self.columns,
+                [self.eliminated, self.count, self.idle, wanted],
+                [self.factors, lost],
+                SERIAL,
             )
         if self.joints:
             self._prepare_joints(matrix, fixed, wanted, lost)
 
-    def apply(self, matrix, residual, wanted, z: wp.array, dots: wp.array) -> None:
-        """z of the blocks of rods and joints from the residual, where block Jacobi has left its own, and r . z block by block."""
+    def apply(self, matrix, residual, barred, wanted, z: wp.array, dots: wp.array) -> None:
+        """z of the blocks of rods and joints from the residual, where block Jacobi has left its own, and r . z block by block.
+
+        Blocks that are barred (W N,), with all bits set, keep theirs.
+        """
         if self._walk_places:
-            inputs = [self.factors, residual, self.places, self.held, self.count, wanted, self.net.blocks]
+            inputs = [self.factors, residual, self.places, self.held, self.count, self.idle, wanted, self.net.blocks]
             self._launch(self._walk_places, self.columns, inputs, [self.values, z, dots], SERIAL)
             return
         if self._at_places:
-            given = residual, self.places, self.held, self.count, wanted, self.net.blocks
+            given = residual, self.places, self.held, self.count, self.idle, wanted, self.net.blocks
             self.reduction.again_at_places(self.plan.twist, *given, z, dots)
             return
         self._eliminate(matrix, wanted, self.values, residual, None)
-        self._apply_joints(matrix, residual, wanted, z, dots)
+        self._apply_joints(matrix, residual, barred, wanted, z, dots)
 
     def _prepare_joints(self, matrix, fixed, wanted, lost: wp.array) -> None:
         """Factors of joints, once those of chains are there."""
@@ -273,7 +282,7 @@ class Chains:
             [self.parts, lost],
         )
 
-    def _apply_joints(self, matrix, residual, wanted, z: wp.array, dots: wp.array) -> None:
+    def _apply_joints(self, matrix, residual, barred, wanted, z: wp.array, dots: wp.array) -> None:
         """z from what chains make of the residual on their own."""
         net = self.net
         if self.joints:
@@ -296,7 +305,7 @@ class Chains:
         self._launch(
             self._finish,
             arrays.takers(net.worlds * net.blocks, self.device),
-            [residual, self.values, self.where, self.width, self.joint_row, self.joint_rows, self.moved, wanted]
+            [residual, self.values, self.where, self.width, self.joint_row, self.joint_rows, self.moved, barred, wanted]
             + [net.blocks, net.host.nodes],
             [z, dots],
         )
@@ -311,7 +320,17 @@ class Chains:
         self._launch(
             self._load,
             (arrays.takers(self.longest, self.device), solves * self.columns),
-            [matrix, table.columns, self.places, self.count, self.held, self.starts, self.items, self.joint_row]
+            [
+                matrix,
+                table.columns,
+                self.places,
+                self.count,
+                self.idle,
+                self.held,
+                self.starts,
+                self.items,
+                self.joint_row,
+            ]
             + [self.joint_rows, wanted, net.blocks, table.positions, int(residual is not None)]
             + [int(moved is not None), self.moved if residual is None else residual]
             + [self.moved if moved is None else moved],
@@ -321,7 +340,8 @@ class Chains:
             self._reduce(values, wanted)
             return
         kernel, sides = (self._solve, 1) if values is self.values else (self._solve_all, self.plan.size)
-        self._launch(kernel, solves // sides * self.columns, [self.factors, self.count, wanted], [values], SERIAL)
+        inputs = [self.factors, self.count, self.idle, wanted]
+        self._launch(kernel, solves // sides * self.columns, inputs, [values], SERIAL)
 
     def _reduce(self, values: wp.array, wanted: wp.array) -> None:
         """H_II^-1 of values by cyclic reduction, which eliminates long chains anew every time."""
@@ -336,7 +356,7 @@ class Chains:
 
     def _spread(self, wanted: wp.array) -> None:
         """Which chains are wanted, of the worlds that are."""
-        self._launch(self._columns[0], self.columns, [wanted, self.width], [self._wanted])
+        self._launch(self._columns[0], self.columns, [wanted, self.idle, self.width], [self._wanted])
 
     def _note(self) -> None:
         """Raise what is lost of worlds by what their chains lose."""

@@ -35,6 +35,7 @@ class NetContact:
         forces (W N,) [N], stiffness (W N,) [N/m]: what pushes nodes, and a bound on how stiff that is.
         diagonal: (W N,) blocks of its matrix at nodes.
         bound: (W N,) where iterates of worlds on their way are bound for, and where those of others are.
+        bodies: which each block of a world belongs to (blocks,), -1 for none, and how many there are.
         bends: whether its matrix has what comes of pairs that turn, once the search is near; see `kernels.contact.pair_bend`.
         crossed: (1,) pairs that would have passed through each other in all steps so far; least: (1,) the smallest gap [m].
     """
@@ -71,7 +72,9 @@ class NetContact:
         self.crossed, self.least = make(1, wp.int64), wp.full(1, math.inf, dtype=real, device=device)
         self.tally = Tally(self.terms)
         self._counts = self.crossed, self.least, self.search.searches, *self.tally.arrays
-        self._unit, self._units = self._number_units(host, model.motions)
+        self.bodies = _number_bodies(host)
+        unit, self._units = _number_units(*self.bodies, host, model.motions)
+        self._unit = wp.array(unit, dtype=int, device=device)
         places = np.concatenate([host.moving[:, 0], host.turning[:, 0]])
         self._nodes = wp.array(places.astype(np.int32), dtype=int, device=device)
         self._aims = make((max(1, len(places)), worlds), net.vector)
@@ -108,22 +111,6 @@ class NetContact:
     def bind(self, chains) -> None:
         """Have a part in what chains eliminate, once their plan is made."""
         self._bands = ContactBands(chains, self.shapes)
-
-    def _number_units(self, host, motions: list) -> tuple[wp.array, int]:
-        """Unit of every block: what is cut together, a rod, a shell, or all that one motion moves; and how many there are."""
-        unit = np.full(host.blocks, -1, np.int32)
-        count = 0
-        for rod in host.rods:
-            unit[rod.all_nodes], unit[rod.all_edges] = count, count
-            count += 1
-        for shell in host.shells:
-            unit[shell.nodes], unit[shell.edges[shell.edges >= 0]] = count, count
-            count += 1
-        unit = _joined(unit, host)
-        starts = pose_starts(motions)
-        for places, poses in ((host.moving[:, 0], host.moving[:, 1:].max(1)), host.turning.T):
-            unit[places] = count + np.searchsorted(starts, poses, side="right") - 1
-        return wp.array(unit, dtype=int, device=self.newton.device), count + len(motions)
 
     @property
     def kernels(self) -> list:
@@ -223,7 +210,7 @@ class NetContact:
         newton = self.newton
         curved = self._curved if self.bends else None
         busy, dots = newton.islands.wanted, newton.krylov_dots
-        self.terms.settle(p, product, newton.q, curved, newton.fixed, busy, dots)
+        self.terms.settle(p, product, newton.q, curved, newton.barred, busy, dots)
 
     def hold(self) -> None:
         """Cut what was moved, and say what that is expected to gain."""
@@ -331,6 +318,27 @@ class NetContact:
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self.newton.device)
+
+
+def _number_bodies(host) -> tuple[np.ndarray, int]:
+    """Rod or shell that every block belongs to, one for all that are joined, -1 for none; and how many there may be."""
+    unit = np.full(host.blocks, -1, np.int32)
+    count = 0
+    for rod in host.rods:
+        unit[rod.all_nodes], unit[rod.all_edges] = count, count
+        count += 1
+    for shell in host.shells:
+        unit[shell.nodes], unit[shell.edges[shell.edges >= 0]] = count, count
+        count += 1
+    return _joined(unit, host), count
+
+
+def _number_units(body: np.ndarray, count: int, host, motions: list) -> tuple[np.ndarray, int]:
+    """Unit of every block: what is cut together, a body or all that one motion moves; and how many there are."""
+    unit, starts = body.copy(), pose_starts(motions)
+    for places, poses in ((host.moving[:, 0], host.moving[:, 1:].max(1)), host.turning.T):
+        unit[places] = count + np.searchsorted(starts, poses, side="right") - 1
+    return unit, count + len(motions)
 
 
 def _joined(unit: np.ndarray, host) -> np.ndarray:

@@ -55,6 +55,7 @@ class ExactSystem:
         self.system = NetSystem(net)
         self.planes = DevicePlanes(net, self.system, real, self.linear) if host.frames else None
         self.fixed = self.bits(host.fixed)
+        self.barred = wp.array(np.tile(self.fixed.numpy(), worlds), dtype=wp.uint8, device=device)
         self.mass = net.mass if inertia is None else inertia
         self.right, self.direction = (make(self.all, H) for _ in range(2))
         self.matrix = make((9, worlds * self.system.positions), self.linear)

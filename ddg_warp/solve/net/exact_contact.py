@@ -56,7 +56,7 @@ class ExactContact:
     def multiply(self, p: wp.array, product: wp.array) -> None:
         """Add H p, and write p . H p block by block."""
         system = self._system
-        given = system.fixed, system.islands.wanted, system.krylov_dots
+        given = system.barred, system.islands.wanted, system.krylov_dots
         self.terms.settle(p, product, self._q, self.net.every, *given)
 
     def outgrown(self, q: wp.array) -> bool:

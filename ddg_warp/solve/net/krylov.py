@@ -51,12 +51,12 @@ class ConjugateGradients:
         table, blocks, wanted, anew = newton.system, newton.net.blocks, newton.islands.wanted, newton.anew.wanted
         self._launch(
             self._invert,
-            [newton.matrix, table.diagonal, newton.fixed, anew, blocks, table.positions, self._more],
+            [newton.matrix, table.diagonal, newton.barred, anew, blocks, table.positions, self._more],
             [self.inverse],
         )
         self._launch(
             self._start,
-            [newton.right, self.inverse, wanted, blocks],
+            [newton.right, self.inverse, newton.barred, wanted, blocks],
             [self.rest, newton.direction, self.p, newton.krylov_dots],
         )
         if newton.chains:
@@ -84,9 +84,9 @@ class ConjugateGradients:
         newton = self.newton
         wanted, dots = newton.islands.wanted, newton.krylov_dots
         if newton.chains:
-            newton.chains.apply(newton.matrix, self.rest, wanted, z, dots)
+            newton.chains.apply(newton.matrix, self.rest, newton.barred, wanted, z, dots)
         if self.levels:
-            self.levels.apply(self.rest, newton.fixed, wanted, z, dots)
+            self.levels.apply(self.rest, newton.barred, wanted, z, dots)
 
     def cycle(self) -> None:
         """One iteration."""
@@ -94,20 +94,20 @@ class ConjugateGradients:
         blocks, wanted, dots = newton.net.blocks, newton.islands.wanted, newton.krylov_dots
         _, advance, turn, test = self._cycle
         if newton.chains and newton.chains.banded:
-            newton.chains.product(newton.matrix, self.p, newton.fixed, wanted, self.product, dots)
+            newton.chains.product(newton.matrix, self.p, newton.barred, wanted, self.product, dots)
         else:
             self.multiply(self.p)
         self.couple(self.p)
         self.sum(dots, self.curvature)
         self._launch(
             advance,
-            [self.p, self.product, self.inverse, newton.system.diagonal, self.rho, self.curvature]
+            [self.p, self.product, self.inverse, newton.system.diagonal, newton.barred, self.rho, self.curvature]
             + [newton.iterations, wanted, blocks],
             [newton.direction, self.rest, self.z, dots, self.busy],
         )
         self.precondition(self.z)
         self.sum(dots, self.total)
-        self._launch(turn, [self.z, self.total, self.rho, wanted, blocks], [self.p])
+        self._launch(turn, [self.z, self.total, self.rho, newton.barred, wanted, blocks], [self.p])
         wp.launch(
             test,
             newton.worlds,
@@ -122,12 +122,12 @@ class ConjugateGradients:
             self.newton.contact.multiply(p, self.product)
 
     def multiply(self, p: wp.array) -> None:
-        """H p on free dofs where none of H lies in bands, and p . H p block by block."""
+        """H p on dofs that are not barred where none of H lies in bands, and p . H p block by block."""
         newton = self.newton
         table, wanted = newton.system, newton.islands.wanted
         self._launch(
             self._cycle[0],
-            [newton.matrix, table.columns, table.slices, newton.fixed, p, wanted, newton.net.blocks, table.positions],
+            [newton.matrix, table.columns, table.slices, newton.barred, p, wanted, newton.net.blocks, table.positions],
             [self.product, newton.krylov_dots],
         )
 

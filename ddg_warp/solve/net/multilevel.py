@@ -91,7 +91,7 @@ class Multilevel:
             )
             members, count = block, groups
 
-    def apply(self, residual, fixed, wanted, z: wp.array, dots: wp.array) -> None:
+    def apply(self, residual, barred, wanted, z: wp.array, dots: wp.array) -> None:
         """Add the corrections of all levels to z, where the finest one has left its own, and r . z block by block."""
         worlds, nodes, blocks = self.net.worlds, self.net.host.nodes, self.net.blocks
         values, order, count, stride = residual, self.order, nodes, blocks
@@ -117,7 +117,7 @@ class Multilevel:
         wp.launch(
             self._finish,
             worlds * blocks,
-            [residual, self.corrections[0], self.group, fixed, self.counts[0], blocks, wanted],
+            [residual, self.corrections[0], self.group, barred, self.counts[0], blocks, wanted],
             [z, dots],
             device=self.device,
         )

@@ -21,6 +21,7 @@ from ddg_warp.solve.net.contact import NetContact
 from ddg_warp.solve.net.frozen import Frozen
 from ddg_warp.solve.net.krylov import Directions
 from ddg_warp.solve.net.planes import DevicePlanes
+from ddg_warp.solve.net.resting import Resting
 from ddg_warp.solve.net.system import Assembly, NetSystem, Sums
 from ddg_warp.solve.net.tolerance import Allowed
 from ddg_warp.solve.net.turns import Turns
@@ -41,6 +42,9 @@ class NetNewton:
         drag: whether a block has more than a mass; see `kernels.drag`.
         reuse: whether the matrix of a step's first iterate serves the whole step.
         split: whether edges may be stiffer than the matrix carries, where that can be; see `Chains.splits`.
+
+    Attributes:
+        barred: (W N,) bits of dofs that a direction leaves where they are: held ones and, in contact, those of what rests.
     """
 
     banded = True  # whether chains keep their part of H, which holds on free dofs alone
@@ -83,6 +87,7 @@ class NetNewton:
         self.fixed = wp.array(bits, dtype=wp.uint8, device=device)
         self.held = self.fixed  # components in space, for predictors: rates along oblique planes stay in them
         self.planes = DevicePlanes(net, self.system, self.real, self.linear) if host.frames else None
+        self.barred = wp.array(np.tile(bits, worlds), dtype=wp.uint8, device=device)
         if self.planes:
             bits[list(host.frames)] = 0
             self.held = wp.array(bits, dtype=wp.uint8, device=device)
@@ -147,6 +152,7 @@ class NetNewton:
         self.allowed = Allowed(net, self.real, self.linear)
         outer = outer_forces(host, gravity)
         self.outer = self.allowed.assign(self.allowed.bodies.loads(outer)[None])
+        self.resting = Resting(self, *self.contact.bodies) if self.contact else None
         self.here = self.contact.bound if self.contact else self.q
         self._balance = Balance(self, drag)
         self._worst = Sums(worlds, self.allowed.ratio.shape[1], self.real, device, largest=True)
@@ -196,7 +202,7 @@ class NetNewton:
         """Kernels to load before a capture."""
         own = [*self._balance.kernels, self._judge, self._measure, self._rotate, self._take]
         own += [*self.allowed.kernels, *([self._repeat] if self._repeat else [])]
-        used = (self.chains, None if self._direct else self.krylov, self.planes, self.turns, self.contact)
+        used = (self.chains, None if self._direct else self.krylov, self.planes, self.turns, self.contact, self.resting)
         parts = [self._move, *self.net.carries, *(k for part in used if part for k in part.kernels)]
         evaluate = [(kernel, 128) for kernel in self._evaluate]
         sums = (self._sum, self._sum_weights, self._largest, self._worst)
@@ -212,6 +218,8 @@ class NetNewton:
         """Iterate until no world is active, with the lagged data of `state`; can be captured."""
         if self.frozen:
             self.frozen.begin()
+        if self.resting:
+            self.resting.wake()
         wp.capture_while(self.islands.active, lambda: self.iterate(state))
 
     def iterate(self, state) -> None:
@@ -233,6 +241,8 @@ class NetNewton:
 
     def _aim(self) -> None:
         """Directions, and how far along them, of worlds that do not shorten a step."""
+        if self.resting:
+            self.resting(self.contact.terms.products)
         self.assemble()
         self.direct()
         self.take()
@@ -300,6 +310,7 @@ class NetNewton:
                 self.islands,
                 self.anew,
                 self.fixed,
+                self.barred,
                 self.right,
                 self.negative,
                 self.direction,

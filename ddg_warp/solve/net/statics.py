@@ -116,6 +116,8 @@ class StaticNewton(NetNewton):
 
     def follow(self, state, step: wp.array) -> None:
         """The direction of the free dofs where held ones make a `step`: H d = r - H step, in worlds that want it."""
+        if self.resting:
+            self.resting.wake()
         self.evaluate(state)
         self.balance()
         self.assemble()
