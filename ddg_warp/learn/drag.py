@@ -122,7 +122,8 @@ class NetDragAdjoint:
     def pull(
         self, before, tangents: wp.array, q: wp.array, w: wp.array, rate: float, held, start, by_rate, by_tangents
     ):
-        """As of `ChainDragAdjoint`, of a solve with the solution q; derivatives by tangents are added to `by_tangents`."""
+        """As of `ChainDragAdjoint`, of a solve with the solution q; derivatives by tangents are added to `by_tangents`, those by
+        coefficients to `by_coefficients`."""
         net, drag = self.net, self.drag
         read = [tangents, before.q, before.v, q, self._ends, self._angles, net.drag, drag.flow, w, rate]
         outputs = [self._by_tangent, self._by_velocity, self.by_coefficients]

@@ -61,14 +61,28 @@ class Engine:
     # steps
 
     def forward(self, start: float, dt: float, state, controls: dict, graded: bool) -> list[torch.Tensor]:
-        """The state after a step, its tensors, and of every part what tells whether it has a gradient (islands,), if that is asked."""
+        """The state after a step, its tensors, and of every part what tells whether it has a gradient (islands,), if that is asked.
+
+        Then follow the `lagged`, of 24 bytes a block in float64.
+        """
         integrator = self.integrator
         self.fill(self.source, state)
         integrator._prepare(dt, self.before)
         self.controls.give(controls)
         integrator.advance(0, start, dt, anew=True)
         s = integrator._solved(dt)
-        return copies(self.target) + [self._smooth(part, s, graded) for part in integrator._parts]
+        found = copies(self.target) + [self._smooth(part, s, graded) for part in integrator._parts]
+        return found + (self.lagged() if graded else [])
+
+    @property
+    def solutions(self) -> list[wp.array]:
+        """As of `NetContact`, of the net."""
+        net = self.integrator._net
+        return net.newton.contact.solutions if net is not None and net.newton.contact else []
+
+    def lagged(self) -> list[torch.Tensor]:
+        """Tensors of the `solutions` of the step just made, which its reverse reads."""
+        return [view(values).clone() for values in self.solutions]
 
     def check(self, state) -> None:
         """Refuse to start from the tensors of a state in which surfaces overlap. Reads from the device where there is contact.
@@ -119,13 +133,13 @@ class Engine:
     # gradients
 
     def backward(
-        self, start: float, dt: float, before, after, given, controls: dict
+        self, start: float, dt: float, before, after, lagged, given, controls: dict
     ) -> tuple[list[torch.Tensor], list]:
         """Derivatives by the state before a step, and by what else it read, part by part.
 
         Args:
             start, dt: time and length of the step.
-            before, after, given: tensors of the states at its ends, and of the derivatives by the latter.
+            before, after, lagged, given: tensors of the states at its ends, `lagged` of it, and those of the derivatives by its end.
             controls: which it was given.
         """
         adjoint = self._adjoint()
@@ -141,7 +155,7 @@ class Engine:
             for middle, *ends in ((kept.x, end.x, kept.before.x), (kept.theta, end.theta, kept.before.theta)):
                 torch.mul(sum(view(array) for array in ends), 0.5, out=view(middle))
         if adjoint.net:
-            parts.append(self._net_kept(start, dt))
+            parts.append(self._net_kept(start, dt, lagged))
 
         told = [self._told_by(own.solve.failed) for own in adjoint.parts]
         self._solved_by = [place[-1] for place in told]
@@ -182,7 +196,8 @@ class Engine:
                 before, data = self.before.net, self.after.net.data
                 if self.midpoint:
                     data = {index: wp.clone(values) for index, values in data.items()}
-                self._net = NetKept(before, replace(before, q=wp.clone(before.q), data=data), None)
+                solved = replace(before, q=wp.clone(before.q), data=data)
+                self._net = NetKept(before, solved, None, lagged=[wp.clone(values) for values in self.solutions])
                 self._turned = wp.clone(before.q)  # scratch
             self.adjoint = adjoint
             self.poses = Poses(adjoint, self.midpoint) if self.model.grips else None
@@ -192,11 +207,13 @@ class Engine:
         kernels = [kernel for own in self.adjoint.parts for kernel in own.kernels]
         arrays.load_kernels([*kernels, self._solves], self.model.wp_device)
 
-    def _net_kept(self, start: float, dt: float) -> NetKept:
+    def _net_kept(self, start: float, dt: float, lagged) -> NetKept:
         """Of the net: joints' rotations are those at the rates of the step, as their dofs begin it at zero."""
         net, before, after, kept = self.model.net, self.before.net, self.after.net, self._net
         q = view(kept.solved.q)
         q.copy_(view(after.q))
+        for own, values in zip(kept.lagged, lagged, strict=True):
+            view(own).copy_(values)
         if self.midpoint:
             q.add_(view(before.q)).mul_(0.5)
             self._data_between(start, dt)
@@ -277,6 +294,11 @@ class Engine:
     def parts(self) -> int:
         """How many parts step on their own: groups of rods, and the net."""
         return len(self.integrator._parts)
+
+    @property
+    def told(self) -> int:
+        """How many tensors `forward` gives beside the state, at most."""
+        return self.parts + len(self.solutions)
 
 
 def _on_host(controls: dict) -> Controls:

@@ -226,12 +226,13 @@ class Case:
     def reverse(self) -> dict[str, float]:
         """Derivatives by what is no tensor, from the reverse of every step."""
         self.engine.tables.write((), [])  # parameters are those of the model
-        states, sums = [self.state], {"time step": 0.0, "mass damping": 0.0}
+        states, lagged, sums = [self.state], [], {"time step": 0.0, "mass damping": 0.0}
         for _ in range(STEPS):
             states.append(self.simulator.step(states[-1], None, self.posed))
+            lagged.append(self.engine.lagged())
         given = self._by_end(states[-1])
-        for before, after in zip(states[-2::-1], states[:0:-1], strict=True):
-            given, read = self.engine.backward(before.time, DT, before.values, after.values, given, self.posed)
+        for before, after, own in zip(states[-2::-1], states[:0:-1], lagged[::-1], strict=True):
+            given, read = self.engine.backward(before.time, DT, before.values, after.values, own, given, self.posed)
             for each in read:
                 by_rate = sum(own.numpy().sum() for own in (each.rate, *getattr(each, "elements_rate", ())))
                 # an implicit step is over dt, the midpoint rule's over half of it

@@ -132,12 +132,12 @@ def _touch(scene: Scene, law: str, **options) -> None:
 
 
 def _crossing(scene: Scene, material: Material) -> None:
-    """Rods that cross, one of them held."""
+    """Rods that cross, one of them held, with friction that is lagged twice in a step."""
     rods = [scene.add_rod(CURVE, section=Circle(0.004), material=material, name="lower")]
     points = CURVE[3] + np.stack([0.1 * T - 0.05, 0.3 * T - 0.15, 0.014 + 0.03 * (T - 0.5) ** 2], axis=1)
     rods.append(scene.add_rod(points, section=Circle(0.003), material=material, name="upper"))
     scene.clamp(rods[0], edges=[0, -1])
-    _touch(scene, "barrier")
+    _touch(scene, "barrier", lags=2)
 
 
 def _on_ball(scene: Scene, material: Material) -> None:

@@ -1,6 +1,7 @@
 """Reverse of a step of a net; see `ddg_warp.learn.adjoint`."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 import warp as wp
@@ -20,13 +21,17 @@ from ddg_warp.model.net import NetState
 
 @dataclass
 class NetKept:
-    """What the reverse of a step reads of it: the state `before`, and the solution of its solve with its lagged data."""
+    """What the reverse of a step reads of it: the state `before`, and the solution of its solve with its lagged data.
+
+    `lagged` are the solutions where friction was taken anew (W N,), in this order; what else is lagged stays.
+    """
 
     before: NetState
     solved: NetState
     whole: wp.array | None
     retries: wp.array | None = None
     time: float = 0.0
+    lagged: list[wp.array] = field(default_factory=list)
 
     @property
     def frame(self) -> wp.array:
@@ -93,7 +98,7 @@ class NetAdjoint:
         self._damping = wp.array([model.scene.mass_damping], dtype=real, device=self.device)
         self._pull = [reverse.pull_kernel(part.term, real) for part in net.sets]
         self._strains = [reverse.strain_kernel(p.term, real) if p.term.density.lagged else None for p in net.sets]
-        self._solution, self._start, self._ended = reverse.step_kernels(real, midpoint, drag)
+        self._solution, self._inert, self._start, self._ended = reverse.step_kernels(real, midpoint, drag)
         self._inertia = self.drag.inertia if drag else wp.zeros((1, 1), dtype=block_inertia(real), device=self.device)
         self._rates = wp.zeros(net.worlds, dtype=real, device=self.device)
 
@@ -104,6 +109,7 @@ class NetAdjoint:
             return [self._shares.make(rows(part.term), part.elements) for part in net.sets]
 
         self._by_end, self._by_q, self._w, self._end, self._stays = (make() for _ in range(5))
+        self._by_lagged = make() if self.contact and self.contact.lags > 1 else None
         self._given_frame = self._shares.make(FRAME, net.edges)
         # of frames and own lagged rows: of what the step ends in, of its solve, and of where it starts
         self._by_frame = [self._shares.make(FRAME, net.edges) for _ in range(2)]
@@ -114,7 +120,7 @@ class NetAdjoint:
             data=of_sets(lambda term: term.measure.data_size),
             end_data=of_sets(lambda term: term.measure.data_size),
             mass=make(),
-            load=self._w,
+            load=make(),
             held=self._by_q,
             rate=make(real),
             damping=make(real),
@@ -129,7 +135,8 @@ class NetAdjoint:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [*self._pull, *(kernel for kernel in self._strains if kernel), self._solution, self._start, self._ended]
+        own = [*self._pull, *(kernel for kernel in self._strains if kernel)]
+        own += [self._solution, self._inert, self._start, self._ended]
         parts = (self._shares, self.solve, self.supports, self.drag, self.followers, self.predictor, self.contact)
         return own + [kernel for part in parts if part for kernel in part.kernels]
 
@@ -160,7 +167,8 @@ class NetAdjoint:
             frame, lag = step._lagged
             solved = replace(solved, frame=wp.clone(frame), lag=[wp.clone(values) for values in lag])
         islands = step.islands
-        return NetKept(before, solved, wp.clone(islands.portion), wp.clone(islands.retries))
+        lagged = [wp.clone(values) for values in step.newton.contact.solutions] if self.contact else []
+        return NetKept(before, solved, wp.clone(islands.portion), wp.clone(islands.retries), lagged=lagged)
 
     def pull(
         self, kept: NetKept, after: NetState, given: NetState, s: float, states=None, factors: bool = False
@@ -199,19 +207,32 @@ class NetAdjoint:
             self.drag.resist(before, tangents, rate)
         read = [given.q, given.v, by_end, self._inertia, rate, last, net.blocks]
         self._launch(self._solution, len(by_q), read, [by_q])
-        damped = replace(solved, last=before.last)
         self._rates.fill_(rate)
-        if self.contact:
-            self.contact.system.find(before.q, solved.q, self._rates)
-        self.solve(damped, rate, kept.time, by_q, w, factors)
-        shares.clear()
-        for i, kernel in enumerate(self._pull):
-            written = [shares.slots[i], shares.lags[i], inputs.parameters[i], start.last[i], inputs.elements_rate[i]]
-            self._over(i, kernel, [net.elements(damped, i, rate=self._rates), w], written)
-        shares.collect(by_q, carried, inputs.data)
-        shares.add_own(own)
-        if self.contact:
-            self.contact.pull(before.q, solved.q, w, self._rates, by_q, start.q)
+        by_tangents = by_predicted if self._midpoint else start.q
+        for at, q in reversed(
+            list(pairwise([before.q, *kept.lagged, solved.q]))
+        ):  # friction lagged there, and the solution
+            damped = replace(solved, q=q, last=before.last)
+            if self.contact:
+                self.contact.system.find(at, before.q, q, self._rates)
+            self.solve(damped, rate, kept.time, by_q, w, factors)
+            shares.clear()
+            for i, kernel in enumerate(self._pull):
+                written = [shares.slots[i], shares.lags[i], inputs.parameters[i]]
+                written += [start.last[i], inputs.elements_rate[i]]
+                self._over(i, kernel, [net.elements(damped, i, rate=self._rates), w], written)
+            shares.collect(by_q, carried, inputs.data)
+            shares.add_own(own)
+            if self.drag:
+                self.drag.pull(before, tangents, q, w, rate, by_q, start, inputs.rate, by_tangents)
+            read = [q, before.q, before.v, w, net.mass, self.gravity, net.host.nodes, last, net.blocks, rate]
+            written = [start.q, start.v, inputs.load, inputs.mass, inputs.rate, inputs.damping, inputs.gravity]
+            self._launch(self._inert, len(q), [*read, self._damping], written)
+            if self.contact:
+                by = start.q if at is before.q else self._by_lagged, start.q, by_q
+                self.contact.pull((at, before.q, q), w, self._rates, by)
+            if at is not before.q:
+                self.solve.chain(self._by_lagged, by_q)
         if self.solve.held is not None:
             wp.map(wp.add, by_q, self.solve.held, out=by_q)
         if self.supports:
@@ -219,12 +240,8 @@ class NetAdjoint:
             frame, by_frame = (net.frames(array) for array in (solved.frame, carried))
             held, angle = net.components(by_q), net.angles(by_q)
             self.supports.pull(net.points(solved.q), frame, held, angle, by_frame)
-        if self.drag:
-            by_tangents = by_predicted if self._midpoint else start.q
-            read = before, tangents, solved.q, w, rate, by_q, start, inputs.rate
-            self.drag.pull(*read, by_tangents)
         if self.followers:
-            of = net.components(w), net.angles(w), net.components(by_predicted)
+            of = net.components(inputs.load), net.angles(inputs.load), net.components(by_predicted)
             self.followers.pull(net.points(lagged.q), *of)
         if predictor:
             if predictor.carries:
@@ -238,9 +255,8 @@ class NetAdjoint:
         self._launch(
             self._start,
             len(by_q),
-            [given.q, given.v, by_end, solved.q, before.q, before.v, w, self._stays, self._inertia, net.mass]
-            + [self.gravity, net.host.nodes, last, net.blocks, rate, self._damping],
-            [start.q, start.v, inputs.mass, inputs.rate, inputs.damping, inputs.gravity],
+            [given.q, given.v, by_end, solved.q, before.q, self._stays, self._inertia, last, net.blocks, rate],
+            [start.q, start.v, inputs.rate],
         )
         return start, inputs
 
@@ -256,8 +272,12 @@ class NetAdjoint:
         inputs, start = self._inputs, self._start_state
         own = [array for arrays in self._by_own for array in arrays]
         for array in (
-            *(self._by_end, start.q, start.v, inputs.rate, *self._by_frame, *own),
+            *(self._by_end, start.q, start.v, *start.last, *self._by_frame, *own),
+            *(inputs.load, inputs.mass, inputs.rate, inputs.damping, inputs.gravity, *inputs.elements_rate),
             *(*inputs.parameters, *inputs.data, *inputs.end_data),
+            *([inputs.drag] if self.drag else []),
+            *([self.contact.by_groups, self.contact.by_radius] if self.contact else []),
+            *([self.solve.failed] if self.solve.failed is not None else []),
         ):
             array.zero_()
         self._shares.clear()

@@ -4,7 +4,6 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.errors import SceneError
 from ddg_warp.kernels.adjoint import contact_sums
 from ddg_warp.kernels.adjoint.contact import NUMBERS, RATE, pull_kernel, rub_kernel
 from ddg_warp.kernels.contact.gather import SLOTS, sum_kernel
@@ -21,8 +20,8 @@ class ContactAdjoint:
     """Of the contact of a `DeviceNet`, friction included; derivatives by obstacles are those by their nodes.
 
     What is differentiated is a step, or an equilibrium, solved exactly: by positions at its end and, with friction, at its start, where
-    this takes normal forces, directions and slip from; by the numbers of pairs; by the length of the step. Against differences it errs
-    by 1e-9 to 1e-7.
+    this takes slip from, and where it takes normal forces and directions from: the start, or the solution before; by the numbers of
+    pairs; by the length of the step. Against differences it errs by 1e-9 to 1e-7.
 
     At kinks gradients are those of one side: where closest points go over an end of an edge or a side of a triangle, whose second
     derivatives jump there; where a pair begins to push, beyond the second derivative of a barrier, and with 1e-14 of the force of a
@@ -31,23 +30,18 @@ class ContactAdjoint:
     rest, which tell what is all but parallel, and arc lengths within which edges are no pair stay as they were built.
 
     Attributes:
+        lags: how often in a step friction is lagged.
         by_groups: by stiffness, range, thickness, friction and rate, of groups of first and second things (`NUMBERS`, worlds, groups,
-            groups); by_radius (worlds, bodies).
-
-    Raises:
-        SceneError: friction is lagged more than once in a step.
+            groups); by_radius (worlds, bodies). Both are added to.
     """
 
     def __init__(self, net):
         given, real, device = net.host.touching, net.real, net.device
-        if given.law.lags > 1 and given.friction.any():
-            raise SceneError(
-                f"contact: friction that is lagged {given.law.lags} times in a step has no gradient; take lags=1 and shorter steps"
-            )
         self.net, self.system = net, ExactContact(net)
         terms, search = self.system.terms, self.system.search
         serial, nodes = arrays.serial(device), len(terms.forces)
         every = wp.zeros(net.blocks, dtype=wp.uint8, device=device)
+        self.lags = given.law.lags if terms.frictions else 1
         self._rubs, self._velocity = terms.frictions or [None] * len(terms.lists), given.law.velocity
         law, friction = LAWS[given.law.law], FRICTION[given.law.friction_law]
         kinds = [pairs.kind for pairs in search.lists]
@@ -94,19 +88,22 @@ class ContactAdjoint:
         lists, vector = self.system.search.lists, self.net.vector
         most = max(pairs.capacity for pairs in lists)
         self._numbers = self._zeros(NUMBERS, most)
-        self._start_parts = arrays.allocate((SLOTS, most), vector, self.net.device)
+        shape, device = (SLOTS, most), self.net.device
+        self._start_parts, self._lagged_parts = (arrays.allocate(shape, vector, device) for _ in range(2))
         self._by_direction = wp.zeros(most if self._direct else 1, dtype=vector, device=self.net.device)
         for items, pairs in zip(self._items, lists, strict=True):
             items.reserve(pairs.capacity)
 
-    def pull(self, before: wp.array, q: wp.array, w: wp.array, rate: wp.array, by_q: wp.array, by_before: wp.array):
-        """After `find` of `system` with the same, add to derivatives by blocks at the solution and at the start; write the others.
+    def pull(self, at: tuple, w: wp.array, rate: wp.array, by: tuple) -> None:
+        """After `find` of `system` with the same, add to derivatives by blocks, and to the others.
 
         Args:
+            at: blocks where friction was lagged, at the start and at the solution (W N,) each.
             w: solution of the linear system (W N,).
+            by: derivatives by these three.
         """
-        terms = self.system.terms
-        for array in (self.by_groups, self.by_radius, *self._things.values()):
+        terms, (lagged, before, q), (by_lagged, by_before, by_q) = self.system.terms, at, by
+        for array in self._things.values():
             array.zero_()
         for i, (part, rub) in enumerate(zip(terms.lists, self._rubs, strict=True)):
             read, pairs = [part.pairs, part.count, part.found.sides, terms.law], part.found.capacity
@@ -118,13 +115,14 @@ class ContactAdjoint:
             if rub:
                 self._items[i].list(rub.count, rub.factor.nodes)
                 read = [rub.pairs, rub.count, part.found.sides, terms.law, rub.factor.nodes, rub.factor.used]
-                inputs = [*read, before, q, w, self._velocity, rate, *rub.directions]
-                written = [rub.gradient, self._start_parts, self._numbers, self._by_direction]
+                inputs = [*read, lagged, before, q, w, self._velocity, rate, *rub.directions]
+                written = [rub.gradient, self._start_parts, self._lagged_parts, self._numbers, self._by_direction]
                 self._take_turns(self._rub[i], pairs, inputs, written)
                 self._add_up(i, rub, rub.gradient, by_q)
                 self._add_up(i, rub, self._start_parts, by_before)
+                self._add_up(i, rub, self._lagged_parts, by_lagged)
                 self._sum(i, rub)
-                self._lead(i, rub, by_before)
+                self._lead(i, rub, by_lagged)
         for size, found in self._things.items():
             starts, things = self._starts[size], len(found) // self.net.worlds
             self._launch(self._bodies, self.by_radius.shape, [found, starts, things], [self.by_radius])
@@ -157,12 +155,12 @@ class ContactAdjoint:
         upload = (arrays.upload(np.asarray(v, np.int32), int, self.net.device) for v in (starts, items))
         return *upload, found
 
-    def _lead(self, index: int, rub, by_before: wp.array) -> None:
-        """Add to derivatives by the start what comes by the directions of rods."""
+    def _lead(self, index: int, rub, by_lagged: wp.array) -> None:
+        """Add to derivatives by what was lagged what comes by the directions of rods."""
         if self._direct:
             things, gather = self._direct
             starts, items, found = self._leads[index]
-            flat, nodes = found.flatten(), by_before.reshape((self.net.worlds, self.net.blocks))
+            flat, nodes = found.flatten(), by_lagged.reshape((self.net.worlds, self.net.blocks))
             self._launch(things, len(flat), [rub.count, rub.starts, rub.partners, self._by_direction], [flat])
             self._launch(gather, nodes.shape, [starts, items, found], [nodes])
 

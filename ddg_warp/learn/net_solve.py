@@ -8,6 +8,7 @@ import warp as wp
 
 from ddg_warp.compile.storage import FREE
 from ddg_warp.errors import SolverError
+from ddg_warp.kernels.adjoint.solve import chain_kernel
 from ddg_warp.learn.solve import HostSolve
 from ddg_warp.solve.net.exact import ExactSystem
 from ddg_warp.solve.net.tangent import NetTangent
@@ -34,6 +35,7 @@ class NetSolve:
         self.failed = self.system and self.system.failed
         self.held = None
         self._rate = wp.zeros(net.worlds, dtype=net.real, device=net.device)
+        self._chain = chain_kernel(net.real)
         self._left_out = self.system and self.system.bits(~net.host.fixed | _moved(net.host))
 
     @cached_property
@@ -48,7 +50,7 @@ class NetSolve:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return self.system.kernels if self.system else []
+        return [*self.system.kernels, self._chain] if self.system else []
 
     def __call__(self, state, rate: float, time: float, right: wp.array, w: wp.array, factors: bool = False) -> None:
         """Write w (W N,), zero at held dofs.
@@ -81,6 +83,12 @@ class NetSolve:
         if host.held is not None:
             self.held = wp.empty_like(w)
             self.held.assign(tangent.back(host.held).reshape(-1, 3))
+
+    def chain(self, by_lagged: wp.array, by_q: wp.array) -> None:
+        """Turn derivatives by a solution (W N,) into g of the solve that led to what it lags, by which they are `by_lagged`: zeroed."""
+        wp.launch(
+            self._chain, len(by_q), [self.system.fixed, self.net.blocks], [by_lagged, by_q], device=self.net.device
+        )
 
     def stays(self, by_q: wp.array, out: wp.array) -> None:
         """Write the part of derivatives by held dofs (W N,) that goes to where a step starts: of those that no motion moves."""

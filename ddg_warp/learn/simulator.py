@@ -224,7 +224,8 @@ class Simulator(torch.nn.Module):
         if memory is not None:
             arguments.number("memory", memory, "bytes, more than none", lambda value: value > 0.0)
         flags = sum(len(part.islands) for part in state.engine.integrator._parts) * state.values[0].element_size()
-        return plan(bytes_of([*state.values, *controls.values()]) + flags, steps, save, every, memory)
+        told = flags + sum(values.capacity for values in state.engine.solutions)
+        return plan(bytes_of([*state.values, *controls.values()]) + told, steps, save, every, memory)
 
     @torch.compiler.disable
     def equilibrium(

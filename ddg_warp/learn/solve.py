@@ -144,6 +144,7 @@ class ClosedChains:
         system.factorise()
         system.right, system.direction = right, solution
         system.direct()
+        bad.zero_()
         read = [system.rho, system.rho_first, MISSED]
         wp.launch(self._check, system.group.columns, read, [bad], device=system.device)
 

@@ -49,7 +49,7 @@ class Call:
 
 
 class Step(torch.autograd.Function):
-    """step(call, *tensors) -> the tensors of the state after it, and one of each part that tells where there are gradients."""
+    """step(call, *tensors) -> the tensors of the state after it, and what else `Engine.forward` gives."""
 
     @staticmethod
     def forward(call: Call, *tensors):
@@ -84,7 +84,7 @@ class Step(torch.autograd.Function):
     @staticmethod
     def vmap(info, in_dims, call: Call, *tensors):
         axes = call.axes
-        return _folded(Step, info.batch_size, in_dims, call, tensors, axes, call.state_axes + [0] * call.engine.parts)
+        return _folded(Step, info.batch_size, in_dims, call, tensors, axes, call.state_axes + [0] * call.engine.told)
 
 
 class Balance(torch.autograd.Function):
@@ -137,14 +137,14 @@ class Pull(torch.autograd.Function):
     @staticmethod
     def forward(call: Call, *tensors):
         engine, count = call.engine, len(call.fields)
-        parts = engine.parts
+        told = count + engine.told
         given, tensors = tensors[-count:], tensors[:-count]
-        output, tensors = tensors[-count - parts :], tensors[: -count - parts]
+        output, tensors = tensors[-told:], tensors[:-told]
         state, parameters, controls = call.split(tensors)
-        flags = output[count:]
+        flags, lagged = output[count : count + engine.parts], output[count + engine.parts :]
         with engine.stream():
             engine.tables.write(call.parameters, parameters)
-            found, inputs = engine.backward(call.start, call.dt, state, output[:count], given, controls)
+            found, inputs = engine.backward(call.start, call.dt, state, output[:count], lagged, given, controls)
             flags = engine.solved(flags)
             by_state = engine.layout.flagged(found, flags)
             by_parameters = engine.tables.pull(call.parameters, inputs, flags)
@@ -163,7 +163,7 @@ class Pull(torch.autograd.Function):
     def vmap(info, in_dims, call: Call, *tensors):
         axes = call.axes
         smooth = [field.axis for field in call.fields if field.smooth]
-        given = [*axes, *call.state_axes, *[0] * call.engine.parts, *call.state_axes]
+        given = [*axes, *call.state_axes, *[0] * call.engine.told, *call.state_axes]
         return _folded(Pull, info.batch_size, in_dims, call, tensors, given, smooth + axes[len(call.fields) :])
 
 

@@ -2,14 +2,17 @@
 
 Of a loss with w from H^T w = g, what contact brings is the derivative of -w . dE/dx, E the energy of pairs (`contact.pair_energy`) at
 the solution x, by x, stiffness, range and thickness. Friction is a function of what it lags, too (`contact.pair_friction`): with the
-gradient g of contact at the start x^n of the step, which is one of x^n and of the same numbers, its force along w is
+gradient g of contact at lagged positions y, which is one of y and of the same numbers, its force along w is
 
     w . f = sum_i weight_i w_i . (t1, t2) psi'(u; mu N) ,   N, n = sum g_i of the first thing,   weight_i = g_i . n / N ,
     u = (t1, t2) . sum_i weight_i (x_i - x_i^n) ,
 
-and its reverse goes through normal force, normal and weights at x^n, through the slip from x^n to x, and to coefficient and rate; and
-through the directions of rods at x^n, where friction is directed. The matrix of all this by x is symmetric, as what is lagged is no
-function of x.
+and its reverse goes through normal force, normal and weights at y, through the slip from the start x^n of the step to x, and to
+coefficient and rate; and through the directions of rods at y, where friction is directed. The matrix of all this by x is symmetric,
+as what is lagged is no function of x.
+
+At first y is x^n. With more `lags` it is the solution before, so that a step is a chain of solves: the derivative by y of the last one
+is the g of the one before it, and so on, each with a matrix of its own.
 """
 
 from functools import cache
@@ -66,7 +69,8 @@ def pull_kernel(kind: Kind, density: Density, real):
 
 @cache
 def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: bool):
-    """rub(...): what friction brings by slot of the solution and of the start, and by the numbers of pairs, as `pull_kernel` has it.
+    """rub(...): what friction brings by slot of the solution, of the start and of what was lagged, and by the numbers of pairs, as
+    `pull_kernel` has it.
 
     Where it is `directed`, by the directions of rods (capacity,), too, from `beside` by `ways` as of `pair_friction.lag_kernel`.
     """
@@ -81,18 +85,17 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
 
     @wp.func
     def force(
-        start: X, x: X, v: X, d: V, way: V, p: P, threshold: real, inner: W, mu: real, velocity: real, inverse: real
+        y: X, moved: X, v: X, d: V, way: V, p: P, threshold: real, inner: W, mu: real, velocity: real, inverse: real
     ):
-        """The derivative of the potential of friction by x, along v."""
-        _e, g = evaluate(start, p, threshold, inner)
+        """The derivative along v of the potential of friction that was lagged at y, by what has `moved` since the start."""
+        _e, g = evaluate(y, p, threshold, inner)
         push = V()
         for slot in range(wp.static(kind.first)):
             push += g[slot]
         normal = wp.length(push)
         n = push / normal
         weight = (g * n) / normal
-        move = (x[0] - start[0]) * weight[0] + (x[1] - start[1]) * weight[1]
-        move += (x[2] - start[2]) * weight[2] + (x[3] - start[3]) * weight[3]
+        move = moved[0] * weight[0] + moved[1] * weight[1] + moved[2] * weight[2] + moved[3] * weight[3]
         along = v[0] * weight[0] + v[1] * weight[1] + v[2] * weight[2] + v[3] * weight[3]
         if wp.static(directed):
             ahead, t2, back = along_rod(n, d, way)
@@ -112,6 +115,7 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
         law: Law,
         nodes: wp.array(dtype=wp.vec4i),
         used: wp.array(dtype=int),
+        lagged: wp.array(dtype=V),
         start: wp.array(dtype=V),
         x: wp.array(dtype=V),
         w: wp.array(dtype=V),
@@ -121,6 +125,7 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
         ways: wp.array2d(dtype=V),
         parts: wp.array2d(dtype=V),
         start_parts: wp.array2d(dtype=V),
+        lagged_parts: wp.array2d(dtype=V),
         numbers: wp.array2d(dtype=real),
         directions: wp.array(dtype=V),
     ):
@@ -134,13 +139,13 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
                 d, way = V(), V()
                 if wp.static(directed):
                     first = world * sides.first.nodes_a_world
-                    d = start[beside[i][1] + first] - start[beside[i][0] + first]
+                    d = lagged[beside[i][1] + first] - lagged[beside[i][0] + first]
                     way = ways[a, b]
                 p, threshold, inner = given(law, sides, pairs[pair])
                 n = nodes[pair]
-                ds, dx, _dv, dd, _dw, dp, _dt, _di, dmu, _dn, dr = wp.grad(force)(
-                    corners(start, n),
-                    corners(x, n),
+                dy, dx, _dv, dd, _dw, dp, _dt, _di, dmu, _dn, dr = wp.grad(force)(
+                    corners(lagged, n),
+                    corners(x, n) - corners(start, n),
                     -corners(w, n),
                     d,
                     way,
@@ -153,7 +158,8 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
                 )
                 for slot in range(wp.static(SLOTS)):
                     parts[slot, pair] = V(dx[slot, 0], dx[slot, 1], dx[slot, 2])
-                    start_parts[slot, pair] = V(ds[slot, 0], ds[slot, 1], ds[slot, 2])
+                    start_parts[slot, pair] = -parts[slot, pair]
+                    lagged_parts[slot, pair] = V(dy[slot, 0], dy[slot, 1], dy[slot, 2])
                 for i in range(3):
                     numbers[i, pair] = dp[i]
                 numbers[wp.static(FRICTION), pair] = dmu

@@ -167,7 +167,7 @@ def chain_kernels(kind: ChainKind, real, midpoint: bool):
 
 @cache
 def net_kernels(real, midpoint: bool):
-    """The same of the edges and blocks of a net: edges(...) writes what the two nodes of an edge get."""
+    """The same of the edges and blocks of a net: edges(...) writes what the two nodes of an edge get, and adds to coefficients."""
     V, P = wp.types.vector(3, real), wp.types.vector(ROWS, real)
     Inertia, resisted = block_inertia(real), resisted_function(3, real)
 
@@ -217,7 +217,7 @@ def net_kernels(real, midpoint: bool):
         for i in range(2):
             velocity_out[i, tid] = dv * real(0.5)
         for i in range(wp.static(ROWS)):
-            coefficient_out[i, tid] = dp[i]
+            coefficient_out[i, tid] = coefficient_out[i, tid] + dp[i]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def nodes(

@@ -18,7 +18,7 @@ from ddg_warp.kernels.variation import variation_functions
 @cache
 def pull_kernel(term: Term, real):
     """pull(...): what elements bring, -w . dE/dq, by their slots, lagged and constant data, rest measure, parameters, strains of the
-    last step and rate. Adds but to the last two.
+    last step and rate. Adds.
     """
     Elements, measure, density = elements_type(real), term.measure, term.density
     V = wp.types.vector(3, real)
@@ -51,11 +51,11 @@ def pull_kernel(term: Term, real):
             lag_out[i, tid] = lag_out[i, tid] + ds[i]
         parameter_out[0, tid] = parameter_out[0, tid] + dmeasure
         for i in range(wp.static(rows)):
-            parameter_out[1 + i, tid] = dp[i]
+            parameter_out[1 + i, tid] = parameter_out[1 + i, tid] + dp[i]
         if wp.static(lagged):
             for i in range(wp.static(n)):
-                last_out[i, tid] = dp[wp.static(rows) + i]
-            rate_out[tid] = dp[wp.static(size - 1)]
+                last_out[i, tid] = last_out[i, tid] + dp[wp.static(rows) + i]
+            rate_out[tid] = rate_out[tid] + dp[wp.static(size - 1)]
 
     return pull
 
@@ -135,7 +135,8 @@ def lag_kernel(term: Term, real):
 
 @cache
 def step_kernels(real, midpoint: bool, drag: bool):
-    """solution(...) and start(...) as of `kernels.adjoint.step`, of the blocks of a net; ended(...): blocks at the end of a step.
+    """solution(...) and start(...) as of `kernels.adjoint.step`, of the blocks of a net, but for what forces, weight and inertia in a
+    solve bring, inert(...); ended(...): blocks at the end of a step.
 
     Joints' rotations begin every step at zero.
     """
@@ -175,16 +176,11 @@ def step_kernels(real, midpoint: bool, drag: bool):
         out[i] = total
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def start(
-        q: wp.array(dtype=V),
-        v: wp.array(dtype=V),
-        more: wp.array(dtype=V),
+    def inert(
         solved: wp.array(dtype=V),
         q0: wp.array(dtype=V),
         v0: wp.array(dtype=V),
         w: wp.array(dtype=V),
-        held: wp.array(dtype=V),
-        inertia: wp.array2d(dtype=Inertia),
         mass: wp.array2d(dtype=V),
         gravity: wp.array(dtype=V),
         nodes: int,
@@ -194,41 +190,63 @@ def step_kernels(real, midpoint: bool, drag: bool):
         damping: wp.array(dtype=real),
         q_out: wp.array(dtype=V),
         v_out: wp.array(dtype=V),
+        load_out: wp.array(dtype=V),
         mass_out: wp.array(dtype=V),
         rate_out: wp.array(dtype=real),
         damping_out: wp.array(dtype=real),
         gravity_out: wp.array(dtype=V),
     ):
-        """`held` is what is left at held dofs that no motion moves; `gravity` is of worlds. Adds to derivatives by the start and by
-        the rate."""
+        """`gravity` is of worlds. Adds."""
         i = wp.tid()
         world = i / blocks
         k = i - world * blocks
+        own = w[i]
+        load_out[i] = load_out[i] + own
         if k >= last:
             return
         c = rate * (rate + damping[0])
         m = mass[world, k]
-        own = w[i]
+        pushed = wp.cw_mul(m, own)
         step = solved[i] - q0[i]
         before = v0[i]
-        ended = wp.cw_mul(swing(inertia, i, blocks), v[i])
-        q_out[i] = q_out[i] + wp.cw_mul(m, own) * c + held[i] - (q[i] + more[i]) * kept - ended * rate
-        v_out[i] = v_out[i] + wp.cw_mul(m, own) * rate - (ended - v[i]) * kept
+        q_out[i] = q_out[i] + pushed * c
+        v_out[i] = v_out[i] + pushed * rate
         outer = before * rate - step * c
         if k < nodes:
             outer += gravity[world]
-            gravity_out[i] = wp.cw_mul(m, own)
-        mass_out[i] = wp.cw_mul(own, outer)
-        rate_out[i] = (
-            rate_out[i]
-            + wp.dot(ended, step)
-            - wp.dot(wp.cw_mul(m, own), step * (real(2.0) * rate + damping[0]) - before)
-        )
-        damping_out[i] = -rate * wp.dot(wp.cw_mul(m, own), step)
+            gravity_out[i] = gravity_out[i] + pushed
+        mass_out[i] = mass_out[i] + wp.cw_mul(own, outer)
+        rate_out[i] = rate_out[i] - wp.dot(pushed, step * (real(2.0) * rate + damping[0]) - before)
+        damping_out[i] = damping_out[i] - rate * wp.dot(pushed, step)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def start(
+        q: wp.array(dtype=V),
+        v: wp.array(dtype=V),
+        more: wp.array(dtype=V),
+        solved: wp.array(dtype=V),
+        q0: wp.array(dtype=V),
+        held: wp.array(dtype=V),
+        inertia: wp.array2d(dtype=Inertia),
+        last: int,
+        blocks: int,
+        rate: real,
+        q_out: wp.array(dtype=V),
+        v_out: wp.array(dtype=V),
+        rate_out: wp.array(dtype=real),
+    ):
+        """`held` is what is left at held dofs that no motion moves. Adds."""
+        i = wp.tid()
+        if i % blocks >= last:
+            return
+        ended = wp.cw_mul(swing(inertia, i, blocks), v[i])
+        q_out[i] = q_out[i] + held[i] - (q[i] + more[i]) * kept - ended * rate
+        v_out[i] = v_out[i] - (ended - v[i]) * kept
+        rate_out[i] = rate_out[i] + wp.dot(ended, solved[i] - q0[i])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def ended(solved: wp.array(dtype=V), q0: wp.array(dtype=V), out: wp.array(dtype=V)):
         i = wp.tid()
         out[i] = solved[i] + (solved[i] - q0[i])
 
-    return solution, start, ended
+    return solution, inert, start, ended

@@ -35,6 +35,22 @@ def block_kernels(real, linear):
 
 
 @cache
+def chain_kernel(real):
+    """chain(...): from derivatives by a solution, and by another one that it lags, to the right-hand side of the solve for that."""
+    V = wp.types.vector(3, real)
+    _, free = product_functions(real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def chain(bits: wp.array(dtype=wp.uint8), blocks: int, by_lagged: wp.array(dtype=V), by_q: wp.array(dtype=V)):
+        """What free dofs of a solution still have is balanced by what it does not lag; held ones are where they are in both."""
+        i = wp.tid()
+        by_q[i] = by_q[i] - wp.cw_mul(by_q[i], free(bits[i % blocks])) + by_lagged[i]
+        by_lagged[i] = V()
+
+    return chain
+
+
+@cache
 def check_kernels(linear):
     """rest(...): the residual that a solution leaves, preconditioned by the diagonal blocks; check(...): whether that is little."""
     H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
@@ -63,9 +79,13 @@ def check_kernels(linear):
         missed: linear,
         failed_out: wp.array(dtype=int),
     ):
-        """Marks worlds whose residual is more than a part `missed` of the right-hand side, or no number; zero is solved by zero."""
+        """Marks worlds whose residual is more than a part `missed` of the right-hand side, or no number; zero is solved by zero.
+
+        Marks stay: a solve may be one of several.
+        """
         w = wp.tid()
         little = wp.abs(total[w]) <= missed * missed * first[w]
-        failed_out[w] = wp.where(little or first[w] == linear(0.0), 0, 1)
+        if not (little or first[w] == linear(0.0)):
+            failed_out[w] = 1
 
     return rest, check

@@ -164,7 +164,7 @@ def world_kernels(real):
 def block_kernels(real, linear, serial: bool):
     """gain(...) by a motion; lessen(...) the residual by a product; aim(...), push(...) and
     arrive(...) of supports; stay(...) of worlds that do not move; part(...) with what was proposed; way(...) that is left, and
-    add(...) it."""
+    add(...) it; keep(...) a solution."""
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     _, free = product_functions(linear)
     share, until = share_function(serial), until_function(serial)
@@ -319,7 +319,15 @@ def block_kernels(real, linear, serial: bool):
             for k in range(start, until(start, blocks)):
                 direction[k + w * blocks] += way[k + w * blocks]
 
-    return gain, lessen, aim, push, arrive, stay, part, way, add
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def keep(q: wp.array(dtype=V), moved: wp.array(dtype=int), blocks: int, out: wp.array(dtype=V)):
+        """Of worlds that are solved for: what others have was theirs when they were."""
+        w, start = share(wp.tid(), blocks)
+        if moved[w] != 0:
+            for k in range(start, until(start, blocks)):
+                out[k + w * blocks] = q[k + w * blocks]
+
+    return gain, lessen, aim, push, arrive, stay, part, way, add, keep
 
 
 @cache

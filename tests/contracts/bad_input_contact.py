@@ -6,7 +6,6 @@ from bad_inputs import DOME, INF, NAN, RUBBER, built, dome, each, refuse, rods
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.learn.adjoint import Adjoint
 from ddg_warp.solve.relaxation import relax
 
 TURN = np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
@@ -162,9 +161,6 @@ refuse("contact", {
     "midpoint": (lambda: stepped(touching(), scheme="implicit_midpoint"), "contact: ", "implicit_euler"),
     "projective": (lambda: stepped(touching(), solver="projective"), "contact: ", "'newton'"),
     "asked without": (lambda: (model := built(scene()), model.contacts(model.state())), "contacts: ", "add scene.contact()"),
-    "gradients of friction that is lagged twice": (
-        lambda: Adjoint(ddg.Integrator(built(touching(friction=0.1, lags=2)))), "contact: ", "lagged 2 times", "lags=1"
-    ),
     "an oblique plane of symmetry": (
         lambda: stepped(_on_oblique_plane()), "contact: ", "oblique plane", "axis of space"
     ),

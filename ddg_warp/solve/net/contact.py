@@ -37,6 +37,7 @@ class NetContact:
         bound: (W N,) where iterates of worlds on their way are bound for, and where those of others are.
         bodies: which each block of a world belongs to (blocks,), -1 for none, and how many there are.
         bends: whether its matrix has what comes of pairs that turn, once the search is near; see `kernels.contact.pair_bend`.
+        solutions: where the last step took friction anew, in this order, for its reverse: `lags` - 1 of (W N,) with friction.
         crossed: (1,) pairs that would have passed through each other in all steps so far; least: (1,) the smallest gap [m].
     """
 
@@ -56,7 +57,7 @@ class NetContact:
         self.touch = Touch(net, linear, newton.q, held)
         self.shapes, self.search, self.terms = self.touch.shapes, self.touch.search, self.touch.terms
         self.rubs = bool(host.touching.friction.any())
-        worlds = net.worlds
+        worlds, again = net.worlds, self.touch.law.lags - 1 if self.rubs else 0
         self.forces, self.stiffness, self.diagonal = self.terms.forces, self.terms.stiffness, self.terms.diagonal
 
         def make(shape, dtype):
@@ -65,6 +66,7 @@ class NetContact:
         self._modes, self._curved, self._projected = (make(worlds, int) for _ in range(3))
         self.bends, self._late = newton.psd != "gauss_newton", 0 if newton.psd == "none" else EARLY
         self._kept, self._gain = make((2, worlds), real), make(worlds, real)
+        self.solutions = [make(newton.all, net.vector) for _ in range(again)]
         self._move = make(newton.all, net.vector)
         self.bound = make(newton.all, net.vector)
         self._way, self._pushed = (make(newton.all, wp.types.vector(3, linear)) for _ in range(2))
@@ -102,6 +104,7 @@ class NetContact:
             self._part,
             self._find_way,
             self._add,
+            self._keep_solution,
         ) = made
         self._kernels += made
         self._sum = Sums(worlds, newton.dots.shape[1], real, device)
@@ -135,16 +138,13 @@ class NetContact:
         self.newton.islands.driven.zero_()
         self._going.zero_()
 
-    def lag_again(self) -> None:
-        """Take friction anew from where the solve has come to, for worlds that have converged."""
-        self.search.update(self.newton.q)
-        self.terms.lag(self.newton.q, again=True)
-        self._launch(self._again, self.net.worlds, [self.newton.islands.arrays[0]], [])
-
-    @property
-    def more_lags(self) -> int:
-        """How often that is to be done in a step."""
-        return self.touch.law.lags - 1 if self.rubs else 0
+    def lag_again(self, solution: wp.array) -> None:
+        """Take friction anew from where the solve has come to, for worlds that have converged; keep that in one of `solutions`."""
+        newton = self.newton
+        self._sweep(self._keep_solution, [newton.q, newton.islands.moved, self.net.blocks], [solution])
+        self.search.update(newton.q)
+        self.terms.lag(newton.q, again=True)
+        self._launch(self._again, self.net.worlds, [newton.islands.arrays[0]], [])
 
     def place(self) -> None:
         """Cut the predictor, once supports are placed, where they have to be."""

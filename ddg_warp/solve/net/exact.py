@@ -33,7 +33,7 @@ class ExactSystem:
     Attributes:
         tolerance: what conjugate gradients leave of the residual, in the norm of their preconditioner.
         missed: what they may have left in truth, for rounding.
-        failed: not zero of worlds where it is more, so that w means nothing (worlds,).
+        failed: not zero of worlds where it is more, so that w means nothing (worlds,); zeroed by who asks for solves.
     """
 
     tolerance = 1e-12

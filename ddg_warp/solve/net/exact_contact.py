@@ -10,10 +10,10 @@ MARGIN = 1e-3  # of the reach, by which searches go beyond it: what is searched 
 
 
 class ExactContact:
-    """Contact of a `DeviceNet`. Candidates are found again, at the start and at the solution, so that nothing is kept of steps.
+    """Contact of a `DeviceNet`. Candidates are found again, where friction was lagged and at the solution: steps keep none.
 
     Attributes:
-        touch: search, pairs and their terms, friction as it is lagged at the start.
+        touch: search, pairs and their terms, friction as it was lagged.
         diagonal: blocks at nodes, for preconditioners.
     """
 
@@ -35,15 +35,15 @@ class ExactContact:
         """Kernels to load before a capture."""
         return [*self.search.kernels, *self.terms.kernels, *(self._bands.kernels if self._bands else [])]
 
-    def find(self, before: wp.array, q: wp.array, rate: wp.array) -> None:
-        """Of a step from blocks `before` to the solution q, at rates 1/h (worlds,). Launches alone."""
+    def find(self, lagged: wp.array, before: wp.array, q: wp.array, rate: wp.array) -> None:
+        """Of a solution q with friction lagged at blocks `lagged`, in a step from `before` at rates 1/h (worlds,). Launches alone."""
         search, terms = self.search, self.terms
-        search.rebuild(before)
+        search.rebuild(lagged)
         if terms.frictions:
-            search.search(before)
-            terms.lag(before)
+            search.search(lagged)
+            terms.lag(lagged)
         search.search(q)
-        terms.evaluate(q, rate if terms.frictions else None)
+        terms.evaluate(q, rate if terms.frictions else None, before)
         terms.meet()
         terms.prepare(q, self.net.every)
         self._q = q

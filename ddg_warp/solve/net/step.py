@@ -185,8 +185,8 @@ class NetStep(PartStep):
             solver.contact.place()
         solver.solve(start)
         if solver.contact:
-            for _ in range(solver.contact.more_lags):
-                solver.contact.lag_again()
+            for solution in solver.contact.solutions:
+                solver.contact.lag_again(solution)
                 solver.solve(start)
             solver.contact.finish(before.q)
         if self.energy:
