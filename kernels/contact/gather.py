@@ -207,6 +207,13 @@ def collect_kernels(real, linear, serial: bool):
         return M(b[0], b[1], b[2], b[1], b[3], b[4], b[2], b[4], b[5])
 
     @wp.func
+    def items_of(sets: wp.array(dtype=PairSet), node: int):
+        every = int(0)
+        for s in range(sets.shape[0]):
+            every += sets[s].numbers[node]
+        return every
+
+    @wp.func
     def add_all(
         sets: wp.array(dtype=PairSet),
         forces: wp.array(dtype=V),
@@ -247,12 +254,17 @@ def collect_kernels(real, linear, serial: bool):
         forces: wp.array(dtype=V),
         diagonal: wp.array(dtype=M),
         stiffness: wp.array(dtype=real),
+        told: wp.array(dtype=wp.uint8),
     ):
-        """`stiffness` are the traces of the blocks."""
+        """`stiffness` are the traces of the blocks; `told` are nodes that had items, of which most never have any, or else are zero."""
         node = wp.tid()
         if wp.static(serial):
             add_all(sets, forces, diagonal, stiffness)
             return
+        every = items_of(sets, node)
+        if every == 0 and told[node] == wp.uint8(0):
+            return
+        told[node] = wp.uint8(wp.min(every, 1))
         force, total = V(), B()
         for s in range(sets.shape[0]):
             number = sets[s].numbers[node]
@@ -268,14 +280,24 @@ def collect_kernels(real, linear, serial: bool):
         stiffness[node] = real(total[0] + total[3] + total[5])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def join(sets: wp.array(dtype=PairSet), edges: Surface, count: int, between: wp.array(dtype=M)):
-        """Items of the first node that come from this edge, not from another one that begins there."""
+    def join(
+        sets: wp.array(dtype=PairSet),
+        edges: Surface,
+        count: int,
+        between: wp.array(dtype=M),
+        told: wp.array(dtype=wp.uint8),
+    ):
+        """Items of the first node that come from this edge, not from another one that begins there; `told`: as above, of edges."""
         i = wp.tid()
         if wp.static(serial):
             join_all(sets, between)
             return
         w = i / count
         node = edges.nodes[i - w * count, 0] + w * edges.nodes_a_world
+        every = items_of(sets, node)
+        if every == 0 and told[i] == wp.uint8(0):
+            return
+        told[i] = wp.uint8(wp.min(every, 1))
         total = B()
         for s in range(sets.shape[0]):
             number = sets[s].numbers[node]

@@ -69,21 +69,21 @@ def resting_kernels(real, linear, serial: bool):
         ratio: wp.array2d(dtype=real),
         owner: wp.array(dtype=int),
         bodies: int,
-        rtol: real,
+        bound: real,
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         link: wp.array(dtype=int),
         awake: wp.array(dtype=int),
         any_awake: wp.array(dtype=int),
     ):
-        """Islands with a residual, or a sum of some, that is larger than it may be, or no number."""
+        """Islands with a residual, or a sum of some, larger than `bound` over the load scale, or no number."""
         w, start = share(wp.tid(), owner.shape[0])
         if flags[WANTED, w] == 0:
             return
         for i in range(start, until(start, owner.shape[0])):
             u = owner[i]
             if u >= 0:
-                if not ratio[w, i] <= rtol * scalars[LOAD_SCALE, w]:
+                if not ratio[w, i] <= bound * scalars[LOAD_SCALE, w]:
                     awake[first_of(link, u + w * bodies)] = 1
                     any_awake[w] = 1
 

@@ -122,7 +122,9 @@ def solver_kernels(linear, indefinite: bool = False):
         if wanted[w] == 0:
             return
         k = i - w * blocks
-        if diagonal[k] < 0 or barred[i] == BARRED:  # chains see to it, or nobody
+        if diagonal[k] < 0:  # chains see to it, and it stays zero
+            return
+        if barred[i] == BARRED:
             inverse_out[i] = M()
             return
         p = diagonal[k] + w * positions
@@ -143,6 +145,7 @@ def solver_kernels(linear, indefinite: bool = False):
     def start(
         right: wp.array(dtype=H),
         inverse: wp.array(dtype=M),
+        diagonal: wp.array(dtype=int),
         barred: wp.array(dtype=wp.uint8),
         wanted: wp.array(dtype=int),
         blocks: int,
@@ -155,14 +158,16 @@ def solver_kernels(linear, indefinite: bool = False):
         w = i / blocks
         if wanted[w] == 0:
             return
-        r = H()
+        k = i - w * blocks
+        r, z = H(), H()
         if barred[i] != BARRED:
             r = right[i]
-        z = inverse[i] * r
+            if diagonal[k] >= 0:
+                z = inverse[i] * r
         residual_out[i] = r
         solution_out[i] = H()
         p_out[i] = z
-        dots_out[w, i - w * blocks] = wp.dot(r, z)
+        dots_out[w, k] = wp.dot(r, z)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def begin(

@@ -90,6 +90,9 @@ class PairTerms:
         block = wp.types.matrix((3, 3), self.linear)
         self.diagonal = wp.zeros(nodes, dtype=block, device=self.device)
         self.between = wp.zeros(search.worlds * len(self.law.square), dtype=block, device=self.device)
+        self._told, self._told_edges = (
+            wp.zeros(len(array), dtype=wp.uint8, device=self.device) for array in (self.forces, self.between)
+        )
         told_not = np.zeros(len(search.shapes.points), np.uint8)
         told_not[[] if silent is None else silent] = 1
         told_not = wp.array(told_not, dtype=wp.uint8, device=self.device)
@@ -178,7 +181,7 @@ class PairTerms:
         iterates = self._no_iterates if iterates is None else iterates
         for part in self.frictions:
             part.evaluate(x, start, rate, iterates)
-        outputs = [self.forces, self.diagonal, self.stiffness]
+        outputs = [self.forces, self.diagonal, self.stiffness, self._told]
         arrays.sweep(self._collect, len(self.forces), [self.products.sets], outputs, self.device)
         self._totals(self.search.overflow)
 
@@ -224,7 +227,7 @@ class PairTerms:
         """Write `between` of the last `evaluate`."""
         edges = self.search.lists[0].first
         inputs = [self.products.sets, edges.surface, edges.count]
-        arrays.sweep(self._join, len(self.between), inputs, [self.between], self.device)
+        arrays.sweep(self._join, len(self.between), inputs, [self.between, self._told_edges], self.device)
 
     def _check(self, rate: wp.array) -> None:
         """Refuse rates that do not fit, and friction that was not lagged."""

@@ -56,7 +56,7 @@ class ConjugateGradients:
         )
         self._launch(
             self._start,
-            [newton.right, self.inverse, newton.barred, wanted, blocks],
+            [newton.right, self.inverse, table.diagonal, newton.barred, wanted, blocks],
             [self.rest, newton.direction, self.p, newton.krylov_dots],
         )
         if newton.chains:
