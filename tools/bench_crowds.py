@@ -10,8 +10,8 @@ in parts of steps that were not taken. What is said of errors: `rtol`, to which 
 largest estimate of `StepControl` [m/s], by which the steps of some scenes are halved; `gained`, the energy that was created over what
 was lost so far, of the scenes that nothing drives. `dt` is the mean of steps [s]. `search_share` is what searches take of the wall
 time, from one that is timed after them. Of scenes in which nothing touches, the ratio of a step with contact to one without. Of
-tolerances, for noodles that land, how far nodes are from where the tightest one has them, and where steps half as long have them, or
-those under control.
+tolerances, for noodles and hair that land, how far nodes are from where the tightest one has them, and where steps half as long have
+them, or those under control.
 """
 
 import argparse
@@ -47,11 +47,10 @@ CASES = {  # scene, its arguments, longest step [s], duration [s], whether somet
     "hair_10000": ("strands", {"count": 10_000, "contact": True}, 1 / 960, 1.0, True),
 }
 TOLERANCES = (1e-6, 1e-3, 1e-2, 3e-2, 1e-1, 3e-1)
-LANDING = (
-    {"count": 49, "nodes": 241, "bowl": 0.45},
-    420,
-    40,
-)  # noodles, steps of 1/960 s until they land, and that are compared
+LANDING = {  # arguments of a scene, steps of 1/960 s until things land, and that are compared
+    "noodles": ({"count": 49, "nodes": 241, "bowl": 0.45}, 420, 40),
+    "strands": ({"count": 256, "contact": True}, 270, 40),
+}
 APART, NODES = (100, 1_000, 10_000), 50  # rods of so many nodes that do not touch
 WARM, TIMED, TURN = 64, 80, 5  # steps: before time counts, until all graphs are captured, that are timed, and in turn
 
@@ -188,11 +187,15 @@ def _lattice(rods: int, touching: bool) -> ddg.Scene:
 
 
 def tolerances(device) -> list[dict]:
-    """What the tolerance of steps costs and does to noodles that land, and what their length does."""
-    given, before, count = LANDING
-    scene = import_module("ddg_warp.scenes.noodles").build(**given)
+    """What the tolerance of steps costs and does to noodles and hair that land, and what their length does."""
+    return [row for name in LANDING for row in _tolerances(name, device)]
+
+
+def _tolerances(name: str, device) -> list[dict]:
+    given, before, count = LANDING[name]
+    scene = import_module(f"ddg_warp.scenes.{name}").build(**given)
     model = scene.build(device)
-    start, dt = scene.initial(model), 1 / 960
+    start, dt = scene.initial(model) if scene.initial else model.state(), 1 / 960
     integrator = ddg.Integrator(model, rtol=OTHERWISE)
     for _ in range(before):
         start = integrator.step(start, dt)
@@ -200,7 +203,7 @@ def tolerances(device) -> list[dict]:
     for rtol, length, halvings in [
         *((rtol, dt, 0) for rtol in TOLERANCES),
         (TOLERANCES[0], dt / 2, 0),
-        (RTOL["noodles"], 4 * dt, 2),
+        *([(RTOL[name], 4 * dt, CONTROL[name][1])] if name in CONTROL else []),
     ]:
         integrator, state = ddg.Integrator(model, rtol=rtol), start
         steps = ddg.StepControl(integrator, CONTROL["noodles"][0], halvings)
@@ -214,6 +217,7 @@ def tolerances(device) -> list[dict]:
         off = np.linalg.norm(state.points() - points, axis=1)
         rows.append(
             {
+                "case": name,
                 "rtol": rtol,
                 "dt": count * dt / number,
                 "wall": wall,
