@@ -158,7 +158,6 @@ def inertia_function(real, linear, drag: bool):
     return inertia_of
 
 
-BARRED = wp.constant(wp.uint8(7))  # bits of a block none of whose dofs takes part in a direction
 SETS = 6  # sets that one launch sums
 
 

@@ -320,18 +320,8 @@ class Chains:
         self._launch(
             self._load,
             (arrays.takers(self.longest, self.device), solves * self.columns),
-            [
-                matrix,
-                table.columns,
-                self.places,
-                self.count,
-                self.idle,
-                self.held,
-                self.starts,
-                self.items,
-                self.joint_row,
-            ]
-            + [self.joint_rows, wanted, net.blocks, table.positions, int(residual is not None)]
+            [matrix, table.columns, self.places, self.count, self.idle, self.held, self.starts, self.items]
+            + [self.joint_row, self.joint_rows, wanted, net.blocks, table.positions, int(residual is not None)]
             + [int(moved is not None), self.moved if residual is None else residual]
             + [self.moved if moved is None else moved],
             [values],
