@@ -3,7 +3,9 @@
 import numpy as np
 
 import ddg_warp as ddg
+from ddg_warp.ask import sag_free
 from ddg_warp.geometry import meshes
+from ddg_warp.kernels.densities.quadratic import quadratic
 
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # rad
 HAIR = np.array([0.36, 0.21, 0.11])  # RGB
@@ -20,6 +22,19 @@ def placed(motion: ddg.Motion, rest: np.ndarray, t: float) -> np.ndarray:
 def edge_lengths(points: np.ndarray) -> np.ndarray:
     """Lengths (..., nodes - 1) of the edges between points (..., nodes, 3)."""
     return np.linalg.norm(np.diff(points, axis=-2), axis=-1)
+
+
+def as_drawn(points: np.ndarray, **about) -> dict:
+    """Natural shapes and laws, as `add_rods` takes them, by which strands (count, nodes, 3) held by their first edge hang as drawn.
+
+    Args:
+        points: as drawn; about: section and material.
+    """
+    scene = ddg.Scene()
+    scene.clamp(scene.add_rods(points, **about), edges=[0])
+    found = sag_free.rest_strains(scene.build("cpu", "float64"))
+    *natural, stretch = (values.reshape(len(points), -1) for values in found.values())
+    return {"natural": tuple(natural), "laws": {"rod_stretch": ddg.Law(quadratic, rest=stretch)}}
 
 
 def moments(points: np.ndarray, weight: float) -> np.ndarray:

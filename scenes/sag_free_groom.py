@@ -14,7 +14,6 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.ask import sag_free
-from ddg_warp.kernels.densities.quadratic import quadratic
 from ddg_warp.scenes import _learn, _strands
 from ddg_warp.scenes.strands import GROOM, groom
 
@@ -35,18 +34,20 @@ def build(path: str = str(GROOM), count: int = 512, young: float = 1.5e8) -> ddg
         young: Young's modulus [Pa]
     """
     points, radius = groom(path, count)
-    found = sag_free.rest_strains(strands(points, radius, young).build("cpu", "float64"))
-    *natural, stretch = (values.reshape(count, -1) for values in found.values())
-    return strands(
-        points, radius, young, natural=tuple(natural), laws={"rod_stretch": ddg.Law(quadratic, rest=stretch)}
-    )
+    about = kind(radius, young)
+    return strands(points, **about, **_strands.as_drawn(points, **about))
 
 
-def strands(points: np.ndarray, radius: float, young: float, **rest) -> ddg.Scene:
+def kind(radius: float, young: float) -> dict:
+    """Section and material of strands."""
+    material = ddg.Material(young=young, poisson=0.4, density=1300.0)
+    return {"section": ddg.Circle(radius), "material": material}
+
+
+def strands(points: np.ndarray, **about) -> ddg.Scene:
     """Strands (count, nodes, 3) held by their first edge; by default their drawn shape is their natural one."""
     scene = ddg.Scene(analysis=ddg.Statics(load_steps=4))
-    material = ddg.Material(young=young, poisson=0.4, density=1300.0)
-    scene.clamp(scene.add_rods(points, section=ddg.Circle(radius), material=material, name="strands", **rest))
+    scene.clamp(scene.add_rods(points, **about, name="strands"), edges=[0])
     return scene
 
 
@@ -59,7 +60,7 @@ def young(batch) -> float:
 def sagged(model) -> np.ndarray:
     """Where strands hang (nodes, 3) whose natural shape is the drawn one."""
     (batch,) = model.scene.batches
-    scene = strands(batch.points, float(batch.section.radius), young(batch))
+    scene = strands(batch.points, **kind(float(batch.section.radius), young(batch)))
     return ddg.statics.solve(scene.build("cpu", "float64"), load_steps=4).points()
 
 
@@ -107,7 +108,8 @@ def slope(result, chosen: np.ndarray) -> float:
 
     (batch,) = result.model.scene.batches
     rows = np.flatnonzero(chosen)[:: -(-int(chosen.sum()) // GRADED)]
-    model = strands(batch.points[rows], float(batch.section.radius), young(batch)).build("cpu", "float64")
+    about = kind(float(batch.section.radius), young(batch))
+    model = strands(batch.points[rows], **about).build("cpu", "float64")
     simulator, points, sizes = Simulator(model, dt=0.01), torch.tensor(model.state().points()), []
     for load in (0.0, 1.0):  # rest strains for no weight are those drawn
         strains = sag_free.rest_strains(model, load=load)

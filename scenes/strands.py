@@ -4,7 +4,7 @@ The strands come from a USD file as an artist would export it. Their shape there
 gravity and the motion of the head work on them. A strand stands for a wisp of hair: thicker than a hair, and so much softer that
 the bending length (EI / w)^(1/3), with w its weight per length, is 9 cm, near the 5 cm of a single hair.
 All strands are held by their first edge. With `contact` they touch each other and the head, which moves as they do; without they
-pass through both.
+pass through both. So they sag at first, far and onto the head; `sag_free` they hang as drawn where nothing moves (`sag_free_groom`).
 """
 
 from pathlib import Path
@@ -18,6 +18,10 @@ GROOM = Path(__file__).resolve().parent / "data" / "strands.usdc"
 PERIOD = 1.0  # s, of the head's motion
 REST = 2.0  # s; the head has come to rest by then
 TURN = 0.9  # rad
+YOUNG = {
+    False: 4.0e7,
+    True: 1.5e8,
+}  # Pa, of strands that sag, and of those that do not: softer ones turn over (`sag_free_groom`)
 CROWD = 512  # strands, from which on they are thinner where they touch, so that with their range they fill as much of the room
 RTOL = {False: 1e-6, True: 3e-2}  # of a strand's weight, to which forces balance in a step; see `noodles`
 # on the CPU float64 matrices take a sixth more time in contact; by them states differ by 1e-5 m at 0.5 s, by halved steps by 9e-3 m
@@ -34,9 +38,10 @@ HAIR = 4e-5  # m, radius of a hair, the least that strands in a crowd have where
 def build(
     path: str = str(GROOM),
     count: int = 512,
-    young: float = 4.0e7,
+    young: float = 0.0,
     sway: float = 0.12,
     contact: bool = False,
+    sag_free: bool = False,
     seed: int = -1,
 ) -> ddg.Scene:
     """The groom on its moving head.
@@ -44,9 +49,10 @@ def build(
     Args:
         path: USD file with curves of equal vertex counts
         count: strands; fewer are picked evenly, more are copies that stand between them
-        young: Young's modulus [Pa]
+        young: Young's modulus [Pa]; 4e7 or, of strands that hang as drawn, 1.5e8 if 0
         sway: sideways amplitude of the head [m]
         contact: whether strands touch each other and the head
+        sag_free: whether strands hang under their weight as they are drawn
         seed: of a jitter of the shapes at rest, beyond what is held, a fifth of the range of contact; none below 0
     """
     points, radius = groom(path, count)
@@ -60,13 +66,10 @@ def build(
         mass_damping=0.4,  # 1/s, drag of the air
         analysis=ddg.Dynamics(dt=1.0 / STEPS[contact], duration=REST, rtol=RTOL[contact], precision=PRECISION[contact]),
     )
-    strands = scene.add_rods(
-        points,
-        section=ddg.Circle(radius),
-        material=ddg.Material(young=young, poisson=0.4, density=1300.0, viscosity=2e-3),
-        natural="shape",
-        name="strands",
-    )
+    material = ddg.Material(young=young or YOUNG[sag_free], poisson=0.4, density=1300.0, viscosity=2e-3)
+    about = {"section": ddg.Circle(radius), "material": material}
+    natural = _strands.as_drawn(points, **about) if sag_free else {"natural": "shape"}
+    strands = scene.add_rods(points, **about, **natural, name="strands")
     motion = head_motion(points, sway)
     scene.clamp(strands, edges=[0], motion=motion)
     if contact:

@@ -1,7 +1,9 @@
 """Every scene's own check at a small size; by its defaults, and those that take longer, they are slow."""
 
+import numpy as np
 import pytest
 
+import ddg_warp as ddg
 from ddg_warp.run.catalog import load_scene, parameters, scene_files
 from ddg_warp.run.simulate import simulate
 
@@ -132,6 +134,30 @@ def test_small(device, name):
 
 def test_hair_that_touches(device):
     checked("strands", device, count=16, contact=True)
+
+
+def test_hair_that_touches_and_is_sag_free(device):
+    checked("strands", device, count=16, contact=True, sag_free=True)
+
+
+@pytest.mark.parametrize("contact", [False, True])
+def test_hair_hangs_as_drawn_while_the_head_has_hardly_turned(device, contact):
+    """It would fall by g t^2 / 2 = 1.4 mm; sag-free it moves by the turn of the head, and where it touches from the start."""
+    from ddg_warp.scenes import strands
+
+    moved = {}
+    for sag_free in (False, True):
+        scene = strands.build(count=32, sway=0.0, contact=contact, sag_free=sag_free)
+        model = scene.build(device, "float64")
+        integrator, state = ddg.Integrator(model), model.state()
+        for _ in range(4):
+            state = integrator.step(state, 1 / 240)
+        moved[sag_free] = np.linalg.norm(state.points() - model.state().points(), axis=1)
+    batch = scene.batches[0]
+    arm = np.linalg.norm(batch.points - batch.points[:, 0].mean(0), axis=-1).max()
+    turned = arm * strands.head_motion(batch.points, 0.0).angle(4 / 240)
+    assert np.median(moved[False]) > 1e-3
+    assert np.percentile(moved[True], 75 if contact else 100) < turned + 1e-6
 
 
 @pytest.mark.slow

@@ -143,7 +143,7 @@ class PartStep:
         Raises:
             SolverError: names the first, its outcome, where it went wrong and what to do.
         """
-        if not int(self.tally.numpy()[outcome.MAX_ITERATIONS :].sum()):
+        if not self._counted()[outcome.MAX_ITERATIONS :].any():
             return
         failed = np.flatnonzero(self.islands.status.numpy() == outcome.GIVEN_UP)
         if not failed.size:
@@ -156,6 +156,10 @@ class PartStep:
             outcome=name,
             rods=self.rods_of(failed),
         )
+
+    def _counted(self) -> np.ndarray:
+        """`tally` after the last step."""
+        return self.tally.numpy()
 
     def failure(self, state, island: int) -> tuple[str, str]:
         """Outcome of an island that was given up and rests in a state, and what to tell of it."""

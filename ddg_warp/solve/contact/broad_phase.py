@@ -17,6 +17,7 @@ from ddg_warp.solve.contact.tree import Things
 
 SLACK = 1e-3  # of the margin, by which a search goes beyond it, for rounding
 NONE = np.iinfo(np.int64).max
+MORE = 16  # numbers of others that are read along
 
 
 class BroadPhase:
@@ -42,6 +43,7 @@ class BroadPhase:
         lists: a `PairList` for each kind of pairs that there can be.
         overflow: (1,), not zero once pairs did not fit: `fit` has to follow, and whatever came of the pairs is to be done again.
         searches: (1,) how many there were; looks: (1,), see `Runs`; sought: both as of the last `fit` or `check`.
+        more: (MORE,) numbers that others count, which these read along; more_read: what they have read.
         gap [m], time and crossed, of each world: see `measure`, `impact` and `crossings`.
         shares: (worlds times units,), limited: of each world, how many of them are below 1; see `filter`.
         every: (worlds,) ones, of motions in which all nodes of every world go by one share.
@@ -84,8 +86,11 @@ class BroadPhase:
         self._placed = wp.array(placed, dtype=wp.uint8, device=self.device)
         self._shift = wp.zeros(worlds, dtype=x.dtype, device=self.device)
         self._never, self.every = (wp.full(worlds, flag, dtype=int, device=self.device) for flag in (0, 1))
-        self._read = wp.zeros(4, dtype=int, device=self.device)  # at once, after every step
-        self.overflow, self._lost, self.searches, self.looks = (self._read[k : k + 1] for k in range(4))
+        # at once, after every step: a reading takes as long as a kernel or two
+        self._memory = wp.zeros(2 + MORE, dtype=wp.int64, device=self.device)
+        own = wp.array(ptr=self._memory.ptr, shape=4, dtype=int, device=self.device)
+        self.overflow, self._lost, self.searches, self.looks = (own[k : k + 1] for k in range(4))
+        self.more, self.more_read = self._memory[2:], np.zeros(MORE, np.int64)
         self.sought = (0, 0)
         # whether pairs are out of date, or were for the check of a whole step; whether the last `update` found them anew
         self._stale, self._beyond, self._done = (wp.zeros(1, dtype=int, device=self.device) for _ in range(3))
@@ -219,8 +224,9 @@ class BroadPhase:
 
     def _checked(self) -> bool:
         """The same; whether pairs did not fit."""
-        overflow, lost, *sought = self._read.numpy().tolist()
-        self.sought, node = tuple(sought), lost - 1
+        memory = self._memory.numpy()
+        overflow, lost, *sought = memory[:2].view(np.int32).tolist()
+        self.sought, self.more_read, node = tuple(sought), memory[2:], lost - 1
         if node >= 0:
             self._lost.zero_()
             world, node = divmod(node, len(self.shapes.points))

@@ -58,6 +58,10 @@ class NetStep(PartStep):
             self.newton.pcg_work = counts_of.newton.pcg_work
             if solver.contact:
                 solver.contact.go_on(counts_of.newton.contact)
+        if solver.contact:
+            own = solver.contact.search.more[: len(self.tally)]
+            wp.copy(own, self.tally)
+            self.tally = own
         self._counts = [*self.islands.arrays, self.tally, self.work, self.newton.pcg_work]
         self._kept = [wp.zeros_like(array) for array in self._counts] if solver.contact else []
         self._begin, self._finish = newton.step_kernels(real, self.midpoint, arrays.serial(model.wp_device))
@@ -158,6 +162,11 @@ class NetStep(PartStep):
         for kept, array in zip(self._kept, self._counts, strict=True):
             wp.copy(array, kept)
         return True
+
+    def _counted(self) -> np.ndarray:
+        """As of `PartStep`; where there is contact as `outgrown` has read it."""
+        contact = self.newton.contact
+        return contact.search.more_read[: len(self.tally)] if contact else super()._counted()
 
     def attempt(self, before, after) -> None:
         """One solve of every world that has not finished the step, from state `before` to `after`."""
