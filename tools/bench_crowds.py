@@ -28,7 +28,7 @@ from ddg_warp.run.summary import machine, table, write_table
 
 # Of the weight of a rod, see `tolerances`: nodes err by a fifth of what steps half as long change, or less. By steps of 1/120 s 1e-1
 # is too much: noodles then seem to pass.
-RTOL, OTHERWISE = {"noodles": 3e-1, "hair_10000": 3e-1, "hair_10000_sag_free": 3e-1}, 3e-2
+RTOL, OTHERWISE = {"noodles": 3e-1, "hair_512": 1e-1, "hair_10000": 3e-1, "hair_10000_sag_free": 3e-1}, 3e-2
 # of `StepControl`, error [m/s] and halvings; steps of other cases are all of one length
 CONTROL, ONE_LENGTH = {"noodles": (5e-3, 2), "hair_10000_sag_free": (5e-3, 2)}, (5e-3, 0)
 PARTS = 6  # rows of a case
