@@ -3,7 +3,6 @@
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.ask import sag_free
 from ddg_warp.geometry import meshes
 from ddg_warp.kernels.densities.quadratic import quadratic
 
@@ -30,6 +29,8 @@ def as_drawn(points: np.ndarray, **about) -> dict:
     Args:
         points: as drawn; about: section and material.
     """
+    from ddg_warp.ask import sag_free  # brings SciPy, which scenes of hair do without
+
     scene = ddg.Scene()
     scene.clamp(scene.add_rods(points, **about), edges=[0])
     found = sag_free.rest_strains(scene.build("cpu", "float64"))

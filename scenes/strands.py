@@ -18,10 +18,8 @@ GROOM = Path(__file__).resolve().parent / "data" / "strands.usdc"
 PERIOD = 1.0  # s, of the head's motion
 REST = 2.0  # s; the head has come to rest by then
 TURN = 0.9  # rad
-YOUNG = {
-    False: 4.0e7,
-    True: 1.5e8,
-}  # Pa, of strands that sag, and of those that do not: softer ones turn over (`sag_free_groom`)
+# Pa, of strands that sag, and of those that do not: softer ones turn over (`sag_free_groom`)
+YOUNG = {False: 4.0e7, True: 1.5e8}
 CROWD = 512  # strands, from which on they are thinner where they touch, so that with their range they fill as much of the room
 # of a strand's weight, to which forces balance in a step: in contact nodes are off by a sixth of what halved steps change
 RTOL = {False: 1e-6, True: 1e-1}
