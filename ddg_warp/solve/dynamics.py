@@ -101,6 +101,10 @@ class Integrator:
             arguments.count("check_every", check_every)
         self.model, self.scheme, self.solver, self.linear = model, scheme, solver, linear
         self.options = NewtonOptions(**options)
+        if self.options.outliers and not model.scene.touching:
+            raise SceneError(
+                f"outliers = {self.options.outliers!r} is of scenes with contact, whose bodies wait for each other; this one has none"
+            )
         self.retry_limit = arguments.count("retry_limit (0 for no retry)", retry_limit, 0)
         self.energy_bound = energy.bound(energy_bound, scheme)
         self.check_every = check_every or (32 if model.wp_device.is_cuda else 1)

@@ -3,8 +3,9 @@
 A unit is what shortens as one: a rod, a shell or a node. All moves are straight, at one time: where units a, b go by s_a, s_b of
 theirs, the pair is judged by the time of impact t of the motion that is left (`impact`), in which what all move in common does not
 count. The first round is of the whole motion; a pair that hits brings its units to t. What then still hits, as one side was stopped by
-others, is brought to max(t s, the smallest share in the pair), round by round until nothing changes; pairs whose shares have not
-changed are not asked again. A pair is safe where all of it goes by one share up to its first t; so but for rounding no share falls
+others, is brought to max(t s, the smallest share in the pair), round by round until nothing changes. Pairs whose shares have not
+changed are not asked again: the others are picked by a kernel of its own, as the one that asks takes so many registers that few threads
+of it wait for memory at once. A pair is safe where all of it goes by one share up to its first t; so but for rounding no share falls
 below the earliest time of its world. Where the last round allowed still changes some, the world goes by that time as a whole, which is
 safe.
 """
@@ -22,17 +23,51 @@ ROUNDS = 50  # what falls on what has stopped stops layer by layer, one in a rou
 
 
 @cache
-def limit_kernel(kind: Kind, real):
-    """Lowers the shares of units whose pairs hit, and the earliest `time` of their worlds."""
+def limit_kernels(kind: Kind, real):
+    """pick(...) pairs with a share that the last round has changed; limit(...) the shares of units whose pairs hit, and the earliest
+    `time` of their worlds."""
     Sides, X, W = sides_struct(real), wp.types.vector(3, real), wp.types.vector(4, real)
     slots, _, thickness, _ = pair_functions(kind, real)
     corners, (impact, _) = corners_function(real), impact_functions(kind, real)
+
+    @wp.func
+    def things(sides: Sides, pair: wp.vec2i):
+        """World of a pair, and both things in it."""
+        w = pair[0] / sides.counts[0]
+        return w, pair[0] - w * sides.counts[0], pair[1] - w * sides.counts[1]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def pick(
+        threads: int,
+        pairs: wp.array(dtype=wp.vec2i),
+        count: wp.array(dtype=int),
+        sides: Sides,
+        unit: wp.array(dtype=int),
+        units: int,
+        shares: wp.array(dtype=real),
+        before: wp.array(dtype=real),
+        picked: wp.array(dtype=int),
+        number: wp.array(dtype=int),
+    ):
+        """In any order: what they come to is the least of what each does."""
+        for p in range(wp.tid(), count[0], threads):
+            w, i, j = things(sides, pairs[p])
+            nodes = slots(sides, i, j, w)
+            changed = int(0)
+            for k in range(4):
+                of = unit[nodes[k] - w * sides.first.nodes_a_world]
+                if of >= 0:
+                    if shares[of + w * units] != before[of + w * units]:
+                        changed = 1
+            if changed != 0:
+                picked[wp.atomic_add(number, 0, 1)] = p
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def limit(
         threads: int,
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
+        picked: wp.array(dtype=int),
         sides: Sides,
         x: wp.array(dtype=X),
         move: wp.array(dtype=X),
@@ -41,38 +76,39 @@ def limit_kernel(kind: Kind, real):
         unit: wp.array(dtype=int),
         units: int,
         shares: wp.array(dtype=real),
-        before: wp.array(dtype=real),
         lowered: wp.array(dtype=real),
         time: wp.array(dtype=real),
     ):
-        for pair in range(wp.tid(), count[0], threads):
-            w = pairs[pair][0] / sides.counts[0]
-            i, j = pairs[pair][0] - w * sides.counts[0], pairs[pair][1] - w * sides.counts[1]
+        """Of `count` pairs all, or those that are `picked`, if any array of such is given."""
+        for n in range(wp.tid(), count[0], threads):
+            p = n
+            if picked.shape[0] > 0:
+                p = picked[n]
+            w, i, j = things(sides, pairs[p])
             nodes = slots(sides, i, j, w)
             s = W(real(1.0), real(1.0), real(1.0), real(1.0))
             of = wp.vec4i()
-            changed, least, most = int(0), real(1.0), real(0.0)
+            least, most = real(1.0), real(-1.0)
             for k in range(4):
                 of[k] = unit[nodes[k] - w * sides.first.nodes_a_world]
                 if of[k] >= 0:
                     of[k] += w * units
                     s[k] = shares[of[k]]
                     least, most = wp.min(least, s[k]), wp.max(most, s[k])
-                    if s[k] != before[of[k]]:
-                        changed = 1
-            if changed != 0:
-                p = corners(move, nodes)
-                p = wp.matrix_from_rows(s[0] * p[0], s[1] * p[1], s[2] * p[2], s[3] * p[3])
-                t = impact(corners(x, nodes), p, keep * thickness(sides, i, j, w), reach)
-                if t < real(1.0):
-                    wp.atomic_min(time, w, t)
-                    if most == least:
-                        least = real(0.0)
-                    for k in range(4):
-                        if of[k] >= 0:
-                            wp.atomic_min(lowered, of[k], wp.max(t * s[k], least))
+            if most < real(0.0):  # nothing of it is ever shortened
+                continue
+            m = corners(move, nodes)
+            m = wp.matrix_from_rows(s[0] * m[0], s[1] * m[1], s[2] * m[2], s[3] * m[3])
+            t = impact(corners(x, nodes), m, keep * thickness(sides, i, j, w), reach)
+            if t < real(1.0):
+                wp.atomic_min(time, w, t)
+                if most == least:
+                    least = real(0.0)
+                for k in range(4):
+                    if of[k] >= 0:
+                        wp.atomic_min(lowered, of[k], wp.max(t * s[k], least))
 
-    return limit
+    return pick, limit
 
 
 @cache

@@ -14,6 +14,7 @@ from ddg_warp.kernels.islands import (
     HALVINGS,
     ITERATION,
     MOVED,
+    PROGRESS,
     SLOT,
     STATUS,
     STEP_LENGTH,
@@ -119,12 +120,20 @@ def world_kernels(real):
     def refuse(
         crossed: wp.array(dtype=int),
         gap: wp.array(dtype=real),
+        overflow: wp.array(dtype=int),
         flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
         total: wp.array(dtype=wp.int64),
         least: wp.array(dtype=real),
     ):
-        """A part of a step in which things passed through each other is not taken; of others the smallest gap is kept."""
+        """A part of a step in which things passed through each other is not taken; of others the smallest gap is kept.
+
+        Where pairs did not fit, the step is over: it will be done again from its start.
+        """
         w = wp.tid()
+        if overflow[0] != 0:
+            scalars[PROGRESS, w] = real(1.0)
+            return
         if flags[MOVED, w] != 0 and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING):
             if crossed[w] > 0:
                 flags[STATUS, w] = wp.static(outcome.CROSSED)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from ddg_warp import arrays
+from ddg_warp import arguments, arrays
 from ddg_warp.errors import SceneError, check_options
 from ddg_warp.kernels import balance, chain, evaluate, search, step
 from ddg_warp.kernels.islands import Islands
@@ -44,6 +44,9 @@ class NewtonOptions:
             shells' bending, of glue and of magnets are left out, which "none" refuses. It is indefinite where a pivot is lost, or
             conjugate gradients meet negative curvature; by "gauss_newton" nets go on with the direction found so far, and leave
             compression out of the next matrix.
+        outliers: in contact, part of the bodies of a world (rods, shells, and what is joined of them) that may be out of balance
+            at the end of a step, each by no more than ten times the tolerance: in crowds some slip off others at any time, and
+            hold up all the rest. What is left of its residual acts on such a body like a force, in that step.
     """
 
     rtol: float = 1e-6
@@ -53,8 +56,11 @@ class NewtonOptions:
     rotation_cap: float = 1.0
     linear_rtol: float = 1e-8
     psd: str = "auto"
+    outliers: float = 0.0
 
     def __post_init__(self):
+        part = "a part of all bodies, from 0 to less than 1"
+        arguments.number("outliers", self.outliers, part, lambda v: 0.0 <= v < 1.0)
         check_options(self, ("rtol", "floor_factor", "rotation_cap", "linear_rtol"), ("max_iterations", "max_halvings"))
         if self.psd not in PSD_MODES:
             raise SceneError(f"psd {self.psd!r}: it is one of {', '.join(PSD_MODES)}")

@@ -4,7 +4,7 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.contact.shares import limit_kernel, share_kernels
+from ddg_warp.kernels.contact.shares import limit_kernels, share_kernels
 
 
 class MotionFilter:
@@ -20,13 +20,15 @@ class MotionFilter:
     def __init__(self, lists: list, nodes: int, worlds: int, real, device):
         self._lists, self._nodes, self._worlds, self._device = lists, nodes, worlds, device
         serial = arrays.serial(device)
-        self._limits = [limit_kernel(pairs.kind, real) for pairs in lists]
+        made = [limit_kernels(pairs.kind, real) for pairs in lists]
+        self._picks, self._limits = zip(*made, strict=True)
         self._start, self._turn, self._settle, self._finish, self._shorten = share_kernels(real, serial)
-        self.kernels = [*self._limits, self._start, self._turn, self._settle, self._finish, self._shorten]
+        self.kernels = [*self._picks, *self._limits, self._start, self._turn, self._settle, self._finish, self._shorten]
         self._all = [wp.zeros(worlds * nodes, dtype=real, device=device) for _ in range(3)]
         self._earliest, self._later = (wp.zeros(worlds, dtype=real, device=device) for _ in range(2))
         self._open, self.limited = (wp.zeros(worlds, dtype=int, device=device) for _ in range(2))
-        self._changed, self._rounds = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
+        self._changed, self._rounds, self._number = (wp.zeros(1, dtype=int, device=device) for _ in range(3))
+        self._unpicked = wp.zeros(0, dtype=int, device=device)
         self.shares = self._all[0]
 
     def check(self, unit: wp.array, together: wp.array, units: int) -> None:
@@ -57,16 +59,21 @@ class MotionFilter:
         for numbers in (self._rounds, self.limited):
             numbers.zero_()
 
-        def go(times: wp.array) -> None:
+        def go(times: wp.array, again: bool = True) -> None:
             wp.launch(self._turn, self._worlds, [], [self._open, self._changed, self._rounds], device=self._device)
-            for kernel, pairs in zip(self._limits, self._lists, strict=True):
-                inputs = [pairs.pairs, pairs.count, pairs.sides, base, move, keep, reach, unit, units]
-                outputs = [shares, before, lowered, times]
-                arrays.take_turns(kernel, pairs.capacity, inputs, outputs, self._device)
+            for pick, limit, pairs in zip(self._picks, self._limits, self._lists, strict=True):
+                count, picked = pairs.count, self._unpicked
+                if again:
+                    self._number.zero_()
+                    inputs = [pairs.pairs, count, pairs.sides, unit, units, shares, before]
+                    arrays.take_turns(pick, pairs.capacity, inputs, [pairs.picked, self._number], self._device)
+                    count, picked = self._number, pairs.picked
+                inputs = [pairs.pairs, count, picked, pairs.sides, base, move, keep, reach, unit, units, shares]
+                arrays.take_turns(limit, pairs.capacity, inputs, [lowered, times], self._device)
             inputs = [together, self._earliest, lowered, self._rounds]
             self._sweep(self._settle, len(shares), inputs, [shares, before, self._open, self._changed])
 
-        go(self._earliest)
+        go(self._earliest, again=False)
         wp.capture_while(self._changed, lambda: go(self._later))
         outputs = [shares, time, self.limited]
         self._sweep(self._finish, len(shares), [self._earliest, self._open, overflow], outputs)

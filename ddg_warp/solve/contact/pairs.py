@@ -51,7 +51,7 @@ class PairList:
     Attributes:
         pairs: things (i, j) of both sides, counted over all worlds, sorted; the first `count` hold.
         starts, partners: of each first thing (first.all,), where its pairs start and how many they are, where all pairs fit.
-        count: of pairs, zero where they do not fit.
+        count: of pairs, zero where they do not fit; picked: room for the numbers of some.
         sides: see `kernels.contact.surfaces`; overflow: shared with other lists; not zero once pairs did not fit.
     """
 
@@ -89,6 +89,7 @@ class PairList:
             self._met = wp.zeros(met, dtype=wp.vec2i, device=self.device)
             self._before = wp.zeros(met, dtype=int, device=self.device)
         self.pairs = wp.zeros(pairs, dtype=wp.vec2i, device=self.device)
+        self.picked = wp.zeros(pairs, dtype=int, device=self.device)
         self._needed.zero_()
 
     def fit(self) -> None:
@@ -102,7 +103,8 @@ class PairList:
             raise SolverError("more than 2^31 pairs are near; use a smaller margin or reach", outcome="too_many_pairs")
         now = np.array([self.capacity, len(self._met)])
         if (needed > now).any():
-            self.reserve(*np.where(needed > now, np.minimum(needed + needed // 2, 2**31 - 1), now).tolist())
+            # not for the next few alone: graphs are captured anew, which takes longer than many steps
+            self.reserve(*np.where(needed > now, np.minimum(2 * needed, 2**31 - 1), now).tolist())
 
     def meet(self) -> None:
         """Find the pairs whose boxes meet; see `kernels.contact.candidates`."""

@@ -35,7 +35,7 @@ class NetContact:
         forces (W N,) [N], stiffness (W N,) [N/m]: what pushes nodes, and a bound on how stiff that is.
         diagonal: (W N,) blocks of its matrix at nodes.
         bound: (W N,) where iterates of worlds on their way are bound for, and where those of others are.
-        bodies: which each block of a world belongs to (blocks,), -1 for none, and how many there are.
+        bodies: which each block of a world belongs to (blocks,), -1 for none, and how many there may be.
         bends: whether its matrix has what comes of pairs that turn, once the search is near; see `kernels.contact.pair_bend`.
         solutions: where the last step took friction anew, in this order, for its reverse: `lags` - 1 of (W N,) with friction.
         crossed: (1,) pairs that would have passed through each other in all steps so far; least: (1,) the smallest gap [m].
@@ -110,6 +110,11 @@ class NetContact:
         self._sum = Sums(worlds, newton.dots.shape[1], real, device)
         self._bands = None
         self._least = LEAST * float(host.touching.range.min()) if self.touch.keep else -math.inf
+
+    @property
+    def touching_bodies(self) -> int:
+        """How many there are in a world."""
+        return len(np.setdiff1d(self.bodies[0], [-1]))
 
     def bind(self, chains) -> None:
         """Have a part in what chains eliminate, once their plan is made."""
@@ -259,7 +264,7 @@ class NetContact:
         """Take no part of a step in which things passed through each other."""
         newton = self.newton
         self.search.check_crossings(before, newton.q)
-        inputs = [self.search.crossed, self.terms.gap, newton.islands.arrays[0]]
+        inputs = [self.search.crossed, self.terms.gap, self.search.overflow, *newton.islands.arrays]
         self._launch(self._refuse, self.net.worlds, inputs, [self.crossed, self.least])
         self.tally(newton.islands.arrays[0])
 

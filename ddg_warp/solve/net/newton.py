@@ -20,6 +20,7 @@ from ddg_warp.solve.net.chains import Chains
 from ddg_warp.solve.net.contact import NetContact
 from ddg_warp.solve.net.frozen import Frozen
 from ddg_warp.solve.net.krylov import Directions
+from ddg_warp.solve.net.outliers import Outliers
 from ddg_warp.solve.net.planes import DevicePlanes
 from ddg_warp.solve.net.resting import Resting
 from ddg_warp.solve.net.system import Assembly, NetSystem, Sums
@@ -153,6 +154,8 @@ class NetNewton:
         outer = outer_forces(host, gravity)
         self.outer = self.allowed.assign(self.allowed.bodies.loads(outer)[None])
         self.resting = Resting(self, *self.contact.bodies) if self.contact else None
+        most = int(options.outliers * self.contact.touching_bodies) if self.contact else 0
+        self.outliers = Outliers(self, most) if most else None
         self.here = self.contact.bound if self.contact else self.q
         self._balance = Balance(self, drag)
         self._worst = Sums(worlds, self.allowed.ratio.shape[1], self.real, device, largest=True)
@@ -203,6 +206,7 @@ class NetNewton:
         own = [*self._balance.kernels, self._judge, self._measure, self._rotate, self._take]
         own += [*self.allowed.kernels, *([self._repeat] if self._repeat else [])]
         used = (self.chains, None if self._direct else self.krylov, self.planes, self.turns, self.contact, self.resting)
+        used += (self.outliers,)
         parts = [self._move, *self.net.carries, *(k for part in used if part for k in part.kernels)]
         evaluate = [(kernel, 128) for kernel in self._evaluate]
         sums = (self._sum, self._sum_weights, self._largest, self._worst)
@@ -274,6 +278,8 @@ class NetNewton:
         options = self.options
         self._sum_weights(self._weights.reshape((3 * self.worlds, -1)), self._weight.flatten())
         self._worst(self.allowed.ratio, self.worst)
+        if self.outliers:
+            self.outliers()
         if self.contact:
             self.contact.account(self._weight[0], self._weight[1])
         wp.launch(

@@ -24,12 +24,15 @@ class Resting:
 
     Args:
         newton: once its contact and what residuals may be are there.
-        body: which rod, shell, or what is joined of them, each block belongs to (blocks,), -1 for none; bodies: how many there are.
+        body: which rod, shell, or what is joined of them, each block belongs to (blocks,), -1 for none; bodies: how many there may be.
+
+    Attributes:
+        owner: the body of every ratio of `NetNewton.allowed`, -1 for none.
     """
 
     def __init__(self, newton, body: np.ndarray, bodies: int):
         self.newton, net, device = newton, newton.net, newton.device
-        self._worlds, self._bodies = net.worlds, bodies
+        self._worlds, self.bodies = net.worlds, bodies
         owner = [body]
         for level in newton.allowed.bodies.levels:  # sums over parts belong to what their blocks do
             owner.append(owner[-1][level.items[level.starts[:-1]]])
@@ -37,7 +40,7 @@ class Resting:
         def put(values):
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
 
-        self._owner, self._body = put(np.concatenate(owner)), put(body)
+        self.owner, self._body = put(np.concatenate(owner)), put(body)
         self._link, self._awake = (put(np.arange(net.worlds * bodies)) for _ in range(2))
         self._any = put(np.zeros(net.worlds))
         chains = newton.chains
@@ -51,11 +54,11 @@ class Resting:
         """Find what rests, by the residuals of the iterate and the pairs of a `PairProduct`."""
         newton, device = self.newton, self.newton.device
         arrays.sweep(self._begin, len(self._link), [], [self._link, self._awake, self._any], device)
-        inputs = [products.sets, self._body, self._bodies]
+        inputs = [products.sets, self._body, self.bodies]
         arrays.take_turns(self._join, products.most, inputs, [self._link], device)
-        inputs = [newton.allowed.ratio, self._owner, self._bodies, REST * newton.options.rtol, *newton.islands.arrays]
+        inputs = [newton.allowed.ratio, self.owner, self.bodies, REST * newton.options.rtol, *newton.islands.arrays]
         outputs = [self._link, self._awake, self._any]
-        arrays.sweep(self._look, len(self._owner), inputs, outputs, device, worlds=self._worlds)
+        arrays.sweep(self._look, len(self.owner), inputs, outputs, device, worlds=self._worlds)
         self._bar()
         arrays.take_turns(self._leave, products.most, [products.sets, newton.barred], [], device)
 
@@ -67,7 +70,7 @@ class Resting:
     def _bar(self) -> None:
         newton = self.newton
         self._idle.fill_(1)
-        inputs = [self._link, self._awake, self._any, self._bodies, newton.stalled, newton.islands.arrays[0]]
+        inputs = [self._link, self._awake, self._any, self.bodies, newton.stalled, newton.islands.arrays[0]]
         inputs += [self._body, newton.fixed, self._where, self._width]
         outputs = [newton.barred, self._idle]
         arrays.sweep(self._settle, len(self._body), inputs, outputs, newton.device, worlds=self._worlds)

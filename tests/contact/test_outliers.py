@@ -1,0 +1,113 @@
+"""Crowds in balance but for a few bodies, and what these few may be off by."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import ddg_warp as ddg
+from ddg_warp.kernels.islands import DROWNED, STATUS, UNBALANCED
+from ddg_warp.kernels.net.outliers import FARTHEST
+
+RADIUS, DT, RTOL = 2e-3, 1 / 240, 1e-4
+SOFT = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
+STRAIGHT = np.linspace(-0.03, 0.03, 9)
+
+
+def crossed(count: int, fastest: float = 3.0) -> tuple[ddg.Scene, np.ndarray]:
+    """Pairs of crossed rods apart from each other, which meet at speeds up to the fastest, and velocities."""
+    scene, velocities = ddg.Scene(), []
+    for i, speed in enumerate(np.linspace(0.1, fastest, count)):
+        at = np.array([0.2 * i, 0.0, 0.0])
+        one = np.stack([STRAIGHT, 0 * STRAIGHT, 0 * STRAIGHT], 1) + at
+        other = np.stack([0 * STRAIGHT, STRAIGHT, 0 * STRAIGHT + 4.5e-3], 1) + at
+        scene.add_rods(np.stack([one, other]), section=ddg.Circle(RADIUS), material=SOFT, name=f"pair {i}")
+        velocities += [np.zeros((9, 3)), np.tile([0.0, 0.0, -speed], (9, 1))]
+    scene.contact(range=1e-3, friction=0.3)
+    return scene, np.concatenate(velocities)
+
+
+def stepped(device, outliers: float, worlds: int = 1):
+    """Positions after a step, of every body the largest residual over the tolerance, and Newton iterations."""
+    scene, velocities = crossed(10)
+    model = scene.build(device=device, worlds=worlds)
+    integrator = ddg.Integrator(model, rtol=RTOL, outliers=outliers, check_every=1)
+    state = integrator.step(model.state(velocities=velocities), DT)
+    newton = integrator._net.newton
+    ratio, owner = newton.allowed.ratio.numpy(), newton.resting.owner.numpy()
+    worst = np.zeros((worlds, newton.resting.bodies))
+    for own, found in zip(worst, ratio, strict=True):
+        np.maximum.at(own, owner[owner >= 0], found[owner >= 0])
+    worst /= RTOL * newton.islands.load_scale.numpy()[:, None]
+    return state.points(), worst, integrator.statistics()["newton_iterations"]["max"]
+
+
+def test_few_are_out_of_balance_and_nearly_in_it(device):
+    """Without, all bodies balance; with a fifth, 4 of 20 rods may be off by ten times the tolerance, and the step ends earlier."""
+    _, none, iterations = stepped(device, 0.0)
+    assert none.max() <= 1.0
+    _, few, fewer = stepped(device, 0.2)
+    assert 0 < (few > 1.0).sum() <= 4 and few.max() <= FARTHEST
+    assert fewer < iterations
+
+
+def test_each_world_has_its_own(device):
+    """As many of each world, the same in both."""
+    one, few, _ = stepped(device, 0.2)
+    two, both, _ = stepped(device, 0.2, worlds=2)
+    assert ((both > 1.0).sum(1) == (few > 1.0).sum()).all()
+    np.testing.assert_allclose(two.reshape(2, *one.shape), [one, one], rtol=0, atol=1e-9)
+
+
+def test_no_whole_body_is_no_outlier(device):
+    """Less than one body of a world: to the bit what it is without."""
+    (one, _, _), (other, _, _) = stepped(device, 0.0), stepped(device, 0.04)
+    assert (one == other).all()
+
+
+# bodies out of balance, by how many times the tolerance, whether sums are numbers; and whether they are excused
+CASES = {
+    "two": ((1, 4), 9.0, True, True),
+    "one far off": ((3,), 11.0, True, False),
+    "three": ((0, 1, 2), 2.0, True, False),
+    "no number": ((1,), 2.0, False, False),
+    "of no body": ((-1,), 2.0, True, False),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_who_is_excused(device, case):
+    """Two of twenty at most, by any number of their blocks."""
+    bodies, off, finite, excused = CASES[case]
+    scene, _ = crossed(10)
+    model = scene.build(device=device, precision="float64")
+    newton = ddg.Integrator(model, rtol=RTOL, outliers=0.1)._net.newton
+    owner, islands, scale = newton.resting.owner.numpy().copy(), newton.islands, 3.0
+    if bodies == (-1,):
+        owner[7] = -1
+        newton.outliers._owner.assign(owner)
+    ratio = np.where(np.isin(owner, bodies), off, 0.5) * RTOL * scale
+    newton.allowed.ratio.assign(ratio[None])
+    newton.worst.fill_(ratio.max())
+    newton._weight.assign(np.array([[0.0], [0.0], [1.0 if finite else np.nan]]))
+    islands.load_scale.fill_(scale)
+    flags = islands.arrays[0].numpy()
+    flags[[STATUS, UNBALANCED, DROWNED]] = [[0], [1], [1]]
+    islands.arrays[0].assign(flags)
+    newton.outliers()
+    wp.synchronize()
+    assert (islands.arrays[0].numpy()[[UNBALANCED, DROWNED]] == (0 if excused else 1)).all()
+
+
+@pytest.mark.parametrize("wrong", [-0.1, 1.0, np.nan, "0.1", True, None])
+def test_what_is_no_part_is_refused(device, wrong):
+    scene, _ = crossed(2)
+    with pytest.raises(ddg.SceneError, match="outliers"):
+        ddg.Integrator(scene.build(device=device), outliers=wrong)
+
+
+def test_without_contact_it_is_refused(device):
+    """Bodies that do not touch do not wait for each other."""
+    scene = ddg.Scene()
+    scene.add_rod(np.stack([STRAIGHT, 0 * STRAIGHT, 0 * STRAIGHT], 1), section=ddg.Circle(RADIUS), material=SOFT)
+    with pytest.raises(ddg.SceneError, match="scenes with contact"):
+        ddg.Integrator(scene.build(device=device), outliers=0.1)
