@@ -1,8 +1,8 @@
 """Times large scenes of contact, noodles, woven_cylinder, rod_pile and hair on a moving head, and contact where nothing touches.
 
-    python tools/bench_crowds.py --device cuda:0 [--only noodles ...] [--limit SECONDS] [--out DIR]
+    python tools/bench_crowds.py --device cuda:0 [--only noodles ...] [--limit SECONDS] [--out DIR] [--name NAME]
 
-Prints a table; writes crowds_DEVICE.csv and .json, crowds_apart_DEVICE, and crowds_tolerance_DEVICE. Each case runs to its end or
+Prints a table; writes NAME_DEVICE.csv and .json, crowds_apart_DEVICE, and crowds_tolerance_DEVICE. Each case runs to its end or
 for `limit` seconds of wall time; a row is a sixth of that, from start to the time `until`: seconds of wall time for each simulated
 one, means a step of solves (more than one where steps were taken in parts), of Newton and of conjugate gradient iterations and of
 searches, pairs in contact and the smallest gap over the range so far. `refused` are pairs that would have passed through each other
@@ -254,6 +254,7 @@ def main() -> int:
     parser.add_argument("--limit", type=float, default=60.0, help="seconds of wall time of a case")
     parser.add_argument("--commit", default="", help="commit, where there is no git checkout")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    parser.add_argument("--name", default="crowds", help="of the table of cases (default: crowds)")
     chosen = parser.parse_args()
     device = wp.get_device(chosen.device)
     own = "cuda" if device.is_cuda else "cpu"
@@ -262,7 +263,7 @@ def main() -> int:
     rows = []
     for name in (name for name in chosen.only if name in CASES):
         rows += run(name, device, chosen.limit)
-        write_table(chosen.out / f"crowds_{own}", rows, about)
+        write_table(chosen.out / f"{chosen.name}_{own}", rows, about)
     if rows:
         print(table(rows))
     for name in (name for name in chosen.only if name in OTHERS):

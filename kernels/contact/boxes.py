@@ -12,6 +12,57 @@ FAR = 1e15  # beyond anything [m], squared still a number
 LEAST = 1e-30  # so that zero is rounded outwards, too [m]
 
 
+@wp.struct
+class Trees:
+    """Boxes of two sides whose pairs are asked for, in all worlds, and the tree of the second.
+
+    lower, upper: of first things; second_lower, second_upper: of second ones; bundle_lower, bundle_upper: of bundles of first ones;
+    bundles: of these in one world, the first things that they start with, and how many there are; leaves: the same of the bundles of
+    second things, whose boxes are those of the tree.
+    """
+
+    lower: wp.array(dtype=wp.vec3)
+    upper: wp.array(dtype=wp.vec3)
+    second_lower: wp.array(dtype=wp.vec3)
+    second_upper: wp.array(dtype=wp.vec3)
+    bundle_lower: wp.array(dtype=wp.vec3)
+    bundle_upper: wp.array(dtype=wp.vec3)
+    bundles: wp.array(dtype=int)
+    leaves: wp.array(dtype=int)
+    tree: wp.uint64
+
+
+@wp.func
+def overlap(lower: wp.vec3, upper: wp.vec3, other_lower: wp.vec3, other_upper: wp.vec3):
+    """Whether two boxes meet, as trees see it."""
+    x = lower[0] <= other_upper[0] and upper[0] >= other_lower[0]
+    y = lower[1] <= other_upper[1] and upper[1] >= other_lower[1]
+    return x and y and lower[2] <= other_upper[2] and upper[2] >= other_lower[2]
+
+
+@wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+def bundle(
+    starts: wp.array(dtype=int),
+    count: int,
+    lower: wp.array(dtype=wp.vec3),
+    upper: wp.array(dtype=wp.vec3),
+    lower_out: wp.array(dtype=wp.vec3),
+    upper_out: wp.array(dtype=wp.vec3),
+):
+    """Boxes of bundles, which start with such things, of `count` in a world."""
+    tid = wp.tid()
+    bundles = starts.shape[0] - 1
+    w = tid / bundles
+    start = starts[tid - w * bundles] + w * count
+    low = lower[start]
+    high = upper[start]
+    for i in range(start + 1, starts[tid - w * bundles + 1] + w * count):
+        low = wp.min(low, lower[i])
+        high = wp.max(high, upper[i])
+    lower_out[tid] = low
+    upper_out[tid] = high
+
+
 @cache
 def outward_function(real):
     """outward(value, sign): in float32, down or up by the sign, no nearer than it is."""

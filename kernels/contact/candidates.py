@@ -1,8 +1,10 @@
 """Pairs that are near: those whose boxes meet, by a tree; judged by their distance; and listed in the order of their indices.
 
 Walking the tree and judging pairs are kernels of their own. A walk waits for memory, and takes so few registers that many threads
-wait at once. (Larger boxes whose pairs serve several searches were tried: what falls leaves them in a step, and what rests gains
-nothing, as many more of them meet.)
+wait at once: with a loop over things and their boxes in it, it took 2.4 times as long on an H200. Bundles of edges that follow each
+other along a rod share a leaf of the tree, and a walk; all pairs of things of two bundles whose boxes meet are judged, a slot each.
+(Larger boxes whose pairs serve several searches were tried: what falls leaves them in a step, and what rests gains nothing, as many
+more of them meet.)
 
 Of a motion those are found that may come near anywhere on the way. Whatever its share of its way, each node is between both ends of
 it; so the sides are as far apart as these ends are along any direction. The one asked is that of the closest points in the middle of
@@ -24,37 +26,114 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.contact.boxes import Trees, overlap
 from ddg_warp.kernels.contact.motion import corners_function, relative_function
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
 MOST = 2**31 - 1  # pairs that can be counted; more are told as so many
-AT_ONCE = 8  # pairs of a thing that are given places together: all threads wait for the one counter of places
+AT_ONCE = 8  # pairs of a bundle that are given places together: all threads wait for the one counter of places
+
+
+@wp.func
+def met_fit(found: wp.array(dtype=int), met: wp.array(dtype=wp.vec2i)):
+    """Whether there was room for all that have met; more than can be counted are fewer than none."""
+    return found[0] >= 0 and found[0] <= met.shape[0]
+
+
+@wp.func
+def note_needed(
+    found: wp.array(dtype=int),
+    met: wp.array(dtype=wp.vec2i),
+    overflow: wp.array(dtype=int),
+    needed: wp.array(dtype=int),
+):
+    """How much room that takes, and whether it was there."""
+    needed[1] = wp.max(needed[1], wp.where(found[0] < 0, wp.static(MOST), found[0]))
+    if not met_fit(found, met):
+        overflow[0] = 1
 
 
 @cache
-def query_function(grouped: bool, real):
-    """begin(sides, i) -> query, w, k: second things of world w whose boxes meet that of first thing i, the k-th of w."""
-    Sides = sides_struct(real)
+def meet_kernel(alike: bool, inner: bool, grouped: bool):
+    """meet(...): bundles whose boxes meet, of things that are alike each two once and, if `inner`, each with itself."""
+    Few, least = wp.types.vector(AT_ONCE, int), 1 - inner
 
     @wp.func
-    def begin(sides: Sides, i: int):
-        w = i / sides.counts[0]
+    def put(found: wp.array(dtype=int), met: wp.array(dtype=wp.vec2i), i: int, few: Few, number: int):
+        first = wp.atomic_add(found, 0, number)
+        for n in range(number):
+            if first + n < met.shape[0]:
+                met[first + n] = wp.vec2i(i, few[n])
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def meet(trees: Trees, found: wp.array(dtype=int), met: wp.array(dtype=wp.vec2i)):
+        """As many as fit, and how many there are. A thread has a bundle of a world."""
+        i = wp.tid()
         root = int(-1)
         if wp.static(grouped):
-            root = wp.bvh_get_group_root(sides.tree, w)
-        return wp.bvh_query_aabb(sides.tree, sides.lower[i], sides.upper[i], root), w, i - w * sides.counts[0]
+            root = wp.bvh_get_group_root(trees.tree, i / (trees.bundles.shape[0] - 1))
+        query = wp.bvh_query_aabb(trees.tree, trees.bundle_lower[i], trees.bundle_upper[i], root)
+        few, number = Few(), int(0)
+        j = int(0)
+        while wp.bvh_query_next(query, j):
+            if not wp.static(alike) or j >= i + wp.static(least):
+                few[number] = j
+                number += 1
+                if number == wp.static(AT_ONCE):
+                    put(found, met, i, few, number)
+                    number = 0
+        if number > 0:
+            put(found, met, i, few, number)
 
-    return begin
+    return meet
 
 
 @cache
-def candidate_kernels(kind: Kind, grouped: bool, real):
-    """meet(...) of boxes, judge(...) by distance, and fill(...) the list of pairs."""
+def slot_functions(kind: Kind, real):
+    """slots_of(...): how many slots there are of bundles that have met; pair(...) -> w, k, l: the things of a world in a slot, k = -1
+    where these are none that may touch and whose boxes meet; second(...): the second one, of all worlds."""
+    Sides = sides_struct(real)
+    _, may_touch, *_ = pair_functions(kind, real)
+
+    @wp.func
+    def slots_of(found: wp.array(dtype=int), met: wp.array(dtype=wp.vec2i), wide: wp.vec2i):
+        return wp.min(found[0], met.shape[0]) * wide[0] * wide[1]
+
+    @wp.func
+    def pair(sides: Sides, trees: Trees, wide: wp.vec2i, met: wp.array(dtype=wp.vec2i), slot: int):
+        n = slot / (wide[0] * wide[1])
+        place = slot - n * wide[0] * wide[1]
+        both = met[n]
+        w = both[0] / (trees.bundles.shape[0] - 1)
+        one, other = both[0] - w * (trees.bundles.shape[0] - 1), both[1] - w * (trees.leaves.shape[0] - 1)
+        k = trees.bundles[one] + place / wide[1]
+        l = trees.leaves[other] + place % wide[1]
+        if k >= trees.bundles[one + 1] or l >= trees.leaves[other + 1]:
+            return w, -1, l
+        i, j = k + w * sides.counts[0], l + w * sides.counts[1]
+        if not overlap(trees.lower[i], trees.upper[i], trees.second_lower[j], trees.second_upper[j]):
+            return w, -1, l
+        if not may_touch(sides, k, l):
+            return w, -1, l
+        return w, k, l
+
+    @wp.func
+    def second(sides: Sides, trees: Trees, wide: wp.vec2i, met: wp.array(dtype=wp.vec2i), slot: int):
+        n = slot / (wide[0] * wide[1])
+        leaves, leaf = trees.leaves.shape[0] - 1, met[n][1]
+        w = leaf / leaves
+        return trees.leaves[leaf - w * leaves] + slot % wide[1] + w * sides.counts[1]
+
+    return slots_of, pair, second
+
+
+@cache
+def candidate_kernels(kind: Kind, real):
+    """judge(...) by distance, and fill(...) the list of pairs."""
     Sides, X, Y = sides_struct(real), wp.types.vector(3, real), wp.types.matrix((4, 3), real)
-    Few = wp.types.vector(AT_ONCE, int)
-    slots, may_touch, thickness, closest = pair_functions(kind, real)
-    begin = query_function(grouped, real)
+    slots, _, thickness, closest = pair_functions(kind, real)
+    slots_of, pair, second = slot_functions(kind, real)
     corners, relative = corners_function(real), relative_function(kind, real)
     half, two, tiny = wp.constant(real(0.5)), wp.constant(real(2.0)), wp.constant(real(1.0e-30))
 
@@ -79,38 +158,12 @@ def candidate_kernels(kind: Kind, grouped: bool, real):
                 second = wp.max(second, at + off)
         return first - second - two * around
 
-    @wp.func
-    def put(found: wp.array(dtype=int), met: wp.array(dtype=wp.vec2i), i: int, few: Few, number: int):
-        first = wp.atomic_add(found, 0, number)
-        for n in range(number):
-            if first + n < met.shape[0]:
-                met[first + n] = wp.vec2i(i, few[n])
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def meet(
-        sides: Sides,
-        found: wp.array(dtype=int),
-        met: wp.array(dtype=wp.vec2i),
-    ):
-        """Pairs of things that may touch and whose boxes meet, as many as fit, and how many there are."""
-        i = wp.tid()
-        query, w, k = begin(sides, i)
-        few, number = Few(), int(0)
-        j = int(0)
-        while wp.bvh_query_next(query, j):
-            if may_touch(sides, k, j - w * sides.counts[1]):
-                few[number] = j
-                number += 1
-                if number == wp.static(AT_ONCE):
-                    put(found, met, i, few, number)
-                    number = 0
-        if number > 0:
-            put(found, met, i, few, number)
-
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def judge(
         threads: int,
         sides: Sides,
+        trees: Trees,
+        wide: wp.vec2i,
         x: wp.array(dtype=X),
         move: wp.array(dtype=X),
         together: wp.array(dtype=int),
@@ -123,20 +176,24 @@ def candidate_kernels(kind: Kind, grouped: bool, real):
         partners: wp.array(dtype=int),
     ):
         """Which of them may come as near as both radii and `reach` within `around` of their ways: linked, and counted by thing."""
-        for slot in range(wp.tid(), wp.min(found[0], met.shape[0]), threads):
-            i = met[slot][0]
-            w = i / sides.counts[0]
-            k, l = i - w * sides.counts[0], met[slot][1] - w * sides.counts[1]
+        for slot in range(wp.tid(), slots_of(found, met, wide), threads):
+            w, k, l = pair(sides, trees, wide, met, slot)
+            if k < 0:
+                continue
             nodes = slots(sides, k, l, w)
             y, p = corners(x, nodes), corners(move, nodes)
             if together[w] != 0:
                 p, _speed = relative(y, p)
             if apart(y, p, around) <= thickness(sides, k, l, w) + reach:
+                i = k + w * sides.counts[0]
                 before[slot] = wp.atomic_exch(last, i, slot)
                 wp.atomic_add(partners, i, 1)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def fill(
+        sides: Sides,
+        trees: Trees,
+        wide: wp.vec2i,
         found: wp.array(dtype=int),
         met: wp.array(dtype=wp.vec2i),
         before: wp.array(dtype=int),
@@ -152,12 +209,11 @@ def candidate_kernels(kind: Kind, grouped: bool, real):
         i = wp.tid()
         end = starts.shape[0] - 1
         total = starts[end] + partners[end]
-        met_all = found[0] >= 0 and found[0] <= met.shape[0]
-        fits = met_all and total <= pairs.shape[0]
+        fits = met_fit(found, met) and total <= pairs.shape[0]
         if i == 0:
             count[0] = wp.where(fits, total, 0)
             needed[0] = wp.max(needed[0], total)
-            needed[1] = wp.max(needed[1], wp.where(found[0] < 0, wp.static(MOST), found[0]))
+            note_needed(found, met, overflow, needed)
             if not fits:
                 overflow[0] = 1
         if fits:
@@ -165,7 +221,7 @@ def candidate_kernels(kind: Kind, grouped: bool, real):
             end = start
             at = last[i]
             for _partner in range(partners[i]):
-                j = met[at][1]
+                j = second(sides, trees, wide, met, at)
                 k = end
                 while k > start and pairs[wp.max(k - 1, 0)][1] > j:
                     pairs[k] = pairs[k - 1]
@@ -174,4 +230,4 @@ def candidate_kernels(kind: Kind, grouped: bool, real):
                 end += 1
                 at = before[at]
 
-    return meet, judge, fill
+    return judge, fill

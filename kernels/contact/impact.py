@@ -10,7 +10,8 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.contact.candidates import query_function
+from ddg_warp.kernels.contact.boxes import Trees
+from ddg_warp.kernels.contact.candidates import note_needed, slot_functions
 from ddg_warp.kernels.contact.motion import corners_function, relative_function
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS
@@ -80,19 +81,25 @@ def impact_functions(kind: Kind, real):
 
 
 @cache
-def impact_kernel(kind: Kind, grouped: bool, passing: bool, real):
+def impact_kernel(kind: Kind, passing: bool, real):
     """The earliest time of impact of each world or, if `passing`, how many pairs pass through each other and the first of them.
 
-    Pairs are numbered i times the second things of all worlds + j. They are found through a tree of boxes around the motion.
+    Pairs are numbered i times the second things of all worlds + j. They are those of bundles whose boxes around the motion have met.
     """
     Sides, X = sides_struct(real), wp.types.vector(3, real)
-    slots, may_touch, thickness, _ = pair_functions(kind, real)
-    begin, (impact, meet) = query_function(grouped, real), impact_functions(kind, real)
+    slots, _, thickness, _ = pair_functions(kind, real)
+    slots_of, pair, _ = slot_functions(kind, real)
+    impact, meet = impact_functions(kind, real)
     corners = corners_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def impacts(
+        threads: int,
         sides: Sides,
+        trees: Trees,
+        wide: wp.vec2i,
+        found: wp.array(dtype=int),
+        met: wp.array(dtype=wp.vec2i),
         x: wp.array(dtype=X),
         move: wp.array(dtype=X),
         keep: real,
@@ -100,30 +107,26 @@ def impact_kernel(kind: Kind, grouped: bool, passing: bool, real):
         time: wp.array(dtype=real),
         number: wp.array(dtype=int),
         least: wp.array(dtype=wp.int64),
+        overflow: wp.array(dtype=int),
+        needed: wp.array(dtype=int),
     ):
-        """A thread has a first thing of a world."""
-        i = wp.tid()
-        query, w, k = begin(sides, i)
-        j, soonest, met = int(0), real(1.0), int(0)
-        while wp.bvh_query_next(query, j):
-            l = j - w * sides.counts[1]
-            if not may_touch(sides, k, l):
+        if wp.tid() == 0:
+            note_needed(found, met, overflow, needed)
+        for slot in range(wp.tid(), slots_of(found, met, wide), threads):
+            w, k, l = pair(sides, trees, wide, met, slot)
+            if k < 0:
                 continue
             nodes = slots(sides, k, l, w)
             y, p = corners(x, nodes), corners(move, nodes)
             if wp.static(passing):
                 if meet(y, p):
-                    met += 1
-                    key = wp.int64(i) * wp.int64(sides.counts[1] * number.shape[0]) + wp.int64(j)
-                    wp.atomic_min(least, 0, key)
+                    wp.atomic_add(number, w, 1)
+                    i, j = k + w * sides.counts[0], l + w * sides.counts[1]
+                    wp.atomic_min(least, 0, wp.int64(i) * wp.int64(sides.counts[1] * number.shape[0]) + wp.int64(j))
             else:
-                soonest = wp.min(soonest, impact(y, p, keep * thickness(sides, k, l, w), reach))
-        if wp.static(passing):
-            if met > 0:
-                wp.atomic_add(number, w, met)
-        else:
-            if soonest < real(1.0):
-                wp.atomic_min(time, w, soonest)
+                t = impact(y, p, keep * thickness(sides, k, l, w), reach)
+                if t < real(1.0):
+                    wp.atomic_min(time, w, t)
 
     return impacts
 

@@ -60,9 +60,8 @@ def surface_struct(real):
 def sides_struct(real):
     """Two surfaces whose pairs are asked for.
 
-    first, second: see `surface_struct`; lower, upper: boxes of the first, in all worlds; tree: of the boxes of the second; counts: of
-    both in one world; ignored: keys of pairs of objects that pass through each other, sorted (smaller number times `objects` + larger);
-    obstacle (objects,): not zero of those of which no two are a pair.
+    first, second: see `surface_struct`; counts: of both in one world; ignored: keys of pairs of objects that pass through each other,
+    sorted (smaller number times `objects` + larger); obstacle (objects,): not zero of those of which no two are a pair.
     """
     surface = surface_struct(real)
 
@@ -70,9 +69,6 @@ def sides_struct(real):
     class Sides:
         first: surface
         second: surface
-        lower: wp.array(dtype=wp.vec3)
-        upper: wp.array(dtype=wp.vec3)
-        tree: wp.uint64
         counts: wp.vec2i
         ignored: wp.array(dtype=wp.int64)
         obstacle: wp.array(dtype=wp.uint8)

@@ -41,7 +41,8 @@ class BroadPhase:
 
     Attributes:
         lists: a `PairList` for each kind of pairs that there can be.
-        overflow: (1,), not zero once pairs did not fit: `fit` has to follow, and whatever came of the pairs is to be done again.
+        overflow: (1,), not zero once pairs did not fit, `impact` and `crossings` among them: `fit` has to follow, and whatever came of
+            the pairs is to be done again.
         searches: (1,) how many there were; looks: (1,), see `Runs`; sought: both as of the last `fit` or `check`.
         more: (MORE,) numbers that others count, which these read along; more_read: what they have read.
         gap [m], time and crossed, of each world: see `measure`, `impact` and `crossings`.
@@ -106,7 +107,7 @@ class BroadPhase:
             if second in things
         ]
         self._impacts, self._passes = (
-            [impact_kernel(pairs.kind, grouped, passing, real) for pairs in self.lists] for passing in (False, True)
+            [impact_kernel(pairs.kind, passing, real) for pairs in self.lists] for passing in (False, True)
         )
         # what kernels of impacts have no use for
         self._unused = [wp.zeros(worlds, dtype=dtype, device=self.device) for dtype in (real, int, wp.int64)]
@@ -123,7 +124,7 @@ class BroadPhase:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         lists = [kernel for pairs in self.lists for kernel in pairs.kernels]
-        boxes = [part.kernel for part in self._things]
+        boxes = [kernel for part in self._things for kernel in part.kernels]
         return [*lists, *boxes, *self._motion, *self._impacts, *self._passes, *self._filter.kernels]
 
     @property
@@ -303,11 +304,10 @@ class BroadPhase:
     def _passing(self, kernels, x, move, keep: float, number, firsts) -> None:
         self._enclose(x, move, self.every, keep, 0.0)
         for part in self._trees:
-            part.tree.refit()
+            part.refit()
         for kernel, pairs, least in zip(kernels, self.lists, firsts, strict=True):
-            outputs = [self.time, number, least]
-            inputs = [pairs.sides, x, move, keep, self._room(keep)]
-            wp.launch(kernel, pairs.first.all, inputs, outputs, device=self.device)
+            pairs.meet()
+            pairs.impact(kernel, x, move, keep, self._room(keep), [self.time, number, least])
 
     def _room(self, keep: float) -> float:
         """The reach, in which gaps close step by step; none where they may close."""

@@ -6,7 +6,8 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.contact import sums
-from ddg_warp.kernels.contact.candidates import candidate_kernels
+from ddg_warp.kernels.contact.boxes import Trees
+from ddg_warp.kernels.contact.candidates import MOST, candidate_kernels, meet_kernel
 from ddg_warp.kernels.contact.impact import passing_kernel
 from ddg_warp.kernels.contact.motion import gap_kernel
 from ddg_warp.kernels.contact.surfaces import Kind, sides_struct
@@ -52,7 +53,7 @@ class PairList:
         pairs: things (i, j) of both sides, counted over all worlds, sorted; the first `count` hold.
         starts, partners: of each first thing (first.all,), where its pairs start and how many they are, where all pairs fit.
         count: of pairs, zero where they do not fit; picked: room for the numbers of some.
-        sides: see `kernels.contact.surfaces`; overflow: shared with other lists; not zero once pairs did not fit.
+        sides, trees: see `kernels.contact.surfaces` and `boxes`; overflow: shared with other lists; not zero once pairs did not fit.
     """
 
     def __init__(
@@ -62,32 +63,44 @@ class PairList:
         self.overflow, self.device = overflow, first.device
         self.sides = sides_struct(real)()
         self.sides.first, self.sides.second = first.surface, second.surface
-        self.sides.lower, self.sides.upper, self.sides.tree = first.lower, first.upper, second.tree.id
         self.sides.counts, self.sides.objects = wp.vec2i(first.count, second.count), len(shapes.names)
         self.sides.ignored = wp.array(shapes.ignored, dtype=wp.int64, device=self.device)
         obstacle = [number in shapes.obstacle for number in range(len(shapes.names))]
         self.sides.obstacle = wp.array(obstacle, dtype=wp.uint8, device=self.device)
+        self.trees = Trees()
+        self.trees.lower, self.trees.upper, self.trees.bundles = first.lower, first.upper, first.bundles
+        self.trees.second_lower, self.trees.second_upper, self.trees.leaves = second.lower, second.upper, second.bundles
+        self.trees.bundle_lower, self.trees.bundle_upper = first.leaves.lower, first.leaves.upper
+        self.trees.tree = second.leaves.tree.id
         self._last, self.partners = (wp.zeros(first.all, dtype=int, device=self.device) for _ in range(2))
         self._sums = RunningSums(self.partners)
         self.starts = self._sums.starts
-        self._meet, self._judge, self._fill = candidate_kernels(kind, grouped, real)
+        self._wide = wp.vec2i(first.bundle, second.bundle)
+        # two edges of a rod that follow each other have a node in common
+        self._meet = meet_kernel(kind.alike, first.bundle > 2, grouped)
+        self._judge, self._fill = candidate_kernels(kind, real)
         self._gaps, self._passing = gap_kernel(kind, real), passing_kernel(kind, real)
         self.count, self._found = (wp.zeros(1, dtype=int, device=self.device) for _ in range(2))
         # the most pairs of any search since there was room for so many, and those whose boxes met
         self._needed = wp.zeros(2, dtype=int, device=self.device)
         self.kernels = [self._meet, self._judge, self._fill, self._gaps, self._passing, *self._sums.kernels]
         # kernels have as many threads as there is room: more is made where there are more
-        self.reserve(max(1024, first.all), max(4096, 4 * first.all))
+        self.reserve(max(1024, first.all), max(4096, 4 * first.leaves.all))
+
+    @property
+    def _slots(self) -> int:
+        """Pairs of things of two bundles."""
+        return self._wide[0] * self._wide[1]
 
     @property
     def capacity(self) -> int:
         return len(self.pairs)
 
     def reserve(self, pairs: int, met: int | None = None) -> None:
-        """Make room for so many pairs, and so many whose boxes meet, by default as many as there is room for."""
+        """Make room for so many pairs, and so many bundles whose boxes meet, by default as many as there is room for."""
         if met is not None:
             self._met = wp.zeros(met, dtype=wp.vec2i, device=self.device)
-            self._before = wp.zeros(met, dtype=int, device=self.device)
+            self._before = wp.zeros(met * self._slots, dtype=int, device=self.device)
         self.pairs = wp.zeros(pairs, dtype=wp.vec2i, device=self.device)
         self.picked = wp.zeros(pairs, dtype=int, device=self.device)
         self._needed.zero_()
@@ -99,30 +112,36 @@ class PairList:
             SolverError: there are more pairs than can be counted.
         """
         needed = self._needed.numpy().astype(np.int64)
-        if (needed >= 2**31 - 1).any():
+        if (needed >= [MOST, MOST // self._slots]).any():
             raise SolverError("more than 2^31 pairs are near; use a smaller margin or reach", outcome="too_many_pairs")
         now = np.array([self.capacity, len(self._met)])
         if (needed > now).any():
             # not for the next few alone: graphs are captured anew, which takes longer than many steps
-            self.reserve(*np.where(needed > now, np.minimum(2 * needed, 2**31 - 1), now).tolist())
+            most = np.array([MOST, MOST // self._slots])
+            self.reserve(*np.where(needed > now, np.minimum(2 * needed, most), now).tolist())
 
     def meet(self) -> None:
-        """Find the pairs whose boxes meet; see `kernels.contact.candidates`."""
+        """Find the bundles whose boxes meet; see `kernels.contact.candidates`."""
         self._found.zero_()
-        self._launch(self._meet, [self.sides], [self._found, self._met])
+        outputs = [self._found, self._met]
+        wp.launch(self._meet, self.first.leaves.all, [self.trees], outputs, device=self.device)
 
     def judge(self, x, move, together, reach: float, around: float) -> None:
         """List those of them that are near, or may be on their way."""
-        met = [self._met, self._before, self._last]
+        given, met = [self.sides, self.trees, self._wide], [self._met, self._before, self._last]
         self.partners.zero_()
-        inputs = [self.sides, x, move, together, reach, around, self._found]
-        arrays.take_turns(self._judge, len(self._met), inputs, [*met, self.partners], self.device)
+        inputs = [*given, x, move, together, reach, around, self._found]
+        arrays.take_turns(self._judge, len(self._before), inputs, [*met, self.partners], self.device)
         self._sums()
         outputs = [self.pairs, self.count, self.overflow, self._needed]
-        self._launch(self._fill, [self._found, *met, self.starts, self.partners], outputs)
+        inputs = [*given, self._found, *met, self.starts, self.partners]
+        wp.launch(self._fill, self.first.all, inputs, outputs, device=self.device)
 
-    def _launch(self, kernel, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, self.first.all, inputs, outputs, device=self.device)
+    def impact(self, kernel, x, move, keep: float, room: float, outputs: list) -> None:
+        """What a kernel of `kernels.contact.impact` makes of the pairs whose boxes around the motion have met."""
+        inputs = [self.sides, self.trees, self._wide, self._found, self._met, x, move, keep, room]
+        outputs = [*outputs, self.overflow, self._needed]
+        arrays.take_turns(kernel, len(self._before), inputs, outputs, self.device)
 
     def measure(self, x, gap, enough: float) -> None:
         """Lower the smallest gaps of worlds to those of pairs, until they are below `enough`."""
