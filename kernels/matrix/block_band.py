@@ -317,24 +317,15 @@ def factor_kernel(kind: ChainKind, linear):
 
 
 @cache
-def substitute_function(nb: int, span: int, linear, dotted: bool = False, tensions: int = 0, deep: bool = False):
+def substitute_function(nb: int, span: int, linear, dotted: bool = False, tensions: int = 0):
     """substitute(factor, v, out, n, r, s): out = (L D L^T)^-1 v along a chain; returns v . out if it is `dotted`.
 
-    The factors lie in column r, the vectors in column s. What the next node takes is read before this one is dealt with, if `deep` what
-    the next two take: a thread that walks waits for memory most of the time.
+    The factors lie in column r, the vectors in column s.
     """
-    nb2, ahead = nb**2, 1 + deep
+    nb2 = nb**2
     H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     load, _, vector, put = block_functions(nb, linear)
     _, _, _, lower_vector, upper_vector, _ = pivot.signed_functions(nb, tensions, linear)
-
-    @wp.func
-    def second(factor: wp.array3d(dtype=linear), j: int, r: int):
-        """D^-1 F, where there is one."""
-        V = M()
-        if wp.static(span == 2):
-            V = load(factor, wp.static(nb2), j, r)
-        return V
 
     @wp.func
     def substitute(
@@ -345,61 +336,46 @@ def substitute_function(nb: int, span: int, linear, dotted: bool = False, tensio
         r: int,
         s: int,
     ):
+        # What the next node takes is read before this one is dealt with: a thread that walks waits for memory most of the time.
         before = H()
         before2 = H()
         U = load(factor, 0, 0, r)
-        V = second(factor, 0, r)
+        V = M()
+        if wp.static(span == 2):
+            V = load(factor, wp.static(nb2), 0, r)
         here = vector(v, 0, 0, s)
-        if wp.static(deep):
-            one = wp.min(1, n - 1)
-            U_next = load(factor, 0, one, r)
-            V_next = second(factor, one, r)
-            here_next = vector(v, 0, one, s)
         for j in range(n):
-            k = wp.min(j + wp.static(ahead), n - 1)
-            U_later = load(factor, 0, k, r)
-            V_later = second(factor, k, r)
-            here_later = vector(v, 0, k, s)
+            ahead = wp.min(j + 1, n - 1)
+            U_ahead = load(factor, 0, ahead, r)
+            V_ahead = M()
+            if wp.static(span == 2):
+                V_ahead = load(factor, wp.static(nb2), ahead, r)
+            here_ahead = vector(v, 0, ahead, s)
             # z = D^-1 (v - E^T z_before - ...): with U = D^-1 E stored, E^T D^-1 w = U^T w
             w = here - before
             put(out, 0, j, s, w)
             before = before2 + w * U
             if wp.static(span == 2):
                 before2 = w * V
-            if wp.static(deep):
-                U = U_next
-                V = V_next
-                here = here_next
-                U_next = U_later
-                V_next = V_later
-                here_next = here_later
-            else:
-                U = U_later
-                V = V_later
-                here = here_later
+            U = U_ahead
+            V = V_ahead
+            here = here_ahead
         e1 = H()
         e2 = H()
         total = linear(0.0)
-        U = load(factor, 0, n - 1, r)
-        V = second(factor, n - 1, r)
         L = load(factor, wp.static(2 * nb2), n - 1, r)
         inverse = vector(factor, wp.static(3 * nb2), n - 1, r)
         here = vector(out, 0, n - 1, s)
-        if wp.static(deep):
-            one = wp.max(n - 2, 0)
-            U_next = load(factor, 0, one, r)
-            V_next = second(factor, one, r)
-            L_next = load(factor, wp.static(2 * nb2), one, r)
-            inverse_next = vector(factor, wp.static(3 * nb2), one, r)
-            here_next = vector(out, 0, one, s)
         for i in range(n):
             j = n - 1 - i
-            k = wp.max(j - wp.static(ahead), 0)
-            U_later = load(factor, 0, k, r)
-            V_later = second(factor, k, r)
-            L_later = load(factor, wp.static(2 * nb2), k, r)
-            inverse_later = vector(factor, wp.static(3 * nb2), k, r)
-            here_later = vector(out, 0, k, s)
+            ahead = wp.max(j - 1, 0)
+            U_ahead = load(factor, 0, ahead, r)
+            V_ahead = M()
+            if wp.static(span == 2):
+                V_ahead = load(factor, wp.static(nb2), ahead, r)
+            L_ahead = load(factor, wp.static(2 * nb2), ahead, r)
+            inverse_ahead = vector(factor, wp.static(3 * nb2), ahead, r)
+            here_ahead = vector(out, 0, ahead, s)
             u = upper_vector(L, inverse, lower_vector(L, here))
             u -= U * e1
             if wp.static(span == 2):
@@ -409,23 +385,11 @@ def substitute_function(nb: int, span: int, linear, dotted: bool = False, tensio
             put(out, 0, j, s, u)
             e2 = e1
             e1 = u
-            if wp.static(deep):
-                U = U_next
-                V = V_next
-                L = L_next
-                inverse = inverse_next
-                here = here_next
-                U_next = U_later
-                V_next = V_later
-                L_next = L_later
-                inverse_next = inverse_later
-                here_next = here_later
-            else:
-                U = U_later
-                V = V_later
-                L = L_later
-                inverse = inverse_later
-                here = here_later
+            U = U_ahead
+            V = V_ahead
+            L = L_ahead
+            inverse = inverse_ahead
+            here = here_ahead
         return total
 
     return substitute

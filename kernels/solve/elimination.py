@@ -99,8 +99,7 @@ def chain_kernels(twist: bool, span: int, linear, sides: int, serial: bool, spli
     H, B = wp.types.vector(3, linear), wp.types.vector(nb, linear)
     _, _, _, put = block_functions(nb, linear)
     factor = factor_function(nb, span, linear, int(split))
-    deep = not serial and linear == wp.float32  # two nodes in float64 are more registers than there are
-    substitute = substitute_function(nb, span, linear, tensions=int(split), deep=deep)
+    substitute = substitute_function(nb, span, linear, tensions=int(split))
     substitute_all = substitute_all_function(nb, span, linear, sides)
     free_of, _ = place_functions(twist, linear, split)
     until = until_function(serial)
