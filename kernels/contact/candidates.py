@@ -89,43 +89,28 @@ def meet_kernel(alike: bool, inner: bool, grouped: bool):
     return meet
 
 
+@wp.func
+def things_of(trees: Trees, both: wp.vec2i):
+    """World of two bundles, where the first and the second begin there and end."""
+    w = both[0] / (trees.bundles.shape[0] - 1)
+    one, other = both[0] - w * (trees.bundles.shape[0] - 1), both[1] - w * (trees.leaves.shape[0] - 1)
+    return w, trees.bundles[one], trees.bundles[one + 1], trees.leaves[other], trees.leaves[other + 1]
+
+
 @cache
-def slot_functions(kind: Kind, real):
-    """slots_of(...): how many slots there are of bundles that have met; pair(...) -> w, k, l: the things of a world in a slot, k = -1
-    where these are none that may touch and whose boxes meet; second(...): the second one, of all worlds."""
+def asked_function(kind: Kind, real):
+    """asked(sides, trees, k, l, w): whether boxes of things of a world meet that may touch."""
     Sides = sides_struct(real)
     _, may_touch, *_ = pair_functions(kind, real)
 
     @wp.func
-    def slots_of(found: wp.array(dtype=int), met: wp.array(dtype=wp.vec2i), wide: wp.vec2i):
-        return wp.min(found[0], met.shape[0]) * wide[0] * wide[1]
-
-    @wp.func
-    def pair(sides: Sides, trees: Trees, wide: wp.vec2i, met: wp.array(dtype=wp.vec2i), slot: int):
-        n = slot / (wide[0] * wide[1])
-        place = slot - n * wide[0] * wide[1]
-        both = met[n]
-        w = both[0] / (trees.bundles.shape[0] - 1)
-        one, other = both[0] - w * (trees.bundles.shape[0] - 1), both[1] - w * (trees.leaves.shape[0] - 1)
-        k = trees.bundles[one] + place / wide[1]
-        l = trees.leaves[other] + place % wide[1]
-        if k >= trees.bundles[one + 1] or l >= trees.leaves[other + 1]:
-            return w, -1, l
+    def asked(sides: Sides, trees: Trees, k: int, l: int, w: int):
         i, j = k + w * sides.counts[0], l + w * sides.counts[1]
-        if not overlap(trees.lower[i], trees.upper[i], trees.second_lower[j], trees.second_upper[j]):
-            return w, -1, l
-        if not may_touch(sides, k, l):
-            return w, -1, l
-        return w, k, l
+        if overlap(trees.lower[i], trees.upper[i], trees.second_lower[j], trees.second_upper[j]):
+            return may_touch(sides, k, l)
+        return False
 
-    @wp.func
-    def second(sides: Sides, trees: Trees, wide: wp.vec2i, met: wp.array(dtype=wp.vec2i), slot: int):
-        n = slot / (wide[0] * wide[1])
-        leaves, leaf = trees.leaves.shape[0] - 1, met[n][1]
-        w = leaf / leaves
-        return trees.leaves[leaf - w * leaves] + slot % wide[1] + w * sides.counts[1]
-
-    return slots_of, pair, second
+    return asked
 
 
 @cache
@@ -133,7 +118,7 @@ def candidate_kernels(kind: Kind, real):
     """judge(...) by distance, and fill(...) the list of pairs."""
     Sides, X, Y = sides_struct(real), wp.types.vector(3, real), wp.types.matrix((4, 3), real)
     slots, _, thickness, closest = pair_functions(kind, real)
-    slots_of, pair, second = slot_functions(kind, real)
+    asked = asked_function(kind, real)
     corners, relative = corners_function(real), relative_function(kind, real)
     half, two, tiny = wp.constant(real(0.5)), wp.constant(real(2.0)), wp.constant(real(1.0e-30))
 
@@ -172,22 +157,24 @@ def candidate_kernels(kind: Kind, real):
         found: wp.array(dtype=int),
         met: wp.array(dtype=wp.vec2i),
         before: wp.array(dtype=int),
-        last: wp.array(dtype=int),
+        last_slot: wp.array(dtype=int),
         partners: wp.array(dtype=int),
     ):
         """Which of them may come as near as both radii and `reach` within `around` of their ways: linked, and counted by thing."""
-        for slot in range(wp.tid(), slots_of(found, met, wide), threads):
-            w, k, l = pair(sides, trees, wide, met, slot)
-            if k < 0:
-                continue
-            nodes = slots(sides, k, l, w)
-            y, p = corners(x, nodes), corners(move, nodes)
-            if together[w] != 0:
-                p, _speed = relative(y, p)
-            if apart(y, p, around) <= thickness(sides, k, l, w) + reach:
+        for n in range(wp.tid(), wp.min(found[0], met.shape[0]), threads):
+            w, start, end, first, last = things_of(trees, met[n])
+            for k in range(start, end):
                 i = k + w * sides.counts[0]
-                before[slot] = wp.atomic_exch(last, i, slot)
-                wp.atomic_add(partners, i, 1)
+                for l in range(first, last):
+                    if asked(sides, trees, k, l, w):
+                        nodes = slots(sides, k, l, w)
+                        y, p = corners(x, nodes), corners(move, nodes)
+                        if together[w] != 0:
+                            p, _speed = relative(y, p)
+                        if apart(y, p, around) <= thickness(sides, k, l, w) + reach:
+                            slot = (n * wide[0] + k - start) * wide[1] + l - first
+                            before[slot] = wp.atomic_exch(last_slot, i, slot)
+                            wp.atomic_add(partners, i, 1)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def fill(
@@ -197,7 +184,7 @@ def candidate_kernels(kind: Kind, real):
         found: wp.array(dtype=int),
         met: wp.array(dtype=wp.vec2i),
         before: wp.array(dtype=int),
-        last: wp.array(dtype=int),
+        last_slot: wp.array(dtype=int),
         starts: wp.array(dtype=int),
         partners: wp.array(dtype=int),
         pairs: wp.array(dtype=wp.vec2i),
@@ -219,9 +206,10 @@ def candidate_kernels(kind: Kind, real):
         if fits:
             start = starts[i]
             end = start
-            at = last[i]
+            at = last_slot[i]
             for _partner in range(partners[i]):
-                j = second(sides, trees, wide, met, at)
+                _w, _start, _end, first, _last = things_of(trees, met[at / (wide[0] * wide[1])])
+                j = first + at % wide[1] + i / sides.counts[0] * sides.counts[1]
                 k = end
                 while k > start and pairs[wp.max(k - 1, 0)][1] > j:
                     pairs[k] = pairs[k - 1]

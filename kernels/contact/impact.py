@@ -11,7 +11,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.contact.boxes import Trees
-from ddg_warp.kernels.contact.candidates import note_needed, slot_functions
+from ddg_warp.kernels.contact.candidates import asked_function, note_needed, things_of
 from ddg_warp.kernels.contact.motion import corners_function, relative_function
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS
@@ -88,7 +88,7 @@ def impact_kernel(kind: Kind, passing: bool, real):
     """
     Sides, X = sides_struct(real), wp.types.vector(3, real)
     slots, _, thickness, _ = pair_functions(kind, real)
-    slots_of, pair, _ = slot_functions(kind, real)
+    asked = asked_function(kind, real)
     impact, meet = impact_functions(kind, real)
     corners = corners_function(real)
 
@@ -97,7 +97,6 @@ def impact_kernel(kind: Kind, passing: bool, real):
         threads: int,
         sides: Sides,
         trees: Trees,
-        wide: wp.vec2i,
         found: wp.array(dtype=int),
         met: wp.array(dtype=wp.vec2i),
         x: wp.array(dtype=X),
@@ -112,21 +111,24 @@ def impact_kernel(kind: Kind, passing: bool, real):
     ):
         if wp.tid() == 0:
             note_needed(found, met, overflow, needed)
-        for slot in range(wp.tid(), slots_of(found, met, wide), threads):
-            w, k, l = pair(sides, trees, wide, met, slot)
-            if k < 0:
-                continue
-            nodes = slots(sides, k, l, w)
-            y, p = corners(x, nodes), corners(move, nodes)
-            if wp.static(passing):
-                if meet(y, p):
-                    wp.atomic_add(number, w, 1)
-                    i, j = k + w * sides.counts[0], l + w * sides.counts[1]
-                    wp.atomic_min(least, 0, wp.int64(i) * wp.int64(sides.counts[1] * number.shape[0]) + wp.int64(j))
-            else:
-                t = impact(y, p, keep * thickness(sides, k, l, w), reach)
-                if t < real(1.0):
-                    wp.atomic_min(time, w, t)
+        for n in range(wp.tid(), wp.min(found[0], met.shape[0]), threads):
+            w, start, end, first, last = things_of(trees, met[n])
+            for k in range(start, end):
+                for l in range(first, last):
+                    if not asked(sides, trees, k, l, w):
+                        continue
+                    nodes = slots(sides, k, l, w)
+                    y, p = corners(x, nodes), corners(move, nodes)
+                    if wp.static(passing):
+                        if meet(y, p):
+                            wp.atomic_add(number, w, 1)
+                            i, j = k + w * sides.counts[0], l + w * sides.counts[1]
+                            key = wp.int64(i) * wp.int64(sides.counts[1] * number.shape[0]) + wp.int64(j)
+                            wp.atomic_min(least, 0, key)
+                    else:
+                        t = impact(y, p, keep * thickness(sides, k, l, w), reach)
+                        if t < real(1.0):
+                            wp.atomic_min(time, w, t)
 
     return impacts
 

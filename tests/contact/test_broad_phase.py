@@ -7,10 +7,10 @@ from brute_force import SIDES, listed, near, scene, upload
 
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.solve.contact import tree
 from ddg_warp.solve.contact.broad_phase import BroadPhase
 from ddg_warp.solve.contact.pairs import RunningSums
 from ddg_warp.solve.contact.shapes import Shapes
-from ddg_warp.solve.contact.tree import Things
 
 REACH, MARGIN = 0.004, 0.01
 
@@ -59,6 +59,24 @@ def test_edges_within_an_arc_length_are_no_pairs(device, closed, apart):
     steps = np.minimum(j - i, n - (j - i)) if closed else j - i
     wanted = (steps > 1) & (0.1 * (steps - 1) >= apart)
     assert found.tolist() == np.column_stack([i, j])[wanted].tolist()
+
+
+@pytest.mark.parametrize("most", [1, 2, 3, 5])
+def test_bundles_change_nothing(device, monkeypatch, most):
+    """However many edges share a leaf: the same pairs, in two worlds, and the same that cross."""
+    shapes, points = scene(17, 0.3, rods=10, triangles=40)
+    move = 0.05 * np.random.default_rng(18).normal(size=(2 * len(points), 3))
+    found = []
+    for bundle in (tree.BUNDLE, (most, most)):
+        monkeypatch.setattr(tree, "BUNDLE", bundle)
+        search = BroadPhase(shapes, upload(np.tile(points, (2, 1)), device), 2, reach=REACH, margin=MARGIN)
+        x = upload(np.tile(points, (2, 1)), device)
+        lists = [pairs.tolist() for pairs in listed(search)]
+        search.crossings(x, upload(move, device))
+        assert not search.fit(x)
+        found.append((lists, search.crossed.numpy().tolist(), search.first_crossing()))
+    assert found[0] == found[1]
+    assert min(found[0][1]) > 10
 
 
 def test_worlds_do_not_meet(device):
@@ -221,7 +239,7 @@ def test_boxes_hold_what_they_are_around(device, offset):
     for size in shapes.sizes:
         nodes, radius, *_ = shapes.things(size)
         radii = wp.array([shapes.radii], dtype=wp.float64, device=device)
-        part = Things(shapes, size, 1, wp.float64, wp.get_device(device), radii)
+        part = tree.Things(shapes, size, 1, wp.float64, wp.get_device(device), radii)
         part.enclose(x, wp.zeros_like(x), wp.zeros(1, dtype=wp.vec3d, device=device), 1.0, 0.002, lost)
         reach = (radius + 0.002)[:, None]
         below = points[nodes].min(1) - reach - part.lower.numpy().astype(float)

@@ -131,7 +131,7 @@ class PairList:
         given, met = [self.sides, self.trees, self._wide], [self._met, self._before, self._last]
         self.partners.zero_()
         inputs = [*given, x, move, together, reach, around, self._found]
-        arrays.take_turns(self._judge, len(self._before), inputs, [*met, self.partners], self.device)
+        arrays.take_turns(self._judge, len(self._met), inputs, [*met, self.partners], self.device)
         self._sums()
         outputs = [self.pairs, self.count, self.overflow, self._needed]
         inputs = [*given, self._found, *met, self.starts, self.partners]
@@ -139,9 +139,9 @@ class PairList:
 
     def impact(self, kernel, x, move, keep: float, room: float, outputs: list) -> None:
         """What a kernel of `kernels.contact.impact` makes of the pairs whose boxes around the motion have met."""
-        inputs = [self.sides, self.trees, self._wide, self._found, self._met, x, move, keep, room]
+        inputs = [self.sides, self.trees, self._found, self._met, x, move, keep, room]
         outputs = [*outputs, self.overflow, self._needed]
-        arrays.take_turns(kernel, len(self._before), inputs, outputs, self.device)
+        arrays.take_turns(kernel, len(self._met), inputs, outputs, self.device)
 
     def measure(self, x, gap, enough: float) -> None:
         """Lower the smallest gaps of worlds to those of pairs, until they are below `enough`."""
