@@ -20,7 +20,7 @@ from ddg_warp.run.simulate import Result, simulate
 from ddg_warp.scene.scene import Dynamics
 
 RUN_SETTINGS = ("dt", "duration", "precision")
-SOLVER_OPTIONS = ("solver", "linear", "rtol")
+SOLVER_OPTIONS = ("solver", "linear", "rtol", "outliers")
 RESOLUTION = ("n", "cells", "segments", "rings", "around")  # what scenes call their number of edges or cells
 REFINED = 4  # how much finer the reference of a default study is than the scene, where no check has one
 
@@ -31,7 +31,7 @@ class Study:
 
     Attributes:
         grid: Values by name; every combination is run, and the scene's defaults. A name is a parameter of `build`, a setting of the
-            run (dt, duration, precision) or an option of the solver (scheme, solver, linear, rtol).
+            run (dt, duration, precision) or an option of the solver (scheme, solver, linear, rtol, outliers).
         measure: What is compared: the beginning of the name of one of the scene's checks, or a function of a result that gives a
             number or an array.
         reference: What `measure` should give; or settings, by name, that turn a case into its reference run. A check has its own.
@@ -249,7 +249,7 @@ def defaults(module, study: Study, device: str | None) -> dict:
     analysis = module.build(**{name: value for name, value in study.fixed.items() if name in known}).analysis
     usual = {"precision": "mixed" if wp.get_device(device).is_cuda else "float64", "linear": "auto", "solver": "newton"}
     if isinstance(analysis, Dynamics):
-        usual |= {name: getattr(analysis, name) for name in ("dt", "duration", "scheme", "rtol")}
+        usual |= {name: getattr(analysis, name) for name in ("dt", "duration", "scheme", "rtol", "outliers")}
         usual["precision"] = analysis.precision or usual["precision"]
     else:
         usual |= {"solver": "auto", "rtol": StaticsOptions().rtol}

@@ -207,7 +207,8 @@ def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clo
     from ddg_warp.solve.dynamics import Integrator
 
     analysis = result.scene.analysis
-    integrator = Integrator(result.model, **{"scheme": analysis.scheme, "rtol": analysis.rtol} | options)
+    given = {name: getattr(analysis, name) for name in ("scheme", "rtol", "outliers")}
+    integrator = Integrator(result.model, **given | options)
     state = result.state
     try:
         for _ in range(round(float(state.time) / result.dt), steps):

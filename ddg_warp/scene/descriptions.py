@@ -21,7 +21,8 @@ RUN = 2**16  # nodes
 class Dynamics:
     """Advance in time: step dt [s] to duration [s] by `scheme` (`implicit_euler` or `implicit_midpoint`).
 
-    In each step forces balance to `rtol` of the load of a rod or shell: its weight and what else it is given; see `Integrator`.
+    In each step forces balance to `rtol` of the load of a rod or shell: its weight and what else it is given; in contact all but a part
+    `outliers` of them; see `Integrator`.
     `precision` ("float64", "mixed" or "float32") is that of models that are built without one; by default what suits the device.
     """
 
@@ -30,11 +31,13 @@ class Dynamics:
     scheme: str = "implicit_euler"
     rtol: float = 1e-6
     precision: str | None = None
+    outliers: float = 0.0
 
     def __post_init__(self):
         arguments.positive("Dynamics: dt", self.dt, "s")
         arguments.positive("Dynamics: duration", self.duration, "s")
         arguments.positive("Dynamics: rtol", self.rtol)
+        arguments.number("Dynamics: outliers", self.outliers, *arguments.PART)
         arguments.choice("Dynamics: scheme", self.scheme, ("implicit_euler", "implicit_midpoint"))
         if self.precision is not None:
             arguments.choice("Dynamics: precision", self.precision, ("float64", "mixed", "float32"))

@@ -1,5 +1,7 @@
 """Crowds in balance but for a few bodies, and what these few may be off by."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import warp as wp
@@ -7,6 +9,7 @@ import warp as wp
 import ddg_warp as ddg
 from ddg_warp.kernels.islands import DROWNED, STATUS, UNBALANCED
 from ddg_warp.kernels.net.outliers import FARTHEST
+from ddg_warp.run.simulate import simulate
 
 RADIUS, DT, RTOL = 2e-3, 1 / 240, 1e-4
 SOFT = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
@@ -24,6 +27,10 @@ def crossed(count: int, fastest: float = 3.0) -> tuple[ddg.Scene, np.ndarray]:
         velocities += [np.zeros((9, 3)), np.tile([0.0, 0.0, -speed], (9, 1))]
     scene.contact(range=1e-3, friction=0.3)
     return scene, np.concatenate(velocities)
+
+
+def moving(model, velocities):
+    return model.state(velocities=velocities)
 
 
 def stepped(device, outliers: float, worlds: int = 1):
@@ -48,6 +55,18 @@ def test_few_are_out_of_balance_and_nearly_in_it(device):
     _, few, fewer = stepped(device, 0.2)
     assert 0 < (few > 1.0).sum() <= 4 and few.max() <= FARTHEST
     assert fewer < iterations
+
+
+def test_a_scene_says_it(device):
+    """`Dynamics(outliers=...)`, or the options of a run in its place."""
+    ends = []
+    for analysis, options in ((0.2, {}), (0.0, {"outliers": 0.2}), (0.0, {})):
+        scene, velocities = crossed(10)
+        scene.initial = partial(moving, velocities=velocities)
+        scene.analysis = ddg.Dynamics(dt=DT, duration=6 * DT, rtol=RTOL, outliers=analysis)
+        ends.append(simulate(scene, device=device, options=options, progress=False).state.points())
+    assert (ends[0] == ends[1]).all()
+    assert (ends[0] != ends[2]).any()
 
 
 def test_each_world_has_its_own(device):

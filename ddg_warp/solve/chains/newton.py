@@ -59,8 +59,7 @@ class NewtonOptions:
     outliers: float = 0.0
 
     def __post_init__(self):
-        part = "a part of all bodies, from 0 to less than 1"
-        arguments.number("outliers", self.outliers, part, lambda v: 0.0 <= v < 1.0)
+        arguments.number("outliers", self.outliers, *arguments.PART)
         check_options(self, ("rtol", "floor_factor", "rotation_cap", "linear_rtol"), ("max_iterations", "max_halvings"))
         if self.psd not in PSD_MODES:
             raise SceneError(f"psd {self.psd!r}: it is one of {', '.join(PSD_MODES)}")
