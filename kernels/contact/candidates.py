@@ -98,19 +98,31 @@ def things_of(trees: Trees, both: wp.vec2i):
 
 
 @cache
-def asked_function(kind: Kind, real):
-    """asked(sides, trees, k, l, w): whether boxes of things of a world meet that may touch."""
+def asked_functions(kind: Kind, real):
+    """reaches(sides, trees, bundle, l, w): whether the box of a second thing of a world meets that of a bundle.
+
+    asked(sides, trees, k, l, w): whether boxes of things meet that may touch.
+    """
     Sides = sides_struct(real)
     _, may_touch, *_ = pair_functions(kind, real)
 
     @wp.func
+    def reaches(sides: Sides, trees: Trees, bundle: int, l: int, w: int):
+        j = l + w * sides.counts[1]
+        lower, upper = trees.second_lower[j], trees.second_upper[j]
+        return overlap(trees.bundle_lower[bundle], trees.bundle_upper[bundle], lower, upper)
+
+    @wp.func
     def asked(sides: Sides, trees: Trees, k: int, l: int, w: int):
+        if wp.static(kind.alike):
+            if l <= k:
+                return False
         i, j = k + w * sides.counts[0], l + w * sides.counts[1]
         if overlap(trees.lower[i], trees.upper[i], trees.second_lower[j], trees.second_upper[j]):
             return may_touch(sides, k, l)
         return False
 
-    return asked
+    return reaches, asked
 
 
 @cache
@@ -118,7 +130,7 @@ def candidate_kernels(kind: Kind, real):
     """judge(...) by distance, and fill(...) the list of pairs."""
     Sides, X, Y = sides_struct(real), wp.types.vector(3, real), wp.types.matrix((4, 3), real)
     slots, _, thickness, closest = pair_functions(kind, real)
-    asked = asked_function(kind, real)
+    reaches, asked = asked_functions(kind, real)
     corners, relative = corners_function(real), relative_function(kind, real)
     half, two, tiny = wp.constant(real(0.5)), wp.constant(real(2.0)), wp.constant(real(1.0e-30))
 
@@ -163,15 +175,17 @@ def candidate_kernels(kind: Kind, real):
         """Which of them may come as near as both radii and `reach` within `around` of their ways: linked, and counted by thing."""
         for n in range(wp.tid(), wp.min(found[0], met.shape[0]), threads):
             w, start, end, first, last = things_of(trees, met[n])
-            for k in range(start, end):
-                i = k + w * sides.counts[0]
-                for l in range(first, last):
+            for l in range(first, last):
+                if not reaches(sides, trees, met[n][0], l, w):
+                    continue
+                for k in range(start, end):
                     if asked(sides, trees, k, l, w):
                         nodes = slots(sides, k, l, w)
                         y, p = corners(x, nodes), corners(move, nodes)
                         if together[w] != 0:
                             p, _speed = relative(y, p)
                         if apart(y, p, around) <= thickness(sides, k, l, w) + reach:
+                            i = k + w * sides.counts[0]
                             slot = (n * wide[0] + k - start) * wide[1] + l - first
                             before[slot] = wp.atomic_exch(last_slot, i, slot)
                             wp.atomic_add(partners, i, 1)

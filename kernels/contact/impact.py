@@ -11,7 +11,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.contact.boxes import Trees
-from ddg_warp.kernels.contact.candidates import asked_function, note_needed, things_of
+from ddg_warp.kernels.contact.candidates import asked_functions, note_needed, things_of
 from ddg_warp.kernels.contact.motion import corners_function, relative_function
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS
@@ -88,7 +88,7 @@ def impact_kernel(kind: Kind, passing: bool, real):
     """
     Sides, X = sides_struct(real), wp.types.vector(3, real)
     slots, _, thickness, _ = pair_functions(kind, real)
-    asked = asked_function(kind, real)
+    reaches, asked = asked_functions(kind, real)
     impact, meet = impact_functions(kind, real)
     corners = corners_function(real)
 
@@ -113,8 +113,10 @@ def impact_kernel(kind: Kind, passing: bool, real):
             note_needed(found, met, overflow, needed)
         for n in range(wp.tid(), wp.min(found[0], met.shape[0]), threads):
             w, start, end, first, last = things_of(trees, met[n])
-            for k in range(start, end):
-                for l in range(first, last):
+            for l in range(first, last):
+                if not reaches(sides, trees, met[n][0], l, w):
+                    continue
+                for k in range(start, end):
                     if not asked(sides, trees, k, l, w):
                         continue
                     nodes = slots(sides, k, l, w)
