@@ -38,7 +38,9 @@ def number(what: str, value, rule: str = "one finite number", holds: Callable = 
     return result
 
 
-PART = "a part of all, from 0 to less than 1", lambda v: 0.0 <= v < 1.0  # rule of a `number`
+def part(what: str, value) -> float:
+    """One number from 0 to less than 1, or a refusal that names `what`."""
+    return number(what, value, "a part of all, from 0 to less than 1", lambda v: 0.0 <= v < 1.0)
 
 
 def positive(what: str, value, unit: str = "") -> float:

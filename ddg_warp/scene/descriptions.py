@@ -37,7 +37,7 @@ class Dynamics:
         arguments.positive("Dynamics: dt", self.dt, "s")
         arguments.positive("Dynamics: duration", self.duration, "s")
         arguments.positive("Dynamics: rtol", self.rtol)
-        arguments.number("Dynamics: outliers", self.outliers, *arguments.PART)
+        arguments.part("Dynamics: outliers", self.outliers)
         arguments.choice("Dynamics: scheme", self.scheme, ("implicit_euler", "implicit_midpoint"))
         if self.precision is not None:
             arguments.choice("Dynamics: precision", self.precision, ("float64", "mixed", "float32"))

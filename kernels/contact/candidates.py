@@ -90,7 +90,7 @@ def meet_kernel(alike: bool, inner: bool, grouped: bool):
 
 
 @wp.func
-def things_of(trees: Trees, both: wp.vec2i):
+def ranges_of(trees: Trees, both: wp.vec2i):
     """World of two bundles, where the first and the second begin there and end."""
     w = both[0] / (trees.bundles.shape[0] - 1)
     one, other = both[0] - w * (trees.bundles.shape[0] - 1), both[1] - w * (trees.leaves.shape[0] - 1)
@@ -114,9 +114,6 @@ def asked_functions(kind: Kind, real):
 
     @wp.func
     def asked(sides: Sides, trees: Trees, k: int, l: int, w: int):
-        if wp.static(kind.alike):
-            if l <= k:
-                return False
         i, j = k + w * sides.counts[0], l + w * sides.counts[1]
         if overlap(trees.lower[i], trees.upper[i], trees.second_lower[j], trees.second_upper[j]):
             return may_touch(sides, k, l)
@@ -174,7 +171,7 @@ def candidate_kernels(kind: Kind, real):
     ):
         """Which of them may come as near as both radii and `reach` within `around` of their ways: linked, and counted by thing."""
         for n in range(wp.tid(), wp.min(found[0], met.shape[0]), threads):
-            w, start, end, first, last = things_of(trees, met[n])
+            w, start, end, first, last = ranges_of(trees, met[n])
             for l in range(first, last):
                 if not reaches(sides, trees, met[n][0], l, w):
                     continue
@@ -222,8 +219,8 @@ def candidate_kernels(kind: Kind, real):
             end = start
             at = last_slot[i]
             for _partner in range(partners[i]):
-                _w, _start, _end, first, _last = things_of(trees, met[at / (wide[0] * wide[1])])
-                j = first + at % wide[1] + i / sides.counts[0] * sides.counts[1]
+                w, _start, _end, first, _last = ranges_of(trees, met[at / (wide[0] * wide[1])])
+                j = first + at % wide[1] + w * sides.counts[1]
                 k = end
                 while k > start and pairs[wp.max(k - 1, 0)][1] > j:
                     pairs[k] = pairs[k - 1]

@@ -11,9 +11,9 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.contact.boxes import Trees
-from ddg_warp.kernels.contact.candidates import asked_functions, note_needed, things_of
+from ddg_warp.kernels.contact.candidates import asked_functions, note_needed, ranges_of
 from ddg_warp.kernels.contact.motion import corners_function, relative_function
-from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
+from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct, things_function
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
 REST, NEAR = 0.1, 0.5  # of the gap: what is left of wide ones; of narrow ones, and of the reach
@@ -112,7 +112,7 @@ def impact_kernel(kind: Kind, passing: bool, real):
         if wp.tid() == 0:
             note_needed(found, met, overflow, needed)
         for n in range(wp.tid(), wp.min(found[0], met.shape[0]), threads):
-            w, start, end, first, last = things_of(trees, met[n])
+            w, start, end, first, last = ranges_of(trees, met[n])
             for l in range(first, last):
                 if not reaches(sides, trees, met[n][0], l, w):
                     continue
@@ -141,7 +141,7 @@ def passing_kernel(kind: Kind, real):
     Sides, X = sides_struct(real), wp.types.vector(3, real)
     slots, *_ = pair_functions(kind, real)
     _, meet = impact_functions(kind, real)
-    corners = corners_function(real)
+    corners, things = corners_function(real), things_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def passing(
@@ -154,8 +154,7 @@ def passing_kernel(kind: Kind, real):
         number: wp.array(dtype=int),
     ):
         for p in range(wp.tid(), count[0], threads):
-            w = pairs[p][0] / sides.counts[0]
-            i, j = pairs[p][0] - w * sides.counts[0], pairs[p][1] - w * sides.counts[1]
+            w, i, j = things(sides, pairs[p])
             nodes = slots(sides, i, j, w)
             if meet(corners(x, nodes), corners(move, nodes)):
                 wp.atomic_add(number, w, 1)

@@ -5,7 +5,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.contact.motion import corners_function
-from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
+from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct, things_function
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
 
@@ -14,6 +14,7 @@ def look_kernel(kind: Kind, real):
     """Gap [m] of each pair, and the place between its closest points [m]."""
     Sides, X = sides_struct(real), wp.types.vector(3, real)
     (slots, _, thickness, closest), corners = pair_functions(kind, real), corners_function(real)
+    things = things_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def look(
@@ -24,8 +25,7 @@ def look_kernel(kind: Kind, real):
         point_out: wp.array(dtype=X),
     ):
         p = wp.tid()
-        w = pairs[p][0] / sides.counts[0]
-        i, j = pairs[p][0] - w * sides.counts[0], pairs[p][1] - w * sides.counts[1]
+        w, i, j = things(sides, pairs[p])
         nodes = slots(sides, i, j, w)
         r, weights = closest(corners(x, nodes))
         gap_out[p] = wp.length(r) - thickness(sides, i, j, w)
@@ -43,6 +43,7 @@ def closest_kernel(kind: Kind, real):
     points, negative on the second, and the thickness [m]."""
     Sides, X, W = sides_struct(real), wp.types.vector(3, real), wp.types.vector(4, real)
     (slots, _, thickness, closest), corners = pair_functions(kind, real), corners_function(real)
+    things = things_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def closest_points(
@@ -55,8 +56,7 @@ def closest_kernel(kind: Kind, real):
         thickness_out: wp.array(dtype=real),
     ):
         p = wp.tid()
-        w = pairs[p][0] / sides.counts[0]
-        i, j = pairs[p][0] - w * sides.counts[0], pairs[p][1] - w * sides.counts[1]
+        w, i, j = things(sides, pairs[p])
         nodes = slots(sides, i, j, w)
         way, shares = closest(corners(x, nodes))
         way_out[p] = way

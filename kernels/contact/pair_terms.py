@@ -12,7 +12,7 @@ from ddg_warp.kernels.contact.pair_energy import (
     rows_of,
     shape_types,
 )
-from ddg_warp.kernels.contact.surfaces import EDGES, Kind, pair_functions, sides_struct
+from ddg_warp.kernels.contact.surfaces import EDGES, Kind, pair_functions, sides_struct, things_function
 from ddg_warp.kernels.densities import Density
 from ddg_warp.kernels.densities.contact import SHARE
 from ddg_warp.kernels.threads import CPU_OPTIONS
@@ -43,12 +43,11 @@ def law_struct(real):
 @cache
 def groups_function(real):
     """groups(law, sides, pair) -> world w of a pair of all worlds, i and j in it, and the groups of both."""
-    Law, Sides = law_struct(real), sides_struct(real)
+    Law, Sides, things = law_struct(real), sides_struct(real), things_function(real)
 
     @wp.func
     def groups(law: Law, sides: Sides, pair: wp.vec2i):
-        w = pair[0] / sides.counts[0]
-        i, j = pair[0] - w * sides.counts[0], pair[1] - w * sides.counts[1]
+        w, i, j = things(sides, pair)
         return w, i, j, law.group[sides.first.object[i]], law.group[sides.second.object[j]]
 
     return groups
@@ -98,12 +97,12 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
     about, row_of, *_ = pair_energy_functions(kind, density, real)
     bends = bend_function(kind, density, real)
     given, corners = read_functions(kind, real)
-    (slots, *_), rows = pair_functions(kind, real), rows_of(kind)
+    (slots, *_), things, rows = pair_functions(kind, real), things_function(real), rows_of(kind)
 
     @wp.func
     def nodes_of(sides: Sides, pair: wp.vec2i):
-        w = pair[0] / sides.counts[0]
-        n = slots(sides, pair[0] - w * sides.counts[0], pair[1] - w * sides.counts[1], w)
+        w, i, j = things(sides, pair)
+        n = slots(sides, i, j, w)
         return wp.vec4i(n[0], n[1], n[2], n[3])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

@@ -16,7 +16,7 @@ import warp as wp
 
 from ddg_warp.kernels.contact.impact import impact_functions
 from ddg_warp.kernels.contact.motion import corners_function
-from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct
+from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct, things_function
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 ROUNDS = 50  # what falls on what has stopped stops layer by layer, one in a round
@@ -28,13 +28,7 @@ def limit_kernels(kind: Kind, real):
     `time` of their worlds."""
     Sides, X, W = sides_struct(real), wp.types.vector(3, real), wp.types.vector(4, real)
     slots, _, thickness, _ = pair_functions(kind, real)
-    corners, (impact, _) = corners_function(real), impact_functions(kind, real)
-
-    @wp.func
-    def things(sides: Sides, pair: wp.vec2i):
-        """World of a pair, and both things in it."""
-        w = pair[0] / sides.counts[0]
-        return w, pair[0] - w * sides.counts[0], pair[1] - w * sides.counts[1]
+    corners, (impact, _), things = corners_function(real), impact_functions(kind, real), things_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pick(

@@ -78,6 +78,19 @@ def sides_struct(real):
 
 
 @cache
+def things_function(real):
+    """things(sides, pair) -> world w of a pair of all worlds, and both things in it."""
+    Sides = sides_struct(real)
+
+    @wp.func
+    def things(sides: Sides, pair: wp.vec2i):
+        w = pair[0] / sides.counts[0]
+        return w, pair[0] - w * sides.counts[0], pair[1] - w * sides.counts[1]
+
+    return things
+
+
+@cache
 def pair_functions(kind: Kind, real):
     """slots(sides, i, j, w) -> the four nodes; may_touch(sides, i, j); thickness(sides, i, j, w); closest(y) -> r, w.
 

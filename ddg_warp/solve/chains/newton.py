@@ -59,7 +59,7 @@ class NewtonOptions:
     outliers: float = 0.0
 
     def __post_init__(self):
-        arguments.number("outliers", self.outliers, *arguments.PART)
+        arguments.part("outliers", self.outliers)
         check_options(self, ("rtol", "floor_factor", "rotation_cap", "linear_rtol"), ("max_iterations", "max_halvings"))
         if self.psd not in PSD_MODES:
             raise SceneError(f"psd {self.psd!r}: it is one of {', '.join(PSD_MODES)}")

@@ -96,7 +96,7 @@ class BroadPhase:
         # whether pairs are out of date, or were for the check of a whole step; whether the last `update` found them anew
         self._stale, self._beyond, self._done = (wp.zeros(1, dtype=int, device=self.device) for _ in range(3))
         self._edges = things[2]
-        self._trees = [things[size] for size in things if size != 1]
+        self._trees = [things[size].leaves for size in things if size != 1]
         self._motion = motion_kernels(real, arrays.serial(self.device))
         self.rebuild(x)
         grouped = worlds > 1
@@ -304,7 +304,7 @@ class BroadPhase:
     def _passing(self, kernels, x, move, keep: float, number, firsts) -> None:
         self._enclose(x, move, self.every, keep, 0.0)
         for part in self._trees:
-            part.refit()
+            part.tree.refit()
         for kernel, pairs, least in zip(kernels, self.lists, firsts, strict=True):
             pairs.meet()
             pairs.impact(kernel, x, move, keep, self._room(keep), [self.time, number, least])

@@ -38,16 +38,12 @@ class Boxes:
         else:
             self.tree.rebuild()
 
-    def refit(self) -> None:
-        """The same tree for boxes as they are."""
-        self.tree.refit()
-
     def renew(self) -> None:
         """A tree for boxes that may have moved far: anew on the CPU, as it was built on CUDA; that can be slower by far."""
         if self.device.is_cpu:
             self.build()
         else:
-            self.refit()
+            self.tree.refit()
 
 
 class Things:
@@ -84,7 +80,6 @@ class Things:
         self.leaves = Boxes(len(starts) - 1, worlds, device, corners)
         self._enclose = box_kernel(nodes.shape[1], size == PLANES, real)
         self.kernels = [self._enclose] if self._single else [self._enclose, bundle]
-        self.build, self.refit, self.renew = self.leaves.build, self.leaves.refit, self.leaves.renew
 
     def enclose(self, x, move, shift, share: float, more: float, lost) -> None:
         """Boxes around x and x + move, the latter less `shift` of the world, inflated by a share of the radius and more [m]."""
