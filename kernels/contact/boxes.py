@@ -18,7 +18,7 @@ class Trees:
 
     lower, upper: of first things; second_lower, second_upper: of second ones; bundle_lower, bundle_upper: of bundles of first ones;
     bundles: of these in one world, the first things that they start with, and how many there are; leaves: the same of the bundles of
-    second things, whose boxes are those of the tree.
+    second things, whose boxes are those of the tree; order: in which walks take bundles of first ones, by number if empty.
     """
 
     lower: wp.array(dtype=wp.vec3)
@@ -29,6 +29,7 @@ class Trees:
     bundle_upper: wp.array(dtype=wp.vec3)
     bundles: wp.array(dtype=int)
     leaves: wp.array(dtype=int)
+    order: wp.array(dtype=int)
     tree: wp.uint64
 
 
@@ -61,6 +62,41 @@ def bundle(
         high = wp.max(high, upper[i])
     lower_out[tid] = low
     upper_out[tid] = high
+
+
+@wp.func
+def spread(v: int):
+    """Bits of a number of ten, every third."""
+    v = (v | (v << 16)) & 0x030000FF
+    v = (v | (v << 8)) & 0x0300F00F
+    v = (v | (v << 4)) & 0x030C30C3
+    return (v | (v << 2)) & 0x09249249
+
+
+@wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+def encode(
+    lower: wp.array(dtype=wp.vec3),
+    upper: wp.array(dtype=wp.vec3),
+    count: int,
+    corner: wp.vec3,
+    scale: float,
+    dropped: int,
+    keys_out: wp.array(dtype=int),
+    numbers_out: wp.array(dtype=int),
+):
+    """Keys that sort boxes, `count` in a world, by world and along a Morton curve, less some bits of it; and their numbers.
+
+    Args:
+        corner, scale: of the room that is divided into 1024 cells along each axis; beyond it boxes are in its outermost cells.
+        dropped: bits of the curve that keys are without.
+    """
+    i = wp.tid()
+    at = (wp.float32(0.5) * (lower[i] + upper[i]) - corner) * scale
+    key = int(0)
+    for d in range(3):
+        key |= spread(int(wp.clamp(at[d], wp.float32(0.0), wp.float32(1023.0)))) << d
+    keys_out[i] = (i / count << (30 - dropped)) | (key >> dropped)
+    numbers_out[i] = i
 
 
 @cache

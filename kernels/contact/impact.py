@@ -11,7 +11,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.contact.boxes import Trees
-from ddg_warp.kernels.contact.candidates import asked_functions, note_needed, ranges_of
+from ddg_warp.kernels.contact.candidates import asked_functions, note_needed, ranges_of, turns
 from ddg_warp.kernels.contact.motion import corners_function, relative_function
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct, things_function
 from ddg_warp.kernels.threads import CPU_OPTIONS
@@ -111,7 +111,8 @@ def impact_kernel(kind: Kind, passing: bool, real):
     ):
         if wp.tid() == 0:
             note_needed(found, met, overflow, needed)
-        for n in range(wp.tid(), wp.min(found[0], met.shape[0]), threads):
+        begin, stop, step = turns(wp.tid(), threads, found, met)
+        for n in range(begin, stop, step):
             w, start, end, first, last = ranges_of(trees, met[n])
             for l in range(first, last):
                 if not reaches(sides, trees, met[n][0], l, w):

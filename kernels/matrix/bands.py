@@ -9,13 +9,37 @@ import warp as wp
 
 from ddg_warp.kernels.drag import mass_type
 from ddg_warp.kernels.islands import CARRIED, WANTED
-from ddg_warp.kernels.matrix.block_band import block_functions
+from ddg_warp.kernels.matrix.block_band import TILE, block_functions
 from ddg_warp.kernels.matrix.chain_blocks import blocks_function, layout_type
 from ddg_warp.kernels.matrix.chain_places import behind_function, place_dofs, value_function
 from ddg_warp.kernels.matrix.sliced import BARRED, product_functions
 from ddg_warp.kernels.net.places import along_type
 from ddg_warp.kernels.terms import Term
 from ddg_warp.kernels.threads import CPU_OPTIONS, first_of, until_function
+
+
+@cache
+def times_functions(nb: int, linear):
+    """along(m, u) and back(m, u): a block and its transpose times a vector, summed in one order by all kernels."""
+    B, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
+
+    @wp.func
+    def along(m: M, u: B):
+        y = B()
+        for i in range(wp.static(nb)):
+            for j in range(wp.static(nb)):
+                y[i] = y[i] + m[i, j] * u[j]
+        return y
+
+    @wp.func
+    def back(m: M, u: B):
+        y = B()
+        for i in range(wp.static(nb)):
+            for j in range(wp.static(nb)):
+                y[i] = y[i] + m[j, i] * u[j]
+        return y
+
+    return along, back
 
 
 @cache
@@ -36,7 +60,8 @@ def band_kernels(
     nb = place_dofs(twist, split)
     H, B = wp.types.vector(3, linear), wp.types.vector(nb, linear)
     Mass, Layout, Along, until = mass_type(real, drag), layout_type(), along_type(real, linear), until_function(serial)
-    _, store, _, _ = block_functions(nb, linear)
+    load, store, _, _ = block_functions(nb, linear)
+    along, back = times_functions(nb, linear)
     times, free = product_functions(linear)
     blocks_at = blocks_function(terms, twist, span, real, linear, exact_from, drag, split)
     value = value_function(twist, linear, split)
@@ -79,24 +104,29 @@ def band_kernels(
                 matrix[j, taken[i] + w * positions] = linear(0.0)
 
     @wp.func
-    def along(bands: wp.array3d(dtype=linear), row: int, first: int, count: int, k: int, r: int, u: B):
-        """`count` rows of a block, from `first` on, times a vector."""
-        y = H()
-        for i in range(3):
-            if i < count:
-                for j in range(wp.static(nb)):
-                    y[i] = y[i] + bands[row + (first + i) * wp.static(nb) + j, k, r] * u[j]
-        return y
-
-    @wp.func
-    def back(bands: wp.array3d(dtype=linear), row: int, first: int, count: int, k: int, r: int, u: B):
-        """The same of its transpose."""
-        y = H()
-        for i in range(3):
-            if i < count:
-                for j in range(wp.static(nb)):
-                    y[i] = y[i] + bands[row + j * wp.static(nb) + first + i, k, r] * u[j]
-        return y
+    def settle(
+        matrix: wp.array2d(dtype=linear),
+        columns: wp.array(dtype=int),
+        slices: wp.array(dtype=int),
+        barred: wp.array(dtype=wp.uint8),
+        p: wp.array(dtype=H),
+        blocks: int,
+        positions: int,
+        b: int,
+        w: int,
+        y: H,
+        product_out: wp.array(dtype=H),
+        dots_out: wp.array2d(dtype=linear),
+    ):
+        """The product in a block, with what bands bring to it."""
+        i = b + w * blocks
+        if barred[i] == BARRED:
+            y = H()
+        else:
+            y += times(matrix, columns, slices, p, b, w * positions, w * blocks)
+            y = wp.cw_mul(y, free(barred[i]))
+        product_out[i] = y
+        dots_out[w, b] = wp.dot(p[i], y)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def product(
@@ -110,45 +140,51 @@ def band_kernels(
         positions: int,
         bands: wp.array3d(dtype=linear),
         places: wp.array3d(dtype=int),
-        where: wp.array(dtype=int),
         count: wp.array(dtype=int),
         idle: wp.array(dtype=int),
-        nodes: int,
+        threads: int,
+        apart: wp.array(dtype=int),
         product_out: wp.array(dtype=H),
         dots_out: wp.array2d(dtype=linear),
     ):
-        i = wp.tid()
-        w = i / blocks
+        """`threads` have places, in tiles of `TILE` chains, whose neighbours read what the cache still has; others blocks `apart`."""
+        tid = wp.tid()
+        if tid >= threads:
+            w = (tid - threads) / apart.shape[0]
+            if wanted[w] == 1:
+                b = apart[tid - threads - w * apart.shape[0]]
+                settle(matrix, columns, slices, barred, p, blocks, positions, b, w, H(), product_out, dots_out)
+            return
+        tile = tid / (bands.shape[1] * TILE)
+        k = tid / TILE - tile * bands.shape[1]
+        r = tile * TILE + tid % TILE
+        w = r / count.shape[0]
+        c = r - w * count.shape[0]
+        if w >= wanted.shape[0] or k >= count[c]:
+            return
         if wanted[w] != 1:
             return
-        b = i - w * blocks
-        if barred[i] == BARRED:
-            product_out[i] = H()
-            dots_out[w, b] = linear(0.0)
-            return
-        shift = w * blocks
-        y = times(matrix, columns, slices, p, b, w * positions, shift)
-        at = where[b]
-        if at >= 0:
-            k = at / count.shape[0]
-            c = at - k * count.shape[0]
-            r = w * count.shape[0] + c
-            n = count[c]
-            first = wp.where(b < nodes, 0, 3)
-            size = wp.where(b < nodes, 3, 1)
-            y += along(bands, 0, first, size, k, r, value(p, places, k, c, shift))
-            if k + 1 < n:
-                y += along(bands, wp.static(nb**2), first, size, k, r, value(p, places, k + 1, c, shift))
+        u, shift = B(), w * blocks
+        if idle[r] == 0:
+            u = along(load(bands, 0, k, r), value(p, places, k, c, shift))
+            if k + 1 < count[c]:
+                u += along(load(bands, wp.static(nb**2), k, r), value(p, places, k + 1, c, shift))
             if k > 0:
-                y += back(bands, wp.static(nb**2), first, size, k - 1, r, value(p, places, k - 1, c, shift))
+                u += back(load(bands, wp.static(nb**2), k - 1, r), value(p, places, k - 1, c, shift))
             if wp.static(span == 2):
-                if k + 2 < n:
-                    y += along(bands, wp.static(2 * nb**2), first, size, k, r, value(p, places, k + 2, c, shift))
+                if k + 2 < count[c]:
+                    u += along(load(bands, wp.static(2 * nb**2), k, r), value(p, places, k + 2, c, shift))
                 if k > 1:
-                    y += back(bands, wp.static(2 * nb**2), first, size, k - 2, r, value(p, places, k - 2, c, shift))
-        y = wp.cw_mul(y, free(barred[i]))
-        product_out[i] = y
-        dots_out[w, b] = wp.dot(p[i], y)
+                    u += back(load(bands, wp.static(2 * nb**2), k - 2, r), value(p, places, k - 2, c, shift))
+        node = places[0, k, c]
+        if node >= 0:
+            y = H(u[0], u[1], u[2])
+            settle(matrix, columns, slices, barred, p, blocks, positions, node, w, y, product_out, dots_out)
+        if wp.static(twist):
+            angle = places[1, k, c]
+            if angle >= 0:
+                y = H(u[3], linear(0.0), linear(0.0))
+                settle(matrix, columns, slices, barred, p, blocks, positions, angle, w, y, product_out, dots_out)
 
     return assemble, clear, product
 
@@ -157,28 +193,11 @@ def band_kernels(
 def product_walk_kernel(twist: bool, span: int, linear, split: bool = False):
     """walk(...): the same product by one thread, for the CPU: it reads each block once, and goes on with what its transpose adds."""
     nb = place_dofs(twist, split)
-    H, B, M = wp.types.vector(3, linear), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
+    H, B = wp.types.vector(3, linear), wp.types.vector(nb, linear)
     load, _, _, _ = block_functions(nb, linear)
+    along, back = times_functions(nb, linear)
     times, free = product_functions(linear)
     value = value_function(twist, linear, split)
-
-    @wp.func
-    def along(m: M, u: B):
-        """Summed in the order of the kernel for many threads, so that both find the same."""
-        y = B()
-        for i in range(wp.static(nb)):
-            for j in range(wp.static(nb)):
-                y[i] = y[i] + m[i, j] * u[j]
-        return y
-
-    @wp.func
-    def back(m: M, u: B):
-        """The same of the transpose."""
-        y = B()
-        for i in range(wp.static(nb)):
-            for j in range(wp.static(nb)):
-                y[i] = y[i] + m[j, i] * u[j]
-        return y
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def walk(
@@ -192,10 +211,8 @@ def product_walk_kernel(twist: bool, span: int, linear, split: bool = False):
         positions: int,
         bands: wp.array3d(dtype=linear),
         places: wp.array3d(dtype=int),
-        where: wp.array(dtype=int),
         count: wp.array(dtype=int),
         idle: wp.array(dtype=int),
-        nodes: int,
         product_out: wp.array(dtype=H),
         dots_out: wp.array2d(dtype=linear),
     ):

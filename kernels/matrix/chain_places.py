@@ -57,24 +57,37 @@ def place_functions(twist: bool, linear, split: bool = False):
 
 
 @cache
-def value_function(twist: bool, linear, split: bool = False):
-    """value(v, places, k, c, shift): of a vector of blocks, what belongs to a place; blocks of the world begin at `shift`."""
+def gather_function(twist: bool, linear, split: bool = False):
+    """gather(v, node, angle, shift): of a vector of blocks, what belongs to a place with these; its world begins at `shift`."""
     H, B = wp.types.vector(3, linear), wp.types.vector(place_dofs(twist, split), linear)
 
     @wp.func
-    def value(v: wp.array(dtype=H), places: wp.array3d(dtype=int), k: int, c: int, shift: int):
+    def gather(v: wp.array(dtype=H), node: int, angle: int, shift: int):
         u = B()
-        node = places[0, k, c]
         if node >= 0:
             x = v[node + shift]
             for d in range(3):
                 u[d] = x[d]
         if wp.static(twist):
-            angle = places[1, k, c]
             if angle >= 0:
                 x = v[angle + shift]
                 u[3] = x[0]
         return u
+
+    return gather
+
+
+@cache
+def value_function(twist: bool, linear, split: bool = False):
+    """value(v, places, k, c, shift): the same by the place."""
+    H, gather = wp.types.vector(3, linear), gather_function(twist, linear, split)
+
+    @wp.func
+    def value(v: wp.array(dtype=H), places: wp.array3d(dtype=int), k: int, c: int, shift: int):
+        angle = int(-1)
+        if wp.static(twist):
+            angle = places[1, k, c]
+        return gather(v, places[0, k, c], angle, shift)
 
     return value
 

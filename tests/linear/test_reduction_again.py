@@ -3,28 +3,12 @@
 import numpy as np
 import pytest
 import warp as wp
+from chain_system import system
 
 from ddg_warp import arrays
 from ddg_warp.solve.reduction import CyclicReduction
 
 COUNTS = (2, 3, 4, 5, 17, 31, 32, 33, 50, 64)
-
-
-def system(nb: int, rng) -> tuple[np.ndarray, list]:
-    """Bands (3 nb^2, nodes, columns) of definite matrices of chains of `COUNTS` nodes, and these matrices."""
-    bands, matrices = np.zeros((3, nb, nb, max(COUNTS), len(COUNTS))), []
-    for column, n in enumerate(COUNTS):
-        L = np.zeros((n, nb, n, nb))
-        for k in range(n):
-            for back in range(min(3, k + 1)):
-                L[k, :, k - back] = rng.normal(size=(nb, nb))
-        L = L.reshape(n * nb, n * nb)
-        H = (L @ L.T + 0.5 * np.eye(n * nb)).reshape(n, nb, n, nb)
-        matrices.append(H.reshape(n * nb, n * nb))
-        for k in range(n):
-            for ahead in range(min(3, n - k)):
-                bands[ahead, :, :, k, column] = H[k, :, k + ahead]
-    return bands.reshape(3 * nb**2, max(COUNTS), len(COUNTS)), matrices
 
 
 @pytest.mark.parametrize("nb", [3, 4])
@@ -35,7 +19,7 @@ def test_further_right_hand_sides_are_dense_solves(device, nb):
     count, every = wp.array(COUNTS, dtype=int, device=device), wp.full(columns, 1, dtype=int, device=device)
     bad, some = wp.zeros(columns, dtype=int, device=device), np.arange(columns) % 5 != 0
     for _ in range(2):
-        bands, matrices = system(nb, rng)
+        bands, matrices = system(nb, COUNTS, rng)
         matrix = arrays.upload(bands, wp.float64, device)
         right = rng.normal(size=(2, nb, max(COUNTS), columns))
         given = [arrays.upload(values, wp.float64, device) for values in right]

@@ -96,7 +96,7 @@ class BroadPhase:
         # whether pairs are out of date, or were for the check of a whole step; whether the last `update` found them anew
         self._stale, self._beyond, self._done = (wp.zeros(1, dtype=int, device=self.device) for _ in range(3))
         self._edges = things[2]
-        self._trees = [things[size].leaves for size in things if size != 1]
+        self._walked = [part for part in self._things if part.walked]
         self._motion = motion_kernels(real, arrays.serial(self.device))
         self.rebuild(x)
         grouped = worlds > 1
@@ -141,7 +141,7 @@ class BroadPhase:
         Where everything has changed places since, a search takes tens of times as long.
         """
         self._enclose(x, self._still, self._never, 1.0, self._within)
-        for part in self._trees:
+        for part in self._things:
             part.build()
 
     def update(self, base: wp.array, q: wp.array | None = None, together: wp.array | None = None) -> None:
@@ -161,8 +161,8 @@ class BroadPhase:
         move = self._still if move is None else move
         together = self._never if together is None else together
         self._enclose(x, move, together, 1.0, self._within)
-        for part in self._trees:
-            part.renew()
+        for part in self._walked:
+            part.leaves.renew()
         for pairs in self.lists:
             pairs.meet()
             pairs.judge(x, move, together, self.reach, self._around)
@@ -303,8 +303,8 @@ class BroadPhase:
 
     def _passing(self, kernels, x, move, keep: float, number, firsts) -> None:
         self._enclose(x, move, self.every, keep, 0.0)
-        for part in self._trees:
-            part.tree.refit()
+        for part in self._walked:
+            part.leaves.tree.refit()
         for kernel, pairs, least in zip(kernels, self.lists, firsts, strict=True):
             pairs.meet()
             pairs.impact(kernel, x, move, keep, self._room(keep), [self.time, number, least])

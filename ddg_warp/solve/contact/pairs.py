@@ -14,6 +14,9 @@ from ddg_warp.kernels.contact.surfaces import Kind, sides_struct
 from ddg_warp.solve.contact.shapes import Shapes
 from ddg_warp.solve.contact.tree import Things
 
+# Parts of what meets, where each has as many bundles at least: so they are about as full. Of 310,000 bundles 64 are as fast as 1024.
+PARTS, LEAST = 64, 1024
+
 
 class RunningSums:
     """The sum of those before it for each of some integers, in `starts`."""
@@ -72,6 +75,8 @@ class PairList:
         self.trees.second_lower, self.trees.second_upper, self.trees.leaves = second.lower, second.upper, second.bundles
         self.trees.bundle_lower, self.trees.bundle_upper = first.leaves.lower, first.leaves.upper
         self.trees.tree = second.leaves.tree.id
+        if first.order is not None:
+            self.trees.order = first.order.numbers
         self._last, self.partners = (wp.zeros(first.all, dtype=int, device=self.device) for _ in range(2))
         self._sums = RunningSums(self.partners)
         self.starts = self._sums.starts
@@ -80,7 +85,9 @@ class PairList:
         self._meet = meet_kernel(kind.alike, first.bundle > 2, grouped)
         self._judge, self._fill = candidate_kernels(kind, real)
         self._gaps, self._passing = gap_kernel(kind, real), passing_kernel(kind, real)
-        self.count, self._found = (wp.zeros(1, dtype=int, device=self.device) for _ in range(2))
+        self.count = wp.zeros(1, dtype=int, device=self.device)
+        parts = 1 if arrays.serial(self.device) else min(max(first.leaves.all // LEAST, 1), PARTS)
+        self._found = wp.zeros(parts, dtype=int, device=self.device)
         # the most pairs of any search since there was room for so many, and those whose boxes met
         self._needed = wp.zeros(2, dtype=int, device=self.device)
         self.kernels = [self._meet, self._judge, self._fill, self._gaps, self._passing, *self._sums.kernels]
@@ -99,6 +106,7 @@ class PairList:
     def reserve(self, pairs: int, met: int | None = None) -> None:
         """Make room for so many pairs, and so many bundles whose boxes meet, by default as many as there is room for."""
         if met is not None:
+            met = -(-met // len(self._found)) * len(self._found)  # as much for each part
             self._met = wp.zeros(met, dtype=wp.vec2i, device=self.device)
             self._before = wp.zeros(met * self._slots, dtype=int, device=self.device)
         self.pairs = wp.zeros(pairs, dtype=wp.vec2i, device=self.device)
@@ -128,14 +136,17 @@ class PairList:
 
     def judge(self, x, move, together, reach: float, around: float) -> None:
         """List those of them that are near, or may be on their way."""
-        given, met = [self.sides, self.trees, self._wide], [self._met, self._before, self._last]
+        given, met, room = (
+            [self.sides, self.trees, self._wide],
+            [self._met, self._before, self._last],
+            [self.overflow, self._needed],
+        )
         self.partners.zero_()
         inputs = [*given, x, move, together, reach, around, self._found]
-        arrays.take_turns(self._judge, len(self._met), inputs, [*met, self.partners], self.device)
+        arrays.take_turns(self._judge, len(self._met), inputs, [*met, self.partners, *room], self.device)
         self._sums()
-        outputs = [self.pairs, self.count, self.overflow, self._needed]
-        inputs = [*given, self._found, *met, self.starts, self.partners]
-        wp.launch(self._fill, self.first.all, inputs, outputs, device=self.device)
+        inputs = [*given, *met, self.starts, self.partners]
+        wp.launch(self._fill, self.first.all, inputs, [self.pairs, self.count, *room], device=self.device)
 
     def impact(self, kernel, x, move, keep: float, room: float, outputs: list) -> None:
         """What a kernel of `kernels.contact.impact` makes of the pairs whose boxes around the motion have met."""

@@ -8,12 +8,14 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.matrix import bands
+from ddg_warp.kernels.matrix.block_band import TILE
 from ddg_warp.kernels.matrix.chain_blocks import layout_type
 from ddg_warp.kernels.matrix.sliced import SETS
 from ddg_warp.kernels.net.places import along_type, place_kernel
 from ddg_warp.kernels.solve import elimination, joints
 from ddg_warp.kernels.solve.walk import walk_kernel
 from ddg_warp.solve.choice import long_and_few
+from ddg_warp.solve.net.both_ends import BothEnds
 from ddg_warp.solve.net.plan import ChainPlan
 from ddg_warp.solve.reduction import CyclicReduction
 
@@ -84,6 +86,7 @@ class Chains:
 
         self.places = arrays.upload(plan.places.astype(np.int32), int, device)
         self.chain, self.count, self.where = put(plan.chain), put(plan.count), put(plan.where)
+        self._at_none = put(np.flatnonzero(plan.where < 0))  # blocks without a place
         self.held = arrays.upload(plan.held(net.host), wp.uint8, device)
         self.longest, self.width = plan.chain.shape
         self.columns = worlds * self.width
@@ -141,9 +144,12 @@ class Chains:
         made = elimination.chain_kernels(plan.twist, plan.span, linear, plan.size, serial, self.split)
         self._factorise, self._load, self._solve, self._solve_all, self._follow, self._finish, *self._columns = made
         self._measure, self._meet = joints.joint_kernels(linear) if self.joints else (None, None)
-        self._walk = self._walk_places = None
+        self._walk = self._walk_places = self._both = None
         if serial and not (self.joints or self.reduction):
             self._walk_places = elimination.walk_places_kernel(plan.twist, plan.span, linear, self.split)
+        if not (serial or self.joints or self.reduction or self.split):
+            given = self.places, self.held, self.count, self.idle
+            self._both = BothEnds(plan, linear, device, given, net.blocks, self.columns, SERIAL)
         if self.split:
             self.longer = arrays.allocate((2, self.longest, self.columns), linear, device)
             self._lengthen = bands.lengthen_kernel(terms, real, linear)
@@ -154,7 +160,9 @@ class Chains:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         own = [self._walk] if self._walk else [self._assemble]
-        if self._walk_places:
+        if self._both:
+            own += self._both.kernels
+        elif self._walk_places:
             own += [] if self._walk else [(self._walk_places, SERIAL)]
         else:
             own += [self._load] if self.coupled or not self._walk else []
@@ -162,7 +170,7 @@ class Chains:
         if self.reduction:
             own += [*self._columns, *self.reduction.kernels]
             own += [self.reduction.again_kernel_at_places(self.plan.twist)] if self._at_places else []
-        else:
+        elif not self._both:
             own += [] if self._walk else [(self._factorise, SERIAL), (self._solve, SERIAL)]
             own += [(self._solve_all, SERIAL)] if self.coupled else []
         own += [self._balance] if self.banded else []
@@ -204,14 +212,14 @@ class Chains:
 
     def product(self, matrix, p: wp.array, barred, wanted, product: wp.array, dots: wp.array) -> None:
         """H p with what the bands make of p, and p . H p block by block."""
-        table, net = self.table, self.net
-        self._launch(
-            self._product,
-            arrays.takers(net.worlds * net.blocks, self.device),
-            [matrix, table.columns, table.slices, barred, p, wanted, net.blocks, table.positions]
-            + [self.bands, self.places, self.where, self.count, self.idle, net.host.nodes],
-            [product, dots],
-        )
+        table, net, threads = self.table, self.net, 1
+        inputs = [matrix, table.columns, table.slices, barred, p, wanted, net.blocks, table.positions]
+        inputs += [self.bands, self.places, self.count, self.idle]
+        if not arrays.serial(self.device):
+            of_places = -(-self.columns // TILE) * TILE * self.longest
+            inputs += [of_places, self._at_none]
+            threads = of_places + net.worlds * len(self._at_none)
+        self._launch(self._product, threads, inputs, [product, dots])
 
     def direct(self, matrix, mass, islands, anew, fixed, barred, right, lost: wp.array, z: wp.array, dots) -> None:
         """H^-1 r of the worlds that want a direction, where this is exact; raises `lost` where H is indefinite.
@@ -243,6 +251,8 @@ class Chains:
             self._spread(wanted)
             self.reduction.factorise(self.eliminated, self._all, self._wanted, self._bad)
             self._note()
+        elif self._both:
+            self._both.factorise(self.eliminated, wanted, self.factors, lost)
         elif not self.reduction:
             self._launch(
                 self._factorise,
@@ -262,6 +272,9 @@ class Chains:
         if self._walk_places:
             inputs = [self.factors, residual, self.places, self.held, self.count, self.idle, wanted, self.net.blocks]
             self._launch(self._walk_places, self.columns, inputs, [self.values, z, dots], SERIAL)
+            return
+        if self._both:
+            self._both.solve(self.factors, residual, wanted, self.values, z, dots)
             return
         if self._at_places:
             given = residual, self.places, self.held, self.count, self.idle, wanted, self.net.blocks

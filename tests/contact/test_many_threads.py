@@ -1,0 +1,94 @@
+"""What a thread each finds, as on a GPU, is what one thread finds that walks along everything."""
+
+import numpy as np
+import pytest
+import warp as wp
+from brute_force import listed, scene, upload
+
+import ddg_warp as ddg
+from ddg_warp import arrays
+from ddg_warp.solve.contact import pairs, tree
+from ddg_warp.solve.contact.broad_phase import BroadPhase
+
+REACH, MARGIN = 0.004, 0.01
+
+
+@pytest.fixture
+def many(monkeypatch):
+    """Makes what follows take a thread each, and what meets lie in several parts."""
+
+    def switch():
+        monkeypatch.setattr(arrays, "serial", lambda device: False)
+        monkeypatch.setattr(pairs, "LEAST", 16)
+
+    return switch
+
+
+@pytest.mark.parametrize("worlds", [1, 3])
+def test_candidates_are_the_same(device, many, worlds):
+    shapes, points = scene(1, 0.3)
+    rng = np.random.default_rng(1)
+    x = upload(np.concatenate([points + 1e-3 * rng.normal(size=points.shape) for _ in range(worlds)]), device)
+    one = listed(BroadPhase(shapes, x, worlds, reach=REACH, margin=MARGIN))
+    many()
+    search = BroadPhase(shapes, x, worlds, reach=REACH, margin=MARGIN)
+    assert max(len(side._found) for side in search.lists) > 4
+    for found, other in zip(one, listed(search), strict=True):
+        np.testing.assert_array_equal(found, other)
+
+
+def test_walks_go_along_a_morton_curve(device):
+    """World by world; in each, keys of three times ten bits grow, and boxes outside of the room are at its sides."""
+    rng, count = np.random.default_rng(2), 200
+    for worlds in (1, 3):
+        boxes = tree.Boxes(count, worlds, wp.get_device(device))
+        order = tree.WalkOrder(boxes)
+        for away in (0.0, 5.0):  # the second time some have left the room, which stays
+            lower = rng.uniform(size=(worlds * count, 3))
+            lower[::7] += away
+            boxes.lower.assign(lower.astype(np.float32))
+            boxes.upper.assign((lower + 0.01).astype(np.float32))
+            order()
+            if not away:
+                center, size = 0.5 * (lower.min(0) + lower.max(0) + 0.01), 2.0 * np.ptp(lower, axis=0).max() + 0.02
+            cells = np.clip((lower + 0.005 - center + 0.5 * size) * 1024.0 / size, 0, 1023).astype(int)
+            numbers = order.numbers.numpy()[: worlds * count]
+            assert sorted(numbers) == list(range(worlds * count))
+            assert (np.diff(numbers // count) >= 0).all()
+            bits = (cells[:, :, None] >> np.arange(10)) & 1
+            keys = (bits << (3 * np.arange(10) + np.arange(3)[:, None])).sum((1, 2)) >> (2 if worlds > 1 else 0)
+            keys = keys[numbers].reshape(worlds, count)
+            assert (np.diff(keys, axis=1) >= 0).all()
+
+
+def crossed_layers() -> ddg.Scene:
+    """Two layers of rods that fall onto each other and a plane, with friction."""
+    model = ddg.Scene(mass_damping=0.5)
+    s = np.linspace(-0.1, 0.1, 13)
+    for layer in range(2):
+        for k in range(3):
+            points = np.zeros((13, 3))
+            points[:, layer], points[:, 1 - layer], points[:, 2] = s, 0.05 * (k - 1), 0.004 + 0.006 * layer
+            points[:, 2] += 1e-3 * np.sin(20.0 * s + k)
+            model.add_rod(points, section=ddg.Circle(2e-3), material=ddg.Material(1e7, 0.4, 1200.0))
+    model.add_obstacle(ddg.Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
+    model.contact(range=1e-3, stiffness=100.0, friction=0.3, velocity=1e-2)
+    return model
+
+
+def test_steps_are_the_same(device, many):
+    """Sums are taken in other orders, so but for rounding, which 40 steps with impacts make grow."""
+    found = []
+    for _ in range(2):
+        model = crossed_layers().build(device)
+        integrator, state = ddg.Integrator(model, rtol=1e-9), model.state()
+        for _ in range(40):
+            state = integrator.step(state, 1 / 480)
+        statistics = integrator.statistics()
+        found.append((state.points(), state.velocities(), statistics["contact"]["contacts"]["mean"]))
+        assert statistics["pcg_iterations"] > 100
+        many()
+    assert found[0][2] > 5
+    assert found[0][2] == found[1][2]
+    np.testing.assert_allclose(found[1][0], found[0][0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found[1][1], found[0][1], rtol=0, atol=1e-6)

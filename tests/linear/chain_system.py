@@ -1,0 +1,20 @@
+"""Random definite matrices of chains, as bands and dense."""
+
+import numpy as np
+
+
+def system(nb: int, counts: tuple[int, ...], rng, span: int = 2) -> tuple[np.ndarray, list]:
+    """Bands (3 nb^2, nodes, columns) of definite matrices of chains of so many nodes, and these matrices."""
+    bands, matrices = np.zeros((3, nb, nb, max(counts), len(counts))), []
+    for column, n in enumerate(counts):
+        L = np.zeros((n, nb, n, nb))
+        for k in range(n):
+            for back in range(min(span + 1, k + 1)):
+                L[k, :, k - back] = rng.normal(size=(nb, nb))
+        L = L.reshape(n * nb, n * nb)
+        H = (L @ L.T + 0.5 * np.eye(n * nb)).reshape(n, nb, n, nb)
+        matrices.append(H.reshape(n * nb, n * nb))
+        for k in range(n):
+            for ahead in range(min(span + 1, n - k)):
+                bands[ahead, :, :, k, column] = H[k, :, k + ahead]
+    return bands.reshape(3 * nb**2, max(counts), len(counts)), matrices

@@ -1,0 +1,115 @@
+"""Chains that are eliminated from both ends, against dense solves."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import warp as wp
+from chain_system import system
+
+from ddg_warp import arrays
+from ddg_warp.kernels.matrix.chain_places import place_dofs
+from ddg_warp.solve.net.both_ends import BothEnds
+
+COUNTS = (1, 2, 3, 4, 5, 6, 17, 32, 33)
+LONGEST, WIDTH = max(COUNTS), len(COUNTS)
+FROM = np.cumsum([0, *COUNTS])  # node that chains start with
+
+
+def layout(twist: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Places (2, longest, chains) of nodes one after the other, with angles after all of them, and a dof (longest, chains) held."""
+    places, held = np.full((2, LONGEST, WIDTH), -1), np.zeros((LONGEST, WIDTH), np.uint8)
+    for c, n in enumerate(COUNTS):
+        places[0, :n, c] = np.arange(FROM[c], FROM[c] + n)
+        if twist:
+            places[1, : n - 1, c] = FROM[-1] + np.arange(FROM[c], FROM[c] + n - 1)
+        held[n // 3, c] = 2  # y
+    return places, held
+
+
+def constrained(bands: np.ndarray, matrices: list, places: np.ndarray, held: np.ndarray, nb: int) -> list[np.ndarray]:
+    """Make rows and columns of dofs that are held, or not there, those of the identity in both; and which are free."""
+    free = []
+    bands = bands.reshape(3, nb, nb, LONGEST, WIDTH)
+    for c, (n, H) in enumerate(zip(COUNTS, matrices, strict=True)):
+        own = np.array([[not held[k, c] >> d & 1 for d in range(nb)] for k in range(n)])
+        if nb > 3:
+            own[:, 3] &= places[1, :n, c] >= 0
+        off = ~own.ravel()
+        H[off] = H[:, off] = 0.0
+        H[off, off] = 1.0
+        blocks = H.reshape(n, nb, n, nb)
+        for k in range(n):
+            for ahead in range(min(3, n - k)):
+                bands[ahead, :, :, k, c] = blocks[k, :, k + ahead]
+        free.append(own)
+    return free
+
+
+@pytest.mark.parametrize(("twist", "span"), [(False, 1), (False, 2), (True, 2)])
+@pytest.mark.parametrize("in_place", [False, True])
+def test_solutions_are_those_of_dense_solves(device, twist, span, in_place):
+    """Of two worlds, of which the second wants nothing, and of all chains but one that is idle; what these have is left alone."""
+    rng, nb, worlds, idle = np.random.default_rng(5), place_dofs(twist), 2, 4
+    places, held = layout(twist)
+    bands, matrices = system(nb, COUNTS, rng, span)
+    free = constrained(bands, matrices, places, held, nb)
+    total = FROM[-1] * (2 if twist else 1)
+    columns = worlds * WIDTH
+    given = (
+        arrays.upload(places.astype(np.int32), int, device),
+        arrays.upload(held, wp.uint8, device),
+        wp.array(COUNTS, dtype=int, device=device),
+        wp.array(np.arange(columns) % WIDTH == idle, dtype=int, device=device),
+    )
+    both = BothEnds(SimpleNamespace(twist=twist, span=span, block=nb), wp.float64, device, given, total, columns, 32)
+    rows = np.concatenate([np.tile(bands, (1, 1, worlds)), np.zeros((nb, LONGEST, columns))])
+    factors = arrays.upload(rows, wp.float64, device)
+    matrix = factors if in_place else arrays.upload(rows[:-nb], wp.float64, device)
+    wanted, lost = wp.array([1, 0], dtype=int, device=device), wp.zeros(worlds, dtype=int, device=device)
+    residual = rng.normal(size=(worlds * total, 3))
+    z = wp.array(np.full((worlds * total, 3), 7.0), dtype=wp.vec3d, device=device)
+    dots = wp.array(np.full((worlds, total), 7.0), dtype=wp.float64, device=device)
+    values = arrays.allocate((nb, LONGEST, columns), wp.float64, device)
+    both.factorise(matrix, wanted, factors, lost)
+    both.solve(factors, wp.array(residual, dtype=wp.vec3d, device=device), wanted, values, z, dots)
+    z, dots = z.numpy(), dots.numpy()
+    assert (lost.numpy() == 0).all()
+    assert (z[total:] == 7.0).all()
+    assert (dots[1] == 7.0).all()
+    for c, (n, H) in enumerate(zip(COUNTS, matrices, strict=True)):
+        nodes = np.arange(FROM[c], FROM[c] + n)
+        if c == idle:
+            assert (z[nodes] == 7.0).all()
+            continue
+        right = np.zeros((n, nb))
+        right[:, :3] = residual[nodes]
+        if twist:
+            right[:-1, 3] = residual[FROM[-1] + nodes[:-1], 0]
+        found = np.linalg.solve(H, (right * free[c]).ravel()).reshape(n, nb)
+        np.testing.assert_allclose(z[nodes], found[:, :3], rtol=0, atol=1e-11 * abs(found).max())
+        np.testing.assert_allclose(dots[0, nodes], (residual[nodes] * z[nodes]).sum(1), rtol=1e-12, atol=1e-14)
+        if twist:
+            angles = FROM[-1] + nodes[:-1]
+            np.testing.assert_allclose(z[angles, 0], found[:-1, 3], rtol=0, atol=1e-11 * abs(found).max())
+            np.testing.assert_allclose(dots[0, angles], residual[angles, 0] * z[angles, 0], rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("place", [0, 3, 4, 7])
+def test_negative_pivots_are_noted(device, place):
+    """Wherever they are: on either side, or at one of the places in the middle."""
+    n, nb = 8, 3
+    bands = np.zeros((3 * nb**2 + nb, n, 1))
+    bands[: nb**2 : nb + 1] = 1.0
+    bands[nb + 1, place] = -1.0
+    factors = arrays.upload(bands, wp.float64, device)
+    given = (
+        arrays.upload(np.arange(n, dtype=np.int32).reshape(1, n, 1), int, device),
+        arrays.upload(np.zeros((n, 1), np.uint8), wp.uint8, device),
+        wp.full(1, n, dtype=int, device=device),
+        wp.zeros(1, dtype=int, device=device),
+    )
+    both = BothEnds(SimpleNamespace(twist=False, span=2, block=nb), wp.float64, device, given, n, 1, 32)
+    lost = wp.zeros(1, dtype=int, device=device)
+    both.factorise(factors, wp.full(1, 1, dtype=int, device=device), factors, lost)
+    assert lost.numpy()[0] == 1
