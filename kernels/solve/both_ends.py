@@ -9,7 +9,8 @@ which are those of the side that it belongs to. Not of edges that are split (`ke
 that its edge ends at, and has to come after both of its nodes. From the other end it would come before one of them, with the slack
 alone as its pivot where the other is held, and all digits that it is there for would be lost.
 
-10,000 chains of 32 places, an H200, float32: load, solve and finish of `elimination` took 82 us, half of it for memory to answer.
+10,000 chains of 32 places, an H200, float32: 49 us, where load, solve and finish of `elimination` take 82; 64 us if a thread reads
+which dofs a place has only when it needs them. The factors take 26 us at 4 TB/s.
 """
 
 from functools import cache

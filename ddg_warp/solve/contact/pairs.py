@@ -16,6 +16,7 @@ from ddg_warp.solve.contact.tree import Things
 
 # Parts of what meets, where each has as many bundles at least: so they are about as full. Of 310,000 bundles 64 are as fast as 1024.
 PARTS, LEAST = 64, 1024
+LINE = 32  # integers of a line of the cache, in which there is one counter
 
 
 class RunningSums:
@@ -87,7 +88,8 @@ class PairList:
         self._gaps, self._passing = gap_kernel(kind, real), passing_kernel(kind, real)
         self.count = wp.zeros(1, dtype=int, device=self.device)
         parts = 1 if arrays.serial(self.device) else min(max(first.leaves.all // LEAST, 1), PARTS)
-        self._found = wp.zeros(parts, dtype=int, device=self.device)
+        self._counters = wp.zeros((parts, LINE), dtype=int, device=self.device)
+        self._found = self._counters[:, 0]
         # the most pairs of any search since there was room for so many, and those whose boxes met
         self._needed = wp.zeros(2, dtype=int, device=self.device)
         self.kernels = [self._meet, self._judge, self._fill, self._gaps, self._passing, *self._sums.kernels]
@@ -130,7 +132,7 @@ class PairList:
 
     def meet(self) -> None:
         """Find the bundles whose boxes meet; see `kernels.contact.candidates`."""
-        self._found.zero_()
+        self._counters.zero_()
         outputs = [self._found, self._met]
         wp.launch(self._meet, self.first.leaves.all, [self.trees], outputs, device=self.device)
 
