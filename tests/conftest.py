@@ -3,9 +3,21 @@
 import numpy as np
 import pytest
 
+from ddg_warp import arrays
+
 
 def pytest_addoption(parser):
     parser.addoption("--device", default="cpu", help="Warp device that the tests run on (default: cpu)")
+    parser.addoption(
+        "--many-threads",
+        action="store_true",
+        help="have kernels take a thread a thing on the CPU, too, as they do on CUDA",
+    )
+
+
+def pytest_configure(config):
+    if config.getoption("--many-threads"):
+        arrays.serial = lambda device: False
 
 
 def pytest_collection_modifyitems(config, items):

@@ -13,6 +13,7 @@ from ddg_warp.solve.contact.shapes import PLANES
 # with leaves of single edges, 28 of two and 25 of four, among 512 strands of hair 14, 11 and 8; among 10,000 strands an H200 takes 1.5,
 # 2.1 and, of three, 3.3 ms, as what meets is judged edge by edge, and ten times as many meet as are near.
 BUNDLE = 1, 4
+WALKERS = 1, 2  # sizes of what looks for others in their trees: points and edges
 
 
 class Boxes:
@@ -82,7 +83,7 @@ class Things:
     Attributes:
         count: in one world; all: in all worlds; surface: see `surface_struct`; lower, upper: corners of boxes (all,).
         bundles: of one world, the things that bundles start with, and how many there are; bundle: things of the largest one.
-        leaves: boxes of bundles, and their tree; walked: whether there is one; order: in which walks take them, None if by number.
+        leaves: boxes of bundles, and their tree; walked: whether there is a tree; order: in which walks take them, None if by number.
     """
 
     def __init__(self, shapes, size: int, worlds: int, real, device, radius: wp.array):
@@ -105,8 +106,8 @@ class Things:
         self._single = self.bundle == 1
         corners = (self.lower, self.upper) if self._single else None
         self.leaves = Boxes(len(starts) - 1, worlds, device, corners)
-        self.walked = size != 1  # others have no tree, and planes no walks
-        self.order = None if arrays.serial(device) or size == PLANES else WalkOrder(self.leaves)
+        self.walked = size != 1  # points look for others, which do not look for them
+        self.order = WalkOrder(self.leaves) if size in WALKERS and not arrays.serial(device) else None
         self._enclose = box_kernel(nodes.shape[1], size == PLANES, real)
         self.kernels = [self._enclose] if self._single else [self._enclose, bundle]
         self.kernels += [encode] if self.order else []
