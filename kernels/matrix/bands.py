@@ -12,7 +12,7 @@ from ddg_warp.kernels.islands import CARRIED, WANTED
 from ddg_warp.kernels.matrix.block_band import TILE, block_functions
 from ddg_warp.kernels.matrix.chain_blocks import blocks_function, layout_type
 from ddg_warp.kernels.matrix.chain_places import behind_function, place_dofs, value_function
-from ddg_warp.kernels.matrix.sliced import BARRED, product_functions
+from ddg_warp.kernels.matrix.sliced import BARRED, product_functions, settle_function
 from ddg_warp.kernels.net.places import along_type
 from ddg_warp.kernels.terms import Term
 from ddg_warp.kernels.threads import CPU_OPTIONS, first_of, until_function
@@ -62,7 +62,7 @@ def band_kernels(
     Mass, Layout, Along, until = mass_type(real, drag), layout_type(), along_type(real, linear), until_function(serial)
     load, store, _, _ = block_functions(nb, linear)
     along, back = times_functions(nb, linear)
-    times, free = product_functions(linear)
+    settle = settle_function(linear)
     blocks_at = blocks_function(terms, twist, span, real, linear, exact_from, drag, split)
     value = value_function(twist, linear, split)
 
@@ -102,31 +102,6 @@ def band_kernels(
         if wanted[w] != 0:
             for j in range(9):
                 matrix[j, taken[i] + w * positions] = linear(0.0)
-
-    @wp.func
-    def settle(
-        matrix: wp.array2d(dtype=linear),
-        columns: wp.array(dtype=int),
-        slices: wp.array(dtype=int),
-        barred: wp.array(dtype=wp.uint8),
-        p: wp.array(dtype=H),
-        blocks: int,
-        positions: int,
-        b: int,
-        w: int,
-        y: H,
-        product_out: wp.array(dtype=H),
-        dots_out: wp.array2d(dtype=linear),
-    ):
-        """The product in a block, with what bands bring to it."""
-        i = b + w * blocks
-        if barred[i] == BARRED:
-            y = H()
-        else:
-            y += times(matrix, columns, slices, p, b, w * positions, w * blocks)
-            y = wp.cw_mul(y, free(barred[i]))
-        product_out[i] = y
-        dots_out[w, b] = wp.dot(p[i], y)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def product(

@@ -78,18 +78,63 @@ def gather_function(twist: bool, linear, split: bool = False):
 
 
 @cache
-def value_function(twist: bool, linear, split: bool = False):
-    """value(v, places, k, c, shift): the same by the place."""
-    H, gather = wp.types.vector(3, linear), gather_function(twist, linear, split)
+def angle_function(twist: bool):
+    """angle_of(places, k, c): the block of the angle of a place, -1 without."""
 
     @wp.func
-    def value(v: wp.array(dtype=H), places: wp.array3d(dtype=int), k: int, c: int, shift: int):
+    def angle_of(places: wp.array3d(dtype=int), k: int, c: int):
         angle = int(-1)
         if wp.static(twist):
             angle = places[1, k, c]
-        return gather(v, places[0, k, c], angle, shift)
+        return angle
+
+    return angle_of
+
+
+@cache
+def value_function(twist: bool, linear, split: bool = False):
+    """value(v, places, k, c, shift): as `gather_function`, by the place."""
+    H, gather, angle_of = wp.types.vector(3, linear), gather_function(twist, linear, split), angle_function(twist)
+
+    @wp.func
+    def value(v: wp.array(dtype=H), places: wp.array3d(dtype=int), k: int, c: int, shift: int):
+        return gather(v, places[0, k, c], angle_of(places, k, c), shift)
 
     return value
+
+
+@cache
+def solve_functions(twist: bool, linear, split: bool = False):
+    """Of chains that are all that there is to a solve.
+
+    right(v, node, angle, held, shift): what stands on the right for a place, nothing for what is held; hand(u, b, node, angle, w,
+    shift, z, dots): its solution u, of a residual b, to its blocks in world w.
+    """
+    H, B = wp.types.vector(3, linear), wp.types.vector(place_dofs(twist, split), linear)
+    free_of, _ = place_functions(twist, linear, split)
+    gather = gather_function(twist, linear, split)
+
+    @wp.func
+    def right(v: wp.array(dtype=H), node: int, angle: int, held: wp.uint8, shift: int):
+        u = gather(v, node, angle, shift)
+        if held != wp.uint8(0):
+            u = wp.cw_mul(u, free_of(held))
+        return u
+
+    @wp.func
+    def hand(
+        u: B, b: B, node: int, angle: int, w: int, shift: int, z: wp.array(dtype=H), dots_out: wp.array2d(dtype=linear)
+    ):
+        if node >= 0:
+            y = H(u[0], u[1], u[2])
+            z[node + shift] = y
+            dots_out[w, node] = wp.dot(H(b[0], b[1], b[2]), y)
+        if wp.static(twist):
+            if angle >= 0:
+                z[angle + shift] = H(u[3], linear(0.0), linear(0.0))
+                dots_out[w, angle] = b[3] * u[3]
+
+    return right, hand
 
 
 def splits(term: Term) -> bool:

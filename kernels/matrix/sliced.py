@@ -278,3 +278,36 @@ def product_functions(linear):
         return y
 
     return times, free
+
+
+@cache
+def settle_function(linear):
+    """settle(...): writes H p of a block with y, what else comes to it, on dofs that are not barred, and p . H p."""
+    H = wp.types.vector(3, linear)
+    times, free = product_functions(linear)
+
+    @wp.func
+    def settle(
+        matrix: wp.array2d(dtype=linear),
+        columns: wp.array(dtype=int),
+        slices: wp.array(dtype=int),
+        barred: wp.array(dtype=wp.uint8),
+        p: wp.array(dtype=H),
+        blocks: int,
+        positions: int,
+        b: int,
+        w: int,
+        y: H,
+        product_out: wp.array(dtype=H),
+        dots_out: wp.array2d(dtype=linear),
+    ):
+        i = b + w * blocks
+        if barred[i] == BARRED:
+            y = H()
+        else:
+            y += times(matrix, columns, slices, p, b, w * positions, w * blocks)
+            y = wp.cw_mul(y, free(barred[i]))
+        product_out[i] = y
+        dots_out[w, b] = wp.dot(p[i], y)
+
+    return settle

@@ -18,7 +18,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.matrix.block_band import block_functions
-from ddg_warp.kernels.matrix.chain_places import gather_function, place_dofs, place_functions
+from ddg_warp.kernels.matrix.chain_places import angle_function, gather_function, place_dofs, solve_functions
 from ddg_warp.kernels.solve import pivot
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
@@ -43,6 +43,28 @@ def factor_kernels(twist: bool, span: int, linear):
     M = wp.types.matrix((nb, nb), linear)
     load, store, _, put = block_functions(nb, linear)
     factor, lower, upper, _, _, congruence = pivot.functions(nb, linear)
+
+    @wp.func
+    def eliminate(D: M, E: M, F: M, factors: wp.array3d(dtype=linear), k: int, r: int):
+        """Writes the factors of a place.
+
+        Returns what that takes from the block of the next place, from what couples that one to the place after it and from the block of
+        the latter, and how many pivots were lost.
+        """
+        L, inverse, bad = factor(D)
+        Zb = lower(L, E)
+        store(factors, 0, k, r, upper(L, inverse, Zb))
+        taken = congruence(Zb, inverse, Zb)
+        couple = M()
+        beyond = M()
+        if wp.static(span == 2):
+            Zc = lower(L, F)
+            store(factors, wp.static(nb2), k, r, upper(L, inverse, Zc))
+            couple = congruence(Zb, inverse, Zc)
+            beyond = congruence(Zc, inverse, Zc)
+        store(factors, wp.static(2 * nb2), k, r, L)
+        put(factors, wp.static(3 * nb2), k, r, inverse)
+        return taken, couple, beyond, bad
 
     @wp.func
     def coupling(blocks: wp.array3d(dtype=linear), which: int, j: int, n: int, side: int, r: int):
@@ -90,19 +112,11 @@ def factor_kernels(twist: bool, span: int, linear):
             if wp.static(span == 2):
                 F_ahead = coupling(blocks, 2, ahead, n, side, r)
             if j >= 0:
-                k = place_of(j, n, side)
-                L, inverse, own = factor(D - minus)
+                taken, couple, beyond, own = eliminate(D - minus, E - minus_couple, F, factors, place_of(j, n, side), r)
                 bad += own
-                Zb = lower(L, E - minus_couple)
-                store(factors, 0, k, r, upper(L, inverse, Zb))
-                minus = minus_next + congruence(Zb, inverse, Zb)
-                if wp.static(span == 2):
-                    Zc = lower(L, F)
-                    store(factors, wp.static(nb2), k, r, upper(L, inverse, Zc))
-                    minus_couple = congruence(Zb, inverse, Zc)
-                    minus_next = congruence(Zc, inverse, Zc)
-                store(factors, wp.static(2 * nb2), k, r, L)
-                put(factors, wp.static(3 * nb2), k, r, inverse)
+                minus = minus_next + taken
+                minus_couple = couple
+                minus_next = beyond
             D = D_ahead
             E = E_ahead
             F = F_ahead
@@ -131,18 +145,13 @@ def factor_kernels(twist: bool, span: int, linear):
         D = load(blocks, 0, h, r) - load(taken, 0, 1, r)
         if h > 0:
             A = load(blocks, 0, h - 1, r) - load(taken, 0, 0, r) - load(taken, wp.static(2 * nb2), 1, r)
-            L, inverse, own = factor(A)
-            bad += own
             E = load(blocks, wp.static(nb2), h - 1, r) - load(taken, wp.static(nb2), 0, r)
-            Z = lower(L, E - wp.transpose(load(taken, wp.static(nb2), 1, r)))
-            D = D - load(taken, wp.static(2 * nb2), 0, r) - congruence(Z, inverse, Z)
-            store(factors, 0, h - 1, r, upper(L, inverse, Z))
-            store(factors, wp.static(2 * nb2), h - 1, r, L)
-            put(factors, wp.static(3 * nb2), h - 1, r, inverse)
-        L, inverse, own = factor(D)
-        bad += own
-        store(factors, wp.static(2 * nb2), h, r, L)
-        put(factors, wp.static(3 * nb2), h, r, inverse)
+            E = E - wp.transpose(load(taken, wp.static(nb2), 1, r))
+            own, _couple, _beyond, number = eliminate(A, E, M(), factors, h - 1, r)
+            bad += number
+            D = D - load(taken, wp.static(2 * nb2), 0, r) - own
+        _own, _couple, _beyond, number = eliminate(D, M(), M(), factors, h, r)
+        bad += number
         if bad > 0:
             lost[w] = 1
 
@@ -160,44 +169,8 @@ def solve_kernels(twist: bool, span: int, linear):
     H, B, M = wp.types.vector(3, linear), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     load, _, vector, put = block_functions(nb, linear)
     _, _, _, lower_vector, upper_vector, _ = pivot.functions(nb, linear)
-    free_of, _ = place_functions(twist, linear)
-    gather = gather_function(twist, linear)
-
-    @wp.func
-    def angle_of(places: wp.array3d(dtype=int), k: int, c: int):
-        angle = int(-1)
-        if wp.static(twist):
-            angle = places[1, k, c]
-        return angle
-
-    @wp.func
-    def right(residual: wp.array(dtype=H), node: int, angle: int, held: wp.uint8, first: int):
-        """What stands on the right for a place; nothing for what is held."""
-        u = gather(residual, node, angle, first)
-        if held != wp.uint8(0):
-            u = wp.cw_mul(u, free_of(held))
-        return u
-
-    @wp.func
-    def hand(
-        u: B,
-        b: B,
-        node: int,
-        angle: int,
-        w: int,
-        first: int,
-        z: wp.array(dtype=H),
-        dots_out: wp.array2d(dtype=linear),
-    ):
-        """The solution at a place, of a residual b, to the blocks that it has."""
-        if node >= 0:
-            y = H(u[0], u[1], u[2])
-            z[node + first] = y
-            dots_out[w, node] = wp.dot(H(b[0], b[1], b[2]), y)
-        if wp.static(twist):
-            if angle >= 0:
-                z[angle + first] = H(u[3], linear(0.0), linear(0.0))
-                dots_out[w, angle] = b[3] * u[3]
+    gather, angle_of = gather_function(twist, linear), angle_function(twist)
+    right, hand = solve_functions(twist, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def inward(

@@ -28,7 +28,13 @@ from ddg_warp.kernels.matrix.block_band import (
     substitute_all_function,
     substitute_function,
 )
-from ddg_warp.kernels.matrix.chain_places import place_dofs, place_functions, value_function
+from ddg_warp.kernels.matrix.chain_places import (
+    angle_function,
+    place_dofs,
+    place_functions,
+    solve_functions,
+    value_function,
+)
 from ddg_warp.kernels.matrix.sliced import BARRED
 from ddg_warp.kernels.solve.joints import coupling_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS, first_of, until_function
@@ -41,8 +47,8 @@ def walk_places_kernel(twist: bool, span: int, linear, split: bool = False):
     H = wp.types.vector(3, linear)
     _, _, vector, put = block_functions(nb, linear)
     substitute = substitute_function(nb, span, linear, tensions=int(split))
-    free_of, _ = place_functions(twist, linear, split)
-    value = value_function(twist, linear, split)
+    right, hand = solve_functions(twist, linear, split)
+    value, angle_of = value_function(twist, linear, split), angle_function(twist)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def solve(
@@ -65,24 +71,11 @@ def walk_places_kernel(twist: bool, span: int, linear, split: bool = False):
             return
         n, first = count[c], first_of(w, blocks)
         for k in range(n):
-            u = value(residual, places, k, c, first)
-            if held[k, c] != wp.uint8(0):
-                u = wp.cw_mul(u, free_of(held[k, c]))
-            put(values, 0, k, r, u)
+            put(values, 0, k, r, right(residual, places[0, k, c], angle_of(places, k, c), held[k, c], first))
         _product = substitute(factors, values, values, n, r, r)
         for k in range(n):
-            u = vector(values, 0, k, r)
-            node = places[0, k, c]
-            if node >= 0:
-                y = H(u[0], u[1], u[2])
-                z[node + first] = y
-                dots_out[w, node] = wp.dot(residual[node + first], y)
-            if wp.static(twist):
-                angle = places[1, k, c]
-                if angle >= 0:
-                    y = H(u[3], linear(0.0), linear(0.0))
-                    z[angle + first] = y
-                    dots_out[w, angle] = wp.dot(residual[angle + first], y)
+            b = value(residual, places, k, c, first)
+            hand(vector(values, 0, k, r), b, places[0, k, c], angle_of(places, k, c), w, first, z, dots_out)
 
     return solve
 

@@ -9,7 +9,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.matrix.sliced import BARRED, product_functions
+from ddg_warp.kernels.matrix.sliced import BARRED, product_functions, settle_function
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
 TILE = 4096  # entries that one block of threads sums
@@ -93,7 +93,8 @@ def solver_kernels(linear, indefinite: bool = False):
     Saunders (SIAM J. Numer. Anal. 12, 1975, 617), each of which there is unless a curvature is zero.
     """
     H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
-    times, free = product_functions(linear)
+    _, free = product_functions(linear)
+    settle = settle_function(linear)
     inverse_of = inverse_function(linear)
     eps = wp.constant(linear(2.3e-16 if linear == wp.float64 else 1.2e-7))
 
@@ -210,12 +211,7 @@ def solver_kernels(linear, indefinite: bool = False):
         w = i / blocks
         if wanted[w] != 1:
             return
-        k = i - w * blocks
-        y = H()
-        if barred[i] != BARRED:
-            y = wp.cw_mul(times(matrix, columns, slices, p, k, w * positions, w * blocks), free(barred[i]))
-        product_out[i] = y
-        dots_out[w, k] = wp.dot(p[i], y)
+        settle(matrix, columns, slices, barred, p, blocks, positions, i - w * blocks, w, H(), product_out, dots_out)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def advance(

@@ -13,7 +13,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.matrix.chain_places import place_dofs, place_functions, value_function
+from ddg_warp.kernels.matrix.chain_places import angle_function, place_dofs, solve_functions
 from ddg_warp.kernels.solve.cyclic_reduction import block_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
@@ -186,8 +186,8 @@ def again_at_places_kernel(twist: bool, linear):
     """The same of a net's chains, from the residual r of its blocks to z, and r . z block by block; see `matrix.chain_places`."""
     nb = place_dofs(twist)
     H, parts = wp.types.vector(3, linear), 1 + twist  # blocks of a place: its node, and the angle of the edge ahead
-    solve, value = again_functions(nb, linear), value_function(twist, linear)
-    free_of, _ = place_functions(twist, linear)
+    solve, angle_of = again_functions(nb, linear), angle_function(twist)
+    right, _ = solve_functions(twist, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def again(
@@ -221,9 +221,7 @@ def again_at_places_kernel(twist: bool, linear):
             for d in range(wp.static(nb)):
                 rest[r, j, at + d] = linear(0.0)
             if k < n:
-                u = value(residual, places, k, c, first)
-                if held[k, c] != wp.uint8(0):
-                    u = wp.cw_mul(u, free_of(held[k, c]))
+                u = right(residual, places[0, k, c], angle_of(places, k, c), held[k, c], first)
                 for d in range(wp.static(nb)):
                     rest[r, j, at + d] = u[d]
         solve(packed, r, t, threads, blocks, rest, found)

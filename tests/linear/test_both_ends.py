@@ -62,7 +62,7 @@ def test_solutions_are_those_of_dense_solves(device, twist, span, in_place):
         wp.array(COUNTS, dtype=int, device=device),
         wp.array(np.arange(columns) % WIDTH == idle, dtype=int, device=device),
     )
-    both = BothEnds(SimpleNamespace(twist=twist, span=span, block=nb), wp.float64, device, given, total, columns, 32)
+    both = BothEnds(SimpleNamespace(twist=twist, span=span, block=nb), columns, wp.float64, device, 32)
     rows = np.concatenate([np.tile(bands, (1, 1, worlds)), np.zeros((nb, LONGEST, columns))])
     factors = arrays.upload(rows, wp.float64, device)
     matrix = factors if in_place else arrays.upload(rows[:-nb], wp.float64, device)
@@ -71,8 +71,9 @@ def test_solutions_are_those_of_dense_solves(device, twist, span, in_place):
     z = wp.array(np.full((worlds * total, 3), 7.0), dtype=wp.vec3d, device=device)
     dots = wp.array(np.full((worlds, total), 7.0), dtype=wp.float64, device=device)
     values = arrays.allocate((nb, LONGEST, columns), wp.float64, device)
-    both.factorise(matrix, wanted, factors, lost)
-    both.solve(factors, wp.array(residual, dtype=wp.vec3d, device=device), wanted, values, z, dots)
+    both.factorise(matrix, *given[2:], wanted, factors, lost)
+    at = wp.array(residual, dtype=wp.vec3d, device=device), *given, wanted, total
+    both.solve(factors, at, values, z, dots)
     z, dots = z.numpy(), dots.numpy()
     assert (lost.numpy() == 0).all()
     assert (z[total:] == 7.0).all()
@@ -103,13 +104,8 @@ def test_negative_pivots_are_noted(device, place):
     bands[: nb**2 : nb + 1] = 1.0
     bands[nb + 1, place] = -1.0
     factors = arrays.upload(bands, wp.float64, device)
-    given = (
-        arrays.upload(np.arange(n, dtype=np.int32).reshape(1, n, 1), int, device),
-        arrays.upload(np.zeros((n, 1), np.uint8), wp.uint8, device),
-        wp.full(1, n, dtype=int, device=device),
-        wp.zeros(1, dtype=int, device=device),
-    )
-    both = BothEnds(SimpleNamespace(twist=False, span=2, block=nb), wp.float64, device, given, n, 1, 32)
+    both = BothEnds(SimpleNamespace(twist=False, span=2, block=nb), 1, wp.float64, device, 32)
+    count, idle = wp.full(1, n, dtype=int, device=device), wp.zeros(1, dtype=int, device=device)
     lost = wp.zeros(1, dtype=int, device=device)
-    both.factorise(factors, wp.full(1, 1, dtype=int, device=device), factors, lost)
+    both.factorise(factors, count, idle, wp.full(1, 1, dtype=int, device=device), factors, lost)
     assert lost.numpy()[0] == 1

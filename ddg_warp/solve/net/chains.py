@@ -148,8 +148,7 @@ class Chains:
         if serial and not (self.joints or self.reduction):
             self._walk_places = elimination.walk_places_kernel(plan.twist, plan.span, linear, self.split)
         if not (serial or self.joints or self.reduction or self.split):
-            given = self.places, self.held, self.count, self.idle
-            self._both = BothEnds(plan, linear, device, given, net.blocks, self.columns, SERIAL)
+            self._both = BothEnds(plan, self.columns, linear, device, SERIAL)
         if self.split:
             self.longer = arrays.allocate((2, self.longest, self.columns), linear, device)
             self._lengthen = bands.lengthen_kernel(terms, real, linear)
@@ -252,7 +251,7 @@ class Chains:
             self.reduction.factorise(self.eliminated, self._all, self._wanted, self._bad)
             self._note()
         elif self._both:
-            self._both.factorise(self.eliminated, wanted, self.factors, lost)
+            self._both.factorise(self.eliminated, self.count, self.idle, wanted, self.factors, lost)
         elif not self.reduction:
             self._launch(
                 self._factorise,
@@ -269,16 +268,15 @@ class Chains:
 
         Blocks that are barred (W N,), with all bits set, keep theirs.
         """
+        at = residual, self.places, self.held, self.count, self.idle, wanted, self.net.blocks
         if self._walk_places:
-            inputs = [self.factors, residual, self.places, self.held, self.count, self.idle, wanted, self.net.blocks]
-            self._launch(self._walk_places, self.columns, inputs, [self.values, z, dots], SERIAL)
+            self._launch(self._walk_places, self.columns, [self.factors, *at], [self.values, z, dots], SERIAL)
             return
         if self._both:
-            self._both.solve(self.factors, residual, wanted, self.values, z, dots)
+            self._both.solve(self.factors, at, self.values, z, dots)
             return
         if self._at_places:
-            given = residual, self.places, self.held, self.count, self.idle, wanted, self.net.blocks
-            self.reduction.again_at_places(self.plan.twist, *given, z, dots)
+            self.reduction.again_at_places(self.plan.twist, *at, z, dots)
             return
         self._eliminate(matrix, wanted, self.values, residual, None)
         self._apply_joints(matrix, residual, barred, wanted, z, dots)
