@@ -39,6 +39,7 @@ FLAGS = (
     "bent",  # whether the predictor has to turn edges
     "moved",  # whether this part of it succeeded
     "driven",  # whether supports that contact holds up moved in the last step of the solve; see `kernels.net.touch`
+    "cut",  # whether contact has cut the last motion, of the predictor or of a step
     # in the first column, whether any island is still active, and whether one turns the edges of a step or renews its frames; of
     # nets, whether one wants a direction
     "active",
@@ -62,8 +63,8 @@ SCALARS = (
     "portion",
 )
 (STATUS, ITERATION, UNBALANCED, DROWNED, SLOT, HALVINGS, WANTED, TODO, PLACED, STALE) = range(10)
-(CLAMPED, LOST, BAD, DETOURS, PATIENCE, CAUTIOUS, RETRIES, REASON, BENT, MOVED, DRIVEN) = range(10, 21)
-ACTIVE, TURNING, WANTING = range(21, len(FLAGS))
+(CLAMPED, LOST, BAD, DETOURS, PATIENCE, CAUTIOUS, RETRIES, REASON, BENT, MOVED, DRIVEN, CUT) = range(10, 22)
+ACTIVE, TURNING, WANTING = range(22, len(FLAGS))
 (COEFFICIENT, RATE, LOAD_SCALE, RESIDUAL, STEP_LENGTH, DECREMENT, MERIT, ANGLE_CHANGE) = range(8)
 CARRIED, TURN, PROGRESS, PORTION = range(8, len(SCALARS))
 DETOURS_ALLOWED, LEAST = 30, 0.125  # by parts of a time step that are larger than this

@@ -341,8 +341,8 @@ def test_a_net_stalls_by_what_a_whole_step_would_gain(device, length, decrease, 
     real, n = wp.float64, 4 * STALLED
     judge = search_kernels(real, real, True, False, False)[0]
     islands = Islands(1, real, device)
-    change, noise, square, worst, best, forcing, goal = (
-        wp.full(1, v, dtype=real, device=device) for v in (0.0, 1.0, 1.0, 1.0, 0.0, 0.1, 0.0)
+    change, noise, square, worst, best, forcing, goal, limit = (
+        wp.full(1, v, dtype=real, device=device) for v in (0.0, 1.0, 1.0, 1.0, 0.0, 0.1, 0.0, 0.0)
     )
     stalled = wp.zeros(1, dtype=int, device=device)
     for k in range(n):
@@ -350,7 +350,7 @@ def test_a_net_stalls_by_what_a_whole_step_would_gain(device, length, decrease, 
         islands.step_length.fill_(length)
         islands.decrement.fill_(decrease)
         given = [change, noise, square, worst, 1e-6, 1e-4, 10 * n, 20, 0.1, 1e-8, 0.5]
-        wp.launch(judge, 1, [*given, *islands.arrays, best, stalled, forcing, goal], device=device)
+        wp.launch(judge, 1, [*given, *islands.arrays, best, stalled, forcing, goal, limit], device=device)
         status = int(islands.status.numpy()[0])
         assert status == (outcome.CONVERGED_TO_ROUNDING if stalls and k > STALLED else outcome.ACTIVE)
 

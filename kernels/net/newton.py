@@ -9,6 +9,7 @@ from ddg_warp.kernels import outcome
 from ddg_warp.kernels.islands import (
     ACTIVE,
     CAUTIOUS,
+    CUT,
     DECREMENT,
     DRIVEN,
     DROWNED,
@@ -34,16 +35,18 @@ from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
 
 ON_THE_WAY, THERE = 2, 1  # worlds whose supports or predictor were held up: not there yet, there since the last step
 POLISH = 1e-3  # reduction to which a direction must have been solved before rounding excuses what it leaves
+FIRST = 1e-2  # to which the first direction of a crowd may be solved
 STALLED = 8  # iterations without progress, where energies drown in rounding, that a world is given
 
 
 @cache
-def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contact: bool = False):
+def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contact: bool = False, crowd: bool = False):
     """judge(...) of an iterate, measure(...) and take(...) of a direction, move(...) of the blocks.
 
     Args:
         turns: whether there are rods, whose edges turn; renews: whether there are frames, which may have to be renewed.
         contact: whether supports may be on their way; see `kernels.net.touch`.
+        crowd: whether a few of what is in a world may be out of balance; see `ddg_warp.solve.net.outliers`.
     """
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     balanced, decide = judge_functions(renews, real, contact)
@@ -68,13 +71,17 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
         stalled: wp.array(dtype=int),
         forcing: wp.array(dtype=linear),
         goal: wp.array(dtype=real),
+        limit: wp.array(dtype=real),
     ):
         """Decides by the sums over all blocks; `worst` is the largest residual over what it may be at rtol = 1.
 
         How exactly the next direction is solved follows Eisenstat and Walker (1996). Where that leaves less than a fraction `spare`
-        of the tolerance, this fraction is its `goal`. A world whose expected decrease of energy drowns in rounding, and whose
-        residual has not halved in `STALLED` iterations whose directions were solved (see `take`), has converged to rounding: on bad
-        meshes rounding leaves more than the estimate block by block.
+        of the tolerance, this fraction is its `goal`. In a crowd it is that wherever contact cuts nothing, and theirs the `limit` to
+        which it is sought: residuals of bodies that count are far smaller than the largest ones, which make up the norm.
+
+        A world whose expected decrease of energy drowns in rounding, and whose residual has not halved in `STALLED` iterations whose
+        directions were solved (see `take`), has converged to rounding: on bad meshes rounding leaves more than the estimate block by
+        block.
         """
         w = wp.tid()
         flags[WANTED, w] = 0
@@ -115,7 +122,14 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
             if not first and before > real(0.0):
                 eta = wp.clamp(real(0.9) * square[w] / before, tightest, loosest)
             enough = rtol * scalars[LOAD_SCALE, w] / worst[w]
-            goal[w] = wp.where(spare * enough >= eta, spare * rtol * scalars[LOAD_SCALE, w], real(wp.static(math.inf)))
+            till = spare * enough >= eta
+            limit[w] = tightest
+            if wp.static(crowd):
+                if flags[CUT, w] == 0:
+                    till = True
+                    limit[w] = wp.where(first, real(wp.static(FIRST)), eta)
+                    eta = loosest
+            goal[w] = wp.where(till, spare * rtol * scalars[LOAD_SCALE, w], real(wp.static(math.inf)))
             eta = wp.max(eta, wp.min(enough, real(0.5)))
             if polish:
                 eta = wp.min(eta, real(wp.static(POLISH)))

@@ -8,6 +8,7 @@ from ddg_warp.kernels import outcome
 from ddg_warp.kernels.islands import (
     ACTIVE,
     CLAMPED,
+    CUT,
     DECREMENT,
     DETOURS,
     DRIVEN,
@@ -105,6 +106,8 @@ def world_kernels(real):
         length = scalars[STEP_LENGTH, w]
         moves = modes[w] != wp.static(NONE)
         cut = moves and time[w] < real(1.0)
+        if moves:
+            flags[CUT, w] = int(cut)
         short = cut or (moves and flags[HALVINGS, w] > 0)
         if projected[w] > 0 and flags[CLAMPED, w] == 0 and (short or (moves and projected[w] <= wp.static(UNTRIED))):
             flags[CLAMPED, w] = 1
@@ -163,16 +166,18 @@ def world_kernels(real):
     def short(modes: wp.array(dtype=int), time: wp.array(dtype=real), flags: wp.array2d(dtype=int)):
         """Worlds whose predictor was cut are on their way."""
         w = wp.tid()
-        if modes[w] != wp.static(NONE) and time[w] < real(1.0):
-            flags[DRIVEN, w] = wp.static(ON_THE_WAY)
+        if modes[w] != wp.static(NONE):
+            flags[CUT, w] = int(time[w] < real(1.0))
+            if flags[CUT, w] != 0:
+                flags[DRIVEN, w] = wp.static(ON_THE_WAY)
 
     return account, modes, predicted, depart, expect, refuse, curve, again, short
 
 
 @cache
 def block_kernels(real, linear, serial: bool):
-    """gain(...) by a motion; lessen(...) the residual by a product; aim(...), push(...) and
-    arrive(...) of supports; stay(...) of worlds that do not move; part(...) with what was proposed; way(...) that is left, and
+    """gain(...) by a motion; lessen(...) the residual by a product; aim(...), push(...), land(...)
+    and arrive(...) of supports; stay(...) of worlds that do not move; part(...) with what was proposed; way(...) that is left, and
     add(...) it; keep(...) a solution."""
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     _, free = product_functions(linear)
@@ -237,6 +242,28 @@ def block_kernels(real, linear, serial: bool):
         for c in range(3):
             if ((int(fixed[k]) >> c) & 1) != 0:
                 direction[k + w * blocks][c] = linear(d[c])
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def land(
+        nodes: wp.array(dtype=int),
+        aims: wp.array2d(dtype=V),
+        fixed: wp.array(dtype=wp.uint8),
+        modes: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        blocks: int,
+        q: wp.array(dtype=V),
+    ):
+        """Supports that a whole step was to bring where they have to be are bound for there, though directions are rounded."""
+        i, w = wp.tid()
+        if modes[w] == wp.static(NONE) or flags[DRIVEN, w] == 0 or scalars[STEP_LENGTH, w] != real(1.0):
+            return
+        k = nodes[i]
+        x = q[k + w * blocks]
+        for c in range(3):
+            if ((int(fixed[k]) >> c) & 1) != 0:
+                x[c] = aims[i, w][c]
+        q[k + w * blocks] = x
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def arrive(
@@ -336,7 +363,7 @@ def block_kernels(real, linear, serial: bool):
             for k in range(start, until(start, blocks)):
                 out[k + w * blocks] = q[k + w * blocks]
 
-    return gain, lessen, aim, push, arrive, stay, part, way, add, keep
+    return gain, lessen, aim, push, land, arrive, stay, part, way, add, keep
 
 
 @cache

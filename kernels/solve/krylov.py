@@ -327,16 +327,28 @@ def confirm_kernels(real, linear):
     def confirm(
         worst: wp.array(dtype=real),
         goal: wp.array(dtype=real),
-        tightest: real,
+        number: wp.array(dtype=int),
+        most: int,
+        farthest: real,
+        limit: wp.array(dtype=real),
         forcing: wp.array(dtype=linear),
         wanted: wp.array(dtype=int),
         busy_out: wp.array(dtype=int),
     ):
-        """Sends worlds on whose largest ratio is above their goal, to a residual smaller by as much in the preconditioner's norm."""
+        """Sends worlds on whose largest ratio is above their goal, to a residual smaller by as much in the preconditioner's norm.
+
+        But for `most` bodies, which may be `farthest` times as far; `number` says of how many ratios are above.
+        """
         w = wp.tid()
-        if wanted[w] != 2 or worst[w] <= goal[w] or real(forcing[w]) <= tightest:
+        if wanted[w] != 2 or worst[w] <= goal[w] or real(forcing[w]) <= limit[w]:
             return
-        forcing[w] = forcing[w] * linear(wp.clamp(goal[w] / worst[w], real(0.1), real(0.8)))
+        least = real(0.1)
+        if most > 0:
+            if number[w] <= most and worst[w] <= farthest * goal[w]:
+                return
+            least = real(0.5)
+        share = wp.clamp(goal[w] / worst[w], least, real(0.8))
+        forcing[w] = linear(wp.max(share * real(forcing[w]), limit[w]))
         wanted[w] = 1
         busy_out[0] = 1
 

@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+from eager_steps import eagerly
 
 import ddg_warp as ddg
 from ddg_warp.errors import SolverError
+from ddg_warp.kernels.net.newton import ON_THE_WAY
 from ddg_warp.scenes import overhand_knot
+from ddg_warp.solve.net.contact import NetContact
 from ddg_warp.solve.tangent import Tangent
 
 
@@ -28,6 +31,35 @@ def test_steps_that_are_cut_end_in_balance(device):
     left = np.where(tangent.free, tangent.gradient(state) - tangent.loads(1.0, tangent.dofs(state)), 0.0)
     assert np.abs(left).max() < 1e-5  # inertia is some 1e-6 N
     assert list(integrator.statistics()["outcomes"]) == ["converged"]
+
+
+def test_what_a_whole_step_brings_there_is_there(device, monkeypatch):
+    """A rod is drawn by its end onto another, which cuts the predictor: a whole step ends its way, though directions are float32."""
+    s = np.linspace(-0.05, 0.05, 13)
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    about = {"section": ddg.Circle(2e-3), "material": ddg.Material(young=1e5, density=1000.0, poisson=0.5)}
+    scene.add_rod(np.stack([0 * s - 0.046, s, 0 * s - 4.5e-3], 1), **about)
+    drawn = scene.add_rod(np.stack([s, 0 * s, 0 * s], 1), **about)
+    scene.clamp(drawn, edges=[0], motion=ddg.Motion(translation=lambda t: (0.0, 0.0, -0.1 * np.pi * t)))
+    scene.contact(range=1e-3, friction=0.0)
+    model = scene.build(device=device, precision="mixed")
+    seen, hold, place = [], NetContact.hold, NetContact.place
+
+    def look(contact):
+        islands = contact.newton.islands
+        found = (contact.search.time, islands.step_length, islands.driven)
+        seen.append([float(values.numpy()[0]) for values in found])
+
+    def watched(method):
+        return lambda contact: (method(contact), look(contact))
+
+    monkeypatch.setattr(NetContact, "place", watched(place))
+    monkeypatch.setattr(NetContact, "hold", watched(hold))
+    eagerly(ddg.Integrator(model, rtol=1e-3), model.state(), 1 / 240)
+    predictor, *steps = seen
+    assert predictor[0] < 1.0 and predictor[2] == ON_THE_WAY
+    whole = [driven for share, length, driven in steps if share == 1.0 and length == 1.0]
+    assert whole and ON_THE_WAY not in whole
 
 
 @pytest.mark.slow

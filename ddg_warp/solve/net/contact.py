@@ -99,6 +99,7 @@ class NetContact:
             self._lessen,
             self._aim,
             self._push,
+            self._land,
             self._arrive,
             self._stay,
             self._part,
@@ -222,6 +223,9 @@ class NetContact:
         newton = self.newton
         self._launch(self._find_modes, self.net.worlds, [newton.islands.arrays[0]], [self._modes])
         self._launch(self._depart, self.net.worlds, [self._modes], [newton.islands.arrays[0]])
+        if len(self._nodes):
+            inputs = [self._nodes, self._aims, newton.fixed, self._modes, *newton.islands.arrays, self.net.blocks]
+            self._launch(self._land, (len(self._nodes), self.net.worlds), inputs, [newton.q])
         self._cut()
         self._let_go()
         inputs = [newton.right, newton.q, newton.base, self._modes, self.net.blocks]

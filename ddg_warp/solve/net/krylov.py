@@ -4,9 +4,12 @@ import math
 
 import warp as wp
 
+from ddg_warp.kernels.net.outliers import FARTHEST
 from ddg_warp.kernels.solve import krylov
 from ddg_warp.solve.net.multilevel import Multilevel
 from ddg_warp.solve.net.system import Sums
+
+SPARE = 0.5  # of the tolerance, what the last linear solve of a step may leave
 
 
 class ConjugateGradients:
@@ -163,10 +166,14 @@ class Directions(ConjugateGradients):
         self._launch(self._compare, [self.rest, allowed.blocks, wanted, newton.net.blocks], [allowed.ratio])
         allowed.sum_up(self.rest, rtol, newton.islands, *self._unread)
         self._worst(allowed.ratio, newton.worst)
+        few = newton.outliers
+        if few:
+            few.count(SPARE * rtol)
+        number, most = (few.number, few.most) if few else (self._unread[0], 0)
         wp.launch(
             self._confirm,
             newton.worlds,
-            [newton.worst, newton.goal, newton.options.linear_rtol],
+            [newton.worst, newton.goal, number, most, FARTHEST, newton.limit],
             [newton.forcing, wanted, self.busy],
             device=newton.device,
         )

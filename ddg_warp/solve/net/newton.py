@@ -19,7 +19,7 @@ from ddg_warp.solve.net.balance import Balance
 from ddg_warp.solve.net.chains import Chains
 from ddg_warp.solve.net.contact import NetContact
 from ddg_warp.solve.net.frozen import Frozen
-from ddg_warp.solve.net.krylov import Directions
+from ddg_warp.solve.net.krylov import SPARE, Directions
 from ddg_warp.solve.net.outliers import Outliers
 from ddg_warp.solve.net.planes import DevicePlanes
 from ddg_warp.solve.net.resting import Resting
@@ -28,7 +28,6 @@ from ddg_warp.solve.net.tolerance import Allowed
 from ddg_warp.solve.net.turns import Turns
 
 PRECONDITIONERS = ("block_jacobi", "chain", "multilevel", "chain_multilevel")
-SPARE = 0.5  # of the tolerance, what the last linear solve of a step may leave
 STRAIGHT = 1e-9  # turn between edges of a rod at rest that may be rounding [rad]
 LOOSEST = 0.1  # largest reduction of the residual that a direction is solved to (Eisenstat and Walker's forcing term)
 
@@ -99,7 +98,9 @@ class NetNewton:
         self.krylov_dots = make((worlds, blocks), self.linear)
         self.islands = Islands(worlds, self.real, device)
         self.iterations, self.stalled = (make(worlds, int) for _ in range(2))
-        self.best, self.decrease, self.turn, self.worst, self.goal = (make(worlds, self.real) for _ in range(5))
+        self.best, self.decrease, self.turn, self.worst, self.goal, self.limit = (
+            make(worlds, self.real) for _ in range(6)
+        )
         self.goal.fill_(math.inf)
         self.forcing = make(worlds, self.linear)
         self.pcg_work = make(1, wp.int64)
@@ -147,14 +148,14 @@ class NetNewton:
             net, self.system, self.parts, self.real, self.linear, self.exact_from, self.local, drag
         )
         self.turns = Turns(self) if host.rods else None
+        most = int(options.outliers * self.contact.touching_bodies) if self.contact else 0
         self._judge, self._measure, self._rotate, self._take, self._move = newton.search_kernels(
-            self.real, self.linear, serial, bool(host.rods), bool(net.edges), self.contact is not None
+            self.real, self.linear, serial, bool(host.rods), bool(net.edges), self.contact is not None, most > 0
         )
         self.allowed = Allowed(net, self.real, self.linear)
         outer = outer_forces(host, gravity)
         self.outer = self.allowed.assign(self.allowed.bodies.loads(outer)[None])
         self.resting = Resting(self, *self.contact.bodies) if self.contact else None
-        most = int(options.outliers * self.contact.touching_bodies) if self.contact else 0
         self.outliers = Outliers(self, most) if most else None
         self.here = self.contact.bound if self.contact else self.q
         self._balance = Balance(self, drag)
@@ -288,7 +289,7 @@ class NetNewton:
             [*(self._weight[i] for i in range(3)), self.worst, options.rtol]
             + [options.floor_factor * self.eps]
             + [options.max_iterations, options.max_halvings, LOOSEST, options.linear_rtol, SPARE]
-            + [*self.islands.arrays, self.best, self.stalled, self.forcing, self.goal],
+            + [*self.islands.arrays, self.best, self.stalled, self.forcing, self.goal, self.limit],
             device=self.device,
         )
 

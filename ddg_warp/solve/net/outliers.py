@@ -17,23 +17,31 @@ class Outliers:
     Args:
         newton: with its `Resting`, by whose numbers bodies go.
         most: bodies of a world that may be out of balance.
+
+    Attributes:
+        most; number: (worlds,) of bodies that are out of balance, as of the last `count`.
     """
 
     def __init__(self, newton, most: int):
-        self.newton, self._most = newton, most
+        self.newton, self.most = newton, most
         self._owner, self._bodies = newton.resting.owner, newton.resting.bodies
         worlds, device = newton.worlds, newton.device
         self._out_of_balance = wp.zeros(worlds * self._bodies, dtype=int, device=device)
-        self._number = wp.zeros(worlds, dtype=int, device=device)
+        self.number = wp.zeros(worlds, dtype=int, device=device)
         self._count, self._excuse = self.kernels = outlier_kernels(newton.real, arrays.serial(device))
 
     def __call__(self) -> None:
         """Lower the flags of worlds in which so few are out of balance, by what was found of residuals."""
         newton, rtol = self.newton, self.newton.options.rtol
-        self._out_of_balance.zero_()
-        self._number.zero_()
-        inputs = [newton.allowed.ratio, self._owner, self._bodies, rtol, *newton.islands.arrays]
-        outputs = [self._out_of_balance, self._number]
-        arrays.sweep(self._count, len(self._owner), inputs, outputs, newton.device, worlds=newton.worlds)
-        inputs = [self._number, self._most, newton.worst, newton._weight[2], rtol, *newton.islands.arrays]
+        self.count(rtol)
+        inputs = [self.number, self.most, newton.worst, newton._weight[2], rtol, *newton.islands.arrays]
         wp.launch(self._excuse, newton.worlds, inputs, device=newton.device)
+
+    def count(self, rtol: float) -> None:
+        """Those with a ratio of residuals that is above a tolerance, of active worlds."""
+        newton = self.newton
+        self._out_of_balance.zero_()
+        self.number.zero_()
+        inputs = [newton.allowed.ratio, self._owner, self._bodies, rtol, *newton.islands.arrays]
+        outputs = [self._out_of_balance, self.number]
+        arrays.sweep(self._count, len(self._owner), inputs, outputs, newton.device, worlds=newton.worlds)

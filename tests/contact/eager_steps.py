@@ -1,0 +1,13 @@
+"""Steps that are not captured, so that what happens in them can be watched."""
+
+from ddg_warp.solve.net.step import TREES
+
+
+def eagerly(integrator, state, dt):
+    """Launch a step."""
+    source = integrator._own(state)
+    integrator._vacate(1 - source)
+    integrator._prepare(dt, state)
+    for part in integrator._parts:
+        part.prescribe(state.time, state.time + dt)
+    integrator._launch(source, TREES)
