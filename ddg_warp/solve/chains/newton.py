@@ -47,7 +47,7 @@ class NewtonOptions:
         outliers: in contact, part of the bodies of a world (rods, shells, and what is joined of them) that may be out of balance
             at the end of a step, each by no more than ten times the tolerance: in crowds some slip off others at any time, and
             hold up all the rest. What is left of its residual acts on such a body like a force, in that step. Where contact cuts
-            nothing, directions are solved until all but as many balance by what is linear, too.
+            nothing, directions are solved until all but half as many balance by what is linear.
     """
 
     rtol: float = 1e-6

@@ -9,7 +9,7 @@ from ddg_warp.kernels.solve import krylov
 from ddg_warp.solve.net.multilevel import Multilevel
 from ddg_warp.solve.net.system import Sums
 
-SPARE = 0.5  # of the tolerance, what the last linear solve of a step may leave
+SPARE = 0.5  # of the tolerance, and of those that may be out of it, what the last linear solve of a step may leave
 
 
 class ConjugateGradients:
@@ -169,7 +169,7 @@ class Directions(ConjugateGradients):
         few = newton.outliers
         if few:
             few.count(SPARE * rtol)
-        number, most = (few.number, few.most) if few else (self._unread[0], 0)
+        number, most = (few.number, int(SPARE * few.most)) if few else (self._unread[0], 0)
         wp.launch(
             self._confirm,
             newton.worlds,
