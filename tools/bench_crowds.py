@@ -30,7 +30,7 @@ from ddg_warp.run.summary import machine, table, write_table
 # is too much: noodles then seem to pass.
 LARGE = ("hair_10000", "hair_10000_control", "hair_10000_sag_free")
 RTOL, OTHERWISE = {"noodles": 3e-1, "hair_512": 1e-1} | dict.fromkeys(LARGE, 3e-1), 3e-2
-# none otherwise: by these one strand in a hundred errs by nearly as much as steps half as long change
+# none otherwise: by these nodes err by a half of what steps half as long change
 OUTLIERS = dict.fromkeys(LARGE, 5e-2)
 # of `StepControl`, error [m/s] and halvings; steps of other cases are all of one length
 CONTROL, ONE_LENGTH = {"noodles": (5e-3, 2)} | dict.fromkeys(LARGE[1:], (5e-3, 3)), (5e-3, 0)
