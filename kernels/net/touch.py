@@ -1,4 +1,4 @@
-"""Contact within Newton's method on a net: its energy in the search, its own part in the preconditioner, and what supports push."""
+"""Contact within Newton's method on a net: its energy in the search, how far worlds move, and what supports push."""
 
 from functools import cache
 
@@ -22,9 +22,6 @@ from ddg_warp.kernels.islands import (
     TODO,
     WANTED,
 )
-from ddg_warp.kernels.matrix.block_band import block_functions
-from ddg_warp.kernels.matrix.chain_blocks import layout_type
-from ddg_warp.kernels.matrix.chain_places import place_dofs, place_functions
 from ddg_warp.kernels.matrix.sliced import product_functions
 from ddg_warp.kernels.net.newton import ON_THE_WAY, THERE
 from ddg_warp.kernels.search import PLACE, RELAG, STRAIGHT
@@ -364,53 +361,3 @@ def block_kernels(real, linear, serial: bool):
                 out[k + w * blocks] = q[k + w * blocks]
 
     return gain, lessen, aim, push, land, arrive, stay, part, way, add, keep
-
-
-@cache
-def stiffen_kernel(twist: bool, linear):
-    """stiffen(...): the bands of chains with contact's blocks of nodes, and of the edges ahead of them."""
-    nb = place_dofs(twist)
-    K, M, Layout = wp.types.matrix((3, 3), linear), wp.types.matrix((nb, nb), linear), layout_type()
-    load, store, _, _ = block_functions(nb, linear)
-    free_of, _ = place_functions(twist, linear)
-
-    @wp.func
-    def wide(own: K):
-        m = M()
-        for i in range(3):
-            for j in range(3):
-                m[i, j] = own[i, j]
-        return m
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def stiffen(
-        bands: wp.array3d(dtype=linear),
-        layout: Layout,
-        ahead: wp.array2d(dtype=int),
-        edges: int,
-        flags: wp.array2d(dtype=int),
-        blocks: int,
-        diagonal: wp.array(dtype=K),
-        between: wp.array(dtype=K),
-        stiffer: wp.array3d(dtype=linear),
-    ):
-        k, r = wp.tid()
-        w = r / layout.count.shape[0]
-        c = r - w * layout.count.shape[0]
-        if flags[WANTED, w] == 0 or layout.idle[r] != 0 or k >= layout.count[c]:
-            return
-        f = free_of(layout.held[k, c])
-        D = load(bands, 0, k, r)
-        node = layout.places[0, k, c]
-        if node >= 0:
-            D += wp.cw_mul(wide(diagonal[node + w * blocks]), wp.outer(f, f))
-        store(stiffer, 0, k, r, D)
-        E = load(bands, wp.static(nb**2), k, r)
-        e = ahead[k, c]
-        if e >= 0:
-            E += wp.cw_mul(wide(between[e + w * edges]), wp.outer(f, free_of(layout.held[k + 1, c])))
-        store(stiffer, wp.static(nb**2), k, r, E)
-        for row in range(wp.static(2 * nb**2), wp.static(3 * nb**2)):
-            stiffer[row, k, r] = bands[row, k, r]
-
-    return stiffen

@@ -4,10 +4,12 @@ from ddg_warp.solve.net.step import TREES
 
 
 def eagerly(integrator, state, dt):
-    """Launch a step."""
+    """Launch a step, in which all pairs have room; the buffers that it ends in."""
     source = integrator._own(state)
     integrator._vacate(1 - source)
     integrator._prepare(dt, state)
     for part in integrator._parts:
         part.prescribe(state.time, state.time + dt)
     integrator._launch(source, TREES)
+    assert not integrator._net.outgrown(integrator._buffers[source].own.net)
+    return integrator._buffers[1 - source]

@@ -75,10 +75,7 @@ def test_directions_leave_no_more_out_of_balance(device, monkeypatch):
         take(newton)
         if newton is integrator._net.newton and not newton.islands.cut.numpy()[0]:
             newton.islands.wanted.fill_(2)
-            krylov, allowed = newton.krylov, newton.allowed
-            inputs = [krylov.rest, allowed.blocks, newton.islands.wanted, newton.net.blocks]
-            wp.launch(krylov._compare, newton.all, inputs, [allowed.ratio], device=newton.device)
-            allowed.sum_up(krylov.rest, tolerance, newton.islands, *krylov._unread)
+            newton.krylov.compare()
             newton.outliers.count(SPARE * tolerance)
             reduced, limit = float(newton.forcing.numpy()[0]), float(newton.limit.numpy()[0])
             found.append((int(newton.outliers.number.numpy()[0]), reduced, limit))

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from eager_steps import eagerly
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.solve.net.step import TREES
 
 RADIUS, DT = 2e-3, 1 / 240
 SOFT = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
@@ -69,11 +69,7 @@ def watched(device, scene, velocities, worlds: int = 1, linear="chain", **option
         seen.append((newton.direction.numpy().reshape(worlds, -1, 3)[:, :nodes].astype(float), before))
 
     newton.direct = directed
-    source = integrator._own(state)
-    integrator._prepare(DT, state)
-    integrator._launch(source, TREES)
-    assert not integrator._net.outgrown(integrator._buffers[source].own.net)
-    end = integrator._buffers[1 - source]
+    end = eagerly(integrator, state, DT)
     return end.state, end.own.net.q.numpy().reshape(worlds, -1, 3)[:, :nodes], seen
 
 

@@ -160,23 +160,27 @@ class Directions(ConjugateGradients):
 
     def reduce(self) -> None:
         """Until one of the two says so."""
-        newton = self.newton
-        allowed, wanted, rtol = newton.allowed, newton.islands.wanted, newton.options.rtol
+        newton, few = self.newton, self.newton.outliers
         super().iterate()
-        self._launch(self._compare, [self.rest, allowed.blocks, wanted, newton.net.blocks], [allowed.ratio])
-        allowed.sum_up(self.rest, rtol, newton.islands, *self._unread)
-        self._worst(allowed.ratio, newton.worst)
-        few = newton.outliers
+        self.compare()
+        self._worst(newton.allowed.ratio, newton.worst)
         if few:
-            few.count(SPARE * rtol)
+            few.count(SPARE * newton.options.rtol)
         number, most = (few.number, int(SPARE * few.most)) if few else (self._unread[0], 0)
         wp.launch(
             self._confirm,
             newton.worlds,
             [newton.worst, newton.goal, number, most, FARTHEST, newton.limit],
-            [newton.forcing, wanted, self.busy],
+            [newton.forcing, newton.islands.wanted, self.busy],
             device=newton.device,
         )
+
+    def compare(self) -> None:
+        """Ratios of `NetNewton.allowed` by what a solve has left, of worlds that are done."""
+        newton, allowed = self.newton, self.newton.allowed
+        inputs = [self.rest, allowed.blocks, newton.islands.wanted, newton.net.blocks]
+        self._launch(self._compare, inputs, [allowed.ratio])
+        allowed.sum_up(self.rest, newton.options.rtol, newton.islands, *self._unread)
 
     def cycle(self) -> None:
         """One iteration."""
