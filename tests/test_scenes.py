@@ -22,6 +22,7 @@ SMALL = {
     "cloth_twist": {"around": 16, "along": 8, "turns": 0.2},
     "crossed_beams": {"n": 20},
     "deep_arch": {},
+    "drawn_rod": {},
     "entangled_worms": {"count": 7, "n": 40, "dt": 0.02},
     "flag_on_pole": {"cells": 12},
     "flagellum": {"n": 25, "steps": 50},

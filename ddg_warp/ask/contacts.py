@@ -18,7 +18,7 @@ def contacts(model, state) -> Contacts:
     if touch is None:
         raise SceneError("contacts: this scene has no contact; add scene.contact()")
     touch.at(state.net.q)
-    found = touch.pairs(state.net.q, state.net.v)
+    found = touch.pairs(state.net.q, state.rubbing)
     owners = {size: touch.shapes.things(size)[2] for size in touch.shapes.sizes}
     objects = np.zeros((len(found["gap"]), 2), int)
     for size, own in owners.items():

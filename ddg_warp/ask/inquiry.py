@@ -60,7 +60,7 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     q = tangent.dofs(state)
     gradient = tangent.gradient(state)
     if model.touch and model.touch.terms.frictions:
-        rubbing = model.touch.friction(state.net.q, state.net.v)
+        rubbing = model.touch.friction(state.net.q, state.rubbing)
         Tangent.of(tangent.parts[-1], gradient)[:] -= rubbing.ravel()
     force = tangent.back(np.where(tangent.free, 0.0, gradient - tangent.loads(factor, q)))
     q = tangent.back(q)

@@ -94,7 +94,7 @@ def contact_terms(touching) -> set[str]:
     pairs |= {name for kind, name in ((MESH, "point_triangle"), (PLANE, "obstacle")) if kind in kinds}
     names = {f"{law.law}_{pair}" for pair in pairs}
     suffix = "_polynomial" if law.friction_law == "polynomial" else ""
-    return names | {f"friction_{pair}{suffix}" for pair in pairs if touching.friction.any()}
+    return names | {f"friction_{pair}{suffix}" for pair in pairs if touching.rubs}
 
 
 def _between(values: np.ndarray) -> str:

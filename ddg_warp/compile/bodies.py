@@ -64,6 +64,11 @@ class Touching:
         return np.nonzero(meet)
 
     @property
+    def rubs(self) -> bool:
+        """Whether there is friction."""
+        return bool(self.friction.any())
+
+    @property
     def reach(self) -> float:
         """Largest range [m]."""
         return float(self.range.max())

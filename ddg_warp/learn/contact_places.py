@@ -16,7 +16,7 @@ ROUNDING = 1e-6  # by which a range may exceed what is searched
 def contact_elements(model, name: str) -> list:
     """What has such a number, in the order of its values: pairs of names of objects, or labels of bodies; nothing without contact."""
     given = model.net.host.touching if model.net is not None else None
-    if given is None or (name == "contact.friction" and not given.friction.any()):
+    if given is None or (name == "contact.friction" and not given.rubs):
         return []
     if name == RADIUS:
         return [given.bodies[i].label for i in _round(given)]

@@ -250,7 +250,7 @@ class Simulator(torch.nn.Module):
 
         Raises:
             SolverError: there is none, in one of the worlds.
-            SceneError: the state has a history of gradients, which would end here; a name or shape does not fit.
+            SceneError: the state has a history of gradients, which would end here; a name or shape does not fit; there is friction.
         """
         if state is not None and torch.is_grad_enabled() and any(value.requires_grad for value in state.values):
             raise SceneError(
@@ -259,6 +259,7 @@ class Simulator(torch.nn.Module):
             )
         state = state or self.initial_state(batch)
         engine, end = self._own(state), arguments.number("end", options.get("end", 1.0))
+        validate.refuse_friction(engine.model)
         full, controls = self._full(engine, parameters), self._controls(engine, controls)
         call = self._call(engine, end, full, controls)
         values = [*(value for _, own in full for value in own), *controls.values()]

@@ -62,10 +62,13 @@ class State:
         grips: poses of the grips of all worlds; None without, see `Grip`.
         stable: of an equilibrium that a static solver found, whether it is stable, in all worlds; None where that was not asked, as
             in dynamics. See `Equilibrium.solve`.
+        sliding: of an equilibrium with friction, velocities of the blocks of the net (W N,) on the way there, by which friction acts,
+            though the state is at rest; None where it acts by those of the state.
     """
 
     def __init__(self, model, groups: list[GroupState], net=None, time: float = 0.0, grips: GripState | None = None):
         self.stable: bool | None = None
+        self.sliding: wp.array | None = None
         self.model = model
         self.groups = groups
         self.net = net
@@ -86,6 +89,11 @@ class State:
         """Device arrays "part/name" as they are stored, see `GroupState`; each goes to other libraries without a copy, by DLPack:
         `torch.from_dlpack(state.arrays()["0/x"])`."""
         return {f"{part}/{name}": array for part, own in self.parts().items() for name, array in own.arrays().items()}
+
+    @property
+    def rubbing(self) -> wp.array:
+        """Velocities of the blocks of the net (W N,) by which friction acts."""
+        return self.net.v if self.sliding is None else self.sliding
 
     def points(self) -> np.ndarray:
         """Positions (P, 3) [m], or (worlds, P, 3): nodes in the order of `model.curves` (rods, meridians), then vertices."""
@@ -141,7 +149,7 @@ class State:
         """An independent copy."""
         other = self.model.empty_state()
         other.assign(self)
-        other.stable = self.stable
+        other.stable, other.sliding = self.stable, self.sliding
         return other
 
     def assign(self, other: "State") -> None:
@@ -149,7 +157,7 @@ class State:
         for mine, theirs in zip(self.parts().values(), other.parts().values(), strict=True):
             for array, source in zip(mine.arrays().values(), theirs.arrays().values(), strict=True):
                 arrays.copy(array, source)
-        self.time, self.stable = other.time, None
+        self.time, self.stable, self.sliding = other.time, None, None
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Everything a bitwise restart needs."""

@@ -34,7 +34,7 @@ def refuse_curved_membranes(model) -> None:
 
 
 def refuse_friction(model) -> None:
-    """Refuse contact with friction, of whose many equilibria the way there decides, where an equilibrium is asked about."""
+    """Refuse contact with friction where an equilibrium is asked about that the way there does not decide."""
     given = model.net.host.touching if model.net is not None else None
     pairs = zip(*given.meeting, strict=True) if given is not None else ()
     rough = next(((g, h) for g, h in pairs if given.friction[g, h] > 0.0), None)
@@ -42,9 +42,9 @@ def refuse_friction(model) -> None:
         return
     one, other = (given.names[g] for g in rough)
     raise SceneError(
-        f"contact: equilibria, stability and paths know no friction, and it is {given.friction[rough]:g} between {one!r} and "
-        f"{other!r}, where the way there decides which equilibrium is found; set friction=0, or step "
-        "the scene in time, damped, until it rests"
+        f"contact: stability and gradients of equilibria know no friction, and it is {given.friction[rough]:g} between {one!r} and "
+        f"{other!r}, where the way there decides which equilibrium is found; set friction=0, or ask for equilibria alone by "
+        "statics.solve, or for gradients of steps in time"
     )
 
 

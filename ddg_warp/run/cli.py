@@ -235,7 +235,7 @@ def say(result, content: dict, checks: list, directory: Path) -> None:
         verdicts = {
             True: "stable",
             False: "UNSTABLE",
-            None: "not asked whether stable: ddg_warp.solve.stability.spectrum tells",
+            None: "not asked whether stable: ddg_warp.solve.stability.spectrum tells, but of friction",
         }
         print(f"last equilibrium: {verdicts[content['stable']]}")
     if checks:

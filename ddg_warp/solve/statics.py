@@ -10,7 +10,8 @@ the device by conjugate gradients instead (`ddg_warp.solve.net.statics`).
 
 So is what touches, at any size: its search cuts every iterate before anything passes through anything. Where nets are small its
 equilibria are judged by the factored tangent, saddles are left, and what conjugate gradients are slow to finish, without second
-derivatives of shells' bending, is finished by this search, its steps cut alike. There is no friction in equilibria.
+derivatives of shells' bending, is finished by this search, its steps cut alike. With friction an equilibrium is that of an increment of
+the load parameter, which the way there decides; it is found on the device at any size, and nothing tells whether it is stable.
 """
 
 from dataclasses import dataclass
@@ -52,7 +53,7 @@ class StaticsOptions:
         rtol: residual over load scale (sum of the outer forces on a rod or shell, or largest support force) at which a dof is in
             equilibrium; see `ddg_warp.compile.tolerance`.
         floor_factor: rounding units of the forces that meet at a dof which count as rounding.
-        max_iterations: Newton iterations of one load step.
+        max_iterations: Newton iterations of one load step; with friction, how often it takes normal forces anew.
         rotation_cap: largest turn of an edge or change of an angle in one update [rad].
         mode: "minimise" or "follow".
         max_cuts: how often a load increment is halved before the search is given up; after one that succeeds the next is doubled,
@@ -109,12 +110,14 @@ def solve(
         The equilibrium. Its `stable` says whether the tangent stiffness is positive but for rigid modes: True, False (in mode
         "follow" alone, or by conjugate gradients), or None where it was not asked: by conjugate gradients, which only notice what
         is unstable, and under loads without a potential. Then `ddg_warp.solve.stability.spectrum` tells.
-        In contact where a body ends along what neither supports, loads nor what it touches decide is arbitrary.
+        In contact where a body ends along what neither supports, loads nor what it touches decide is arbitrary. Friction acts against
+        what slides in a load step, as in that much time: what sticks creeps by less than `velocity` of `scene.contact` times the
+        increment of the load parameter. More load steps follow the order in which things begin to slide.
 
     Raises:
         SolverError: no equilibrium was found, or in mode "minimise" none that is stable; carries the last good state.
-        SceneError: nothing holds the rods, controls do not fit the model, or in contact there is friction, surfaces overlap where
-            the search begins, or the mode or solver keeps nothing apart.
+        SceneError: nothing holds the rods, controls do not fit the model, or in contact surfaces overlap where the search begins, the
+            mode or solver keeps nothing apart, or there is friction and no increment of the load parameter.
     """
     validate.check_model("statics", model)
     if state is not None:
@@ -150,7 +153,8 @@ class Equilibrium:
         lost_in_rounding(model)
         scene_validate.warn_of_massless(model)
         self.net = NetEquilibrium(self) if self._solver() == "pcg" else None
-        self.factors = self.net is None or (model.touch is not None and not large_static(model))
+        self._rubs = model.touch is not None and model.net.host.touching.rubs
+        self.factors = self.net is None or (model.touch is not None and not self._rubs and not large_static(model))
         self.mixed = self.tangent.shells_alone and self.net is None
         self.iterations, self.shift = 0, 0.0
         self.outcome, self.stiffness = "", None
@@ -174,7 +178,6 @@ class Equilibrium:
 
     def _check_contact(self, obstacle: str) -> None:
         """Refuse what does not keep apart what touches; `obstacle`: to conjugate gradients."""
-        validate.refuse_friction(self.model)
         if self.options.mode == "follow":
             raise SceneError(
                 "contact: mode 'follow' and paths by continuation step along tangents, which do not tell when something will touch; "
@@ -197,6 +200,11 @@ class Equilibrium:
         controls: Controls | None = None,
     ) -> State:
         """Load stepping; see `solve`."""
+        if self._rubs and start == end:
+            raise SceneError(
+                f"contact: friction acts against what slides along an increment of the load parameter, and from {start:g} to {end:g} "
+                "there is none; give start other than end, or friction=0"
+            )
         found = checked(controls, self.model, "statics")
         if self.model.touch and self.model.touch.keep:  # by a penalty equilibria may overlap
             self.net.newton.contact.check(state.net.q)
@@ -242,7 +250,7 @@ class Equilibrium:
             state = found
         else:
             moved = self._with_supports_moved(state, before, at)
-            state = self._minimum(moved, at, state)
+            state = self._minimum(moved, at, state, abs(at - before))
             if not self.factors:
                 return state
         for _ in range(DESCENTS):
@@ -253,7 +261,7 @@ class Equilibrium:
             if beside is None:
                 state.stable = None
                 return state
-            state = self._minimum(beside, at, state)
+            state = self._minimum(beside, at, state, abs(at - before))
         raise SolverError(
             f"no stable equilibrium at load parameter {at:g}: saddle, {DESCENTS} descents from saddles led to others; begin from a "
             "state without symmetry, or take mode='follow' to accept what is unstable",
@@ -261,12 +269,12 @@ class Equilibrium:
             outcome="saddle",
         )
 
-    def _minimum(self, state: State, at: float, before: State) -> State:
+    def _minimum(self, state: State, at: float, before: State, increment: float) -> State:
         """The equilibrium at load parameter `at` from a state with its supports in place; in contact, on a way from `before`."""
         if not self.net:
             return self._descend(state, at)
         try:
-            state = self.net.solve(state, at, before)
+            state = self.net.solve(state, at, before, increment)
         except SolverError as error:
             if not (self.factors and error.outcome in UNFINISHED and self.net.arrived):
                 raise

@@ -120,7 +120,7 @@ class Tangent:
         for part in self.parts:
             part.assign(state, self.of(part, q))
         self.model.carry_frames(state)
-        state.stable = None
+        state.stable = state.sliding = None
 
     def move_supports(self, state, before: float, at: float) -> None:
         """Put held dofs, and the magnetic field, where they are at load parameter `at`; the state belongs to `before`."""

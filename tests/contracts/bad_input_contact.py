@@ -146,14 +146,14 @@ def _rough():
     return built(touching(friction=0.2))
 
 
-_CALLS = {
-    "statics": lambda: ddg.statics.solve(_rough()),
-    "continuation": lambda: ddg.continuation.Continuation(_rough(), {"z": ddg.Displacement.of(-1, "z")}).trace(),
-    "spectrum": lambda: (model := _rough(), ddg.stability.spectrum(model, model.state())),
-}
 refuse("contact", {
-    name: (call, "contact: equilibria", "it is 0.2 between", "friction=0", "step the scene in time") for name, call in _CALLS.items()
-} | {
+    "friction in a spectrum": (
+        lambda: (model := _rough(), ddg.stability.spectrum(model, model.state())),
+        *("contact: stability", "it is 0.2 between", "friction=0", "statics.solve"),
+    ),
+    "friction without an increment": (
+        lambda: ddg.statics.solve(_rough(), start=1.0), "contact: friction", "from 1 to 1", "start other than end",
+    ),
     "follows": (lambda: ddg.statics.solve(built(touching()), mode="follow"), "contact: ", "'follow'", "mode='minimise'"),
     "factors": (lambda: ddg.statics.solve(built(touching()), solver="direct"), "contact: ", "'direct'", "solver='auto'"),
     "path": (lambda: ddg.continuation.Continuation(built(touching())), "contact: ", "continuation", "load steps"),

@@ -74,17 +74,9 @@ for _question in ("contact", "moved obstacle"):
         **dict.fromkeys(IN_CONTACT, ("has contact already", "use contact_between")),
         "shell, curved membrane": ("shell 0", "'curved'", "statics", "membrane='flat'"),
     }
-REFUSED["rests"] = REFUSED["contact"] | dict.fromkeys(IN_CONTACT, ("contact: equilibria", "friction", "set friction=0"))
-del REFUSED["rests"]["shell, curved membrane"]
-for _question in (
-    *("reactions", "motion", "turned clamp", "load", "couple", "pressure", "grip"),
-    *("equilibrium", "spectrum", "continuation"),
-):
-    REFUSED.setdefault(_question, {})
-    REFUSED[_question] = (
-        dict.fromkeys(IN_CONTACT, ("contact: equilibria", "friction", "set friction=0", "step the scene in time"))
-        | REFUSED[_question]
-    )
+REFUSED["rests"] = {name: words for name, words in REFUSED["contact"].items() if name != "shell, curved membrane"}
+REFUSED["spectrum"] = dict.fromkeys(IN_CONTACT, ("contact: stability", "friction", "set friction=0", "statics.solve"))
+REFUSED["continuation"] |= dict.fromkeys(IN_CONTACT, ("contact: ", "paths by continuation", "load steps"))
 REFUSED["implicit midpoint"] |= dict.fromkeys(IN_CONTACT, ("contact: ", "use 'implicit_euler'"))
 REFUSED["failure"] |= dict.fromkeys(IN_CONTACT, ("contact: ", "'ball'", "overlap", "move them apart"))
 MANY = {"continuation": ("one world",)}  # what several worlds are refused

@@ -37,6 +37,7 @@ class NetContact:
         bound: (W N,) where iterates of worlds on their way are bound for, and where those of others are.
         bodies: which each block of a world belongs to (blocks,), -1 for none, and how many there may be.
         bends: whether its matrix has what comes of pairs that turn, once the search is near; see `kernels.contact.pair_bend`.
+        rubs: whether there is friction; rate: over what it counts slips (worlds,) [1/s].
         solutions: where the last step took friction anew, in this order, for its reverse: `lags` - 1 of (W N,) with friction.
         crossed: (1,) pairs that would have passed through each other in all steps so far; least: (1,) the smallest gap [m].
     """
@@ -56,7 +57,7 @@ class NetContact:
         held = np.concatenate([np.zeros(0, int), *host.obstacles])  # forces on them are asked of states, not here
         self.touch = Touch(net, linear, newton.q, held)
         self.shapes, self.search, self.terms = self.touch.shapes, self.touch.search, self.touch.terms
-        self.rubs = bool(host.touching.friction.any())
+        self.rubs, self.rate = host.touching.rubs, newton.islands.rate
         worlds, again = net.worlds, self.touch.law.lags - 1 if self.rubs else 0
         self.forces, self.stiffness, self.diagonal = self.terms.forces, self.terms.stiffness, self.terms.diagonal
 
@@ -132,11 +133,11 @@ class NetContact:
         if self.newton.device.is_cuda:
             self.search.rebuild(before)
 
-    def start(self, before: wp.array) -> None:
-        """Start an attempt: candidates at positions `before`, and what friction takes from there."""
+    def start(self, before: wp.array, again: bool = False) -> None:
+        """Start an attempt: candidates at positions `before`, and what friction takes from there; slips, unless it does so `again`."""
         self.search.update(before)
         if self.rubs:
-            self.terms.lag(before)
+            self.terms.lag(before, again)
 
     def rest(self) -> None:
         """Nothing is on its way: what is proposed is where it is."""
@@ -148,8 +149,7 @@ class NetContact:
         """Take friction anew from where the solve has come to, for worlds that have converged; keep that in one of `solutions`."""
         newton = self.newton
         self._sweep(self._keep_solution, [newton.q, newton.islands.moved, self.net.blocks], [solution])
-        self.search.update(newton.q)
-        self.terms.lag(newton.q, again=True)
+        self.start(newton.q, again=True)
         self._launch(self._again, self.net.worlds, [newton.islands.arrays[0]], [])
 
     def place(self) -> None:
@@ -168,7 +168,7 @@ class NetContact:
         q, islands = self.newton.q, self.newton.islands
         self.search.update(q)
         if self.rubs:
-            self.terms.evaluate(q, islands.rate, iterates=(islands.slot, islands.iteration))
+            self.terms.evaluate(q, self.rate, iterates=(islands.slot, islands.iteration))
         else:
             self.terms.evaluate(q)
 

@@ -4,6 +4,10 @@ The loop is that of a time step without its inertia: energies fall, and the matr
 stresses; in contact with second derivatives, too, as in a time step. Loads follow every iterate and do the work of their mean along a
 step; their own stiffness is left out of the matrix, which costs iterations and no accuracy. No pivot is seen, so that a saddle on which
 nothing pushes off is not told from a minimum: `ddg_warp.solve.stability` tells.
+
+Friction is that of a step in time without inertia, as long as the increment of the load parameter: it acts against slips since the
+equilibrium before, and what sticks creeps by less than `velocity` times the increment. Normal forces are lagged, at first those of the
+equilibrium before, and taken anew from what is found until that is in equilibrium with its own.
 """
 
 import math
@@ -27,6 +31,7 @@ from ddg_warp.solve.net.newton import NetNewton
 FORCING = 1e-4  # smallest reduction of the residual that a direction is solved to: Gauss-Newton errs by more
 ADRIFT = 1e3  # of the size of the net, from which on what moves goes nowhere
 FAR = 4.0  # turns of a direction, over the cap of a step, at which it is far enough
+LAGGED = 5  # iterations with the same normal forces, which without friction at first may lead far off
 
 
 class StaticNewton(NetNewton):
@@ -42,6 +47,9 @@ class StaticNewton(NetNewton):
         self._there, self._before = wp.zeros_like(self.load), wp.zeros_like(self.q)
         self.islands.moved.fill_(1)
         self._follow, self._less, self._far = newton.static_kernels(self.real, self.linear)
+        self.rubs = self.contact is not None and self.contact.rubs
+        if self.rubs:  # another than that of strain-rate damping, which counts at rest
+            self.contact.rate = wp.zeros_like(self.islands.rate)
 
     @property
     def kernels(self) -> list:
@@ -49,11 +57,17 @@ class StaticNewton(NetNewton):
         return [*super().kernels, self._follow, self._less, self._far, *(self.loads.kernels if self.loads else [])]
 
     def begin(
-        self, q: np.ndarray, dead: np.ndarray, at: float, scale: np.ndarray, before: np.ndarray | None = None
+        self,
+        q: np.ndarray,
+        dead: np.ndarray,
+        at: float,
+        scale: np.ndarray,
+        before: np.ndarray | None = None,
+        rate: float = 0.0,
     ) -> None:
         """Set out from dofs `q` under dead loads (worlds, 3 blocks), with those that follow at `at`; load scales of bodies.
 
-        In contact q is what is proposed to what is at dofs `before`.
+        In contact q is what is proposed to what is at dofs `before`; friction counts slips over `rate`, and without there is none.
         """
         for name in ("status", "iteration", "halvings", "unbalanced", "drowned", "clamped", "stale"):
             getattr(self.islands, name).zero_()
@@ -62,6 +76,8 @@ class StaticNewton(NetNewton):
         if self.contact:
             wp.copy(self._before, self.base)
             self.contact.rest()
+        if self.rubs:
+            self.contact.rate.fill_(rate)
         for load in (self.load, self._there):
             load.assign(dead.reshape(-1, 3))
         if self.loads:
@@ -84,11 +100,11 @@ class StaticNewton(NetNewton):
                 device=self.device,
             )
 
-    def search(self, state) -> None:
-        """From where `begin` has set out, with the lagged data of `state`; can be captured."""
+    def search(self, state, again: bool = False) -> None:
+        """From where `begin` has set out, with the lagged data of `state`; can be captured. Slips of one `again` go on."""
         if self.contact:
             self.contact.renew(self._before)
-            self.contact.start(self._before)
+            self.contact.start(self._before, again)
             self.contact.place()
         self.solve(state)
 
@@ -118,6 +134,8 @@ class StaticNewton(NetNewton):
         """The direction of the free dofs where held ones make a `step`: H d = r - H step, in worlds that want it."""
         if self.resting:
             self.resting.wake()
+        if self.contact:
+            self.contact.start(self._before)
         self.evaluate(state)
         self.balance()
         self.assemble()
@@ -132,17 +150,17 @@ class NetEquilibrium:
     """Equilibria of a model that is a net alone, for `Equilibrium`, whose tangent and load scale it uses."""
 
     def __init__(self, owner):
-        model, options = owner.model, owner.options
+        model, options, touching = owner.model, owner.options, owner.model.net.host.touching
         self.owner, self.model, self.net, self.tangent = owner, model, model.net, owner.tangent
         self.newton = StaticNewton(
             model,
             NewtonOptions(
                 rtol=options.rtol,
                 floor_factor=options.floor_factor,
-                max_iterations=options.max_iterations,
+                max_iterations=LAGGED if touching and touching.rubs else options.max_iterations,
                 rotation_cap=options.rotation_cap,
                 linear_rtol=FORCING,
-                psd="progressive" if model.net.host.touching else "gauss_newton",
+                psd="progressive" if touching else "gauss_newton",
             ),
         )
         self._rest = self.tangent.dofs(model.state())
@@ -169,20 +187,30 @@ class NetEquilibrium:
         direction = self.newton.direction.numpy().astype(np.float64).ravel()
         return direction if np.isfinite(direction).all() else None
 
-    def solve(self, state: State, at: float, before: State) -> State:
+    def solve(self, state: State, at: float, before: State, increment: float) -> State:
         """The equilibrium at load parameter `at` from a state with its supports in place.
 
-        In contact things go there from the state `before`, as far as nothing is in their way.
+        In contact things go there from the state `before`, as far as nothing is in their way; with friction in the time `increment`.
 
         Raises:
             SolverError: it was not found; names the outcome.
         """
-        state, owner = state.copy(), self.owner
+        state, owner, first = state.copy(), self.owner, before
+        rubs, rate = self.newton.rubs, 1.0 / increment if self.newton.rubs else 0.0
         again = self.net.edges or self.model.motions  # what is found is judged by its own frames and forces on supports
-        for _ in range(2 if again else 1):
-            self._replay("solve", partial(self._begin, state, at, before), lambda: self.newton.search(self._start))
-            before = state
-            owner.iterations += int(self.newton.islands.iteration.numpy().sum())
+        held = self.tangent.dofs(state)
+        for solves in range(owner.options.max_iterations if rubs else 1 + bool(again)):
+            on = solves > 0 and rubs
+            if on and not self.arrived:
+                state = state.copy()
+                self.tangent.assign(state, np.where(self.tangent.free, self.tangent.dofs(state), held))
+            self._replay(
+                "slide on" if on else "solve",
+                partial(self._begin, state, at, before, rate),
+                partial(self.newton.search, self._start, on),
+            )
+            before, iterations = state, int(self.newton.islands.iteration.numpy().sum())
+            owner.iterations += iterations
             wp.copy(state.net.q, self.newton.q)
             for name in ("frame", *(f"lag_{i}" for i in range(len(self.net.sets)))):
                 wp.copy(state.net.arrays()[name], self._start.arrays()[name])  # renewed on the way, perhaps
@@ -191,12 +219,20 @@ class NetEquilibrium:
             q = self.tangent.dofs(state)
             if self.newton.contact:
                 self._refuse_drifting(state, q, at)
-            outer = self.tangent.loads(at, q)
-            residual = outer - self.tangent.gradient(state)
-            if status > outcome.CONVERGED_TO_ROUNDING:
-                name = outcome.NAMES[status]
-                tightest = self.newton.contact.tightest(state.net.q, status) if self.newton.contact else ""
-                raise SolverError(owner.residuals.where(name, residual, at, tightest), state=state, outcome=name)
+            if status > outcome.CONVERGED_TO_ROUNDING and not (rubs and status == outcome.MAX_ITERATIONS):
+                break
+            if on and not iterations:  # in equilibrium with the friction of its own normal forces
+                break
+        outer = self.tangent.loads(at, q)
+        residual = outer - self.tangent.gradient(state)
+        if rubs:
+            rates = (state.net.q.numpy() - first.net.q.numpy()) * rate
+            state.sliding = wp.array(rates, dtype=self.net.vector, device=self.net.device)
+            residual += self.tangent.into(self.model.touch.friction(state.net.q, state.sliding).ravel())
+        if status > outcome.CONVERGED_TO_ROUNDING:
+            name = outcome.NAMES[status]
+            tightest = self.newton.contact.tightest(state.net.q, status) if self.newton.contact else ""
+            raise SolverError(owner.residuals.where(name, residual, at, tightest), state=state, outcome=name)
         owner.outcome = outcome.NAMES[status]
         # in contact the last matrix may be the projected one without a trial of the exact one, which tells nothing
         indefinite = self.newton.contact is None and self.newton.islands.clamped.numpy().any()
@@ -233,13 +269,13 @@ class NetEquilibrium:
                 return
             self._graphs.clear()
 
-    def _begin(self, state: State, at: float, before: State | None = None) -> None:
+    def _begin(self, state: State, at: float, before: State | None = None, rate: float = 0.0) -> None:
         tangent, part = self.tangent, self.tangent.parts[-1]
         q = tangent.dofs(state)
         start = q if before is None else self._beside(q, tangent.dofs(before))
         outer, gradient = tangent.loads(at, q), part.elastic_gradient(state)
         scale = self.owner.residuals.load_scale(outer, gradient)
-        self.newton.begin(tangent.back(q), part.dead_loads(at), at, scale, tangent.back(start))
+        self.newton.begin(tangent.back(q), part.dead_loads(at), at, scale, tangent.back(start), rate)
         for name, array in self._start.arrays().items():
             wp.copy(array, state.net.arrays()[name])
 

@@ -1,0 +1,186 @@
+"""Equilibria with friction: what rests on a slope, what is drawn and let go, a rope about a drum, and what is refused."""
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+from ddg_warp import statics
+from ddg_warp.errors import SolverError
+from ddg_warp.geometry import meshes
+from ddg_warp.scenes import capstan
+from ddg_warp.solve.statics import Equilibrium
+
+RUBBER = ddg.Material(young=1e7, density=1000.0, poisson=0.5)
+G = 9.81  # m/s^2
+NU = 1e-3  # m/s, by default
+
+
+def line(start, end, n: int) -> np.ndarray:
+    return np.linspace(np.array(start, float), np.array(end, float), n + 1)
+
+
+def rod_on_floor(scene):
+    rod = scene.add_rod(line((0.0, 0.0, 0.006), (0.2, 0.03, 0.006), 6), section=ddg.Circle(0.005), material=RUBBER)
+    scene.add_obstacle(ddg.Plane())
+    return rod
+
+
+def cross_on_floor(scene):
+    one = rod_on_floor(scene)
+    other = scene.add_rod(line((0.1, 0.015, 0.006), (0.09, 0.1, 0.006), 4), section=ddg.Circle(0.005), material=RUBBER)
+    scene.join([(one, 3), (other, 0)])
+
+
+def sheet_on_floor(scene):
+    points, triangles = meshes.rectangle(4, 2, (0.2, 0.1))
+    scene.add_shell(points + [0.0, 0.0, 0.006], triangles, thickness=0.01, material=RUBBER)
+    scene.add_obstacle(ddg.Plane())
+
+
+def rod_on_rods(scene):
+    for x in (0.03, 0.17):
+        rod = scene.add_rod(line((x, -0.1, 0.0), (x, 0.1, 0.0), 5), section=ddg.Circle(0.005), material=RUBBER)
+        scene.fix(rod, range(6))
+    stiff = ddg.Material(young=1e11, density=1000.0, poisson=0.5)  # which does not sag in between
+    scene.add_rod(line((0.0, 0.0, 0.011), (0.2, 0.0, 0.011), 7), section=ddg.Circle(0.005), material=stiff)
+
+
+RESTING = {"rod": rod_on_floor, "joined": cross_on_floor, "sheet": sheet_on_floor, "rods": rod_on_rods}
+
+
+def on_slope(add, angle: float, **contact) -> ddg.Scene:
+    scene = ddg.Scene(gravity=(G * np.sin(angle), 0.0, -G * np.cos(angle)))
+    add(scene)
+    scene.contact(**contact)
+    return scene
+
+
+CREEP = {  # speed over nu at which the law has a share s of the friction
+    "logistic": lambda s: -np.log(2.0 / (1.0 + s) - 1.0) / 15.0,
+    "polynomial": lambda s: 1.0 - np.sqrt(1.0 - s),
+}
+
+
+@pytest.mark.parametrize("law", CREEP)
+@pytest.mark.parametrize("name", RESTING)
+def test_what_rests_on_a_slope_creeps(device, name, law):
+    """Friction is tan(angle) / mu of all there is at every point: all creep at the same speed, for the time of the increments."""
+    mu, angle = 0.5, 0.3
+    model = on_slope(RESTING[name], angle, friction=mu, friction_law=law).build(device, precision="float64")
+    found = [statics.solve(model, load_steps=steps) for steps in (1, 4)]
+    for state in found:
+        moved = (state.points() - model.state().points())[-7:, 0]  # of what is free
+        np.testing.assert_allclose(moved.mean(), NU * CREEP[law](np.tan(angle) / mu), rtol=1e-3)
+        assert not state.velocities().any()
+        assert state.stable is None
+
+
+def test_reactions_and_contacts_have_friction(device):
+    """What rests is held by the floor against its weight, along the slope by friction, pair by pair."""
+    angle = 0.3
+    model = on_slope(rod_on_floor, angle, friction=0.5).build(device, precision="float64")
+    state = statics.solve(model)
+    weight = 1000.0 * np.pi * 0.005**2 * np.hypot(0.2, 0.03) * G
+    floor = model.reactions(state)[-1].force
+    np.testing.assert_allclose(
+        floor, weight * np.array([-np.sin(angle), 0.0, np.cos(angle)]), rtol=1e-6, atol=1e-9 * weight
+    )
+    touching = model.contacts(state)
+    shares = np.linalg.norm(touching.friction, axis=1) / np.linalg.norm(touching.force, axis=1)
+    np.testing.assert_allclose(shares, np.tan(angle), rtol=1e-3)
+    again = state.copy()
+    np.testing.assert_array_equal(model.contacts(again).friction, touching.friction)
+
+
+def test_what_slides_off_has_no_equilibrium(device):
+    model = on_slope(rod_on_floor, 0.3, friction=0.3).build(device, precision="float64")
+    with pytest.raises(SolverError, match="no equilibrium"):
+        statics.solve(model, max_cuts=1, max_iterations=30)
+
+
+def test_rests_on_in_time(device):
+    """Steps from an equilibrium begin at rest, and it goes on creeping as slowly."""
+    model = on_slope(rod_on_floor, 0.3, friction=0.5).build(device, precision="float64")
+    state = first = statics.solve(model, load_steps=2)
+    integrator = ddg.Integrator(model)
+    for _ in range(40):
+        state = integrator.step(state, 1 / 400)
+    moved = np.linalg.norm(state.points() - first.points(), axis=1).max()
+    assert 0.0 < moved < 0.12 * NU
+
+
+LENGTH, RADIUS, SOFT = 1.0, 0.005, 1e5  # m, m, N/m^2
+WEIGHT = 1000.0 * G * np.pi * RADIUS**2  # N/m
+
+
+def drawn(mu: float, far: float) -> ddg.Scene:
+    """A rod that lies on a floor; its last end is drawn by `far` after t = 1000, and back by a part of it after 1001."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, -G / 1000.0))  # of load parameters about 1000
+    material = ddg.Material(young=SOFT, density=1000.0, poisson=0.5)
+    points = line((0.0, 0.0, RADIUS), (LENGTH, 0.0, RADIUS), 100)
+    rod = scene.add_rod(points, section=ddg.Circle(RADIUS), material=material)
+    there_and_back = ddg.Motion(lambda t: (far * np.interp(t, [1000.0, 1001.0, 1002.0], [0.0, 1.0, 0.2]), 0.0, 0.0))
+    scene.fix(rod, [-1], "xy", motion=there_and_back)
+    scene.add_obstacle(ddg.Plane((0.0, 0.0, -1e-3)))
+    scene.contact(friction=mu, velocity=1e-7, range=1e-3)
+    return scene
+
+
+def test_a_rod_that_is_drawn_slides_from_its_end(device):
+    """Tension falls by mu w where it slides: F^2 / (2 EA mu w) at the end. Drawn back, friction turns round from the end on: the force
+    falls by 2 sqrt(EA mu w du), so that it depends on the way. The weight is a thousandth or two more.
+    """
+    mu, EA = 0.4, SOFT * np.pi * RADIUS**2
+    friction = mu * WEIGHT
+    far = (0.5 * friction * LENGTH) ** 2 / (2.0 * EA * friction)  # half of it slides
+    full = np.sqrt(2.0 * EA * friction * far)
+    back = full - 2.0 * np.sqrt(EA * friction * 0.8 * far)
+    assert back < 0.0 < np.sqrt(2.0 * EA * friction * 0.2 * far)  # the force of one that was never drawn farther
+    model = drawn(mu, far).build(device, precision="float64")
+    search = Equilibrium(model)
+    state = search.load(model.state(), 1, 999.0, 1000.0)
+    for end, expected in ((1001.0, full), (1002.0, back)):
+        state = search.load(state, 2, state.time, end)
+        assert abs(model.reactions(state, factor=end)[0].force[0] - expected) < 1e-3 * full
+
+
+def test_a_rope_about_a_drum(device):
+    """Euler and Eytelwein, with the bending stiffness of the rod; see the scene."""
+    scene = capstan.build(n=30, friction=0.3)
+    model = scene.build(device, precision="float64")
+    slack = np.linalg.norm(scene.loads[0].force)
+    state = statics.solve(model, scene.initial(model), start=1.0, end=5.0)
+    ratio = np.linalg.norm(model.reactions(state, factor=5.0)[0].force) / (5.0 * slack)
+    assert abs(ratio / capstan.expected(0.3, np.pi, 5.0 * slack) - 1.0) < 5e-3
+
+
+@pytest.mark.parametrize("load_steps", [1, 3])
+def test_pushed_by_an_obstacle(device, load_steps):
+    """A ball pushes a rod along the floor over many ranges of contact: by mu of its weight."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, -G))
+    scene.add_rod(line((0.0, -0.1, 0.006), (0.0, 0.1, 0.006), 6), section=ddg.Circle(0.005), material=RUBBER)
+    scene.add_obstacle(ddg.Plane(), name="floor")
+    wall = ddg.Plane((-0.02, 0.0, 0.0), (1.0, 0.0, 0.0))
+    scene.add_obstacle(wall, motion=ddg.Motion(lambda t: (0.1 * t, 0.0, 0.0)), name="wall")
+    scene.contact(friction=0.3)
+    scene.contact_between("wall", "rod", friction=0.0)
+    model = scene.build(device, precision="float64")
+    state = statics.solve(model, load_steps=load_steps)
+    weight = 1000.0 * np.pi * 0.005**2 * 0.2 * G
+    assert state.points()[:, 0].min() > 0.08
+    np.testing.assert_allclose(
+        model.reactions(state)[-1].force, (0.3 * weight, 0.0, 0.0), rtol=1e-6, atol=1e-8 * weight
+    )
+
+
+def test_runs_and_worlds_are_bitwise_equal(device):
+    model = on_slope(cross_on_floor, 0.3, friction=0.5).build(device, precision="float64", worlds=2)
+    one, other = (statics.solve(model, load_steps=2).points() for _ in range(2))
+    np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(one[0], one[1])
+
+
+def test_friction_needs_an_increment(device):
+    model = on_slope(rod_on_floor, 0.3, friction=0.5).build(device, precision="float64")
+    with pytest.raises(ddg.SceneError, match=r"friction .* from 1 to 1 there is none; give start other than end"):
+        statics.solve(model, start=1.0)
