@@ -11,6 +11,8 @@ from ddg_warp.threads import launches
 def contacts(model, state) -> Contacts:
     """What touches what at a state, `Contacts`: all pairs closer than the range of contact, and what rubs by its velocities.
 
+    An equilibrium with friction has that of the way there.
+
     Raises:
         SceneError: the scene has no contact.
     """

@@ -46,7 +46,8 @@ def energies(model, state) -> dict:
 def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     """Force and moment of every support of the scene: of rods in the order they were added, then of shells, rings and obstacles.
 
-    What holds an obstacle takes what is pushed against it and what rubs on it, by the velocities of the state; see `contacts`.
+    What holds an obstacle takes what is pushed against it and what rubs on it, by the velocities of the state, or of the way to
+    an equilibrium; see `contacts`.
     They balance the internal forces, without those of strain-rate damping, and the loads on held dofs, and hold the normals of
     clamped mesh edges and of planes of symmetry; the inertia of a held node itself is left out, and drag on it, which a moving
     support would have to add. Of a ring, x is the radial force summed around it, and moments do not hold the direction of the

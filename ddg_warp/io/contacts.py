@@ -22,7 +22,7 @@ class Contacts:
         point: between the closest points (n, 3) [m]; gap: (n,) [m].
         force: of contact, without friction, on the first object (n, 3) [N]; the second has its opposite.
         friction: on the first object (n, 3) [N], by the velocities of the state and its forces of contact; a step takes those forces
-            as they were at its start. Nothing rubs in a state at rest.
+            as they were at its start. Of an equilibrium with friction it is by the way there; else nothing rubs in a state at rest.
     """
 
     world: np.ndarray

@@ -244,7 +244,7 @@ def equilibrate(result: Result, steps: int, keep: Callable, *, options: Mapping,
         mean = sum(iterations) / max(1, len(iterations))
         newton = {"mean": mean, "max": max(iterations, default=0)}
         counts = {"newton_iterations": newton, "pcg_iterations": equilibrium.pcg_iterations}
-        result.statistics = {**counts, "outcomes": dict(outcomes)}
+        result.statistics = {**counts, "outcomes": dict(outcomes), **equilibrium.statistics()}
 
 
 def follow(result: Result, steps: int, keep: Callable, *, options: Mapping, clock, bar) -> None:

@@ -18,7 +18,7 @@ def summary(scene: str, parameters: Mapping, result, checks: Iterable) -> dict:
     """The content of summary.json.
 
     `failure` is there only where the solver failed, `stable` only of equilibria (null: not asked); `contact`, its law and
-    `statistics()["contact"]` of the integrator, only of scenes with contact.
+    `statistics()["contact"]` of the integrator or the search for equilibria, only of scenes with contact.
     """
     statistics = result.statistics
     content = {
@@ -51,7 +51,7 @@ def contact_line(contact: Mapping) -> str:
     said = [
         f"contact by {contact['law']}: {pairs['last']} pairs at the end, {pairs['mean']:.3g} in the mean",
         f"smallest gap {gap:.3g} m" if math.isfinite(gap) else "no gap below the range",
-        f"{contact['refused_crossings']} refused crossings",
+        *([f"{contact['refused_crossings']} refused crossings"] if "refused_crossings" in contact else []),
         f"{contact['searches']} searches",
     ]
     if "friction_work" in contact:

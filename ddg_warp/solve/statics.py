@@ -211,7 +211,9 @@ class Equilibrium:
         self.tangent.give(found)
         self.tangent.poses = poses_between(state, found["poses"], start, end) if "poses" in found else None
         if start == end:
-            return self.solve(state, start, end)
+            state = self.solve(state, start, end)
+            self._count(state, 0.0)
+            return state
         at, whole, cuts = start, (end - start) / load_steps, 0
         state = state.copy()
         while at != end:
@@ -219,6 +221,7 @@ class Equilibrium:
             target = end if abs(end - at) <= abs(increment) * (1.0 + 1e-12) else at + increment
             try:
                 state = self.solve(state, at, target)
+                self._count(state, abs(target - at))
                 at, cuts = target, max(0, cuts - 1)  # what was too much before may do now
             except SolverError as error:
                 cuts += 1
@@ -233,6 +236,15 @@ class Equilibrium:
                     ) from None
         state.time = end
         return state
+
+    def _count(self, state: State, increment: float) -> None:
+        """Count an equilibrium that was found, an increment of the load parameter after the one before."""
+        if self.model.touch:
+            self.net.count(state, increment)
+
+    def statistics(self) -> dict:
+        """Under "contact", where there is any, what touched in the equilibria of `load`: see `NetEquilibrium.contact_statistics`."""
+        return {"contact": self.net.contact_statistics()} if self.model.touch else {}
 
     def solve(self, state: State, before: float, at: float) -> State:
         """The equilibrium at load parameter `at`, from a state that belongs to `before`, under the controls of the last `load`.

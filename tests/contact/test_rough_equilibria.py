@@ -75,6 +75,21 @@ def test_what_rests_on_a_slope_creeps(device, name, law):
         assert state.stable is None
 
 
+@pytest.mark.parametrize("way, mu", [(1.0, 0.3), (-1.0, 0.6)])
+def test_friction_by_direction(device, way, mu):
+    """A rod creeps down the slope by the friction of its way, whose speed nu is as much smaller as that is more than the least."""
+    angle = 0.2
+    for law in ("barrier", "penalty"):
+        scene = ddg.Scene(gravity=(way * G * np.sin(angle), 0.0, -G * np.cos(angle)))
+        scene.add_rod(line((0.0, 0.0, 0.0055), (0.2, 0.0, 0.0055), 6), section=ddg.Circle(0.005), material=RUBBER)
+        scene.add_obstacle(ddg.Plane(), name="floor")
+        scene.contact(law=law)
+        scene.contact_between("rod", "floor", friction=(0.3, 0.6, 0.5))
+        model = scene.build(device, precision="float64")
+        moved = (statics.solve(model).points() - model.state().points())[:, 0]
+        np.testing.assert_allclose(moved.mean(), way * NU * 0.3 / mu * CREEP["logistic"](np.tan(angle) / mu), rtol=1e-3)
+
+
 def test_reactions_and_contacts_have_friction(device):
     """What rests is held by the floor against its weight, along the slope by friction, pair by pair."""
     angle = 0.3
@@ -128,7 +143,8 @@ def drawn(mu: float, far: float) -> ddg.Scene:
 
 def test_a_rod_that_is_drawn_slides_from_its_end(device):
     """Tension falls by mu w where it slides: F^2 / (2 EA mu w) at the end. Drawn back, friction turns round from the end on: the force
-    falls by 2 sqrt(EA mu w du), so that it depends on the way. The weight is a thousandth or two more.
+    falls by 2 sqrt(EA mu w du), so that it depends on the way. Friction takes the integral of mu w u, F^3 / (6 EA mu w).
+    The weight is a thousandth or two more.
     """
     mu, EA = 0.4, SOFT * np.pi * RADIUS**2
     friction = mu * WEIGHT
@@ -142,6 +158,10 @@ def test_a_rod_that_is_drawn_slides_from_its_end(device):
     for end, expected in ((1001.0, full), (1002.0, back)):
         state = search.load(state, 2, state.time, end)
         assert abs(model.reactions(state, factor=end)[0].force[0] - expected) < 1e-3 * full
+        if end == 1001.0:
+            np.testing.assert_allclose(
+                search.statistics()["contact"]["friction_work"], full**3 / (6.0 * EA * friction), rtol=5e-3
+            )
 
 
 def test_a_rope_about_a_drum(device):

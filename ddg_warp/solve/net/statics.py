@@ -168,10 +168,32 @@ class NetEquilibrium:
         self._start = model.net.empty()  # lagged data of a solve
         self._step = wp.zeros(self.newton.all, dtype=self.newton.right.dtype, device=model.wp_device)
         self._graphs = Graphs(model, lambda: arrays.load_kernels(self.newton.kernels, model.wp_device))
+        self._least, self._touching, self._friction_work = math.inf, [], 0.0
 
     def pcg_iterations(self) -> int:
         """Iterations of conjugate gradients so far, without those that let the free dofs follow supports."""
         return self.newton.pcg_iterations()
+
+    def count(self, state: State, increment: float) -> None:
+        """Count what touches in an equilibrium that was found, and what friction took on its way, in the time `increment`."""
+        touch = self.model.touch
+        touch.at(state.net.q)
+        gap = float(touch.terms.gap.numpy().min())
+        self._least = min(self._least, gap if gap < touch.search.reach else math.inf)
+        self._touching.append(int(touch.terms.touching.numpy().sum()))
+        if self.newton.rubs:
+            touch.rub(state.net.q, state.rubbing)
+            self._friction_work += increment * float(touch.terms.dissipated.numpy().sum())
+
+    def contact_statistics(self) -> dict:
+        """Of the equilibria that were counted, as of `NetContact.statistics`; no straight way leads to them for pairs to cross on."""
+        pairs = self._touching or [0]
+        result = {
+            "searches": int(self.newton.contact.search.searches.numpy()[0]),
+            "smallest_gap": self._least,
+            "contacts": {"mean": float(np.mean(pairs)), "last": pairs[-1]},
+        }
+        return result | ({"friction_work": self._friction_work} if self.newton.rubs else {})
 
     def following(self, state: State, step: np.ndarray, at: float) -> np.ndarray | None:
         """How the free dofs follow held ones that make a `step` (size,), by the tangent; None if there is no answer."""
