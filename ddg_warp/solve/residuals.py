@@ -67,11 +67,11 @@ class Residuals:
         worst = float((size - np.maximum(limit, floor))[free].max())
         return max(worst, *(excess for _, excess in sums)), "converged" if small else "converged_to_rounding"
 
-    def where(self, outcome: str, residual: np.ndarray, at: float, tightest: str = "") -> str:
-        """What to tell of a search that failed; in contact, of the pair that is `tightest`."""
+    def where(self, outcome: str, residual: np.ndarray, at: float, told: str = "") -> str:
+        """What to tell of a search that failed, with what is `told` of contact."""
         masked = np.where(self.tangent.free, np.abs(self.scaled(residual)), -1.0)
         worst = int(np.argmax(np.where(np.isfinite(masked), masked, np.inf)))
         return (
             f"no equilibrium at load parameter {at:g}: {outcome}, largest residual {residual[worst]:.3g} at "
-            f"{self.tangent.where(worst)}; {tightest}take more load steps, or hold what can still move freely"
+            f"{self.tangent.where(worst)}; {told}take more load steps, or hold what can still move freely"
         )

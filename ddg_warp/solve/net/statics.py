@@ -253,8 +253,10 @@ class NetEquilibrium:
             residual += self.tangent.into(self.model.touch.friction(state.net.q, state.sliding).ravel())
         if status > outcome.CONVERGED_TO_ROUNDING:
             name = outcome.NAMES[status]
-            tightest = self.newton.contact.tightest(state.net.q, status) if self.newton.contact else ""
-            raise SolverError(owner.residuals.where(name, residual, at, tightest), state=state, outcome=name)
+            told = self.newton.contact.tightest(state.net.q, status) if self.newton.contact else ""
+            if rubs:
+                told += "what slides may come to no rest: step the scene in time, "
+            raise SolverError(owner.residuals.where(name, residual, at, told), state=state, outcome=name)
         owner.outcome = outcome.NAMES[status]
         # in contact the last matrix may be the projected one without a trial of the exact one, which tells nothing
         indefinite = self.newton.contact is None and self.newton.islands.clamped.numpy().any()
