@@ -116,6 +116,13 @@ def test_what_slides_off_has_no_equilibrium(device):
         statics.solve(model, max_cuts=1, max_iterations=30)
 
 
+def test_friction_that_has_not_settled_is_no_equilibrium(device):
+    """After two rounds what is found is in equilibrium with the friction of other normal forces, a sixth off."""
+    model = on_slope(rod_on_floor, 0.3, friction=0.5).build(device, precision="float64")
+    with pytest.raises(SolverError, match="max_iterations"):
+        statics.solve(model, max_cuts=1, max_iterations=2)
+
+
 def test_rests_on_in_time(device):
     """Steps from an equilibrium begin at rest, and it goes on creeping as slowly."""
     model = on_slope(rod_on_floor, 0.3, friction=0.5).build(device, precision="float64")

@@ -31,6 +31,7 @@ from ddg_warp.solve.net.newton import NetNewton
 FORCING = 1e-4  # smallest reduction of the residual that a direction is solved to: Gauss-Newton errs by more
 ADRIFT = 1e3  # of the size of the net, from which on what moves goes nowhere
 FAR = 4.0  # turns of a direction, over the cap of a step, at which it is far enough
+POLISH = 2  # iterations of a solve that begins within rounding, at most
 LAGGED = 5  # iterations with the same normal forces, which without friction at first may lead far off
 
 
@@ -243,8 +244,11 @@ class NetEquilibrium:
                 self._refuse_drifting(state, q, at)
             if status > outcome.CONVERGED_TO_ROUNDING and not (rubs and status == outcome.MAX_ITERATIONS):
                 break
-            if on and not iterations:  # in equilibrium with the friction of its own normal forces
+            # in equilibrium with the friction of its own normal forces
+            if on and iterations <= (POLISH if status == outcome.CONVERGED_TO_ROUNDING else 0):
                 break
+        else:
+            status = outcome.MAX_ITERATIONS if rubs else status
         outer = self.tangent.loads(at, q)
         residual = outer - self.tangent.gradient(state)
         if rubs:
