@@ -232,20 +232,20 @@ class NetEquilibrium:
                 partial(self._begin, state, at, before, rate),
                 partial(self.newton.search, self._start, on),
             )
-            before, iterations = state, int(self.newton.islands.iteration.numpy().sum())
-            owner.iterations += iterations
+            before, iterations, ends = state, self.newton.islands.iteration.numpy(), self.newton.islands.status.numpy()
+            owner.iterations += int(iterations.sum())
             wp.copy(state.net.q, self.newton.q)
             for name in ("frame", *(f"lag_{i}" for i in range(len(self.net.sets)))):
                 wp.copy(state.net.arrays()[name], self._start.arrays()[name])  # renewed on the way, perhaps
             self.model.carry_frames(state)
-            status = int(self.newton.islands.status.numpy().max())
+            status = int(ends.max())
             q = self.tangent.dofs(state)
             if self.newton.contact:
                 self._refuse_drifting(state, q, at)
             if status > outcome.CONVERGED_TO_ROUNDING and not (rubs and status == outcome.MAX_ITERATIONS):
                 break
             # in equilibrium with the friction of its own normal forces
-            if on and iterations <= (POLISH if status == outcome.CONVERGED_TO_ROUNDING else 0):
+            if on and (iterations <= np.where(ends == outcome.CONVERGED_TO_ROUNDING, POLISH, 0)).all():
                 break
         else:
             status = outcome.MAX_ITERATIONS if rubs else status
