@@ -46,12 +46,11 @@ def energies(model, state) -> dict:
 def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     """Force and moment of every support of the scene: of rods in the order they were added, then of shells, rings and obstacles.
 
-    What holds an obstacle takes what is pushed against it and what rubs on it, by the velocities of the state, or of the way to
-    an equilibrium; see `contacts`.
-    They balance the internal forces, without those of strain-rate damping, and the loads on held dofs, and hold the normals of
-    clamped mesh edges and of planes of symmetry; the inertia of a held node itself is left out, and drag on it, which a moving
-    support would have to add. Of a ring, x is the radial force summed around it, and moments do not hold the direction of the
-    meridian. A dof that several supports hold counts with the first of them, so that the reactions add up.
+    What holds an obstacle takes what is pushed against it and what rubs on it, by the velocities of the state, or of the way to an
+    equilibrium; see `contacts`. They balance the internal forces, without those of strain-rate damping, and the loads on held dofs,
+    and hold the normals of clamped mesh edges and of planes of symmetry; the inertia of a held node itself is left out, and drag on
+    it, which a moving support would have to add. Of a ring, x is the radial force summed around it, and moments do not hold the
+    direction of the meridian. A dof that several supports hold counts with the first of them, so that the reactions add up.
 
     Args:
         point: what moments are about (3,); by default the first node that a support holds.
@@ -59,10 +58,7 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     """
     tangent = Tangent(model)
     q = tangent.dofs(state)
-    gradient = tangent.gradient(state)
-    if model.touch and model.touch.terms.frictions:
-        rubbing = model.touch.friction(state.net.q, state.rubbing)
-        Tangent.of(tangent.parts[-1], gradient)[:] -= rubbing.ravel()
+    gradient = tangent.gradient(state) - tangent.friction(state)
     force = tangent.back(np.where(tangent.free, 0.0, gradient - tangent.loads(factor, q)))
     q = tangent.back(q)
     scene = model.scene

@@ -130,6 +130,14 @@ class Tangent:
                 part.move_supports(state, before, at)
             self.model.carry_frames(state)
 
+    def friction(self, state) -> np.ndarray:
+        """Forces of friction by `state.rubbing` (size,) [N], which have no potential and are in no gradient; zero without."""
+        result, touch = np.zeros(self.size), self.model.touch
+        if touch and touch.terms.frictions:
+            net = self.parts[-1]
+            self.of(net, result)[:] = net.into(touch.friction(state.net.q, state.rubbing).ravel())
+        return result
+
     @property
     def prescribes(self) -> bool:
         """Whether supports turn normals of shells, or a magnetic field acts: what states hold beside their dofs."""

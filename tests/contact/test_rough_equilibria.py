@@ -186,7 +186,7 @@ def test_a_rope_about_a_drum(device):
 
 @pytest.mark.parametrize("load_steps", [1, 3])
 def test_pushed_by_an_obstacle(device, load_steps):
-    """A ball pushes a rod along the floor over many ranges of contact: by mu of its weight."""
+    """A wall pushes a rod along the floor over many ranges of contact: by mu of its weight."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -G))
     scene.add_rod(line((0.0, -0.1, 0.006), (0.0, 0.1, 0.006), 6), section=ddg.Circle(0.005), material=RUBBER)
     scene.add_obstacle(ddg.Plane(), name="floor")

@@ -355,9 +355,7 @@ def equilibrium(kind, variant):
 def balanced(model, state, scale: float, variant: Variant) -> None:
     """Loads, stresses and what touches and rubs are in equilibrium at free dofs."""
     tangent = Tangent(model)
-    residual = tangent.loads(1.0, tangent.dofs(state)) - tangent.gradient(state)
-    if model.touch:
-        tangent.of(tangent.parts[-1], residual)[:] += model.touch.friction(state.net.q, state.rubbing).ravel()
+    residual = tangent.loads(1.0, tangent.dofs(state)) - tangent.gradient(state) + tangent.friction(state)
     assert np.abs(residual[tangent.free]).max() < (1e-3 if variant.precision == "float32" else 1e-6) * scale
 
 

@@ -254,7 +254,7 @@ class NetEquilibrium:
         if rubs:
             rates = (state.net.q.numpy() - first.net.q.numpy()) * rate
             state.sliding = wp.array(rates, dtype=self.net.vector, device=self.net.device)
-            residual += self.tangent.into(self.model.touch.friction(state.net.q, state.sliding).ravel())
+            residual += self.tangent.friction(state)
         if status > outcome.CONVERGED_TO_ROUNDING:
             name = outcome.NAMES[status]
             told = self.newton.contact.tightest(state.net.q, status) if self.newton.contact else ""
