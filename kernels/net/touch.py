@@ -35,7 +35,7 @@ UNTRIED = 2  # iterates that are not tried with the exact matrix after one in wh
 def world_kernels(real):
     """A thread a world: account(...) for the energy; modes(...) of motions, and of what is predicted(...); depart(...) on them;
     expect(...) of steps that were cut; refuse(...) what crossed; curve(...) of matrices; again(...) with another friction;
-    short(...) of predictors that were cut."""
+    short(...) of predictors that were cut; less(...) of motions that were long."""
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def account(
@@ -168,14 +168,21 @@ def world_kernels(real):
             if flags[CUT, w] != 0:
                 flags[DRIVEN, w] = wp.static(ON_THE_WAY)
 
-    return account, modes, predicted, depart, expect, refuse, curve, again, short
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def less(modes: wp.array(dtype=int), longest: wp.array(dtype=real), most: real, time: wp.array(dtype=real)):
+        """The part of a motion that is made, where that was cut to `most` before it was made."""
+        w = wp.tid()
+        if modes[w] == wp.static(WHOLE) and longest[w] > most:
+            time[w] = time[w] * (most / longest[w])
+
+    return account, modes, predicted, depart, expect, refuse, curve, again, short, less
 
 
 @cache
 def block_kernels(real, linear, serial: bool):
     """gain(...) by a motion; lessen(...) the residual by a product; aim(...), push(...), land(...)
-    and arrive(...) of supports; stay(...) of worlds that do not move; part(...) with what was proposed; way(...) that is left, and
-    add(...) it; keep(...) a solution."""
+    and arrive(...) of supports; stay(...) of worlds that do not move; near(...) where they start for others; part(...) with what was
+    proposed; way(...) that is left, and add(...) it; keep(...) a solution."""
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     _, free = product_functions(linear)
     share, until = share_function(serial), until_function(serial)
@@ -299,6 +306,7 @@ def block_kernels(real, linear, serial: bool):
         start_out: wp.array(dtype=V),
         modes: wp.array(dtype=int),
         proposed: wp.array(dtype=V),
+        longest: wp.array(dtype=real),
     ):
         """Where motions start: what does not move, from where it is. Worlds in which a node goes `far` have one share."""
         w, start = share(wp.tid(), blocks)
@@ -311,8 +319,28 @@ def block_kernels(real, linear, serial: bool):
             else:
                 proposed[i] = q[i]
                 if k < nodes and unit[k] >= 0:
-                    if wp.length_sq(q[i] - base[i]) > far * far:
+                    square = wp.length_sq(q[i] - base[i])
+                    if square > far * far:
                         modes[w] = wp.static(WHOLE)
+                        wp.atomic_max(longest, w, wp.sqrt(square))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def near(
+        base: wp.array(dtype=V),
+        unit: wp.array(dtype=int),
+        modes: wp.array(dtype=int),
+        longest: wp.array(dtype=real),
+        most: real,
+        blocks: int,
+        q: wp.array(dtype=V),
+    ):
+        """Cuts motions by one share in which a node goes farther than `most` to where the farthest goes so far."""
+        w, start = share(wp.tid(), blocks)
+        if modes[w] == wp.static(WHOLE) and longest[w] > most:
+            for k in range(start, until(start, blocks)):
+                if unit[k] >= 0:
+                    i = k + w * blocks
+                    q[i] = base[i] + (most / longest[w]) * (q[i] - base[i])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def part(
@@ -360,4 +388,4 @@ def block_kernels(real, linear, serial: bool):
             for k in range(start, until(start, blocks)):
                 out[k + w * blocks] = q[k + w * blocks]
 
-    return gain, lessen, aim, push, land, arrive, stay, part, way, add, keep
+    return gain, lessen, aim, push, land, arrive, stay, near, part, way, add, keep

@@ -11,6 +11,7 @@ from ddg_warp.errors import SolverError
 from ddg_warp.geometry import meshes
 from ddg_warp.scenes import crossed_beams
 from ddg_warp.solve import continuation, relaxation, stability
+from ddg_warp.solve.contact import pairs
 from ddg_warp.solve.net.statics import NetEquilibrium
 from ddg_warp.solve.tangent import Tangent
 from tests.contact.brute_force import edge_edge
@@ -355,3 +356,54 @@ def test_what_the_device_does_not_finish_the_host_does(monkeypatch, outcome):
     state = statics.solve(model)
     assert state.stable
     np.testing.assert_allclose(state.points(), finished.points(), rtol=0.0, atol=1e-13)
+
+
+def layers_apart() -> ddg.Scene:
+    """Crossed layers far above each other, that can go up and down alone; the higher, the heavier, so that all overtake all."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, -G))
+    s, off = np.linspace(-0.1, 0.1, 13), np.linspace(-0.08, 0.08, 8)
+    for level in range(5):
+        for k, y in enumerate(off):
+            along = np.stack([s, np.full(13, y + 1e-3 * level), np.full(13, 0.02 + 0.03 * level + 1e-3 * k)], 1)
+            rod = scene.add_rod(
+                along[:, [1, 0, 2]] if level % 2 else along,
+                section=ddg.Circle(0.002),
+                material=ddg.Material(young=1e7, density=1000.0 * (1.0 + level), poisson=0.5),
+            )
+            scene.fix(rod, range(13), "xy")
+            scene.fix_twist(rod, range(12))
+    scene.add_obstacle(ddg.Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), name="floor")
+    scene.contact(range=1e-3)
+    return scene
+
+
+def test_long_ways_past_a_crowd_are_gone_in_parts(device, monkeypatch):
+    """By room for few pairs, or for all there are along the ways, what sags far comes to the same rest."""
+    model = layers_apart().build(device, precision="float64")
+    at_once = statics.Equilibrium(model)
+    rest = at_once.load(model.state(), 1)
+    monkeypatch.setattr(pairs, "CROWD", 1)
+    monkeypatch.setattr(pairs, "CROWD_LEAST", 1)
+    in_parts = statics.Equilibrium(model)
+    state = in_parts.load(model.state(), 1)
+    contact = in_parts.net.newton.contact
+    assert at_once.net.newton.contact.way == np.inf
+    assert contact.way < 0.05
+    assert contact.search.lists[0].capacity < at_once.net.newton.contact.search.lists[0].capacity
+    np.testing.assert_allclose(state.points(), rest.points(), rtol=0.0, atol=1e-8)
+
+
+def test_the_part_of_a_motion_that_is_safe(device, monkeypatch):
+    """Whatever there is room for at first: up to where crossed rods 23 mm apart meet, which are 4 mm thick, or by room for few less."""
+    model = layers_apart().build(device, precision="float64")
+    before = Tangent(model).dofs(model.state()).reshape(-1, 3)
+    z = before[: 40 * 13, 2]
+    way = np.zeros_like(before)
+    way[: len(z), 2] = -12.0 * (z - z.min())  # all come together, and pass by each other
+    meet = (1.0 - 4.0 / 23.0) / 12.0
+    share = statics.Equilibrium(model).net.share(before.ravel(), (before + way).ravel())
+    assert 0.85 * meet < share < meet
+    monkeypatch.setattr(pairs, "CROWD", 1)
+    monkeypatch.setattr(pairs, "CROWD_LEAST", 1)
+    part = statics.Equilibrium(model).net.share(before.ravel(), (before + way).ravel())
+    assert 0.2 * meet < part < meet

@@ -1,6 +1,7 @@
 """Candidates of contact on a device, how long they hold, and how far everything may move; see `kernels.contact`."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import warp as wp
@@ -199,8 +200,12 @@ class BroadPhase:
         search = (self.overflow, self.time, self._done, self._start, self._end)
         self._filter(base, self._move, q, unit, together, units, keep, self._room(keep), search)
 
-    def fit(self, x: wp.array) -> bool:
+    def fit(self, x: wp.array, shorten: Callable[[], bool] | None = None) -> bool:
         """Make room for pairs that did not fit, and search again until they do; whether there were any. Reads from the device.
+
+        Args:
+            x: where to search again.
+            shorten: asked where they are a crowd, see `PairList.crowded`; if it is true, motions will be shorter, and no room is made.
 
         Raises:
             SolverError: names a node whose position is not finite; or if there are more pairs than can be counted.
@@ -208,9 +213,10 @@ class BroadPhase:
         grown = False
         while self._checked():
             self.overflow.zero_()
+            spare = shorten is not None and any(pairs.crowded for pairs in self.lists) and shorten()
             for pairs in self.lists:
-                pairs.fit()
-            self.version += 1
+                pairs.dismiss() if spare else pairs.fit()
+            self.version += not spare
             grown = True
             self.search(x)
         return grown

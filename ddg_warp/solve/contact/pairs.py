@@ -16,6 +16,9 @@ from ddg_warp.solve.contact.tree import Things
 
 # Parts of what meets, where each has as many bundles at least: so they are about as full (64 of 310,000 bundles within 8 %).
 PARTS, LEAST = 64, 1024
+# Pairs of each of the first things, and at least, from which on they are a crowd: sixty contacts a rod of 50 edges are two, what lies
+# in fifty layers has ten, and a pair takes 1.6 kB with friction in float64.
+CROWD, CROWD_LEAST = 32, 2**16
 LINE = 32  # integers of a line of the cache, in which there is one counter
 
 
@@ -129,6 +132,16 @@ class PairList:
             # not for the next few alone: graphs are captured anew, which takes longer than many steps
             most = np.array([MOST, MOST // self._slots])
             self.reserve(*np.where(needed > now, np.minimum(2 * needed, most), now).tolist())
+
+    @property
+    def crowded(self) -> bool:
+        """Whether pairs, or bundles that meet, were a crowd in some search for which there was no room. Reads from the device."""
+        most = max(CROWD_LEAST, CROWD * self.first.all)
+        return bool((self._needed.numpy() > np.maximum(most, [self.capacity, len(self._met)])).any())
+
+    def dismiss(self) -> None:
+        """Forget how many did not fit."""
+        self._needed.zero_()
 
     def meet(self) -> None:
         """Find the bundles whose boxes meet; see `kernels.contact.candidates`."""

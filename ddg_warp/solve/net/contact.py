@@ -23,6 +23,8 @@ from ddg_warp.solve.net.contact_bands import ContactBands
 from ddg_warp.solve.net.system import Sums
 
 FAR = 16.0  # margins that a node goes from which on a world has one share: of so long ways too many pairs would be near
+# Where pairs would be too many all the same ways are cut to so many margins, and to a part of what they were until they are not.
+LONGEST, SHORTER = 4096.0, 0.25
 LEAST = 1e-3  # of the range, the gap from which on a barrier has no room
 ROUNDING = 16.0  # units in the last place within which supports have arrived
 
@@ -39,6 +41,7 @@ class NetContact:
         bends: whether its matrix has what comes of pairs that turn, once the search is near; see `kernels.contact.pair_bend`.
         rubs: whether there is friction; rate: over what it counts slips (worlds,) [1/s].
         solutions: where the last step took friction anew, in this order, for its reverse: `lags` - 1 of (W N,) with friction.
+        way: [m] that nodes go at most in worlds of one share, as many pairs are near along longer ones; see `outgrown`.
         crossed: (1,) pairs that would have passed through each other in all steps so far; least: (1,) the smallest gap [m].
     """
 
@@ -72,6 +75,7 @@ class NetContact:
         self.bound = make(newton.all, net.vector)
         self._way, self._pushed = (make(newton.all, wp.types.vector(3, linear)) for _ in range(2))
         self._going = make(1, int)
+        self._longest, self.way = make(worlds, real), math.inf
         self.crossed, self.least = make(1, wp.int64), wp.full(1, math.inf, dtype=real, device=device)
         self.tally = Tally(self.terms)
         self._counts = self.crossed, self.least, self.search.searches, *self.tally.arrays
@@ -92,6 +96,7 @@ class NetContact:
             self._find_curved,
             self._again,
             self._find_short,
+            self._less,
         ) = made
         self._kernels = list(made)
         made = kernels.block_kernels(real, linear, arrays.serial(device))
@@ -103,6 +108,7 @@ class NetContact:
             self._land,
             self._arrive,
             self._stay,
+            self._near,
             self._part,
             self._find_way,
             self._add,
@@ -240,8 +246,14 @@ class NetContact:
         newton = self.newton
         far = FAR * self.search.margin
         inputs = [newton.q, newton.base, self._unit, self.net.host.nodes, far, self.net.blocks]
-        self._sweep(self._stay, inputs, [self._move, self._modes, self.bound])
+        self._longest.zero_()
+        self._sweep(self._stay, inputs, [self._move, self._modes, self.bound, self._longest])
+        shorter = [self._modes, self._longest, self.way]
+        if self.way < math.inf:
+            self._sweep(self._near, [self._move, self._unit, *shorter, self.net.blocks], [newton.q])
         self.search.filter(self._move, newton.q, self._unit, self._modes, self._units, self.touch.keep)
+        if self.way < math.inf:
+            self._launch(self._less, self.net.worlds, shorter, [self.search.time])
         if len(self._nodes):
             eps = ROUNDING * newton.eps
             inputs = [self._nodes, self._aims, newton.fixed, self._modes, eps, self.net.blocks, newton.q]
@@ -249,14 +261,23 @@ class NetContact:
 
     def share(self, before: np.ndarray, after: np.ndarray) -> float:
         """The part of a motion (3 W N,) of all worlds in which nothing passes through anything. Not in a capture."""
-        newton = self.newton
-        base, q = (wp.array(x.reshape(-1, 3), dtype=self.net.vector, device=newton.device) for x in (before, after))
+        base = wp.array(before.reshape(-1, 3), dtype=self.net.vector, device=self.newton.device)
         self._modes.fill_(kernels.WHOLE)
+        longest, least, part = np.abs(after - before).max(), FAR * self.search.margin, 1.0
+
+        def shorten() -> bool:
+            nonlocal part
+            long = part * longest > least
+            part *= SHORTER if long else 1.0
+            return long
+
         self.search.fit(base)
-        self.search.filter(base, q, self._unit, self._modes, self._units, self.touch.keep)
-        if self.search.fit(base):
+        while True:
+            end = before + part * (after - before)
+            q = wp.array(end.reshape(-1, 3), dtype=self.net.vector, device=self.newton.device)
             self.search.filter(base, q, self._unit, self._modes, self._units, self.touch.keep)
-        return float(self.search.time.numpy().min())
+            if not self.search.fit(base, shorten):  # else nothing has moved
+                return part * float(self.search.time.numpy().min())
 
     def _let_go(self) -> None:
         """Let go of what was proposed where nothing is on its way."""
@@ -314,9 +335,20 @@ class NetContact:
         remedy = "give their contact a larger stiffness or range, " if reason == outcome.NO_ROOM else ""
         return f"the smallest gap, {gap:.3g} m, is between {pair}; {remedy}"
 
+    def _shorten(self) -> bool:
+        """Go shorter ways from now on, if those of the last motion were long."""
+        longest, least = min(self.way, float(self._longest.numpy().max())), FAR * self.search.margin
+        if longest <= least:
+            return False
+        self.way = max(least, min(longest * SHORTER, LONGEST * self.search.margin))
+        return True
+
     def outgrown(self, x: wp.array) -> bool:
-        """Whether pairs did not fit, for which there is room then. Reads from the device."""
-        grown = self.search.fit(x)
+        """Whether pairs did not fit, for which there is room then, or no need: long ways past a crowd of others are gone in parts.
+
+        Reads from the device.
+        """
+        grown = self.search.fit(x, self._shorten)
         grown = self.terms.fit() or grown
         if grown:
             self.tally.forget()
