@@ -343,12 +343,12 @@ class NetContact:
         self.way = max(least, min(longest * SHORTER, LONGEST * self.search.margin))
         return True
 
-    def outgrown(self, x: wp.array) -> bool:
-        """Whether pairs did not fit, for which there is room then, or no need: long ways past a crowd of others are gone in parts.
+    def outgrown(self, x: wp.array, spare: bool = False) -> bool:
+        """Whether pairs did not fit, for which there is room then, or to `spare` it no need: long ways past a crowd are gone in parts.
 
         Reads from the device.
         """
-        grown = self.search.fit(x, self._shorten)
+        grown = self.search.fit(x, self._shorten if spare else None)
         grown = self.terms.fit() or grown
         if grown:
             self.tally.forget()

@@ -110,8 +110,11 @@ class StaticNewton(NetNewton):
         self.solve(state)
 
     def outgrown(self) -> bool:
-        """Whether pairs did not fit, for which there is room then, so that all is to be done again. Reads from the device."""
-        return self.contact is not None and self.contact.outgrown(self._before)
+        """Whether pairs did not fit, so that all is to be done again, with room or by shorter ways. Reads from the device.
+
+        Without inertia what nothing holds goes as far as it likes, past all else; steps in time end somewhere.
+        """
+        return self.contact is not None and self.contact.outgrown(self._before, spare=True)
 
     def watch(self) -> None:
         """Directions grow with every iteration: one that would be cut to a fraction is far enough.
