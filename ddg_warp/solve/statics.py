@@ -17,7 +17,6 @@ the load parameter, which the way there decides; it is found on the device at an
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
 
 from ddg_warp import arguments
 from ddg_warp.compile.precision import lost_in_rounding
@@ -28,7 +27,7 @@ from ddg_warp.model.state import State
 from ddg_warp.scene import validate as scene_validate
 from ddg_warp.solve import mixed, stability
 from ddg_warp.solve.choice import large_static, static_solver, why_not_pcg
-from ddg_warp.solve.direct import Factorisation, SingularError
+from ddg_warp.solve.descent import Descent
 from ddg_warp.solve.motion import jump_between, poses_between
 from ddg_warp.solve.net.statics import NetEquilibrium
 from ddg_warp.solve.residuals import Residuals
@@ -135,7 +134,7 @@ class Equilibrium:
 
     Attributes:
         tangent: energy, gradient and Hessian of the model; residuals: what is small against what, of it.
-        net: what solves by conjugate gradients, if that is the solver.
+        net: what solves by conjugate gradients, if that is the solver; descent: what solves by factors.
         factors: whether the tangent at what it finds is factored, to tell whether that is stable.
         mixed: whether Newton with stresses of its own is tried first; where it can be, by default.
         iterations: Newton iterations so far.
@@ -156,6 +155,7 @@ class Equilibrium:
         self._rubs = model.touch is not None and model.net.host.touching.rubs
         self.factors = self.net is None or (model.touch is not None and not self._rubs and not large_static(model))
         self.mixed = self.tangent.shells_alone and self.net is None
+        self.descent = Descent(self)
         self.iterations, self.shift = 0, 0.0
         self.outcome, self.stiffness = "", None
 
@@ -284,13 +284,13 @@ class Equilibrium:
     def _minimum(self, state: State, at: float, before: State, increment: float) -> State:
         """The equilibrium at load parameter `at` from a state with its supports in place; in contact, on a way from `before`."""
         if not self.net:
-            return self._descend(state, at)
+            return self.descent.solve(state, at)
         try:
             state = self.net.solve(state, at, before, increment)
         except SolverError as error:
             if not (self.factors and error.outcome in UNFINISHED and self.net.arrived):
                 raise
-            return self._descend(error.state, at)  # with second derivatives that conjugate gradients leave out
+            return self.descent.solve(error.state, at)  # with second derivatives that conjugate gradients leave out
         self.stiffness = self.tangent.stiffness(state, at) if self.factors else None
         return state
 
@@ -310,72 +310,6 @@ class Equilibrium:
                 return beside
             step = 0.5 * step
         return None
-
-    def _descend(self, state: State, at: float) -> State:
-        """The equilibrium at load parameter `at` from a state with its supports in place, by Newton with a line search."""
-        tangent, options = self.tangent, self.options
-        free = tangent.free
-        energies, q = tangent.element_energies(state), tangent.dofs(state)
-        outer = tangent.loads(at, q)
-        gradient = tangent.gradient(state)
-        first, polished = self.residuals.first_scale(outer, gradient), False
-        for _ in range(options.max_iterations):
-            residual = outer - gradient
-            hessian = tangent.stiffness(state, at)
-            if not np.isfinite(residual).all() or not np.isfinite(hessian.data).all():
-                raise SolverError(self.residuals.where("non_finite", residual, at), state=state, outcome="non_finite")
-            scale = np.maximum(first, self.residuals.load_scale(outer, gradient))
-            excess, self.outcome = self.residuals.excess(residual, gradient, hessian, q, scale)
-            self.stiffness = hessian
-            if excess <= 0.0 and (self.outcome == "converged" or polished):
-                return self.found(state, outer, residual, at)
-            polished = excess <= 0.0  # the floor is a bound: one more iteration gives what rounding allows
-            self.iterations += 1
-            direction, decrease = self._direction(hessian, residual)
-            shortened = min(1.0, options.rotation_cap / max(1e-300, tangent.rotation(q, direction)))
-            direction, decrease = shortened * direction, shortened * decrease
-            taken, found = 1.0, False
-            merit = np.linalg.norm(self.residuals.scaled(residual)[free])
-            for _ in range(30):
-                trial = tangent.retract(q, taken * direction)
-                if self.net:
-                    share = self.net.share(q, trial)
-                    taken, trial = share * taken, q + share * (trial - q)
-                candidate = state.copy()
-                tangent.assign(candidate, trial)
-                new_gradient = tangent.gradient(candidate)
-                new_energies = tangent.element_energies(candidate)
-                new_outer = tangent.loads(at, trial)
-                change = (new_energies - energies).sum() - 0.5 * (outer + new_outer) @ (trial - q)
-                noise = 64 * self.model.types.eps * (np.abs(energies).sum() + np.abs(gradient) @ np.abs(q))
-                new_merit = np.linalg.norm(self.residuals.scaled(new_outer - new_gradient)[free])
-                if not np.isfinite(change) or not np.isfinite(new_merit):
-                    found = False
-                elif options.mode == "follow":
-                    found = new_merit < (1.0 - 1e-4 * taken) * merit or (taken == 1.0 and new_merit < 10.0 * merit)
-                elif taken * decrease > 10.0 * noise:
-                    found = change <= -1e-4 * taken * decrease + noise
-                else:
-                    found = new_merit <= 2.0 * merit
-                if found:
-                    break
-                taken *= 0.5
-            if not found and polished:
-                return self.found(state, outer, residual, at)
-            if not found:
-                raise SolverError(
-                    self.residuals.where("line_search_failed", residual, at), state=state, outcome="line_search_failed"
-                )
-            state, q, energies, gradient, outer = (
-                candidate,
-                tangent.dofs(candidate),
-                new_energies,
-                new_gradient,
-                new_outer,
-            )
-        raise SolverError(
-            self.residuals.where("max_iterations", outer - gradient, at), state=state, outcome="max_iterations"
-        )
 
     def _hidden(self, outer: np.ndarray, residual: np.ndarray) -> bool:
         """Whether more than half of the loads is left over, of which rounding does not let the dofs tell."""
@@ -406,7 +340,7 @@ class Equilibrium:
         if not step.any():
             return alone
         state = tangent.with_prescribed(state, at)
-        direction = (self.net.following if self.net else self._following)(state, step, at)
+        direction = (self.net or self.descent).following(state, step, at)
         if direction is None:
             return alone
         q = tangent.dofs(state)
@@ -418,33 +352,3 @@ class Equilibrium:
         overturned = tangent.turned_over(q, tangent.dofs(alone))
         better = overturned or not potential(alone) <= potential(follow)
         return follow if better and np.isfinite(potential(follow)) else alone
-
-    def _following(self, state: State, step: np.ndarray, at: float) -> np.ndarray | None:
-        """How the free dofs follow held ones that make a `step` (size,), by the tangent; None if there is no answer."""
-        tangent = self.tangent
-        hessian = tangent.stiffness(state, at)
-        if not np.isfinite(hessian.data).all():
-            return None
-        outer = tangent.loads(at, tangent.dofs(state))
-        return self._direction(hessian, outer - tangent.gradient(state) - hessian @ step)[0]
-
-    def _direction(self, hessian, residual: np.ndarray) -> tuple[np.ndarray, float]:
-        """Newton direction on the free dofs and the decrease of energy it promises."""
-        free = np.flatnonzero(self.tangent.free)
-        matrix, right = hessian[free][:, free], residual[free]
-        solution = self._factor(matrix).solve(right)
-        direction = np.zeros(self.tangent.size)
-        direction[free] = solution
-        return direction, float(right @ solution)
-
-    def _factor(self, matrix) -> Factorisation:
-        """The tangent's factors; shifted until it is definite, or in mode "follow" until it is regular."""
-        diagonal = sparse.diags(np.abs(matrix.diagonal()) + 1e-12 * np.abs(matrix.diagonal()).max())
-        for self.shift in (0.0, *np.geomspace(1e-6, 16.0, 13)):
-            try:
-                factor = Factorisation((matrix + self.shift * diagonal).tocsc())
-            except SingularError:
-                continue
-            if self.options.mode == "follow" or (factor.reliable and not factor.negative):
-                break
-        return factor
