@@ -63,17 +63,19 @@ def world_kernels(real):
             noise[w] = noise[w] + wp.abs(energy[w])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def modes(flags: wp.array2d(dtype=int), modes_out: wp.array(dtype=int)):
-        """A step that was shortened by the search moves all with one share: it descends, if short enough."""
+    def modes(flags: wp.array2d(dtype=int), modes_out: wp.array(dtype=int), longest_out: wp.array(dtype=real)):
+        """A step that was shortened by the search moves all with one share: it descends, if short enough. None is long so far."""
         w = wp.tid()
+        longest_out[w] = real(0.0)
         modes_out[w] = wp.static(NONE)
         if flags[TODO, w] == wp.static(PLACE) or flags[TODO, w] == wp.static(STRAIGHT):
             modes_out[w] = wp.where(flags[HALVINGS, w] > 0, int(wp.static(WHOLE)), int(wp.static(UNITS)))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def predicted(flags: wp.array2d(dtype=int), modes_out: wp.array(dtype=int)):
+    def predicted(flags: wp.array2d(dtype=int), modes_out: wp.array(dtype=int), longest_out: wp.array(dtype=real)):
         """The same of predictors, which the worlds have that are on their way."""
         w = wp.tid()
+        longest_out[w] = real(0.0)
         modes_out[w] = wp.where(flags[MOVED, w] != 0, int(wp.static(UNITS)), int(wp.static(NONE)))
         flags[DRIVEN, w] = 0
 
@@ -181,8 +183,8 @@ def world_kernels(real):
 @cache
 def block_kernels(real, linear, serial: bool):
     """gain(...) by a motion; lessen(...) the residual by a product; aim(...), push(...), land(...)
-    and arrive(...) of supports; stay(...) of worlds that do not move; near(...) where they start for others; part(...) with what was
-    proposed; way(...) that is left, and add(...) it; keep(...) a solution."""
+    and arrive(...) of supports; stay(...) of worlds that do not move; near(...) where they would go too
+    far; part(...) with what was proposed; way(...) that is left, and add(...) it; keep(...) a solution."""
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     _, free = product_functions(linear)
     share, until = share_function(serial), until_function(serial)
@@ -308,7 +310,8 @@ def block_kernels(real, linear, serial: bool):
         proposed: wp.array(dtype=V),
         longest: wp.array(dtype=real),
     ):
-        """Where motions start: what does not move, from where it is. Worlds in which a node goes `far` have one share."""
+        """Where motions start: what does not move, from where it is. Worlds in which a node goes `far` have one share; how far the
+        `longest` way is of these."""
         w, start = share(wp.tid(), blocks)
         still = modes[w] == wp.static(NONE)
         for k in range(start, until(start, blocks)):

@@ -41,7 +41,7 @@ class NetContact:
         bends: whether its matrix has what comes of pairs that turn, once the search is near; see `kernels.contact.pair_bend`.
         rubs: whether there is friction; rate: over what it counts slips (worlds,) [1/s].
         solutions: where the last step took friction anew, in this order, for its reverse: `lags` - 1 of (W N,) with friction.
-        way: [m] that nodes go at most in worlds of one share, as many pairs are near along longer ones; see `outgrown`.
+        farthest: [m] that nodes go in worlds of one share, as too many pairs are near along longer ways; see `outgrown`.
         crossed: (1,) pairs that would have passed through each other in all steps so far; least: (1,) the smallest gap [m].
     """
 
@@ -75,7 +75,7 @@ class NetContact:
         self.bound = make(newton.all, net.vector)
         self._way, self._pushed = (make(newton.all, wp.types.vector(3, linear)) for _ in range(2))
         self._going = make(1, int)
-        self._longest, self.way = make(worlds, real), math.inf
+        self._longest, self.farthest = make(worlds, real), math.inf
         self.crossed, self.least = make(1, wp.int64), wp.full(1, math.inf, dtype=real, device=device)
         self.tally = Tally(self.terms)
         self._counts = self.crossed, self.least, self.search.searches, *self.tally.arrays
@@ -164,7 +164,7 @@ class NetContact:
         if len(self._nodes):
             inputs = [self._nodes, self.net.blocks, newton.q]
             self._launch(self._aim, (len(self._nodes), self.net.worlds), inputs, [self._aims])
-        self._launch(self._find_predicted, self.net.worlds, [newton.islands.arrays[0]], [self._modes])
+        self._launch(self._find_predicted, self.net.worlds, [newton.islands.arrays[0]], [self._modes, self._longest])
         self._cut()
         self._launch(self._find_short, self.net.worlds, [self._modes, self.search.time], [newton.islands.arrays[0]])
         self._let_go()
@@ -227,7 +227,7 @@ class NetContact:
     def hold(self) -> None:
         """Cut what was moved, and say what that is expected to gain."""
         newton = self.newton
-        self._launch(self._find_modes, self.net.worlds, [newton.islands.arrays[0]], [self._modes])
+        self._launch(self._find_modes, self.net.worlds, [newton.islands.arrays[0]], [self._modes, self._longest])
         self._launch(self._depart, self.net.worlds, [self._modes], [newton.islands.arrays[0]])
         if len(self._nodes):
             inputs = [self._nodes, self._aims, newton.fixed, self._modes, *newton.islands.arrays, self.net.blocks]
@@ -246,13 +246,12 @@ class NetContact:
         newton = self.newton
         far = FAR * self.search.margin
         inputs = [newton.q, newton.base, self._unit, self.net.host.nodes, far, self.net.blocks]
-        self._longest.zero_()
         self._sweep(self._stay, inputs, [self._move, self._modes, self.bound, self._longest])
-        shorter = [self._modes, self._longest, self.way]
-        if self.way < math.inf:
+        shorter = [self._modes, self._longest, self.farthest]
+        if self.farthest < math.inf:
             self._sweep(self._near, [self._move, self._unit, *shorter, self.net.blocks], [newton.q])
         self.search.filter(self._move, newton.q, self._unit, self._modes, self._units, self.touch.keep)
-        if self.way < math.inf:
+        if self.farthest < math.inf:
             self._launch(self._less, self.net.worlds, shorter, [self.search.time])
         if len(self._nodes):
             eps = ROUNDING * newton.eps
@@ -263,20 +262,14 @@ class NetContact:
         """The part of a motion (3 W N,) of all worlds in which nothing passes through anything. Not in a capture."""
         base = wp.array(before.reshape(-1, 3), dtype=self.net.vector, device=self.newton.device)
         self._modes.fill_(kernels.WHOLE)
-        longest, least, part = np.abs(after - before).max(), FAR * self.search.margin, 1.0
-
-        def shorten() -> bool:
-            nonlocal part
-            long = part * longest > least
-            part *= SHORTER if long else 1.0
-            return long
-
+        move = after - before
+        longest = float(np.abs(move).max())
         self.search.fit(base)
         while True:
-            end = before + part * (after - before)
-            q = wp.array(end.reshape(-1, 3), dtype=self.net.vector, device=self.newton.device)
+            part = min(1.0, self.farthest / longest) if longest > 0.0 else 1.0
+            q = wp.array((before + part * move).reshape(-1, 3), dtype=self.net.vector, device=self.newton.device)
             self.search.filter(base, q, self._unit, self._modes, self._units, self.touch.keep)
-            if not self.search.fit(base, shorten):  # else nothing has moved
+            if not self.search.fit(base, lambda: self._shorten(longest)):  # else nothing has moved
                 return part * float(self.search.time.numpy().min())
 
     def _let_go(self) -> None:
@@ -335,12 +328,12 @@ class NetContact:
         remedy = "give their contact a larger stiffness or range, " if reason == outcome.NO_ROOM else ""
         return f"the smallest gap, {gap:.3g} m, is between {pair}; {remedy}"
 
-    def _shorten(self) -> bool:
-        """Go shorter ways from now on, if those of the last motion were long."""
-        longest, least = min(self.way, float(self._longest.numpy().max())), FAR * self.search.margin
+    def _shorten(self, longest: float) -> bool:
+        """Go shorter ways than `longest` [m] from now on, if that is long."""
+        longest, least = min(self.farthest, longest), FAR * self.search.margin
         if longest <= least:
             return False
-        self.way = max(least, min(longest * SHORTER, LONGEST * self.search.margin))
+        self.farthest = max(least, min(longest * SHORTER, LONGEST * self.search.margin))
         return True
 
     def outgrown(self, x: wp.array, spare: bool = False) -> bool:
@@ -348,7 +341,11 @@ class NetContact:
 
         Reads from the device.
         """
-        grown = self.search.fit(x, self._shorten if spare else None)
+
+        def shorten() -> bool:
+            return self._shorten(float(self._longest.numpy().max()))
+
+        grown = self.search.fit(x, shorten if spare else None)
         grown = self.terms.fit() or grown
         if grown:
             self.tally.forget()
