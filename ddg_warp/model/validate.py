@@ -42,8 +42,8 @@ def refuse_friction(model) -> None:
         return
     one, other = (given.names[g] for g in rough)
     raise SceneError(
-        f"contact: stability and gradients of equilibria know no friction, and it is {given.friction[rough]:g} between {one!r} and "
-        f"{other!r}, where the way there decides which equilibrium is found; set friction=0, or ask for equilibria alone by "
+        f"contact: stability, paths and gradients of equilibria know no friction, and it is {given.friction[rough]:g} between {one!r} "
+        f"and {other!r}, where the way there decides which equilibrium is found; set friction=0, or ask for equilibria alone by "
         "statics.solve, or for gradients of steps in time"
     )
 

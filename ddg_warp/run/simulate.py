@@ -251,7 +251,7 @@ def follow(result: Result, steps: int, keep: Callable, *, options: Mapping, cloc
     """Follow the path of equilibria and `keep` each point, with its load parameter and what is watched."""
     from ddg_warp.solve.continuation import Continuation
 
-    analysis, started = result.scene.analysis, clock()
+    analysis, started, continuation = result.scene.analysis, clock(), None
     settings = {name: getattr(analysis, name) for name in ("step", "max_step", "load_scale")}
     try:
         continuation = Continuation(result.model, analysis.watch, **{**settings, **options})
@@ -271,7 +271,8 @@ def follow(result: Result, steps: int, keep: Callable, *, options: Mapping, cloc
         iterations = [point.iterations for point in points]
         newton = {"mean": sum(iterations) / max(1, len(iterations)), "max": max(iterations, default=0)}
         outcomes = dict(Counter(point.kind for point in points))
-        result.statistics = {"newton_iterations": newton, "pcg_iterations": 0, "outcomes": outcomes}
+        touched = continuation.statistics(points) if continuation else {}
+        result.statistics = {"newton_iterations": newton, "pcg_iterations": 0, "outcomes": outcomes, **touched}
 
 
 def step_count(dt: float, duration: float) -> int:

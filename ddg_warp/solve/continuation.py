@@ -6,9 +6,13 @@ from zero after every iterate; so increments are counted iterate by iterate and 
 
 Between two points the sign of the load's rate shows a limit point, and the number of negative eigenvalues a bifurcation, as far
 as the limit point does not account for its change (at one, K t = f l' makes the critical eigenvalue change with l' (f . t)).
+
+Where contact sets in or ends a path turns within a small part of the range of contact, all but at once. What is too short for steps is
+passed over as a corner. The load may be stationary there; which eigenvalues change sign at a corner is not looked for.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import brentq
@@ -88,6 +92,15 @@ class Continuation:
         if stop is not None and stop.displacement is not None and stop.displacement[0] not in self.watched:
             raise SceneError(f"stop at {stop.displacement[0]!r}: it is not watched; there is {list(self.watched)}")
         return stop or Stop()
+
+    def statistics(self, points: Sequence[Point]) -> dict:
+        """Under "contact", where there is any, what touches at these points and all that were given before.
+
+        See `NetEquilibrium.contact_statistics`.
+        """
+        for point in points:
+            self.corrector.equilibrium.count(point.state, 0.0)
+        return self.corrector.equilibrium.statistics()
 
     def switch(self, bifurcation: Point, *, side: int = 1, step: float | None = None, stop: Stop | None = None) -> Path:
         """Leave a bifurcation along its critical mode, and follow the other path.
@@ -184,22 +197,7 @@ class Continuation:
         for _ in range(stop.steps):
             turn = self.tangent.rotation(self.tangent.dofs(here.state), here.direction[:-1])
             step = min(step, options.max_step, options.rotation_cap / max(1e-300, turn))
-            while True:
-                try:
-                    there = self.corrector.at(here, step)
-                    outcome, row, value = self._bound(here, there, stop) or ("", None, 0.0)
-                    there = self.corrector.to(here, row, value) if outcome else there
-                    self.corrector.follows(here, there)
-                    events = self._events(here, there)
-                    break
-                except Failed as failed:
-                    step *= 0.5
-                    if step < options.min_step:
-                        raise self._error(
-                            "step_too_small",
-                            path,
-                            f"{failed}: the path may end or branch here; begin elsewhere, or take min_step smaller",
-                        ) from None
+            there, events, outcome, step = self._next(path, step, stop)
             for event in events:
                 path.points.append(event)
                 if event.kind == LIMIT_POINT and len(path.limit_points) == stop.limit_points:
@@ -213,6 +211,29 @@ class Continuation:
             here = there
         path.outcome = "steps"
         return path
+
+    def _next(self, path: Path, step: float, stop: Stop) -> tuple[Point, list[Point], str, float]:
+        """The point after the last of a path, events on the way, which bound of `stop` it lies on, if any, and the step to it."""
+        here, options = path.points[-1], self.options
+        while step >= options.min_step:
+            try:
+                there = self.corrector.at(here, step)
+                outcome, row, value = self._bound(here, there, stop) or ("", None, 0.0)
+                there = self.corrector.to(here, row, value) if outcome else there
+                self.corrector.follows(here, there)
+                return there, self._events(here, there), outcome, step
+            except Failed as failure:
+                failed, step = failure, 0.5 * step
+        there = self.corrector.past_corner(here)
+        if there is None:
+            remedy = f"{failed}: the path may end or branch here; begin elsewhere, or take min_step smaller"
+            raise self._error("step_too_small", path, remedy)
+        events = []
+        if here.direction[-1] * there.direction[-1] < 0.0:
+            highest = here.direction[-1] > 0.0
+            last = max(here, there, key=lambda point: point.load if highest else -point.load)
+            events = [replace(last, kind=LIMIT_POINT, negative=min(here.negative, there.negative))]
+        return there, events, "", there.arclength - here.arclength
 
     def _bound(self, here: Point, there: Point, stop: Stop):
         """The bound that lies between two points: its name, the functional and its value; None if there is none."""

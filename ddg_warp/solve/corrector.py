@@ -1,11 +1,13 @@
 """The corrector of a continuation: Newton on the equations of equilibrium and one condition more.
 
+In contact a path goes from state to state on ways on which nothing passes through anything, to which predictors and iterates are cut.
+
 The metric of a path is (mean square displacement) / (size of the scene)^2 + (change of load / load_scale)^2, with angles times an
 edge length among the displacements.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
@@ -50,6 +52,9 @@ class ContinuationOptions:
         check_options(self, positive, ("iterations", "max_iterations"))
 
 
+CUTS, SHORTER = 16, 0.9  # of a move in contact: how often it is cut, and to what part of it at most
+CORNERS = (1e-3, 1e-4, 1e-5, 1e-6)  # arc lengths by which a path is followed past one, the first that does
+AROUND = 4.0  # of that length: how far from it an equilibrium beyond the corner may be
 BEND = 0.2  # of a step: how far its chord may be from the mean of the tangents at its ends
 
 
@@ -110,6 +115,36 @@ class Corrector:
         if self.norm(gap) > BEND * length or abs(gap[-1]) > BEND * rates:
             raise Failed("leap")
 
+    def past_corner(self, here: Point) -> Point | None:
+        """The equilibrium beyond a corner of the path, where something begins or ceases to touch; None where there is none.
+
+        Beyond the corner the tangent is all but that of states on the line that leads there. Of both ways along it one leads to
+        equilibria whose energy of contact has grown or fallen as on that line, the other one back.
+        """
+        if not self.equilibrium.net:
+            return None
+        energy = self._contact_energy(here.state)
+        for distance in CORNERS:
+            try:
+                state, move = self._moved(here.state, here.load, distance * here.direction)
+                change = self._contact_energy(state) - energy
+                beside = replace(here, state=state, load=here.load + move[-1])
+                along = self._along(self.system(state, self.tangent.dofs(state), beside.load), here.direction)[0]
+            except Failed:
+                continue
+            along /= self.norm(along)
+            for way in (along, -along):
+                try:
+                    there = self.correct(beside, distance * way, self.metric * way, reach=AROUND * distance)
+                except Failed:
+                    continue
+                if (self._contact_energy(there.state) - energy) * change > 0.0:
+                    if self.dot(there.direction, way) < 0.0:
+                        there.direction = -there.direction
+                    there.arclength = here.arclength + distance
+                    return there
+        return None
+
     def to(self, here: Point, row: np.ndarray, value: float) -> Point:
         """The equilibrium at which a linear functional of dofs (from rest) and load has a value."""
 
@@ -128,30 +163,33 @@ class Corrector:
             there.direction = -there.direction
         return there
 
-    def correct(self, here: Point, step: np.ndarray, row: np.ndarray, gap: Callable | None = None) -> Point:
-        """Newton from `here` + `step` on equilibrium and the condition row . (increments) = gap(q, load), zero by default."""
+    def correct(
+        self, here: Point, step: np.ndarray, row: np.ndarray, gap: Callable | None = None, reach: float | None = None
+    ) -> Point:
+        """Newton from `here` + `step` on equilibrium and the condition row . (increments) = gap(q, load), zero by default.
+
+        Without `gap` it is given up farther than `reach` from there, by default as far as it is from `here`.
+        """
         tangent, options, solver = self.tangent, self.options, self.equilibrium
-        load = here.load + step[-1]
-        state = tangent.advance(here.state, step[:-1], load)
-        total, reach, polished = step, self.norm(step), False
+        state, total = self._moved(here.state, here.load, step)
+        load, polished, reach = here.load + total[-1], False, self.norm(step) if reach is None else reach
         first = solver.residuals.first_scale(
             tangent.loads(here.load, tangent.dofs(here.state)), tangent.gradient(here.state)
         )
         pivot = here.direction
         for iteration in range(options.max_iterations + 1):
             q = tangent.dofs(state)
-            residual, stiffness, rate, support, gradient, outer = self.system(state, q, load)
+            system = self.system(state, q, load)
+            residual, stiffness, _, support, gradient, outer = system
             if not np.isfinite(residual).all() or not np.isfinite(stiffness.data).all():
                 raise Failed("non_finite")
             scale = np.maximum(first, solver.residuals.load_scale(outer, gradient))
-            missing = gap(q, load) if gap else 0.0
+            missing = gap(q, load) if gap else row @ (step - total)
             excess, solver.outcome = solver.residuals.excess(
                 residual, gradient, stiffness, q, scale if scale.any() else scale + np.abs(residual).max()
             )
             done = excess <= 0.0 and abs(missing) <= 1e-12 * (1.0 + np.abs(row[:-1]) @ np.abs(q) + abs(row[-1] * load))
-            matrix = sparse.csc_matrix(stiffness[self.free][:, self.free])
-            bordered = self._bordered(matrix, rate, pivot)
-            along = self._full(bordered.tangent(), support)
+            along, bordered = self._along(system, pivot)
             if done and (solver.outcome == "converged" or polished):
                 break
             if iteration == options.max_iterations:
@@ -164,17 +202,31 @@ class Corrector:
             move = move + along * ((missing - row @ move) / slope)
             if not np.isfinite(move).all() or tangent.rotation(q, move[:-1]) > 1.0:
                 raise Failed("diverged")
-            total = total + move
+            state, move = self._moved(state, load, move)
+            total, load = total + move, load + move[-1]
             if self.norm(total - step) > max(reach, 1e-12) and gap is None:
                 raise Failed("diverged")
-            load = load + move[-1]
-            state = tangent.advance(state, move[:-1], load)
         direction = along / self.norm(along)
         values = {name: float(row @ (q - self.rest)) for name, row in self.watched.items()}
         arclength = here.arclength + abs(self.dot(total, here.direction))
         negative = stability.instabilities(tangent, state, stiffness)
         state.stable = negative == 0
         return Point(state, float(load), arclength, values, negative, REGULAR, direction, iterations=iteration)
+
+    def _contact_energy(self, state: State) -> float:
+        """Energy of all that touches [J]."""
+        return float(self.tangent.energy(state)["contact"].sum())
+
+    def _moved(self, state: State, load: float, move: np.ndarray) -> tuple[State, np.ndarray]:
+        """The state after a move (size + 1,) from it and from `load`, and what of the move was taken before something is in the way."""
+        taken = 1.0
+        for _ in range(CUTS):
+            there = self.tangent.advance(state, taken * move[:-1], load + taken * move[-1])
+            share = self.equilibrium.share(state, there)
+            if share == 1.0:
+                return there, taken * move
+            taken *= min(share, SHORTER)
+        raise Failed("in_the_way")
 
     def system(self, state: State, q: np.ndarray, load: float):
         """Residual, tangent stiffness, and the rates of the residual and of supports with the load parameter."""
@@ -189,13 +241,16 @@ class Corrector:
             rate = rate - (ahead - behind) / (2.0 * delta)
         return outer - gradient, stiffness, rate - stiffness @ support, support, gradient, outer
 
-    def _bordered(self, matrix, rate: np.ndarray, direction: np.ndarray) -> Bordered:
-        """Factors with the unknown prescribed that changes most along `direction`."""
+    def _along(self, system: tuple, direction: np.ndarray) -> tuple[np.ndarray, Bordered]:
+        """The tangent of a `system`, and its factors with the unknown prescribed that changes most along `direction`."""
+        _, stiffness, rate, support, *_ = system
+        matrix = sparse.csc_matrix(stiffness[self.free][:, self.free])
         change = np.abs(direction) * np.sqrt(self.metric)
         try:
-            return Bordered(matrix, rate[self.free], int(np.argmax(change[np.append(self.free, -1)])))
+            bordered = Bordered(matrix, rate[self.free], int(np.argmax(change[np.append(self.free, -1)])))
         except SingularError:
             raise Failed("singular") from None
+        return self._full(bordered.tangent(), support), bordered
 
     def _full(self, z: np.ndarray, support: np.ndarray) -> np.ndarray:
         """All dofs and the load parameter from those of the free dofs; supports go with the load."""
@@ -207,6 +262,7 @@ class Corrector:
         """The equilibrium at a load parameter, with the direction in which the load grows."""
         held = np.zeros(self.tangent.size + 1)
         held[-1] = 1.0
+        self.equilibrium.check_apart(state)
         begin = Point(state, load, 0.0, {}, 0, REGULAR, held)
         try:
             point = self.correct(begin, np.zeros_like(held), held, lambda _q, at: load - at)

@@ -10,8 +10,9 @@ the device by conjugate gradients instead (`ddg_warp.solve.net.statics`).
 
 So is what touches, at any size: its search cuts every iterate before anything passes through anything. Where nets are small its
 equilibria are judged by the factored tangent, saddles are left, and what conjugate gradients are slow to finish, without second
-derivatives of shells' bending, is finished by this search, its steps cut alike. With friction an equilibrium is that of an increment of
-the load parameter, which the way there decides; it is found on the device at any size, and nothing tells whether it is stable.
+derivatives of shells' bending, is finished by this search, its steps cut alike, as are those of mode "follow". With friction an
+equilibrium is that of an increment of the load parameter, which the way there decides; it is found on the device at any size, and
+nothing tells whether it is stable.
 """
 
 from dataclasses import dataclass
@@ -59,7 +60,7 @@ class StaticsOptions:
             up to its first size.
         solver: "direct": the exact tangent and its factors, on the host. "pcg": conjugate gradients on the device, for nets that are
             too large for factors, and for contact; in mode "minimise" alone, and of large nets without a count of unstable directions.
-            "auto": by size, and in contact "pcg".
+            "auto": by mode and size, in contact by mode alone.
     """
 
     rtol: float = 1e-10
@@ -101,7 +102,7 @@ def solve(
         controls: forces, moments, gravity and magnetic field, world by world, which the load parameter scales as it does those of the
             scene; and poses of grips at `end`, which move there straight from where the state has them.
         load_steps: increments; one that fails is halved. In contact supports and obstacles may go any way in one: they stop where
-            something is in their way, and go on once it has yielded.
+            something is in their way, and go on once it has yielded; in mode "follow" the increment is halved until nothing is.
         start, end: load parameter, which scales gravity and loads and is the time of motions and amplitudes.
         options: see `StaticsOptions`.
 
@@ -134,7 +135,7 @@ class Equilibrium:
 
     Attributes:
         tangent: energy, gradient and Hessian of the model; residuals: what is small against what, of it.
-        net: what solves by conjugate gradients, if that is the solver; descent: what solves by factors.
+        net: what solves by conjugate gradients, if that is the solver, and keeps apart what touches; descent: what solves by factors.
         factors: whether the tangent at what it finds is factored, to tell whether that is stable.
         mixed: whether Newton with stresses of its own is tried first; where it can be, by default.
         iterations: Newton iterations so far.
@@ -151,9 +152,10 @@ class Equilibrium:
         require_supports(model)
         lost_in_rounding(model)
         scene_validate.warn_of_massless(model)
-        self.net = NetEquilibrium(self) if self._solver() == "pcg" else None
+        self._descends = self._solver() == "direct"
+        self.net = None if self._descends and not model.touch else NetEquilibrium(self)
         self._rubs = model.touch is not None and model.net.host.touching.rubs
-        self.factors = self.net is None or (model.touch is not None and not self._rubs and not large_static(model))
+        self.factors = self._descends or (model.touch is not None and not self._rubs and not large_static(model))
         self.mixed = self.tangent.shells_alone and self.net is None
         self.descent = Descent(self)
         self.iterations, self.shift = 0, 0.0
@@ -162,14 +164,14 @@ class Equilibrium:
     @property
     def pcg_iterations(self) -> int:
         """Iterations of conjugate gradients so far."""
-        return self.net.pcg_iterations() if self.net else 0
+        return 0 if self._descends else self.net.pcg_iterations()
 
     def _solver(self) -> str:
         """The solver that the options ask for, if it can serve this model."""
         solver, obstacle = self.options.solver, why_not_pcg(self.model)
         if self.model.touch:
             self._check_contact(obstacle)
-            return "pcg"
+            return "direct" if self.options.mode == "follow" else "pcg"
         if solver == "pcg" and obstacle:
             raise SceneError(f"statics solver 'pcg': {obstacle}; take solver='direct'")
         if solver == "auto":
@@ -177,14 +179,14 @@ class Equilibrium:
         return solver
 
     def _check_contact(self, obstacle: str) -> None:
-        """Refuse what does not keep apart what touches; `obstacle`: to conjugate gradients."""
+        """Refuse solvers that do not serve what touches; `obstacle`: to conjugate gradients."""
         if self.options.mode == "follow":
+            validate.refuse_friction(self.model)
+        elif self.options.solver == "direct":
             raise SceneError(
-                "contact: mode 'follow' and paths by continuation step along tangents, which do not tell when something will touch; "
-                "take mode='minimise' and load steps"
+                "contact: statics solver 'direct' stops all where two things come close, and serves mode 'follow' alone; take "
+                "solver='auto' or 'pcg'"
             )
-        if self.options.solver == "direct":
-            raise SceneError("contact: statics solver 'direct' keeps nothing apart; take solver='auto' or 'pcg'")
         if obstacle:
             raise SceneError(
                 "contact: an equilibrium needs all rods among the objects that touch, and some are on their own; leave objects out of "
@@ -206,13 +208,12 @@ class Equilibrium:
                 "there is none; give start other than end, or friction=0"
             )
         found = checked(controls, self.model, "statics")
-        if self.model.touch and self.model.touch.keep:  # by a penalty equilibria may overlap
-            self.net.newton.contact.check(state.net.q)
+        self.check_apart(state)
         self.tangent.give(found)
         self.tangent.poses = poses_between(state, found["poses"], start, end) if "poses" in found else None
         if start == end:
             state = self.solve(state, start, end)
-            self._count(state, 0.0)
+            self.count(state, 0.0)
             return state
         at, whole, cuts = start, (end - start) / load_steps, 0
         state = state.copy()
@@ -221,7 +222,7 @@ class Equilibrium:
             target = end if abs(end - at) <= abs(increment) * (1.0 + 1e-12) else at + increment
             try:
                 state = self.solve(state, at, target)
-                self._count(state, abs(target - at))
+                self.count(state, abs(target - at))
                 at, cuts = target, max(0, cuts - 1)  # what was too much before may do now
             except SolverError as error:
                 cuts += 1
@@ -237,13 +238,25 @@ class Equilibrium:
         state.time = end
         return state
 
-    def _count(self, state: State, increment: float) -> None:
+    def check_apart(self, state: State) -> None:
+        """Refuse to begin where surfaces overlap; by a penalty equilibria may."""
+        if self.model.touch and self.model.touch.keep:
+            self.net.newton.contact.check(state.net.q)
+
+    def share(self, before: State, after: State) -> float:
+        """The part of the straight way between two states in which nothing passes through anything."""
+        return self.net.share(*map(self.tangent.dofs, (before, after))) if self.model.touch else 1.0
+
+    def count(self, state: State, increment: float) -> None:
         """Count an equilibrium that was found, an increment of the load parameter after the one before."""
         if self.model.touch:
             self.net.count(state, increment)
 
     def statistics(self) -> dict:
-        """Under "contact", where there is any, what touched in the equilibria of `load`: see `NetEquilibrium.contact_statistics`."""
+        """Under "contact", where there is any, what touched in the equilibria that were counted, as those of `load` are.
+
+        See `NetEquilibrium.contact_statistics`.
+        """
         return {"contact": self.net.contact_statistics()} if self.model.touch else {}
 
     def solve(self, state: State, before: float, at: float) -> State:
@@ -283,7 +296,14 @@ class Equilibrium:
 
     def _minimum(self, state: State, at: float, before: State, increment: float) -> State:
         """The equilibrium at load parameter `at` from a state with its supports in place; in contact, on a way from `before`."""
-        if not self.net:
+        if self._descends:
+            if self.share(before, state) < 1.0:
+                raise SolverError(
+                    f"no equilibrium at load parameter {at:g}: in_the_way, supports and what follows them would pass through "
+                    "something; take more load steps, or mode='minimise', whose supports wait until it has yielded",
+                    state=before,
+                    outcome="in_the_way",
+                )
             return self.descent.solve(state, at)
         try:
             state = self.net.solve(state, at, before, increment)
@@ -318,7 +338,7 @@ class Equilibrium:
 
     def found(self, state: State, outer: np.ndarray, residual: np.ndarray, at: float) -> State:
         """The state as the equilibrium at `at`, unless rounding hides its loads and spoils the tangent that would carry them."""
-        if (self.shift > 0.0 or self.net) and self._hidden(outer, residual):
+        if (self.shift > 0.0 or not self._descends) and self._hidden(outer, residual):
             raise SolverError(
                 f"no equilibrium at load parameter {at:g}: lost_in_rounding, the stiffest elements make forces as uncertain as "
                 "the loads are large; take better shaped elements, or float64",
@@ -340,7 +360,7 @@ class Equilibrium:
         if not step.any():
             return alone
         state = tangent.with_prescribed(state, at)
-        direction = (self.net or self.descent).following(state, step, at)
+        direction = (self.descent if self._descends else self.net).following(state, step, at)
         if direction is None:
             return alone
         q = tangent.dofs(state)

@@ -154,9 +154,9 @@ refuse("contact", {
     "friction without an increment": (
         lambda: ddg.statics.solve(_rough(), start=1.0), "contact: friction", "from 1 to 1", "start other than end",
     ),
-    "follows": (lambda: ddg.statics.solve(built(touching()), mode="follow"), "contact: ", "'follow'", "mode='minimise'"),
+    "follows": (lambda: ddg.statics.solve(_rough(), mode="follow"), "contact: ", "paths", "it is 0.2 between", "friction=0"),
     "factors": (lambda: ddg.statics.solve(built(touching()), solver="direct"), "contact: ", "'direct'", "solver='auto'"),
-    "path": (lambda: ddg.continuation.Continuation(built(touching())), "contact: ", "continuation", "load steps"),
+    "path": (lambda: ddg.continuation.Continuation(_rough()), "contact: ", "paths", "it is 0.2 between", "friction=0"),
     "relaxation": (lambda: relax(built(touching())), "contact: ", "relaxation", "statics.solve"),
     "midpoint": (lambda: stepped(touching(), scheme="implicit_midpoint"), "contact: ", "implicit_euler"),
     "projective": (lambda: stepped(touching(), solver="projective"), "contact: ", "'newton'"),

@@ -6,6 +6,7 @@ from questions import Variant, _mass, close
 
 import ddg_warp as ddg
 from ddg_warp import statics
+from ddg_warp.solve.continuation import Continuation
 
 STEP, COUNT = 2e-3, 8
 
@@ -66,8 +67,8 @@ def moved_obstacle(kind, variant):
         close(points, alone.points(), atol=1e-8)
 
 
-def rests(kind, variant):
-    """What hangs down onto a ball rests on it: supports and ball carry its weight, in every world as alone."""
+def _over_ball(kind, variant):
+    """A scene with a ball below what hangs down under half of its weight, where it sinks the most."""
     weighed = {"gravity": (0.0, 0.0, -0.5)}
     free, _ = kind.scene(**weighed)
     model = variant.build(free)
@@ -81,6 +82,12 @@ def rests(kind, variant):
     scene.add_obstacle(ddg.Sphere(tuple(centre), 0.005), name="ball")
     scene.contact(range=-0.2 * sag[row, 2])
     pass_each_other(scene)
+    return scene
+
+
+def rests(kind, variant):
+    """What hangs down onto a ball rests on it: supports and ball carry its weight, in every world as alone."""
+    scene = _over_ball(kind, variant)
     model = variant.build(scene)
     state = statics.solve(model)
     found, forces = model.contacts(state), [variant.each(reaction.force) for reaction in model.reactions(state)]
@@ -97,4 +104,23 @@ def rests(kind, variant):
     close(heights, np.tile(statics.solve(alone).points()[:, 2], (variant.worlds, 1)), atol=1e-8)
 
 
-CONTACT_QUESTIONS = {"contact": contact, "moved obstacle": moved_obstacle, "rests": rests}
+def path_onto_a_ball(kind, variant):
+    """A path of equilibria under growing weight leads onto the ball, where load steps lead to."""
+    model = variant.build(_over_ball(kind, variant))
+    path = Continuation(model).trace(stop=ddg.Stop(load=(-1.0, 1.0)))
+    state, pushes = (
+        path.points[-1].state,
+        [np.array(model.reactions(point.state)[-1].force)[2] for point in path.points],
+    )
+    assert path.points[-1].load == 1.0
+    assert path.points[-1].stable
+    assert 0.0 <= pushes[0] < pushes[-1]
+    close(state.points()[:, 2], statics.solve(model).points()[:, 2], atol=1e-8)
+
+
+CONTACT_QUESTIONS = {
+    "contact": contact,
+    "moved obstacle": moved_obstacle,
+    "rests": rests,
+    "path onto a ball": path_onto_a_ball,
+}

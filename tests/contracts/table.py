@@ -76,10 +76,16 @@ for _question in ("contact", "moved obstacle"):
     }
 REFUSED["rests"] = {name: words for name, words in REFUSED["contact"].items() if name != "shell, curved membrane"}
 REFUSED["spectrum"] = dict.fromkeys(IN_CONTACT, ("contact: stability", "friction", "set friction=0", "statics.solve"))
-REFUSED["continuation"] |= dict.fromkeys(IN_CONTACT, ("contact: ", "paths by continuation", "load steps"))
+REFUSED["continuation"] |= dict.fromkeys(
+    IN_CONTACT, ("contact: ", "paths", "friction", "set friction=0", "statics.solve")
+)
+REFUSED["path onto a ball"] = REFUSED["rests"] | {"rod without bending": REFUSED["continuation"]["rod without bending"]}
 REFUSED["implicit midpoint"] |= dict.fromkeys(IN_CONTACT, ("contact: ", "use 'implicit_euler'"))
 REFUSED["failure"] |= dict.fromkeys(IN_CONTACT, ("contact: ", "'ball'", "overlap", "move them apart"))
-MANY = {"continuation": ("one world",)}  # what several worlds are refused
+ALONE = {
+    "continuation": {},
+    "path onto a ball": REFUSED["rests"],
+}  # several worlds are refused, but of what is refused before
 
 
 def answer(name: str, question: str, variant: Variant) -> str:
@@ -94,8 +100,8 @@ def answer(name: str, question: str, variant: Variant) -> str:
 
 def expected(name: str, question: str, variant: Variant) -> tuple[str, ...]:
     """Words of the sentence by which a cell is refused; none where it works."""
-    if variant.worlds > 1 and question in MANY:
-        return MANY[question]
+    if variant.worlds > 1 and name not in ALONE.get(question, OBJECTS):
+        return ("one world",)
     return REFUSED.get(question, {}).get(name, ())
 
 

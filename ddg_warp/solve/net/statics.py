@@ -289,7 +289,7 @@ class NetEquilibrium:
 
     def share(self, before: np.ndarray, after: np.ndarray) -> float:
         """The part of a motion from dofs `before` to `after` in which nothing passes through anything."""
-        return self.newton.contact.share(self.tangent.back(before), self.tangent.back(after))
+        return self.newton.contact.share(self.tangent.back(before), self.tangent.back(self._beside(before, after)))
 
     def _replay(self, name: str, begin: Callable[[], None], launch: Callable[[], None]) -> None:
         """Launch what is captured under a name, again from its beginning while there is no room for what touches."""
@@ -310,6 +310,6 @@ class NetEquilibrium:
         for name, array in self._start.arrays().items():
             wp.copy(array, state.net.arrays()[name])
 
-    def _beside(self, q: np.ndarray, before: np.ndarray) -> np.ndarray:
-        """Dofs q with the positions of those `before`: angles, which are about other frames, take no way."""
-        return np.where(self.tangent.angle, q, before)
+    def _beside(self, q: np.ndarray, other: np.ndarray) -> np.ndarray:
+        """Dofs q with the positions of `other` ones: angles, which are about other frames, take no way."""
+        return np.where(self.tangent.angle, q, other)
