@@ -309,7 +309,8 @@ class Continuation:
         root = low + (high - low) * (a / (a - b) if a * b < 0.0 else 0.5)
         point = point_at(root)
         point.kind = BIFURCATION
-        point.negative = min(count, after) + (jump if root > fold else 0)
+        # where both are all but one, their order may be taken for the other one
+        point.negative = max(0, min(count, after) + (jump if root > fold else 0))
         point.mode = self.corrector.critical(point)[1]
         point.mode_displacements = self.tangent.at_points(point.mode)
         # the tangent of the path itself, between those beside it

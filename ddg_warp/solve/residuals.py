@@ -71,7 +71,8 @@ class Residuals:
         """What to tell of a search that failed, with what is `told` of contact."""
         masked = np.where(self.tangent.free, np.abs(self.scaled(residual)), -1.0)
         worst = int(np.argmax(np.where(np.isfinite(masked), masked, np.inf)))
+        longer = "a larger max_iterations, " if outcome == "max_iterations" else ""
         return (
             f"no equilibrium at load parameter {at:g}: {outcome}, largest residual {residual[worst]:.3g} at "
-            f"{self.tangent.where(worst)}; {told}take more load steps, or hold what can still move freely"
+            f"{self.tangent.where(worst)}; {told}take {longer}more load steps, or hold what can still move freely"
         )

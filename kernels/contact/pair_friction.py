@@ -114,18 +114,22 @@ def lag_kernel(kind: Kind, real, linear, directed: bool):
         ways: wp.array2d(dtype=V),
         contact: Factor,
         gradient: wp.array2d(dtype=V),
+        onward: int,
+        before: wp.array(dtype=int),
         pairs_out: wp.array(dtype=wp.vec2i),
         factor: Factor,
         lagged: Lagged,
         slip: wp.array2d(dtype=E),
         along: wp.array2d(dtype=E),
     ):
-        """Of pairs that were others before, slips and directions of iterates are forgotten."""
+        """Where a search goes on, `onward`, iterates of pairs that are as `before`, so many, keep slips and directions."""
         for p in range(wp.tid(), count[0], threads):
+            same = onward != 0 and p < before[0] and pairs_out[p] == pairs[p]
             pairs_out[p] = pairs[p]
-            for row in range(2):
-                slip[row, p] = E()
-                along[row, p] = E()
+            if not same:
+                for row in range(2):
+                    slip[row, p] = E()
+                    along[row, p] = E()
             factor.nodes[p] = contact.nodes[p]
             factor.used[p] = 0
             lagged.bound[p] = real(0.0)
@@ -164,6 +168,7 @@ def friction_kernel(density: Density, real, linear, directed: bool):
 
     things: first things of pairs in one world; velocity: nu [m/s]; rate (worlds,): 1/h [1/s]; accepted, iteration (worlds,): which of
     both rows of `slip` and `along` are the accepted iterate's, and how many there were; none, and w is that of the slip, without them.
+    onward: not zero where those before the first one count, too.
     """
     Factor, Lagged = factor_struct(linear), lagged_struct(real)
     V, L = wp.types.vector(3, real), wp.types.vector(3, linear)
@@ -212,6 +217,7 @@ def friction_kernel(density: Density, real, linear, directed: bool):
         rate: wp.array(dtype=real),
         accepted: wp.array(dtype=int),
         iteration: wp.array(dtype=int),
+        onward: int,
         x: wp.array(dtype=V),
         start: wp.array(dtype=V),
         slip: wp.array2d(dtype=E),
@@ -249,7 +255,7 @@ def friction_kernel(density: Density, real, linear, directed: bool):
                 if accepted.shape[0] > 0:
                     old = accepted[world]
                     w = E()
-                    if iteration[world] > 0:
+                    if iteration[world] > 0 or onward != 0:
                         w = turned(along[old, p], slip[old, p], u, bound, given)
                     slip[1 - old, p] = u
                     along[1 - old, p] = w

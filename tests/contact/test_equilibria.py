@@ -4,6 +4,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_bvp, trapezoid
+from scipy.optimize import brentq
 
 import ddg_warp as ddg
 from ddg_warp import statics
@@ -290,6 +292,62 @@ def test_what_lies_on_a_floor_swings_upon_it(device, law):
     square = 2.0 * change * G / (heights[0] - heights[1])
     values = stability.spectrum(model, state, 8).eigenvalues
     assert np.abs(values / square - 1.0).min() < 1e-5
+
+
+def ruck(load: float) -> tuple[float, float]:
+    """Shortening and height of a heavy rod's ruck on a floor, EI = 1, w = 1, by the force along it.
+
+    EI theta'' = -P sin(theta) - w s cos(theta), theta = 0 at its crest s = 0, and theta = theta' = 0 where it comes down, at a length
+    that is to be found (Vella, Boudaoud and Adda-Bedia, Phys. Rev. Lett. 103, 2009, 174301).
+    """
+
+    def along(u, y, p):
+        return np.array([p[0] * y[1], -p[0] * (load * np.sin(y[0]) + p[0] * u * np.cos(y[0]))])
+
+    u, root = np.linspace(0.0, 1.0, 201), 4.493409  # of tan(x) = x, for small slopes
+    half = root / np.sqrt(load)
+    guess = half / load * (np.sin(root * u) / np.sin(root) - u)
+    found = solve_bvp(
+        along,
+        lambda a, b, p: np.array([a[0], b[0], b[1]]),
+        u,
+        [guess, np.gradient(guess, u) / half],
+        p=[half],
+        tol=1e-9,
+    )
+    u = np.linspace(0.0, 1.0, 4001)
+    slope, half = found.sol(u)[0], found.p[0]
+    return 2.0 * half * trapezoid(1.0 - np.cos(slope), u), half * abs(trapezoid(np.sin(slope), u))
+
+
+@each_law
+def test_a_ruck_in_a_rug(device, law):
+    """A heavy rod that is too long for the room between its ends lies on the floor but for one wave."""
+    load, far, n, radius = 3.0, 4.0, 240, 0.005
+    shortening, height = ruck(load)
+    x = np.linspace(-far, far, 20001)
+    length = 2.0 * far + shortening
+
+    def drawn(rise):
+        z = np.where(np.abs(x) < 2.0, 0.5 * rise * (1.0 + np.cos(0.5 * np.pi * x)), 0.0)
+        return z, np.append(0.0, np.cumsum(np.hypot(np.diff(x), np.diff(z))))
+
+    z, s = drawn(brentq(lambda rise: drawn(rise)[1][-1] - length, 1e-3, 5.0))
+    even = np.linspace(0.0, length, n + 1)
+    points = np.stack([np.interp(even, s, x), 0.0 * even, np.interp(even, s, z) + 1.1 * radius], axis=1)
+    scene = ddg.Scene(gravity=(0.0, 0.0, -G))
+    section = ddg.Stiffness(EA=1e5, EI1=1.0, radius=radius, mass_per_length=1.0 / G)
+    rod = scene.add_rod(points, section=section, natural="straight", twist=False)
+    scene.fix(rod, range(n + 1), components="y")
+    for end in (0, -1):
+        scene.fix(rod, [end], components="x")
+    scene.add_obstacle(ddg.Plane(), name="floor")
+    scene.contact(law=law, range=1e-3)
+    model = scene.build(device, precision="float64")
+    state = statics.solve(model, start=1.0, end=1.0, max_iterations=1000)
+    pushes = np.array([reaction.force for reaction in model.reactions(state)])[1:3, 0]
+    np.testing.assert_allclose(pushes, [load, -load], rtol=2e-3)
+    assert np.ptp(state.points()[:, 2]) == pytest.approx(height, rel=1e-3)
 
 
 def rods_with(friction: float = 0.0, objects=None):

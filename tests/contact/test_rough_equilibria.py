@@ -111,7 +111,7 @@ def test_what_slides_off_has_no_equilibrium(device):
     model = on_slope(rod_on_floor, 0.3, friction=0.3).build(device, precision="float64")
     with pytest.raises(
         SolverError,
-        match=r"no equilibrium .* max_iterations.* may come to no rest: step the scene in time, take more load steps",
+        match=r"no equilibrium .* max_iterations.* may come to no rest: step the scene in time, take a larger max_iterations",
     ):
         statics.solve(model, max_cuts=1, max_iterations=30)
 
@@ -132,6 +132,44 @@ def test_rests_on_in_time(device):
         state = integrator.step(state, 1 / 400)
     moved = np.linalg.norm(state.points() - first.points(), axis=1).max()
     assert 0.0 < moved < 0.12 * NU
+
+
+def ladder(angle: float, mu: float, law: str) -> ddg.Scene:
+    """A stiff rod of 1 m from the floor to a wall, at an angle to the floor."""
+    radius, apart = 0.005, 0.0054
+    scene, s = ddg.Scene(gravity=(0.0, 0.0, -G)), np.linspace(0.0, 1.0, 9)
+    points = np.stack([(s - 1.0) * np.cos(angle) - apart, 0.0 * s, s * np.sin(angle) + apart], axis=1)
+    rod = scene.add_rod(points, section=ddg.Circle(radius), material=ddg.Material(young=1e11, density=1000.0))
+    scene.fix(rod, range(9), "y")
+    scene.add_obstacle(ddg.Plane(), name="floor")
+    scene.add_obstacle(ddg.Plane((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0)), name="wall")
+    scene.contact(law=law, range=5e-4, friction=mu)
+    return scene
+
+
+@pytest.mark.parametrize("law", ["barrier", "penalty"])
+@pytest.mark.parametrize("mu", [0.3, 0.6])
+@pytest.mark.parametrize("load_steps", [1, 2, 8])
+def test_a_ladder_stands_from_its_critical_angle_on(device, law, mu, load_steps):
+    """Where both ends slide, N (1 + mu^2) = w of the floor, and the moment about the foot is w cos / 2 = mu N (sin + mu cos): so at
+    tan(angle) = (1 - mu^2) / (2 mu). By normal forces that are those of a smaller load it would fall.
+    """
+    critical = np.arctan((1.0 - mu**2) / (2.0 * mu))
+    for beyond in (0.02, 0.1, 0.3):
+        model = ladder(critical + beyond, mu, law).build(device, precision="float64")
+        state = statics.solve(model, load_steps=load_steps)
+        assert np.abs(state.points() - model.state().points()).max() < 2e-3
+        weight = 1000.0 * np.pi * 0.005**2 * G
+        floor, wall = (np.array(reaction.force) for reaction in model.reactions(state)[-2:])
+        np.testing.assert_allclose(floor + wall, [0.0, 0.0, weight], atol=1e-4 * weight)
+        assert abs(floor[0]) <= mu * floor[2] * (1.0 + 1e-6)
+        assert abs(wall[2]) <= -mu * wall[0] * (1.0 + 1e-6)
+    model = ladder(critical - 0.03, mu, law).build(device, precision="float64")
+    try:
+        state = statics.solve(model, load_steps=load_steps)
+    except SolverError:
+        return
+    assert np.abs(state.points() - model.state().points()).max() > 0.1  # it lies
 
 
 LENGTH, RADIUS, SOFT = 1.0, 0.005, 1e5  # m, m, N/m^2

@@ -46,6 +46,7 @@ class FrictionElements(PairElements):
             ways = wp.array(ways, dtype=wp.types.vector(3, real), device=self.device)
             self.directions = arrays.upload(beside.astype(np.int32), wp.vec2i, self.device), ways
         self.kernels += [self._lag, self._evaluate]
+        self._onward = 0
         self._kept = ("count", "starts", "partners")
         self.lagged = lagged_struct(real)()
         self.reserve()
@@ -62,11 +63,12 @@ class FrictionElements(PairElements):
         self.lagged.weight = wp.zeros(capacity, dtype=wp.types.vector(4, self.real), device=self.device)
         self.lagged.tangent = arrays.allocate((self._rows, capacity), wp.types.vector(3, self.real), self.device)
 
-    def lag(self, law, x: wp.array) -> None:
-        """Take the pairs of contact as it was evaluated last, at x."""
+    def lag(self, law, x: wp.array, again: bool) -> None:
+        """Take the pairs of contact as it was evaluated last, at x; `again`: of a search that goes on, with the directions of slips."""
+        self._onward = int(again)
         of = self._contact
         inputs = [of.pairs, of.count, self.found.sides, law, x, *self.directions]
-        inputs += [of.factor, of.gradient]
+        inputs += [of.factor, of.gradient, self._onward, self.count]
         outputs = [self.pairs, self.factor, self.lagged, self._slip, self._along]
         self._take_turns(self._lag, self.found.capacity, inputs, outputs)
         for name in self._kept:
@@ -76,6 +78,6 @@ class FrictionElements(PairElements):
     def evaluate(self, x, start, rate: wp.array, iterates: tuple) -> None:
         """Write energies, work, gradients and factors at x by the slip since `start`."""
         inputs = [self.pairs, self.count, self.found.first.count]
-        inputs += [self.lagged, self._velocity, rate, *iterates, x, start]
+        inputs += [self.lagged, self._velocity, rate, *iterates, self._onward, x, start]
         outputs = [self._slip, self._along, self.factor, self.energy, self.work, self.gradient]
         self._take_turns(self._evaluate, self.found.capacity, inputs, outputs)

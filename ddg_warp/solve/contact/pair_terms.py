@@ -148,7 +148,7 @@ class PairTerms:
         self._start_anew()
         for part, friction in zip(self.lists, self.frictions, strict=True):
             part.write(x, self.law, self.gap)
-            friction.lag(self.law, x)
+            friction.lag(self.law, x, again)
         if not again:
             wp.copy(self._start, x)
         self._lagged = self._version

@@ -7,7 +7,8 @@ nothing pushes off is not told from a minimum: `ddg_warp.solve.stability` tells.
 
 Friction is that of a step in time without inertia, as long as the increment of the load parameter: it acts against slips since the
 equilibrium before, and what sticks creeps by less than `velocity` times the increment. Normal forces are lagged, at first those of the
-equilibrium before, and taken anew from what is found until that is in equilibrium with its own.
+equilibrium before, and taken anew after every iteration, until what is found is in equilibrium with its own. What swings about that,
+as normal forces come of friction elsewhere and that of theirs, goes less than the whole way.
 """
 
 import math
@@ -32,7 +33,11 @@ FORCING = 1e-4  # smallest reduction of the residual that a direction is solved 
 ADRIFT = 1e3  # of the size of the net, from which on what moves goes nowhere
 FAR = 4.0  # turns of a direction, over the cap of a step, at which it is far enough
 POLISH = 2  # iterations of a solve that begins within rounding, at most
-LAGGED = 5  # iterations with the same normal forces, which without friction at first may lead far off
+LEAST, LEAP = (
+    0.1,
+    10.0,
+)  # parts of a way with other normal forces that are taken, and the longest one over the one before
+LAGGED = 1  # iterations with the same normal forces: by too small ones what would stick slides far off
 
 
 class StaticNewton(NetNewton):
@@ -150,6 +155,29 @@ class StaticNewton(NetNewton):
         self._whole = False
 
 
+class Relaxation:
+    """Aitken's relaxation of a fixed point, at most 1 (Irons and Tuck, Int. J. Numer. Meth. Eng. 1, 1969, 275), with no leaps.
+
+    What is held by friction alone has no stiffness where all of it slides, by normal forces that are not yet those of its equilibrium.
+    """
+
+    def __init__(self, worlds: int):
+        self._part, self._last = np.ones(worlds), np.zeros((worlds, 0))
+
+    def __call__(self, way: np.ndarray, whole: np.ndarray) -> np.ndarray:
+        """Part (worlds,) of a way (worlds, n) that is to be taken; all of it where it is to be `whole`, after which all begins anew."""
+        if self._last.size:
+            size, last = (np.sqrt((each**2).sum(1)) for each in (way, self._last))
+            turn = way - self._last
+            square = (turn**2).sum(1)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                part = -self._part * (self._last * turn).sum(1) / square
+                part = np.minimum(np.where(part > 0.0, np.clip(part, LEAST, 1.0), 1.0), LEAP * self._part * last / size)
+            self._part = np.where(whole | (last == 0.0) | (size == 0.0), 1.0, part)
+        self._last = np.where(whole[:, None], 0.0, way)
+        return self._part
+
+
 class NetEquilibrium:
     """Equilibria of a model that is a net alone, for `Equilibrium`, whose tangent and load scale it uses."""
 
@@ -225,6 +253,7 @@ class NetEquilibrium:
         rubs, rate = self.newton.rubs, 1.0 / increment if self.newton.rubs else 0.0
         again = self.net.edges or self.model.motions  # what is found is judged by its own frames and forces on supports
         held = self.tangent.dofs(state)
+        relaxation = Relaxation(self.net.worlds) if rubs else None
         for solves in range(owner.options.max_iterations if rubs else 1 + bool(again)):
             on = solves > 0 and rubs
             if on and not self.arrived:
@@ -237,7 +266,10 @@ class NetEquilibrium:
             )
             before, iterations, ends = state, self.newton.islands.iteration.numpy(), self.newton.islands.status.numpy()
             owner.iterations += int(iterations.sum())
+            begun = state.net.q.numpy().copy()
             wp.copy(state.net.q, self.newton.q)
+            if on:
+                self._relax(relaxation, state, begun)
             for name in ("frame", *(f"lag_{i}" for i in range(len(self.net.sets)))):
                 wp.copy(state.net.arrays()[name], self._start.arrays()[name])  # renewed on the way, perhaps
             self.model.carry_frames(state)
@@ -281,6 +313,14 @@ class NetEquilibrium:
                 state=state,
                 outcome="adrift",
             )
+
+    def _relax(self, relaxation, state: State, begun: np.ndarray) -> None:
+        """Take less of a way with other normal forces, of worlds whose supports have not moved on it."""
+        way = (state.net.q.numpy() - begun).reshape(self.net.worlds, -1)
+        held = ~self.tangent.free.reshape(self.net.worlds, -1)
+        part = relaxation(way, (way * held).any(1))
+        if (part < 1.0).any():
+            state.net.q.assign(begun + (part[:, None] * way).reshape(begun.shape))
 
     @property
     def arrived(self) -> bool:
