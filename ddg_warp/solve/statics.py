@@ -217,6 +217,8 @@ class Equilibrium:
             return state
         at, whole, cuts = start, (end - start) / load_steps, 0
         state = state.copy()
+        if self._rubs:
+            self.net.wary = True
         while at != end:
             increment = whole * 0.5**cuts
             target = end if abs(end - at) <= abs(increment) * (1.0 + 1e-12) else at + increment
@@ -228,7 +230,9 @@ class Equilibrium:
                 cuts += 1
                 if error.outcome == arguments.PRESCRIBED:
                     raise
-                if cuts > self.options.max_cuts:
+                if cuts > self.options.max_cuts and self._rubs and self.net.wary:
+                    self.net.wary, cuts = False, 0  # it may have to slide
+                elif cuts > self.options.max_cuts:
                     advice = jump_between(self.model, at, target)
                     raise SolverError(
                         f"{advice and advice + '; '}{error} (load parameter {at:g} of {end:g} reached, {cuts - 1} increments halved)",

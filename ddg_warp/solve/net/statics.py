@@ -7,12 +7,14 @@ nothing pushes off is not told from a minimum: `ddg_warp.solve.stability` tells.
 
 Friction is that of a step in time without inertia, as long as the increment of the load parameter: it acts against slips since the
 equilibrium before, and what sticks creeps by less than `velocity` times the increment. Normal forces are lagged, at first those of the
-equilibrium before, and taken anew after every iteration, until what is found is in equilibrium with its own. What swings about that,
-as normal forces come of friction elsewhere and that of theirs, goes less than the whole way.
+equilibrium before, and taken anew from what is found until that is in equilibrium with its own. Where something has slid, that may be
+as normal forces were those of a smaller load: then they are taken anew after every iteration. What swings about an equilibrium, as
+normal forces come of friction elsewhere and that of theirs, goes less than the whole way.
 """
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -33,11 +35,11 @@ FORCING = 1e-4  # smallest reduction of the residual that a direction is solved 
 ADRIFT = 1e3  # of the size of the net, from which on what moves goes nowhere
 FAR = 4.0  # turns of a direction, over the cap of a step, at which it is far enough
 POLISH = 2  # iterations of a solve that begins within rounding, at most
-LEAST, LEAP = (
-    0.1,
-    10.0,
-)  # parts of a way with other normal forces that are taken, and the longest one over the one before
-LAGGED = 1  # iterations with the same normal forces: by too small ones what would stick slides far off
+LEAST, LEAP = 0.1, 10.0  # part of a way with other normal forces that is taken, and the longest one over the one before
+# Iterations with the same normal forces. By too small ones what would stick slides far off: a wary search takes one. In a crowd that
+# falls into place bodies lose touch for an iteration, and are carried far by the friction of others: it takes some without.
+LAGGED = 5
+SETTLED, SLIDING = 1e-4, 0.999  # residuals over all loads of what has settled; friction over its bound of what slides
 
 
 class StaticNewton(NetNewton):
@@ -179,7 +181,11 @@ class Relaxation:
 
 
 class NetEquilibrium:
-    """Equilibria of a model that is a net alone, for `Equilibrium`, whose tangent and load scale it uses."""
+    """Equilibria of a model that is a net alone, for `Equilibrium`, whose tangent and load scale it uses.
+
+    Attributes:
+        wary: whether what has slid is searched for again with normal forces that are taken anew after every iteration.
+    """
 
     def __init__(self, owner):
         model, options, touching = owner.model, owner.options, owner.model.net.host.touching
@@ -189,7 +195,7 @@ class NetEquilibrium:
             NewtonOptions(
                 rtol=options.rtol,
                 floor_factor=options.floor_factor,
-                max_iterations=LAGGED if touching and touching.rubs else options.max_iterations,
+                max_iterations=options.max_iterations,
                 rotation_cap=options.rotation_cap,
                 linear_rtol=FORCING,
                 psd="progressive" if touching else "gauss_newton",
@@ -200,6 +206,7 @@ class NetEquilibrium:
         self._start = model.net.empty()  # lagged data of a solve
         self._step = wp.zeros(self.newton.all, dtype=self.newton.right.dtype, device=model.wp_device)
         self._graphs = Graphs(model, lambda: arrays.load_kernels(self.newton.kernels, model.wp_device))
+        self.wary = True
         self._least, self._touching, self._friction_work = math.inf, [], 0.0
 
     def pcg_iterations(self) -> int:
@@ -249,6 +256,39 @@ class NetEquilibrium:
         Raises:
             SolverError: it was not found; names the outcome.
         """
+        if not self.newton.rubs:
+            return self._search(state, at, before, increment)
+        try:
+            found = self._search(state, at, before, increment)
+        except SolverError:
+            if not self.wary:
+                raise
+        else:
+            if not self.wary or (self._settled(found, at) and not self._slides(found)):
+                return found
+        return self._search(state, at, before, increment, warily=True)
+
+    def _settled(self, state: State, at: float) -> bool:
+        """Whether forces balance with the friction of their own normal forces, and not only to what rounding leaves of a search."""
+        tangent = self.tangent
+        outer, points = tangent.loads(at, tangent.dofs(state)), tangent.free & ~tangent.angle
+        residual = outer - tangent.gradient(state) + tangent.friction(state)
+        return float(np.abs(residual[points]).max(initial=0.0)) <= SETTLED * float(np.abs(outer[points]).sum())
+
+    def _slides(self, state: State) -> bool:
+        """Whether friction is all there somewhere, as it is of what does not stick."""
+        touch = self.model.touch
+        touch.at(state.net.q)
+        touch.rub(state.net.q, state.rubbing)
+        for part in touch.terms.frictions:
+            n = int(part.count.numpy()[0])
+            force = np.linalg.norm(part.gradient.numpy()[: part.found.kind.first, :n].sum(0), axis=-1)
+            if (force > SLIDING * part.lagged.bound.numpy()[:n]).any():
+                return True
+        return False
+
+    def _search(self, state: State, at: float, before: State, increment: float, warily: bool = False) -> State:
+        """See `solve`; `warily` with normal forces that are taken anew after every iteration."""
         state, owner, first = state.copy(), self.owner, before
         rubs, rate = self.newton.rubs, 1.0 / increment if self.newton.rubs else 0.0
         again = self.net.edges or self.model.motions  # what is found is judged by its own frames and forces on supports
@@ -259,8 +299,12 @@ class NetEquilibrium:
             if on and not self.arrived:
                 state = state.copy()
                 self.tangent.assign(state, np.where(self.tangent.free, self.tangent.dofs(state), held))
+            name = "slide on" if on else "solve"
+            if rubs:
+                self.newton.options = replace(self.newton.options, max_iterations=1 if warily else LAGGED)
+                name += " warily" if warily else ""
             self._replay(
-                "slide on" if on else "solve",
+                name,
                 partial(self._begin, state, at, before, rate),
                 partial(self.newton.search, self._start, on),
             )
