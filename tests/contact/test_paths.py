@@ -147,11 +147,10 @@ RUBBER = ddg.Material(young=1e6, density=1000.0, poisson=0.4)
 RADIUS = 4e-3
 
 
-def cantilever(scene, angle: float = 0.0, height: float = 0.0, name: str = "rod", **options) -> int:
-    """A rod of 0.2 m from the origin along x, turned about z; its end sinks by 0.05 m if nothing is below."""
-    along = np.linspace(0.0, 0.2, 13)
-    points = np.stack([np.cos(angle) * along, np.sin(angle) * along, 0.0 * along + height], axis=1)
-    rod = scene.add_rod(points, section=ddg.Circle(RADIUS), material=RUBBER, name=name, **options)
+def cantilever(scene) -> int:
+    """A rod of 0.2 m from the origin along x; its end sinks by 0.05 m if nothing is below."""
+    points = np.linspace((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), 13)
+    rod = scene.add_rod(points, section=ddg.Circle(RADIUS), material=RUBBER, name="rod")
     scene.clamp(rod, edges=[0])
     return rod
 

@@ -108,14 +108,12 @@ def path_onto_a_ball(kind, variant):
     """A path of equilibria under growing weight leads onto the ball, where load steps lead to."""
     model = variant.build(_over_ball(kind, variant))
     path = Continuation(model).trace(stop=ddg.Stop(load=(-1.0, 1.0)))
-    state, pushes = (
-        path.points[-1].state,
-        [np.array(model.reactions(point.state)[-1].force)[2] for point in path.points],
-    )
-    assert path.points[-1].load == 1.0
-    assert path.points[-1].stable
-    assert 0.0 <= pushes[0] < pushes[-1]
-    close(state.points()[:, 2], statics.solve(model).points()[:, 2], atol=1e-8)
+    first, last = path.points[0], path.points[-1]
+    before, pushed = (model.reactions(point.state)[-1].force[2] for point in (first, last))
+    assert last.load == 1.0
+    assert last.stable
+    assert 0.0 <= before < pushed
+    close(last.state.points()[:, 2], statics.solve(model).points()[:, 2], atol=1e-8)
 
 
 CONTACT_QUESTIONS = {

@@ -82,10 +82,8 @@ REFUSED["continuation"] |= dict.fromkeys(
 REFUSED["path onto a ball"] = REFUSED["rests"] | {"rod without bending": REFUSED["continuation"]["rod without bending"]}
 REFUSED["implicit midpoint"] |= dict.fromkeys(IN_CONTACT, ("contact: ", "use 'implicit_euler'"))
 REFUSED["failure"] |= dict.fromkeys(IN_CONTACT, ("contact: ", "'ball'", "overlap", "move them apart"))
-ALONE = {
-    "continuation": {},
-    "path onto a ball": REFUSED["rests"],
-}  # several worlds are refused, but of what is refused before
+# questions that several worlds are refused, and the objects that are refused before
+ALONE = {"continuation": {}, "path onto a ball": REFUSED["rests"]}
 
 
 def answer(name: str, question: str, variant: Variant) -> str:

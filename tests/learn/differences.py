@@ -8,7 +8,6 @@ from ddg_warp.learn.adjoint import Adjoint
 
 DEVICE = "cpu"  # what models of these tests are built for; see `conftest`
 CHANGE = 1e-5  # of the loss, by a step of differences
-LEAST = 1e-6  # derivative that such a step can be for; what is less is rounding
 TIGHT = {"rtol": 1e-13}
 CLOSE = 1e-6  # relative error of a gradient, as asked
 
@@ -127,7 +126,7 @@ class Difference:
 
     def by_entry(self, name: str, direction: np.ndarray, about: float) -> float:
         """Along a direction in an array of the first state, where it is `about` as large; by steps that change the loss by CHANGE."""
-        array, step = entries(self.state)[name], CHANGE / max(abs(about), LEAST)
+        array, step = entries(self.state)[name], CHANGE / max(abs(about), 1e-6)
         values = arrays.download(array)
         return self.by(lambda x: arrays.assign(array, values + x * direction), step)
 
@@ -191,4 +190,4 @@ def check_state(model, gradient, difference) -> None:
         values = arrays.download(entries(gradient)[entry])
         direction = along(values, meant)
         found = float((values * direction).sum())
-        assert close(found, difference.by_entry(entry, direction, found), LEAST), entry
+        assert close(found, difference.by_entry(entry, direction, found)), entry

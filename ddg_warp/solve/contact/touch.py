@@ -13,6 +13,7 @@ from ddg_warp.solve.contact.shapes import Shapes
 LAWS = {"barrier": log_barrier, "penalty": smooth_penalty}
 KEEP = {"barrier": 1.0, "penalty": 0.0}  # of the thickness, what motion never goes into
 MARGIN = 1.0  # of a typical radius, by which searches go beyond the reach
+SLIDING = 0.999  # of its bound, friction of what does not stick
 
 
 class Touch:
@@ -81,6 +82,14 @@ class Touch:
         self.rub(x, v)
         return self.terms.forces.numpy() - pushed
 
+    def slides(self) -> bool:
+        """After `friction`, whether it is all there somewhere, as it is of what does not stick."""
+        for part in self.terms.frictions:
+            used, forces = _forces(part)
+            if (np.linalg.norm(forces, axis=1) > SLIDING * part.lagged.bound.numpy()[used]).any():
+                return True
+        return False
+
     def find(self, x: wp.array) -> None:
         """Candidates at blocks x, all of them; `at` has to follow before energies are asked for. Not in a capture; raises as `at`."""
         self.search.rebuild(x)
@@ -134,17 +143,23 @@ class Touch:
         return float(found["gap"][k]), f"{one} and {other}{world}"
 
 
+def _forces(part) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of `PairElements` that bring anything (n,), and forces on their first things (n, 3) [N]."""
+    used = np.flatnonzero(part.factor.used.numpy()[: int(part.count.numpy()[0])])
+    return used, -part.gradient.numpy()[: part.found.kind.first, used].sum(0)
+
+
 def _of_first(part, pairs) -> np.ndarray:
     """Forces of `PairElements` on the first things of candidates (count, 3) [N], none where `part` is None."""
     count = int(pairs.count.numpy()[0])
     forces, own = np.zeros((count, 3)), 0 if part is None else int(part.count.numpy()[0])
     if own:
-        used = np.flatnonzero(part.factor.used.numpy()[:own])
+        used, found = _forces(part)
         every, those = (
             of.pairs.numpy()[:number].astype(np.int64) @ [pairs.second.all, 1]
             for of, number in ((pairs, count), (part, own))
         )  # sorted, both
-        forces[np.searchsorted(every, those[used])] = -part.gradient.numpy()[: pairs.kind.first, used].sum(0)
+        forces[np.searchsorted(every, those[used])] = found
     return forces
 
 

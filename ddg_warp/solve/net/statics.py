@@ -39,7 +39,7 @@ LEAST, LEAP = 0.1, 10.0  # part of a way with other normal forces that is taken,
 # Iterations with the same normal forces. By too small ones what would stick slides far off: a wary search takes one. In a crowd that
 # falls into place bodies lose touch for an iteration, and are carried far by the friction of others: it takes some without.
 LAGGED = 5
-SETTLED, SLIDING = 1e-4, 0.999  # residuals over all loads of what has settled; friction over its bound of what slides
+SETTLED = 1e-4  # residuals over all loads, of what has
 
 
 class StaticNewton(NetNewton):
@@ -256,39 +256,25 @@ class NetEquilibrium:
         Raises:
             SolverError: it was not found; names the outcome.
         """
-        if not self.newton.rubs:
-            return self._search(state, at, before, increment)
         try:
-            found = self._search(state, at, before, increment)
+            found, certain = self._search(state, at, before, increment)
         except SolverError:
-            if not self.wary:
+            if not (self.newton.rubs and self.wary):
                 raise
         else:
-            if not self.wary or (self._settled(found, at) and not self._slides(found)):
+            if certain or not self.wary:
                 return found
-        return self._search(state, at, before, increment, warily=True)
+        return self._search(state, at, before, increment, warily=True)[0]
 
-    def _settled(self, state: State, at: float) -> bool:
-        """Whether forces balance with the friction of their own normal forces, and not only to what rounding leaves of a search."""
-        tangent = self.tangent
-        outer, points = tangent.loads(at, tangent.dofs(state)), tangent.free & ~tangent.angle
-        residual = outer - tangent.gradient(state) + tangent.friction(state)
-        return float(np.abs(residual[points]).max(initial=0.0)) <= SETTLED * float(np.abs(outer[points]).sum())
+    def _search(
+        self, state: State, at: float, before: State, increment: float, warily: bool = False
+    ) -> tuple[State, bool]:
+        """See `solve`; `warily` with normal forces that are taken anew after every iteration.
 
-    def _slides(self, state: State) -> bool:
-        """Whether friction is all there somewhere, as it is of what does not stick."""
-        touch = self.model.touch
-        touch.at(state.net.q)
-        touch.rub(state.net.q, state.rubbing)
-        for part in touch.terms.frictions:
-            n = int(part.count.numpy()[0])
-            force = np.linalg.norm(part.gradient.numpy()[: part.found.kind.first, :n].sum(0), axis=-1)
-            if (force > SLIDING * part.lagged.bound.numpy()[:n]).any():
-                return True
-        return False
-
-    def _search(self, state: State, at: float, before: State, increment: float, warily: bool = False) -> State:
-        """See `solve`; `warily` with normal forces that are taken anew after every iteration."""
+        Returns:
+            The equilibrium; and whether it is one however normal forces were taken: forces balance with friction of their own normal
+            forces, and not only to what rounding leaves of a search, and all sticks.
+        """
         state, owner, first = state.copy(), self.owner, before
         rubs, rate = self.newton.rubs, 1.0 / increment if self.newton.rubs else 0.0
         again = self.net.edges or self.model.motions  # what is found is judged by its own frames and forces on supports
@@ -330,10 +316,14 @@ class NetEquilibrium:
             status = outcome.MAX_ITERATIONS if rubs else status
         outer = self.tangent.loads(at, q)
         residual = outer - self.tangent.gradient(state)
+        certain = True
         if rubs:
             rates = (state.net.q.numpy() - first.net.q.numpy()) * rate
             state.sliding = wp.array(rates, dtype=self.net.vector, device=self.net.device)
             residual += self.tangent.friction(state)
+            points = self.tangent.free & ~self.tangent.angle
+            settled = np.abs(residual[points]).max(initial=0.0) <= SETTLED * np.abs(outer[points]).sum()
+            certain = bool(settled) and not self.model.touch.slides()
         if status > outcome.CONVERGED_TO_ROUNDING:
             name = outcome.NAMES[status]
             told = self.newton.contact.tightest(state.net.q, status) if self.newton.contact else ""
@@ -344,7 +334,7 @@ class NetEquilibrium:
         # in contact the last matrix may be the projected one without a trial of the exact one, which tells nothing
         indefinite = self.newton.contact is None and self.newton.islands.clamped.numpy().any()
         state.stable = False if indefinite else None
-        return owner.found(state, outer, residual, at)
+        return owner.found(state, outer, residual, at), certain
 
     def _refuse_drifting(self, state: State, q: np.ndarray, at: float) -> None:
         """Refuse what loads carry away, as neither supports nor contact hold it."""
