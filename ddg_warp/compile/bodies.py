@@ -11,8 +11,8 @@ ROD = "rod"
 
 @dataclass
 class Body:
-    """A rod, shell or obstacle: nodes, kind, radius [m], name of its group, how messages call it, cells of nodes, and which shell it
-    is, -1 for none."""
+    """A rod, shell or obstacle: nodes, kind, radius [m], name of its group, how messages call it, cells of nodes, which shell it
+    is, -1 for none, and the markers of one that spins."""
 
     nodes: np.ndarray
     kind: str
@@ -23,6 +23,7 @@ class Body:
     closed: bool = False
     still: bool = False
     shell: int = -1
+    markers: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
 
 @dataclass

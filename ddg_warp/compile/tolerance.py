@@ -134,7 +134,7 @@ class Bodies:
         """Residual at rtol = 1 of every block (N,) [N, N m], of bodies with such loads (count,)."""
         result = np.zeros(self.host.blocks)
         np.maximum.at(result, self._blocks, loads[self._body] * self._weight)
-        result[np.concatenate([np.zeros(0, int), *self.host.obstacles])] = 1.0  # of no body, and held
+        result[self.host.of_obstacles] = 1.0  # of no body, and held
         return result
 
 

@@ -5,7 +5,7 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.kernels.adjoint import contact_sums
-from ddg_warp.kernels.adjoint.contact import NUMBERS, RATE, pull_kernel, rub_kernel
+from ddg_warp.kernels.adjoint.contact import NUMBERS, RATE, SPUN, THICKNESS, pull_kernel, rub_kernel
 from ddg_warp.kernels.contact.gather import SLOTS, sum_kernel
 from ddg_warp.solve.contact.node_items import NodeItems
 from ddg_warp.solve.contact.pair_terms import FRICTION
@@ -47,7 +47,9 @@ class ContactAdjoint:
         kinds = [pairs.kind for pairs in search.lists]
         self._pull = [pull_kernel(kind, law, real) for kind in kinds]
         directed = bool(terms.frictions) and terms.frictions[0].directions[0] is not None
-        self._rub = [rub_kernel(kind, law, friction, real, directed) for kind in kinds if terms.frictions]
+        self._spins = terms.spins if terms.frictions and terms.spins.any else None
+        spins = bool(self._spins)
+        self._rub = [rub_kernel(kind, law, friction, real, directed, spins) for kind in kinds if terms.frictions]
         self._direct = contact_sums.direction_kernels(real) if directed else ()
         self._leads = [self._led(search.shapes.beside(kind.first)) for kind in kinds if directed]
         self._sides = [contact_sums.side_kernels(kind, real) for kind in kinds]
@@ -55,10 +57,12 @@ class ContactAdjoint:
         self._items, self._add = [NodeItems(kind, nodes, every) for kind in kinds], sum_kernel(real, serial)
         self.by_groups = self._zeros(NUMBERS, *terms.law.stiffness.shape)
         self.by_radius = self._zeros(*net.touching["radius"].shape)
-        self._things, self._starts = {}, {}
+        self._things, self._starts, self._spun_things = {}, {}, {}
+        self._by_spun = self._zeros(SPUN, *self.by_radius.shape)
         for size in search.shapes.sizes:
             owner = search.shapes.things(size)[2]
             self._things[size] = self._zeros(net.worlds * len(owner))
+            self._spun_things[size] = self._zeros(SPUN if spins else 0, net.worlds * len(owner))
             starts = np.searchsorted(owner, np.arange(len(given.bodies) + 1)).astype(np.int32)
             self._starts[size] = wp.array(starts, dtype=int, device=device)
         most = max(self._pieces(pairs)[0] for pairs in search.lists)
@@ -87,7 +91,7 @@ class ContactAdjoint:
         """Make room for as many pairs as the search has."""
         lists, vector = self.system.search.lists, self.net.vector
         most = max(pairs.capacity for pairs in lists)
-        self._numbers = self._zeros(NUMBERS, most)
+        self._numbers, self._spun = self._zeros(NUMBERS, most), self._zeros(SPUN, most if self._spins else 1)
         shape, device = (SLOTS, most), self.net.device
         self._start_parts, self._lagged_parts = (arrays.allocate(shape, vector, device) for _ in range(2))
         self._by_direction = wp.zeros(most if self._direct else 1, dtype=vector, device=self.net.device)
@@ -103,7 +107,7 @@ class ContactAdjoint:
             by: derivatives by these three.
         """
         terms, (lagged, before, q), (by_lagged, by_before, by_q) = self.system.terms, at, by
-        for array in self._things.values():
+        for array in (*self._things.values(), *self._spun_things.values()):
             array.zero_()
         for i, (part, rub) in enumerate(zip(terms.lists, self._rubs, strict=True)):
             read, pairs = [part.pairs, part.count, part.found.sides, terms.law], part.found.capacity
@@ -116,16 +120,30 @@ class ContactAdjoint:
                 self._items[i].list(rub.count, rub.factor.nodes)
                 read = [rub.pairs, rub.count, part.found.sides, terms.law, rub.factor.nodes, rub.factor.used]
                 inputs = [*read, lagged, before, q, w, self._velocity, rate, *rub.directions]
-                written = [rub.gradient, self._start_parts, self._lagged_parts, self._numbers, self._by_direction]
+                inputs += [terms.spins.places, terms.spins.turned.flatten()]
+                written = [
+                    rub.gradient,
+                    self._start_parts,
+                    self._lagged_parts,
+                    self._numbers,
+                    self._by_direction,
+                    self._spun,
+                ]
                 self._take_turns(self._rub[i], pairs, inputs, written)
                 self._add_up(i, rub, rub.gradient, by_q)
                 self._add_up(i, rub, self._start_parts, by_before)
                 self._add_up(i, rub, self._lagged_parts, by_lagged)
                 self._sum(i, rub)
                 self._lead(i, rub, by_lagged)
-        for size, found in self._things.items():
-            starts, things = self._starts[size], len(found) // self.net.worlds
-            self._launch(self._bodies, self.by_radius.shape, [found, starts, things], [self.by_radius])
+                if self._spins:
+                    for row in range(SPUN):
+                        self._to_things(i, rub, self._spun[row], self._spun_row(row))
+        self._to_bodies(self._things, self.by_radius)
+        if self._spins:
+            self._by_spun.zero_()
+            for row in range(SPUN):
+                self._to_bodies(self._spun_row(row), self._by_spun[row])
+            self._spins.pull(before, q, self._by_spun, [by_before, by_q, self.by_radius])
 
     def _add_up(self, index: int, part, written: wp.array, out: wp.array) -> None:
         """Add what pairs that are used have written by slot to nodes."""
@@ -142,11 +160,25 @@ class ContactAdjoint:
         inputs = [*lists, part.pairs, found.sides, law, self._numbers, number, things]
         self._launch(pieces, self.net.worlds * number, inputs, [self._partial])
         self._launch(total, self.by_groups.shape[1:], [self._partial, number], [self.by_groups])
-        first, second = self._sides[index]
-        self._launch(first, found.first.all, [*lists, self._numbers], [self._things[found.first.size]])
-        items = self._items[index]
-        inputs = [part.pairs, found.sides, items.places, items.numbers, items.items, self._numbers]
-        self._launch(second, found.second.all, inputs, [self._things[found.second.size]])
+        self._to_things(index, part, self._numbers[THICKNESS], self._things)
+
+    def _to_things(self, index: int, part, values: wp.array, out: dict[int, wp.array]) -> None:
+        """Add what pairs of elements have (capacity,) to the things of either side, by their size."""
+        found, items, (first, second) = part.found, self._items[index], self._sides[index]
+        inputs = [part.count, part.starts, part.partners, values]
+        self._launch(first, found.first.all, inputs, [out[found.first.size]])
+        inputs = [part.pairs, found.sides, items.places, items.numbers, items.items, values]
+        self._launch(second, found.second.all, inputs, [out[found.second.size]])
+
+    def _to_bodies(self, things: dict[int, wp.array], out: wp.array) -> None:
+        """Add what things have, by their size, to bodies (worlds, bodies)."""
+        for size, found in things.items():
+            starts, count = self._starts[size], len(found) // self.net.worlds
+            self._launch(self._bodies, out.shape, [found, starts, count], [out])
+
+    def _spun_row(self, row: int) -> dict[int, wp.array]:
+        """What things have of it, by their size."""
+        return {size: found[row] for size, found in self._spun_things.items()}
 
     def _led(self, beside: np.ndarray) -> tuple:
         """Of nodes, which first things lead from and to them: starts and items; and memory of what comes by directions."""

@@ -140,3 +140,8 @@ class Obstacle:
     name: str
 
     call, components = "add_obstacle", "xyz"  # as of supports, which hold its points
+
+    @property
+    def spins(self) -> bool:
+        """Whether its surface may move where its points stay: a round one that turns."""
+        return self.shape.radius > 0.0 and self.motion is not None and self.motion.turns

@@ -8,8 +8,8 @@ gradient g of contact at lagged positions y, which is one of y and of the same n
     u = (t1, t2) . sum_i weight_i (x_i - x_i^n) ,
 
 and its reverse goes through normal force, normal and weights at y, through the slip from the start x^n of the step to x, and to
-coefficient and rate; and through the directions of rods at y, where friction is directed. The matrix of all this by x is symmetric,
-as what is lagged is no function of x.
+coefficient and rate; through the directions of rods at y, where friction is directed; and through how far obstacles have turned that
+spin. The matrix of all this by x is symmetric, as what is lagged is no function of x.
 
 At first y is x^n. With more `lags` it is the solution before, so that a step is a chain of solves: the derivative by y of the last one
 is the g of the one before it, and so on, each with a matrix of its own.
@@ -21,7 +21,7 @@ import warp as wp
 
 from ddg_warp.kernels.contact.gather import SLOTS
 from ddg_warp.kernels.contact.pair_energy import pair_energy_functions, shape_types
-from ddg_warp.kernels.contact.pair_friction import directed_basis
+from ddg_warp.kernels.contact.pair_friction import directed_basis, spun_function
 from ddg_warp.kernels.contact.pair_terms import groups_function, law_struct, read_functions
 from ddg_warp.kernels.contact.surfaces import Kind, sides_struct
 from ddg_warp.kernels.densities import Density
@@ -30,6 +30,8 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 
 STIFFNESS, RANGE, THICKNESS, FRICTION, RATE = range(5)
 NUMBERS = 5  # of a pair, that derivatives are by
+TURN, ARM = 0, 3  # of what spins: how far it has turned (3), and its radius
+SPUN = 4
 
 
 @cache
@@ -68,11 +70,12 @@ def pull_kernel(kind: Kind, density: Density, real):
 
 
 @cache
-def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: bool):
+def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: bool, spins: bool):
     """rub(...): what friction brings by slot of the solution, of the start and of what was lagged, and by the numbers of pairs, as
     `pull_kernel` has it.
 
-    Where it is `directed`, by the directions of rods (capacity,), too, from `beside` by `ways` as of `pair_friction.lag_kernel`.
+    Where it is `directed`, by the directions of rods (capacity,), too, from `beside` by `ways` as of `pair_friction.lag_kernel`; where
+    something `spins`, by `TURN` and `ARM` of what does (SPUN, capacity).
     """
     Law, Sides = law_struct(real), sides_struct(real)
     X, W, P = shape_types(real)
@@ -81,11 +84,24 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
     _, _, evaluate, _ = pair_energy_functions(kind, density, real)
     given, corners = read_functions(kind, real)
     tangents, groups, along_rod = basis(real), groups_function(real), directed_basis(real)
+    spun = spun_function(real)
     slope_of = friction.laws(real, 2)[1]
 
     @wp.func
     def force(
-        y: X, moved: X, v: X, d: V, way: V, p: P, threshold: real, inner: W, mu: real, velocity: real, inverse: real
+        y: X,
+        moved: X,
+        v: X,
+        d: V,
+        way: V,
+        p: P,
+        threshold: real,
+        inner: W,
+        mu: real,
+        velocity: real,
+        inverse: real,
+        turn: V,
+        arm: real,
     ):
         """The derivative along v of the potential of friction that was lagged at y, by what has `moved` since the start."""
         _e, g = evaluate(y, p, threshold, inner)
@@ -97,6 +113,8 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
         weight = (g * n) / normal
         move = moved[0] * weight[0] + moved[1] * weight[1] + moved[2] * weight[2] + moved[3] * weight[3]
         along = v[0] * weight[0] + v[1] * weight[1] + v[2] * weight[2] + v[3] * weight[3]
+        if wp.static(spins):
+            move += wp.cross(turn, n) * arm
         if wp.static(directed):
             ahead, t2, back = along_rod(n, d, way)
             t1 = wp.where(wp.dot(ahead + back, move) < real(0.0), back, ahead)
@@ -123,27 +141,38 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
         rate: wp.array(dtype=real),
         beside: wp.array(dtype=wp.vec2i),
         ways: wp.array2d(dtype=V),
+        spinning: wp.array(dtype=wp.vec4i),
+        turns: wp.array(dtype=V),
         parts: wp.array2d(dtype=V),
         start_parts: wp.array2d(dtype=V),
         lagged_parts: wp.array2d(dtype=V),
         numbers: wp.array2d(dtype=real),
         directions: wp.array(dtype=V),
+        spun_out: wp.array2d(dtype=real),
     ):
         for pair in range(wp.tid(), count[0], threads):
             for i in range(wp.static(NUMBERS)):
                 numbers[i, pair] = real(0.0)
             if wp.static(directed):
                 directions[pair] = V()
+            if wp.static(spins):
+                for i in range(wp.static(SPUN)):
+                    spun_out[i, pair] = real(0.0)
             if used[pair] != 0:
-                world, i, _j, a, b = groups(law, sides, pairs[pair])
+                world, i, j, a, b = groups(law, sides, pairs[pair])
                 d, way = V(), V()
                 if wp.static(directed):
                     first = world * sides.first.nodes_a_world
                     d = lagged[beside[i][1] + first] - lagged[beside[i][0] + first]
                     way = ways[a, b]
+                of, turn, arm = int(-1), V(), real(0.0)
+                if wp.static(spins):
+                    of, arm = spun(sides, spinning, world, i, j)
+                    if of >= 0:
+                        turn = turns[of]
                 p, threshold, inner = given(law, sides, pairs[pair])
                 n = nodes[pair]
-                dy, dx, _dv, dd, _dw, dp, _dt, _di, dmu, _dn, dr = wp.grad(force)(
+                dy, dx, _dv, dd, _dw, dp, _dt, _di, dmu, _dn, dr, dturn, darm = wp.grad(force)(
                     corners(lagged, n),
                     corners(x, n) - corners(start, n),
                     -corners(w, n),
@@ -155,6 +184,8 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
                     law.friction[world, a, b],
                     velocity,
                     rate[world],
+                    turn,
+                    arm,
                 )
                 for slot in range(wp.static(SLOTS)):
                     parts[slot, pair] = V(dx[slot, 0], dx[slot, 1], dx[slot, 2])
@@ -166,5 +197,10 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
                 numbers[wp.static(RATE), pair] = dr
                 if wp.static(directed):
                     directions[pair] = dd
+                if wp.static(spins):
+                    if of >= 0:
+                        for i in range(3):
+                            spun_out[wp.static(TURN) + i, pair] = dturn[i]
+                        spun_out[wp.static(ARM), pair] = darm
 
     return rub

@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.adjoint.contact import NUMBERS, THICKNESS
+from ddg_warp.kernels.adjoint.contact import NUMBERS
 from ddg_warp.kernels.contact.gather import taken_apart
 from ddg_warp.kernels.contact.pair_terms import groups_function, law_struct
 from ddg_warp.kernels.contact.surfaces import Kind, sides_struct
@@ -60,7 +60,7 @@ def group_kernels(real):
 
 @cache
 def side_kernels(kind: Kind, real):
-    """first(...) and second(...): add derivatives by the thickness of pairs to the things of either side (things of all worlds,)."""
+    """first(...) and second(...): add derivatives by a number of pairs to the things of either side (things of all worlds,)."""
     Sides = sides_struct(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -68,14 +68,14 @@ def side_kernels(kind: Kind, real):
         count: wp.array(dtype=int),
         starts: wp.array(dtype=int),
         partners: wp.array(dtype=int),
-        numbers: wp.array2d(dtype=real),
+        values: wp.array(dtype=real),
         out: wp.array(dtype=real),
     ):
         i = wp.tid()
         own = real(0.0)
         if count[0] > 0:
             for p in range(starts[i], starts[i] + partners[i]):
-                own += numbers[wp.static(THICKNESS), p]
+                own += values[p]
         out[i] = out[i] + own
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -85,7 +85,7 @@ def side_kernels(kind: Kind, real):
         places: wp.array(dtype=int),
         number: wp.array(dtype=int),
         items: wp.array(dtype=int),
-        numbers: wp.array2d(dtype=real),
+        values: wp.array(dtype=real),
         out: wp.array(dtype=real),
     ):
         """By the items of the first node of things, of all nodes."""
@@ -96,7 +96,7 @@ def side_kernels(kind: Kind, real):
         for k in range(places[node], places[node] + number[node]):
             p, slot = taken_apart(items[k])
             if slot == wp.static(kind.first) and pairs[p][1] == j:
-                own += numbers[wp.static(THICKNESS), p]
+                own += values[p]
         out[j] = out[j] + own
 
     return first, second

@@ -15,6 +15,9 @@ with forces f_i = -w_i f, f = (t1, t2) psi'(u) at most mu N. They have no result
 to the other, their moment is that of -f at r. What would balance it turns surfaces about their middle, where friction here is applied.
 Where the forces of a pair on one side all but cancel, weights are large; still |f_i| <= mu |g_i . n|.
 
+Surfaces of obstacles that are round move where their nodes stay: one of radius R that has turned by phi (`kernels.contact.spins`) adds
+phi x R n to the slip, whichever side it is on, and is turned by the couple -R n x f.
+
 Rods on obstacles may have one coefficient forwards, one backwards and one across: `directed`. Then mu is the smallest that is not zero,
 t1 lies along the rod, and t1 and t2 are as long as the coefficients of their directions over mu, t1 by the sense of the slip. So psi is
 convex with a continuous slope; forces are at most those whose components, over the most along and across, have squares with a sum of 1,
@@ -51,6 +54,8 @@ def lagged_struct(real):
     """What is lagged of pairs (capacity,): mu N [N], zero where there is no friction, weights of nodes, and tangents (2, capacity).
 
     Tangents that are directed are of slips forwards; in a third row there is the first one of slips backwards.
+    Where there are objects that spin (`kernels.contact.spins`): which one of all worlds a pair has, `spinning`, below zero for none,
+    and its radius along the normal, `arm` [m].
     """
     V, W = wp.types.vector(3, real), wp.types.vector(SLOTS, real)
 
@@ -59,8 +64,30 @@ def lagged_struct(real):
         bound: wp.array(dtype=real)
         weight: wp.array(dtype=W)
         tangent: wp.array2d(dtype=V)
+        spinning: wp.array(dtype=int)
+        arm: wp.array(dtype=V)
 
     return Lagged
+
+
+@cache
+def spun_function(real):
+    """spun(sides, spinning, w, i, j) -> which object of things i and j spins, of all in all worlds, and its radius; or -1."""
+    Sides = sides_struct(real)
+
+    @wp.func
+    def spun(sides: Sides, spinning: wp.array(dtype=wp.vec4i), w: int, i: int, j: int):
+        a, b = sides.first.object[i], sides.second.object[j]
+        of, radius = int(-1), real(0.0)
+        if spinning[a][0] >= 0:
+            of = a + w * sides.objects
+            radius += sides.first.radius[w, a]
+        elif spinning[b][0] >= 0:
+            of = b + w * sides.objects
+            radius += sides.second.radius[w, b]
+        return of, radius
+
+    return spun
 
 
 @cache
@@ -90,17 +117,18 @@ def directed_basis(real):
 
 
 @cache
-def lag_kernel(kind: Kind, real, linear, directed: bool):
+def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool):
     """Keep pairs, their nodes and the items of nodes, and what is lagged of friction, from factors and gradients of contact.
 
     x: lagged positions; beside (things,): the two nodes that say where the rod of a first thing of one world leads; ways: by groups,
-    coefficients forwards, backwards and across over `friction`. All three are read where friction is directed.
+    coefficients forwards, backwards and across over `friction`. All three are read where friction is directed. spinning (objects,):
+    where objects have markers, below zero without; read where some of them spin.
     """
     Law, Sides, Factor, Lagged = law_struct(real), sides_struct(real), factor_struct(linear), lagged_struct(real)
     V, W, L = wp.types.vector(3, real), wp.types.vector(SLOTS, real), wp.types.vector(SLOTS, linear)
     E = wp.types.vector(2, real)
     tangents, groups, size = basis(real), groups_function(real), kind.first + kind.second
-    along_rod = directed_basis(real)
+    along_rod, spun = directed_basis(real), spun_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def lag(
@@ -112,6 +140,7 @@ def lag_kernel(kind: Kind, real, linear, directed: bool):
         x: wp.array(dtype=V),
         beside: wp.array(dtype=wp.vec2i),
         ways: wp.array2d(dtype=V),
+        spinning: wp.array(dtype=wp.vec4i),
         contact: Factor,
         gradient: wp.array2d(dtype=V),
         onward: int,
@@ -133,7 +162,7 @@ def lag_kernel(kind: Kind, real, linear, directed: bool):
             factor.nodes[p] = contact.nodes[p]
             factor.used[p] = 0
             lagged.bound[p] = real(0.0)
-            w, i, _j, a, b = groups(law, sides, pairs[p])
+            w, i, j, a, b = groups(law, sides, pairs[p])
             mu = law.friction[w, a, b]
             push = V()
             for slot in range(wp.static(kind.first)):
@@ -152,6 +181,10 @@ def lag_kernel(kind: Kind, real, linear, directed: bool):
                 weight = W()
                 for slot in range(wp.static(size)):
                     weight[slot] = wp.dot(gradient[slot, p], n) / normal
+                if wp.static(spins):
+                    of, radius = spun(sides, spinning, w, i, j)
+                    lagged.spinning[p] = of
+                    lagged.arm[p] = n * radius
                 lagged.bound[p] = mu * normal
                 lagged.weight[p] = weight
                 lagged.tangent[0, p] = t1
@@ -163,12 +196,12 @@ def lag_kernel(kind: Kind, real, linear, directed: bool):
 
 
 @cache
-def friction_kernel(density: Density, real, linear, directed: bool):
+def friction_kernel(density: Density, real, linear, directed: bool, spins: bool):
     """Energy, work, gradient by slot and factor of each pair at positions x, by its slip since `start`.
 
     things: first things of pairs in one world; velocity: nu [m/s]; rate (worlds,): 1/h [1/s]; accepted, iteration (worlds,): which of
     both rows of `slip` and `along` are the accepted iterate's, and how many there were; none, and w is that of the slip, without them.
-    onward: not zero where those before the first one count, too.
+    onward: not zero where those before the first one count, too. turns: of objects that spin, in all worlds.
     """
     Factor, Lagged = factor_struct(linear), lagged_struct(real)
     V, L = wp.types.vector(3, real), wp.types.vector(3, linear)
@@ -220,6 +253,7 @@ def friction_kernel(density: Density, real, linear, directed: bool):
         onward: int,
         x: wp.array(dtype=V),
         start: wp.array(dtype=V),
+        turns: wp.array(dtype=V),
         slip: wp.array2d(dtype=E),
         along: wp.array2d(dtype=E),
         factor: Factor,
@@ -239,6 +273,9 @@ def friction_kernel(density: Density, real, linear, directed: bool):
                 move = V()
                 for slot in range(wp.static(SLOTS)):
                     move += (x[nodes[slot]] - start[nodes[slot]]) * weight[slot]
+                if wp.static(spins):
+                    if lagged.spinning[p] >= 0:
+                        move += wp.cross(turns[lagged.spinning[p]], lagged.arm[p])
                 way = int(0)
                 if wp.static(directed):
                     if wp.dot(lagged.tangent[0, p] + lagged.tangent[2, p], move) < real(0.0):

@@ -69,6 +69,50 @@ def test_moved_obstacles_take_along_what_is_in_their_way(device, shape):
     )
 
 
+ROUND = {
+    "sphere": SHAPES["sphere"],
+    "capsule": SHAPES["capsule"],
+    "mesh": ddg.Mesh([[-1e-4, -0.1, -0.05], [1e-4, -0.1, -0.05], [0.0, 0.1, -0.05]], [[0, 1, 2]], radius=0.05),
+}
+
+
+@pytest.mark.parametrize("held", ["motion", "grip"])
+@pytest.mark.parametrize("shape", ROUND)
+def test_surfaces_that_spin_take_along_what_lies_on_them(device, shape, held):
+    """A rod across the top of what turns about the line in its middle slides with mu N / m until it is as fast as the surface, omega R.
+
+    What turns it brings up the couple mu N R while it slides, and none once nothing does.
+    """
+    mu, dt, settled, radius = 0.3, 2e-3, 60, ROUND[shape].radius
+    pivot, speed = (0.0, 0.0, -radius), 0.08
+    scene = ddg.Scene()
+    points = np.linspace((-0.05, 0.0, 1.48 * RADIUS), (0.05, 0.0, 1.48 * RADIUS), 11)
+    scene.add_rod(points, section=ddg.Circle(RADIUS), material=ddg.Material(young=1e8, density=1000.0, viscosity=1e-3))
+    scene.contact(friction=mu)
+
+    def angle(t: float) -> float:
+        return speed / radius * max(0.0, t - settled * dt)
+
+    motions = {"motion": ddg.Motion(angle=angle, axis=(0.0, 1.0, 0.0), pivot=pivot), "grip": ddg.Grip(pivot=pivot)}
+    scene.add_obstacle(ROUND[shape], motion=motions[held])
+    model = scene.build(device=device)
+    integrator, state, speeds, pushes, couples = ddg.Integrator(model), model.state(), [], [], []
+    for _ in range(settled + 18):
+        told = {}
+        if held == "grip":
+            told["controls"] = ddg.Controls(poses=np.array([[0.0, 0.0, 0.0, 0.0, angle(state.time + dt), 0.0]]))
+        state = integrator.step(state, dt, **told)
+        speeds.append(state.velocities()[:, 0].mean())
+        pushes.append(np.linalg.norm(model.contacts(state).force.sum(0)))
+        couples.append(model.reactions(state, point=pivot)[0].moment[1])
+    mass = model.scene.batches[0].section.mass_per_length * 0.1
+    sliding = slice(settled, settled + 8)
+    np.testing.assert_allclose(np.diff(speeds)[sliding].sum() / dt, mu * np.sum(pushes[sliding]) / mass, rtol=0.03)
+    np.testing.assert_allclose(np.sum(couples[sliding]), mu * radius * np.sum(pushes[sliding]), rtol=0.03)
+    assert abs(speeds[-1] - speed) < model.scene.touching.velocity
+    assert abs(couples[-1]) < 0.05 * mu * radius * pushes[-1]
+
+
 def test_a_turned_mesh_sweeps_a_rod_aside(device):
     """A wall that turns about z pushes the rod ahead of it."""
     wall = ddg.Mesh([[-0.001, 0, -0.1], [0.2, 0, -0.1], [0.2, 0, 0.1], [-0.001, 0, 0.1]], [[0, 1, 2], [0, 2, 3]])

@@ -1,5 +1,7 @@
 """Equilibria with friction: what rests on a slope, what is drawn and let go, a rope about a drum, and what is refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -220,6 +222,28 @@ def test_a_rope_about_a_drum(device):
     state = statics.solve(model, scene.initial(model), start=1.0, end=5.0)
     ratio = np.linalg.norm(model.reactions(state, factor=5.0)[0].force) / (5.0 * slack)
     assert abs(ratio / capstan.expected(0.3, np.pi, 5.0 * slack) - 1.0) < 5e-3
+
+
+@pytest.mark.parametrize("sense", [-1.0, 1.0])
+def test_a_band_brake(device, sense):
+    """The drum turns in a rope whose end is held: away from that this pulls as one that is drawn does, towards it the slack one does.
+
+    What turns the drum brings up the difference of both tensions times its radius.
+    """
+    scene, slip = capstan.build(n=30, friction=0.3), 1.5 * capstan.SPEED
+    scene.supports[0] = replace(scene.supports[0], motion=None)
+    turn = ddg.Motion(angle=lambda t: sense * slip * t / capstan.DRUM, axis=(0.0, 1.0, 0.0))
+    scene.obstacles[0] = replace(scene.obstacles[0], motion=turn)
+    model = scene.build(device, precision="float64")
+    slack = np.linalg.norm(scene.loads[0].force)
+    state = statics.solve(model, scene.initial(model), start=1.0, end=5.0)
+    end, drum = model.reactions(state, point=(0.0, 0.0, 0.0), factor=5.0)
+    found, low = np.linalg.norm(end.force), 5.0 * slack
+    ratio = found / low
+    if sense > 0.0:
+        ratio, low = 1.0 / ratio, found
+    assert abs(ratio / capstan.expected(0.3, np.pi, low) - 1.0) < 5e-3
+    np.testing.assert_allclose(drum.moment[1], sense * abs(found - 5.0 * slack) * capstan.DRUM, rtol=5e-3)
 
 
 @pytest.mark.parametrize("load_steps", [1, 3])

@@ -77,6 +77,14 @@ SCENES = {
     "rod on ball": _over(ddg.Sphere((0.001, 0.002, -0.1), 0.1)),
     "rod on capsule": _over(ddg.Capsule((0.002, -0.1, -0.03), (0.0, 0.1, -0.03), 0.03)),
     "rod on mesh": _over(MESH),
+    "rod on spinning ball": _over(
+        ddg.Sphere((0.001, 0.002, -0.1), 0.1),
+        ddg.Motion(lambda t: (0.0, 0.01 * t, 0.0), lambda t: 0.7 * t, (0.2, 1.0, 0.3), (0.0, 0.0, -0.1)),
+    ),
+    "rod on spinning capsule": _over(
+        ddg.Capsule((0.002, -0.1, -0.03), (0.0, 0.1, -0.03), 0.03),
+        ddg.Motion(angle=lambda t: -2.0 * t, axis=(0.01, 1.0, 0.02), pivot=(0.0, 0.0, -0.03)),
+    ),
     "rod on moved mesh": _over(
         MESH, ddg.Motion(lambda t: t * np.array([[0.03, 0, 0], [0, 0.1, 0.03], [0, 0, 0], [0, 0, 0.1]]))
     ),

@@ -78,6 +78,7 @@ class _Builder:
         self.shells: list[tuple] = []
         self.meridians: list[np.ndarray] = []
         self.obstacles: list[np.ndarray] = []
+        self.markers: list[np.ndarray] = []
         self.numbers: list[tuple[np.ndarray, np.ndarray]] = []  # of the nodes and of the angles of some rods
         self.rod_edges = 0
         self.frames: list[np.ndarray] = []
@@ -119,8 +120,10 @@ class _Builder:
         self.meridians.append(self._number(np.column_stack([radius, 0.0 * radius, height])))
 
     def add_obstacle(self, obstacle) -> None:
-        """Number the points of an obstacle."""
-        self.obstacles.append(self._number(obstacle.shape.points))
+        """Number the points of an obstacle, and markers of one that spins."""
+        points, radius = obstacle.shape.points, obstacle.shape.radius
+        self.obstacles.append(self._number(points))
+        self.markers.append(self._number(points[0] + radius * np.eye(3 if obstacle.spins else 0, 3)))
 
     def _number(self, points: np.ndarray) -> np.ndarray:
         self.points.append(points)
@@ -182,6 +185,7 @@ class _Builder:
                 for i, (shell, numbers) in enumerate(zip(scene.axisymmetric_shells, self.meridians, strict=True))
             ],
             obstacles=[merged[numbers] for numbers in self.obstacles],
+            markers=[merged[numbers] for numbers in self.markers],
         )
         net.fixed[nodes : nodes + angles, 1:] = True
         net.sets = net_elements.element_sets(scene, net, self.along)

@@ -42,8 +42,9 @@ def hold(scene, net: Net) -> None:
         nodes = net.meridians[support.shell].nodes[support.nodes]
         each = np.arange(len(nodes))
         claims.take(support, nodes, each, each)
-    for obstacle, nodes in zip(scene.obstacles, net.obstacles, strict=True):
-        each = np.arange(len(nodes))
+    for obstacle, nodes, markers in zip(scene.obstacles, net.obstacles, net.markers, strict=True):
+        each = np.append(np.arange(len(nodes)), 0 * markers)  # markers go with the first point
+        nodes = np.append(nodes, markers)
         claims.take(obstacle, nodes, each, each)
     claims.finish()
     frames_of_planes(net, normals)

@@ -92,7 +92,8 @@ class Net(Storage):
         ends: nodes of every rod edge (rod_edges, 2); frame: director and tangent of it (6, rod_edges).
         stiffness: EI1, EI2 and GJ of its section (3, rod_edges) [N m^2].
         mass: of every dof (N, 3) [kg, kg m^2]; fixed: held dofs (N, 3).
-        obstacles: nodes of each, which are held; touching: contact, None without.
+        obstacles: nodes of each, which are held; markers: three more of each that spins, as far from its first one as its radius, along
+            x, y and z at rest; touching: contact, None without.
         frames: orthonormal rows (3, 3) that the held components of a node on an oblique plane refer to; see `compile.net.planes`.
     """
 
@@ -110,6 +111,7 @@ class Net(Storage):
     fixed: np.ndarray
     meridians: list[axisymmetric.NetMeridian] = field(default_factory=list)
     obstacles: list[np.ndarray] = field(default_factory=list)
+    markers: list[np.ndarray] = field(default_factory=list)
     touching: Touching | None = None
     frames: dict[int, np.ndarray] = field(default_factory=dict)
 
@@ -121,6 +123,11 @@ class Net(Storage):
     @property
     def size(self) -> int:
         return self.blocks
+
+    @property
+    def of_obstacles(self) -> np.ndarray:
+        """Nodes of all obstacles, markers included, which belong to no body."""
+        return np.concatenate([np.zeros(0, int), *self.obstacles, *self.markers])
 
     @property
     def holds(self) -> np.ndarray:

@@ -37,10 +37,10 @@ def touching(scene, net: Net) -> Touching | None:
             forces.append((net.mass[shell.nodes, 0].max(), bending / half))
     weight = max(GRAVITY, float(np.linalg.norm(scene.gravity)))
     scale = [max(WEIGHTS * mass * weight, BENDING * bending) for mass, bending in forces]
-    for index, (obstacle, nodes) in enumerate(zip(scene.obstacles, net.obstacles, strict=True)):
-        shape = obstacle.shape
-        label = f"obstacle {index} ('{obstacle.name}')"
-        bodies.append(Body(nodes, shape.kind, shape.radius, obstacle.name, label, nodes[shape.cells], still=True))
+    for index, (obstacle, nodes, markers) in enumerate(zip(scene.obstacles, net.obstacles, net.markers, strict=True)):
+        shape, name = obstacle.shape, obstacle.name
+        given = nodes, shape.kind, shape.radius, name, f"obstacle {index} ('{name}')", nodes[shape.cells]
+        bodies.append(Body(*given, still=True, markers=markers))
     return _numbers(scene, law, bodies, np.array([*scale, *np.full(len(scene.obstacles), np.nan)]))
 
 

@@ -8,6 +8,7 @@ from ddg_warp.kernels.contact.pair_friction import ROWS, friction_kernel, lag_ke
 from ddg_warp.kernels.densities import Density
 from ddg_warp.solve.contact.contact_elements import ContactElements
 from ddg_warp.solve.contact.pair_elements import PairElements
+from ddg_warp.solve.contact.spins import Spins
 
 
 class FrictionElements(PairElements):
@@ -18,6 +19,7 @@ class FrictionElements(PairElements):
         velocity: below which surfaces stick [m/s].
         directed: nodes beside first things (things, 2), and by groups coefficients over `friction` forwards, backwards and across
             (groups, groups, 3), see `lag_kernel`; None: it is the same all ways.
+        spins: how far objects have turned since slips started.
 
     Attributes:
         directions: both of `directed` on the device, None without.
@@ -30,15 +32,16 @@ class FrictionElements(PairElements):
         density: Density,
         velocity: float,
         directed: tuple[np.ndarray, np.ndarray] | None,
+        spins: Spins,
         nodes: int,
         real,
         linear,
         silent: wp.array,
     ):
         super().__init__(contact.found, ROWS, nodes, real, linear, silent)
-        self._contact, self._velocity = contact, velocity
-        self._lag = lag_kernel(self.found.kind, real, linear, directed is not None)
-        self._evaluate = friction_kernel(density, real, linear, directed is not None)
+        self._contact, self._velocity, self._spins = contact, velocity, spins
+        self._lag = lag_kernel(self.found.kind, real, linear, directed is not None, spins.any)
+        self._evaluate = friction_kernel(density, real, linear, directed is not None, spins.any)
         self._rows, self.directions = ROWS, (None, None)
         if directed is not None:
             beside, ways = directed
@@ -61,13 +64,17 @@ class FrictionElements(PairElements):
         self._slip, self._along = (arrays.allocate((2, capacity), pair, self.device) for _ in range(2))
         self.work, self.lagged.bound = (wp.zeros(capacity, dtype=self.real, device=self.device) for _ in range(2))
         self.lagged.weight = wp.zeros(capacity, dtype=wp.types.vector(4, self.real), device=self.device)
-        self.lagged.tangent = arrays.allocate((self._rows, capacity), wp.types.vector(3, self.real), self.device)
+        vector = wp.types.vector(3, self.real)
+        self.lagged.tangent = arrays.allocate((self._rows, capacity), vector, self.device)
+        spinning = capacity if self._spins.any else 0
+        self.lagged.spinning = wp.zeros(spinning, dtype=int, device=self.device)
+        self.lagged.arm = wp.zeros(spinning, dtype=vector, device=self.device)
 
     def lag(self, law, x: wp.array, again: bool) -> None:
         """Take the pairs of contact as it was evaluated last, at x; `again`: of a search that goes on, with the directions of slips."""
         self._onward = int(again)
         of = self._contact
-        inputs = [of.pairs, of.count, self.found.sides, law, x, *self.directions]
+        inputs = [of.pairs, of.count, self.found.sides, law, x, *self.directions, self._spins.places]
         inputs += [of.factor, of.gradient, self._onward, self.count]
         outputs = [self.pairs, self.factor, self.lagged, self._slip, self._along]
         self._take_turns(self._lag, self.found.capacity, inputs, outputs)
@@ -76,8 +83,18 @@ class FrictionElements(PairElements):
         self._items.list(self.count, self.factor.nodes)
 
     def evaluate(self, x, start, rate: wp.array, iterates: tuple) -> None:
-        """Write energies, work, gradients and factors at x by the slip since `start`."""
+        """Write energies, work, gradients and factors at x by the slip since `start`, and by how far objects have turned."""
         inputs = [self.pairs, self.count, self.found.first.count]
-        inputs += [self.lagged, self._velocity, rate, *iterates, self._onward, x, start]
+        inputs += [self.lagged, self._velocity, rate, *iterates, self._onward, x, start, self._spins.turned.flatten()]
         outputs = [self._slip, self._along, self.factor, self.energy, self.work, self.gradient]
         self._take_turns(self._evaluate, self.found.capacity, inputs, outputs)
+
+    def couples(self) -> np.ndarray:
+        """What pairs turn objects that spin by (worlds, objects, 3) [N m], as evaluated last. Reads from the device."""
+        count = int(self.count.numpy()[0])
+        used = np.flatnonzero((self.factor.used.numpy()[:count] != 0) & (self.lagged.spinning.numpy()[:count] >= 0))
+        pushed = self.gradient.numpy()[: self.found.kind.first, used].sum(0)
+        worlds, objects = self._spins.turned.shape
+        found = np.zeros((worlds * objects, 3))
+        np.add.at(found, self.lagged.spinning.numpy()[used], -np.cross(self.lagged.arm.numpy()[used], pushed))
+        return found.reshape(worlds, objects, 3)

@@ -16,6 +16,7 @@ from ddg_warp.solve.contact.contact_elements import ContactElements
 from ddg_warp.solve.contact.friction_elements import FrictionElements
 from ddg_warp.solve.contact.law_tables import law_tables, table
 from ddg_warp.solve.contact.pair_product import PairProduct
+from ddg_warp.solve.contact.spins import Spins
 from ddg_warp.solve.contact.totals import Totals
 
 FRICTION = {"logistic": logistic_friction, "polynomial": polynomial_friction}
@@ -55,6 +56,7 @@ class PairTerms:
             an edge, is in both, positive semi-definite together. See `join`.
         stiffness: (worlds times nodes,) [N/m], traces of `diagonal`.
         law: `law_struct`, on the device; products: the `PairProduct` of all lists.
+        spins: how far objects that spin have turned since slips started.
 
     Raises:
         SceneError: names the parameter, the pair of objects where there is one, and the remedy.
@@ -101,6 +103,7 @@ class PairTerms:
         ]
         self._collect, self._join = gather.collect_kernels(self.real, self.linear, arrays.serial(self.device))
         self._version, self._lagged = search.version, -1
+        self.spins = Spins(search)
         self.frictions = self._with_friction(rubs, ways, friction_law, velocity, told_not)
         self._start = wp.zeros_like(self.forces)
         self.products = PairProduct(self._parts, self.law, self.real, self.linear)
@@ -113,7 +116,7 @@ class PairTerms:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         parts = [kernel for part in self._parts for kernel in part.kernels]
-        own = [self._collect, self._join]
+        own = [self._collect, self._join, *(self.spins.kernels if self.frictions else [])]
         return [*own, *self.products.kernels, *self._totals.kernels, *parts]
 
     @property
@@ -179,6 +182,8 @@ class PairTerms:
         start = self._start if start is None else start
         rate = self._no_rate if rate is None else rate
         iterates = self._no_iterates if iterates is None else iterates
+        if self.frictions:
+            self.spins(start, x)
         for part in self.frictions:
             part.evaluate(x, start, rate, iterates)
         outputs = [self.forces, self.diagonal, self.stiffness, self._told]
@@ -256,6 +261,7 @@ class PairTerms:
                 FRICTION[law],
                 float(velocity),
                 None if same else (self.search.shapes.beside(part.found.kind.first), np.stack(ways, -1)),
+                self.spins,
                 len(self.forces),
                 self.real,
                 self.linear,

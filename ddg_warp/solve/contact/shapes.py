@@ -3,6 +3,7 @@
 import numpy as np
 
 from ddg_warp.errors import SceneError
+from ddg_warp.kernels.contact.spins import MARKERS
 
 BALLS, PLANES = 0, -1  # in place of a number of nodes: the points that are balls, the planes of half-spaces
 FLAT = 1e-12  # area of a triangle over the square of its longest edge, below which it has none
@@ -19,6 +20,7 @@ class Shapes:
     Attributes:
         names, radii: of all objects [m]; obstacle: numbers of those that are still.
         ignored_pairs: of objects that pass through each other, the smaller number first.
+        spinning: the first node and the markers of objects whose surfaces turn as these do, by number.
     """
 
     def __init__(self, points: np.ndarray):
@@ -30,6 +32,7 @@ class Shapes:
         self.obstacle: set[int] = set()
         self._parts: dict[int, list] = {1: [], 2: [], 3: [], BALLS: [], PLANES: []}
         self.ignored_pairs: set[tuple[int, int]] = set()
+        self.spinning: dict[int, np.ndarray] = {}
 
     def rod(
         self,
@@ -120,6 +123,25 @@ class Shapes:
         if np.abs(arms - 1.0).max() > 1e-6:
             raise SceneError(f"{name}: it takes three nodes, the second and the third 1 m from the first")
         return self._add(name, 0.0, {PLANES: nodes[None]}, np.zeros((0, 4)), still=True)
+
+    def spin(self, number: int, markers) -> None:
+        """The surface of an object that is still turns as nodes do, its markers (3,) about its first one; see `kernels.contact.spins`.
+
+        Raises:
+            SceneError: it is not still, or markers are not at right angles about the first node, each as far from it as the others.
+        """
+        name = self.names[number]
+        markers = self._checked(markers, 1, name)
+        if number not in self.obstacle or len(markers) != MARKERS:
+            raise SceneError(f"{name} spins: that is of an obstacle, and told by {MARKERS} nodes, not {len(markers)}")
+        first = next(nodes[0, 0] for part in self._parts.values() for nodes, _, own, _ in part if own == number)
+        arms = self.points[markers] - self.points[first]
+        square = arms @ arms.T
+        if not np.allclose(square, square[0, 0] * np.eye(MARKERS), atol=1e-9 * square[0, 0]) or square[0, 0] <= 0.0:
+            raise SceneError(
+                f"{name} spins: markers are at right angles about its node {first}, as far from it as each other"
+            )
+        self.spinning[number] = np.append(first, markers)
 
     def ignore(self, first: int, second: int) -> None:
         """Two objects pass through each other; an object and itself: it has no contact with itself.

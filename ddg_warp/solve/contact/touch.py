@@ -76,11 +76,14 @@ class Touch:
         self.terms.evaluate(x, wp.full(self.net.worlds, 1.0, dtype=self.net.real, device=x.device), start)
 
     def friction(self, x: wp.array, v: wp.array) -> np.ndarray:
-        """Forces of friction on blocks (W N, 3) [N] that are at x and move by v. Not in a capture; raises as `at`."""
+        """Forces of friction on blocks (W N, 3) [N] that are at x and move by v, on markers those that turn what spins.
+
+        Not in a capture; raises as `at`.
+        """
         self.at(x)
         pushed = self.terms.forces.numpy().astype(float)
         self.rub(x, v)
-        return self.terms.forces.numpy() - pushed
+        return self.terms.forces.numpy() - pushed + self.terms.spins.forces(x, self.terms.frictions)
 
     def slides(self) -> bool:
         """After `friction`, whether it is all there somewhere, as it is of what does not stick."""
@@ -169,14 +172,16 @@ def shapes_of(host) -> Shapes:
     for body in given.bodies:
         given_too = {"name": body.label, "still": body.still}
         if body.kind == PLANE:
-            shapes.plane(body.nodes, name=body.label)
+            number = shapes.plane(body.nodes, name=body.label)
         elif body.kind == MESH:
-            shapes.shell(body.cells, 2.0 * body.radius, **given_too)
+            number = shapes.shell(body.cells, 2.0 * body.radius, **given_too)
         elif body.kind == BALL:
-            shapes.ball(int(body.nodes[0]), body.radius, **given_too)
+            number = shapes.ball(int(body.nodes[0]), body.radius, **given_too)
         else:
             apart = 0.0 if body.kind == CAPSULE else given.law.apart
-            shapes.rod(body.nodes, body.radius, closed=body.closed, apart=apart, **given_too)
+            number = shapes.rod(body.nodes, body.radius, closed=body.closed, apart=apart, **given_too)
+        if body.markers.size:
+            shapes.spin(number, body.markers)
     for g, h in given.ignored:
         for one in np.flatnonzero(given.group == g):
             for other in np.flatnonzero(given.group == h):

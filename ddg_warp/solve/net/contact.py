@@ -57,8 +57,8 @@ class NetContact:
                 "contact: solver 'projective' keeps the matrix of a step, which contact changes; use 'newton'"
             )
         newton.q.assign(np.tile(host.rest, (net.worlds, 1)))
-        held = np.concatenate([np.zeros(0, int), *host.obstacles])  # forces on them are asked of states, not here
-        self.touch = Touch(net, linear, newton.q, held)
+        # forces on obstacles are asked of states, not here
+        self.touch = Touch(net, linear, newton.q, host.of_obstacles)
         self.shapes, self.search, self.terms = self.touch.shapes, self.touch.search, self.touch.terms
         self.rubs, self.rate = host.touching.rubs, newton.islands.rate
         worlds, again = net.worlds, self.touch.law.lags - 1 if self.rubs else 0

@@ -1,6 +1,5 @@
 """Contact and friction at the solution of a step, in linear systems with the exact Hessian; see `ExactSystem`."""
 
-import numpy as np
 import warp as wp
 
 from ddg_warp.solve.contact.touch import Touch
@@ -19,7 +18,7 @@ class ExactContact:
 
     def __init__(self, net):
         self.net, given = net, net.host.touching
-        held = np.concatenate([np.zeros(0, int), *net.host.obstacles])  # whose rows of H do not count
+        held = net.host.of_obstacles  # whose rows of H do not count
         self.touch = Touch(net, wp.float64, net.rest().q, held, MARGIN * given.reach, exact=True)
         self.search, self.terms = self.touch.search, self.touch.terms
         self.diagonal = self.terms.diagonal

@@ -213,8 +213,7 @@ class NetTangent(Part):
         """Sum of the outer forces on every body, or its largest support force if that is more (worlds bodies,) [N]."""
         bodies, shape = self.host.bodies, (self.net.worlds, self.host.blocks, 3)
         gradient = np.array(gradient).reshape(shape)
-        for nodes in self.host.obstacles:  # of no body
-            gradient[:, nodes] = 0.0
+        gradient[:, self.host.of_obstacles] = 0.0
         gradient, result = gradient.ravel(), []
         for own, force in zip(
             np.where(self.free & ~self.angle, np.abs(outer), 0.0).reshape(shape),
