@@ -67,6 +67,7 @@ SMALL = {
     "rod_pile": {"count": 6, "duration": 0.3},
     "rod_on_floor": {"dt": 2e-3},
     "roll_up": {"n": 100},
+    "rolling_rods": {"dt": 2e-3},
     "sag_free_groom": {"count": 8},
     "sedimenting_rod": {},
     "slit_annulus": {},

@@ -81,7 +81,8 @@ def contact_lines(touching) -> list[str]:
         (touching.stiffness, "stiffness", "N/m"),
         (touching.friction[..., None] * touching.ways, "friction", ""),
     )
-    said = (f"{name} {_between(values)}{unit and ' ' + unit}" for values, name, unit in numbers)
+    said = [f"{name} {_between(values)}{unit and ' ' + unit}" for values, name, unit in numbers]
+    said += ["which rolls rods"] * law.rolling
     return [
         f"contact: {law.law} between {len(touching.bodies) - still} bodies and {still} obstacles, {', '.join(said)}"
     ]

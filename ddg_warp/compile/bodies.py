@@ -12,7 +12,7 @@ ROD = "rod"
 @dataclass
 class Body:
     """A rod, shell or obstacle: nodes, kind, radius [m], name of its group, how messages call it, cells of nodes, which shell it
-    is, -1 for none, and the markers of one that spins."""
+    is, -1 for none, the markers of one that spins, and the angles of the edges of one that friction may roll."""
 
     nodes: np.ndarray
     kind: str
@@ -24,6 +24,7 @@ class Body:
     still: bool = False
     shell: int = -1
     markers: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    angles: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
 
 @dataclass

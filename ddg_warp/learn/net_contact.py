@@ -5,8 +5,8 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.kernels.adjoint import contact_sums
-from ddg_warp.kernels.adjoint.contact import NUMBERS, RATE, SPUN, THICKNESS, pull_kernel, rub_kernel
-from ddg_warp.kernels.contact.gather import SLOTS, sum_kernel
+from ddg_warp.kernels.adjoint.contact import NUMBERS, RATE, ROLLED, SPUN, THICKNESS, pull_kernel, rub_kernel
+from ddg_warp.kernels.contact.gather import ITEMS, SLOTS, sum_kernel
 from ddg_warp.solve.contact.node_items import NodeItems
 from ddg_warp.solve.contact.pair_terms import FRICTION
 from ddg_warp.solve.contact.touch import LAWS
@@ -46,15 +46,22 @@ class ContactAdjoint:
         law, friction = LAWS[given.law.law], FRICTION[given.law.friction_law]
         kinds = [pairs.kind for pairs in search.lists]
         self._pull = [pull_kernel(kind, law, real) for kind in kinds]
-        directed = bool(terms.frictions) and terms.frictions[0].directions[0] is not None
+        leads, directed = ([of.directions[k] is not None for of in terms.frictions] for k in range(2))
+        self._rolls = [of.rolls for of in terms.frictions] or [False] * len(kinds)
         self._spins = terms.spins if terms.frictions and terms.spins.any else None
         spins = bool(self._spins)
-        self._rub = [rub_kernel(kind, law, friction, real, directed, spins) for kind in kinds if terms.frictions]
-        self._direct = contact_sums.direction_kernels(real) if directed else ()
-        self._leads = [self._led(search.shapes.beside(kind.first)) for kind in kinds if directed]
+        what = zip(kinds, directed, self._rolls, strict=bool(terms.frictions))
+        self._rub = [rub_kernel(kind, law, friction, real, ways, spins, rolls) for kind, ways, rolls in what]
+        self._direct = contact_sums.direction_kernels(real) if any(leads) else ()
+        beside = search.shapes.beside
+        self._leads = [
+            self._led(beside(kind.first)) if there else None for kind, there in zip(kinds, leads, strict=False)
+        ]
         self._sides = [contact_sums.side_kernels(kind, real) for kind in kinds]
         self._group, self._bodies = contact_sums.group_kernels(real), contact_sums.body_kernel(real)
         self._items, self._add = [NodeItems(kind, nodes, every) for kind in kinds], sum_kernel(real, serial)
+        rolling = zip(kinds, self._items, self._rolls, strict=True)
+        self._rub_items = [NodeItems(kind, nodes, every, True) if rolls else items for kind, items, rolls in rolling]
         self.by_groups = self._zeros(NUMBERS, *terms.law.stiffness.shape)
         self.by_radius = self._zeros(*net.touching["radius"].shape)
         self._things, self._starts, self._spun_things = {}, {}, {}
@@ -73,7 +80,15 @@ class ContactAdjoint:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         own = [*self._pull, *self._rub, self._add, *self._group, self._bodies, *self._direct]
-        return [*own, *(k for pair in self._sides for k in pair), *(k for items in self._items for k in items.kernels)]
+        return [
+            *own,
+            *(k for pair in self._sides for k in pair),
+            *(k for items in self._every_items for k in items.kernels),
+        ]
+
+    @property
+    def _every_items(self) -> list[NodeItems]:
+        return [*self._items, *(items for items in self._rub_items if items not in self._items)]
 
     @property
     def by_rate(self) -> wp.array:
@@ -92,11 +107,13 @@ class ContactAdjoint:
         lists, vector = self.system.search.lists, self.net.vector
         most = max(pairs.capacity for pairs in lists)
         self._numbers, self._spun = self._zeros(NUMBERS, most), self._zeros(SPUN, most if self._spins else 1)
-        shape, device = (SLOTS, most), self.net.device
+        shape, device = (ITEMS if any(self._rolls) else SLOTS, most), self.net.device
+        self._radii = self._zeros(ROLLED, most if any(self._rolls) else 1)
         self._start_parts, self._lagged_parts = (arrays.allocate(shape, vector, device) for _ in range(2))
         self._by_direction = wp.zeros(most if self._direct else 1, dtype=vector, device=self.net.device)
-        for items, pairs in zip(self._items, lists, strict=True):
-            items.reserve(pairs.capacity)
+        for made in (self._items, self._rub_items):
+            for items, pairs in zip(made, lists, strict=True):
+                items.reserve(pairs.capacity)
 
     def pull(self, at: tuple, w: wp.array, rate: wp.array, by: tuple) -> None:
         """After `find` of `system` with the same, add to derivatives by blocks, and to the others.
@@ -111,14 +128,23 @@ class ContactAdjoint:
             array.zero_()
         for i, (part, rub) in enumerate(zip(terms.lists, self._rubs, strict=True)):
             read, pairs = [part.pairs, part.count, part.found.sides, terms.law], part.found.capacity
-            self._items[i].list(part.count, part.factor.nodes)
+            self._items[i].list(part.count, part.factor)
             inputs = [*read, part.factor.nodes, q, w]
             self._take_turns(self._pull[i], pairs, inputs, [part.gradient, self._numbers])
-            self._add_up(i, part, part.gradient, by_q)
-            self._sum(i, part)
+            self._add_up(self._items[i], part, part.gradient, by_q)
+            self._sum(i, self._items[i], part)
             if rub:
-                self._items[i].list(rub.count, rub.factor.nodes)
-                read = [rub.pairs, rub.count, part.found.sides, terms.law, rub.factor.nodes, rub.factor.used]
+                items = self._rub_items[i]
+                items.list(rub.count, rub.factor)
+                read = [
+                    rub.pairs,
+                    rub.count,
+                    part.found.sides,
+                    terms.law,
+                    rub.factor.nodes,
+                    rub.factor.angles,
+                    rub.factor.used,
+                ]
                 inputs = [*read, lagged, before, q, w, self._velocity, rate, *rub.directions]
                 inputs += [terms.spins.places, terms.spins.turned.flatten()]
                 written = [
@@ -128,16 +154,22 @@ class ContactAdjoint:
                     self._numbers,
                     self._by_direction,
                     self._spun,
+                    self._radii,
                 ]
                 self._take_turns(self._rub[i], pairs, inputs, written)
-                self._add_up(i, rub, rub.gradient, by_q)
-                self._add_up(i, rub, self._start_parts, by_before)
-                self._add_up(i, rub, self._lagged_parts, by_lagged)
-                self._sum(i, rub)
+                for found, by_found in (
+                    (rub.gradient, by_q),
+                    (self._start_parts, by_before),
+                    (self._lagged_parts, by_lagged),
+                ):
+                    self._add_up(items, rub, found, by_found)
+                self._sum(i, items, rub)
                 self._lead(i, rub, by_lagged)
+                if rub.rolls:
+                    self._to_things(i, items, rub, (self._radii[0], self._radii[1]), self._things)
                 if self._spins:
                     for row in range(SPUN):
-                        self._to_things(i, rub, self._spun[row], self._spun_row(row))
+                        self._to_things(i, items, rub, (self._spun[row],) * 2, self._spun_row(row))
         self._to_bodies(self._things, self.by_radius)
         if self._spins:
             self._by_spun.zero_()
@@ -145,13 +177,12 @@ class ContactAdjoint:
                 self._to_bodies(self._spun_row(row), self._by_spun[row])
             self._spins.pull(before, q, self._by_spun, [by_before, by_q, self.by_radius])
 
-    def _add_up(self, index: int, part, written: wp.array, out: wp.array) -> None:
+    def _add_up(self, items: NodeItems, part, written: wp.array, out: wp.array) -> None:
         """Add what pairs that are used have written by slot to nodes."""
-        items = self._items[index]
         inputs = [written, part.factor.used, items.places, items.numbers, items.items]
         self._sweep(self._add, len(out), inputs, [out])
 
-    def _sum(self, index: int, part) -> None:
+    def _sum(self, index: int, items: NodeItems, part) -> None:
         """Add what the pairs of elements have by their numbers to that of groups and things."""
         found, law = part.found, self.system.terms.law
         pieces, total = self._group
@@ -160,14 +191,14 @@ class ContactAdjoint:
         inputs = [*lists, part.pairs, found.sides, law, self._numbers, number, things]
         self._launch(pieces, self.net.worlds * number, inputs, [self._partial])
         self._launch(total, self.by_groups.shape[1:], [self._partial, number], [self.by_groups])
-        self._to_things(index, part, self._numbers[THICKNESS], self._things)
+        self._to_things(index, items, part, (self._numbers[THICKNESS],) * 2, self._things)
 
-    def _to_things(self, index: int, part, values: wp.array, out: dict[int, wp.array]) -> None:
-        """Add what pairs of elements have (capacity,) to the things of either side, by their size."""
-        found, items, (first, second) = part.found, self._items[index], self._sides[index]
-        inputs = [part.count, part.starts, part.partners, values]
+    def _to_things(self, index: int, items: NodeItems, part, values: tuple, out: dict[int, wp.array]) -> None:
+        """Add what pairs of elements have for both sides (capacity,) to the things there, by their size."""
+        found, (first, second), (one, other) = part.found, self._sides[index], values
+        inputs = [part.count, part.starts, part.partners, one]
         self._launch(first, found.first.all, inputs, [out[found.first.size]])
-        inputs = [part.pairs, found.sides, items.places, items.numbers, items.items, values]
+        inputs = [part.pairs, found.sides, items.places, items.numbers, items.items, other]
         self._launch(second, found.second.all, inputs, [out[found.second.size]])
 
     def _to_bodies(self, things: dict[int, wp.array], out: wp.array) -> None:
@@ -189,7 +220,7 @@ class ContactAdjoint:
 
     def _lead(self, index: int, rub, by_lagged: wp.array) -> None:
         """Add to derivatives by what was lagged what comes by the directions of rods."""
-        if self._direct:
+        if self._leads[index]:
             things, gather = self._direct
             starts, items, found = self._leads[index]
             flat, nodes = found.flatten(), by_lagged.reshape((self.net.worlds, self.net.blocks))

@@ -29,6 +29,7 @@ class Contact:
     friction_law: str = "logistic"
     velocity: float = 1e-3
     lags: int = 1
+    rolling: bool = False
     apart: float | None = None
     radius: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     objects: tuple[str, ...] | None = None
@@ -63,6 +64,7 @@ class Contacts:
         friction_law: str = "logistic",
         velocity: float = 1e-3,
         lags: int = 1,
+        rolling: bool = False,
         apart: float | None = None,
         radius: Mapping[str, float] | None = None,
         objects=None,
@@ -85,6 +87,8 @@ class Contacts:
             friction_law: "logistic" or "polynomial": how friction grows with the speed.
             velocity: the speed nu from which on all of the friction acts, nearly [m/s]: what sticks creeps by less.
             lags: how often in a step friction takes the normal forces and directions anew.
+            rolling: whether friction acts on the surfaces of rods and turns them about their axes, so that they roll. Else it acts
+                between their middle lines.
             apart: edges of a rod with less than this between them along it are no pair [m]; by default pi times its radius.
             radius: by name of objects, instead of those of their sections, or half thicknesses [m].
             objects: names of the rods and shells that touch; by default all. Obstacles always do.
@@ -112,6 +116,7 @@ class Contacts:
             arguments.choice(f"{call}friction_law", friction_law, FRICTION_LAWS),
             arguments.positive(f"{call}velocity", velocity, "m/s"),
             arguments.count(f"{call}lags", lags),
+            arguments.flag(f"{call}rolling", rolling),
             apart,
             MappingProxyType(dict(radius or {})),
             None if objects is None else _names(f"{call}objects", objects),

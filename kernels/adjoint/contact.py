@@ -8,8 +8,8 @@ gradient g of contact at lagged positions y, which is one of y and of the same n
     u = (t1, t2) . sum_i weight_i (x_i - x_i^n) ,
 
 and its reverse goes through normal force, normal and weights at y, through the slip from the start x^n of the step to x, and to
-coefficient and rate; through the directions of rods at y, where friction is directed; and through how far obstacles have turned that
-spin. The matrix of all this by x is symmetric, as what is lagged is no function of x.
+coefficient and rate; through the directions of rods at y, where friction is directed or rolls them; and through how far obstacles that
+spin and rods that roll have turned. The matrix of all this by x is symmetric, as what is lagged is no function of x.
 
 At first y is x^n. With more `lags` it is the solution before, so that a step is a chain of solves: the derivative by y of the last one
 is the g of the one before it, and so on, each with a matrix of its own.
@@ -19,9 +19,9 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.contact.gather import SLOTS
+from ddg_warp.kernels.contact.gather import ANGLES, SLOTS
 from ddg_warp.kernels.contact.pair_energy import pair_energy_functions, shape_types
-from ddg_warp.kernels.contact.pair_friction import directed_basis, spun_function
+from ddg_warp.kernels.contact.pair_friction import directed_basis, rolling_functions, spun_function
 from ddg_warp.kernels.contact.pair_terms import groups_function, law_struct, read_functions
 from ddg_warp.kernels.contact.surfaces import Kind, sides_struct
 from ddg_warp.kernels.densities import Density
@@ -32,6 +32,7 @@ STIFFNESS, RANGE, THICKNESS, FRICTION, RATE = range(5)
 NUMBERS = 5  # of a pair, that derivatives are by
 TURN, ARM = 0, 3  # of what spins: how far it has turned (3), and its radius
 SPUN = 4
+ROLLED = 2  # of what rolls: radii of both things
 
 
 @cache
@@ -70,12 +71,13 @@ def pull_kernel(kind: Kind, density: Density, real):
 
 
 @cache
-def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: bool, spins: bool):
+def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: bool, spins: bool, rolls: bool):
     """rub(...): what friction brings by slot of the solution, of the start and of what was lagged, and by the numbers of pairs, as
     `pull_kernel` has it.
 
-    Where it is `directed`, by the directions of rods (capacity,), too, from `beside` by `ways` as of `pair_friction.lag_kernel`; where
-    something `spins`, by `TURN` and `ARM` of what does (SPUN, capacity).
+    Where it is `directed`, or rods roll, by the directions of rods (capacity,), too, from `beside` by `ways` as of
+    `pair_friction.lag_kernel`; where something `spins`, by `TURN` and `ARM` of what does (SPUN, capacity); where a rod `rolls`, by
+    slots of angles, and by the radii of both things (ROLLED, capacity).
     """
     Law, Sides = law_struct(real), sides_struct(real)
     X, W, P = shape_types(real)
@@ -84,7 +86,9 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
     _, _, evaluate, _ = pair_energy_functions(kind, density, real)
     given, corners = read_functions(kind, real)
     tangents, groups, along_rod = basis(real), groups_function(real), directed_basis(real)
-    spun = spun_function(real)
+    spun, A = spun_function(real), wp.types.vector(ANGLES, real)
+    _, radii, levers = rolling_functions(kind, real)
+    leads = directed or rolls
     slope_of = friction.laws(real, 2)[1]
 
     @wp.func
@@ -102,6 +106,10 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
         inverse: real,
         turn: V,
         arm: real,
+        angles: wp.vec2i,
+        r: A,
+        rolled: A,
+        v_rolled: A,
     ):
         """The derivative along v of the potential of friction that was lagged at y, by what has `moved` since the start."""
         _e, g = evaluate(y, p, threshold, inner)
@@ -115,6 +123,10 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
         along = v[0] * weight[0] + v[1] * weight[1] + v[2] * weight[2] + v[3] * weight[3]
         if wp.static(spins):
             move += wp.cross(turn, n) * arm
+        if wp.static(rolls):
+            lever = levers(d, y[3] - y[2], n, r, angles)
+            move += lever[0] * rolled[0] + lever[1] * rolled[1]
+            along += lever[0] * v_rolled[0] + lever[1] * v_rolled[1]
         if wp.static(directed):
             ahead, t2, back = along_rod(n, d, way)
             t1 = wp.where(wp.dot(ahead + back, move) < real(0.0), back, ahead)
@@ -132,6 +144,7 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
         sides: Sides,
         law: Law,
         nodes: wp.array(dtype=wp.vec4i),
+        angles: wp.array(dtype=wp.vec2i),
         used: wp.array(dtype=int),
         lagged: wp.array(dtype=V),
         start: wp.array(dtype=V),
@@ -149,22 +162,35 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
         numbers: wp.array2d(dtype=real),
         directions: wp.array(dtype=V),
         spun_out: wp.array2d(dtype=real),
+        radii_out: wp.array2d(dtype=real),
     ):
         for pair in range(wp.tid(), count[0], threads):
             for i in range(wp.static(NUMBERS)):
                 numbers[i, pair] = real(0.0)
-            if wp.static(directed):
+            if wp.static(leads):
                 directions[pair] = V()
+            if wp.static(rolls):
+                for side in range(wp.static(ROLLED)):
+                    radii_out[side, pair] = real(0.0)
             if wp.static(spins):
                 for i in range(wp.static(SPUN)):
                     spun_out[i, pair] = real(0.0)
             if used[pair] != 0:
                 world, i, j, a, b = groups(law, sides, pairs[pair])
                 d, way = V(), V()
-                if wp.static(directed):
+                if wp.static(leads):
                     first = world * sides.first.nodes_a_world
                     d = lagged[beside[i][1] + first] - lagged[beside[i][0] + first]
+                if wp.static(directed):
                     way = ways[a, b]
+                turned, r, rolled, v_rolled = wp.vec2i(-1, -1), A(), A(), A()
+                if wp.static(rolls):
+                    turned = angles[pair]
+                    r = radii(sides, world, i, j)
+                    for side in range(wp.static(ANGLES)):
+                        if turned[side] >= 0:
+                            rolled[side] = x[turned[side]][0] - start[turned[side]][0]
+                            v_rolled[side] = -w[turned[side]][0]
                 of, turn, arm = int(-1), V(), real(0.0)
                 if wp.static(spins):
                     of, arm = spun(sides, spinning, world, i, j)
@@ -172,7 +198,9 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
                         turn = turns[of]
                 p, threshold, inner = given(law, sides, pairs[pair])
                 n = nodes[pair]
-                dy, dx, _dv, dd, _dw, dp, _dt, _di, dmu, _dn, dr, dturn, darm = wp.grad(force)(
+                dy, dx, _dv, dd, _dw, dp, _dt, _di, dmu, _dn, dr, dturn, darm, _da, dradii, drolled, _dw2 = wp.grad(
+                    force
+                )(
                     corners(lagged, n),
                     corners(x, n) - corners(start, n),
                     -corners(w, n),
@@ -186,6 +214,10 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
                     rate[world],
                     turn,
                     arm,
+                    turned,
+                    r,
+                    rolled,
+                    v_rolled,
                 )
                 for slot in range(wp.static(SLOTS)):
                     parts[slot, pair] = V(dx[slot, 0], dx[slot, 1], dx[slot, 2])
@@ -195,8 +227,13 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
                     numbers[i, pair] = dp[i]
                 numbers[wp.static(FRICTION), pair] = dmu
                 numbers[wp.static(RATE), pair] = dr
-                if wp.static(directed):
+                if wp.static(leads):
                     directions[pair] = dd
+                if wp.static(rolls):
+                    for side in range(wp.static(ANGLES)):
+                        radii_out[side, pair] = dradii[side]
+                        parts[wp.static(SLOTS) + side, pair] = V(drolled[side], real(0.0), real(0.0))
+                        start_parts[wp.static(SLOTS) + side, pair] = V(-drolled[side], real(0.0), real(0.0))
                 if wp.static(spins):
                     if of >= 0:
                         for i in range(3):

@@ -1,6 +1,7 @@
 """What pairs bring to nodes, gathered in one order: which pairs each node is in, and sums over them.
 
-An item is 4 pair + slot. One thread alone lists items in order. Many threads list them in any order, and then put each one where as
+An item is 6 pair + slot. Slots are of the four nodes of a pair and, where friction turns rods, of two angles of their edges, the x of
+blocks of their own. One thread alone lists items in order. Many threads list them in any order, and then put each one where as
 many of its list as are smaller come before it, so that sums of two runs agree to the bit.
 """
 
@@ -11,24 +12,27 @@ import warp as wp
 from ddg_warp.kernels.contact.surfaces import Kind, surface_struct
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
-SLOTS = 4  # nodes of a pair
+SLOTS, ANGLES = 4, 2  # nodes of a pair, and angles
+ITEMS = SLOTS + ANGLES
 
 
 @wp.func
 def taken_apart(item: int):
     """The pair of an item, and the slot."""
-    p = item / wp.static(SLOTS)
-    return p, item - wp.static(SLOTS) * p
+    p = item / wp.static(ITEMS)
+    return p, item - wp.static(ITEMS) * p
 
 
 @cache
 def factor_struct(linear):
-    """Rows of the factors of pairs: where bit k + 1 of used[p] is set, row k of p has weight[k, p][i] direction[k, p] for its node i.
+    """Rows of the factors of pairs: where bit k + 1 of used[p] is set, row k of p has weight[k, p][i] direction[k, p] for its node i,
+    and lever[k, p][i] for the x of its block angles[p][i].
 
     nodes (capacity,): of each pair, in all worlds; used (capacity,): zero of pairs that add nothing, else bit 0 is set; bend
-    (capacity,): see `pair_bend`, zero where a pair has none.
+    (capacity,): see `pair_bend`, zero where a pair has none; angles (capacity,): below zero for none, empty where friction rolls
+    nothing.
     """
-    V, W = wp.types.vector(3, linear), wp.types.vector(SLOTS, linear)
+    V, W, A = wp.types.vector(3, linear), wp.types.vector(SLOTS, linear), wp.types.vector(ANGLES, linear)
 
     @wp.struct
     class Factor:
@@ -37,6 +41,8 @@ def factor_struct(linear):
         direction: wp.array2d(dtype=V)
         weight: wp.array2d(dtype=W)
         bend: wp.array(dtype=linear)
+        angles: wp.array(dtype=wp.vec2i)
+        lever: wp.array2d(dtype=A)
 
     return Factor
 
@@ -45,14 +51,15 @@ def factor_struct(linear):
 def set_struct(real, linear):
     """A list of pairs: its factor (see `factor_struct`) and gradients, the items of nodes, and what products write.
 
-    ranks: of each pair, the places of its items among all of the list, -1 where it has none; `placed` by these is what products bring
-    to nodes, which read it one after the other.
+    ranks, angle_ranks: of each pair, the places of its items among all of the list, -1 where it has none; `placed` by these is what
+    products bring to nodes, which read it one after the other.
     marks, starts, columns: of pairs whose Hessians are kept, see `pair_terms.mollified_kernels`; empty where there are none.
     idle: of each pair, not zero where products leave out what it brings to nodes, which nobody reads then.
     count (1,): how many pairs there are; kind: place in `pair_bend.KINDS`, -1 without `bend`; edges: how many of its things, the
     first ones, are edges; rows: of its factor; things: first things of pairs in one world.
     """
     X, V, W = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.vector(SLOTS, linear)
+    A = wp.types.vector(ANGLES, linear)
 
     @wp.struct
     class PairSet:
@@ -62,6 +69,8 @@ def set_struct(real, linear):
         direction: wp.array2d(dtype=V)
         weight: wp.array2d(dtype=W)
         bend: wp.array(dtype=linear)
+        angles: wp.array(dtype=wp.vec2i)
+        lever: wp.array2d(dtype=A)
         gradient: wp.array2d(dtype=X)
         marks: wp.array(dtype=int)
         starts: wp.array(dtype=int)
@@ -71,6 +80,7 @@ def set_struct(real, linear):
         numbers: wp.array(dtype=int)
         items: wp.array(dtype=int)
         ranks: wp.array(dtype=wp.vec4i)
+        angle_ranks: wp.array(dtype=wp.vec2i)
         count: wp.array(dtype=int)
         idle: wp.array(dtype=wp.uint8)
         kind: int
@@ -82,25 +92,59 @@ def set_struct(real, linear):
 
 
 @cache
-def list_kernels(kind: Kind, serial: bool):
+def list_kernels(kind: Kind, serial: bool, rolls: bool = False):
     """number(...) and fill(...) the items of nodes, sort(...) each list into `ordered`.
 
-    Items are of as many pairs as `count` says, and of none of the nodes of a world that are `silent`, not zero.
+    Items are of as many pairs as `count` says, of their nodes and, if friction `rolls` rods, of `angles`; and of none of the nodes of a
+    world that are `silent`, not zero.
     """
-    size = kind.first + kind.second
+    size, R = kind.first + kind.second, wp.types.vector(ITEMS, int)
+    slots = ITEMS if rolls else size
+
+    @wp.func
+    def node_of(
+        nodes: wp.array(dtype=wp.vec4i),
+        angles: wp.array(dtype=wp.vec2i),
+        silent: wp.array(dtype=wp.uint8),
+        p: int,
+        slot: int,
+    ):
+        """Which block has the item of a slot, -1 for none."""
+        node = int(-1)
+        if slot < wp.static(size):
+            node = nodes[p][slot]
+        if wp.static(rolls):
+            if slot >= wp.static(SLOTS):
+                node = angles[p][slot - wp.static(SLOTS)]
+        if node >= 0:
+            if silent[node % silent.shape[0]] != wp.uint8(0):
+                node = -1
+        return node
+
+    @wp.func
+    def note(
+        ranks: wp.array(dtype=wp.vec4i),
+        angle_ranks: wp.array(dtype=wp.vec2i),
+        p: int,
+        rank: R,
+    ):
+        ranks[p] = wp.vec4i(rank[0], rank[1], rank[2], rank[3])
+        if wp.static(rolls):
+            angle_ranks[p] = wp.vec2i(rank[4], rank[5])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def number(
         threads: int,
         count: wp.array(dtype=int),
         nodes: wp.array(dtype=wp.vec4i),
+        angles: wp.array(dtype=wp.vec2i),
         silent: wp.array(dtype=wp.uint8),
         numbers: wp.array(dtype=int),
     ):
         for p in range(wp.tid(), count[0], threads):
-            for slot in range(wp.static(size)):
-                node = nodes[p][slot]
-                if silent[node % silent.shape[0]] == wp.uint8(0):
+            for slot in range(wp.static(slots)):
+                node = node_of(nodes, angles, silent, p, slot)
+                if node >= 0:
                     wp.atomic_add(numbers, node, 1)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -108,49 +152,53 @@ def list_kernels(kind: Kind, serial: bool):
         threads: int,
         count: wp.array(dtype=int),
         nodes: wp.array(dtype=wp.vec4i),
+        angles: wp.array(dtype=wp.vec2i),
         silent: wp.array(dtype=wp.uint8),
         starts: wp.array(dtype=int),
         filled: wp.array(dtype=int),
         items: wp.array(dtype=int),
         ranks: wp.array(dtype=wp.vec4i),
+        angle_ranks: wp.array(dtype=wp.vec2i),
     ):
         """One thread alone fills them in order: these are the ranks then."""
         for p in range(wp.tid(), count[0], threads):
-            rank = wp.vec4i(-1, -1, -1, -1)
-            for slot in range(wp.static(size)):
-                node = nodes[p][slot]
-                if silent[node % silent.shape[0]] == wp.uint8(0):
+            rank = R(-1, -1, -1, -1, -1, -1)
+            for slot in range(wp.static(slots)):
+                node = node_of(nodes, angles, silent, p, slot)
+                if node >= 0:
                     rank[slot] = starts[node] + wp.atomic_add(filled, node, 1)
-                    items[rank[slot]] = wp.static(SLOTS) * p + slot
+                    items[rank[slot]] = wp.static(ITEMS) * p + slot
             if wp.static(serial):
-                ranks[p] = rank
+                note(ranks, angle_ranks, p, rank)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def sort(
         threads: int,
         count: wp.array(dtype=int),
         nodes: wp.array(dtype=wp.vec4i),
+        angles: wp.array(dtype=wp.vec2i),
         silent: wp.array(dtype=wp.uint8),
         starts: wp.array(dtype=int),
         numbers: wp.array(dtype=int),
         items: wp.array(dtype=int),
         ordered: wp.array(dtype=int),
         ranks: wp.array(dtype=wp.vec4i),
+        angle_ranks: wp.array(dtype=wp.vec2i),
     ):
         """A thread a pair, as a thread a node would take thousands of steps where a node is in thousands of pairs."""
         for p in range(wp.tid(), count[0], threads):
-            rank = wp.vec4i(-1, -1, -1, -1)
-            for slot in range(wp.static(size)):
-                node = nodes[p][slot]
-                if silent[node % silent.shape[0]] == wp.uint8(0):
+            rank = R(-1, -1, -1, -1, -1, -1)
+            for slot in range(wp.static(slots)):
+                node = node_of(nodes, angles, silent, p, slot)
+                if node >= 0:
                     start = starts[node]
-                    item = wp.static(SLOTS) * p + slot
+                    item = wp.static(ITEMS) * p + slot
                     smaller = int(0)
                     for k in range(start, start + numbers[node]):
                         smaller += wp.where(items[k] < item, 1, 0)
                     ordered[start + smaller] = item
                     rank[slot] = start + smaller
-            ranks[p] = rank
+            note(ranks, angle_ranks, p, rank)
 
     return number, fill, sort
 
@@ -183,13 +231,16 @@ def sum_kernel(real, serial: bool):
 
 
 @cache
-def collect_kernels(real, linear, serial: bool):
+def collect_kernels(real, linear, serial: bool, rolls: bool):
     """collect(...) forces of all lists on nodes, and the blocks of H on its diagonal; join(...) those between the nodes of edges.
+
+    If friction `rolls` rods, blocks of angles are among those of nodes, and roll(...) finds what is between these and nodes.
 
     One thread alone adds pair by pair, in the order in which others gather node by node.
     """
     PairSet, Surface = set_struct(real, linear), surface_struct(real)
     V, M, B = wp.types.vector(3, real), wp.types.matrix((3, 3), linear), wp.types.vector(6, linear)
+    L, until = wp.types.vector(3, linear), until_function(serial)
 
     @wp.func
     def block(own: PairSet, p: int, a: int, b: int):
@@ -201,6 +252,19 @@ def collect_kernels(real, linear, serial: bool):
                 w = own.weight[k, p]
                 m += B(v[0] * v[0], v[0] * v[1], v[0] * v[2], v[1] * v[1], v[1] * v[2], v[2] * v[2]) * (w[a] * w[b])
         return m
+
+    @wp.func
+    def block_of(own: PairSet, p: int, slot: int):
+        """What it adds to the matrix of the block in a slot with itself."""
+        if wp.static(rolls):
+            if slot >= wp.static(SLOTS):
+                m, used = B(), own.used[p]
+                for k in range(own.rows):
+                    if (used >> (k + 1)) & 1 != 0:
+                        a = own.lever[k, p][slot - wp.static(SLOTS)]
+                        m[0] += a * a
+                return m
+        return block(own, p, slot, slot)
 
     @wp.func
     def whole(b: B):
@@ -232,6 +296,14 @@ def collect_kernels(real, linear, serial: bool):
                             node = own.nodes[p][slot]
                             forces[node] = forces[node] - own.gradient[slot, p]
                             diagonal[node] = diagonal[node] + whole(block(own, p, slot, slot))
+                    if wp.static(rolls):
+                        if own.angles.shape[0] > 0:
+                            for side in range(wp.static(ANGLES)):
+                                angle = own.angles[p][side]
+                                if own.angle_ranks[p][side] >= 0:
+                                    slot = wp.static(SLOTS) + side
+                                    forces[angle] = forces[angle] - own.gradient[slot, p]
+                                    diagonal[angle] = diagonal[angle] + whole(block_of(own, p, slot))
         for node in range(forces.shape[0]):
             stiffness[node] = real(wp.trace(diagonal[node]))
 
@@ -274,7 +346,7 @@ def collect_kernels(real, linear, serial: bool):
                     p, slot = taken_apart(own.items[k])
                     if own.used[p] != 0:
                         force -= own.gradient[slot, p]
-                        total += block(own, p, slot, slot)
+                        total += block_of(own, p, slot)
         forces[node] = force
         diagonal[node] = whole(total)
         stiffness[node] = real(total[0] + total[3] + total[5])
@@ -310,4 +382,42 @@ def collect_kernels(real, linear, serial: bool):
                             total += block(own, p, slot, slot + 1)
         between[i] = whole(total)
 
-    return collect, join
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def roll(
+        sets: wp.array(dtype=PairSet),
+        angles: wp.array(dtype=int),
+        blocks: int,
+        first: wp.array(dtype=L),
+        second: wp.array(dtype=L),
+        ahead: wp.array(dtype=linear),
+    ):
+        """What the angle of each edge, of those of a world, has with both of its nodes and with the angle of the next edge."""
+        tid = wp.tid()
+        for i in range(tid, until(tid, first.shape[0])):
+            w = i / angles.shape[0]
+            a, b, c = L(), L(), linear(0.0)
+            if angles[i - w * angles.shape[0]] >= 0:
+                block = angles[i - w * angles.shape[0]] + w * blocks
+                for s in range(sets.shape[0]):
+                    if sets[s].numbers[block] > 0:
+                        own = sets[s]
+                        for k in range(own.places[block], own.places[block] + own.numbers[block]):
+                            p, slot = taken_apart(own.items[k])
+                            side = slot - wp.static(SLOTS)
+                            for row in range(own.rows):
+                                if own.used[p] != 0 and (own.used[p] >> (row + 1)) & 1 != 0:
+                                    lever, weight = own.lever[row, p], own.weight[row, p]
+                                    v = own.direction[row, p] * lever[side]
+                                    if own.edges > 0:
+                                        a += v * weight[2 * side]
+                                        b += v * weight[2 * side + 1]
+                                    elif side == 0:  # the edge before a point
+                                        b += v * weight[0]
+                                        c += lever[0] * lever[1]
+                                    else:
+                                        a += v * weight[0]
+            first[i] = a
+            second[i] = b
+            ahead[i] = c
+
+    return collect, join, roll

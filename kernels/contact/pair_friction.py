@@ -16,7 +16,8 @@ to the other, their moment is that of -f at r. What would balance it turns surfa
 Where the forces of a pair on one side all but cancel, weights are large; still |f_i| <= mu |g_i . n|.
 
 Surfaces of obstacles that are round move where their nodes stay: one of radius R that has turned by phi (`kernels.contact.spins`) adds
-phi x R n to the slip, whichever side it is on, and is turned by the couple -R n x f.
+phi x R n to the slip, whichever side it is on, and is turned by the couple -R n x f. So does a rod of radius R that friction may
+roll: its edge with the direction d adds R d x n times what its angle has changed by.
 
 Rods on obstacles may have one coefficient forwards, one backwards and one across: `directed`. Then mu is the smallest that is not zero,
 t1 lies along the rod, and t1 and t2 are as long as the coefficients of their directions over mu, t1 by the sense of the slip. So psi is
@@ -39,9 +40,9 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.contact.gather import SLOTS, factor_struct
+from ddg_warp.kernels.contact.gather import ANGLES, SLOTS, factor_struct
 from ddg_warp.kernels.contact.pair_terms import groups_function, law_struct
-from ddg_warp.kernels.contact.surfaces import Kind, sides_struct
+from ddg_warp.kernels.contact.surfaces import EDGES, Kind, sides_struct
 from ddg_warp.kernels.densities import Density
 from ddg_warp.kernels.measures.slip import basis
 from ddg_warp.kernels.threads import CPU_OPTIONS
@@ -55,7 +56,7 @@ def lagged_struct(real):
 
     Tangents that are directed are of slips forwards; in a third row there is the first one of slips backwards.
     Where there are objects that spin (`kernels.contact.spins`): which one of all worlds a pair has, `spinning`, below zero for none,
-    and its radius along the normal, `arm` [m].
+    and its radius along the normal, `arm` [m]. Where rods roll: what both angles of a pair add to the slip, `lever` (2, capacity) [m].
     """
     V, W = wp.types.vector(3, real), wp.types.vector(SLOTS, real)
 
@@ -66,6 +67,7 @@ def lagged_struct(real):
         tangent: wp.array2d(dtype=V)
         spinning: wp.array(dtype=int)
         arm: wp.array(dtype=V)
+        lever: wp.array2d(dtype=V)
 
     return Lagged
 
@@ -88,6 +90,47 @@ def spun_function(real):
         return of, radius
 
     return spun
+
+
+@cache
+def rolling_functions(kind: Kind, real):
+    """angles_of(first_angles, second_angles, i, j, offset) -> blocks of both angles of a pair; radii(sides, w, i, j) -> of both things;
+    levers(one, two, n, radii, angles) -> what both angles add to the slip, by the directions of both rods.
+
+    The angles are those of both edges, or of those before and after a point, half of each.
+    """
+    Sides, V, A = sides_struct(real), wp.types.vector(3, real), wp.types.vector(ANGLES, real)
+
+    @wp.func
+    def angles_of(
+        first_angles: wp.array(dtype=wp.vec2i), second_angles: wp.array(dtype=wp.vec2i), i: int, j: int, offset: int
+    ):
+        one, two = first_angles[i][0], first_angles[i][1]
+        if wp.static(kind == EDGES):
+            two = second_angles[j][0]
+        return wp.vec2i(wp.where(one >= 0, one + offset, -1), wp.where(two >= 0, two + offset, -1))
+
+    @wp.func
+    def radii(sides: Sides, w: int, i: int, j: int):
+        return A(sides.first.radius[w, sides.first.object[i]], sides.second.radius[w, sides.second.object[j]])
+
+    @wp.func
+    def levers(one: V, two: V, n: V, r: A, angles: wp.vec2i):
+        a, b, t = r[0] * real(1.0), r[0] * real(1.0), wp.normalize(one)
+        u = t
+        if wp.static(kind == EDGES):
+            b = r[1] * real(1.0)
+            u = wp.normalize(two)
+        elif angles[0] >= 0 and angles[1] >= 0:
+            a *= real(0.5)
+            b *= real(0.5)
+        if angles[0] < 0:
+            a *= real(0.0)
+        if angles[1] < 0:
+            b *= real(0.0)
+        return wp.matrix_from_rows(wp.cross(t, n) * a, wp.cross(u, n) * b)
+
+    return angles_of, radii, levers
 
 
 @cache
@@ -117,18 +160,20 @@ def directed_basis(real):
 
 
 @cache
-def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool):
+def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: bool):
     """Keep pairs, their nodes and the items of nodes, and what is lagged of friction, from factors and gradients of contact.
 
     x: lagged positions; beside (things,): the two nodes that say where the rod of a first thing of one world leads; ways: by groups,
     coefficients forwards, backwards and across over `friction`. All three are read where friction is directed. spinning (objects,):
-    where objects have markers, below zero without; read where some of them spin.
+    where objects have markers, below zero without; read where some of them spin. first_angles, second_angles (things,): see
+    `Shapes.angles`; read where rods roll, as x and beside are.
     """
     Law, Sides, Factor, Lagged = law_struct(real), sides_struct(real), factor_struct(linear), lagged_struct(real)
     V, W, L = wp.types.vector(3, real), wp.types.vector(SLOTS, real), wp.types.vector(SLOTS, linear)
     E = wp.types.vector(2, real)
     tangents, groups, size = basis(real), groups_function(real), kind.first + kind.second
     along_rod, spun = directed_basis(real), spun_function(real)
+    angles_of, radii, levers = rolling_functions(kind, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def lag(
@@ -141,6 +186,8 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool):
         beside: wp.array(dtype=wp.vec2i),
         ways: wp.array2d(dtype=V),
         spinning: wp.array(dtype=wp.vec4i),
+        first_angles: wp.array(dtype=wp.vec2i),
+        second_angles: wp.array(dtype=wp.vec2i),
         contact: Factor,
         gradient: wp.array2d(dtype=V),
         onward: int,
@@ -164,6 +211,8 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool):
             lagged.bound[p] = real(0.0)
             w, i, j, a, b = groups(law, sides, pairs[p])
             mu = law.friction[w, a, b]
+            if wp.static(rolls):
+                factor.angles[p] = angles_of(first_angles, second_angles, i, j, w * sides.first.nodes_a_world)
             push = V()
             for slot in range(wp.static(kind.first)):
                 push += gradient[slot, p]
@@ -181,6 +230,13 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool):
                 weight = W()
                 for slot in range(wp.static(size)):
                     weight[slot] = wp.dot(gradient[slot, p], n) / normal
+                if wp.static(rolls):
+                    first = w * sides.first.nodes_a_world
+                    one = x[beside[i][1] + first] - x[beside[i][0] + first]
+                    two = x[contact.nodes[p][3]] - x[contact.nodes[p][2]]
+                    lever = levers(one, two, n, radii(sides, w, i, j), factor.angles[p])
+                    lagged.lever[0, p] = lever[0]
+                    lagged.lever[1, p] = lever[1]
                 if wp.static(spins):
                     of, radius = spun(sides, spinning, w, i, j)
                     lagged.spinning[p] = of
@@ -196,7 +252,7 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool):
 
 
 @cache
-def friction_kernel(density: Density, real, linear, directed: bool, spins: bool):
+def friction_kernel(density: Density, real, linear, directed: bool, spins: bool, rolls: bool):
     """Energy, work, gradient by slot and factor of each pair at positions x, by its slip since `start`.
 
     things: first things of pairs in one world; velocity: nu [m/s]; rate (worlds,): 1/h [1/s]; accepted, iteration (worlds,): which of
@@ -205,7 +261,7 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool)
     """
     Factor, Lagged = factor_struct(linear), lagged_struct(real)
     V, L = wp.types.vector(3, real), wp.types.vector(3, linear)
-    E, M = wp.types.vector(2, real), wp.types.matrix((2, 2), real)
+    E, M, A = wp.types.vector(2, real), wp.types.matrix((2, 2), real), wp.types.vector(ANGLES, linear)
     P = wp.types.vector(density.parameter_size(2), real)
     energy_of, slope_of, curvature_of = density.laws(real, 2)
     one, half, tiny = wp.constant(real(1.0)), wp.constant(real(0.5)), wp.constant(real(1.0e-30))
@@ -276,6 +332,11 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool)
                 if wp.static(spins):
                     if lagged.spinning[p] >= 0:
                         move += wp.cross(turns[lagged.spinning[p]], lagged.arm[p])
+                if wp.static(rolls):
+                    for side in range(wp.static(ANGLES)):
+                        angle = factor.angles[p][side]
+                        if angle >= 0:
+                            move += lagged.lever[side, p] * (x[angle][0] - start[angle][0])
                 way = int(0)
                 if wp.static(directed):
                     if wp.dot(lagged.tangent[0, p] + lagged.tangent[2, p], move) < real(0.0):
@@ -288,6 +349,10 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool)
                 work[p] = wp.dot(f, u)
                 for slot in range(wp.static(SLOTS)):
                     gradient[slot, p] = (t1 * f[0] + t2 * f[1]) * weight[slot]
+                if wp.static(rolls):
+                    for side in range(wp.static(ANGLES)):
+                        couple = wp.dot(lagged.lever[side, p], t1 * f[0] + t2 * f[1])
+                        gradient[wp.static(SLOTS) + side, p] = V(couple, real(0.0), real(0.0))
                 w = f / bound
                 if accepted.shape[0] > 0:
                     old = accepted[world]
@@ -307,6 +372,9 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool)
                     if wp.dot(v, v) > real(0.0):
                         used |= 2 << k
                         factor.direction[k, p] = L(linear(v[0]), linear(v[1]), linear(v[2]))
+                        if wp.static(rolls):
+                            one, two = wp.dot(lagged.lever[0, p], v), wp.dot(lagged.lever[1, p], v)
+                            factor.lever[k, p] = A(linear(one), linear(two))
             factor.used[p] = used
 
     return evaluate

@@ -4,18 +4,19 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.contact.gather import SLOTS, set_struct
+from ddg_warp.kernels.contact.gather import ANGLES, SLOTS, set_struct
 from ddg_warp.kernels.contact.pair_bend import bend_function
 from ddg_warp.kernels.matrix.sliced import BARRED, product_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 
 @cache
-def product_kernels(real, linear, serial: bool):
+def product_kernels(real, linear, serial: bool, rolls: bool):
     """multiply(...) pairs; gather(...) to nodes; settle(...), which does so on dofs that are not barred, with dot products, for nodes
     in pairs, which meet(...) finds."""
     PairSet, until = set_struct(real, linear), until_function(serial)
     X, V, Y = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.matrix((4, 3), linear)
+    A = wp.types.vector(ANGLES, linear)
     bend = bend_function(linear)
     _, free = product_functions(linear)
 
@@ -49,6 +50,25 @@ def product_kernels(real, linear, serial: bool):
         if rank >= 0:
             own.placed[rank] = value
 
+    @wp.func
+    def turns_of(own: PairSet, p: int, v: wp.array(dtype=V)):
+        """What is at the angles of a pair, zero where it has none."""
+        t = A()
+        if own.angles.shape[0] > 0:
+            for side in range(wp.static(ANGLES)):
+                if own.angles[p][side] >= 0:
+                    t[side] = v[own.angles[p][side]][0]
+        return t
+
+    @wp.func
+    def put_turns(own: PairSet, p: int, t: A):
+        """What a pair brings to its angles."""
+        if own.angles.shape[0] > 0:
+            for side in range(wp.static(ANGLES)):
+                rank = own.angle_ranks[p][side]
+                if rank >= 0:
+                    own.placed[rank] = V(t[side], linear(0.0), linear(0.0))
+
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def multiply(
         threads: int,
@@ -79,12 +99,21 @@ def product_kernels(real, linear, serial: bool):
                             )
                             put(own, slot, p, value)
                         continue
-                    y = Y()
+                    y, t, turned = Y(), A(), A()
+                    if wp.static(rolls):
+                        t = turns_of(own, p, v)
                     for k in range(own.rows):
                         if (used >> (k + 1)) & 1 != 0:
                             w = own.weight[k, p]
                             along = own.direction[k, p]
-                            y += wp.outer(w, along * wp.dot(along, w * u))
+                            moved = wp.dot(along, w * u)
+                            if wp.static(rolls):
+                                if own.angles.shape[0] > 0:
+                                    moved += wp.dot(own.lever[k, p], t)
+                                    turned += own.lever[k, p] * moved
+                            y += wp.outer(w, along * moved)
+                    if wp.static(rolls):
+                        put_turns(own, p, turned)
                     if wanted.shape[0] > 0 and own.kind >= 0:
                         c = own.bend[p]
                         if c != linear(0.0) and wanted[own.pairs[p][0] / own.things] != 0:
@@ -96,6 +125,8 @@ def product_kernels(real, linear, serial: bool):
                 else:  # nodes that list it read it
                     for slot in range(wp.static(SLOTS)):
                         put(own, slot, p, V())
+                    if wp.static(rolls):
+                        put_turns(own, p, A())
 
     @wp.func
     def total(sets: wp.array(dtype=PairSet), node: int):

@@ -154,8 +154,8 @@ def residual_functions(real, linear, drag: bool, contact: bool, angle: bool = Fa
             inertia += held_back
             change += wp.dot(u, held_back - resistance * u * real(0.5))
             stiff += wp.max(wp.get_diag(resistance))
-        if wp.static(contact and not angle):
-            force += given.push[i]
+        if wp.static(contact):
+            force += own(given.push[i])
             stiff += given.pressed[i]
         return force - inertia, largest(force), stiff, change
 

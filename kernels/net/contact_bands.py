@@ -12,10 +12,11 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 
 
 @cache
-def stiffen_kernel(twist: bool, linear):
-    """stiffen(...): the bands of chains with contact's blocks of nodes, and of the edges ahead of them."""
+def stiffen_kernel(twist: bool, linear, rolls: bool):
+    """stiffen(...): the bands of chains with contact's blocks of nodes, and of the edges ahead; if friction `rolls`, of angles."""
     nb = place_dofs(twist)
     K, M, Layout = wp.types.matrix((3, 3), linear), wp.types.matrix((nb, nb), linear), layout_type()
+    V, t = wp.types.vector(3, linear), nb - 1
     load, store, _, _ = block_functions(nb, linear)
     free_of, _ = place_functions(twist, linear)
 
@@ -37,6 +38,10 @@ def stiffen_kernel(twist: bool, linear):
         blocks: int,
         diagonal: wp.array(dtype=K),
         between: wp.array(dtype=K),
+        turning: wp.array2d(dtype=int),
+        first: wp.array(dtype=V),
+        second: wp.array(dtype=V),
+        next: wp.array(dtype=linear),
         stiffer: wp.array3d(dtype=linear),
     ):
         k, r = wp.tid()
@@ -49,11 +54,28 @@ def stiffen_kernel(twist: bool, linear):
         node = layout.places[0, k, c]
         if node >= 0:
             D += wp.cw_mul(wide(diagonal[node + w * blocks]), wp.outer(f, f))
+        e = ahead[k, c]
+        turned = int(-1)
+        if wp.static(rolls):
+            turned = turning[k, c]
+            if turned >= 0:
+                own = M()
+                own[t, t] = diagonal[layout.places[1, k, c] + w * blocks][0, 0]
+                if node >= 0:
+                    for d in range(3):
+                        own[d, t] = first[turned + w * edges][d]
+                        own[t, d] = own[d, t]
+                D += wp.cw_mul(own, wp.outer(f, f))
         store(stiffer, 0, k, r, D)
         E = load(bands, wp.static(nb**2), k, r)
-        e = ahead[k, c]
         if e >= 0:
-            E += wp.cw_mul(wide(between[e + w * edges]), wp.outer(f, free_of(layout.held[k + 1, c])))
+            own = wide(between[e + w * edges])
+            if wp.static(rolls):
+                if e == turned:
+                    for d in range(3):
+                        own[t, d] = second[e + w * edges][d]
+                    own[t, t] = next[e + w * edges]
+            E += wp.cw_mul(own, wp.outer(f, free_of(layout.held[k + 1, c])))
         store(stiffer, wp.static(nb**2), k, r, E)
         for row in range(wp.static(2 * nb**2), wp.static(3 * nb**2)):
             stiffer[row, k, r] = bands[row, k, r]

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 import warp as wp
-from pair_cases import CASES, central, terms, times
+from pair_cases import CASES, bundle, central, terms, times
 
 MU, RATE, VELOCITY = 0.4, 100.0, 0.01
 SLIP = VELOCITY / RATE  # at which the polynomial law slides
 SLIPS = {"logistic": 0.15 * SLIP, "polynomial": 0.7 * SLIP}  # where some of a scene stick and others slide
+ROLLING = "rolling"  # the parallel ones, with angles
 each_case = pytest.mark.parametrize("case", CASES)
 each_form = pytest.mark.parametrize("form", ["logistic", "polynomial"])
 
@@ -18,7 +19,7 @@ def rates(result, *values) -> wp.array:
 
 def rubbed(case: str, device, form: str = "logistic", slip: float | None = None, seed: int = 1, **options):
     """Terms of friction alone, lagged and moved on by about `slip`: terms, positions on the device, and both positions."""
-    shapes, x = CASES[case]()
+    shapes, x = bundle(rolls=True) if case == ROLLING else CASES[case]()
     result, at = terms(shapes, x, device, **{"friction": MU, "velocity": VELOCITY, "friction_law": form, **options})
     result.lag(at)
     result.law.stiffness.zero_()

@@ -20,17 +20,23 @@ def upload(x: np.ndarray, device, dtype=wp.vec3d) -> wp.array:
     return wp.array(np.ascontiguousarray(x), dtype=dtype, device=device)
 
 
-def bundle(rods: int = 3, edges: int = 4, jitter: float = 2e-5, seed: int = 1) -> tuple[Shapes, np.ndarray]:
-    """Rods side by side over a strip of triangles, parallel but for 1 part in 500: mollifiers are between 0 and 1."""
+def bundle(
+    rods: int = 3, edges: int = 4, jitter: float = 2e-5, seed: int = 1, rolls: bool = False
+) -> tuple[Shapes, np.ndarray]:
+    """Rods side by side over a strip of triangles, parallel but for 1 part in 500: mollifiers are between 0 and 1.
+
+    All but the last have angles at the end, if it `rolls`.
+    """
     rng = np.random.default_rng(seed)
     x, y = np.meshgrid(np.linspace(0.0, 0.2, edges + 1), np.arange(rods) * 0.0062)
     sides = np.stack([x + 0.011 * np.arange(rods)[:, None], y, 0.0 * x], 2).reshape(-1, 3)
     i, j = np.meshgrid(np.arange(4), np.arange(3), indexing="ij")
     strip = np.stack([0.02 + 0.05 * i, -0.005 + 0.01 * j, np.full(i.shape, -0.0056)], 2).reshape(-1, 3)
-    rest = np.concatenate([sides, strip])
+    rest = np.concatenate([sides, strip, np.zeros(((rods - 1) * edges * rolls, 3))])
     shapes = Shapes(rest)
     for r in range(rods):
-        shapes.rod(r * (edges + 1) + np.arange(edges + 1), 0.003)
+        angles = len(sides) + len(strip) + r * edges + np.arange(edges) if rolls and r < rods - 1 else None
+        shapes.rod(r * (edges + 1) + np.arange(edges + 1), 0.003, angles=angles)
     first = len(sides) + (3 * i + j)[:-1, :-1].ravel()
     triangles = np.concatenate(
         [np.stack([first, first + 3, first + 1], 1), np.stack([first + 3, first + 4, first + 1], 1)]

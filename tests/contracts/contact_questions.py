@@ -11,10 +11,10 @@ from ddg_warp.solve.continuation import Continuation
 STEP, COUNT = 2e-3, 8
 
 
-def _hits(kind, variant, velocities, gravity: float, motion=None, controls=None) -> tuple:
+def _hits(kind, variant, velocities, gravity: float, motion=None, controls=None, **options) -> tuple:
     """Steps of an object without supports over a floor, with what is true at each of them; the last state and the integrator."""
     scene, _ = kind.scene(held=False, gravity=(0.0, 0.0, -gravity))
-    over_floor(scene, 2e-3, motion)
+    over_floor(scene, 2e-3, motion, **options)
     model = variant.build(scene)
     integrator = ddg.Integrator(model, rtol=1e-9)
     speed = np.zeros((variant.worlds, model.points_count, 3)) + velocities[:, None]
@@ -48,6 +48,18 @@ def contact(kind, variant):
     state, _ = _hits(kind, variant, speeds, 5.0)
     for world, points in enumerate(variant.each(state.points())):
         alone, _ = _hits(kind, Variant(variant.device, variant.precision), speeds[world : world + 1], 5.0)
+        close(points, alone.points(), atol=1e-8)
+
+
+def rolls(kind, variant):
+    """What falls onto a floor, and slides over it, is turned about the axes of its rods; worlds are as alone."""
+    speeds = np.array([[0.2, 0.3, -0.5 - 0.1 * w] for w in range(variant.worlds)])
+    state, _ = _hits(kind, variant, speeds, 5.0, rolling=True)
+    smooth, _ = _hits(kind, variant, speeds, 5.0)
+    turned = variant.each(state.angles()) - variant.each(smooth.angles())
+    assert (np.abs(turned).max(1) > 1e-4).all()
+    for world, points in enumerate(variant.each(state.points())):
+        alone, _ = _hits(kind, Variant(variant.device, variant.precision), speeds[world : world + 1], 5.0, rolling=True)
         close(points, alone.points(), atol=1e-8)
 
 
@@ -118,6 +130,7 @@ def path_onto_a_ball(kind, variant):
 
 CONTACT_QUESTIONS = {
     "contact": contact,
+    "rolls": rolls,
     "moved obstacle": moved_obstacle,
     "rests": rests,
     "path onto a ball": path_onto_a_ball,

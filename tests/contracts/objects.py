@@ -208,13 +208,13 @@ def _between_balls(adder, at: tuple, thick: float, friction=0.2):
     return add
 
 
-def over_floor(scene, gap: float, motion=None) -> float:
+def over_floor(scene, gap: float, motion=None, **options) -> float:
     """Put a floor below everything, of which the parts pass through each other; its height [m]."""
     low = [batch.points[..., 2].min() - np.max(batch.section.radius) for batch in scene.batches]
     low += [shell.points[:, 2].min() - 0.5 * np.max(shell.thickness) for shell in scene.shells]
     height = min(low, default=0.0) - gap
     scene.add_obstacle(ddg.Plane((0.0, 0.0, height)), motion=motion, name="floor")
-    scene.contact(range=RANGE, friction=0.2)
+    scene.contact(range=RANGE, friction=0.2, **options)
     pass_each_other(scene)
     return height
 

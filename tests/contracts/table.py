@@ -74,6 +74,11 @@ for _question in ("contact", "moved obstacle"):
         **dict.fromkeys(IN_CONTACT, ("has contact already", "use contact_between")),
         "shell, curved membrane": ("shell 0", "'curved'", "statics", "membrane='flat'"),
     }
+REFUSED["rolls"] = dict.fromkeys(SHELLS, ("contact: rolling", "no rod touches anything", "leave rolling out")) | {
+    name: words for name, words in REFUSED["contact"].items() if name != "shell, curved membrane"
+}
+for _name in ("rod without twist", "rod without bending"):
+    REFUSED["rolls"][_name] = ("rolling, and rod 0", "has no twist", "leave rolling out")
 REFUSED["rests"] = {name: words for name, words in REFUSED["contact"].items() if name != "shell, curved membrane"}
 REFUSED["spectrum"] = dict.fromkeys(IN_CONTACT, ("contact: stability", "friction", "set friction=0", "statics.solve"))
 REFUSED["continuation"] |= dict.fromkeys(

@@ -90,6 +90,17 @@ def test_friction_that_is_lagged_anew(name, law, lags):
     check_numbers(model, inputs, difference, ("stiffness", "range", "radius", "friction"))
 
 
+@lagged_once_or_twice
+@pytest.mark.parametrize("name", [name for name in SCENES if not name.startswith("sheet")])
+def test_friction_that_rolls_rods(name, lags):
+    """By angles, and by directions and radii of what rolls, too."""
+    model, gradient, inputs, difference = differentiated(
+        name, "barrier", 2, SLIDING, lags=lags, rolling=True, **RUBBING
+    )
+    check_state(model, gradient, difference)
+    check_numbers(model, inputs, difference, ("stiffness", "range", "radius", "friction"))
+
+
 @pytest.mark.parametrize("lags", [2, 3])
 @pytest.mark.parametrize("name", ["crossing rods", "sheet on ball"])
 def test_what_was_lagged_at_a_solution_counts(name, lags, monkeypatch):

@@ -4,6 +4,7 @@ import numpy as np
 
 from ddg_warp.compile.bodies import ROD, Body, Touching
 from ddg_warp.compile.net.net import Net
+from ddg_warp.errors import SceneError
 from ddg_warp.scene.contact import Contact, touching_names
 from ddg_warp.scene.obstacles import MESH
 
@@ -24,7 +25,15 @@ def touching(scene, net: Net) -> Touching | None:
         if batch.name in names:
             row = rod.rod - batch.first
             radius = law.radius.get(batch.name, float(np.max(_of_rod(batch, "radius", row))))
-            bodies.append(Body(rod.nodes, ROD, radius, batch.name, f"rod {rod.rod}", closed=batch.closed))
+            if law.rolling and not rod.edges.size:
+                raise SceneError(
+                    f"contact: rolling, and rod {rod.rod} ('{batch.name}') has no twist, by which it would roll; leave rolling out, or "
+                    "give the rod twist"
+                )
+            angles = rod.edges if law.rolling else rod.edges[:0]
+            bodies.append(
+                Body(rod.nodes, ROD, radius, batch.name, f"rod {rod.rod}", closed=batch.closed, angles=angles)
+            )
             bending = max(float(np.max(_of_rod(batch, name, row))) for name in ("EI1", "EI2"))
             forces.append((net.mass[rod.nodes, 0].max(), bending / radius**2))
     for index, shell in enumerate(net.shells):
@@ -41,7 +50,11 @@ def touching(scene, net: Net) -> Touching | None:
         shape, name = obstacle.shape, obstacle.name
         given = nodes, shape.kind, shape.radius, name, f"obstacle {index} ('{name}')", nodes[shape.cells]
         bodies.append(Body(*given, still=True, markers=markers))
-    return _numbers(scene, law, bodies, np.array([*scale, *np.full(len(scene.obstacles), np.nan)]))
+    found = _numbers(scene, law, bodies, np.array([*scale, *np.full(len(scene.obstacles), np.nan)]))
+    if law.rolling and not (found.rubs and any(body.angles.size for body in bodies)):
+        lacking = "no rod touches anything" if found.rubs else "there is no friction"
+        raise SceneError(f"contact: rolling, and {lacking}; leave rolling out")
+    return found
 
 
 def _of_rod(batch, name: str, row: int) -> np.ndarray:

@@ -66,7 +66,7 @@ class ContactElements(PairElements):
     def evaluate(self, x: wp.array, law, gap: wp.array) -> None:
         """The same; and list the pairs of nodes."""
         self.write(x, law, gap)
-        self._items.list(self.count, self.factor.nodes)
+        self._items.list(self.count, self.factor)
 
     def exact_product(self, v: wp.array, x: wp.array, law) -> None:
         """Place the product of the exact Hessian at x, those of `evaluate`, with v."""

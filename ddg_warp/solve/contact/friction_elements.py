@@ -4,10 +4,12 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
+from ddg_warp.kernels.contact.gather import ANGLES
 from ddg_warp.kernels.contact.pair_friction import ROWS, friction_kernel, lag_kernel, lagged_struct
 from ddg_warp.kernels.densities import Density
 from ddg_warp.solve.contact.contact_elements import ContactElements
 from ddg_warp.solve.contact.pair_elements import PairElements
+from ddg_warp.solve.contact.shapes import Shapes
 from ddg_warp.solve.contact.spins import Spins
 
 
@@ -17,12 +19,12 @@ class FrictionElements(PairElements):
     Args:
         contact: of the same pairs; nodes, silent: as of `PairElements`.
         velocity: below which surfaces stick [m/s].
-        directed: nodes beside first things (things, 2), and by groups coefficients over `friction` forwards, backwards and across
-            (groups, groups, 3), see `lag_kernel`; None: it is the same all ways.
-        spins: how far objects have turned since slips started.
+        ways: by groups coefficients over `friction` forwards, backwards and across (groups, groups, 3), see `lag_kernel`; None: it is
+            the same all ways.
+        shapes: what may touch; spins: how far objects of it have turned since slips started.
 
     Attributes:
-        directions: both of `directed` on the device, None without.
+        directions: nodes beside first things (things, 2) and `ways` on the device, where they are asked for, else None.
         work: of each pair (capacity,) [J], by the slip of the last `evaluate`.
     """
 
@@ -31,23 +33,28 @@ class FrictionElements(PairElements):
         contact: ContactElements,
         density: Density,
         velocity: float,
-        directed: tuple[np.ndarray, np.ndarray] | None,
+        ways: np.ndarray | None,
+        shapes: Shapes,
         spins: Spins,
         nodes: int,
         real,
         linear,
         silent: wp.array,
     ):
-        super().__init__(contact.found, ROWS, nodes, real, linear, silent)
+        found, kind = contact.found, contact.found.kind
+        angles = [shapes.angles(things.size) for things in (found.first, found.second)]
+        super().__init__(found, ROWS, nodes, real, linear, silent, rolls=any((of >= 0).any() for of in angles))
         self._contact, self._velocity, self._spins = contact, velocity, spins
-        self._lag = lag_kernel(self.found.kind, real, linear, directed is not None, spins.any)
-        self._evaluate = friction_kernel(density, real, linear, directed is not None, spins.any)
-        self._rows, self.directions = ROWS, (None, None)
-        if directed is not None:
-            beside, ways = directed
-            self._rows += 1
+        what = ways is not None, spins.any, self.rolls
+        self._lag = lag_kernel(kind, real, linear, *what)
+        self._evaluate = friction_kernel(density, real, linear, *what)
+        self._rows, beside = ROWS + (ways is not None), None
+        if ways is not None:
             ways = wp.array(ways, dtype=wp.types.vector(3, real), device=self.device)
-            self.directions = arrays.upload(beside.astype(np.int32), wp.vec2i, self.device), ways
+        if ways is not None or self.rolls:
+            beside = self._upload(shapes.beside(kind.first))
+        self.directions = beside, ways
+        self.angles = [self._upload(of) if self.rolls else None for of in angles]
         self.kernels += [self._lag, self._evaluate]
         self._onward = 0
         self._kept = ("count", "starts", "partners")
@@ -69,18 +76,19 @@ class FrictionElements(PairElements):
         spinning = capacity if self._spins.any else 0
         self.lagged.spinning = wp.zeros(spinning, dtype=int, device=self.device)
         self.lagged.arm = wp.zeros(spinning, dtype=vector, device=self.device)
+        self.lagged.lever = arrays.allocate((ANGLES, capacity if self.rolls else 0), vector, self.device)
 
     def lag(self, law, x: wp.array, again: bool) -> None:
         """Take the pairs of contact as it was evaluated last, at x; `again`: of a search that goes on, with the directions of slips."""
         self._onward = int(again)
         of = self._contact
-        inputs = [of.pairs, of.count, self.found.sides, law, x, *self.directions, self._spins.places]
+        inputs = [of.pairs, of.count, self.found.sides, law, x, *self.directions, self._spins.places, *self.angles]
         inputs += [of.factor, of.gradient, self._onward, self.count]
         outputs = [self.pairs, self.factor, self.lagged, self._slip, self._along]
         self._take_turns(self._lag, self.found.capacity, inputs, outputs)
         for name in self._kept:
             wp.copy(getattr(self, name), getattr(of, name))
-        self._items.list(self.count, self.factor.nodes)
+        self._items.list(self.count, self.factor)
 
     def evaluate(self, x, start, rate: wp.array, iterates: tuple) -> None:
         """Write energies, work, gradients and factors at x by the slip since `start`, and by how far objects have turned."""
@@ -88,6 +96,9 @@ class FrictionElements(PairElements):
         inputs += [self.lagged, self._velocity, rate, *iterates, self._onward, x, start, self._spins.turned.flatten()]
         outputs = [self._slip, self._along, self.factor, self.energy, self.work, self.gradient]
         self._take_turns(self._evaluate, self.found.capacity, inputs, outputs)
+
+    def _upload(self, values: np.ndarray) -> wp.array:
+        return arrays.upload(values.astype(np.int32), wp.vec2i, self.device)
 
     def couples(self) -> np.ndarray:
         """What pairs turn objects that spin by (worlds, objects, 3) [N m], as evaluated last. Reads from the device."""

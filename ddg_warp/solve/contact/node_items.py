@@ -13,38 +13,42 @@ class NodeItems:
 
     Args:
         nodes: of all worlds.
-        silent: nodes of a world that have none.
+        silent: nodes of a world that have none; rolls: whether angles have some, too.
 
     Attributes:
         numbers, places: of each node, how many items it has and where they start in `items`.
-        ranks: of each pair, the places of its items, -1 where it has none.
+        ranks, angle_ranks: of each pair, the places of its items, -1 where it has none.
     """
 
-    def __init__(self, kind: Kind, nodes: int, silent: wp.array):
+    def __init__(self, kind: Kind, nodes: int, silent: wp.array, rolls: bool = False):
         self.device, self._size, self._silent = silent.device, kind.first + kind.second, silent
+        self._angles = gather.ANGLES if rolls else 0
         self._both = wp.zeros((2, nodes), dtype=int, device=self.device)  # zeroed at once
         self.numbers, self._filled = self._both[0], self._both[1]
         self._running = RunningSums(self.numbers)
         self.places = self._running.starts
-        self._number, self._fill, self._sort = gather.list_kernels(kind, arrays.serial(self.device))
+        self._number, self._fill, self._sort = gather.list_kernels(kind, arrays.serial(self.device), rolls)
         self.kernels = [self._number, self._fill, self._sort, *self._running.kernels]
 
     def reserve(self, capacity: int) -> None:
         """Make room for the items of so many pairs."""
-        self.items = wp.zeros(self._size * capacity, dtype=int, device=self.device)
+        self.items = wp.zeros((self._size + self._angles) * capacity, dtype=int, device=self.device)
         self._unordered = self.items if arrays.serial(self.device) else wp.zeros_like(self.items)
         self.ranks = wp.zeros(capacity, dtype=wp.vec4i, device=self.device)
+        self.angle_ranks = wp.zeros(capacity if self._angles else 0, dtype=wp.vec2i, device=self.device)
 
-    def list(self, count: wp.array, nodes: wp.array) -> None:
-        """Of so many pairs, with these nodes."""
+    def list(self, count: wp.array, factor) -> None:
+        """Of so many pairs, with the nodes and angles of their factors."""
+        nodes = factor.nodes
         self._both.zero_()
-        inputs = [count, nodes, self._silent]
+        inputs = [count, nodes, factor.angles, self._silent]
         self._take_turns(self._number, len(nodes), inputs, [self.numbers])
         self._running()
-        self._take_turns(self._fill, len(nodes), [*inputs, self.places], [self._filled, self._unordered, self.ranks])
+        ranks = [self.ranks, self.angle_ranks]
+        self._take_turns(self._fill, len(nodes), [*inputs, self.places], [self._filled, self._unordered, *ranks])
         if self._unordered is not self.items:
             inputs += [self.places, self.numbers, self._unordered]
-            self._take_turns(self._sort, len(nodes), inputs, [self.items, self.ranks])
+            self._take_turns(self._sort, len(nodes), inputs, [self.items, *ranks])
 
     def _take_turns(self, kernel, count: int, inputs: list, outputs: list) -> None:
         arrays.take_turns(kernel, count, inputs, outputs, self.device)

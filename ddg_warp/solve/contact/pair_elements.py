@@ -8,7 +8,7 @@ from ddg_warp.kernels.contact import gather
 from ddg_warp.solve.contact.node_items import NodeItems
 from ddg_warp.solve.contact.pairs import PairList
 
-MOST = 2**31 // gather.SLOTS  # pairs whose slots can be counted
+MOST = 2**31 // gather.ITEMS  # pairs whose items can be counted
 
 
 class PairElements:
@@ -17,21 +17,21 @@ class PairElements:
     Args:
         found: list of a search, whose kind of pairs and capacity these have.
         nodes: of all worlds; silent: those of a world that are told of nothing.
-        linear: type of factors.
+        linear: type of factors; rolls: whether they turn rods.
 
     Attributes:
-        factor: see `gather.factor_struct`; energy: of each pair (capacity,) [J]; gradient: by slot (SLOTS, capacity) [N].
+        factor: see `gather.factor_struct`; energy: of each pair (capacity,) [J]; gradient: by slot (SLOTS or ITEMS, capacity) [N, N m].
         placed, idle: see `gather.set_struct`.
         pairs, count, starts, partners: as those of a `PairList`.
         mollified: those whose matrices take more than a factor and what turns (`Mollified`); None without.
-        numbers, places, items, ranks: as of `NodeItems`, which the subclass has list the pairs.
+        numbers, places, items, ranks, angle_ranks: as of `NodeItems`, which the subclass has list the pairs.
     """
 
     mollified = None
 
-    def __init__(self, found: PairList, rows: int, nodes: int, real, linear, silent: wp.array):
+    def __init__(self, found: PairList, rows: int, nodes: int, real, linear, silent: wp.array, rolls: bool = False):
         self.found, self.device, self.rows, self.real, self.linear = found, found.device, rows, real, linear
-        self._items = NodeItems(found.kind, nodes, silent)
+        self.rolls, self._items = rolls, NodeItems(found.kind, nodes, silent, rolls)
         self.numbers, self.places = self._items.numbers, self._items.places
         self.factor = gather.factor_struct(linear)()
         self.count = wp.zeros(1, dtype=int, device=self.device)
@@ -58,9 +58,12 @@ class PairElements:
         self.factor.direction = arrays.allocate((self.rows, capacity), vector, self.device)
         self.factor.weight = arrays.allocate((self.rows, capacity), wp.types.vector(4, linear), self.device)
         self.energy = wp.zeros(capacity, dtype=self.real, device=self.device)
-        self.gradient = arrays.allocate((gather.SLOTS, capacity), wp.types.vector(3, self.real), self.device)
+        slots, turned = (gather.ITEMS, capacity) if self.rolls else (gather.SLOTS, 0)
+        self.gradient = arrays.allocate((slots, capacity), wp.types.vector(3, self.real), self.device)
+        self.factor.angles = wp.zeros(turned, dtype=wp.vec2i, device=self.device)
+        self.factor.lever = arrays.allocate((self.rows, turned), wp.types.vector(gather.ANGLES, linear), self.device)
         self._items.reserve(capacity)
-        self.items, self.ranks = self._items.items, self._items.ranks
+        self.items, self.ranks, self.angle_ranks = self._items.items, self._items.ranks, self._items.angle_ranks
         self.idle = wp.zeros(capacity, dtype=wp.uint8, device=self.device)
         self.placed = wp.zeros(len(self.items), dtype=vector, device=self.device)
 

@@ -22,7 +22,7 @@ class PairProduct:
         self._parts, self._real, self._linear, self._device = parts, real, linear, parts[0].device
         types = int, wp.types.vector(3, real)
         self._nothing = [wp.zeros(0, dtype=dtype, device=self._device) for dtype in types]
-        made = product_kernels(real, linear, arrays.serial(self._device))
+        made = product_kernels(real, linear, arrays.serial(self._device), any(part.rolls for part in parts))
         self._multiply, self._gather, self._meet, self._settle = made
         self.kernels = [*made]
         self.kernels += [kernel for part in self._mollified for kernel in part.kernels]
@@ -68,9 +68,10 @@ class PairProduct:
 
     def _set(self, part):
         own, kind = set_struct(self._real, self._linear)(), part.found.kind
-        for name in ("nodes", "used", "direction", "weight", "bend"):
+        for name in ("nodes", "used", "direction", "weight", "bend", "angles", "lever"):
             setattr(own, name, getattr(part.factor, name))
-        for name in ("pairs", "count", "gradient", "placed", "places", "numbers", "items", "ranks", "idle"):
+        names = ("pairs", "count", "gradient", "placed", "places", "numbers", "items", "ranks", "angle_ranks", "idle")
+        for name in names:
             setattr(own, name, getattr(part, name))
         for name in ("marks", "starts", "columns") if part.mollified and part.mollified.keeps else ():
             setattr(own, name, getattr(part.mollified, name))

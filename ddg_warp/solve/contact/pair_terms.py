@@ -54,6 +54,8 @@ class PairTerms:
         diagonal: (worlds times nodes,) blocks of the Gauss-Newton matrix at nodes, 3 x 3 [N/m]; between: (worlds times edges,) those
             between the first and the second node of edges, in the order of `shapes.things(2)`. Each pair's own part of rods, 6 x 6 for
             an edge, is in both, positive semi-definite together. See `join`.
+        rolls: whether friction turns rods; turned: then of each edge's angle that with the first and with the second node [N], and with
+            the angle of the next edge of the rod [N m]; those with themselves are among `diagonal`.
         stiffness: (worlds times nodes,) [N/m], traces of `diagonal`.
         law: `law_struct`, on the device; products: the `PairProduct` of all lists.
         spins: how far objects that spin have turned since slips started.
@@ -101,11 +103,18 @@ class PairTerms:
         self.lists = [
             ContactElements(pairs, law, nodes, self.real, self.linear, told_not, exact) for pairs in search.lists
         ]
-        self._collect, self._join = gather.collect_kernels(self.real, self.linear, arrays.serial(self.device))
         self._version, self._lagged = search.version, -1
         self.spins = Spins(search)
         self.frictions = self._with_friction(rubs, ways, friction_law, velocity, told_not)
         self._start = wp.zeros_like(self.forces)
+        self.rolls = any(part.rolls for part in self.frictions)
+        made = gather.collect_kernels(self.real, self.linear, arrays.serial(self.device), self.rolls)
+        self._collect, self._join, self._roll = made
+        edges = len(self.between) if self.rolls else 0
+        types = (*(wp.types.vector(3, self.linear),) * 2, self.linear)
+        self.turned = [wp.zeros(edges, dtype=dtype, device=self.device) for dtype in types]
+        angles = search.shapes.angles(2)[:, 0].astype(np.int32)
+        self._angles = wp.array(angles if self.rolls else angles[:0], dtype=int, device=self.device)
         self.products = PairProduct(self._parts, self.law, self.real, self.linear)
         self._rub = PairProduct(self.frictions, self.law, self.real, self.linear) if self.frictions else None
         self._totals = told = Totals(self.lists, self.frictions, search.worlds, self.real, self.device)
@@ -116,7 +125,12 @@ class PairTerms:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         parts = [kernel for part in self._parts for kernel in part.kernels]
-        own = [self._collect, self._join, *(self.spins.kernels if self.frictions else [])]
+        own = [
+            self._collect,
+            self._join,
+            *([self._roll] if self.rolls else []),
+            *(self.spins.kernels if self.frictions else []),
+        ]
         return [*own, *self.products.kernels, *self._totals.kernels, *parts]
 
     @property
@@ -229,10 +243,13 @@ class PairTerms:
         self.products.settle(v, out, x, wanted, barred, busy, dots)
 
     def join(self) -> None:
-        """Write `between` of the last `evaluate`."""
+        """Write `between` and `turned` of the last `evaluate`."""
         edges = self.search.lists[0].first
         inputs = [self.products.sets, edges.surface, edges.count]
         arrays.sweep(self._join, len(self.between), inputs, [self.between, self._told_edges], self.device)
+        if self.rolls:
+            inputs = [self.products.sets, self._angles, len(self.search.shapes.points)]
+            arrays.sweep(self._roll, len(self.between), inputs, self.turned, self.device)
 
     def _check(self, rate: wp.array) -> None:
         """Refuse rates that do not fit, and friction that was not lagged."""
@@ -260,7 +277,8 @@ class PairTerms:
                 part,
                 FRICTION[law],
                 float(velocity),
-                None if same else (self.search.shapes.beside(part.found.kind.first), np.stack(ways, -1)),
+                None if same else np.stack(ways, -1),
+                self.search.shapes,
                 self.spins,
                 len(self.forces),
                 self.real,

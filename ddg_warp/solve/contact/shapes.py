@@ -31,6 +31,7 @@ class Shapes:
         self.radii: list[float] = []
         self.obstacle: set[int] = set()
         self._parts: dict[int, list] = {1: [], 2: [], 3: [], BALLS: [], PLANES: []}
+        self._angles: dict[int, np.ndarray] = {}
         self.ignored_pairs: set[tuple[int, int]] = set()
         self.spinning: dict[int, np.ndarray] = {}
 
@@ -43,6 +44,7 @@ class Shapes:
         apart: float | None = None,
         name: str | None = None,
         still: bool = False,
+        angles=None,
     ) -> int:
         """Add a rod along nodes (m,), a row of capsules; returns the number of the object.
 
@@ -52,6 +54,7 @@ class Shapes:
             apart: edges with less than this between them along the rod [m] are no pair, nor are neighbours; by default pi radius, the
                 arc between opposite sides of the tightest bend that a rod so thick can have.
             still: whether it is no pair with itself and others that are still.
+            angles: of its edges, points whose first number says how far they have turned about themselves; none by default.
 
         Raises:
             SceneError: names the rod, the edge or node, and the remedy.
@@ -70,6 +73,10 @@ class Shapes:
         ends = np.concatenate([[0.0], np.cumsum(lengths)])
         loop = np.full(len(edges), ends[-1] if closed else 0.0)
         span = np.column_stack([ends[:-1], ends[1:], loop, np.full(len(edges), float(apart))])
+        if angles is not None:
+            angles = self._angles[len(self.names)] = self._checked(angles, 1, name)
+            if len(angles) != len(edges):
+                raise SceneError(f"{name} has {len(angles)} angles; it has {len(edges)} edges")
         return self._add(name, radius, {1: nodes[:, None], 2: edges}, span, still)
 
     def shell(self, triangles, thickness: float, *, name: str | None = None, still: bool = False) -> int:
@@ -198,6 +205,20 @@ class Shapes:
             order = np.argsort(keys)
             at = order[np.minimum(np.searchsorted(keys[order], own), len(keys) - 1)]
             result[:, side] = np.where(keys[at] == own, ends[at, side], nodes[:, 0])
+        return result
+
+    def angles(self, size: int) -> np.ndarray:
+        """Of edges their angle, of points on rods those of the edges before and after them; -1 for none (n, 2)."""
+        nodes, _, owner, _ = self.things(size)
+        result = np.full((len(nodes), 2), -1)
+        for number, angles in self._angles.items():
+            own = np.flatnonzero(owner == number)
+            if size == 2:
+                result[own, 0] = angles
+            elif size == 1:
+                closed = len(own) == len(angles)
+                result[own if closed else own[1:], 0] = np.roll(angles, 1) if closed else angles
+                result[own if closed else own[:-1], 1] = angles
         return result
 
     def describe(self, size: int, index: int) -> str:

@@ -179,7 +179,8 @@ def shapes_of(host) -> Shapes:
             number = shapes.ball(int(body.nodes[0]), body.radius, **given_too)
         else:
             apart = 0.0 if body.kind == CAPSULE else given.law.apart
-            number = shapes.rod(body.nodes, body.radius, closed=body.closed, apart=apart, **given_too)
+            angles = body.angles if body.angles.size else None
+            number = shapes.rod(body.nodes, body.radius, closed=body.closed, apart=apart, angles=angles, **given_too)
         if body.markers.size:
             shapes.spin(number, body.markers)
     for g, h in given.ignored:

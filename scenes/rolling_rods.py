@@ -1,0 +1,144 @@
+"""Three rods lie across a slope: one rolls down it, one is bowled and comes to roll, one finds it too slippery.
+
+Friction acts on the surface of a rod and turns it about its axis. A cylinder, I = m r^2 / 2, rolls with 2/3 g sin a, whatever the
+friction mu, as long as tan(a) <= 3 mu. Where it slides with the speed v it gains g (sin a - mu cos a), and its surface, r omega,
+2 mu g cos a: so one that is bowled with v0 comes to roll after v0 / (g (3 mu cos a - sin a)), and where tan(a) > 3 mu none ever does.
+"""
+
+import numpy as np
+
+import ddg_warp as ddg
+from ddg_warp.run.check import once_reached
+from ddg_warp.scenes import _touching, rod_on_floor
+
+LENGTH = 0.1  # m
+RADIUS = 0.005  # m
+GRAVITY = 9.81  # m/s^2
+RANGE = 1e-4  # m, of contact
+NAMES = ("rolls", "bowled", "slips")
+WAYS = [
+    f"way of {what} that {does} [m]" for what in ("the rod", "the surface") for does in ("rolls", "is bowled", "slips")
+]
+LANE = 1.5 * LENGTH  # m, between rods
+
+
+def build(
+    n: int = 10,
+    angle: float = 10.0,
+    friction: float = 0.3,
+    slippery: float = 0.04,
+    speed: float = 1.0,
+    velocity: float = 1e-3,
+    stiffness: float = 2e4,
+    range: float = RANGE,
+    lags: int = 2,
+    dt: float = 1e-3,
+    duration: float = 0.5,
+    seed: int = -1,
+) -> ddg.Scene:
+    """The rods side by side, across the slope, which falls towards x.
+
+    Args:
+        n: edges of each rod
+        angle: of the plane [degrees]
+        friction: coefficient of the rod that rolls and of the one that is bowled
+        slippery: coefficient of the one that slips
+        speed: of the one that is bowled [m/s]
+        velocity: of the friction law, nu [m/s]
+        stiffness: of contact [N/m]
+        range: of contact [m]
+        lags: how often in a step friction takes the normal forces anew
+        dt: time step [s]
+        duration: of the run [s]
+        seed: of a jitter of where rods start; none below 0
+    """
+    a = np.radians(angle)
+    if not 0.0 < a < 0.5 * np.pi:
+        raise ValueError(f"angle = {angle}; a slope is between 0 and 90 degrees")
+    if not 3.0 * slippery < np.tan(a) < 3.0 * friction:
+        raise ValueError(
+            f"friction = {friction}, slippery = {slippery}; a third of tan(angle) = {np.tan(a):.3g} is between them"
+        )
+    down, normal = np.array([np.cos(a), 0.0, -np.sin(a)]), np.array([np.sin(a), 0.0, np.cos(a)])
+    scene = ddg.Scene(
+        gravity=(0.0, 0.0, -GRAVITY),
+        analysis=ddg.Dynamics(dt=dt, duration=duration),
+        initial=lambda model: bowled(model, speed * down),
+    )
+    jitter = _touching.jitter((len(NAMES), 2), seed)
+    along = np.outer(np.linspace(-0.5, 0.5, n + 1) * LENGTH, [0.0, 1.0, 0.0])
+    for k, name in enumerate(NAMES):
+        start = k * LANE * np.array([0.0, 1.0, 0.0]) + 0.1 * RADIUS * jitter[k, 0] * down
+        scene.add_rod(
+            start + along + (RADIUS + range * (0.95 + 0.04 * jitter[k, 1])) * normal,
+            section=ddg.Circle(RADIUS),
+            material=ddg.Material(young=1e7, density=1000.0, poisson=0.5),
+            name=name,
+        )
+    scene.add_obstacle(ddg.Plane(normal=tuple(normal)), name="plane")
+    scene.contact(range=range, stiffness=stiffness, friction=friction, velocity=velocity, lags=lags, rolling=True)
+    scene.contact_between("slips", "plane", friction=slippery)
+    return scene
+
+
+def bowled(model, velocity: np.ndarray):
+    """The rods at rest but for the one that is bowled, without spin."""
+    velocities = np.zeros((len(NAMES), len(model.scene.batches[0].points[0]), 3))
+    velocities[NAMES.index("bowled")] = velocity
+    return model.state(velocities=velocities.reshape(-1, 3))
+
+
+def observe(model, state) -> dict[str, float]:
+    """How far down the slope each rod is [m], how far its surface has turned [m], and the smallest gap [m]."""
+    batches, normal = model.scene.batches, np.array(model.scene.obstacles[0].shape.normal)
+    down = np.array([normal[2], 0.0, -normal[0]])
+    start = np.array([batch.points[0].mean(0) for batch in batches])
+    middles = state.points().reshape(-1, len(batches), *batches[0].points.shape[1:])[0].mean(1)
+    turned = (
+        (state.angles() - model.state().angles()).reshape(-1, len(batches), len(batches[0].points[0]) - 1)[0].mean(1)
+    )
+    found = dict(zip(NAMES, (middles - start) @ down, strict=True))
+    found |= {f"{name}, turned": RADIUS * value for name, value in zip(NAMES, turned, strict=True)}
+    return found | {"gap": _touching.smallest_gap(model, state)}
+
+
+def expected(angle: float, friction: float, speed: float, t: float) -> tuple[float, float]:
+    """Way down a slope [rad], and that of the surface about the axis [m], at the time t of a cylinder with a speed at first."""
+    pull, brake = GRAVITY * np.sin(angle), GRAVITY * friction * np.cos(angle)
+    slides = min(t, speed / (3.0 * brake - pull)) if 3.0 * brake > pull else t
+    rolls, then = t - slides, 2.0 * brake * slides
+    rolled = then * rolls + pull / 3.0 * rolls**2
+    return (speed + 0.5 * (pull - brake) * slides) * slides + rolled, brake * slides**2 + rolled
+
+
+def check(result) -> list[ddg.Check]:
+    """Ways of the rods, and of their surfaces about their axes."""
+    scene = result.model.scene
+    checks = once_reached(result, scene.analysis.duration, WAYS, lambda: _checks(result, scene))
+    return checks + _touching.kept_apart(result)
+
+
+def _checks(result, scene) -> list[ddg.Check]:
+    normal, mu = np.array(scene.obstacles[0].shape.normal), scene.touching.friction
+    speed = np.linalg.norm(scene.initial(result.model).velocities().reshape(-1, 3), axis=-1).max()
+    given = {"rolls": (mu, 0.0), "bowled": (mu, speed), "slips": (scene.betweens[0].friction, 0.0)}
+    found = [expected(np.arctan2(normal[0], normal[2]), *given[name], result.times[-1]) for name in NAMES]
+    law = "m x'' = m g sin a - f, I omega' = f r, f = mu N while it slides"
+    last = {name: values[-1] for name, values in result.series.items()}
+    close = 0.01 * max(1.0, result.dt / 1e-3)
+    keys = [*NAMES, *(f"{name}, turned" for name in NAMES)]
+    ways = [way for way, _ in found] + [turned for _, turned in found]
+    return [
+        ddg.Check(name, last[key], way, min(ddg.Check.COARSEST, close), law, True)
+        for name, key, way in zip(WAYS, keys, ways, strict=True)
+    ]
+
+
+def benchmark() -> ddg.bench.Study:
+    """The way of the rod that was bowled over what contact, friction, steps and nodes are, one by one."""
+    grid = {"n": (5, 10, 20), "dt": (4e-3, 2e-3, 1e-3, 5e-4), "velocity": (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)}
+    grid |= {"stiffness": (2e3, 2e4, 2e5), "range": (2.5e-5, RANGE, 4e-4), "lags": (1, 2, 3)}
+    return ddg.bench.Study(grid, WAYS[1], one_by_one=True)
+
+
+picture = rod_on_floor.picture

@@ -1,0 +1,178 @@
+"""Friction that turns rods about their axes: closed forms of rolling, and the derivatives and blocks of its energy."""
+
+import numpy as np
+import pytest
+from friction_cases import ROLLING, each_form, hold_to_differences, rubbed
+from pair_cases import assembled, repeats
+
+import ddg_warp as ddg
+from ddg_warp import statics
+from ddg_warp.errors import SceneError
+
+RADIUS, G = 2e-3, 9.81
+STIFF = ddg.Material(young=1e7, density=1000.0, poisson=0.4)
+ALONG_Y = np.outer(np.linspace(-0.05, 0.05, 11), [0.0, 1.0, 0.0])
+
+
+def rod(scene, points, **options) -> int:
+    return scene.add_rod(points, section=ddg.Circle(RADIUS), material=STIFF, **options)
+
+
+def spin(model, state, rod: int = 0) -> np.ndarray:
+    """Rates of the angles of a rod [rad/s]."""
+    return state.net.v.numpy()[model.net.host.rods[rod].edges, 0]
+
+
+def run(model, steps: int, dt: float = 1e-3, state=None, **options):
+    integrator, state = ddg.Integrator(model, **options), state or model.state()
+    for _ in range(steps):
+        state = integrator.step(state, dt)
+    return state
+
+
+@pytest.mark.parametrize(("slope", "mu"), [(0.3, 0.5), (0.3, 0.2), (0.5, 0.1), (0.5, 0.15)])
+@pytest.mark.parametrize("mesh", [False, True])
+def test_down_a_slope(device, slope, mu, mesh):
+    """A cylinder, I = m r^2 / 2, rolls with 2/3 g sin while tan(slope) <= 3 mu; else it slides with g (sin - mu cos), and friction
+    turns it up by 2 mu g cos / r."""
+    normal, down = np.array([np.sin(slope), 0.0, np.cos(slope)]), np.array([np.cos(slope), 0.0, -np.sin(slope)])
+    scene = ddg.Scene()
+    rod(scene, ALONG_Y + 1.48 * RADIUS * normal)
+    corners = np.array([-0.3 * down + [0.0, -0.3, 0.0], 0.6 * down + [0.0, -0.3, 0.0], [0.0, 0.6, 0.0]])
+    scene.add_obstacle(ddg.Mesh(corners, [[0, 1, 2]]) if mesh else ddg.Plane(normal=tuple(normal)))
+    scene.contact(friction=mu, rolling=True)
+    model = scene.build(device)
+    state = run(model, 150)
+    speed, turning = (state.velocities() @ down).mean(), spin(model, state).mean()
+    rolls = np.tan(slope) <= 3.0 * mu
+    expected = 2.0 / 3.0 * G * np.sin(slope) if rolls else G * (np.sin(slope) - mu * np.cos(slope))
+    np.testing.assert_allclose(speed / state.time, expected, rtol=2e-3)
+    turned = speed / RADIUS if rolls else 2.0 * mu * G * np.cos(slope) / RADIUS * state.time
+    np.testing.assert_allclose(turning, turned, rtol=5e-3)
+
+
+@pytest.mark.parametrize("law", ["barrier", "penalty"])
+def test_what_slides_comes_to_roll(device, law):
+    """From v0 without spin, after v0 / (3 mu g), it rolls with 2/3 v0, whatever mu; friction has taken a third of its energy."""
+    mu, v0 = 0.2, 0.4
+    scene = ddg.Scene()
+    rod(scene, ALONG_Y + [0.0, 0.0, 1.48 * RADIUS])
+    scene.add_obstacle(ddg.Plane())
+    scene.contact(law=law, friction=mu, rolling=True)
+    model = scene.build(device)
+    start = model.state(velocities=np.tile([v0, 0.0, 0.0], (11, 1)))
+    dt, needed = 2.5e-4, v0 / (3.0 * mu * G)
+    middle = run(model, round(0.5 * needed / dt), dt, start)
+    state = run(model, round(needed / dt), dt, middle)
+    for each in (middle, state):  # what friction does to both keeps m v r + I omega
+        speed = np.average(each.velocities()[:, 0], weights=[0.5, *[1.0] * 9, 0.5])
+        np.testing.assert_allclose(speed + 0.5 * RADIUS * spin(model, each).mean(), v0, rtol=1e-4)
+    assert 0.7 * v0 < middle.velocities()[:, 0].mean() < 0.9 * v0
+    np.testing.assert_allclose(spin(model, state) * RADIUS, 2.0 / 3.0 * v0, rtol=5e-3)
+    energy = [model.energies(each)["kinetic"] for each in (start, state)]
+    np.testing.assert_allclose(energy[1] / energy[0], 2.0 / 3.0, rtol=1e-2)
+
+
+@pytest.mark.parametrize("quasistatic", [True, False])
+def test_a_roller_between_plates(device, quasistatic):
+    """It goes half as far as the upper plate, whose pull is none: rolling resists nothing."""
+    scene, far = ddg.Scene(gravity=(0.0, 0.0, 0.0)), 0.02
+    rod(scene, ALONG_Y)
+    motion = ddg.Motion(lambda t: (far * t, 0.0, 0.0))
+    scene.add_obstacle(ddg.Plane((0.0, 0.0, -1.3 * RADIUS)), name="lower")
+    scene.add_obstacle(ddg.Plane((0.0, 0.0, 1.3 * RADIUS), (0.0, 0.0, -1.0)), motion=motion, name="upper")
+    scene.contact(friction=0.3, velocity=1e-5, rolling=True)
+    model = scene.build(device, precision="float64")
+    state = statics.solve(model, load_steps=2) if quasistatic else run(model, 100, 1e-2)
+    np.testing.assert_allclose(state.points()[:, 0], 0.5 * far, rtol=1e-3)
+    turned = state.angles()[:10] - model.state().angles()[:10]
+    np.testing.assert_allclose(turned, 0.5 * far / RADIUS, rtol=1e-3)
+    pushed = model.contacts(state)
+    assert np.linalg.norm(pushed.friction, axis=1).max() < 0.02 * np.linalg.norm(pushed.force, axis=1).max()
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+def test_a_shaft_drives_what_lies_on_it(device, parallel):
+    """A rod that is turned takes another one across it along with omega r; one along it, which can not get away, turns as fast, the
+    other way round."""
+    omega, mu = 30.0, 0.3
+    scene = ddg.Scene(gravity=(0.0, 0.0, -G))
+    shaft = rod(scene, ALONG_Y, name="shaft")
+    turn = ddg.Motion(angle=lambda t: omega * t, axis=(0.0, 1.0, 0.0))
+    scene.clamp(shaft, edges=list(range(10)), motion=turn)
+    lying = ALONG_Y if parallel else ALONG_Y[:, [1, 0, 2]]
+    upper = rod(scene, lying + [0.0, 0.0, 2.48 * RADIUS], name="upper")
+    if parallel:
+        scene.fix(upper, range(11), "x")
+    scene.contact(friction=mu, rolling=True)
+    model = scene.build(device)
+    state = run(model, 60)
+    if parallel:
+        np.testing.assert_allclose(spin(model, state, upper), -omega, rtol=0.05)
+    else:
+        np.testing.assert_allclose(state.velocities()[11:, 0].mean(), omega * RADIUS, rtol=0.02)
+
+
+@each_form
+def test_forces_and_products_are_differences(device, form):
+    result, at, _, after = rubbed(ROLLING, device, form)
+    assert sum((part.factor.angles.numpy()[: int(part.count.numpy()[0])] >= 0).sum() for part in result.frictions) > 20
+    hold_to_differences(result, at, after)
+
+
+@each_form
+def test_blocks_are_those_of_the_matrix(device, form):
+    """Of what each rod has for itself: its nodes and angles with themselves, of neighbours, and of edges with their nodes."""
+    result, *_ = rubbed(ROLLING, device, form)
+    n, shapes = len(result.forces), result.search.shapes
+    matrix, diagonal = assembled(result, n).transpose(0, 2, 1, 3), result.diagonal.numpy()
+    largest = np.abs(matrix).max(axis=(0, 1, 2, 3))
+    flat = matrix.transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)
+    assert np.abs(flat - flat.T).max() < 1e-14 * largest
+    assert np.linalg.eigvalsh(flat).min() > -1e-13 * largest
+    result.join()
+    first, second, ahead = (array.numpy() for array in result.turned)
+    (nodes, *_), angles = shapes.things(2), shapes.angles(2)[:, 0]
+    rolling = np.flatnonzero(angles >= 0)
+    assert np.abs(first).max() > 1e-3 * largest and np.abs(ahead).max() > 1e-7 * largest
+    own = np.arange(n)
+    assert np.abs(diagonal[angles[rolling]] - matrix[own, own][angles[rolling]]).max() < 1e-13 * largest
+    for e in rolling:
+        # neighbouring edges of a rod are no pair of one edge: rows of two rods alone have both
+        assert np.abs(first[e] - matrix[angles[e], nodes[e, 0], 0]).max() < 1e-13 * largest
+        assert np.abs(second[e] - matrix[angles[e], nodes[e, 1], 0]).max() < 1e-13 * largest
+        if e + 1 in rolling and nodes[e + 1, 0] == nodes[e, 1]:
+            assert abs(ahead[e] - matrix[angles[e], angles[e + 1], 0, 0]) < 1e-13 * largest
+
+
+def test_two_runs_and_worlds_agree_to_the_bit(device):
+    repeats(lambda: [rubbed(ROLLING, device)[0].forces.numpy().copy()])
+    scene = ddg.Scene()
+    rod(scene, ALONG_Y + [0.0, 0.0, 5.0 * RADIUS])
+    rod(scene, 0.6 * ALONG_Y[:, [1, 0, 2]] + [0.0, 0.0, 8.0 * RADIUS])
+    scene.add_obstacle(ddg.Plane((0.0, 0.0, 0.0), (0.2, 0.1, 1.0)))
+    scene.contact(friction=0.3, rolling=True)
+    model = scene.build(device, worlds=2)
+    one, other = (run(model, 80) for _ in range(2))
+    assert np.abs(spin(model, one)).max() > 1.0
+    np.testing.assert_array_equal(one.points(), other.points())
+    np.testing.assert_array_equal(one.points()[0], one.points()[1])
+
+
+def test_where_nothing_can_roll_it_is_refused(device):
+    def scene(**options):
+        made = ddg.Scene()
+        made.add_rod(ALONG_Y, section=ddg.Circle(RADIUS), material=STIFF, **options)
+        made.add_obstacle(ddg.Plane((0.0, 0.0, -0.01)))
+        return made
+
+    without = scene(twist=False)
+    without.contact(friction=0.3, rolling=True)
+    with pytest.raises(SceneError, match=r"rolling, and rod 0 \('rod'\) has no twist"):
+        without.build(device)
+    smooth = scene()
+    smooth.contact(rolling=True)
+    with pytest.raises(SceneError, match="rolling, and there is no friction; leave rolling out"):
+        smooth.build(device)
+    with pytest.raises(SceneError, match="contact: rolling"):
+        scene().contact(friction=0.3, rolling=2)
