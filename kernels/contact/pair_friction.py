@@ -116,18 +116,15 @@ def rolling_functions(kind: Kind, real):
 
     @wp.func
     def levers(one: V, two: V, n: V, r: A, angles: wp.vec2i):
-        a, b, t = r[0] * real(1.0), r[0] * real(1.0), wp.normalize(one)
-        u = t
+        t, share = wp.normalize(one), real(1.0)
+        u, other = t, r[0]
         if wp.static(kind == EDGES):
-            b = r[1] * real(1.0)
             u = wp.normalize(two)
-        elif angles[0] >= 0 and angles[1] >= 0:
-            a *= real(0.5)
-            b *= real(0.5)
-        if angles[0] < 0:
-            a *= real(0.0)
-        if angles[1] < 0:
-            b *= real(0.0)
+            other = r[1]
+        else:
+            share = wp.where(wp.min(angles[0], angles[1]) >= 0, real(0.5), real(1.0))
+        a = wp.where(angles[0] >= 0, r[0] * share, real(0.0))
+        b = wp.where(angles[1] >= 0, other * share, real(0.0))
         return wp.matrix_from_rows(wp.cross(t, n) * a, wp.cross(u, n) * b)
 
     return angles_of, radii, levers
