@@ -131,13 +131,13 @@ def _touch(scene: Scene, law: str, **options) -> None:
     scene.contact(law=law, range=0.02, stiffness=5.0, friction=0.3, velocity=0.5, **options)
 
 
-def _crossing(scene: Scene, material: Material) -> None:
+def _crossing(scene: Scene, material: Material, motion: Grip | None = None, **options) -> None:
     """Rods that cross, one of them held, with friction that is lagged twice in a step."""
     rods = [scene.add_rod(CURVE, section=Circle(0.004), material=material, name="lower")]
     points = CURVE[3] + np.stack([0.1 * T - 0.05, 0.3 * T - 0.15, 0.014 + 0.03 * (T - 0.5) ** 2], axis=1)
     rods.append(scene.add_rod(points, section=Circle(0.003), material=material, name="upper"))
-    scene.clamp(rods[0], edges=[0, -1])
-    _touch(scene, "barrier", lags=2)
+    scene.clamp(rods[0], edges=[0, -1], motion=motion)
+    _touch(scene, "barrier", lags=2, **options)
 
 
 def _on_ball(scene: Scene, material: Material) -> None:
@@ -221,6 +221,7 @@ OBJECTS: dict[str, tuple[int, Callable]] = {
         _sheet("midedge_dof", lambda s, k, first: s.clamp_boundary(k, first, motion=SWING)),
     ),
     "rods in contact": (3, _crossing),
+    "gripped rod that rolls another": (3, lambda s, m: _crossing(s, m, Grip(), rolling=True)),
     "rod on a gripped ball": (3, _on_ball),
     "held rod on a gripped ball": (3, _rod(section=Circle(0.004), hold=_held_on_ball)),
     "shell on a plane": (3, _sheet("midedge_dof", more=_over_plane)),

@@ -24,11 +24,16 @@ FAST = (
     ("shell clamped in a motion", "implicit_midpoint"),
     ("magnetised rod without twist", "implicit_midpoint"),
     ("rod with drag", "implicit_euler"),
-    *((name, "implicit_euler") for name in ("rods in contact", "shell on a plane")),
+    *((name, "implicit_euler") for name in ("rods in contact", "gripped rod that rolls another", "shell on a plane")),
     ("held rod on a gripped ball", "statics"),
     *(("rod on a gripped ball", analysis) for analysis in ("implicit_euler", "implicit_midpoint", "statics")),
 )
-RUBBING = ("rods in contact", "rod on a gripped ball", "shell on a plane")  # which have steps of implicit Euler alone
+RUBBING = (
+    "rods in contact",
+    "gripped rod that rolls another",
+    "rod on a gripped ball",
+    "shell on a plane",
+)  # which have steps of implicit Euler alone
 IN_CONTACT = (*RUBBING, "held rod on a gripped ball")  # which the midpoint rule refuses
 WORDS = ("no gradient goes", "does not differentiate", "serves statics and spectra")  # of which refusals have one
 
