@@ -2,8 +2,8 @@
 
 Coulomb's law: at the angle a a rod rests where tan(a) < mu. Else it slides with the acceleration g (sin a - mu cos a); thrown at the
 speed v it stops after v^2 / (2 g (mu cos a - sin a)). Friction that is regularised lets what rests creep: the logistic law carries
-tan(a) / mu of mu N at the speed nu atanh(tan(a) / mu) / 7.5, and no faster, however long it rests. Friction acts on the middle line
-of a rod, which therefore slides and never rolls.
+tan(a) / mu of mu N at the speed nu atanh(tan(a) / mu) / 7.5, and no faster, however long it rests. Friction acts here on the middle
+line of a rod, which slides and never rolls; see `rolling_rods`.
 """
 
 import numpy as np
