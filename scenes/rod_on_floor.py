@@ -157,7 +157,8 @@ def picture(result, frames) -> dict:
     down, across = np.array([plane.normal[2], 0.0, -plane.normal[0]]), np.array([0.0, 1.0, 0.0])
     low, high = (f([f(shape @ down) for shape in frames.values()]) for f in (np.min, np.max))
     corners, cells = meshes.rectangle(1, 1)
-    x, y = low + (high - low) * corners[:, :1], LANE * (3.0 * corners[:, 1:2] - 0.5)
+    left, right = np.min(points[:, 1]) - 0.5 * LANE, np.max(points[:, 1]) + 0.5 * LANE
+    x, y = low + (high - low) * corners[:, :1], left + (right - left) * corners[:, 1:2]
     floor = x * down + y * across
     return {
         "points_by_time": frames,
