@@ -72,7 +72,10 @@ def test_moved_obstacles_take_along_what_is_in_their_way(device, shape):
 ROUND = {
     "sphere": SHAPES["sphere"],
     "capsule": SHAPES["capsule"],
-    "mesh": ddg.Mesh([[-1e-4, -0.1, -0.05], [1e-4, -0.1, -0.05], [0.0, 0.1, -0.05]], [[0, 1, 2]], radius=0.05),
+    # its first point is of no triangle
+    "mesh": ddg.Mesh(
+        [[1.0, 0, 0], [-1e-4, -0.1, -0.05], [1e-4, -0.1, -0.05], [0, 0.1, -0.05]], [[1, 2, 3]], radius=0.05
+    ),
 }
 
 

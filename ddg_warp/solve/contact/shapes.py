@@ -131,24 +131,22 @@ class Shapes:
             raise SceneError(f"{name}: it takes three nodes, the second and the third 1 m from the first")
         return self._add(name, 0.0, {PLANES: nodes[None]}, np.zeros((0, 4)), still=True)
 
-    def spin(self, number: int, markers) -> None:
-        """The surface of an object that is still turns as nodes do, its markers (3,) about its first one; see `kernels.contact.spins`.
+    def spin(self, number: int, nodes) -> None:
+        """The surface of an object that is still turns as nodes do, markers (3,) about a first one; see `kernels.contact.spins`.
 
         Raises:
             SceneError: it is not still, or markers are not at right angles about the first node, each as far from it as the others.
         """
-        name = self.names[number]
-        markers = self._checked(markers, 1, name)
-        if number not in self.obstacle or len(markers) != MARKERS:
-            raise SceneError(f"{name} spins: that is of an obstacle, and told by {MARKERS} nodes, not {len(markers)}")
-        first = next(nodes[0, 0] for part in self._parts.values() for nodes, _, own, _ in part if own == number)
-        arms = self.points[markers] - self.points[first]
+        name, nodes = self.names[number], self._checked(nodes, 1, self.names[number])
+        if number not in self.obstacle or len(nodes) != 1 + MARKERS:
+            raise SceneError(f"{name} spins: that is of an obstacle, and told by {1 + MARKERS} nodes, not {len(nodes)}")
+        arms = self.points[nodes[1:]] - self.points[nodes[0]]
         square = arms @ arms.T
         if not np.allclose(square, square[0, 0] * np.eye(MARKERS), atol=1e-9 * square[0, 0]) or square[0, 0] <= 0.0:
             raise SceneError(
-                f"{name} spins: markers are at right angles about its node {first}, as far from it as each other"
+                f"{name} spins: markers are at right angles about node {nodes[0]}, as far from it as each other"
             )
-        self.spinning[number] = np.append(first, markers)
+        self.spinning[number] = nodes
 
     def ignore(self, first: int, second: int) -> None:
         """Two objects pass through each other; an object and itself: it has no contact with itself.

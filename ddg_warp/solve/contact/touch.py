@@ -182,7 +182,7 @@ def shapes_of(host) -> Shapes:
             angles = body.angles if body.angles.size else None
             number = shapes.rod(body.nodes, body.radius, closed=body.closed, apart=apart, angles=angles, **given_too)
         if body.markers.size:
-            shapes.spin(number, body.markers)
+            shapes.spin(number, np.append(body.nodes[0], body.markers))
     for g, h in given.ignored:
         for one in np.flatnonzero(given.group == g):
             for other in np.flatnonzero(given.group == h):
