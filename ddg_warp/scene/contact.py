@@ -87,8 +87,8 @@ class Contacts:
             friction_law: "logistic" or "polynomial": how friction grows with the speed.
             velocity: the speed nu from which on all of the friction acts, nearly [m/s]: what sticks creeps by less.
             lags: how often in a step friction takes the normal forces and directions anew.
-            rolling: whether friction acts on the surfaces of rods and turns them about their axes, so that they roll. Else it acts
-                between their middle lines.
+            rolling: whether friction acts on the surfaces of rods, of the capsules that they are here, and turns them about their axes,
+                so that they roll. Else it acts between their middle lines.
             apart: edges of a rod with less than this between them along it are no pair [m]; by default pi times its radius.
             radius: by name of objects, instead of those of their sections, or half thicknesses [m].
             objects: names of the rods and shells that touch; by default all. Obstacles always do.
