@@ -93,8 +93,8 @@ def test_a_roller_between_plates(device, quasistatic):
 
 @pytest.mark.parametrize("parallel", [False, True])
 def test_a_shaft_drives_what_lies_on_it(device, parallel):
-    """A rod that is turned takes another one across it along with omega r; one along it, which can not get away, turns as fast, the
-    other way round."""
+    """A rod that is turned, by mu N r while it slips, takes another one across it along with omega r; one along it, which can not get
+    away, turns as fast, the other way round."""
     omega, mu = 30.0, 0.3
     scene = ddg.Scene(gravity=(0.0, 0.0, -G))
     shaft = rod(scene, ALONG_Y, name="shaft")
@@ -106,7 +106,11 @@ def test_a_shaft_drives_what_lies_on_it(device, parallel):
         scene.fix(upper, range(11), "x")
     scene.contact(friction=mu, rolling=True)
     model = scene.build(device)
-    state = run(model, 60)
+    state = run(model, 5)
+    pushed = np.linalg.norm(model.contacts(state).force.sum(0))
+    moment = model.reactions(state, point=(0.0, 0.0, 0.0))[0].moment
+    np.testing.assert_allclose(moment[1], mu * pushed * RADIUS, rtol=1e-2)
+    state = run(model, 55, state=state)
     if parallel:
         np.testing.assert_allclose(spin(model, state, upper), -omega, rtol=0.05)
     else:
