@@ -134,34 +134,15 @@ class ContactAdjoint:
             self._add_up(self._items[i], part, part.gradient, by_q)
             self._sum(i, self._items[i], part)
             if rub:
-                items = self._rub_items[i]
-                items.list(rub.count, rub.factor)
-                read = [
-                    rub.pairs,
-                    rub.count,
-                    part.found.sides,
-                    terms.law,
-                    rub.factor.nodes,
-                    rub.factor.angles,
-                    rub.factor.used,
-                ]
+                items, factor = self._rub_items[i], rub.factor
+                items.list(rub.count, factor)
+                read = [rub.pairs, rub.count, part.found.sides, terms.law, factor.nodes, factor.angles, factor.used]
                 inputs = [*read, lagged, before, q, w, self._velocity, rate, *rub.directions]
                 inputs += [terms.spins.places, terms.spins.turned.flatten()]
-                written = [
-                    rub.gradient,
-                    self._start_parts,
-                    self._lagged_parts,
-                    self._numbers,
-                    self._by_direction,
-                    self._spun,
-                    self._radii,
-                ]
-                self._take_turns(self._rub[i], pairs, inputs, written)
-                for found, by_found in (
-                    (rub.gradient, by_q),
-                    (self._start_parts, by_before),
-                    (self._lagged_parts, by_lagged),
-                ):
+                written = [rub.gradient, self._start_parts, self._lagged_parts]
+                more = [self._numbers, self._by_direction, self._spun, self._radii]
+                self._take_turns(self._rub[i], pairs, inputs, [*written, *more])
+                for found, by_found in zip(written, (by_q, by_before, by_lagged), strict=True):
                     self._add_up(items, rub, found, by_found)
                 self._sum(i, items, rub)
                 self._lead(i, rub, by_lagged)
