@@ -54,12 +54,9 @@ def build(
         duration: of the run [s]
         seed: of a jitter of where rods start; none below 0
     """
-    a = np.radians(angle)
-    if not 0.0 < a < 0.5 * np.pi:
-        raise ValueError(f"angle = {angle}; a slope is between 0 and 90 degrees")
-    if not slippery < np.tan(a) < friction:
-        raise ValueError(f"friction = {friction}; tan(angle) = {np.tan(a):.3g} is between it and slippery = {slippery}")
-    down, normal = np.array([np.cos(a), 0.0, -np.sin(a)]), np.array([np.sin(a), 0.0, np.cos(a)])
+    down, normal, steep = slope(angle)
+    if not slippery < steep < friction:
+        raise ValueError(f"friction = {friction}; tan(angle) = {steep:.3g} is between it and slippery = {slippery}")
     scene = ddg.Scene(
         gravity=(0.0, 0.0, -GRAVITY),
         analysis=ddg.Dynamics(dt=dt, duration=duration),
@@ -83,24 +80,37 @@ def build(
     return scene
 
 
-def thrown(model, velocity: np.ndarray):
+def slope(angle: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Directions down a slope that falls towards x, and out of it, and the tangent of its angle [degrees]."""
+    a = np.radians(angle)
+    if not 0.0 < a < 0.5 * np.pi:
+        raise ValueError(f"angle = {angle}; a slope is between 0 and 90 degrees")
+    return np.array([np.cos(a), 0.0, -np.sin(a)]), np.array([np.sin(a), 0.0, np.cos(a)]), float(np.tan(a))
+
+
+def thrown(model, velocity: np.ndarray, name: str = "thrown"):
     """The rods at rest but for the one that is thrown."""
-    velocities = np.zeros((len(NAMES), len(model.scene.batches[0].points[0]), 3))
-    velocities[NAMES.index("thrown")] = velocity
+    batches = model.scene.batches
+    velocities = np.zeros((len(batches), len(batches[0].points[0]), 3))
+    velocities[[batch.name for batch in batches].index(name)] = velocity
     return model.state(velocities=velocities.reshape(-1, 3))
+
+
+def ways(model, state) -> dict[str, float]:
+    """How far down the slope each rod is [m], by name."""
+    batches, normal = model.scene.batches, np.array(model.scene.obstacles[0].shape.normal)
+    start = np.array([batch.points[0].mean(0) for batch in batches])
+    middles = state.points().reshape(-1, len(batches), *batches[0].points.shape[1:])[0].mean(1)
+    moved = (middles - start) @ np.array([normal[2], 0.0, -normal[0]])
+    return dict(zip((batch.name for batch in batches), moved, strict=True))
 
 
 def observe(model, state) -> dict[str, float]:
     """How far down the slope each rod is [m], the smallest gap [m], and what the plane carries over the weight that lies on it."""
     normal = np.array(model.scene.obstacles[0].shape.normal)
-    down = np.array([normal[2], 0.0, -normal[0]])
-    batches = model.scene.batches
-    start = np.array([batch.points[0].mean(0) for batch in batches])
-    middles = state.points().reshape(-1, len(batches), *batches[0].points.shape[1:])[0].mean(1)
-    weight = sum(batch.section.mass_per_length for batch in batches) * LENGTH * GRAVITY * normal[2]
+    weight = sum(batch.section.mass_per_length for batch in model.scene.batches) * LENGTH * GRAVITY * normal[2]
     carried = np.reshape(model.reactions(state)[-1].force, (-1, 3))[0] @ normal
-    moved = dict(zip(NAMES, (middles - start) @ down, strict=True))
-    return moved | {"gap": _touching.smallest_gap(model, state), "carried": float(carried / weight)}
+    return ways(model, state) | {"gap": _touching.smallest_gap(model, state), "carried": float(carried / weight)}
 
 
 def check(result) -> list[ddg.Check]:

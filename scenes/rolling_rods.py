@@ -52,18 +52,15 @@ def build(
         duration: of the run [s]
         seed: of a jitter of where rods start; none below 0
     """
-    a = np.radians(angle)
-    if not 0.0 < a < 0.5 * np.pi:
-        raise ValueError(f"angle = {angle}; a slope is between 0 and 90 degrees")
-    if not 3.0 * slippery < np.tan(a) < 3.0 * friction:
+    down, normal, steep = rod_on_floor.slope(angle)
+    if not 3.0 * slippery < steep < 3.0 * friction:
         raise ValueError(
-            f"friction = {friction}, slippery = {slippery}; a third of tan(angle) = {np.tan(a):.3g} is between them"
+            f"friction = {friction}, slippery = {slippery}; a third of tan(angle) = {steep:.3g} is between them"
         )
-    down, normal = np.array([np.cos(a), 0.0, -np.sin(a)]), np.array([np.sin(a), 0.0, np.cos(a)])
     scene = ddg.Scene(
         gravity=(0.0, 0.0, -GRAVITY),
         analysis=ddg.Dynamics(dt=dt, duration=duration),
-        initial=lambda model: bowled(model, speed * down),
+        initial=lambda model: rod_on_floor.thrown(model, speed * down, "bowled"),
     )
     jitter = _touching.jitter((len(NAMES), 2), seed)
     along = np.outer(np.linspace(-0.5, 0.5, n + 1) * LENGTH, [0.0, 1.0, 0.0])
@@ -81,23 +78,11 @@ def build(
     return scene
 
 
-def bowled(model, velocity: np.ndarray):
-    """The rods at rest but for the one that is bowled, without spin."""
-    velocities = np.zeros((len(NAMES), len(model.scene.batches[0].points[0]), 3))
-    velocities[NAMES.index("bowled")] = velocity
-    return model.state(velocities=velocities.reshape(-1, 3))
-
-
 def observe(model, state) -> dict[str, float]:
     """How far down the slope each rod is [m], how far its surface has turned [m], and the smallest gap [m]."""
-    batches, normal = model.scene.batches, np.array(model.scene.obstacles[0].shape.normal)
-    down = np.array([normal[2], 0.0, -normal[0]])
-    start = np.array([batch.points[0].mean(0) for batch in batches])
-    middles = state.points().reshape(-1, len(batches), *batches[0].points.shape[1:])[0].mean(1)
-    turned = (
-        (state.angles() - model.state().angles()).reshape(-1, len(batches), len(batches[0].points[0]) - 1)[0].mean(1)
-    )
-    found = dict(zip(NAMES, (middles - start) @ down, strict=True))
+    edges = len(model.scene.batches[0].points[0]) - 1
+    turned = (state.angles() - model.state().angles()).reshape(-1, len(NAMES), edges)[0].mean(1)
+    found = rod_on_floor.ways(model, state)
     found |= {f"{name}, turned": RADIUS * value for name, value in zip(NAMES, turned, strict=True)}
     return found | {"gap": _touching.smallest_gap(model, state)}
 

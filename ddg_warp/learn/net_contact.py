@@ -83,12 +83,8 @@ class ContactAdjoint:
         return [
             *own,
             *(k for pair in self._sides for k in pair),
-            *(k for items in self._every_items for k in items.kernels),
+            *(k for items in {*self._items, *self._rub_items} for k in items.kernels),
         ]
-
-    @property
-    def _every_items(self) -> list[NodeItems]:
-        return [*self._items, *(items for items in self._rub_items if items not in self._items)]
 
     @property
     def by_rate(self) -> wp.array:
@@ -111,9 +107,8 @@ class ContactAdjoint:
         self._radii = self._zeros(ROLLED, most if any(self._rolls) else 1)
         self._start_parts, self._lagged_parts = (arrays.allocate(shape, vector, device) for _ in range(2))
         self._by_direction = wp.zeros(most if self._direct else 1, dtype=vector, device=self.net.device)
-        for made in (self._items, self._rub_items):
-            for items, pairs in zip(made, lists, strict=True):
-                items.reserve(pairs.capacity)
+        for items, pairs in {*zip(self._items, lists, strict=True), *zip(self._rub_items, lists, strict=True)}:
+            items.reserve(pairs.capacity)
 
     def pull(self, at: tuple, w: wp.array, rate: wp.array, by: tuple) -> None:
         """After `find` of `system` with the same, add to derivatives by blocks, and to the others.

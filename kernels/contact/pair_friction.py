@@ -217,9 +217,10 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: boo
             # what is no number shows in the energy
             if not (mu * normal <= real(0.0)):
                 n = push / normal
-                if wp.static(directed):
+                if wp.static(directed or rolls):
                     first = w * sides.first.nodes_a_world
                     d = x[beside[i][1] + first] - x[beside[i][0] + first]
+                if wp.static(directed):
                     t1, t2, back = along_rod(n, d, ways[a, b])
                     lagged.tangent[2, p] = back
                 else:
@@ -228,10 +229,8 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: boo
                 for slot in range(wp.static(size)):
                     weight[slot] = wp.dot(gradient[slot, p], n) / normal
                 if wp.static(rolls):
-                    first = w * sides.first.nodes_a_world
-                    one = x[beside[i][1] + first] - x[beside[i][0] + first]
                     two = x[contact.nodes[p][3]] - x[contact.nodes[p][2]]
-                    lever = levers(one, two, n, radii(sides, w, i, j), factor.angles[p])
+                    lever = levers(d, two, n, radii(sides, w, i, j), factor.angles[p])
                     lagged.lever[0, p] = lever[0]
                     lagged.lever[1, p] = lever[1]
                 if wp.static(spins):

@@ -39,7 +39,7 @@ def meeting_type(real, linear):
 def given_type(real, drag: bool):
     """What the balance of blocks reads beside the elements.
 
-    In contact nodes have forces `push`, and bounds `pressed` on the stiffness of what pushes them. `allowed` is what the residual
+    In contact blocks have forces `push`, and bounds `pressed` on the stiffness of what pushes them. `allowed` is what the residual
     of a block may be at rtol = 1, over `load_scale`; see `ddg_warp.compile.tolerance`. Moments are compared over the length `arm`.
     What rounding leaves of an edge vector follows from the coordinates of both its ends, `longest` apart at most.
     """

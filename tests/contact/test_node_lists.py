@@ -7,6 +7,7 @@ from pair_cases import move, state, terms, times
 
 from ddg_warp import arrays
 from ddg_warp.kernels.contact import gather
+from ddg_warp.kernels.contact.node_items import list_kernels
 from ddg_warp.kernels.contact.surfaces import EDGES, POINT_TRIANGLE, Kind
 from ddg_warp.solve.contact.shapes import Shapes
 
@@ -76,7 +77,7 @@ def test_items_in_any_order_are_sorted(device, kind):
     inputs[2:2] = none, wp.zeros(4000, dtype=wp.uint8, device=device)
     ordered = wp.zeros(len(items), dtype=int, device=device)
     ranks = wp.zeros(count, dtype=wp.vec4i, device=device)
-    *_, sort = gather.list_kernels(kind, False)
+    *_, sort = list_kernels(kind, False)
     wp.launch(sort, count, [count, *inputs], [ordered, ranks, none], device=device)
     assert (ordered.numpy() == wanted).all()
     assert (wanted[ranks.numpy()[:, :size]].ravel() == items).all()

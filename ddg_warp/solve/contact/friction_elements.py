@@ -102,10 +102,8 @@ class FrictionElements(PairElements):
 
     def couples(self) -> np.ndarray:
         """What pairs turn objects that spin by (worlds, objects, 3) [N m], as evaluated last. Reads from the device."""
-        count = int(self.count.numpy()[0])
-        used = np.flatnonzero((self.factor.used.numpy()[:count] != 0) & (self.lagged.spinning.numpy()[:count] >= 0))
-        pushed = self.gradient.numpy()[: self.found.kind.first, used].sum(0)
-        worlds, objects = self._spins.turned.shape
+        used, forces = self.forces()
+        of, (worlds, objects) = self.lagged.spinning.numpy()[used], self._spins.turned.shape
         found = np.zeros((worlds * objects, 3))
-        np.add.at(found, self.lagged.spinning.numpy()[used], -np.cross(self.lagged.arm.numpy()[used], pushed))
+        np.add.at(found, of[of >= 0], np.cross(self.lagged.arm.numpy()[used], forces)[of >= 0])
         return found.reshape(worlds, objects, 3)

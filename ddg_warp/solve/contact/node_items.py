@@ -1,9 +1,10 @@
-"""Which pairs each node is in; see `kernels.contact.gather`."""
+"""Which pairs each node is in; see `kernels.contact.node_items`."""
 
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.contact import gather
+from ddg_warp.kernels.contact.gather import ANGLES
+from ddg_warp.kernels.contact.node_items import list_kernels
 from ddg_warp.kernels.contact.surfaces import Kind
 from ddg_warp.solve.contact.pairs import RunningSums
 
@@ -22,12 +23,12 @@ class NodeItems:
 
     def __init__(self, kind: Kind, nodes: int, silent: wp.array, rolls: bool = False):
         self.device, self._size, self._silent = silent.device, kind.first + kind.second, silent
-        self._angles = gather.ANGLES if rolls else 0
+        self._angles = ANGLES if rolls else 0
         self._both = wp.zeros((2, nodes), dtype=int, device=self.device)  # zeroed at once
         self.numbers, self._filled = self._both[0], self._both[1]
         self._running = RunningSums(self.numbers)
         self.places = self._running.starts
-        self._number, self._fill, self._sort = gather.list_kernels(kind, arrays.serial(self.device), rolls)
+        self._number, self._fill, self._sort = list_kernels(kind, arrays.serial(self.device), rolls)
         self.kernels = [self._number, self._fill, self._sort, *self._running.kernels]
 
     def reserve(self, capacity: int) -> None:

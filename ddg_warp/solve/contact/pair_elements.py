@@ -1,5 +1,6 @@
 """Elements on pairs: memory of their factors, and what nodes and worlds get of them; see `kernels.contact.gather`."""
 
+import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
@@ -66,6 +67,11 @@ class PairElements:
         self.items, self.ranks, self.angle_ranks = self._items.items, self._items.ranks, self._items.angle_ranks
         self.idle = wp.zeros(capacity, dtype=wp.uint8, device=self.device)
         self.placed = wp.zeros(len(self.items), dtype=vector, device=self.device)
+
+    def forces(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs that bring anything (n,), and forces on their first things (n, 3) [N]. Reads from the device."""
+        used = np.flatnonzero(self.factor.used.numpy()[: int(self.count.numpy()[0])])
+        return used, -self.gradient.numpy()[: self.found.kind.first, used].sum(0)
 
     def _take_turns(self, kernel, count: int, inputs: list, outputs: list) -> None:
         arrays.take_turns(kernel, count, inputs, outputs, self.device)

@@ -38,9 +38,10 @@ class Spins:
 
     def forces(self, x: wp.array, frictions: list) -> np.ndarray:
         """Forces on nodes (W N, 3) [N] at x that have the couples of `FrictionElements` as evaluated last. Reads from the device."""
-        at, out = x.numpy().astype(float), np.zeros((len(x), 3))
+        out = np.zeros((len(x), 3))
         if not self.any:
             return out
+        at = x.numpy().astype(float)
         couples = sum(part.couples() for part in frictions)
         for number, nodes in self._spinning.items():
             for world, couple in enumerate(couples[:, number]):

@@ -88,7 +88,7 @@ class Touch:
     def slides(self) -> bool:
         """After `friction`, whether it is all there somewhere, as it is of what does not stick."""
         for part in self.terms.frictions:
-            used, forces = _forces(part)
+            used, forces = part.forces()
             if (np.linalg.norm(forces, axis=1) > SLIDING * part.lagged.bound.numpy()[used]).any():
                 return True
         return False
@@ -146,18 +146,12 @@ class Touch:
         return float(found["gap"][k]), f"{one} and {other}{world}"
 
 
-def _forces(part) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of `PairElements` that bring anything (n,), and forces on their first things (n, 3) [N]."""
-    used = np.flatnonzero(part.factor.used.numpy()[: int(part.count.numpy()[0])])
-    return used, -part.gradient.numpy()[: part.found.kind.first, used].sum(0)
-
-
 def _of_first(part, pairs) -> np.ndarray:
     """Forces of `PairElements` on the first things of candidates (count, 3) [N], none where `part` is None."""
     count = int(pairs.count.numpy()[0])
     forces, own = np.zeros((count, 3)), 0 if part is None else int(part.count.numpy()[0])
     if own:
-        used, found = _forces(part)
+        used, found = part.forces()
         every, those = (
             of.pairs.numpy()[:number].astype(np.int64) @ [pairs.second.all, 1]
             for of, number in ((pairs, count), (part, own))

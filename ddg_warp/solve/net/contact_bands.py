@@ -17,9 +17,8 @@ class ContactBands:
     def __init__(self, chains, shapes):
         self.chains, self._edges = chains, len(shapes.things(2)[0])
         ahead = _edges_ahead(shapes, chains.plan, chains.net.blocks)
-        turning = _turning(shapes, chains.plan)
-        self._rolls = bool((turning >= 0).any())
-        self._stiffen = stiffen_kernel(chains.plan.twist, chains.bands.dtype, self._rolls)
+        turning = _turning(shapes, chains.plan, chains.net.blocks)
+        self._stiffen = stiffen_kernel(chains.plan.twist, chains.bands.dtype, bool((turning >= 0).any()))
         self.kernels = [self._stiffen]
         self._ahead, self._turning = (arrays.upload(of, int, chains.device) for of in (ahead, turning))
 
@@ -33,19 +32,12 @@ class ContactBands:
         wp.launch(self._stiffen, dim, inputs, [chains.eliminated], device=chains.device)
 
 
-def _turning(shapes, plan) -> np.ndarray:
-    """The contact edge that has the angle of each place of the chains, if friction may turn it, -1 for none.
-
-    It is the one ahead of the place, if its nodes are among the chain.
-    """
-    edge = np.full(plan.places[0].shape, -1, np.int32)
-    angles = shapes.angles(2)[:, 0]
-    if plan.twist and (angles >= 0).any():
-        turned = np.flatnonzero(angles >= 0)
-        turned = turned[np.argsort(angles[turned])]
-        at = np.minimum(np.searchsorted(angles[turned], plan.places[1]), len(turned) - 1)
-        edge = np.where(angles[turned][at] == plan.places[1], turned[at], -1).astype(np.int32)
-    return edge
+def _turning(shapes, plan, blocks: int) -> np.ndarray:
+    """The contact edge that has the angle of each place of the chains, if friction may turn it, -1 for none."""
+    edge, angles = np.full(blocks + 1, -1, np.int32), shapes.angles(2)[:, 0]  # the last one is that of no angle
+    rolling = np.flatnonzero(angles >= 0)
+    edge[angles[rolling]] = rolling
+    return edge[plan.places[1]] if plan.twist else np.full(plan.places[0].shape, -1, np.int32)
 
 
 def _edges_ahead(shapes, plan, blocks: int) -> np.ndarray:
