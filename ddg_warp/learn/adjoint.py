@@ -14,11 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
-from ddg_warp.errors import SolverError
+from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.learn.chains import ChainAdjoint, Kept
 from ddg_warp.learn.net import NetAdjoint, NetKept
 from ddg_warp.model import validate
 from ddg_warp.model.controls import Controls, checked
+from ddg_warp.model.net import NetState
 from ddg_warp.model.state import State
 from ddg_warp.threads import launches
 
@@ -138,9 +139,15 @@ class Adjoint:
 class EquilibriumAdjoint:
     """Gradients of equilibria, stable or not, by what their balance reads; points of a path at their load parameter.
 
+    With friction an equilibrium depends on the one before, too, from which slips count: on the way there its gradient is the sum of
+    those of all on it, each of derivatives `by_before` of the next.
+
     Args:
         model: whose equilibria they are.
         posed: whether they are given poses of grips, by which `Poses` of `ddg_warp.learn.poses` has derivatives then.
+
+    Attributes:
+        by_before: derivatives by the equilibrium before the last one that was pulled, a `State`; None without friction.
 
     Raises:
         SceneError: the model has something that no gradient goes through; names it.
@@ -150,6 +157,7 @@ class EquilibriumAdjoint:
         self.model = model
         self.chains = [ChainAdjoint(model, group, None, posed) for group in model.groups]
         self.net = NetAdjoint(model, None, posed) if model.net is not None else None
+        self.by_before = None
 
     @property
     def parts(self) -> list:
@@ -166,6 +174,7 @@ class EquilibriumAdjoint:
 
         Raises:
             SolverError: the tangent of the equilibrium is singular (a limit point, a bifurcation).
+            SceneError: there is friction, and the state does not know the way to it (`State.sliding`).
         """
         validate.check_state("pull", self.model, state)
         validate.check_state("pull", self.model, given)
@@ -180,15 +189,36 @@ class EquilibriumAdjoint:
             inputs += _copied(self.model.empty_state(), [own.pull(kept, at, by, np.inf, (state, state))[1]])[1]
         if self.net:
             kept = NetKept(state.net, state.net, None, time=state.time)
+            if self.rubs:
+                kept = replace(kept, before=self._before(state), rubbing=1.0 / state.sliding.increment)
             asked = kept, state.net, given.net, np.inf, (state, state)
-            read = self.net.pull(*asked)[1]
+            start, read = self.net.pull(*asked)
             while self.net.outgrown(state.net.q):
-                read = self.net.pull(*asked)[1]
+                start, read = self.net.pull(*asked)
+            if self.rubs:
+                self.by_before = self.model.empty_state()
+                wp.copy(self.by_before.net.q, start.q)
             inputs += _copied(self.model.empty_state(), [read])[1]
         for own in inputs:
             for array in (own.gravity, own.mass):
                 wp.map(wp.mul, array, self.model.types.real(state.time), out=array)
         return inputs
+
+    @property
+    def rubs(self) -> bool:
+        """Whether equilibria have friction."""
+        return self.net is not None and self.net.net.host.touching is not None and self.net.net.host.touching.rubs
+
+    def _before(self, state: State) -> NetState:
+        """The net as it was in the equilibrium before."""
+        sliding, q = state.sliding, wp.empty_like(state.net.q)
+        if sliding is None:
+            raise SceneError(
+                "contact: by friction an equilibrium depends on the way there, which this state does not know; take the one that "
+                "statics.solve returned, not one made of its positions"
+            )
+        q.assign(state.net.q.numpy() - sliding.increment * sliding.velocity.numpy())
+        return replace(state.net, q=q)
 
 
 def _copied(state: State, inputs: list) -> tuple[State, list]:

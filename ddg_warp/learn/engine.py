@@ -21,6 +21,7 @@ from ddg_warp.learn.poses import Poses
 from ddg_warp.learn.predictor import ChainPredictor
 from ddg_warp.learn.tables import Tables
 from ddg_warp.model.controls import Controls
+from ddg_warp.model.state import Sliding
 from ddg_warp.solve import statics
 from ddg_warp.solve.dynamics import Integrator
 from ddg_warp.solve.graphs import Graphs
@@ -40,6 +41,7 @@ class Engine:
         before, after: the states at the ends of a step.
         adjoint, poses: what its reverse goes by, once that was asked for.
         by_poses: derivatives by poses of grips of the last step or equilibrium that was pulled (worlds, grips, 6).
+        by_equilibrium: tensors of the derivatives by the equilibrium before that; None without friction.
     """
 
     def __init__(self, model, scheme: str, options: dict):
@@ -47,7 +49,7 @@ class Engine:
         self.midpoint = scheme == "implicit_midpoint"
         self.integrator = Integrator(model, scheme, failures="flag", check_every=FOREVER, energy_bound=None, **options)
         self.integrator.step_whole()
-        self.adjoint = self.poses = self.by_poses = None
+        self.adjoint = self.poses = self.by_poses = self.by_equilibrium = None
         self._equilibria = {}  # reverse of those that are given poses, and of others
         self.layout, self.tables = Layout(model), Tables(model)
         self.fields = self.layout.fields
@@ -239,19 +241,40 @@ class Engine:
 
     # equilibria
 
-    def balance(self, state, controls: dict, options: dict) -> list[torch.Tensor]:
-        """The equilibrium from the tensors of a state, and one of each part, as of `forward`."""
-        start = self.model.empty_state()
+    def balance(self, state, controls: dict, options: dict, graded: bool) -> list[torch.Tensor]:
+        """The equilibrium from the tensors of a state, and one of each part, as of `forward`.
+
+        With friction, where gradients are asked for, the way there follows: load parameters and increments of all equilibria (n, 2),
+        and of each its tensors and the velocities of its `Sliding`.
+        """
+        start, way = self.model.empty_state(), []
         self.fill(tensors(start, self.fields), state)
-        found = statics.solve(self.model, start, controls=_on_host(controls), **options)
+        found = statics.solve(self.model, start, controls=_on_host(controls), way=way, **options)
         ones = [
             torch.ones(len(part.islands), dtype=state[0].dtype, device=state[0].device)
             for part in self.integrator._parts
         ]
-        return copies(tensors(found, self.fields)) + ones
+        result = copies(tensors(found, self.fields)) + ones
+        if graded and found.sliding is not None:
+            result.append(torch.tensor([[at.time, at.sliding.increment] for at in way], dtype=torch.float64))
+            for at in way:
+                result += [*copies(tensors(at, self.fields)), view(at.sliding.velocity).clone()]
+        return result
 
-    def balance_backward(self, end: float, state, controls: dict, given) -> list:
-        """Derivatives by what an equilibrium at the load parameter `end`, under controls, reads, part by part."""
+    def way(self, found) -> list[tuple]:
+        """Of the tensors that `balance` gave, of every equilibrium on the way: load parameter, tensors, velocities and increment."""
+        rest, count = found[len(self.fields) + self.parts :], len(self.fields) + 1
+        if not rest:
+            return [(None, found[: len(self.fields)], None, 0.0)]
+        numbers, *rest = rest
+        each = [rest[i : i + count] for i in range(0, len(rest), count)]
+        return [(at, own[:-1], own[-1], by) for (at, by), own in zip(numbers.tolist(), each, strict=True)]
+
+    def balance_backward(self, end: float, state, controls: dict, given, velocity=None, increment: float = 0.0) -> list:
+        """Derivatives by what an equilibrium at the load parameter `end`, under controls, reads, part by part.
+
+        With friction it was come to with velocities, in an increment; then `by_equilibrium` are those by the one before.
+        """
         posed = "poses" in controls
         if posed not in self._equilibria:
             adjoint = EquilibriumAdjoint(self.model, posed)
@@ -261,11 +284,20 @@ class Engine:
         self.fill(tensors(at, self.fields), state)
         self.fill(tensors(by, self.fields), given)
         at.time = end
+        if velocity is not None:
+            at.sliding = Sliding(wp.empty_like(at.net.v), increment)
+            view(at.sliding.velocity).copy_(velocity)
         inputs = adjoint.pull(at, by, _on_host(controls))
+        self.by_equilibrium = tensors(adjoint.by_before, self.fields) if adjoint.rubs else None
         if posed:
             poses.pull_equilibrium(inputs, at, by)
             self.by_poses = poses.by_end
         return inputs
+
+    def poses_of(self, state) -> torch.Tensor:
+        """Poses of grips in the tensors of a state (worlds, grips, 6)."""
+        place = next(i for i, field in enumerate(self.fields) if field.name == "grips/pose")
+        return state[place].T.reshape(self.model.worlds, -1, 6)
 
     # what `ddg_warp.learn.step` asks
 

@@ -58,6 +58,8 @@ class Case:
         self.simulator = self.built()
         self.engine = self.simulator.engine(WORLDS)
         self.model = self.engine.model
+        touching = self.model.net.host.touching if self.model.net is not None else None
+        self.slides = self.statics and touching is not None and touching.rubs
         turned = bool(self.model.scene.axisymmetric_shells)  # whose gravity is along z alone
         flat = turned or self.model.scene.dimension == 2
         self.place = self.engine.source[0].device
@@ -85,6 +87,8 @@ class Case:
     def _first(self) -> WorldState:
         """An equilibrium, or a state on the way with random velocities and spins."""
         with torch.no_grad():
+            if self.slides:  # what is found depends on the way there
+                return self.simulator.initial_state(WORLDS)
             if self.statics:
                 return self.simulator.equilibrium(None, self.posed, batch=WORLDS, **TIGHT)
             state = self.simulator.initial_state(WORLDS)
@@ -108,7 +112,9 @@ class Case:
 
     def loss(self, state: WorldState) -> torch.Tensor:
         """Of a state at the end."""
-        terms = [(self.weights[0] * state.positions).sum(), (self.weights[2] * state.angles).sum()]
+        terms = [(self.weights[0] * state.positions).sum()]
+        if not self.slides:  # where they depend on how frames were carried along
+            terms.append((self.weights[2] * state.angles).sum())
         return sum(terms) + (0.0 if self.statics else (self.weights[1] * state.velocities).sum())
 
     def end(self, simulator: Simulator, values=None, parameters=None, controls=None) -> WorldState:
@@ -116,7 +122,8 @@ class Case:
         state = WorldState(tuple(values or self.state.values), self.state.time, simulator.engine(WORLDS))
         controls = self.posed | (controls or {})
         if self.statics:
-            return simulator.equilibrium(parameters, controls, state=state, start=1.0, **TIGHT)
+            begin = {"start": 0.0, "load_steps": STEPS} if self.slides else {"start": 1.0}
+            return simulator.equilibrium(parameters, controls, state=state, **begin, **TIGHT)
         *_, state = simulator.rollout(state, parameters, controls, steps=STEPS)
         return state
 
@@ -176,7 +183,7 @@ class Case:
 
     def _begun(self, name: str, value: torch.Tensor) -> tuple | None:
         """Where an equilibrium begins, at one with another value of a parameter, as angles depend on the way from there."""
-        if not self.statics:
+        if not self.statics or self.slides:
             return None
         with torch.no_grad():
             return self.end(self.simulator, None, {name: value}).values

@@ -147,11 +147,15 @@ def _on_ball(scene: Scene, material: Material) -> None:
     _touch(scene, "penalty")
 
 
-def _held_on_ball(scene: Scene, rod: int) -> None:
-    """Its end rests on a ball that a grip moves, without friction, so that equilibria know it, too."""
-    scene.clamp(rod)
-    scene.add_obstacle(Sphere((0.18, 0.05, -0.352), 0.3), motion=Grip(pivot=(0.1, 0.0, -0.2)))
-    scene.contact(range=0.02, stiffness=5.0)
+def _held_on_ball(**friction) -> Callable:
+    """Its end rests on a ball that a grip moves."""
+
+    def hold(scene: Scene, rod: int) -> None:
+        scene.clamp(rod)
+        scene.add_obstacle(Sphere((0.18, 0.05, -0.352), 0.3), motion=Grip(pivot=(0.1, 0.0, -0.2)))
+        scene.contact(range=0.02, stiffness=5.0, **friction)
+
+    return hold
 
 
 def _over_plane(scene: Scene, shell: int) -> None:
@@ -223,7 +227,15 @@ OBJECTS: dict[str, tuple[int, Callable]] = {
     "rods in contact": (3, _crossing),
     "gripped rod that rolls another": (3, lambda s, m: _crossing(s, m, Grip(), rolling=True)),
     "rod on a gripped ball": (3, _on_ball),
-    "held rod on a gripped ball": (3, _rod(section=Circle(0.004), hold=_held_on_ball)),
+    "held rod on a gripped ball": (3, _rod(section=Circle(0.004), hold=_held_on_ball())),
+    "held rod that rubs a gripped ball": (
+        3,
+        _rod(section=Circle(0.004), hold=_held_on_ball(friction=0.3, velocity=0.01)),
+    ),
+    "held rod that rolls on a gripped ball": (
+        3,
+        _rod(section=Circle(0.004), hold=_held_on_ball(friction=0.3, velocity=0.01, rolling=True)),
+    ),
     "shell on a plane": (3, _sheet("midedge_dof", more=_over_plane)),
     "rod under a couple": (3, _rod(more=lambda s, r: s.add_couple(r, -1, (1e-4, 2e-4, -1e-4)))),
     "shell under pressure": (3, _sheet("midedge_dof", more=lambda s, k: s.add_pressure(k, 5.0))),

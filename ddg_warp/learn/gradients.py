@@ -1,9 +1,9 @@
 """Gradients of steps and equilibria by every input, against central differences: `ddg-warp gradients`.
 
 Each input is moved along one random direction in all of its entries, in two worlds at once; the loss is a random sum of positions,
-velocities and angles after two steps from a state on the way, or of positions and angles in equilibrium. What a `Simulator` takes is
-asked of it, as its user does; damping by mass and the length of the steps of its reverse. Density is all masses and rotary inertia,
-and held to scenes of another one.
+velocities and angles after two steps from a state on the way, or of positions and angles in equilibrium, with friction of positions
+after two load steps from rest. What a `Simulator` takes is asked of it, as its user does; damping by mass and the length of the steps
+of its reverse. Density is all masses and rotary inertia, and held to scenes of another one.
 """
 
 from collections.abc import Iterator

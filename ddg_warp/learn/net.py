@@ -23,7 +23,8 @@ from ddg_warp.model.net import NetState
 class NetKept:
     """What the reverse of a step reads of it: the state `before`, and the solution of its solve with its lagged data.
 
-    `lagged` are the solutions where friction was taken anew (W N,), in this order; what else is lagged stays.
+    `lagged` are the solutions where friction was taken anew (W N,), in this order; what else is lagged stays. Of an equilibrium with
+    friction `before` is the one that slips count from, and `rubbing` over the increment of the load parameter since then.
     """
 
     before: NetState
@@ -32,6 +33,7 @@ class NetKept:
     retries: wp.array | None = None
     time: float = 0.0
     lagged: list[wp.array] = field(default_factory=list)
+    rubbing: float = 0.0
 
     @property
     def frame(self) -> wp.array:
@@ -100,7 +102,7 @@ class NetAdjoint:
         self._strains = [reverse.strain_kernel(p.term, real) if p.term.density.lagged else None for p in net.sets]
         self._solution, self._inert, self._start, self._ended = reverse.step_kernels(real, midpoint, drag)
         self._inertia = self.drag.inertia if drag else wp.zeros((1, 1), dtype=block_inertia(real), device=self.device)
-        self._rates = wp.zeros(net.worlds, dtype=real, device=self.device)
+        self._rates, self._rubbing = (wp.zeros(net.worlds, dtype=real, device=self.device) for _ in range(2))
 
         def make(dtype=net.vector):
             return wp.zeros(count, dtype=dtype, device=self.device)
@@ -208,14 +210,16 @@ class NetAdjoint:
         read = [given.q, given.v, by_end, self._inertia, rate, last, net.blocks]
         self._launch(self._solution, len(by_q), read, [by_q])
         self._rates.fill_(rate)
+        self._rubbing.fill_(kept.rubbing or rate)
+        rough, ways = None, reversed(list(pairwise([before.q, *kept.lagged, solved.q])))
+        if kept.rubbing:  # normal forces are those of the equilibrium
+            rough, ways = self.contact.rubbing(solved.q, before.q, self._rubbing), [(solved.q, solved.q)]
         by_tangents = by_predicted if self._midpoint else start.q
-        for at, q in reversed(
-            list(pairwise([before.q, *kept.lagged, solved.q]))
-        ):  # friction lagged there, and the solution
+        for at, q in ways:  # friction lagged there, and the solution
             damped = replace(solved, q=q, last=before.last)
             if self.contact:
-                self.contact.system.find(at, before.q, q, self._rates)
-            self.solve(damped, rate, kept.time, by_q, w, factors)
+                self.contact.system.find(at, before.q, q, self._rubbing)
+            self.solve(damped, rate, kept.time, by_q, w, factors, rough)
             shares.clear()
             for i, kernel in enumerate(self._pull):
                 written = [shares.slots[i], shares.lags[i], inputs.parameters[i]]
@@ -229,9 +233,11 @@ class NetAdjoint:
             written = [start.q, start.v, inputs.load, inputs.mass, inputs.rate, inputs.damping, inputs.gravity]
             self._launch(self._inert, len(q), [*read, self._damping], written)
             if self.contact:
-                by = start.q if at is before.q else self._by_lagged, start.q, by_q
-                self.contact.pull((at, before.q, q), w, self._rates, by)
-            if at is not before.q:
+                by_lagged = next(by for of, by in ((before.q, start.q), (q, by_q), (at, self._by_lagged)) if of is at)
+                self.contact.pull((at, before.q, q), w, self._rubbing, (by_lagged, start.q, by_q))
+                if kept.rubbing:
+                    self.contact.roll(q, before.q, start.q, by_q)
+            if at is not before.q and at is not q:
                 self.solve.chain(self._by_lagged, by_q)
         if self.solve.held is not None:
             wp.map(wp.add, by_q, self.solve.held, out=by_q)

@@ -2,11 +2,13 @@
 
 import numpy as np
 import warp as wp
+from scipy import sparse
 
 from ddg_warp import arrays
 from ddg_warp.kernels.adjoint import contact_sums
 from ddg_warp.kernels.adjoint.contact import NUMBERS, RATE, ROLLED, SPUN, THICKNESS, pull_kernel, rub_kernel
 from ddg_warp.kernels.contact.gather import ITEMS, SLOTS, sum_kernel
+from ddg_warp.learn.rolling import turned_by
 from ddg_warp.solve.contact.node_items import NodeItems
 from ddg_warp.solve.contact.pair_terms import FRICTION
 from ddg_warp.solve.contact.touch import LAWS
@@ -20,8 +22,8 @@ class ContactAdjoint:
     """Of the contact of a `DeviceNet`, friction included; derivatives by obstacles are those by their nodes.
 
     What is differentiated is a step, or an equilibrium, solved exactly: by positions at its end and, with friction, at its start, where
-    this takes slip from, and where it takes normal forces and directions from: the start, or the solution before; by the numbers of
-    pairs; by the length of the step. Against differences it errs by 1e-9 to 1e-7.
+    this takes slip from, and where it takes normal forces and directions from: the start, or the solution before, and of equilibria
+    themselves; by the numbers of pairs; by the length of the step. Against differences it errs by 1e-9 to 1e-7.
 
     At kinks gradients are those of one side: where closest points go over an end of an edge or a side of a triangle, whose second
     derivatives jump there; where a pair begins to push, beyond the second derivative of a barrier, and with 1e-14 of the force of a
@@ -118,7 +120,7 @@ class ContactAdjoint:
             w: solution of the linear system (W N,).
             by: derivatives by these three.
         """
-        terms, (lagged, before, q), (by_lagged, by_before, by_q) = self.system.terms, at, by
+        terms, (_, before, q), (by_lagged, by_before, by_q) = self.system.terms, at, by
         for array in (*self._things.values(), *self._spun_things.values()):
             array.zero_()
         for i, (part, rub) in enumerate(zip(terms.lists, self._rubs, strict=True)):
@@ -129,14 +131,9 @@ class ContactAdjoint:
             self._add_up(self._items[i], part, part.gradient, by_q)
             self._sum(i, self._items[i], part)
             if rub:
-                items, factor = self._rub_items[i], rub.factor
-                items.list(rub.count, factor)
-                read = [rub.pairs, rub.count, part.found.sides, terms.law, factor.nodes, factor.angles, factor.used]
-                inputs = [*read, lagged, before, q, w, self._velocity, rate, *rub.directions]
-                inputs += [terms.spins.places, terms.spins.turned.flatten()]
-                written = [rub.gradient, self._start_parts, self._lagged_parts]
-                more = [self._numbers, self._by_direction, self._spun, self._radii]
-                self._take_turns(self._rub[i], pairs, inputs, [*written, *more])
+                items = self._rub_items[i]
+                items.list(rub.count, rub.factor)
+                written = self._pull_rub(i, rub, (rub.factor.nodes, rub.factor.angles), at, w, rate)
                 for found, by_found in zip(written, (by_q, by_before, by_lagged), strict=True):
                     self._add_up(items, rub, found, by_found)
                 self._sum(i, items, rub)
@@ -152,6 +149,91 @@ class ContactAdjoint:
             for row in range(SPUN):
                 self._to_bodies(self._spun_row(row), self._by_spun[row])
             self._spins.pull(before, q, self._by_spun, [by_before, by_q, self.by_radius])
+
+    def _pull_rub(self, index: int, rub, of: tuple, at: tuple, w: wp.array, rate: wp.array) -> list[wp.array]:
+        """What friction on the pairs of elements, with nodes and angles `of` these, brings by slot of the solution, of the start and of
+        what was lagged; `at`, w and rate as of `pull`. The rest that `rub_kernel` writes is left where it has its place."""
+        terms = self.system.terms
+        inputs = [rub.pairs, rub.count, rub.found.sides, terms.law, *of, rub.factor.used]
+        inputs += [*at, w, self._velocity, rate, *rub.directions, terms.spins.places, terms.spins.turned.flatten()]
+        written = [rub.gradient, self._start_parts, self._lagged_parts]
+        more = [self._numbers, self._by_direction, self._spun, self._radii]
+        self._take_turns(self._rub[index], rub.found.capacity, inputs, [*written, *more])
+        return written
+
+    def rubbing(self, q: wp.array, before: wp.array, rate: wp.array) -> sparse.csc_matrix:
+        """What friction adds to the matrix of an equilibrium at blocks q that came there from others (3 W N, 3 W N) [N/m].
+
+        Normal forces and directions are those at q, too, so that it is not symmetric. Makes room for pairs; reads from the device.
+        """
+        while True:
+            self.system.find(q, before, q, rate)
+            if not self.outgrown(q):
+                break
+        total = sparse.csc_matrix((3 * len(q),) * 2)
+        for i, rub in enumerate(self._rubs):
+            if rub:
+                total -= self._rub_matrix(i, rub, q, before, rate)
+        return total + total @ turned_by(self.net, q.numpy(), before.numpy())[0] if self.system.terms.rolls else total
+
+    def roll(self, q: wp.array, before: wp.array, by_before: wp.array, by_q: wp.array) -> None:
+        """After `pull` of an equilibrium, add what comes by frames, which are carried along, to derivatives by blocks q and `before`.
+
+        Reads from the device.
+        """
+        if self.system.terms.rolls:
+            found = by_before.numpy().astype(float).ravel()
+            for by, derivative in zip((by_q, by_before), turned_by(self.net, q.numpy(), before.numpy()), strict=True):
+                by.assign(by.numpy() - (derivative.T @ found).reshape(-1, 3))
+
+    def _rub_matrix(self, index: int, rub, q: wp.array, before: wp.array, rate: wp.array) -> sparse.csc_matrix:
+        """Derivative of the friction of elements by q.
+
+        Each pair has blocks of its own, behind those of the net, at which w is one component after another.
+        """
+        count, device, size = int(rub.count.numpy()[0]), self.net.device, 3 * len(q)
+        blocks, angles, ends = rub.factor.nodes.numpy()[:count], rub.factor.angles, None
+        if rub.rolls:
+            blocks = np.column_stack([blocks, angles.numpy()[:count]])
+        felt = (rub.factor.used.numpy()[:count, None] != 0) & (blocks >= 0)
+        felt[:, rub.found.kind.first + rub.found.kind.second : SLOTS] = False
+        apart = np.where(felt, len(q) + np.arange(blocks.size).reshape(blocks.shape), blocks).astype(np.int32)
+        nodes = arrays.upload(apart[:, :SLOTS], wp.vec4i, device)
+        if rub.rolls:
+            angles = arrays.upload(apart[:, SLOTS:], wp.vec2i, device)
+        if rub.directions[0]:
+            world, first = np.divmod(rub.pairs.numpy()[:count, 0], rub.found.first.count)
+            ends = rub.directions[0].numpy()[first] + world[:, None] * self.net.blocks
+        start, x = (
+            wp.array(np.concatenate([own, own[blocks.ravel()]]), dtype=q.dtype, device=device)
+            for own in (before.numpy(), q.numpy())
+        )
+        w, entries = wp.zeros_like(x), [(np.zeros(0, int), np.zeros(0, int), np.zeros(0))]
+
+        def add(row, block, found):
+            """Derivatives `found` (n, 3) of components (n,) by those of blocks (n,)."""
+            columns = 3 * block[:, None] + np.arange(3)
+            entries.append((np.repeat(row, 3), columns.ravel(), found.astype(float).ravel()))
+
+        for slot in range(blocks.shape[1]):
+            on = np.flatnonzero(felt[:, slot])
+            for d in range(3 if slot < SLOTS else 1):
+                unit = np.zeros((len(x), 3))
+                unit[apart[on, slot], d] = 1.0
+                w.assign(unit)
+                written = self._pull_rub(index, rub, (nodes, angles), (x, start, x), w, rate)
+                by_x, _, by_lagged = (array.numpy()[:, :count] for array in written)
+                by_x[:SLOTS] += by_lagged[:SLOTS]
+                row = 3 * blocks[:, slot] + d
+                for other in range(blocks.shape[1]):
+                    both = on[felt[on, other]]
+                    add(row[both], blocks[both, other], by_x[other, both])
+                if ends is not None:
+                    led = self._by_direction.numpy()[on]
+                    add(row[on], ends[on, 1], led)
+                    add(row[on], ends[on, 0], -led)
+        rows, columns, values = map(np.concatenate, zip(*entries, strict=True))
+        return sparse.csc_matrix((values, (rows, columns)), shape=(size, size))
 
     def _add_up(self, items: NodeItems, part, written: wp.array, out: wp.array) -> None:
         """Add what pairs that are used have written by slot to nodes."""

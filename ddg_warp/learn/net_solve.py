@@ -52,7 +52,9 @@ class NetSolve:
         """Kernels to load before a capture."""
         return [*self.system.kernels, self._chain] if self.system else []
 
-    def __call__(self, state, rate: float, time: float, right: wp.array, w: wp.array, factors: bool = False) -> None:
+    def __call__(
+        self, state, rate: float, time: float, right: wp.array, w: wp.array, factors: bool = False, rubbing=None
+    ) -> None:
         """Write w (W N,), zero at held dofs.
 
         Args:
@@ -60,6 +62,7 @@ class NetSolve:
             rate: of the implicit Euler step [1/s], zero for an equilibrium, of which `time` is the load parameter.
             right: g (W N,).
             factors: solve on the host, as conjugate gradients have failed.
+            rubbing: what friction adds to H in an equilibrium (3 W N, 3 W N), see `ContactAdjoint.rubbing`; None without.
 
         Raises:
             SolverError: H is singular; on the host alone, see `failed`. Or it is of a step in contact, which
@@ -78,7 +81,7 @@ class NetSolve:
         tangent, host = self.tangent, self._host
         more = self.drag.matrix if self.drag else None
         given = tangent.into(right.numpy().astype(float).ravel())
-        found = host(SimpleNamespace(net=state), rate, coefficient, None if rate else time, given, more)
+        found = host(SimpleNamespace(net=state), rate, coefficient, None if rate else time, given, more, rubbing)
         w.assign(tangent.back(found).reshape(-1, 3))
         if host.held is not None:
             self.held = wp.empty_like(w)

@@ -5,7 +5,22 @@ import torch
 import warp as wp
 
 from ddg_warp.learn.layout import view
-from ddg_warp.learn.rotations import halfway, matrix, quaternion
+from ddg_warp.learn.rotations import halfway, matrix, partway, quaternion
+
+
+def by_last_poses(first: torch.Tensor, last: torch.Tensor, share: float, given: torch.Tensor) -> torch.Tensor:
+    """Derivatives by the `last` poses of a straight way (worlds, grips, 6), from those `given` by poses on it.
+
+    Such a way is that of `ddg_warp.solve.motion.poses_between`.
+
+    Args:
+        first: poses where it begins; share: the part of the way to where derivatives are given.
+    """
+    with torch.enable_grad():
+        last = last.detach().requires_grad_()
+        (start, turn), (end, last_turn) = first.split(3, -1), last.split(3, -1)
+        poses = torch.cat([start + share * (end - start), partway(turn, last_turn, share)], -1)
+        return torch.autograd.grad((poses * given).sum(), last)[0]
 
 
 class Poses:

@@ -26,6 +26,11 @@ def turned(vectors: torch.Tensor, by: torch.Tensor) -> torch.Tensor:
     return vector * torch.where(small, 2.0 / scalar, 2.0 * torch.atan2(length, scalar) / length)
 
 
+def partway(start: torch.Tensor, end: torch.Tensor, share: float) -> torch.Tensor:
+    """Rotation vectors (..., 3) [rad] after a share of the shorter way from some to others."""
+    return turned(start, share * turned(-start, end))
+
+
 def halfway(start: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
     """The quaternion halfway on the shorter way from one to another."""
     near = torch.where((start * end).sum(-1, keepdim=True) < 0.0, -end, end)

@@ -240,7 +240,8 @@ class Simulator(torch.nn.Module):
         """The equilibrium of every world, with gradients by parameters and controls.
 
         Angles are measured from frames that the search carries along, so that they depend on its way; their gradients are those of
-        a search that begins in the equilibrium. Positions do not. Contact is part of it, without friction.
+        a search that begins in the equilibrium. Positions do not. With friction, gradients go through all increments of the load
+        parameter, of which states are kept.
 
         Args:
             parameters: as of `step`.
@@ -250,7 +251,7 @@ class Simulator(torch.nn.Module):
 
         Raises:
             SolverError: there is none, in one of the worlds.
-            SceneError: the state has a history of gradients, which would end here; a name or shape does not fit; there is friction.
+            SceneError: the state has a history of gradients, which would end here; a name or shape does not fit.
         """
         if state is not None and torch.is_grad_enabled() and any(value.requires_grad for value in state.values):
             raise SceneError(
@@ -259,7 +260,6 @@ class Simulator(torch.nn.Module):
             )
         state = state or self.initial_state(batch)
         engine, end = self._own(state), arguments.number("end", options.get("end", 1.0))
-        validate.refuse_friction(engine.model)
         full, controls = self._full(engine, parameters), self._controls(engine, controls)
         call = self._call(engine, end, full, controls)
         values = [*(value for _, own in full for value in own), *controls.values()]

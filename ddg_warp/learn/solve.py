@@ -38,7 +38,7 @@ class HostSolve:
         self.held = None
 
     def __call__(
-        self, state, rate: float, coefficient: float, factor: float | None, given: np.ndarray, more=None
+        self, state, rate: float, coefficient: float, factor: float | None, given: np.ndarray, more=None, rubbing=None
     ) -> np.ndarray:
         """w (size,), zero at held dofs.
 
@@ -49,6 +49,7 @@ class HostSolve:
             factor: load parameter of an equilibrium, whose loads L follow the dofs q; None in a step, where they do not.
             given: g (size,).
             more: matrix that H has beside these, of drag; None for none.
+            rubbing: the same of friction in an equilibrium, which is not symmetric; None without.
 
         A singular matrix, of what can move without stiffness, serves a loss that does not depend on that motion.
 
@@ -57,15 +58,20 @@ class HostSolve:
         """
         tangent, following = self.tangent, None
         tangent.rate = wp.full(len(tangent.rate), rate, dtype=tangent.rate.dtype, device=tangent.rate.device)
-        matrix = tangent.hessian(state) + sparse.diags(coefficient * tangent.mass)
+        hessian = (
+            tangent.hessian(state) if rubbing is None else tangent.potential_hessian(state) + tangent.matrix(rubbing)
+        )
+        matrix = hessian + sparse.diags(coefficient * tangent.mass)
         if more is not None:
             matrix = matrix + tangent.matrix(more)
         if factor is not None:
-            following = _total(tangent.load_stiffness(factor, tangent.dofs(state)), self._spun(state, factor))
+            spun = self._spun(state, factor, rubbing is not None)
+            following = _total(tangent.load_stiffness(factor, tangent.dofs(state)), spun)
         free = np.flatnonzero(tangent.free)
         own, given = sparse.csc_matrix(matrix if following is None else matrix + following)[free][:, free], given[free]
         try:
-            solve = regular(own, tangent.mass[free])[0].solve if following is None else _transposed(own)
+            symmetric = following is None and rubbing is None
+            solve = regular(own, tangent.mass[free])[0].solve if symmetric else _transposed(own)
             found = solve(given)
         except (SingularError, RuntimeError) as error:
             raise self._singular(free) from error
@@ -77,15 +83,16 @@ class HostSolve:
         self.held = None if following is None else np.where(tangent.free, 0.0, -(following.T @ w))
         return w
 
-    def _spun(self, state, factor: float) -> sparse.csc_matrix | None:
+    def _spun(self, state, factor: float, rubs: bool) -> sparse.csc_matrix | None:
         """What frames that an equilibrium carries along do, where the tangent holds them still; None where nothing twists an edge.
 
         A moment M on the angle of an edge e turns with its frame, which spins about t by t . (t x de) / 2 |e| less than one that is
-        held still: it adds the force M [t] de / 2 |e|^2 across the edge, [t] the matrix of t x. M is what loads and supports put there.
+        held still: it adds the force M [t] de / 2 |e|^2 across the edge, [t] the matrix of t x. M is what loads and supports put there,
+        and friction where it `rubs`: of all together, what is elastic.
         """
         tangent, rows, columns, values = self.tangent, [], [], []
         q = tangent.dofs(state)
-        moments = np.where(tangent.free, tangent.loads(factor, q), tangent.gradient(state))
+        moments = np.where(tangent.free & (not rubs), tangent.loads(factor, q), tangent.gradient(state))
         for body in tangent.bodies():
             if len(body.angles) and (body.nodes >= 0).all():
                 ends = body.nodes[body.ends]  # (edges, 2, 3)

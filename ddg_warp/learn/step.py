@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from ddg_warp.learn.poses import by_last_poses
+
 
 @dataclass(frozen=True)
 class Call:
@@ -99,12 +101,12 @@ class Balance(torch.autograd.Function):
         state, parameters, controls = call.split(tensors)
         with engine.stream():
             engine.tables.write(call.parameters, parameters)
-            return tuple(engine.balance(state, controls, dict(options)))
+            return tuple(engine.balance(state, controls, dict(options), call.graded))
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        call, _, *tensors = inputs
-        ctx.call, ctx.results = call, len(output)
+        call, options, *tensors = inputs
+        ctx.call, ctx.options, ctx.results = call, dict(options), len(output)
         ctx.save_for_backward(*tensors, *output)
         rough = [tensor for tensor, field in zip(output, call.fields, strict=False) if not field.smooth]
         ctx.mark_non_differentiable(*rough, *output[len(call.fields) :])
@@ -115,16 +117,23 @@ class Balance(torch.autograd.Function):
         call, saved = ctx.call, ctx.saved_tensors
         engine, count = call.engine, len(call.fields)
         tensors, output = saved[: -ctx.results], saved[-ctx.results :]
-        _, parameters, controls = call.split(tensors)
-        end, flags = call.start, output[count:]
+        first, parameters, controls = call.split(tensors)
+        flags, given, found = output[count : count + engine.parts], given[:count], []
+        begin, end = ctx.options.get("start", 0.0), call.start
         with engine.stream():
             engine.tables.write(call.parameters, parameters)
-            inputs = engine.balance_backward(end, output[:count], controls, given[:count])
-            found = engine.tables.pull(call.parameters, inputs, flags)
-            for name, value in controls.items():
-                by_load = engine.controls.pull(name, value, inputs, flags)
-                scaled = name in ("forces", "moments", "field")  # by `end`; gravity has been already
-                found.append(end * by_load if scaled else by_load)
+            for at, state, *way in reversed(engine.way(output)):
+                at = end if at is None else at
+                inputs = engine.balance_backward(at, state, controls, given, *way)
+                own = engine.tables.pull(call.parameters, inputs, flags)
+                for name, value in controls.items():
+                    by_load = engine.controls.pull(name, value, inputs, flags)
+                    scaled = name in ("forces", "moments", "field")  # by the load parameter; gravity has been already
+                    if name == "poses" and at != end:
+                        by_load = by_last_poses(engine.poses_of(first), value, (at - begin) / (end - begin), by_load)
+                    own.append(at * by_load if scaled else by_load)
+                found = [a + b for a, b in zip(found, own, strict=True)] if found else own
+                given = engine.by_equilibrium
         return None, None, *([None] * count), *found
 
 

@@ -48,6 +48,19 @@ class GripState:
         return dict(self.__dict__)
 
 
+@dataclass(frozen=True)
+class Sliding:
+    """The way to an equilibrium with friction from the one before.
+
+    Attributes:
+        velocity: of the blocks of the net (W N,) on that way, by load parameter.
+        increment: of the load parameter, positive.
+    """
+
+    velocity: wp.array
+    increment: float
+
+
 @launches
 class State:
     """Positions, velocities, frames and time of a model's rods and shells. A step returns another state and does not change this one.
@@ -62,13 +75,13 @@ class State:
         grips: poses of the grips of all worlds; None without, see `Grip`.
         stable: of an equilibrium that a static solver found, whether it is stable, in all worlds; None where that was not asked, as
             in dynamics. See `Equilibrium.solve`.
-        sliding: of an equilibrium with friction, velocities of the blocks of the net (W N,) on the way there, by which friction acts,
-            though the state is at rest; None where it acts by those of the state.
+        sliding: of an equilibrium with friction, the `Sliding` by which that acts, though the state is at rest; None where it acts by
+            the velocities of the state.
     """
 
     def __init__(self, model, groups: list[GroupState], net=None, time: float = 0.0, grips: GripState | None = None):
         self.stable: bool | None = None
-        self.sliding: wp.array | None = None
+        self.sliding: Sliding | None = None
         self.model = model
         self.groups = groups
         self.net = net
@@ -93,7 +106,7 @@ class State:
     @property
     def rubbing(self) -> wp.array:
         """Velocities of the blocks of the net (W N,) by which friction acts."""
-        return self.net.v if self.sliding is None else self.sliding
+        return self.net.v if self.sliding is None else self.sliding.velocity
 
     def points(self) -> np.ndarray:
         """Positions (P, 3) [m], or (worlds, P, 3): nodes in the order of `model.curves` (rods, meridians), then vertices."""

@@ -34,7 +34,7 @@ def refuse_curved_membranes(model) -> None:
 
 
 def refuse_friction(model) -> None:
-    """Refuse contact with friction where an equilibrium is asked about that the way there does not decide."""
+    """Refuse contact with friction where something is asked of equilibria that the way there does not decide."""
     given = model.net.host.touching if model.net is not None else None
     pairs = zip(*given.meeting, strict=True) if given is not None else ()
     rough = next(((g, h) for g, h in pairs if given.friction[g, h] > 0.0), None)
@@ -42,9 +42,9 @@ def refuse_friction(model) -> None:
         return
     one, other = (given.names[g] for g in rough)
     raise SceneError(
-        f"contact: stability, paths and gradients of equilibria know no friction, and it is {given.friction[rough]:g} between {one!r} "
+        f"contact: stability and paths of equilibria know no friction, and it is {given.friction[rough]:g} between {one!r} "
         f"and {other!r}, where the way there decides which equilibrium is found; set friction=0, or ask for equilibria alone by "
-        "statics.solve, or for gradients of steps in time"
+        "statics.solve, and for their gradients"
     )
 
 

@@ -92,6 +92,7 @@ def solve(
     load_steps: int = 1,
     start: float = 0.0,
     end: float = 1.0,
+    way: list[State] | None = None,
     **options,
 ) -> State:
     """The equilibrium at load parameter `end`, reached from `start` in `load_steps` increments or more.
@@ -104,6 +105,7 @@ def solve(
         load_steps: increments; one that fails is halved. In contact supports and obstacles may go any way in one: they stop where
             something is in their way, and go on once it has yielded; in mode "follow" the increment is halved until nothing is.
         start, end: load parameter, which scales gravity and loads and is the time of motions and amplitudes.
+        way: a list, to which the equilibria of all increments are added, the last one too.
         options: see `StaticsOptions`.
 
     Returns:
@@ -126,7 +128,7 @@ def solve(
         arguments.number(f"statics: {name}", value)
     load_steps = arguments.count("load_steps", load_steps)
     equilibrium = Equilibrium(model, StaticsOptions(**options))
-    return equilibrium.load(state or model.state(), load_steps, start, end, controls)
+    return equilibrium.load(state or model.state(), load_steps, start, end, controls, way)
 
 
 @launches
@@ -200,6 +202,7 @@ class Equilibrium:
         start: float = 0.0,
         end: float = 1.0,
         controls: Controls | None = None,
+        way: list[State] | None = None,
     ) -> State:
         """Load stepping; see `solve`."""
         if self._rubs and start == end:
@@ -214,6 +217,8 @@ class Equilibrium:
         if start == end:
             state = self.solve(state, start, end)
             self.count(state, 0.0)
+            if way is not None:
+                way.append(state)
             return state
         at, whole, cuts = start, (end - start) / load_steps, 0
         state = state.copy()
@@ -225,6 +230,8 @@ class Equilibrium:
             try:
                 state = self.solve(state, at, target)
                 self.count(state, abs(target - at))
+                if way is not None:
+                    way.append(state)
                 at, cuts = target, max(0, cuts - 1)  # what was too much before may do now
             except SolverError as error:
                 cuts += 1

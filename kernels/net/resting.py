@@ -122,7 +122,7 @@ def resting_kernels(real, linear, serial: bool):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def leave(threads: int, sets: wp.array(dtype=PairSet), barred: wp.array(dtype=wp.uint8)):
-        """Pairs none of whose nodes can move."""
+        """Pairs none of whose nodes can move, nor angles turn."""
         for s in range(sets.shape[0]):
             own = sets[s]
             for p in range(wp.tid(), own.count[0], threads):
@@ -130,6 +130,11 @@ def resting_kernels(real, linear, serial: bool):
                 free = int(0)
                 for slot in range(4):
                     free += wp.where(barred[n[slot]] != BARRED, 1, 0)
+                if own.angles.shape[0] > 0:
+                    for side in range(2):
+                        angle = own.angles[p][side]
+                        if angle >= 0:
+                            free += 1 - int(barred[angle] & wp.uint8(1))
                 own.idle[p] = wp.uint8(wp.where(free > 0, 0, 1))
 
     return begin, join, look, settle, leave

@@ -369,7 +369,7 @@ def test_what_equilibria_refuse(device):
     rough, smooth, partly = (model_of(rods_with(**given)) for given in ({"friction": 0.3}, {}, {"objects": ["one"]}))
     with pytest.raises(
         ddg.SceneError,
-        match=r"stability, paths .* know no friction, and it is 0.3 between 'floor' and 'one'.*set friction=0",
+        match=r"stability and paths .* know no friction, and it is 0.3 between 'floor' and 'one'.*set friction=0",
     ):
         stability.spectrum(rough, rough.state())
     with pytest.raises(ddg.SceneError, match=r"'direct' stops all where two things come close.* take solver='auto'"):

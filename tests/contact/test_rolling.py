@@ -117,6 +117,44 @@ def test_a_shaft_drives_what_lies_on_it(device, parallel):
         np.testing.assert_allclose(state.velocities()[11:, 0].mean(), omega * RADIUS, rtol=0.02)
 
 
+@pytest.mark.parametrize(("angle", "load_steps"), [(-0.5, 1), (7.0, 1), (7.0, 5)])
+def test_a_shaft_draws_what_is_held(device, angle, load_steps):
+    """In equilibria as in steps: with mu N at the end that holds the rod which lies across it, and mu N r to turn the shaft."""
+    mu, scene = 0.3, ddg.Scene(gravity=(0.0, 0.0, -G))
+    turn = ddg.Motion(angle=lambda t: angle * t, axis=(0.0, 1.0, 0.0))
+    scene.clamp(rod(scene, ALONG_Y, name="shaft"), edges=list(range(10)), motion=turn)
+    hard = ddg.Material(
+        young=1e10, density=1000.0, poisson=0.4
+    )  # which does not sag, so that normal forces are upright
+    held = scene.add_rod(ALONG_Y[:, [1, 0, 2]] + [0.0, 0.0, 2.48 * RADIUS], section=ddg.Circle(RADIUS), material=hard)
+    scene.fix(held, [0])
+    scene.fix(held, [-1], "y")
+    scene.contact(friction=mu, rolling=True, velocity=1e-4)
+    model = scene.build(device, precision="float64")
+    state = statics.solve(model, load_steps=load_steps)
+    pushed = np.linalg.norm(model.contacts(state).force.sum(0))
+    shaft, end, _ = model.reactions(state, point=(0.0, 0.0, 0.0))
+    np.testing.assert_allclose(end.force[0], -np.sign(angle) * mu * pushed, rtol=1e-3)
+    np.testing.assert_allclose(shaft.moment[1], np.sign(angle) * mu * pushed * RADIUS, rtol=1e-3)
+
+
+def test_angles_beside_held_nodes(device):
+    """Clamped edges of a sagging rod touch the floor where free edges begin: these roll, and the matrix knows that they do."""
+    scene = ddg.Scene(gravity=(1.0, 0.7, -40.0))
+    x = np.linspace(-0.05, 0.05, 7)
+    height = 1.4 * RADIUS + 0.003 * x + 3e-4 * np.cos(55.0 * x)
+    soft = ddg.Material(young=1e6, density=1000.0)
+    bar = scene.add_rod(np.stack([x, 0.02 * x, height], 1), section=ddg.Circle(RADIUS), material=soft)
+    scene.clamp(bar, edges=[0, -1])
+    scene.add_obstacle(ddg.Plane())
+    scene.contact(range=1e-3, stiffness=50.0, friction=0.3, velocity=1e-4, rolling=True)
+    model = scene.build(device, precision="float64")
+    search = statics.Equilibrium(model, statics.StaticsOptions(rtol=1e-12))
+    state = search.load(model.state(), 1)
+    assert np.abs(model.contacts(state).friction).max() > 1e-4
+    assert search.iterations <= 25
+
+
 @each_form
 def test_forces_and_products_are_differences(device, form):
     result, at, _, after = rubbed(ROLLING, device, form)

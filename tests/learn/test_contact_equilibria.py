@@ -1,11 +1,16 @@
-"""Gradients of equilibria in contact against central differences: by stiffnesses, loads, and the numbers of contact."""
+"""Gradients of equilibria in contact against central differences: by stiffnesses, loads, and the numbers of contact.
+
+With friction through all load steps, by poses and forces, too, and by the closed form of a rod that is drawn along a floor.
+"""
 
 import numpy as np
 import pytest
 
 import ddg_warp as ddg
 from ddg_warp import statics
+from ddg_warp.errors import SceneError
 from ddg_warp.learn.adjoint import EquilibriumAdjoint
+from tests.learn import differences
 from tests.learn.contact_cases import MESH, RADIUS, RANGE, bar, rod, sheet
 from tests.learn.differences import Difference, along, built, close, cotangent
 from tests.learn.test_adjoint import by_parameters, shared, tables
@@ -47,13 +52,20 @@ CASES = {
 }
 
 
-def solved(name: str, law: str):
+def pressed_model(name: str, law: str, ways=None, **contact):
     scene = ddg.Scene(gravity=(1.0, 0.7, -40.0))
     CASES[name](scene)
-    scene.contact(law=law, range=RANGE, stiffness=2000.0 if scene.shells else 50.0)
+    scene.contact(law=law, range=RANGE, stiffness=2000.0 if scene.shells else 50.0, **contact)
+    if ways:
+        scene.contact_between("bar", "obstacle", friction=ways)
     model = built(scene)
     ranges = model.net.touching["range"]
     ranges.assign(0.99 * ranges.numpy())  # beyond which it may go, up to the reach of searches
+    return model
+
+
+def solved(name: str, law: str):
+    model = pressed_model(name, law)
     state = statics.solve(model, rtol=RTOL)
     assert state.stable
     assert np.abs(model.contacts(state).force).max() > 1e-4
@@ -84,3 +96,158 @@ def test_an_equilibrium_in_contact_by_a_load(name):
     model, inputs, difference = solved(name, "barrier")
     place = model.net.host.rods[-1].nodes[3]
     check_load(model.net.host, place, inputs[-1].load.numpy()[place], difference)
+
+
+def rubbing(name: str, law: str, velocity: float, **contact):
+    """An equilibrium from rest in one load step, whose gradient is that of positions, as angles depend on the way of the search."""
+    model = pressed_model(name, law, friction=0.3, velocity=velocity, **contact)
+    state = statics.solve(model, rtol=RTOL)
+    weights = {name: values * (name == "net/q") for name, values in position_weights(model, state).items()}
+    weights["net/q"][np.arange(len(weights["net/q"])) % model.net.blocks >= model.net.host.nodes] = 0.0
+    inputs = EquilibriumAdjoint(model).pull(state, cotangent(model, weights))
+    difference = Difference(model, model.state(), weights, lambda start: statics.solve(model, start, rtol=RTOL))
+    return model, state, inputs, difference
+
+
+@pytest.mark.parametrize("law", ["barrier", "penalty"])
+@pytest.mark.parametrize("velocity", [1e-2, 1e-4])
+@pytest.mark.parametrize("name", CASES)
+def test_an_equilibrium_that_rubs(name, velocity, law):
+    """Things creep by the larger velocity, and slide by the smaller one where anything does."""
+    model, state, inputs, difference = rubbing(name, law, velocity)
+    touching = model.contacts(state)
+    share = np.linalg.norm(touching.friction, axis=1) / np.maximum(0.3 * np.linalg.norm(touching.force, axis=1), 1e-12)
+    assert share.max() > (0.05 if velocity == 1e-4 else 1e-3)
+    check_numbers(model, [inputs], difference, ("stiffness", "range", "radius", "friction"))
+    place = model.net.host.rods[-1].nodes[3] if model.net.host.rods else model.net.host.shells[0].nodes[-1]
+    check_load(model.net.host, place, inputs[-1].load.numpy()[place], difference)
+
+
+@pytest.mark.parametrize(
+    ("name", "velocity"), [("plane", 1e-4), ("mesh", 1e-3), ("crossing rods", 1e-2), ("crossing rods", 1e-3)]
+)
+def test_an_equilibrium_with_rods_that_roll(name, velocity):
+    """Edges turn in space on their way, by which frames turn beside those that are carried there straight."""
+    model, _, inputs, difference = rubbing(name, "barrier", velocity, rolling=True)
+    check_numbers(model, [inputs], difference, ("stiffness", "range", "radius", "friction"))
+
+
+@pytest.mark.parametrize("name", ["plane", "ball"])
+def test_an_equilibrium_that_rubs_by_direction(name):
+    model, _, inputs, difference = rubbing(name, "barrier", 1e-4, ways=(0.2, 0.5, 0.3))
+    check_numbers(model, [inputs], difference, ("stiffness", "radius", "friction"))
+
+
+def test_the_way_has_to_be_known():
+    model, state, _, difference = rubbing("plane", "barrier", 1e-3)
+    state.sliding = None
+    with pytest.raises(
+        SceneError, match=r"contact: by friction an equilibrium depends on the way there.*statics.solve"
+    ):
+        EquilibriumAdjoint(model).pull(state, cotangent(model, difference.weights))
+
+
+def gripped(shape, velocity: float, ways=None, rolling: bool = False, worlds: int = 2):
+    """A bar whose first end a grip draws over a plane or a ball, which another grip moves; poses of both in two worlds."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, -40.0))
+    scene.clamp(bar(scene, RADIUS + 0.8 * RANGE), motion=ddg.Grip(pivot=(0.01, 0.02, 0.0)))
+    ball = isinstance(shape, ddg.Sphere)
+    scene.add_obstacle(shape, name="obstacle", motion=ddg.Grip(pivot=(0.0, 0.01, -0.1)) if ball else None)
+    scene.contact(range=RANGE, stiffness=50.0, friction=0.3, velocity=velocity, rolling=rolling)
+    if ways:
+        scene.contact_between("bar", "obstacle", friction=ways)
+    poses = np.array([[[0.003, 0.002, 0.0, 0.0, 0.0, 0.3]], [[0.0, 0.004, 0.0001, 0.0, 0.0, 0.2]]])
+    if ball:
+        poses = np.concatenate([poses, [[[0.001, -0.002, -0.001, 0.2, 0.1, -0.3]]] * 2], axis=1)
+    return scene.build(device=differences.DEVICE, precision="float64", worlds=worlds), poses
+
+
+GRIPPED = {
+    "plane": (ddg.Plane(), 1e-3),
+    "by direction": (ddg.Plane(), 1e-3, (0.2, 0.5, 0.3)),
+    "rolling": (ddg.Plane(), 1e-3, None, True),
+    "turned ball": (ddg.Sphere((0.001, 0.002, -0.1), 0.1), 1e-2),
+}
+
+
+@pytest.mark.parametrize("name", GRIPPED)
+def test_gradients_go_through_all_load_steps(name):
+    """By poses at the end of the way, which all load steps have a part of, by forces, and numbers of contact."""
+    torch = pytest.importorskip("torch")
+    from ddg_warp.torch import Simulator
+    from tests.learn.test_torch import check
+
+    model, poses = gripped(*GRIPPED[name])
+    own = Simulator(model, 0.01)
+    torch.manual_seed(0)
+    weight, force = (torch.randn(*shape, 3, dtype=torch.float64) for shape in ((7,), (2, 7)))
+
+    def loss(poses, forces, **numbers):
+        numbers = {name.replace("_", "."): value for name, value in numbers.items()}
+        controls = {"poses": poses, "forces": forces}
+        found = own.equilibrium(numbers, controls, batch=2, rtol=RTOL, load_steps=3)
+        return (weight * found.positions).sum()
+
+    given = {
+        f"contact_{number}": own.parameter(f"contact.{number}", 2) for number in ("stiffness", "friction", "radius")
+    }
+    given |= {"poses": torch.tensor(poses), "forces": 1e-4 * force}
+    sizes = {"contact_stiffness": 0.05, "contact_friction": 1e-3, "contact_radius": 1e-6 * RADIUS}
+    check(loss, given, sizes | {"poses": 1e-5, "forces": 1e-6})
+
+
+def test_a_rod_that_is_drawn():
+    """A force F draws the end of a rod on a floor by u = F^2 / (2 EA mu w): derivatives by F, mu and EA.
+
+    Loads are so large that weight is all but that of the load step before.
+    """
+    torch = pytest.importorskip("torch")
+    from ddg_warp.torch import Simulator
+
+    young, radius, g, mu = 1e5, 0.005, 9.81, 0.4
+    area, weight = np.pi * radius**2, 1000.0 * g * np.pi * radius**2
+    scene = ddg.Scene(gravity=(0.0, 0.0, -g / 1000.0))  # of load parameters about 1000
+    points = np.linspace([0.0, 0.0, radius], [1.0, 0.0, radius], 101)
+    material = ddg.Material(young=young, density=1000.0, poisson=0.5)
+    scene.add_rod(points, section=ddg.Circle(radius), material=material)
+    scene.add_obstacle(ddg.Plane((0.0, 0.0, -1e-3)))
+    scene.contact(friction=mu, velocity=1e-7, range=1e-3)
+    own = Simulator(built(scene), 0.01)
+    lying = own.equilibrium(start=999.0, end=1000.0).detach()
+    forces = torch.zeros((1, 101, 3), dtype=torch.float64)
+    forces[0, -1, 0] = 0.5 * mu * weight / 1001.0  # half of it slides
+    given = {name: own.parameter(name) for name in ("contact.friction", "rod_stretch.stiffness")}
+    leaves = [value.clone().requires_grad_() for value in (*given.values(), forces)]
+    found = own.equilibrium(
+        dict(zip(given, leaves, strict=False)),
+        {"forces": leaves[-1]},
+        state=lying,
+        start=1000.0,
+        end=1001.0,
+        load_steps=2,
+    )
+    u = found.positions[0, -1, 0] - lying.positions[0, -1, 0]
+    np.testing.assert_allclose(
+        float(u.detach()), (0.5 * mu * weight) ** 2 / (2.0 * young * area * mu * weight), rtol=3e-3
+    )
+    gradients = torch.autograd.grad(u, leaves)
+    by_mu, by_stiffness, by_force = (
+        float((gradient * value).sum())
+        for gradient, value in zip(gradients, (leaf.detach() for leaf in leaves), strict=True)
+    )
+    np.testing.assert_allclose(
+        [by_mu, by_stiffness, by_force], np.array([-1.0, -1.0, 2.0]) * float(u.detach()), rtol=3e-3
+    )
+
+
+def test_worlds_settle_on_their_own():
+    """What slides in two worlds does so as in one, in as many load steps: one that rounding moves does not hold up the other."""
+    model, poses = gripped(*GRIPPED["plane"])
+    way = []
+    both = statics.solve(model, controls=ddg.Controls(poses=poses), rtol=RTOL, load_steps=3, way=way)
+    assert [state.time for state in way] == pytest.approx([1.0 / 3.0, 2.0 / 3.0, 1.0])
+    assert way[-1] is both
+    for world in range(2):
+        one, _ = gripped(*GRIPPED["plane"], worlds=1)
+        alone = statics.solve(one, controls=ddg.Controls(poses=poses[world]), rtol=RTOL, load_steps=3)
+        np.testing.assert_allclose(both.points()[world], alone.points(), rtol=0.0, atol=1e-10)

@@ -57,6 +57,7 @@ class PairTerms:
         rolls: whether friction turns rods; turned: then of each edge's angle that with the first and with the second node [N], and with
             the angle of the next edge of the rod [N m]; those with themselves are among `diagonal`.
         stiffness: (worlds times nodes,) [N/m], traces of `diagonal`.
+        start: positions and angles that slip starts from (worlds times nodes,), if not from others.
         law: `law_struct`, on the device; products: the `PairProduct` of all lists.
         spins: how far objects that spin have turned since slips started.
 
@@ -106,7 +107,7 @@ class PairTerms:
         self._version, self._lagged = search.version, -1
         self.spins = Spins(search)
         self.frictions = self._with_friction(rubs, ways, friction_law, velocity, told_not)
-        self._start = wp.zeros_like(self.forces)
+        self.start = wp.zeros_like(self.forces)
         self.rolls = any(part.rolls for part in self.frictions)
         made = gather.collect_kernels(self.real, self.linear, arrays.serial(self.device), self.rolls)
         self._collect, self._join, self._roll = made
@@ -167,7 +168,7 @@ class PairTerms:
             part.write(x, self.law, self.gap)
             friction.lag(self.law, x, again)
         if not again:
-            wp.copy(self._start, x)
+            wp.copy(self.start, x)
         self._lagged = self._version
 
     def evaluate(
@@ -193,7 +194,7 @@ class PairTerms:
         self._start_anew()
         for part in self.lists:
             part.evaluate(x, self.law, self.gap)
-        start = self._start if start is None else start
+        start = self.start if start is None else start
         rate = self._no_rate if rate is None else rate
         iterates = self._no_iterates if iterates is None else iterates
         if self.frictions:

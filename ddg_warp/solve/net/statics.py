@@ -22,9 +22,10 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.errors import SolverError
+from ddg_warp.geometry import polyline
 from ddg_warp.kernels import outcome
 from ddg_warp.kernels.net import newton
-from ddg_warp.model.state import State
+from ddg_warp.model.state import Sliding, State
 from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.choice import net_preconditioner
 from ddg_warp.solve.graphs import Graphs
@@ -40,6 +41,7 @@ LEAST, LEAP = 0.1, 10.0  # part of a way with other normal forces that is taken,
 # falls into place bodies lose touch for an iteration, and are carried far by the friction of others: it takes some without.
 LAGGED = 5
 SETTLED = 1e-4  # residuals over all loads, of what has
+UNSETTLED = "unsettled"  # outcome where forces do not balance with the friction that the state has
 
 
 class StaticNewton(NetNewton):
@@ -58,6 +60,7 @@ class StaticNewton(NetNewton):
         self.rubs = self.contact is not None and self.contact.rubs
         if self.rubs:  # another than that of strain-rate damping, which counts at rest
             self.contact.rate = wp.zeros_like(self.islands.rate)
+            self.slid = wp.zeros_like(self.q)
 
     @property
     def kernels(self) -> list:
@@ -71,11 +74,13 @@ class StaticNewton(NetNewton):
         at: float,
         scale: np.ndarray,
         before: np.ndarray | None = None,
+        slid: np.ndarray | None = None,
         rate: float = 0.0,
     ) -> None:
         """Set out from dofs `q` under dead loads (worlds, 3 blocks), with those that follow at `at`; load scales of bodies.
 
-        In contact q is what is proposed to what is at dofs `before`; friction counts slips over `rate`, and without there is none.
+        In contact q is what is proposed to what is at dofs `before`; friction counts slips from blocks `slid` on over `rate`, without
+        which there is none.
         """
         for name in ("status", "iteration", "halvings", "unbalanced", "drowned", "clamped", "stale"):
             getattr(self.islands, name).zero_()
@@ -86,6 +91,8 @@ class StaticNewton(NetNewton):
             self.contact.rest()
         if self.rubs:
             self.contact.rate.fill_(rate)
+            if slid is not None:
+                self.slid.assign(slid)
         for load in (self.load, self._there):
             load.assign(dead.reshape(-1, 3))
         if self.loads:
@@ -113,6 +120,8 @@ class StaticNewton(NetNewton):
         if self.contact:
             self.contact.renew(self._before)
             self.contact.start(self._before, again)
+            if self.rubs:
+                wp.copy(self.contact.terms.start, self.slid)
             self.contact.place()
         self.solve(state)
 
@@ -279,7 +288,7 @@ class NetEquilibrium:
         rubs, rate = self.newton.rubs, 1.0 / increment if self.newton.rubs else 0.0
         again = self.net.edges or self.model.motions  # what is found is judged by its own frames and forces on supports
         held = self.tangent.dofs(state)
-        relaxation = Relaxation(self.net.worlds) if rubs else None
+        relaxation, settled = Relaxation(self.net.worlds) if rubs else None, np.zeros(self.net.worlds, bool)
         for solves in range(owner.options.max_iterations if rubs else 1 + bool(again)):
             on = solves > 0 and rubs
             if on and not self.arrived:
@@ -291,7 +300,7 @@ class NetEquilibrium:
                 name += " warily" if warily else ""
             self._replay(
                 name,
-                partial(self._begin, state, at, before, rate),
+                partial(self._begin, state, at, before, self._slid(first, state) if rubs else None, rate),
                 partial(self.newton.search, self._start, on),
             )
             before, iterations, ends = state, self.newton.islands.iteration.numpy(), self.newton.islands.status.numpy()
@@ -303,38 +312,56 @@ class NetEquilibrium:
             for name in ("frame", *(f"lag_{i}" for i in range(len(self.net.sets)))):
                 wp.copy(state.net.arrays()[name], self._start.arrays()[name])  # renewed on the way, perhaps
             self.model.carry_frames(state)
-            status = int(ends.max())
+            # in equilibrium with the friction of its own normal forces; what comes later moves such a world within rounding
+            settled |= on and iterations <= np.where(ends == outcome.CONVERGED_TO_ROUNDING, POLISH, 0)
+            status = int(np.where(settled, np.minimum(ends, outcome.CONVERGED_TO_ROUNDING), ends).max())
             q = self.tangent.dofs(state)
             if self.newton.contact:
                 self._refuse_drifting(state, q, at)
             if status > outcome.CONVERGED_TO_ROUNDING and not (rubs and status == outcome.MAX_ITERATIONS):
                 break
-            # in equilibrium with the friction of its own normal forces
-            if on and (iterations <= np.where(ends == outcome.CONVERGED_TO_ROUNDING, POLISH, 0)).all():
+            if settled.all():
                 break
         else:
             status = outcome.MAX_ITERATIONS if rubs else status
         outer = self.tangent.loads(at, q)
         residual = outer - self.tangent.gradient(state)
-        certain = True
+        certain, name = True, outcome.NAMES[status]
         if rubs:
-            rates = (state.net.q.numpy() - first.net.q.numpy()) * rate
-            state.sliding = wp.array(rates, dtype=self.net.vector, device=self.net.device)
+            rates = (state.net.q.numpy() - self._slid(first, state)) * rate
+            state.sliding = Sliding(wp.array(rates, dtype=self.net.vector, device=self.net.device), increment)
             residual += self.tangent.friction(state)
-            points = self.tangent.free & ~self.tangent.angle
-            settled = np.abs(residual[points]).max(initial=0.0) <= SETTLED * np.abs(outer[points]).sum()
-            certain = bool(settled) and not self.model.touch.slides()
-        if status > outcome.CONVERGED_TO_ROUNDING:
-            name = outcome.NAMES[status]
+            free, points = self.tangent.free, ~self.tangent.angle
+            unbalanced = np.abs(residual[free & points]).max(initial=0.0)
+            loads, supports = (np.abs(of).sum() for of in (outer[free & points], (outer - residual)[~free & points]))
+            certain = unbalanced <= SETTLED * loads and not self.model.touch.slides()
+            if warily and unbalanced > SETTLED * (loads + supports):
+                name = UNSETTLED
+        if status > outcome.CONVERGED_TO_ROUNDING or name == UNSETTLED:
             told = self.newton.contact.tightest(state.net.q, status) if self.newton.contact else ""
             if rubs:
                 told += "what slides may come to no rest: step the scene in time, "
             raise SolverError(owner.residuals.where(name, residual, at, told), state=state, outcome=name)
-        owner.outcome = outcome.NAMES[status]
+        owner.outcome = name
         # in contact the last matrix may be the projected one without a trial of the exact one, which tells nothing
         indefinite = self.newton.contact is None and self.newton.islands.clamped.numpy().any()
         state.stable = False if indefinite else None
         return owner.found(state, outer, residual, at), certain
+
+    def _slid(self, first: State, state: State) -> np.ndarray:
+        """Blocks (W N, 3) that slips of a state count from: those of the `first` one, its angles about the frames that this has.
+
+        Frames came here by way of iterates, and turned on it about their tangents beside ones that come straight.
+        """
+        q, net = first.net.q.numpy().copy(), self.net
+        if self.newton.contact.terms.rolls:
+            (u, t), (v, end) = (
+                np.split(np.moveaxis(of.net.frame.numpy().reshape(6, net.worlds, -1), 0, -1), 2, axis=-1)
+                for of in (first, state)
+            )
+            turned = polyline.signed_angle(polyline.transport(u, t, end), v, end)
+            q.reshape(net.worlds, -1, 3)[:, net.angle_start :][:, : net.edges, 0] -= turned
+        return q
 
     def _refuse_drifting(self, state: State, q: np.ndarray, at: float) -> None:
         """Refuse what loads carry away, as neither supports nor contact hold it."""
@@ -374,13 +401,15 @@ class NetEquilibrium:
                 return
             self._graphs.clear()
 
-    def _begin(self, state: State, at: float, before: State | None = None, rate: float = 0.0) -> None:
+    def _begin(
+        self, state: State, at: float, before: State | None = None, slid: np.ndarray | None = None, rate=0.0
+    ) -> None:
         tangent, part = self.tangent, self.tangent.parts[-1]
         q = tangent.dofs(state)
         start = q if before is None else self._beside(q, tangent.dofs(before))
         outer, gradient = tangent.loads(at, q), part.elastic_gradient(state)
         scale = self.owner.residuals.load_scale(outer, gradient)
-        self.newton.begin(tangent.back(q), part.dead_loads(at), at, scale, tangent.back(start), rate)
+        self.newton.begin(tangent.back(q), part.dead_loads(at), at, scale, tangent.back(start), slid, rate)
         for name, array in self._start.arrays().items():
             wp.copy(array, state.net.arrays()[name])
 

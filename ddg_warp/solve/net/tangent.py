@@ -100,6 +100,10 @@ class NetTangent(Part):
 
     def hessian(self, state, stress: list | None = None) -> sparse.csc_matrix:
         validate.refuse_friction(self.model)
+        return self.potential_hessian(state, stress)
+
+    def potential_hessian(self, state, stress: list | None = None) -> sparse.csc_matrix:
+        """The same without friction, which has no potential, where there is some."""
         scatter, rows, starts = self._pattern
         total = np.zeros(len(rows))
         for i, part in enumerate(self.net.sets):
