@@ -162,7 +162,8 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: boo
 
     x: lagged positions; beside (things,): the two nodes that say where the rod of a first thing of one world leads; ways: by groups,
     coefficients forwards, backwards and across over `friction`. All three are read where friction is directed. spinning (objects,):
-    where objects have markers, below zero without; read where some of them spin. first_angles, second_angles (things,): see
+    where objects have markers, below zero without; read where some of them spin. more (worlds,): what friction counts
+    beside normal forces [N]. first_angles, second_angles (things,): see
     `Shapes.angles`; read where rods roll, as x and beside are.
     """
     Law, Sides, Factor, Lagged = law_struct(real), sides_struct(real), factor_struct(linear), lagged_struct(real)
@@ -188,6 +189,7 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: boo
         contact: Factor,
         gradient: wp.array2d(dtype=V),
         onward: int,
+        more: wp.array(dtype=real),
         before: wp.array(dtype=int),
         pairs_out: wp.array(dtype=wp.vec2i),
         factor: Factor,
@@ -237,7 +239,7 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: boo
                     of, radius = spun(sides, spinning, w, i, j)
                     lagged.spinning[p] = of
                     lagged.arm[p] = n * radius
-                lagged.bound[p] = mu * normal
+                lagged.bound[p] = mu * (normal + more[w])
                 lagged.weight[p] = weight
                 lagged.tangent[0, p] = t1
                 lagged.tangent[1, p] = t2

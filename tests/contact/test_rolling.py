@@ -8,6 +8,7 @@ from pair_cases import assembled, repeats
 import ddg_warp as ddg
 from ddg_warp import statics
 from ddg_warp.errors import SceneError
+from ddg_warp.scenes import capstan
 
 RADIUS, G = 2e-3, 9.81
 STIFF = ddg.Material(young=1e7, density=1000.0, poisson=0.4)
@@ -136,6 +137,68 @@ def test_a_shaft_draws_what_is_held(device, angle, load_steps):
     shaft, end, _ = model.reactions(state, point=(0.0, 0.0, 0.0))
     np.testing.assert_allclose(end.force[0], -np.sign(angle) * mu * pushed, rtol=1e-3)
     np.testing.assert_allclose(shaft.moment[1], np.sign(angle) * mu * pushed * RADIUS, rtol=1e-3)
+
+
+def logs(between: float, floor: float) -> ddg.Scene:
+    """Two logs side by side on a floor, which do not touch, and one on top of both."""
+    scene, radius, gap = ddg.Scene(gravity=(0.0, 0.0, -G)), 0.01, 1e-4
+    y, apart = np.linspace(-0.02, 0.02, 3), 1.0005 * (radius + 0.5 * gap)
+    for x, z in ((-apart, 0.0), (apart, 0.0), (0.0, np.sqrt(3.0) * (radius + 0.5 * gap))):
+        points = np.stack([0.0 * y + x, y, 0.0 * y + radius + gap + z], 1)
+        name = "top" if z else "left" if x < 0.0 else "right"
+        scene.add_rod(points, section=ddg.Circle(radius), material=STIFF, name=name)
+    scene.add_obstacle(ddg.Plane(), name="floor")
+    scene.contact(friction=between, rolling=True, velocity=1e-5, range=gap)
+    scene.contact_between("left", "right", ignore=True)
+    for name in ("left", "right", "top"):
+        scene.contact_between(name, "floor", friction=floor)
+    return scene
+
+
+@pytest.mark.parametrize(("statically", "near"), [(True, 0.01), (False, 0.02)])
+@pytest.mark.parametrize("floor", [False, True])
+def test_a_pile_of_logs(device, statically, near, floor):
+    """It stands where friction between logs is 2 - sqrt(3) at least, and a third of that on the floor; else the upper one parts them.
+
+    The lower log's moment about its axis, and about where it touches the floor, ask for the same friction at both places; normal
+    forces on it are W / 2 / (cos 30 + sin 30 tan 15) from above and 3 W / 2 from below.
+    """
+    least = (2.0 - np.sqrt(3.0)) / (3.0 if floor else 1.0)
+    for mu in (least * (1.0 - near), least * (1.0 + near)):
+        model = logs(*((0.5, mu) if floor else (mu, 0.5))).build(device, precision="float64")
+        state = statics.solve(model) if statically else run(model, 600)
+        assert (state.points()[-3:, 2].mean() > 0.027) == (mu > least)
+
+
+@pytest.mark.parametrize("turns_freely", [True, False])
+def test_a_rope_over_a_pulley(device, turns_freely):
+    """A drum that is held but free to turn passes tension on as it is; one that is clamped by Euler's and Eytelwein's law."""
+    slack, mu = 1000.0 * capstan.B / capstan.AROUND**2, 0.3
+    points, ends = capstan.wound(np.pi, np.pi * capstan.AROUND / 30, capstan.AROUND)
+    EA = capstan.STIFF * slack * np.exp(np.pi * mu)
+    own = {"mass_per_length": capstan.MASS_PER_LENGTH, "rotary_inertia": 1e-10, "radius": capstan.RADIUS}
+    scene, drum = ddg.Scene(gravity=(0.0, 0.0, 0.0)), np.outer(np.linspace(-1.0, 1.0, 4), [0.0, capstan.DRUM, 0.0])
+    section = ddg.Stiffness(EA=EA, EI1=capstan.B, GJ=capstan.B, **own)
+    rope = scene.add_rod(points, section=section, natural="straight")
+    scene.add_force(rope, 0, slack * ends[0])
+    scene.fix(rope, [-1], motion=ddg.Motion(translation=lambda t: tuple(capstan.SPEED * t * ends[1])))
+    pulley = scene.add_rod(drum, section=ddg.Circle(capstan.DRUM), material=STIFF)
+    scene.fix(pulley, range(4))
+    if not turns_freely:
+        scene.clamp(pulley, edges=range(3))
+    scene.contact(range=capstan.RANGE, stiffness=1e4, friction=mu, velocity=capstan.VELOCITY, rolling=True)
+    model = scene.build(device, precision="float64")
+    for statically, load in ((True, 5.0), (False, 1.0)):
+        state = model.state(points=np.concatenate([points, drum]))
+        if statically:
+            state = statics.solve(model, state, start=1.0, end=5.0, load_steps=4)
+        else:
+            state = run(model, 30, 1.0, state)
+        tension = np.linalg.norm(model.reactions(state, factor=load)[0].force) / (load * slack)
+        if turns_freely:
+            np.testing.assert_allclose(tension, 1.0, rtol=1e-3)
+        else:
+            np.testing.assert_allclose(tension, capstan.expected(mu, np.pi, load * slack), rtol=5e-3)
 
 
 def test_angles_beside_held_nodes(device):

@@ -78,12 +78,15 @@ class FrictionElements(PairElements):
         self.lagged.arm = wp.zeros(spinning, dtype=vector, device=self.device)
         self.lagged.lever = arrays.allocate((ANGLES, capacity if self.rolls else 0), vector, self.device)
 
-    def lag(self, law, x: wp.array, again: bool) -> None:
-        """Take the pairs of contact as it was evaluated last, at x; `again`: of a search that goes on, with the directions of slips."""
+    def lag(self, law, x: wp.array, again: bool, more: wp.array) -> None:
+        """Take the pairs of contact as it was evaluated last, at x; `again`: of a search that goes on, with the directions of slips.
+
+        more: beside normal forces, what friction counts (worlds,) [N].
+        """
         self._onward = int(again)
         of = self._contact
         inputs = [of.pairs, of.count, self.found.sides, law, x, *self.directions, self._spins.places, *self.angles]
-        inputs += [of.factor, of.gradient, self._onward, self.count]
+        inputs += [of.factor, of.gradient, self._onward, more, self.count]
         outputs = [self.pairs, self.factor, self.lagged, self._slip, self._along]
         self._take_turns(self._lag, self.found.capacity, inputs, outputs)
         for name in self._kept:

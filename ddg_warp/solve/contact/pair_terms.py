@@ -57,7 +57,8 @@ class PairTerms:
         rolls: whether friction turns rods; turned: then of each edge's angle that with the first and with the second node [N], and with
             the angle of the next edge of the rod [N m]; those with themselves are among `diagonal`.
         stiffness: (worlds times nodes,) [N/m], traces of `diagonal`.
-        start: positions and angles that slip starts from (worlds times nodes,), if not from others.
+        start: positions and angles that slip starts from (worlds times nodes,), if not from others; more: what friction counts beside
+            normal forces (worlds,) [N], none but where what meets is to stick.
         law: `law_struct`, on the device; products: the `PairProduct` of all lists.
         spins: how far objects that spin have turned since slips started.
 
@@ -107,7 +108,7 @@ class PairTerms:
         self._version, self._lagged = search.version, -1
         self.spins = Spins(search)
         self.frictions = self._with_friction(rubs, ways, friction_law, velocity, told_not)
-        self.start = wp.zeros_like(self.forces)
+        self.start, self.more = wp.zeros_like(self.forces), wp.zeros_like(self.gap)
         self.rolls = any(part.rolls for part in self.frictions)
         made = gather.collect_kernels(self.real, self.linear, arrays.serial(self.device), self.rolls)
         self._collect, self._join, self._roll = made
@@ -166,7 +167,7 @@ class PairTerms:
         self._start_anew()
         for part, friction in zip(self.lists, self.frictions, strict=True):
             part.write(x, self.law, self.gap)
-            friction.lag(self.law, x, again)
+            friction.lag(self.law, x, again, self.more)
         if not again:
             wp.copy(self.start, x)
         self._lagged = self._version

@@ -14,6 +14,7 @@ normal forces come of friction elsewhere and that of theirs, goes less than the 
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
@@ -40,6 +41,7 @@ LEAST, LEAP = 0.1, 10.0  # part of a way with other normal forces that is taken,
 # Iterations with the same normal forces. By too small ones what would stick slides far off: a wary search takes one. In a crowd that
 # falls into place bodies lose touch for an iteration, and are carried far by the friction of others: it takes some without.
 LAGGED = 5
+STUCK = 30  # iterations in which what meets for the first time sticks, at most
 SETTLED = 1e-4  # residuals over all loads, of what has
 UNSETTLED = "unsettled"  # outcome where forces do not balance with the friction that the state has
 
@@ -265,6 +267,11 @@ class NetEquilibrium:
         Raises:
             SolverError: it was not found; names the outcome.
         """
+        if self.newton.rubs and self._untouched(before):
+            with suppress(SolverError):  # that of what can not stick
+                found, certain = self._search(state, at, before, increment, sticking=True)
+                if certain:
+                    return found
         try:
             found, certain = self._search(state, at, before, increment)
         except SolverError:
@@ -276,9 +283,10 @@ class NetEquilibrium:
         return self._search(state, at, before, increment, warily=True)[0]
 
     def _search(
-        self, state: State, at: float, before: State, increment: float, warily: bool = False
+        self, state: State, at: float, before: State, increment: float, warily: bool = False, sticking: bool = False
     ) -> tuple[State, bool]:
-        """See `solve`; `warily` with normal forces that are taken anew after every iteration.
+        """See `solve`; `warily` with normal forces that are taken anew after every iteration; `sticking`: what meets does so at first,
+        until it is known what pushes it.
 
         Returns:
             The equilibrium; and whether it is one however normal forces were taken: forces balance with friction of their own normal
@@ -289,6 +297,9 @@ class NetEquilibrium:
         again = self.net.edges or self.model.motions  # what is found is judged by its own frames and forces on supports
         held = self.tangent.dofs(state)
         relaxation, settled = Relaxation(self.net.worlds) if rubs else None, np.zeros(self.net.worlds, bool)
+        if rubs:
+            loads = np.where(self.tangent.angle, 0.0, self.tangent.loads(at, held)).reshape(self.net.worlds, -1)
+            self.newton.contact.terms.more.assign(sticking * np.abs(loads).sum(1))
         for solves in range(owner.options.max_iterations if rubs else 1 + bool(again)):
             on = solves > 0 and rubs
             if on and not self.arrived:
@@ -296,8 +307,9 @@ class NetEquilibrium:
                 self.tangent.assign(state, np.where(self.tangent.free, self.tangent.dofs(state), held))
             name = "slide on" if on else "solve"
             if rubs:
-                self.newton.options = replace(self.newton.options, max_iterations=1 if warily else LAGGED)
-                name += " warily" if warily else ""
+                often = warily or sticking
+                self.newton.options = replace(self.newton.options, max_iterations=1 if often else LAGGED)
+                name += " warily" if often else ""
             self._replay(
                 name,
                 partial(self._begin, state, at, before, self._slid(first, state) if rubs else None, rate),
@@ -314,10 +326,16 @@ class NetEquilibrium:
             self.model.carry_frames(state)
             # in equilibrium with the friction of its own normal forces; what comes later moves such a world within rounding
             settled |= on and iterations <= np.where(ends == outcome.CONVERGED_TO_ROUNDING, POLISH, 0)
-            status = int(np.where(settled, np.minimum(ends, outcome.CONVERGED_TO_ROUNDING), ends).max())
             q = self.tangent.dofs(state)
             if self.newton.contact:
                 self._refuse_drifting(state, q, at)
+            if sticking:
+                sticking = solves < STUCK and not settled.all()
+                if not sticking:
+                    settled[:] = False
+                    self.newton.contact.terms.more.zero_()
+                continue
+            status = int(np.where(settled, np.minimum(ends, outcome.CONVERGED_TO_ROUNDING), ends).max())
             if status > outcome.CONVERGED_TO_ROUNDING and not (rubs and status == outcome.MAX_ITERATIONS):
                 break
             if settled.all():
@@ -347,6 +365,11 @@ class NetEquilibrium:
         indefinite = self.newton.contact is None and self.newton.islands.clamped.numpy().any()
         state.stable = False if indefinite else None
         return owner.found(state, outer, residual, at), certain
+
+    def _untouched(self, before: State) -> bool:
+        """Whether nothing pushed anything in the equilibrium before, so that normal forces are not known."""
+        self.model.touch.at(before.net.q)
+        return not self.model.touch.terms.touching.numpy().any()
 
     def _slid(self, first: State, state: State) -> np.ndarray:
         """Blocks (W N, 3) that slips of a state count from: those of the `first` one, its angles about the frames that this has.
