@@ -276,3 +276,55 @@ def test_friction_needs_an_increment(device):
     model = on_slope(rod_on_floor, 0.3, friction=0.5).build(device, precision="float64")
     with pytest.raises(ddg.SceneError, match=r"friction .* from 1 to 1 there is none; give start other than end"):
         statics.solve(model, start=1.0)
+
+
+def bracket(beyond: float) -> ddg.Scene:
+    """A bracket about a pole, with a bar behind it above and one before it below, under a force at `beyond` the critical distance."""
+    mu, height, pole, radius, steel = 0.3, 0.1, 0.01, 0.003, ddg.Material(young=2e11, density=7800.0)
+    scene, section, away = ddg.Scene(gravity=(0.0, 0.0, 0.0)), ddg.Circle(radius), pole + radius + 1.5e-5
+    post = scene.add_rod(line((0, 0, -0.15), (0, 0, 0.15), 6), section=ddg.Circle(pole), material=steel, name="pole")
+    scene.clamp(post, edges=range(6))
+    above, below, end = (-away, 0.5 * height), (away, -0.5 * height), (0.5 * beyond * height / mu, 0.0, 0.0)
+    bars = [((x, -0.03, z), (x, 0.03, z), 6) for x, z in (above, below)]
+    sides = [((above[0], y, above[1]), (below[0], y, below[1]), 4) for y in (-0.03, 0.03)]
+    arms = [((below[0], y, below[1]), end, 4) for y in (-0.03, 0.03)]
+    upper, lower, left, right, one, other = (
+        scene.add_rod(line(*of), section=section, material=steel, name="bracket") for of in (*bars, *sides, *arms)
+    )
+    for k, side, arm in ((0, left, one), (-1, right, other)):
+        scene.join([(upper, k), (side, 0)], rigid=True)
+        scene.join([(lower, k), (side, -1), (arm, 0)], rigid=True)
+    scene.join([(one, -1), (other, -1)], rigid=True)
+    scene.add_force(one, -1, (0.0, 0.0, -1.0))
+    scene.contact(friction=mu, velocity=1e-6, range=1e-5)
+    scene.contact_between("bracket", "bracket", ignore=True)
+    return scene
+
+
+def test_a_bracket_locks_itself(device):
+    """A force W at a distance e from a pole is held where e > h / 2 mu: N = W e / h pushes it at both heights, 2 mu N holds it."""
+    model = bracket(1.03).build(device, precision="float64")
+    state = statics.solve(model)
+    found = model.contacts(state)
+    np.testing.assert_allclose((found.force + found.friction)[:, 2].sum(), -1.0, rtol=1e-6)
+    with pytest.raises(SolverError, match="what slides may come to no rest"):
+        statics.solve(bracket(0.97).build(device, precision="float64"), max_cuts=1)
+
+
+def test_less_of_a_way_leads_into_nothing(device):
+    """Half of the way that iterates have gone around a rod would be in it: then all of it is gone."""
+    scene = ddg.Scene()
+    scene.fix(
+        scene.add_rod(line((0.0, -0.1, 0.0), (0.0, 0.1, 0.0), 4), section=ddg.Circle(0.005), material=RUBBER), range(5)
+    )
+    scene.add_rod(line((-0.1, 0.01, 0.02), (0.1, 0.01, 0.02), 4), section=ddg.Circle(0.005), material=RUBBER)
+    scene.contact(friction=0.3)
+    model = scene.build(device, precision="float64")
+    search, state = Equilibrium(model).net, model.state()
+    begun = state.net.q.numpy().copy()
+    for way, gone in ((-0.04, -0.04), (0.04, 0.02)):
+        moved = begun.copy()
+        moved[5:10, 2] += way
+        state.net.q.assign(moved)
+        search._relax(lambda way, whole: np.array([0.5]), state, begun)
+        np.testing.assert_allclose(state.net.q.numpy()[5:10, 2] - begun[5:10, 2], gone, rtol=1e-12)

@@ -399,12 +399,17 @@ class NetEquilibrium:
             )
 
     def _relax(self, relaxation, state: State, begun: np.ndarray) -> None:
-        """Take less of a way with other normal forces, of worlds whose supports have not moved on it."""
+        """Take less of a way with other normal forces, of worlds whose supports have not moved on it.
+
+        All of it where less would be in the way of something: iterates do not go straight.
+        """
         way = (state.net.q.numpy() - begun).reshape(self.net.worlds, -1)
         held = ~self.tangent.free.reshape(self.net.worlds, -1)
         part = relaxation(way, (way * held).any(1))
         if (part < 1.0).any():
-            state.net.q.assign(begun + (part[:, None] * way).reshape(begun.shape))
+            less = begun + (part[:, None] * way).reshape(begun.shape)
+            if self.newton.contact.share(begun, less) == 1.0:
+                state.net.q.assign(less)
 
     @property
     def arrived(self) -> bool:
