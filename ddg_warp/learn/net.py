@@ -213,7 +213,7 @@ class NetAdjoint:
         self._rubbing.fill_(kept.rubbing or rate)
         rough, ways = None, reversed(list(pairwise([before.q, *kept.lagged, solved.q])))
         if kept.rubbing:  # normal forces are those of the equilibrium
-            rough, ways = self.contact.rubbing(solved.q, before.q, self._rubbing), [(solved.q, solved.q)]
+            rough, ways = self.contact.matrix(solved.q, before.q, self._rubbing), [(solved.q, solved.q)]
         by_tangents = by_predicted if self._midpoint else start.q
         for at, q in ways:  # friction lagged there, and the solution
             damped = replace(solved, q=q, last=before.last)

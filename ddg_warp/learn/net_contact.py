@@ -2,17 +2,16 @@
 
 import numpy as np
 import warp as wp
-from scipy import sparse
 
 from ddg_warp import arrays
 from ddg_warp.kernels.adjoint import contact_sums
-from ddg_warp.kernels.adjoint.contact import NUMBERS, RATE, ROLLED, SPUN, THICKNESS, pull_kernel, rub_kernel
-from ddg_warp.kernels.contact.gather import ITEMS, SLOTS, sum_kernel
-from ddg_warp.learn.rolling import turned_by
+from ddg_warp.kernels.adjoint.contact import NUMBERS, RATE, SPUN, THICKNESS, pull_kernel
+from ddg_warp.kernels.contact.gather import sum_kernel
 from ddg_warp.solve.contact.node_items import NodeItems
-from ddg_warp.solve.contact.pair_terms import FRICTION
+from ddg_warp.solve.contact.rolling import turned_by
 from ddg_warp.solve.contact.touch import LAWS
 from ddg_warp.solve.net.exact_contact import ExactContact
+from ddg_warp.solve.net.rubbing import Rubbing
 from ddg_warp.solve.net.system import lists
 
 PIECES, LEAST = 256, 64  # of the first things of a world, at most, and what one has at least
@@ -44,16 +43,14 @@ class ContactAdjoint:
         serial, nodes = arrays.serial(device), len(terms.forces)
         every = wp.zeros(net.blocks, dtype=wp.uint8, device=device)
         self.lags = given.law.lags if terms.frictions else 1
-        self._rubs, self._velocity = terms.frictions or [None] * len(terms.lists), given.law.velocity
-        law, friction = LAWS[given.law.law], FRICTION[given.law.friction_law]
+        self._rubs = terms.frictions or [None] * len(terms.lists)
+        law = LAWS[given.law.law]
         kinds = [pairs.kind for pairs in search.lists]
         self._pull = [pull_kernel(kind, law, real) for kind in kinds]
-        leads, directed = ([of.directions[k] is not None for of in terms.frictions] for k in range(2))
+        leads = [of.directions[0] is not None for of in terms.frictions]
         self._rolls = [of.rolls for of in terms.frictions] or [False] * len(kinds)
         self._spins = terms.spins if terms.frictions and terms.spins.any else None
-        spins = bool(self._spins)
-        what = zip(kinds, directed, self._rolls, strict=bool(terms.frictions))
-        self._rub = [rub_kernel(kind, law, friction, real, ways, spins, rolls) for kind, ways, rolls in what]
+        self.rubbing, spins = Rubbing(net, self.system), bool(self._spins)
         self._direct = contact_sums.direction_kernels(real) if any(leads) else ()
         beside = search.shapes.beside
         self._leads = [
@@ -81,7 +78,7 @@ class ContactAdjoint:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [*self._pull, *self._rub, self._add, *self._group, self._bodies, *self._direct]
+        own = [*self._pull, *self.rubbing.kernels, self._add, *self._group, self._bodies, *self._direct]
         return [
             *own,
             *(k for pair in self._sides for k in pair),
@@ -102,13 +99,9 @@ class ContactAdjoint:
 
     def _reserve(self) -> None:
         """Make room for as many pairs as the search has."""
-        lists, vector = self.system.search.lists, self.net.vector
-        most = max(pairs.capacity for pairs in lists)
-        self._numbers, self._spun = self._zeros(NUMBERS, most), self._zeros(SPUN, most if self._spins else 1)
-        shape, device = (ITEMS if any(self._rolls) else SLOTS, most), self.net.device
-        self._radii = self._zeros(ROLLED, most if any(self._rolls) else 1)
-        self._start_parts, self._lagged_parts = (arrays.allocate(shape, vector, device) for _ in range(2))
-        self._by_direction = wp.zeros(most if self._direct else 1, dtype=vector, device=self.net.device)
+        lists = self.system.search.lists
+        self._numbers = self._zeros(NUMBERS, max(pairs.capacity for pairs in lists))
+        self.rubbing.reserve()
         for items, pairs in {*zip(self._items, lists, strict=True), *zip(self._rub_items, lists, strict=True)}:
             items.reserve(pairs.capacity)
 
@@ -133,16 +126,16 @@ class ContactAdjoint:
             if rub:
                 items = self._rub_items[i]
                 items.list(rub.count, rub.factor)
-                written = self._pull_rub(i, rub, (rub.factor.nodes, rub.factor.angles), at, w, rate)
+                written = self.rubbing.pull(i, (rub.factor.nodes, rub.factor.angles), at, w, rate, self._numbers)
                 for found, by_found in zip(written, (by_q, by_before, by_lagged), strict=True):
                     self._add_up(items, rub, found, by_found)
                 self._sum(i, items, rub)
                 self._lead(i, rub, by_lagged)
                 if rub.rolls:
-                    self._to_things(i, items, rub, (self._radii[0], self._radii[1]), self._things)
+                    self._to_things(i, items, rub, (self.rubbing.radii[0], self.rubbing.radii[1]), self._things)
                 if self._spins:
                     for row in range(SPUN):
-                        self._to_things(i, items, rub, (self._spun[row],) * 2, self._spun_row(row))
+                        self._to_things(i, items, rub, (self.rubbing.spun[row],) * 2, self._spun_row(row))
         self._to_bodies(self._things, self.by_radius)
         if self._spins:
             self._by_spun.zero_()
@@ -150,31 +143,11 @@ class ContactAdjoint:
                 self._to_bodies(self._spun_row(row), self._by_spun[row])
             self._spins.pull(before, q, self._by_spun, [by_before, by_q, self.by_radius])
 
-    def _pull_rub(self, index: int, rub, of: tuple, at: tuple, w: wp.array, rate: wp.array) -> list[wp.array]:
-        """What friction on the pairs of elements, with nodes and angles `of` these, brings by slot of the solution, of the start and of
-        what was lagged; `at`, w and rate as of `pull`. The rest that `rub_kernel` writes is left where it has its place."""
-        terms = self.system.terms
-        inputs = [rub.pairs, rub.count, rub.found.sides, terms.law, *of, rub.factor.used]
-        inputs += [*at, w, self._velocity, rate, *rub.directions, terms.spins.places, terms.spins.turned.flatten()]
-        written = [rub.gradient, self._start_parts, self._lagged_parts]
-        more = [self._numbers, self._by_direction, self._spun, self._radii]
-        self._take_turns(self._rub[index], rub.found.capacity, inputs, [*written, *more])
-        return written
-
-    def rubbing(self, q: wp.array, before: wp.array, rate: wp.array) -> sparse.csc_matrix:
-        """What friction adds to the matrix of an equilibrium at blocks q that came there from others (3 W N, 3 W N) [N/m].
-
-        Normal forces and directions are those at q, too, so that it is not symmetric. Makes room for pairs; reads from the device.
-        """
-        while True:
-            self.system.find(q, before, q, rate)
-            if not self.outgrown(q):
-                break
-        total = sparse.csc_matrix((3 * len(q),) * 2)
-        for i, rub in enumerate(self._rubs):
-            if rub:
-                total -= self._rub_matrix(i, rub, q, before, rate)
-        return total + total @ turned_by(self.net, q.numpy(), before.numpy())[0] if self.system.terms.rolls else total
+    def matrix(self, q: wp.array, before: wp.array, rate: wp.array):
+        """As of `Rubbing`; what is pulled after it has room for all pairs."""
+        found = self.rubbing.matrix(q, before, rate)
+        self._reserve()
+        return found
 
     def roll(self, q: wp.array, before: wp.array, by_before: wp.array, by_q: wp.array) -> None:
         """After `pull` of an equilibrium, add what comes by frames, which are carried along, to derivatives by blocks q and `before`.
@@ -185,55 +158,6 @@ class ContactAdjoint:
             found = by_before.numpy().astype(float).ravel()
             for by, derivative in zip((by_q, by_before), turned_by(self.net, q.numpy(), before.numpy()), strict=True):
                 by.assign(by.numpy() - (derivative.T @ found).reshape(-1, 3))
-
-    def _rub_matrix(self, index: int, rub, q: wp.array, before: wp.array, rate: wp.array) -> sparse.csc_matrix:
-        """Derivative of the friction of elements by q.
-
-        Each pair has blocks of its own, behind those of the net, at which w is one component after another.
-        """
-        count, device, size = int(rub.count.numpy()[0]), self.net.device, 3 * len(q)
-        blocks, angles, ends = rub.factor.nodes.numpy()[:count], rub.factor.angles, None
-        if rub.rolls:
-            blocks = np.column_stack([blocks, angles.numpy()[:count]])
-        felt = (rub.factor.used.numpy()[:count, None] != 0) & (blocks >= 0)
-        felt[:, rub.found.kind.first + rub.found.kind.second : SLOTS] = False
-        apart = np.where(felt, len(q) + np.arange(blocks.size).reshape(blocks.shape), blocks).astype(np.int32)
-        nodes = arrays.upload(apart[:, :SLOTS], wp.vec4i, device)
-        if rub.rolls:
-            angles = arrays.upload(apart[:, SLOTS:], wp.vec2i, device)
-        if rub.directions[0]:
-            world, first = np.divmod(rub.pairs.numpy()[:count, 0], rub.found.first.count)
-            ends = rub.directions[0].numpy()[first] + world[:, None] * self.net.blocks
-        start, x = (
-            wp.array(np.concatenate([own, own[blocks.ravel()]]), dtype=q.dtype, device=device)
-            for own in (before.numpy(), q.numpy())
-        )
-        w, entries = wp.zeros_like(x), [(np.zeros(0, int), np.zeros(0, int), np.zeros(0))]
-
-        def add(row, block, found):
-            """Derivatives `found` (n, 3) of components (n,) by those of blocks (n,)."""
-            columns = 3 * block[:, None] + np.arange(3)
-            entries.append((np.repeat(row, 3), columns.ravel(), found.astype(float).ravel()))
-
-        for slot in range(blocks.shape[1]):
-            on = np.flatnonzero(felt[:, slot])
-            for d in range(3 if slot < SLOTS else 1):
-                unit = np.zeros((len(x), 3))
-                unit[apart[on, slot], d] = 1.0
-                w.assign(unit)
-                written = self._pull_rub(index, rub, (nodes, angles), (x, start, x), w, rate)
-                by_x, _, by_lagged = (array.numpy()[:, :count] for array in written)
-                by_x[:SLOTS] += by_lagged[:SLOTS]
-                row = 3 * blocks[:, slot] + d
-                for other in range(blocks.shape[1]):
-                    both = on[felt[on, other]]
-                    add(row[both], blocks[both, other], by_x[other, both])
-                if ends is not None:
-                    led = self._by_direction.numpy()[on]
-                    add(row[on], ends[on, 1], led)
-                    add(row[on], ends[on, 0], -led)
-        rows, columns, values = map(np.concatenate, zip(*entries, strict=True))
-        return sparse.csc_matrix((values, (rows, columns)), shape=(size, size))
 
     def _add_up(self, items: NodeItems, part, written: wp.array, out: wp.array) -> None:
         """Add what pairs that are used have written by slot to nodes."""
@@ -282,7 +206,7 @@ class ContactAdjoint:
             things, gather = self._direct
             starts, items, found = self._leads[index]
             flat, nodes = found.flatten(), by_lagged.reshape((self.net.worlds, self.net.blocks))
-            self._launch(things, len(flat), [rub.count, rub.starts, rub.partners, self._by_direction], [flat])
+            self._launch(things, len(flat), [rub.count, rub.starts, rub.partners, self.rubbing.by_direction], [flat])
             self._launch(gather, nodes.shape, [starts, items, found], [nodes])
 
     def _pieces(self, pairs) -> tuple[int, int]:

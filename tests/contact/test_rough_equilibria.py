@@ -328,3 +328,28 @@ def test_less_of_a_way_leads_into_nothing(device):
         state.net.q.assign(moved)
         search._relax(lambda way, whole: np.array([0.5]), state, begun)
         np.testing.assert_allclose(state.net.q.numpy()[5:10, 2] - begun[5:10, 2], gone, rtol=1e-12)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_pile_at_rest_is_in_equilibrium(device, seed):
+    """What has come to rest in steps, all held by friction, moves on in an equilibrium as far as it creeps in that time."""
+    random, rods = np.random.default_rng(seed), 12
+    scene = ddg.Scene(gravity=(0.0, 0.0, -G), mass_damping=5.0)
+    soft = ddg.Material(young=1e6, density=1000.0, viscosity=3e-3)
+    for k in range(rods):
+        angle = random.uniform(0.0, np.pi)
+        middle = np.array([*random.uniform(-0.02, 0.02, 2), 0.012 + 0.011 * k])
+        along = 0.05 * np.array([np.cos(angle), np.sin(angle), 0.05 * random.normal()])
+        scene.add_rod(line(middle - along, middle + along, 6), section=ddg.Circle(0.004), material=soft)
+    scene.add_obstacle(ddg.Plane())
+    scene.contact(friction=0.5, velocity=1e-4)
+    model = scene.build(device, precision="float64")
+    integrator, state = ddg.Integrator(model), model.state()
+    for _ in range(2500):
+        state = integrator.step(state, 1e-3)
+    search = Equilibrium(model)
+    found = search.load(state, 1, 0.99, 1.0)
+    creep = np.abs(state.velocities()).max()
+    assert creep < 1e-4
+    assert 0.3 * 0.01 * creep < np.abs(found.points() - state.points()).max() < 3.0 * 0.01 * creep
+    assert search.iterations < 30

@@ -9,7 +9,7 @@ Friction is that of a step in time without inertia, as long as the increment of 
 equilibrium before, and what sticks creeps by less than `velocity` times the increment. Normal forces are lagged, at first those of the
 equilibrium before, and taken anew from what is found until that is in equilibrium with its own. Where something has slid, that may be
 as normal forces were those of a smaller load: then they are taken anew after every iteration. What swings about an equilibrium, as
-normal forces come of friction elsewhere and that of theirs, goes less than the whole way.
+normal forces come of friction elsewhere and that of theirs, goes less than the whole way. Once ways are short `polish` goes the rest.
 """
 
 import math
@@ -28,10 +28,11 @@ from ddg_warp.kernels import outcome
 from ddg_warp.kernels.net import newton
 from ddg_warp.model.state import Sliding, State
 from ddg_warp.solve.chains.newton import NewtonOptions
-from ddg_warp.solve.choice import net_preconditioner
+from ddg_warp.solve.choice import large_static, net_preconditioner
 from ddg_warp.solve.graphs import Graphs
 from ddg_warp.solve.loads import StaticLoads
 from ddg_warp.solve.net.newton import NetNewton
+from ddg_warp.solve.net.polish import Polish
 
 FORCING = 1e-4  # smallest reduction of the residual that a direction is solved to: Gauss-Newton errs by more
 ADRIFT = 1e3  # of the size of the net, from which on what moves goes nowhere
@@ -41,6 +42,7 @@ LEAST, LEAP = 0.1, 10.0  # part of a way with other normal forces that is taken,
 # Iterations with the same normal forces. By too small ones what would stick slides far off: a wary search takes one. In a crowd that
 # falls into place bodies lose touch for an iteration, and are carried far by the friction of others: it takes some without.
 LAGGED = 5
+NEAR = 0.01  # of the range of contact: ways on which normal forces hardly change
 STUCK = 30  # iterations in which what meets for the first time sticks, at most
 SETTLED = 1e-4  # residuals over all loads, of what has
 UNSETTLED = "unsettled"  # outcome where forces do not balance with the friction that the state has
@@ -196,6 +198,7 @@ class NetEquilibrium:
 
     Attributes:
         wary: whether what has slid is searched for again with normal forces that are taken anew after every iteration.
+        polish: what finds the last part of the way with friction; None without, or where factors are too large.
     """
 
     def __init__(self, owner):
@@ -218,6 +221,7 @@ class NetEquilibrium:
         self._step = wp.zeros(self.newton.all, dtype=self.newton.right.dtype, device=model.wp_device)
         self._graphs = Graphs(model, lambda: arrays.load_kernels(self.newton.kernels, model.wp_device))
         self.wary = True
+        self.polish = Polish(model, owner.residuals) if self.newton.rubs and not large_static(model) else None
         self._least, self._touching, self._friction_work = math.inf, [], 0.0
 
     def pcg_iterations(self) -> int:
@@ -290,7 +294,7 @@ class NetEquilibrium:
 
         Returns:
             The equilibrium; and whether it is one however normal forces were taken: forces balance with friction of their own normal
-            forces, and not only to what rounding leaves of a search, and all sticks.
+            forces, and not only to what rounding leaves of a search, and all sticks, or has not moved so far that they would change.
         """
         state, owner, first = state.copy(), self.owner, before
         rubs, rate = self.newton.rubs, 1.0 / increment if self.newton.rubs else 0.0
@@ -300,6 +304,7 @@ class NetEquilibrium:
         if rubs:
             loads = np.where(self.tangent.angle, 0.0, self.tangent.loads(at, held)).reshape(self.net.worlds, -1)
             self.newton.contact.terms.more.assign(sticking * np.abs(loads).sum(1))
+        later = 0  # when to polish next
         for solves in range(owner.options.max_iterations if rubs else 1 + bool(again)):
             on = solves > 0 and rubs
             if on and not self.arrived:
@@ -319,6 +324,7 @@ class NetEquilibrium:
             owner.iterations += int(iterations.sum())
             begun = state.net.q.numpy().copy()
             wp.copy(state.net.q, self.newton.q)
+            near = on and self.arrived and self._near(begun, state)
             if on:
                 self._relax(relaxation, state, begun)
             for name in ("frame", *(f"lag_{i}" for i in range(len(self.net.sets)))):
@@ -338,21 +344,27 @@ class NetEquilibrium:
             status = int(np.where(settled, np.minimum(ends, outcome.CONVERGED_TO_ROUNDING), ends).max())
             if status > outcome.CONVERGED_TO_ROUNDING and not (rubs and status == outcome.MAX_ITERATIONS):
                 break
+            if near and solves >= later and self.polish and not settled.all():
+                put, reach = partial(self._slides, first, increment), self.newton.contact.search.reach
+                if found := self.polish(state, at, increment, put, self.share, reach):
+                    status = next(k for k, name in outcome.NAMES.items() if name == found)
+                    break
+                later = 2 * solves
             if settled.all():
                 break
         else:
             status = outcome.MAX_ITERATIONS if rubs else status
-        outer = self.tangent.loads(at, q)
+        outer = self.tangent.loads(at, self.tangent.dofs(state))
         residual = outer - self.tangent.gradient(state)
         certain, name = True, outcome.NAMES[status]
         if rubs:
-            rates = (state.net.q.numpy() - self._slid(first, state)) * rate
-            state.sliding = Sliding(wp.array(rates, dtype=self.net.vector, device=self.net.device), increment)
+            self._slides(first, increment, state)
             residual += self.tangent.friction(state)
             free, points = self.tangent.free, ~self.tangent.angle
             unbalanced = np.abs(residual[free & points]).max(initial=0.0)
             loads, supports = (np.abs(of).sum() for of in (outer[free & points], (outer - residual)[~free & points]))
-            certain = unbalanced <= SETTLED * loads and not self.model.touch.slides()
+            certain = unbalanced <= SETTLED * loads
+            certain &= self._near(first.net.q.numpy(), state) or not self.model.touch.slides()
             if warily and unbalanced > SETTLED * (loads + supports):
                 name = UNSETTLED
         if status > outcome.CONVERGED_TO_ROUNDING or name == UNSETTLED:
@@ -365,6 +377,18 @@ class NetEquilibrium:
         indefinite = self.newton.contact is None and self.newton.islands.clamped.numpy().any()
         state.stable = False if indefinite else None
         return owner.found(state, outer, residual, at), certain
+
+    def _near(self, begun: np.ndarray, state: State) -> bool:
+        """Whether nodes have moved from blocks (W N, 3) by so little that normal forces have hardly changed."""
+        way = np.abs(state.net.q.numpy() - begun).reshape(self.net.worlds, -1, 3)[:, : self.net.host.nodes]
+        return bool(way.max() <= NEAR * self.newton.contact.search.reach)
+
+    def _slides(self, first: State, increment: float, state: State) -> np.ndarray:
+        """Write the way of a state from the first one; blocks that its slips count from (W N, 3)."""
+        slid = self._slid(first, state)
+        velocity = wp.array((state.net.q.numpy() - slid) / increment, dtype=self.net.vector, device=self.net.device)
+        state.sliding = Sliding(velocity, increment)
+        return slid
 
     def _untouched(self, before: State) -> bool:
         """Whether nothing pushed anything in the equilibrium before, so that normal forces are not known."""
