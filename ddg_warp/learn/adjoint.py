@@ -211,14 +211,12 @@ class EquilibriumAdjoint:
 
     def _before(self, state: State) -> NetState:
         """The net as it was in the equilibrium before."""
-        sliding, q = state.sliding, wp.empty_like(state.net.q)
-        if sliding is None:
+        if state.sliding is None:
             raise SceneError(
                 "contact: by friction an equilibrium depends on the way there, which this state does not know; take the one that "
                 "statics.solve returned, not one made of its positions"
             )
-        q.assign(state.net.q.numpy() - sliding.increment * sliding.velocity.numpy())
-        return replace(state.net, q=q)
+        return replace(state.net, q=state.sliding.begun(state.net.q))
 
 
 def _copied(state: State, inputs: list) -> tuple[State, list]:

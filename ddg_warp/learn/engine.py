@@ -261,11 +261,14 @@ class Engine:
                 result += [*copies(tensors(at, self.fields)), view(at.sliding.velocity).clone()]
         return result
 
-    def way(self, found) -> list[tuple]:
-        """Of the tensors that `balance` gave, of every equilibrium on the way: load parameter, tensors, velocities and increment."""
+    def way(self, end: float, found) -> list[tuple]:
+        """Of the tensors that `balance` gave, of every equilibrium on the way: load parameter, tensors, velocities and increment.
+
+        Without friction that is the last one, at the load parameter `end`, alone.
+        """
         rest, count = found[len(self.fields) + self.parts :], len(self.fields) + 1
         if not rest:
-            return [(None, found[: len(self.fields)], None, 0.0)]
+            return [(end, found[: len(self.fields)], None, 0.0)]
         numbers, *rest = rest
         each = [rest[i : i + count] for i in range(0, len(rest), count)]
         return [(at, own[:-1], own[-1], by) for (at, by), own in zip(numbers.tolist(), each, strict=True)]

@@ -145,8 +145,9 @@ class ContactAdjoint:
 
     def matrix(self, q: wp.array, before: wp.array, rate: wp.array):
         """As of `Rubbing`; what is pulled after it has room for all pairs."""
-        found = self.rubbing.matrix(q, before, rate)
-        self._reserve()
+        version, found = self.system.search.version, self.rubbing.matrix(q, before, rate)
+        if self.system.search.version != version:
+            self._reserve()
         return found
 
     def roll(self, q: wp.array, before: wp.array, by_before: wp.array, by_q: wp.array) -> None:

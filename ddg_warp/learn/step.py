@@ -122,8 +122,7 @@ class Balance(torch.autograd.Function):
         begin, end = ctx.options.get("start", 0.0), call.start
         with engine.stream():
             engine.tables.write(call.parameters, parameters)
-            for at, state, *way in reversed(engine.way(output)):
-                at = end if at is None else at
+            for at, state, *way in reversed(engine.way(end, output)):
                 inputs = engine.balance_backward(at, state, controls, given, *way)
                 own = engine.tables.pull(call.parameters, inputs, flags)
                 for name, value in controls.items():

@@ -60,6 +60,10 @@ class Sliding:
     velocity: wp.array
     increment: float
 
+    def begun(self, q: wp.array) -> wp.array:
+        """Blocks (W N,) of the equilibrium before, from which slips count, of an equilibrium with blocks q."""
+        return wp.array(q.numpy() - self.increment * self.velocity.numpy(), dtype=q.dtype, device=q.device)
+
 
 @launches
 class State:

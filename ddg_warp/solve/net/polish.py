@@ -26,32 +26,25 @@ class Polish:
 
     Args:
         residuals: what is small, of the model's tangent.
+        share: the part of the way between dofs in which nothing passes through anything.
+        reach: range of contact [m].
     """
 
-    def __init__(self, model, residuals):
+    def __init__(self, model, residuals, share: Callable[[np.ndarray, np.ndarray], float], reach: float):
         self.model, self.residuals, self.tangent = model, residuals, residuals.tangent
-        self._rubbing = None
+        self._share, self._longest, self._rubbing = share, FAR * reach, None
 
-    def __call__(
-        self,
-        state: State,
-        at: float,
-        increment: float,
-        put: Callable[[State], np.ndarray],
-        share: Callable,
-        reach: float,
-    ) -> str:
+    def __call__(self, state: State, at: float, put: Callable[[State], None]) -> str:
         """Outcome where all balances in the state, which then is another one; else it is empty, and the state as it was.
 
         Args:
-            at: load parameter; increment: since the equilibrium before.
-            put: writes the `Sliding` of a state; blocks that its slips count from (W N, 3).
-            share: the part of the way between dofs in which nothing passes through anything.
-            reach: range of contact [m].
+            at: load parameter.
+            put: writes the `Sliding` of a state.
         """
         tangent, free = self.tangent, np.flatnonzero(self.tangent.free)
         trial = state.copy()
-        matrix = self._matrix(trial, at, increment, put)
+        put(trial)
+        matrix = self._matrix(trial, at)
         residual, size, excess, outcome = self._unbalanced(trial, at, put, matrix)
         for _ in range(STEPS):
             if excess <= 0.0:
@@ -66,11 +59,11 @@ class Polish:
             longest = np.abs(np.where(tangent.angle, 0.0, step)).max()
             if not np.isfinite(longest):
                 return ""
-            part, last = min(1.0, FAR * reach / longest) if longest else 1.0, trial
+            part, last = min(1.0, self._longest / longest) if longest else 1.0, trial
             for _ in range(HALVINGS):
                 trial = last.copy()
                 tangent.assign(trial, q + part * step)
-                if share(q, tangent.dofs(trial)) == 1.0:
+                if self._share(q, tangent.dofs(trial)) == 1.0:
                     residual, less, excess, outcome = self._unbalanced(trial, at, put, matrix)
                     if less < size or excess <= 0.0:
                         break
@@ -79,7 +72,7 @@ class Polish:
                 return ""
             if excess > 0.0 and less > SLOW * size:
                 return ""
-            size, matrix = less, self._matrix(trial, at, increment, put)
+            size, matrix = less, self._matrix(trial, at)
         return ""
 
     def _unbalanced(self, state: State, at: float, put: Callable, matrix) -> tuple[np.ndarray, float, float, str]:
@@ -92,13 +85,13 @@ class Polish:
         excess, outcome = residuals.excess(residual, gradient, matrix, q, residuals.load_scale(outer, gradient))
         return residual, float(np.linalg.norm(residuals.scaled(residual)[tangent.free])), excess, outcome
 
-    def _matrix(self, state: State, at: float, increment: float, put: Callable) -> sparse.csc_matrix:
-        net, part = self.model.net, self.tangent.parts[-1]
+    def _matrix(self, state: State, at: float) -> sparse.csc_matrix:
+        net, part, sliding = self.model.net, self.tangent.parts[-1], state.sliding
         if self._rubbing is None:
             self._rubbing = Rubbing(net, ExactContact(net))
-        before = wp.array(put(state), dtype=net.vector, device=net.device)
-        rate = wp.full(net.worlds, 1.0 / increment, dtype=net.real, device=net.device)
-        matrix = part.potential_hessian(state) + part.matrix(self._rubbing.matrix(state.net.q, before, rate))
+        rate = wp.full(net.worlds, 1.0 / sliding.increment, dtype=net.real, device=net.device)
+        rubbing = self._rubbing.matrix(state.net.q, sliding.begun(state.net.q), rate)
+        matrix = part.potential_hessian(state) + part.matrix(rubbing)
         following = self.tangent.load_stiffness(at, self.tangent.dofs(state))
         matrix = sparse.csc_matrix(matrix if following is None else matrix + following)
         return matrix + sparse.diags(SPIN * np.abs(matrix.diagonal()))

@@ -221,7 +221,9 @@ class NetEquilibrium:
         self._step = wp.zeros(self.newton.all, dtype=self.newton.right.dtype, device=model.wp_device)
         self._graphs = Graphs(model, lambda: arrays.load_kernels(self.newton.kernels, model.wp_device))
         self.wary = True
-        self.polish = Polish(model, owner.residuals) if self.newton.rubs and not large_static(model) else None
+        self.polish = None
+        if self.newton.rubs and not large_static(model):
+            self.polish = Polish(model, owner.residuals, self.share, self.newton.contact.search.reach)
         self._least, self._touching, self._friction_work = math.inf, [], 0.0
 
     def pcg_iterations(self) -> int:
@@ -345,8 +347,7 @@ class NetEquilibrium:
             if status > outcome.CONVERGED_TO_ROUNDING and not (rubs and status == outcome.MAX_ITERATIONS):
                 break
             if near and solves >= later and self.polish and not settled.all():
-                put, reach = partial(self._slides, first, increment), self.newton.contact.search.reach
-                if found := self.polish(state, at, increment, put, self.share, reach):
+                if found := self.polish(state, at, partial(self._slides, first, increment)):
                     status = next(k for k, name in outcome.NAMES.items() if name == found)
                     break
                 later = 2 * solves
@@ -383,12 +384,10 @@ class NetEquilibrium:
         way = np.abs(state.net.q.numpy() - begun).reshape(self.net.worlds, -1, 3)[:, : self.net.host.nodes]
         return bool(way.max() <= NEAR * self.newton.contact.search.reach)
 
-    def _slides(self, first: State, increment: float, state: State) -> np.ndarray:
-        """Write the way of a state from the first one; blocks that its slips count from (W N, 3)."""
-        slid = self._slid(first, state)
-        velocity = wp.array((state.net.q.numpy() - slid) / increment, dtype=self.net.vector, device=self.net.device)
-        state.sliding = Sliding(velocity, increment)
-        return slid
+    def _slides(self, first: State, increment: float, state: State) -> None:
+        """Write the way of a state from the first one."""
+        velocity = (state.net.q.numpy() - self._slid(first, state)) / increment
+        state.sliding = Sliding(wp.array(velocity, dtype=self.net.vector, device=self.net.device), increment)
 
     def _untouched(self, before: State) -> bool:
         """Whether nothing pushed anything in the equilibrium before, so that normal forces are not known."""
