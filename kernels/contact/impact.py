@@ -16,7 +16,7 @@ from ddg_warp.kernels.contact.motion import corners_function, relative_function
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct, things_function
 from ddg_warp.kernels.threads import CPU_OPTIONS
 
-REST, NEAR = 0.1, 0.5  # of the gap: what is left of wide ones; of narrow ones, and of the reach
+REST, NEAR = 0.1, 0.2  # of the gap: what is left of wide ones; of narrow ones, and of the reach
 PARTS = 1000  # in which a motion is followed; where that does not do, the time reached so far is safe, too
 PATIENCE = 100_000  # the same for what is to be told apart from passing
 TOUCHING = 1e-9  # distance of two that pass, over the size of the pair

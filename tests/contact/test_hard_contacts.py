@@ -227,7 +227,8 @@ def test_stiff_contact_of_soft_rods_and_the_reverse(device, share, young):
 
 @pytest.mark.parametrize("share", [1e-3, 1e4])
 def test_stiff_and_soft_contact_carry_what_rests(device, share):
-    model, integrator, states = run(heap_at_rest(share, 2e-3), device, 300, 2e-3)
+    # what lands on the soft one gets through most of it at once, and takes that step again, from where it was
+    model, integrator, states = run(heap_at_rest(share, 2e-3), device, 300, 2e-3, retries=int(share < 1.0))
     found = model.contacts(states[-1])
     np.testing.assert_allclose(forces_on(found, 4).sum(0) / (WEIGHT * 0.1), [0.0, 0.0, -4.0], atol=1e-4)
     assert 0.0 < integrator.statistics()["contact"]["smallest_gap"] <= found.gap.min() + 1e-12

@@ -82,6 +82,11 @@ def test_head_on_impact_by_its_closed_form(device):
     # a motion that all share is none
     search.impact(x, upload(np.broadcast_to([300.0, 5.0, -7.0], (4, 3)), device))
     assert search.time.numpy()[0] == 1.0
+    # a gap of 0.003 within the reach may go down to a fifth, one little wider to a fifth of the reach
+    for gap, least in ((0.003, 0.2 * 0.003), (0.006, 0.2 * REACH), (0.1, 0.1 * 0.1)):
+        near = upload(points + np.outer([0.0, 0.0, 1.0, 1.0], [0.0, 0.0, gap - 0.8]), device)
+        search.impact(near, upload(gap * move, device))
+        assert search.time.numpy()[0] == pytest.approx(0.5 * (1.0 - least / gap), rel=1e-9)
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e3])

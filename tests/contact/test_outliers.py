@@ -38,7 +38,7 @@ def moving(model, velocities):
 
 def stepped(device, outliers: float, worlds: int = 1):
     """Positions after a step, of every body the largest residual over the tolerance, and Newton iterations."""
-    scene, velocities = crossed(10)
+    scene, velocities = crossed(10, fastest=4.0)
     model = scene.build(device=device, worlds=worlds)
     integrator = ddg.Integrator(model, rtol=RTOL, outliers=outliers, check_every=1)
     state = integrator.step(model.state(velocities=velocities), DT)

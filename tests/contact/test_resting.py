@@ -75,7 +75,7 @@ def watched(device, scene, velocities, worlds: int = 1, linear="chain", **option
 
 def test_an_island_in_balance_rests(device):
     """Of two pairs one balances first: it is left where it is, to the bit, while the other goes on."""
-    scene, velocities = pairs([0.1, 3.0])
+    scene, velocities = pairs([0.05, 3.0])
     _, end, seen = watched(device, scene, velocities, rtol=1e-6)
     moved = np.array([[np.abs(d[0, own : own + 18]).max() for own in (0, 18)] for d, _ in seen])
     assert moved[0].all()  # both set out
