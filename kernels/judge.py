@@ -171,7 +171,7 @@ def judge_kernel(kind: ChainKind, real, linear):
         flags[ACTIVE, 0] = 1
         if what == wp.static(PLACE):
             less = scalars[STEP_LENGTH, r]
-            place(x, base, direction, fixed, anchor, less, 0, n, r)
+            place(x, base, base, direction, fixed, anchor, less, 0, n, r)
             turn_angles(theta, direction, less - taken, n, r)
         if wp.static(twist):
             if what == wp.static(RELAG):

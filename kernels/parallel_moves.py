@@ -38,6 +38,7 @@ def move_kernels(kind: ChainKind, real, linear, split: bool = False):
         straight: wp.array(dtype=real),
         onward: int,
         base: wp.array2d(dtype=V),
+        now: wp.array2d(dtype=V),
         x: wp.array2d(dtype=V),
         frame: wp.array3d(dtype=real),
         excess_out: wp.array2d(dtype=V),
@@ -49,7 +50,7 @@ def move_kernels(kind: ChainKind, real, linear, split: bool = False):
         if k >= n - 1:
             return
         if todo[r] == wp.static(PLACE):
-            excess_out[k, r] = excess(base, direction, step_length[r], onward_of(straight[r], onward), k, n, r)
+            excess_out[k, r] = excess(base, now, direction, step_length[r], onward_of(straight[r], onward), k, n, r)
         if wp.static(twist):
             if todo[r] == wp.static(RELAG):
                 u, t = carry(x, frame, k, n, r)
@@ -185,7 +186,8 @@ def move_kernels(kind: ChainKind, real, linear, split: bool = False):
 
 @cache
 def predict_kernels(kind: ChainKind, real, linear):
-    """`aim`: bent rods step along their velocity, with edges turned; `renew`: every rod that moves takes new frames."""
+    """`aim`: bent rods step along their velocity, with edges turned; `renew`: every rod that moves takes new frames; `again`:
+    bent ones step once more."""
     dim, nb = kind.dim, kind.block
     V = wp.types.vector(dim, real)
     predicted = predicted_function(dim, real)
@@ -223,4 +225,10 @@ def predict_kernels(kind: ChainKind, real, linear):
         r = wp.tid()
         flags[TODO, r] = wp.where(scalars[PROGRESS, r] < real(1.0), wp.static(RELAG), 0)
 
-    return aim, renew
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def again(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real)):
+        r = wp.tid()
+        bent = scalars[PROGRESS, r] < real(1.0) and flags[BENT, r] != 0
+        flags[TODO, r] = wp.where(bent, wp.static(PLACE), 0)
+
+    return aim, renew, again

@@ -8,7 +8,7 @@ from ddg_warp.kernels import frames
 from ddg_warp.kernels.chain import ChainKind, gather_functions
 from ddg_warp.kernels.islands import ANGLE_CHANGE, PLACED, STEP_LENGTH, TODO
 from ddg_warp.kernels.threads import CPU_OPTIONS
-from ddg_warp.kernels.turns import edge_functions, place_function
+from ddg_warp.kernels.turns import FURTHER, edge_functions, place_function
 
 PLACE, RELAG, STRAIGHT = 1, 2, 4  # what is left to be done with an iterate: turn edges, renew frames, move straight
 
@@ -23,7 +23,7 @@ def move_functions(kind: ChainKind, real, linear, split: bool = False):
     V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
     transport, *_ = frames.functions(real)
     along, *_ = gather_functions(kind, real)
-    along_edge, excess_of = edge_functions(dim, real)
+    along_edge, excess_of, further_of = edge_functions(dim, real)
 
     @wp.func
     def step_of(direction: wp.array3d(dtype=linear), j: int, r: int):
@@ -35,6 +35,7 @@ def move_functions(kind: ChainKind, real, linear, split: bool = False):
     @wp.func
     def excess(
         base: wp.array2d(dtype=V),
+        now: wp.array2d(dtype=V),
         direction: wp.array3d(dtype=linear),
         amount: real,
         onward: int,
@@ -42,10 +43,15 @@ def move_functions(kind: ChainKind, real, linear, split: bool = False):
         n: int,
         r: int,
     ):
-        """Edge j turned and lengthened by its step, less the same edge with its step added; `onward`: see `kernels.turns`."""
+        """Edge j turned and lengthened by its step, less the same edge with its step added; `onward`: see `kernels.turns`.
+
+        `now`: where nodes are before the step whose predictor the base is, where that goes further; else anything.
+        """
         ahead = along(j + 1, n)
         e = base[ahead, r] - base[j, r]
         de = (step_of(direction, ahead, r) - step_of(direction, j, r)) * amount
+        if onward == wp.static(FURTHER):
+            return further_of(e, now[ahead, r] - now[j, r], de)
         if wp.static(split):
             return excess_of(e, de, real(direction[wp.static(block), j, r]) * amount, onward)
         else:
@@ -111,6 +117,7 @@ def search_functions(kind: ChainKind, real, linear, split: bool = False):
     class Rod:
         x: wp.array2d(dtype=V)
         base: wp.array2d(dtype=V)
+        now: wp.array2d(dtype=V)
         direction: wp.array3d(dtype=linear)
         fixed: wp.array2d(dtype=wp.uint8)
         amount: real
@@ -123,7 +130,7 @@ def search_functions(kind: ChainKind, real, linear, split: bool = False):
     @wp.func
     def excess_at(rod: Rod, j: int):
         here = along(j, rod.count)
-        return excess(rod.base, rod.direction, rod.amount, rod.onward, here, rod.count, rod.r)
+        return excess(rod.base, rod.now, rod.direction, rod.amount, rod.onward, here, rod.count, rod.r)
 
     @wp.func
     def anchored(rod: Rod, j: int):
@@ -144,6 +151,7 @@ def search_functions(kind: ChainKind, real, linear, split: bool = False):
     def place(
         x: wp.array2d(dtype=V),
         base: wp.array2d(dtype=V),
+        now: wp.array2d(dtype=V),
         direction: wp.array3d(dtype=linear),
         fixed: wp.array2d(dtype=wp.uint8),
         anchor: wp.array(dtype=int),
@@ -152,10 +160,11 @@ def search_functions(kind: ChainKind, real, linear, split: bool = False):
         n: int,
         r: int,
     ):
-        """x = base moved along the direction, with edges turned instead of sheared; `onward`: see `kernels.turns`."""
+        """x = base moved along the direction, with edges turned instead of sheared; `onward` and `now`: see `excess`."""
         rod = Rod()
         rod.x = x
         rod.base = base
+        rod.now = now
         rod.direction = direction
         rod.fixed = fixed
         rod.amount = amount
@@ -227,7 +236,7 @@ def adjust_kernel(kind: ChainKind, real, linear, split: bool = False):
                     for d in range(wp.static(dim)):
                         back[d] = straight * real(direction[d, j, r])
                     base[j, r] = x[j, r] - back
-            place(x, base, direction, fixed, anchor, scalars[STEP_LENGTH, r], 0, count[r], r)
+            place(x, base, base, direction, fixed, anchor, scalars[STEP_LENGTH, r], 0, count[r], r)
             turn_angles(theta, direction, scalars[ANGLE_CHANGE, r], count[r], r)
         if wp.static(twist):
             if flags[TODO, r] == wp.static(RELAG):

@@ -15,15 +15,17 @@ TURNED = (
     0.1  # largest turn of an edge that any step takes straight [rad]; see `ddg_warp.compile.precision.straight_turns`
 )
 LEAP = 0.5  # cosine of the largest turn of an edge that a predictor goes on with
+ON, FURTHER = 1, 2  # steps of predictors: the last one again, and what the last solve added; see `edge_functions`
 
 
 @cache
 def edge_functions(dim: int, real):
     """along(e, de): what the step de of an edge e does along it; excess(e, de, stretch, onward): the edge turned by its step and
-    lengthened by `stretch`, less the same edge with its step added.
+    lengthened by `stretch`, less the same edge with its step added; further(e, e1, de): the edge e of a predictor, turned and
+    lengthened as the step de has turned and lengthened e1 - de, that of the last predictor, to what it became, less e + de.
 
-    `onward` is 1 where the step repeats the last one, so that e - de is the edge before: it turns on by the same angle, and its length
-    changes as it did. (Added up, such steps would lengthen an edge that turns by the versine of its turn.)
+    `onward` is `ON` where the step repeats the last one, so that e - de is the edge before: it turns on by the same angle, and its
+    length changes as it did. (Added up, such steps would lengthen an edge that turns by the versine of its turn.)
     """
     V = wp.types.vector(dim, real)
     tiny = 1e-13 if real == wp.float64 else 1e-6
@@ -42,7 +44,7 @@ def edge_functions(dim: int, real):
         grown = length + stretch
         cosine = real(1.0)
         sine = real(0.0)
-        if onward != 0:
+        if onward == wp.static(ON):
             before = wp.length(e - de)
             grown = real(2.0) * length - before
             if before > real(0.0):
@@ -62,16 +64,30 @@ def edge_functions(dim: int, real):
             cosine = real(1.0)
         return (t * cosine + across * sine) * wp.max(grown, real(0.1) * length) - e - de
 
-    return along_edge, excess
+    @wp.func
+    def further(e: V, e1: V, de: V):
+        e0 = e1 - de
+        before, length = wp.length(e0), wp.length(e1)
+        end = e
+        if before > real(0.0):
+            t0, t1 = e0 / before, e1 / length
+            cosine = wp.dot(t0, t1)
+            if cosine > real(LEAP):  # else not at all
+                both = t0 + t1
+                end = e - both * (wp.dot(both, e) / (real(1.0) + cosine)) + t1 * (real(2.0) * wp.dot(t0, e))
+                end *= wp.max(real(1.0) + (length - before) / wp.length(e), real(0.1))
+        return end - e - de
+
+    return along_edge, excess, further
 
 
 @cache
 def onward_function(real):
-    """onward(straight, wanted): `wanted` for rods that always turn their edges; a soft one lengthens as its velocity says."""
+    """onward(straight, wanted): `wanted`, but `ON` for rods alone that always turn their edges; soft ones lengthen as they move."""
 
     @wp.func
     def onward(straight: real, wanted: int):
-        return wp.where(straight == real(0.0), wanted, 0)
+        return wp.where(straight == real(0.0) or wanted != wp.static(ON), wanted, 0)
 
     return onward
 

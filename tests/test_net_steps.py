@@ -79,7 +79,7 @@ def test_joined_rods_stop_where_they_do_alone(device):
         < other["newton_iterations"]["mean"]
         <= one["newton_iterations"]["mean"]
     )
-    assert other["newton_iterations"]["max"] == one["newton_iterations"]["max"]
+    assert 0 <= one["newton_iterations"]["max"] - other["newton_iterations"]["max"] <= 1
     np.testing.assert_allclose(joined[:32], alone, atol=1e-11)
 
 
@@ -185,10 +185,14 @@ def test_whipped_rods_move_as_alone(device):
 
 
 def test_joined_rods_turn_by_more_than_a_right_angle_in_a_step(device):
-    """120 degrees a step, from which frames are renewed within the solve: edges follow as alone, and twist is not lost."""
-    (alone, one), (joined, other) = (advance(spun(own, 1.0 / 3.0), device, 1.0, 3) for own in (False, True))
-    np.testing.assert_allclose(joined[:6], alone, atol=1e-6)
-    assert one["retries"] == other["retries"]
+    """120 degrees a step: edges follow as alone, and twist is not lost.
+
+    Frames are renewed within the solve, and where along its way they are shows, by some 1e-5 m of a rod of 0.3 m.
+    """
+    for steps in (1, 2, 3):
+        (alone, one), (joined, other) = (advance(spun(own, 1.0 / 3.0), device, 1.0, steps) for own in (False, True))
+        np.testing.assert_allclose(joined[:6], alone, rtol=0.0, atol=2e-5)
+        assert one["retries"] == other["retries"] == 0
 
 
 def frame() -> ddg.Scene:

@@ -352,7 +352,7 @@ def test_timed_load_on_a_free_sheet(device):
     model = scene.build(device, "float64")
     mass = model.net.host.mass[:, 0][:count]
     scene.add_vertex_force(0, range(count), mass[:, None] * [0.0, 2.0, 0.0], amplitude=lambda t: t)
-    state, _ = steps(scene.build(device, "float64"), 10, 0.1, rtol=1e-8)
+    state, _ = steps(scene.build(device, "float64"), 10, 0.1, rtol=1e-10)
     np.testing.assert_allclose(state.velocities()[:, 1], 2.0 * 0.01 * 55.0, rtol=1e-9)
 
 

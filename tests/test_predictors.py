@@ -31,7 +31,7 @@ def linear_of(solver: str) -> str:
 def excess_of(device, e, de, onward: int, more: float = 0.0) -> np.ndarray:
     """`edge_functions` of edges e and their steps de (n, dim), lengthened by what these do along them and `more`."""
     dim = e.shape[1]
-    V, (along, excess) = wp.types.vector(dim, wp.float64), edge_functions(dim, wp.float64)
+    V, (along, excess, _) = wp.types.vector(dim, wp.float64), edge_functions(dim, wp.float64)
 
     @wp.kernel(module="unique", enable_backward=False)
     def call(e: wp.array(dtype=V), de: wp.array(dtype=V), more: wp.float64, onward: int, out: wp.array(dtype=V)):
@@ -119,8 +119,12 @@ def test_an_edge_that_turned_over_at_once_keeps_its_length(device):
 # The predictor.
 
 
-def predicted(integrator, state, dt):
-    """The state that a step ends in if its solve makes no iteration: where the predictor leads."""
+def predicted(integrator, state, dt, foresees: bool = False):
+    """The state that a step ends in if its solve makes no iteration: where the predictor leads, or what it `foresees`."""
+    if not foresees:
+        state = state.copy()
+        for part in (*state.groups, *([state.net] if state.net else [])):
+            part.a.zero_()
     integrator._weigh(dt, state)
     for part in integrator._parts:
         part.newton.solve = lambda *_: None

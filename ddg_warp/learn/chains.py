@@ -95,7 +95,7 @@ class ChainAdjoint:
         self._strain = [chain.strain_kernel(kind, i, real) for i in terms] if kind.viscous else []
         self._frame = chain.frame_kernel(kind, real, first=not kind.viscous) if kind.twist else None
         self._ends, self._nodes, self._edges = chain.gather_kernels(kind, real)
-        self.unread = {"v", "omega"} if kind.viscous else {"v", "omega", "frame", "last"}
+        self.unread = {"v", "omega", "a", "alpha"} | (set() if kind.viscous else {"frame", "last"})
         self._more_to_start = bool(self.drag or self.predictor)
         self._solution, self._start = step.step_kernels(kind, real, midpoint, self._more_to_start)
         self._moved = arrays.upload(np.tile(_moved(group), (1, group.worlds)), wp.uint8, device)
@@ -113,6 +113,8 @@ class ChainAdjoint:
             omega=self._make(needed=twisted),
             frame=self._rows(7, twisted),
             last=self._rows(kind.strain_rows, viscous),
+            a=self._make(self.vector),
+            alpha=self._make(needed=twisted),
         )
         self._inputs = ChainInputs(
             parameters=self._rows(sum(len(term.parameter_names) for term in kind.terms)),

@@ -366,6 +366,8 @@ class Model:
             omega=make(nodes, real, kind.twist),
             frame=make((7, *nodes), real, kind.twist),
             last=make((kind.strain_rows, *nodes), real, kind.viscous),
+            a=make(nodes, vector),
+            alpha=make(nodes, real, kind.twist),
         )
 
     def carry_frames(self, state: State) -> None:

@@ -18,6 +18,7 @@ class NetState:
 
     Attributes:
         q, v: blocks (W N,) of positions [m], angles and rotation vectors since the last step [rad], and their rates.
+        a: accelerations of blocks (W N,), as of `GroupState`, as far as they are trusted; see `kernels.net.foresight`.
         frame: director and tangent of rod edges (6, W edges).
         lag: own lagged rows of each element set (rows, W E); last: strains of each damped set at this state.
         data: data (rows, W E) of those sets, by index, that have normals among them that supports turn, or the magnetic field.
@@ -25,6 +26,7 @@ class NetState:
 
     q: wp.array
     v: wp.array
+    a: wp.array
     frame: wp.array
     lag: list[wp.array] = field(default_factory=list)
     last: list[wp.array] = field(default_factory=list)
@@ -32,7 +34,7 @@ class NetState:
 
     def arrays(self) -> dict[str, wp.array]:
         """All arrays by name."""
-        named = {"q": self.q, "v": self.v, "frame": self.frame}
+        named = {"q": self.q, "v": self.v, "a": self.a, "frame": self.frame}
         for i, (lag, last) in enumerate(zip(self.lag, self.last, strict=True)):
             named |= {f"lag_{i}": lag, f"last_{i}": last}
         return named | {f"data_{i}": data for i, data in self.data.items()}
@@ -139,8 +141,8 @@ class DeviceNet:
     def empty(self) -> NetState:
         """Arrays of a state, not yet filled."""
         blocks = self.worlds * self.blocks
-        q, v = (wp.zeros(blocks, dtype=self.vector, device=self.device) for _ in range(2))
-        state = NetState(q, v, *self.lagged())
+        q, v, a = (wp.zeros(blocks, dtype=self.vector, device=self.device) for _ in range(3))
+        state = NetState(q, v, a, *self.lagged())
         for part in self.sets:
             count = self.worlds * part.elements
             strains = len(part.term.measure.strains) if part.term.density.lagged else 0

@@ -19,6 +19,8 @@ class GroupState:
         theta, omega: angle [rad] and its rate [rad/s] of edges (n, R); empty without twist.
         frame: lagged reference frames (7, n, R): first director, tangent, reference twist; empty without twist.
         last: strains at this state (strains, n, R); empty without strain-rate damping.
+        a, alpha: what the last solve added to its predictor, over the square of its step (n, R), [m/s^2] and [rad/s^2]; the next one
+            starts from where they lead. Zero where there was none; alpha is empty without twist.
     """
 
     x: wp.array
@@ -27,6 +29,8 @@ class GroupState:
     omega: wp.array
     frame: wp.array
     last: wp.array
+    a: wp.array
+    alpha: wp.array
 
     def arrays(self) -> dict[str, wp.array]:
         """All arrays by name."""

@@ -72,7 +72,7 @@ def unplace_function(dim: int, real, Rod, anchored, by_shift, free_part, give_ex
 def excess_function(dim: int, real, midpoint: bool):
     """turned(e, de, f, straight): the excess of an edge that a predictor turns, times f; see `turns.onward_function`."""
     V = wp.types.vector(dim, real)
-    along_edge, excess_of = edge_functions(dim, real)
+    along_edge, excess_of, _ = edge_functions(dim, real)
     onward_of = onward_function(real)
 
     @wp.func

@@ -59,6 +59,7 @@ def rod_kernels(kind: ChainKind, real):
         nodes: int,
         q: wp.array(dtype=V),
         v: wp.array(dtype=V),
+        a: wp.array(dtype=V),
         frame: wp.array2d(dtype=real),
         lag: wp.array2d(dtype=real),
         vertex_last: wp.array2d(dtype=real),
@@ -69,6 +70,8 @@ def rod_kernels(kind: ChainKind, real):
         omega_out: wp.array2d(dtype=real),
         frame_out: wp.array3d(dtype=real),
         last_out: wp.array3d(dtype=real),
+        a_out: wp.array2d(dtype=V),
+        alpha_out: wp.array2d(dtype=real),
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
     ):
@@ -91,11 +94,13 @@ def rod_kernels(kind: ChainKind, real):
             i = place(places, wp.static(NODE), r, k, first_of(w, sizes[0]))
             x_out[k, c] = q[i]
             v_out[k, c] = v[i]
+            a_out[k, c] = a[i]
             if k < n - 1:
                 if wp.static(twist):
                     j = place(places, wp.static(ANGLE), r, k, first_of(w, sizes[0]))
                     theta_out[k, c] = q[j][0]
                     omega_out[k, c] = v[j][0]
+                    alpha_out[k, c] = a[j][0]
                     f = place(places, wp.static(ANGLE), r, k, first_of(w, sizes[1]) - nodes)
                     for d in range(6):
                         frame_out[d, k, c] = frame[d, f]
@@ -122,10 +127,13 @@ def rod_kernels(kind: ChainKind, real):
         omega: wp.array2d(dtype=real),
         frame: wp.array3d(dtype=real),
         last: wp.array3d(dtype=real),
+        a: wp.array2d(dtype=V),
+        alpha: wp.array2d(dtype=real),
         flags: wp.array2d(dtype=int),
         told: wp.array2d(dtype=int),
         q_out: wp.array(dtype=V),
         v_out: wp.array(dtype=V),
+        a_out: wp.array(dtype=V),
         frame_out: wp.array2d(dtype=real),
         lag_out: wp.array2d(dtype=real),
         vertex_last: wp.array2d(dtype=real),
@@ -149,11 +157,13 @@ def rod_kernels(kind: ChainKind, real):
             i = place(places, wp.static(NODE), r, k, first_of(w, sizes[0]))
             q_out[i] = x[k, c]
             v_out[i] = v[k, c]
+            a_out[i] = a[k, c]
             if k < n - 1:
                 if wp.static(twist):
                     j = place(places, wp.static(ANGLE), r, k, first_of(w, sizes[0]))
                     q_out[j] = V(theta[k, c], real(0.0), real(0.0))
                     v_out[j] = V(omega[k, c], real(0.0), real(0.0))
+                    a_out[j] = V(alpha[k, c], real(0.0), real(0.0))
                     f = place(places, wp.static(ANGLE), r, k, first_of(w, sizes[1]) - nodes)
                     for d in range(6):
                         frame_out[d, f] = frame[d, k, c]
@@ -318,10 +328,12 @@ def place_kernels(real, serial: bool):
         q: wp.array(dtype=V),
         dt: wp.array(dtype=real),
         v_out: wp.array(dtype=V),
+        a_out: wp.array(dtype=V),
     ):
         i, w = wp.tid()
         k = nodes[i] + w * blocks
         if told[wp.static(TRIED), w] != 0:
             v_out[k] = (q[k] - q0[k]) * (real(1.0) / dt[w])
+            a_out[k] = V()
 
     return wait, stay, follow

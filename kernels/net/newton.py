@@ -31,6 +31,7 @@ from ddg_warp.kernels.islands import (
 )
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
 from ddg_warp.kernels.search import PLACE, STRAIGHT
+from ddg_warp.kernels.step import told_function
 from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
 
 ON_THE_WAY, THERE = 2, 1  # worlds whose supports or predictor were held up: not there yet, there since the last step
@@ -271,9 +272,9 @@ def freeze_kernel():
 
 
 @cache
-def step_kernels(real, midpoint: bool, serial: bool):
+def step_kernels(real, midpoint: bool, serial: bool, contact: bool = False):
     """begin(...) and finish(...) of a time step; see `kernels.step` for the schemes."""
-    length, restart = attempt_functions(real, midpoint)
+    (length, restart), told_of = attempt_functions(real, midpoint), told_function(real, midpoint, contact)
     share, until = share_function(serial), until_function(serial)
     V = wp.types.vector(3, real)
 
@@ -323,24 +324,31 @@ def step_kernels(real, midpoint: bool, serial: bool):
         q: wp.array(dtype=V),
         q0: wp.array(dtype=V),
         v0: wp.array(dtype=V),
+        a0: wp.array(dtype=V),
+        predicted: wp.array(dtype=V),
+        trust: wp.array(dtype=real),
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         blocks: int,
         q_out: wp.array(dtype=V),
         v_out: wp.array(dtype=V),
+        a_out: wp.array(dtype=V),
     ):
-        """Blocks and their velocities at the end of the step, of the worlds that converged."""
+        """Blocks, their velocities and accelerations at the end of the step, of the worlds that converged."""
         w, first = share(wp.tid(), blocks)
         ahead = scalars[PROGRESS, w] < real(1.0) and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING)
         if first == 0:
             flags[MOVED, w] = wp.where(ahead, 1, 0)
+        told = told_of(flags, scalars, w) * trust[w]
         for k in range(first, until(first, blocks)):
             i = k + w * blocks
             start = q0[i]
             v = v0[i]
+            a = a0[i]
             end = start
             if ahead:
                 end = q[i]
+                a = (end - predicted[i]) * told
                 change = (end - start) * scalars[RATE, w]
                 if wp.static(midpoint):
                     end = real(2.0) * end - start
@@ -349,6 +357,7 @@ def step_kernels(real, midpoint: bool, serial: bool):
                     v = change
             q_out[i] = end
             v_out[i] = v
+            a_out[i] = a
 
     return begin, finish
 

@@ -10,7 +10,7 @@ import warp as wp
 from ddg_warp.kernels.islands import CAUTIOUS, MOVED, RATE, STEP_LENGTH, TODO, TURN, TURNING
 from ddg_warp.kernels.search import PLACE
 from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
-from ddg_warp.kernels.turns import edge_functions, onward_function
+from ddg_warp.kernels.turns import FURTHER, edge_functions, onward_function
 
 
 @cache
@@ -20,7 +20,7 @@ def turn_kernels(real, linear, serial: bool):
     piece to piece, a thread a piece; put(...) takes the nodes of one level there, a thread each. `serial`: see `until_function`.
     """
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
-    along_edge, excess_of = edge_functions(3, real)
+    along_edge, excess_of, further_of = edge_functions(3, real)
     onward_of = onward_function(real)
     share, until = share_function(serial), until_function(serial)
 
@@ -94,10 +94,11 @@ def turn_kernels(real, linear, serial: bool):
         todo: wp.array(dtype=int),
         straight: wp.array(dtype=real),
         onward: int,
+        now: wp.array(dtype=V),
         blocks: int,
         excess_out: wp.array2d(dtype=V),
     ):
-        """Excess of the edge from every place to the one `ahead` of it, in worlds that turn their edges."""
+        """Excess of the edge from every place to the one `ahead` of it, of worlds that turn theirs; see `search.move_functions`."""
         p, w = wp.tid()
         if todo[w] != wp.static(PLACE):
             return
@@ -106,7 +107,10 @@ def turn_kernels(real, linear, serial: bool):
         amount = step_length[w]
         step = move_of(direction, b, amount) - move_of(direction, a, amount)
         edge = base[b] - base[a]
-        excess_out[w, p] = excess_of(edge, step, along_edge(edge, step), onward_of(straight[w], onward))
+        if onward == wp.static(FURTHER):
+            excess_out[w, p] = further_of(edge, now[b] - now[a], step)
+        else:
+            excess_out[w, p] = excess_of(edge, step, along_edge(edge, step), onward_of(straight[w], onward))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def turn_longer(

@@ -264,7 +264,7 @@ def take_kernel(kind: ChainKind, real, linear):
             whole = rotation_cap / wp.sqrt(rotation)
         turn_angles(theta, direction, whole, n, r)
         if rotation > scalars[TURN, r] * scalars[TURN, r]:
-            place(x, base, direction, fixed, anchor, whole, 0, n, r)
+            place(x, base, base, direction, fixed, anchor, whole, 0, n, r)
         else:
             for k in range(n):
                 step = V()

@@ -207,7 +207,8 @@ def shot(kick: float = 0.0, rods: int = 1, gap: float = 0.15, **contact) -> tupl
         velocities[11 * (r + 1) : 11 * (r + 2), 2] = -0.02 * (r + 1)
         if kick:
             for node in range(11):
-                scene.add_force(r + 1, node, (0.0, 0.0, -kick), amplitude=lambda t: float(0.2 < t < 0.25))
+                # a little aside, so that the beam, which its hits press, gives way to that side
+                scene.add_force(r + 1, node, (0.0, 0.05 * kick, -kick), amplitude=lambda t: float(0.2 < t < 0.25))
     scene.clamp(0, edges=[0, -1])
     scene.contact(friction=0.3, **contact)
     return scene, velocities

@@ -265,7 +265,7 @@ def test_pushed_by_an_obstacle(device, load_steps):
     )
 
 
-def test_runs_and_worlds_are_bitwise_equal(device):
+def test_runs_are_bitwise_equal_and_worlds_to_rounding(device):
     model = on_slope(cross_on_floor, 0.3, friction=0.5).build(device, precision="float64", worlds=2)
     one, other = (statics.solve(model, load_steps=2).points() for _ in range(2))
     np.testing.assert_array_equal(one, other)

@@ -23,13 +23,16 @@ def entries(state) -> dict[str, object]:
 
 
 class Meaning:
-    """Which entries of a state mean something and may be perturbed: rates of free dofs, no padding, no joints' rotations."""
+    """Which entries of a state mean something and may be perturbed: rates of free dofs, no padding, no joints' rotations, and nothing
+    from which solves only start."""
 
     def __init__(self, model):
         self.model = model
 
     def keep(self, name: str, values: np.ndarray) -> np.ndarray:
         part, _, name = name.partition("/")
+        if name in ("a", "alpha"):
+            return 0.0 * values
         return self._net(name, values) if part == "net" else self._chain(self.model.groups[int(part)], name, values)
 
     def _chain(self, group, name: str, values: np.ndarray) -> np.ndarray:

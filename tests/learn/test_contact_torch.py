@@ -57,7 +57,7 @@ def test_numbers_of_every_world_over_steps(name, law, lags):
         return weighed(own.rollout(start, given, steps=5)[-1])
 
     given = {name.replace(".", "_"): value for name, value in changed.items()}
-    sizes = {"stiffness": 1e-4 * 50.0, "range": 3e-4 * RANGE, "friction": 1e-4, "radius": 1e-6 * RADIUS}
+    sizes = {"stiffness": 1e-4 * 50.0, "range": 3e-4 * RANGE, "friction": 1e-4, "radius": 1e-5 * RADIUS}
     check(loss, given, {name: sizes[name.partition("_")[2]] for name in given})
     torch.testing.assert_close(own.parameter("contact.stiffness", 2), usual["contact.stiffness"])
 

@@ -130,6 +130,7 @@ class ChainNewton:
         self._evaluate = evaluate.evaluate_kernel(kind, self.real, self.linear, self.exact_from, split)
         self._check = balance.check_kernel(kind, self.real, self.linear)
         self._predict = step.predict_kernel(kind, self.real, self.linear, midpoint)
+        self._further = step.further_kernel(kind, self.real, self.linear)
         self._sweep, self._threads = None, 32 if columns < MANY else 128
         if not kind.closed:
             self._sweep = sweep.sweep_kernel(kind, self.real, self.linear, self.exact_from, self.psd == "none", split)
@@ -149,7 +150,8 @@ class ChainNewton:
     @property
     def kernels_around(self) -> list:
         """Those that do not depend on how the system is solved."""
-        return [self._predict, (self._evaluate, 128), self._check, *([self._project] if self._project else [])]
+        own = [self._predict, self._further, (self._evaluate, 128), self._check]
+        return [*own, *([self._project] if self._project else [])]
 
     def pcg_iterations(self) -> int:
         """None: the sweep is direct."""
@@ -167,6 +169,17 @@ class ChainNewton:
             self.group.columns,
             [before.x, before.v, self.group.fixed, self.group.anchor, self.group.count, *self.islands.arrays],
             [self.base, self.direction, self.x, self.frame],
+            device=self.device,
+        )
+
+    def go_further(self, before, predicted: wp.array) -> None:
+        """Start bent rods from where accelerations lead from their predictor, `direction`, with edges turned."""
+        group = self.group
+        wp.launch(
+            self._further,
+            group.columns,
+            [before.x, group.fixed, group.anchor, group.count, *self.islands.arrays, predicted, self.direction],
+            [self.x],
             device=self.device,
         )
 

@@ -8,6 +8,7 @@ import warp as wp
 from ddg_warp import arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels import parallel_moves, parallel_search
+from ddg_warp.kernels.turns import FURTHER, ON
 from ddg_warp.solve.chains.assembled import AssembledNewton
 from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.reduction import CyclicReduction, TensionReduction
@@ -43,14 +44,15 @@ class PartitionedNewton(AssembledNewton):
         self._judge, self._take = parallel_search.decide_kernels(kind, real, self.linear, self.exact)
         self._moves = parallel_moves.move_kernels(kind, real, self.linear, split)
         self._turn_ahead, *_ = parallel_moves.move_kernels(kind, real, self.linear)
-        self._aim, self._renew = parallel_moves.predict_kernels(kind, real, self.linear)
+        self._aim, self._renew, self._again = parallel_moves.predict_kernels(kind, real, self.linear)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [self._weigh, self._gauge, self._judge, self._take, *self._moves, self._aim, self._renew]
+        own = [self._weigh, self._gauge, self._judge, self._take, *self._moves, self._aim, self._renew, self._again]
         own += [self._turn_ahead] * self.split  # without, it is among the moves
-        around = [kernel for kernel in self.kernels_around if kernel is not self._predict]  # it has its own
+        others = self._predict, self._further  # in place of which it has its own
+        around = [kernel for kernel in self.kernels_around if kernel not in others]
         return [*around, self._assemble, *own, *self.reduction.kernels]
 
     def predict(self, before) -> None:
@@ -62,10 +64,15 @@ class PartitionedNewton(AssembledNewton):
             [before.x, before.v, group.fixed, group.count, *self.islands.arrays, self.x],
             [self.base, self.direction],
         )
-        self.move(predicted=True)
+        self.move(0 if self.midpoint else ON)
         if self.midpoint and group.kind.twist:
             wp.launch(self._renew, group.columns, self.islands.arrays, device=self.device)
             self.move()
+
+    def go_further(self, before, predicted: wp.array) -> None:
+        """As of `ChainNewton`."""
+        wp.launch(self._again, self.group.columns, self.islands.arrays, device=self.device)
+        self.move(FURTHER, base=predicted, now=before.x)
 
     def sweep(self) -> None:
         """Assemble, decide, solve for a direction and take it."""
@@ -116,18 +123,20 @@ class PartitionedNewton(AssembledNewton):
             device=self.device,
         )
 
-    def move(self, predicted: bool = False) -> None:
+    def move(self, onward: int | None = None, base: wp.array | None = None, now: wp.array | None = None) -> None:
         """Do what is left to do with every rod: a step, straight or with edges turned, or frames of its iterate.
 
-        `predicted`: whether the step is the predictor's, which has no tensions and may repeat the last one; see `kernels.turns`.
+        Args:
+            onward: of a predictor's step, which has no tensions, how it goes on, see `kernels.turns`; None of one of the solve.
+            base: where it starts, `base` by default; now: see `search.move_functions`.
         """
+        base = self.base if base is None else base
         group, islands, (turn, scan, offset, move) = self.group, self.islands, self._moves
         self._launch(
-            self._turn_ahead if predicted else turn,
+            turn if onward is None else self._turn_ahead,
             group.nodes,
             [group.count, islands.todo, self.direction, islands.step_length, islands.turn]
-            + [int(predicted and not self.midpoint)]
-            + [self.base, self.x, self.frame],
+            + [onward or 0, base, base if now is None else now, self.x, self.frame],
             [self.prefix, self.new_frame],
         )
         self._launch(scan, self.ranges, [group.count, islands.todo, self.width, self.prefix], [self.sums])
@@ -143,7 +152,7 @@ class PartitionedNewton(AssembledNewton):
             group.nodes,
             [group.count, group.fixed, self.held, *islands.arrays, self.direction]
             + [self.prefix, self.sums, self.mean, self.width, self.new_frame],
-            [self.x, self.theta, self.frame, self.base],
+            [self.x, self.theta, self.frame, base],
         )
 
     def _launch(self, kernel, size: int, inputs: list, outputs: list) -> None:

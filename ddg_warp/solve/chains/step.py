@@ -36,6 +36,9 @@ class ChainStep(PartStep):
         self.group = group
         kind, real = group.kind, model.types.real
         self._begin = step.begin_kernel(kind, real, self.midpoint)
+        self._foresee = step.foresee_kernel(kind, real, self.newton.linear)
+        predicted = ((own.shape, own.dtype, model.wp_device) for own in (self.newton.x, self.newton.theta))
+        self._predicted, self._predicted_angle = (arrays.allocate(*given) for given in predicted)
         self._nodes = step.finish_nodes_kernel(kind, real, self.midpoint)
         self._frames = step.finish_frames_kernel(kind, real) if kind.twist else None
         self.outer = group.outer
@@ -67,21 +70,24 @@ class ChainStep(PartStep):
         if self.motion:
             self.motion.place(self.islands, newton.x)
         newton.predict(before)
-        self.islands.bent.zero_()
         if self.motion:
             self.motion.direct(self.islands, newton.x, newton.frame, newton.theta)
         if self.loads:
             self.loads.apply(newton.x, newton.load, newton.load_angle)
         if self.drag:
             self.drag.resist(before, newton, self.islands)
+        if not self.midpoint:
+            self._start_further(before)
+        self.islands.bent.zero_()
         newton.solve(before.last)
         if self.energy:
             self.energy.judge(before)
         self._launch(
             self._nodes,
             group.node_threads,
-            [newton.x, newton.theta, before.x, before.v, before.theta, before.omega, group.count, *self.islands.arrays],
-            [after.x, after.v, after.theta, after.omega],
+            [newton.x, newton.theta, before.x, before.v, before.theta, before.omega, before.a, before.alpha]
+            + [self._predicted, self._predicted_angle, group.count, *self.islands.arrays],
+            [after.x, after.v, after.theta, after.omega, after.a, after.alpha],
         )
         if self.drag:
             self.drag.settle(after, newton, self.islands)
@@ -95,10 +101,21 @@ class ChainStep(PartStep):
         if group.kind.viscous:
             self.model.strains(group, after, after.last)
 
+    def _start_further(self, before) -> None:
+        """Start from where accelerations lead from the predictor, and keep that."""
+        group, newton = self.group, self.newton
+        self._launch(
+            self._foresee,
+            group.node_threads,
+            [before.a, before.alpha, group.fixed, group.count, *self.islands.arrays],
+            [newton.x, newton.theta, self._predicted, self._predicted_angle, newton.direction],
+        )
+        newton.go_further(before, self._predicted)
+
     @property
     def own_kernels(self) -> list:
         """Kernels of an attempt, without those of the solver."""
-        kernels = [self._begin, self._nodes, *([self._frames] if self._frames else [])]
+        kernels = [self._begin, self._foresee, self._nodes, *([self._frames] if self._frames else [])]
         if self.group.kind.viscous:
             kernels.append(element.strain_kernel(self.group.kind, self.model.types.real))
         return kernels

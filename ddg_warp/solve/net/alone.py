@@ -142,12 +142,12 @@ class Alone:
         group, told = chain.group, self._told
         lists = [places.rows, group.count]
         sizes = [places.sizes, self.net.host.nodes]
-        of_rods = [state.x, state.v, state.theta, state.omega, state.frame, state.last]
-        inputs = [*lists, told, *sizes, before.q, before.v, *places.lagged(before)]
+        of_rods = [state.x, state.v, state.theta, state.omega, state.frame, state.last, state.a, state.alpha]
+        inputs = [*lists, told, *sizes, before.q, before.v, before.a, *places.lagged(before)]
         self._launch(gather, group.node_threads, inputs, [*of_rods, *chain.islands.arrays])
         chain.attempt(state, state)
         inputs = [*lists, *sizes, *of_rods, chain.islands.arrays[0]]
-        self._launch(scatter, group.node_threads, inputs, [told, after.q, after.v, *places.lagged(after)])
+        self._launch(scatter, group.node_threads, inputs, [told, after.q, after.v, after.a, *places.lagged(after)])
 
     def _move(self, before, after) -> None:
         """Put obstacles where they are after the step."""
@@ -158,7 +158,7 @@ class Alone:
         self._launch(self._stay, dim, inputs, [after.q])
         if step.motion:
             step.motion.place(step.islands, after.q)
-        self._launch(self._follow, dim, [*inputs, after.q, step.integrator._dt], [after.v])
+        self._launch(self._follow, dim, [*inputs, after.q, step.integrator._dt], [after.v, after.a])
 
     def _judge_by(self, searched: int) -> None:
         """End the step of worlds in which nothing came near, as far as boxes tell or what was searched for."""

@@ -17,6 +17,7 @@ from ddg_warp.solve.drag import NetDrag
 from ddg_warp.solve.energy import NetEnergy
 from ddg_warp.solve.loads import Loads
 from ddg_warp.solve.net.alone import Alone, rods_of, suits, uncoupled
+from ddg_warp.solve.net.foresight import Foresight
 from ddg_warp.solve.net.newton import PRECONDITIONERS, NetNewton
 from ddg_warp.solve.net.prescribed import NetField, NetMotion
 from ddg_warp.solve.step import USUAL, PartStep
@@ -64,7 +65,10 @@ class NetStep(PartStep):
             self.tally = own
         self._counts = [*self.islands.arrays, self.tally, self.work, self.newton.pcg_work]
         self._kept = [wp.zeros_like(array) for array in self._counts] if solver.contact else []
-        self._begin, self._finish = newton.step_kernels(real, self.midpoint, arrays.serial(model.wp_device))
+        self._foresight = Foresight(solver)
+        self._begin, self._finish = newton.step_kernels(
+            real, self.midpoint, arrays.serial(model.wp_device), solver.contact is not None
+        )
         if solver.contact and self.midpoint:
             raise SceneError(
                 "contact: by the midpoint rule steps end beyond where forces balance, in overlaps; use 'implicit_euler'"
@@ -189,6 +193,8 @@ class NetStep(PartStep):
             self.loads.apply(net.points(solver.q), net.points(solver.load), net.angles(solver.load))
         if self.drag:
             self.drag.resist(before, solver, islands)
+        if not self.midpoint:
+            self._foresight.start(before)
         if solver.contact:
             solver.contact.start(before.q)
             solver.contact.place()
@@ -200,8 +206,9 @@ class NetStep(PartStep):
             solver.contact.finish(before.q)
         if self.energy:
             self.energy.judge(before, start)
-        inputs = [solver.q, before.q, before.v, *islands.arrays, blocks]
-        self._sweep(self._finish, inputs, [after.q, after.v])
+        self._foresight.weigh(before)
+        inputs = [solver.q, before.q, before.v, before.a, self._foresight.predicted, self._foresight.trust]
+        self._sweep(self._finish, [*inputs, *islands.arrays, blocks], [after.q, after.v, after.a])
         if self.drag:
             self.drag.settle(after, solver, islands)
         self.net.carry(start, after, kept=before, moved=islands.moved)
@@ -225,7 +232,7 @@ class NetStep(PartStep):
         if not self.net.edges:
             return replace(before, data=self._data)
         frame, lag = self._lagged
-        start = NetState(self.newton.q, before.v, frame, lag, before.last, self._data)
+        start = NetState(self.newton.q, before.v, before.a, frame, lag, before.last, self._data)
         if self.midpoint:
             self.net.carry(before, start, kept=start, moved=self.islands.moved)
             return start
@@ -240,7 +247,7 @@ class NetStep(PartStep):
     def own_kernels(self) -> list:
         """Kernels of an attempt, without those of the solver."""
         real, net = self.model.types.real, self.net
-        kernels = [self._begin, self._finish, self._take]
+        kernels = [self._begin, self._finish, self._take, *self._foresight.kernels]
         for part in net.sets:
             kernels += [elements.term_kernels(part.term, real)[3]] if part.term.density.lagged else []
         return kernels

@@ -5,6 +5,7 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.kernels.net.turns import turn_kernels
+from ddg_warp.kernels.turns import FURTHER, ON
 
 BLOCK = 32  # threads in a block, of pieces of rods: few, which read far apart
 
@@ -65,22 +66,32 @@ class Turns:
         newton, net = self.newton, self.net
         inputs = [newton.q, newton.base, v, newton.held, *newton.islands.arrays, net.blocks]
         wp.launch(self._aim, newton.all, inputs, [newton.direction], device=net.device)
-        self.place(onward, predicted=True)
+        self.place(ON if onward else 0)
         newton.direction.zero_()  # solvers leave out what is held
+
+    def go_further(self, before, predicted: wp.array) -> None:
+        """Start worlds whose predictors turned edges from where accelerations lead from there, the direction, with edges turned."""
+        wp.capture_if(self.newton.islands.turning, lambda: self._further(before, predicted))
+
+    def _further(self, before, predicted: wp.array) -> None:
+        self.place(FURTHER, predicted, before.q)
+        self.newton.direction.zero_()
 
     def turn(self, state) -> None:
         """Place the nodes of rods whose edges turn, and renew the frames that `state` lags where that is to be done."""
-        self.place(predicted=False)
+        self.place()
         if self.net.edges:
             self.net.renew(state, self.newton.q, self.newton.islands.todo)
 
-    def place(self, onward: bool = False, predicted: bool = False) -> None:
-        """Nodes of rods, once the straight step has moved everything; `onward`: see `predict`. Predictors have no tensions."""
+    def place(self, onward: int | None = None, base: wp.array | None = None, now: wp.array | None = None) -> None:
+        """Nodes of rods, once the straight step has moved everything; arguments as of `PartitionedNewton.move`."""
         newton, net = self.newton, self.net
         device, worlds, todo = net.device, net.worlds, newton.islands.todo
-        moved = [newton.base, newton.direction, newton.islands.step_length, todo]
-        turn, inputs = self._turn, [self._nodes, self._ahead, *moved, newton.islands.turn, int(onward), net.blocks]
-        if self._behind and not predicted:
+        base = newton.base if base is None else base
+        moved = [base, newton.direction, newton.islands.step_length, todo]
+        turn, inputs = self._turn, [self._nodes, self._ahead, *moved, newton.islands.turn, onward or 0]
+        inputs += [base if now is None else now, net.blocks]
+        if self._behind and onward is None:
             turn, inputs = self._turn_longer, [self._nodes, self._ahead, *moved, net.blocks, *self._behind]
         wp.launch(turn, (len(self._nodes), worlds), inputs, [self._sums], device=device)
         pieces = self._offsets.shape[2]

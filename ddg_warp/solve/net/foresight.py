@@ -1,0 +1,72 @@
+"""Where a net's solve starts, from what the last one added to its predictor; see `kernels.net.foresight`."""
+
+import warp as wp
+
+from ddg_warp import arrays
+from ddg_warp.kernels.net import foresight
+from ddg_warp.kernels.solve import krylov
+from ddg_warp.solve.net.system import Sums
+
+
+class Foresight:
+    """Starts the solves of a `NetNewton`.
+
+    Attributes:
+        predicted: blocks (W N,) of the predictor; trust: how much of what a solve adds is trusted, of every world.
+    """
+
+    def __init__(self, newton):
+        net, device, serial = newton.net, newton.net.device, arrays.serial(newton.net.device)
+        self.newton = newton
+        self._foresee, self._weigh, self._trust = foresight.foresight_kernels(newton.real, newton.linear, serial)
+        self.predicted = wp.zeros_like(newton.q)
+        self.trust = wp.ones(net.worlds, dtype=newton.real, device=device)
+        self._sum = None
+        if newton.contact:
+            takers, rows = arrays.takers(net.host.nodes, device), foresight.SUMS
+            self._weights = wp.zeros((rows, net.worlds, takers), dtype=newton.real, device=device)
+            self._sums = wp.zeros((rows, net.worlds), dtype=newton.real, device=device)
+            self._sum = Sums(rows * net.worlds, takers, newton.real, device)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        if not self._sum:
+            return [self._foresee]
+        return [self._foresee, self._weigh, self._trust, *((kernel, krylov.THREADS) for kernel in self._sum.kernels)]
+
+    def start(self, before) -> None:
+        """Go on from the predictor of a step from a state `before`, and keep that."""
+        newton, net = self.newton, self.newton.net
+        inputs = [before.a, newton.held, *newton.islands.arrays, net.blocks]
+        arrays.sweep(
+            self._foresee,
+            net.blocks,
+            inputs,
+            [newton.q, self.predicted, newton.direction],
+            net.device,
+            worlds=net.worlds,
+        )
+        if newton.turns:
+            newton.turns.go_further(before, self.predicted)
+
+    def weigh(self, before) -> None:
+        """Find what is to be trusted of what the solve has added, in a net with contact."""
+        if not self._sum:
+            return
+        newton, net, islands = self.newton, self.newton.net, self.newton.islands
+        nodes = net.host.nodes
+        inputs = [
+            newton.q,
+            self.predicted,
+            before.a,
+            net.mass.flatten(),
+            islands.moved,
+            islands.rate,
+            nodes,
+            net.blocks,
+        ]
+        arrays.sweep(self._weigh, nodes, inputs, [self._weights], net.device, worlds=net.worlds)
+        self._sum(self._weights.reshape((foresight.SUMS * net.worlds, -1)), self._sums.flatten())
+        inputs = [self._sums, newton.options.rtol, islands.arrays[1]]
+        wp.launch(self._trust, net.worlds, inputs, [self.trust], device=net.device)
