@@ -8,8 +8,8 @@ so inertia and mass-proportional damping alpha are one quadratic, coefficient * 
 extrapolates, x_n+1 = 2 x - x_n and v_n+1 = 2 (x - x_n) / s - v_n.
 
 The search starts from the predictor, x_n + s v_n with edges turned, and by implicit Euler from s^2 a beyond, where a is what the last
-solve added to its own predictor, over the square of its step: constant accelerations are foreseen. (By the midpoint rule what stiff
-modes add changes sign from step to step.) No solution depends on that: what is lagged is that of the predictor.
+solve added to its own predictor, over the square of its step: constant accelerations of what is loaded are foreseen. (By the midpoint
+rule what stiff modes add changes sign from step to step.) No solution depends on that: what is lagged is that of the predictor.
 
 A rod whose solve fails first starts again from x_n instead of the predictor, then takes the step in halves (`portion`); rods
 are uncoupled, so each does so for itself. `progress` is the part of the step already taken; both are powers of two, exact.
@@ -26,6 +26,7 @@ from ddg_warp.kernels.islands import (
     CAUTIOUS,
     DETOURS,
     ITERATION,
+    LOAD_SCALE,
     LOST,
     MOVED,
     PATIENCE,
@@ -209,7 +210,9 @@ def foresee_kernel(kind: ChainKind, real, linear):
         if scalars[PROGRESS, r] >= real(1.0) or start >= n:
             return
         s = real(1.0) / scalars[RATE, r]
-        weight = wp.where(flags[CAUTIOUS, r] == 0, s * s, real(0.0))
+        # without loads the tolerance is of the residual that a solve starts with
+        foreseen = flags[CAUTIOUS, r] == 0 and scalars[LOAD_SCALE, r] > real(0.0)
+        weight = wp.where(foreseen, s * s, real(0.0))
         for k in range(start, until(start, n)):
             mask = int(fixed[k, r])
             here = x[k, r]

@@ -188,7 +188,7 @@ class Integrator:
 
     def _renews(self, anew: bool) -> int:
         """What a step makes anew, see `NetStep.step`: every few steps the trees that were used since."""
-        if self._net is None or self.model.wp_device.is_cpu:
+        if self._net is None or self._net.newton.contact is None or self.model.wp_device.is_cpu:
             return TREES
         due = anew or self._since_renewal % RENEWAL == 0
         fresh = anew or self._since_renewal == 0

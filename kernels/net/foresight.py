@@ -2,7 +2,7 @@
 
 Among many contacts some of what a solve adds is gone by the next step. What it added is trusted in a world by the cosine of the angle
 between that and what was trusted before, weighed by mass, and less where it has grown by more than `GROWTH`: a shock is not foreseen
-again, and what goes on is, within a few steps. What makes up less than the tolerance is none of the motion at all.
+again, and what goes on is, within a few steps. What takes less than what is left out of balance is none of the motion.
 """
 
 from functools import cache
@@ -43,7 +43,9 @@ def foresight_kernels(real, linear, serial: bool):
         if scalars[PROGRESS, w] >= real(1.0):
             return
         s = real(1.0) / scalars[RATE, w]
-        weight = wp.where(flags[CAUTIOUS, w] == 0, s * s, real(0.0))
+        # without loads the tolerance is of the residual that a solve starts with
+        foreseen = flags[CAUTIOUS, w] == 0 and scalars[LOAD_SCALE, w] > real(0.0)
+        weight = wp.where(foreseen, s * s, real(0.0))
         for k in range(start, until(start, blocks)):
             i = k + w * blocks
             mask = int(held[k])
@@ -92,6 +94,7 @@ def foresight_kernels(real, linear, serial: bool):
     def trust(
         sums: wp.array2d(dtype=real),
         rtol: real,
+        total: wp.array(dtype=real),
         scalars: wp.array2d(dtype=real),
         trust_out: wp.array(dtype=real),
     ):
@@ -102,7 +105,7 @@ def foresight_kernels(real, linear, serial: bool):
             cosine = sums[wp.static(AGREEING), w] / wp.sqrt(added * trusted)
             growth = wp.min(real(GROWTH) * wp.sqrt(trusted / added), real(1.0))
             found = wp.clamp(cosine * growth, real(LEAST), real(1.0))
-        if sums[wp.static(FORCE), w] <= rtol * scalars[LOAD_SCALE, w]:
+        if sums[wp.static(FORCE), w] <= rtol * scalars[LOAD_SCALE, w] * total[w]:
             found = real(0.0)
         trust_out[w] = found
 

@@ -6,6 +6,7 @@ import warp as wp
 from brute_force import SIDES, listed, near, scene, upload
 from motion_cases import MARGIN, REACH, Motion, tangle
 
+from ddg_warp.kernels.contact.motion import AHEAD
 from ddg_warp.solve.contact.broad_phase import BroadPhase
 from ddg_warp.solve.contact.shapes import Shapes
 
@@ -154,3 +155,28 @@ def test_half_spaces_that_move_and_turn_are_seen_from_afar(device, turn):
         assert close <= found
         count += len(close)
     assert count > 100
+
+
+@pytest.mark.parametrize("dtype", [wp.vec3d, wp.vec3f])
+def test_a_search_serves_the_next_motion(device, dtype):
+    """What goes on as it went is not searched for again, and all that is near in the second motion is known; the third one is new."""
+    shapes, points = scene(31, 0.6, rods=20, triangles=60)
+    rng = np.random.default_rng(32)
+    speed = 2.0 * MARGIN * rng.normal(size=points.shape)
+    for together, expected in ((0, [1, 0, 1, 0]), (1, [1, 1, 1, 1])):
+        search = BroadPhase(shapes, upload(points, device, dtype), reach=REACH, margin=MARGIN)
+        flag, found, count = wp.full(1, together, dtype=int, device=device), [], 0
+        for step in range(4):
+            base, q = points + step * speed, points + (step + 1) * speed
+            bends = beside(rng, len(points), 0.4 * MARGIN) if step == 1 else 0.0
+            given = [upload(x, device, dtype) for x in (base, q + bends)]
+            before = int(search.searches.numpy()[0])
+            search.update(*given, flag)
+            found.append(int(search.searches.numpy()[0]) - before)
+            if search.fit(given[0]):  # there is room now
+                search.search(given[0], upload(AHEAD * speed, device, dtype))
+            if not together:
+                for share in (0.3, 1.0):
+                    count += held(search, base + share * (q + bends - base))
+        assert found == expected
+        assert together or count > 50

@@ -80,7 +80,7 @@ class BroadPhase:
             radius = wp.array(np.tile(shapes.radii, (worlds, 1)), dtype=real, device=self.device)
         things = {size: Things(shapes, size, worlds, real, self.device, radius) for size in shapes.sizes}
         self._things = list(things.values())
-        self._still, self._move = (wp.zeros(len(x), dtype=x.dtype, device=self.device) for _ in range(2))
+        self._still, self._move, self._way = (wp.zeros(len(x), dtype=x.dtype, device=self.device) for _ in range(3))
         self._start, self._end = (wp.zeros_like(x) for _ in range(2))  # ways that pairs were found for
         placed = np.zeros(nodes, np.uint8)  # what no thing has may be no place, as blocks of edges are not
         for size in shapes.sizes:
@@ -148,11 +148,22 @@ class BroadPhase:
     def update(self, base: wp.array, q: wp.array | None = None, together: wp.array | None = None) -> None:
         """Search again along the motion from `base` to q if some node is, at either, farther than half of the margin from its way.
 
-        By default q is `base`: nothing moves. Of a motion by one share that is not filtered the candidates hold from q on.
+        By default q is `base`: nothing moves. Else ways go on beyond q, see `kernels.contact.motion`, but in worlds that move by one
+        share; there the candidates of a motion that is not filtered hold from q on.
         """
+        together = self._never if together is None else together
+        _, lengthen, *_ = self._motion
+
+        def anew() -> None:
+            if q is None:
+                self.search(base)
+                return
+            self._sweep(lengthen, base, [self._move, together], [self._way])
+            self.search(base, self._way, together)
+
         self._done.zero_()
         self._watch(base, base if q is None else q, self._stale)
-        wp.capture_if(self._stale, lambda: self.search(base, self._move, together))
+        wp.capture_if(self._stale, anew)
 
     def search(self, x: wp.array, move: wp.array | None = None, together: wp.array | None = None) -> None:
         """Find all candidates at x or, with `move`, anywhere on the straight motion from x by it.
@@ -167,7 +178,7 @@ class BroadPhase:
         for pairs in self.lists:
             pairs.meet()
             pairs.judge(x, move, together, self.reach, self._around)
-        _, mark, _ = self._motion
+        _, _, mark, _ = self._motion
         outputs = [self._start, self._end, self._stale, self._done, self.searches]
         self._sweep(mark, x, [x, move, together, self._placed, self.overflow], outputs)
 

@@ -68,5 +68,5 @@ class Foresight:
         ]
         arrays.sweep(self._weigh, nodes, inputs, [self._weights], net.device, worlds=net.worlds)
         self._sum(self._weights.reshape((foresight.SUMS * net.worlds, -1)), self._sums.flatten())
-        inputs = [self._sums, newton.options.rtol, islands.arrays[1]]
+        inputs = [self._sums, newton.options.rtol, newton.allowed.total, islands.arrays[1]]
         wp.launch(self._trust, net.worlds, inputs, [self.trust], device=net.device)

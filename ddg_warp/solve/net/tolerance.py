@@ -12,7 +12,7 @@ class Allowed:
 
     Attributes:
         blocks: of every block of all worlds [N, N m]; least: what rounding leaves there, which `settle` writes.
-        limits: of the parts of every level (worlds, parts) [N].
+        limits: of the parts of every level (worlds, parts) [N]; total: loads of all bodies (worlds,) [N].
         ratio: of residuals of blocks, then of sums over parts, to what they may be.
     """
 
@@ -40,6 +40,7 @@ class Allowed:
                 make(worlds * n),
             )
             self._levels.append(own)
+        self.total = make(worlds)
         self.limits = [limit for _, _, limit, _, _ in self._levels]
 
     def assign(self, loads: np.ndarray) -> wp.array:
@@ -47,6 +48,7 @@ class Allowed:
         loads = np.broadcast_to(loads, (self.net.worlds, self.bodies.count))
         given = (loads > 0.0).any(1)
         loads = np.where(given[:, None], loads, 1.0)
+        self.total.assign(loads.sum(1))
         self.blocks.assign(np.concatenate([self.bodies.limits(own) for own in loads]))
         for level, limit in zip(self.bodies.levels, self.limits, strict=True):
             limit.assign(loads[:, level.body] * level.weight)
