@@ -7,9 +7,7 @@ Both schemes solve one implicit Euler step of length s (s = h, or h/2 for the im
 so inertia and mass-proportional damping alpha are one quadratic, coefficient * m |x - target|^2 / 2. The midpoint rule then
 extrapolates, x_n+1 = 2 x - x_n and v_n+1 = 2 (x - x_n) / s - v_n.
 
-The search starts from the predictor, x_n + s v_n with edges turned, and by implicit Euler from s^2 a beyond, where a is what the last
-solve added to its own predictor, over the square of its step: constant accelerations of what is loaded are foreseen. (By the midpoint
-rule what stiff modes add changes sign from step to step.) No solution depends on that: what is lagged is that of the predictor.
+The search starts from the predictor, x_n + s v_n with edges turned, or beyond: see `kernels.foresight`.
 
 A rod whose solve fails first starts again from x_n instead of the predictor, then takes the step in halves (`portion`); rods
 are uncoupled, so each does so for itself. `progress` is the part of the step already taken; both are powers of two, exact.
@@ -21,12 +19,12 @@ import warp as wp
 
 from ddg_warp.kernels import frames, outcome
 from ddg_warp.kernels.chain import ChainKind, gather_functions
+from ddg_warp.kernels.foresight import told_function
 from ddg_warp.kernels.islands import (
     BENT,
     CAUTIOUS,
     DETOURS,
     ITERATION,
-    LOAD_SCALE,
     LOST,
     MOVED,
     PATIENCE,
@@ -41,9 +39,7 @@ from ddg_warp.kernels.islands import (
 )
 from ddg_warp.kernels.search import search_functions
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
-from ddg_warp.kernels.turns import FURTHER, ON, onward_function
-
-FORESEEN = 6  # iterations of a solve, at most, after which the next one starts from what it added
+from ddg_warp.kernels.turns import ON, onward_function
 
 
 @cache
@@ -182,83 +178,6 @@ def predict_kernel(kind: ChainKind, real, linear, midpoint: bool):
 
 
 @cache
-def foresee_kernel(kind: ChainKind, real, linear):
-    """Keep the predictor of every rod that still has to move, and start from where its accelerations lead from there.
-
-    They are a `direction`, along which `further_kernel` moves rods whose edges turn.
-    """
-    dim, twist = kind.dim, kind.twist
-    V = wp.types.vector(dim, real)
-    until = until_function(kind.serial)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def foresee(
-        a0: wp.array2d(dtype=V),
-        alpha0: wp.array2d(dtype=real),
-        fixed: wp.array2d(dtype=wp.uint8),
-        count: wp.array(dtype=int),
-        flags: wp.array2d(dtype=int),
-        scalars: wp.array2d(dtype=real),
-        x: wp.array2d(dtype=V),
-        theta: wp.array2d(dtype=real),
-        predicted: wp.array2d(dtype=V),
-        predicted_angle: wp.array2d(dtype=real),
-        direction: wp.array3d(dtype=linear),
-    ):
-        start, r = wp.tid()
-        n = count[r]
-        if scalars[PROGRESS, r] >= real(1.0) or start >= n:
-            return
-        s = real(1.0) / scalars[RATE, r]
-        # without loads the tolerance is of the residual that a solve starts with
-        foreseen = flags[CAUTIOUS, r] == 0 and scalars[LOAD_SCALE, r] > real(0.0)
-        weight = wp.where(foreseen, s * s, real(0.0))
-        for k in range(start, until(start, n)):
-            mask = int(fixed[k, r])
-            here = x[k, r]
-            predicted[k, r] = here
-            more = weight * a0[k, r]
-            for d in range(wp.static(dim)):
-                if ((mask >> d) & 1) != 0:
-                    more[d] = real(0.0)
-                if flags[BENT, r] != 0:
-                    direction[d, k, r] = linear(more[d])
-            x[k, r] = here + more
-            if wp.static(twist):
-                angle = theta[k, r]
-                predicted_angle[k, r] = angle
-                if ((mask >> wp.static(dim)) & 1) == 0:
-                    theta[k, r] = angle + weight * alpha0[k, r]
-
-    return foresee
-
-
-@cache
-def further_kernel(kind: ChainKind, real, linear):
-    """Redo that of a rod whose edges its predictor turned: they turn and lengthen as the last solve has turned and lengthened them."""
-    V = wp.types.vector(kind.dim, real)
-    place, *_ = search_functions(kind, real, linear)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def further(
-        x0: wp.array2d(dtype=V),
-        fixed: wp.array2d(dtype=wp.uint8),
-        anchor: wp.array(dtype=int),
-        count: wp.array(dtype=int),
-        flags: wp.array2d(dtype=int),
-        scalars: wp.array2d(dtype=real),
-        predicted: wp.array2d(dtype=V),
-        direction: wp.array3d(dtype=linear),
-        x: wp.array2d(dtype=V),
-    ):
-        r = wp.tid()
-        if scalars[PROGRESS, r] < real(1.0) and flags[BENT, r] != 0:
-            place(x, predicted, x0, direction, fixed, anchor, real(1.0), wp.static(FURTHER), count[r], r)
-
-    return further
-
-
-@cache
 def start_function(real):
     """start(flags, scalars, i): starts a step of an island, which has all of it to do if it has not been given up."""
 
@@ -282,26 +201,6 @@ def start_kernel(real):
         start_one(flags, scalars, wp.tid())
 
     return start
-
-
-@cache
-def told_function(real, midpoint: bool, crowd: bool = False):
-    """told(flags, scalars, i): square of the rate by which what a solve added is an acceleration that the next one starts with.
-
-    Zero where that is not foreseen: by the midpoint rule, after a solve from x_n, or one of so many iterations that the motion was none
-    that goes on. In a `crowd` these tell of contacts, and `kernels.net.foresight` of the motion.
-    """
-
-    @wp.func
-    def told(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), i: int):
-        known = (
-            wp.static(not midpoint)
-            and flags[CAUTIOUS, i] == 0
-            and (wp.static(crowd) or flags[ITERATION, i] <= wp.static(FORESEEN))
-        )
-        return wp.where(known, scalars[RATE, i] * scalars[RATE, i], real(0.0))
-
-    return told
 
 
 @cache

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from test_predictors import SOLVERS, angle_between, hair, lengths, linear_of, predicted, spinning, turned
+from test_predictors import SOLVERS, angle_between, forgetful, hair, lengths, linear_of, predicted, spinning, turned
 
 import ddg_warp as ddg
 from ddg_warp import arrays
@@ -18,15 +18,6 @@ STEPS = np.array([T240, T240, T240, 0.5 * T240, 0.01, 0.01])
 def accelerations(state) -> list[wp.array]:
     """Arrays of a state, of groups and the net."""
     return [part.a for part in (*state.groups, *([state.net] if state.net else []))]
-
-
-def forgetful(state):
-    """The state with nothing that its last solve added."""
-    state = state.copy()
-    for array in state.arrays().items():
-        if array[0].rpartition("/")[2] in ("a", "alpha"):
-            array[1].zero_()
-    return state
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -119,12 +119,18 @@ def test_an_edge_that_turned_over_at_once_keeps_its_length(device):
 # The predictor.
 
 
+def forgetful(state):
+    """The state with nothing that its last solve added."""
+    state = state.copy()
+    for name, array in state.arrays().items():
+        if name.rpartition("/")[2] in ("a", "alpha"):
+            array.zero_()
+    return state
+
+
 def predicted(integrator, state, dt, foresees: bool = False):
     """The state that a step ends in if its solve makes no iteration: where the predictor leads, or what it `foresees`."""
-    if not foresees:
-        state = state.copy()
-        for part in (*state.groups, *([state.net] if state.net else [])):
-            part.a.zero_()
+    state = state if foresees else forgetful(state)
     integrator._weigh(dt, state)
     for part in integrator._parts:
         part.newton.solve = lambda *_: None

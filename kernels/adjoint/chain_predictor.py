@@ -4,12 +4,13 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.adjoint.turns import excess_function, loose_function, unplace_function
+from ddg_warp.kernels.adjoint.turns import excess_function, unplace_function
 from ddg_warp.kernels.chain import ChainKind, gather_functions
 from ddg_warp.kernels.gather import row_functions
 from ddg_warp.kernels.islands import BENT, RATE, TURN
 from ddg_warp.kernels.step import predicted_function
 from ddg_warp.kernels.threads import CPU_OPTIONS
+from ddg_warp.kernels.turns import loose_function
 
 
 @cache

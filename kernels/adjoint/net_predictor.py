@@ -4,9 +4,10 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.adjoint.turns import excess_function, loose_function, unplace_function
+from ddg_warp.kernels.adjoint.turns import excess_function, unplace_function
 from ddg_warp.kernels.search import PLACE
 from ddg_warp.kernels.threads import CPU_OPTIONS
+from ddg_warp.kernels.turns import loose_function
 
 
 @cache

@@ -81,18 +81,3 @@ def excess_function(dim: int, real, midpoint: bool):
         return wp.dot(excess_of(e, de, along_edge(e, de), onward), f)
 
     return turned
-
-
-@cache
-def loose_function(dim: int, real):
-    """loose(mask, v): what no support holds of a vector of a node with such a mask of held dofs."""
-    V = wp.types.vector(dim, real)
-
-    @wp.func
-    def loose(mask: int, v: V):
-        result = V()
-        for d in range(wp.static(dim)):
-            result[d] = wp.where(((mask >> d) & 1) == 0, v[d], real(0.0))
-        return result
-
-    return loose

@@ -1,4 +1,4 @@
-"""From where the solve of a net's step starts: its predictor, and what the last solve added to its own; see `kernels.step`.
+"""From where the solve of a net's step starts, and what is trusted of what it adds; see `kernels.foresight`.
 
 Among many contacts some of what a solve adds is gone by the next step. What it added is trusted in a world by the cosine of the angle
 between that and what was trusted before, weighed by mass, and less where it has grown by more than `GROWTH`: a shock is not foreseen
@@ -9,9 +9,11 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.islands import CAUTIOUS, LOAD_SCALE, PROGRESS, RATE, TODO
+from ddg_warp.kernels.foresight import ahead_function
+from ddg_warp.kernels.islands import LOAD_SCALE, PROGRESS, TODO
 from ddg_warp.kernels.search import PLACE
 from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
+from ddg_warp.kernels.turns import loose_function
 
 GROWTH, LEAST = 4.0, 0.05  # of what is trusted from one step to the next; the least of it, from which it grows again
 AGREEING, ADDED, BEFORE, FORCE = range(4)  # rows of sums over nodes: m a.b, m a.a, m b.b, m |a|
@@ -22,6 +24,7 @@ SUMS = 4
 def foresight_kernels(real, linear, serial: bool):
     """foresee(...) where a solve starts, weigh(...) what it added, trust(...) it."""
     share, until = share_function(serial), until_function(serial)
+    ahead, loose = ahead_function(real), loose_function(3, real)
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -42,19 +45,12 @@ def foresight_kernels(real, linear, serial: bool):
         w, start = share(wp.tid(), blocks)
         if scalars[PROGRESS, w] >= real(1.0):
             return
-        s = real(1.0) / scalars[RATE, w]
-        # without loads the tolerance is of the residual that a solve starts with
-        foreseen = flags[CAUTIOUS, w] == 0 and scalars[LOAD_SCALE, w] > real(0.0)
-        weight = wp.where(foreseen, s * s, real(0.0))
+        weight = ahead(flags, scalars, w)
         for k in range(start, until(start, blocks)):
             i = k + w * blocks
-            mask = int(held[k])
             here = q[i]
             predicted[i] = here
-            more = weight * a[i]
-            for d in range(3):
-                if ((mask >> d) & 1) != 0:
-                    more[d] = real(0.0)
+            more = loose(int(held[k]), weight * a[i])
             q[i] = here + more
             if flags[TODO, w] == wp.static(PLACE):
                 direction[i] = H(linear(more[0]), linear(more[1]), linear(more[2]))

@@ -6,6 +6,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels import outcome
+from ddg_warp.kernels.foresight import told_function
 from ddg_warp.kernels.islands import (
     ACTIVE,
     CAUTIOUS,
@@ -31,7 +32,6 @@ from ddg_warp.kernels.islands import (
 )
 from ddg_warp.kernels.judge import DIRECT, STOP, judge_functions
 from ddg_warp.kernels.search import PLACE, STRAIGHT
-from ddg_warp.kernels.step import told_function
 from ddg_warp.kernels.threads import CPU_OPTIONS, share_function, until_function
 
 ON_THE_WAY, THERE = 2, 1  # worlds whose supports or predictor were held up: not there yet, there since the last step

@@ -184,7 +184,7 @@ def test_chains_are_eliminated_by_one_thread_or_by_many(device, monkeypatch, nam
         monkeypatch.setattr(net_chains, "long_and_few", lambda *_, reduces=reduces: reduces)
         scene = import_module(f"ddg_warp.scenes.{name}").build()
         model = scene.build(device, precision="float64")
-        integrator = ddg.Integrator(model)
+        integrator = ddg.Integrator(model, rtol=1e-5)  # above rounding, of which iterations are another number
         state = model.state()
         for _ in range(40):
             state = integrator.step(state, scene.analysis.dt)
@@ -193,6 +193,5 @@ def test_chains_are_eliminated_by_one_thread_or_by_many(device, monkeypatch, nam
     assert by_one["contact"]["contacts"]["mean"] > 0.0
     newton = [by["newton_iterations"]["mean"] * sum(by["outcomes"].values()) for by in (by_one, by_many)]
     assert abs(newton[1] - newton[0]) <= 1.0 + 1e-9
-    # of conjugate gradients, those that go down to rounding may be an eighth more
-    assert abs(by_many["pcg_iterations"] - by_one["pcg_iterations"]) < 0.15 * by_one["pcg_iterations"]
+    assert abs(by_many["pcg_iterations"] - by_one["pcg_iterations"]) < 0.1 * by_one["pcg_iterations"]
     np.testing.assert_allclose(many, one, rtol=0.0, atol=1e-7)

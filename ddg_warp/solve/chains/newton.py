@@ -6,7 +6,7 @@ import warp as wp
 
 from ddg_warp import arguments, arrays
 from ddg_warp.errors import SceneError, check_options
-from ddg_warp.kernels import balance, chain, evaluate, search, step
+from ddg_warp.kernels import balance, chain, evaluate, foresight, search, step
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.matrix import geometric
 from ddg_warp.kernels.solve import sweep, tension
@@ -130,7 +130,7 @@ class ChainNewton:
         self._evaluate = evaluate.evaluate_kernel(kind, self.real, self.linear, self.exact_from, split)
         self._check = balance.check_kernel(kind, self.real, self.linear)
         self._predict = step.predict_kernel(kind, self.real, self.linear, midpoint)
-        self._further = step.further_kernel(kind, self.real, self.linear)
+        self._further = None if midpoint else foresight.further_kernel(kind, self.real, self.linear)
         self._sweep, self._threads = None, 32 if columns < MANY else 128
         if not kind.closed:
             self._sweep = sweep.sweep_kernel(kind, self.real, self.linear, self.exact_from, self.psd == "none", split)
@@ -150,8 +150,8 @@ class ChainNewton:
     @property
     def kernels_around(self) -> list:
         """Those that do not depend on how the system is solved."""
-        own = [self._predict, self._further, (self._evaluate, 128), self._check]
-        return [*own, *([self._project] if self._project else [])]
+        own = [self._predict, (self._evaluate, 128), self._check]
+        return [*own, *(kernel for kernel in (self._further, self._project) if kernel)]
 
     def pcg_iterations(self) -> int:
         """None: the sweep is direct."""

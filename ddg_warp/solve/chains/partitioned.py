@@ -49,7 +49,8 @@ class PartitionedNewton(AssembledNewton):
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [self._weigh, self._gauge, self._judge, self._take, *self._moves, self._aim, self._renew, self._again]
+        own = [self._weigh, self._gauge, self._judge, self._take, *self._moves, self._aim]
+        own += [self._renew] if self.midpoint else [self._again]
         own += [self._turn_ahead] * self.split  # without, it is among the moves
         others = self._predict, self._further  # in place of which it has its own
         around = [kernel for kernel in self.kernels_around if kernel not in others]

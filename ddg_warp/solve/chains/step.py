@@ -7,7 +7,7 @@ import numpy as np
 from ddg_warp import arrays
 from ddg_warp.compile.precision import largest_carried
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels import element, step
+from ddg_warp.kernels import element, foresight, step
 from ddg_warp.solve import energy
 from ddg_warp.solve.chains.newton import ChainNewton
 from ddg_warp.solve.chains.partitioned import PartitionedNewton
@@ -36,7 +36,7 @@ class ChainStep(PartStep):
         self.group = group
         kind, real = group.kind, model.types.real
         self._begin = step.begin_kernel(kind, real, self.midpoint)
-        self._foresee = step.foresee_kernel(kind, real, self.newton.linear)
+        self._foresee = foresight.foresee_kernel(kind, real, self.newton.linear)
         predicted = ((own.shape, own.dtype, model.wp_device) for own in (self.newton.x, self.newton.theta))
         self._predicted, self._predicted_angle = (arrays.allocate(*given) for given in predicted)
         self._nodes = step.finish_nodes_kernel(kind, real, self.midpoint)
@@ -115,7 +115,8 @@ class ChainStep(PartStep):
     @property
     def own_kernels(self) -> list:
         """Kernels of an attempt, without those of the solver."""
-        kernels = [self._begin, self._foresee, self._nodes, *([self._frames] if self._frames else [])]
+        kernels = [self._begin, self._nodes, *([self._frames] if self._frames else [])]
+        kernels += [] if self.midpoint else [self._foresee]
         if self.group.kind.viscous:
             kernels.append(element.strain_kernel(self.group.kind, self.model.types.real))
         return kernels

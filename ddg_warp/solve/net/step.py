@@ -247,7 +247,7 @@ class NetStep(PartStep):
     def own_kernels(self) -> list:
         """Kernels of an attempt, without those of the solver."""
         real, net = self.model.types.real, self.net
-        kernels = [self._begin, self._finish, self._take, *self._foresight.kernels]
+        kernels = [self._begin, self._finish, self._take, *([] if self.midpoint else self._foresight.kernels)]
         for part in net.sets:
             kernels += [elements.term_kernels(part.term, real)[3]] if part.term.density.lagged else []
         return kernels
