@@ -4,6 +4,8 @@ On CUDA neighbouring threads work on neighbouring rods, so rods run fastest in m
 there the same logical array has its components fastest and rods slowest, which keeps a rod in the cache (1.35 times faster).
 """
 
+from collections.abc import Callable
+
 import numpy as np
 import warp as wp
 
@@ -91,3 +93,48 @@ def take_turns(kernel, count: int, inputs: list, outputs: list, device) -> None:
 def sweep(kernel, count: int, inputs: list, outputs: list, device, threads: int = THREADS, worlds: int = 1) -> None:
     """Launch a kernel that goes over `count` things, or as many of every world; see `kernels.threads.share_function`."""
     wp.launch(kernel, worlds * takers(count, device), inputs, outputs, device=device, block_dim=threads)
+
+
+_asides: dict[str, list[wp.Stream]] = {}  # streams of devices that are not in use
+
+
+def side_by_side(launches: list[Callable[[], None]], device) -> None:
+    """Launch what does not depend on each other, and have all else wait for it; in a capture on CUDA it may run at once.
+
+    Kernels of few threads then take no time of their own. The first may do so again, and none launches anything conditional.
+    """
+    device = wp.get_device(device)
+    first, *others = launches
+    if not (others and device.is_cuda and device.stream in device.captures):
+        for launch in launches:
+            launch()
+        return
+    main, free = device.stream, _asides.setdefault(device.alias, [])
+    streams = [free.pop() if free else wp.Stream(device) for _ in others]
+    for launch, stream in zip(others, streams, strict=True):
+        with wp.ScopedStream(stream):
+            launch()
+    first()
+    for stream in streams:
+        main.wait_stream(stream)
+    free += streams
+
+
+class Reading:
+    """Values of a small array on the host, which are read again and again: at one place, as to make room takes longer than to copy.
+
+    Where the array is on the host itself, they are those that it has whenever they are looked at.
+    """
+
+    def __init__(self, array: wp.array):
+        self._array, self._host = array, array
+        if array.device.is_cuda:
+            self._host = wp.empty_like(array, device="cpu", pinned=True)
+        self._values = self._host.numpy()
+
+    def __call__(self) -> np.ndarray:
+        """The values now, once all that was launched before is done; the next reading writes over them."""
+        if self._host is not self._array:
+            wp.copy(self._host, self._array)
+            wp.synchronize_stream(self._array.device)
+        return self._values

@@ -24,6 +24,11 @@ class _Turns:
         self._own, self._collection = threading.local(), ExitStack()
         self.shared: bool | None = None  # whether threads share a stream; found out by the first call
 
+    @property
+    def inside(self) -> bool:
+        """Whether this thread launches, or captures, once it is known whether threads share a stream."""
+        return self.shared is not None and getattr(self._own, "depth", 0) > 0
+
     @contextmanager
     def launching(self) -> Iterator[None]:
         depth = getattr(self._own, "depth", 0)
@@ -117,6 +122,8 @@ def _release(self) -> None:
 def _within(turn, function):
     @wraps(function)
     def entered(*args, **kwargs):
+        if turn is launching and _turns.inside:  # in this very turn, which takes less than to take it anew
+            return function(*args, **kwargs)
         with turn():
             return function(*args, **kwargs)
 

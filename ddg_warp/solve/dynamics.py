@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp import arguments
+from ddg_warp import arguments, arrays
 from ddg_warp.compile.precision import lost_in_rounding
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels import outcome
@@ -14,6 +14,7 @@ from ddg_warp.solve import energy
 from ddg_warp.solve.buffers import Buffer
 from ddg_warp.solve.chains.newton import NewtonOptions
 from ddg_warp.solve.chains.step import NET_ONLY, ChainStep
+from ddg_warp.solve.changes import Changes
 from ddg_warp.solve.controls import LOADS, Given
 from ddg_warp.solve.graphs import Graphs
 from ddg_warp.solve.net.step import RUNS, TREES, NetStep
@@ -125,6 +126,7 @@ class Integrator:
         self._longest, self._version = 0.0, model.version
         # steps since the state came from elsewhere, and searches and looks at runs, until their trees were made anew
         self._since_renewal, self._sought = 0, (0, 0)
+        self._changes: Changes | None = None
 
     def step(self, state: State, dt: float, controls: Controls | None = None) -> State:
         """The state after a step of dt [s]. No state changes that is held: see `State`.
@@ -171,25 +173,27 @@ class Integrator:
         """A step from what one buffer holds, at the time `start`, to the other; `anew` where it is from elsewhere: see `forget`."""
         for part in self._parts:
             part.prescribe(start, start + dt)
-        renew = self._renews(anew)
 
         def launch():
             if anew:
                 self.forget()
-            self._launch(source, renew)
+            self._launch(source)
 
         def replay():
-            self._graphs.replay((source, anew, self.given is not None and self.given.any, renew), launch)
+            self._graphs.replay((source, anew, self.given is not None and self.given.any), launch)
 
+        net = self._buffers[source].own.net
+        if what := self._outdated(anew):  # on its own: steps with and without it would be captured one by one
+            self._graphs.replay(("renew", source, what), lambda: self._net.renew(net, what))
         replay()
-        while self._net is not None and self._net.outgrown(self._buffers[source].own.net):
+        while self._net is not None and self._net.outgrown(net):
             self._graphs.clear()
             replay()
 
-    def _renews(self, anew: bool) -> int:
-        """What a step makes anew, see `NetStep.step`: every few steps the trees that were used since."""
+    def _outdated(self, anew: bool) -> int:
+        """What is made anew before a step, see `NetStep.renew`: every few steps the trees that were used since."""
         if self._net is None or self._net.newton.contact is None or self.model.wp_device.is_cpu:
-            return TREES
+            return 0  # on the CPU every search makes its own
         due = anew or self._since_renewal % RENEWAL == 0
         fresh = anew or self._since_renewal == 0
         self._since_renewal += 1
@@ -373,6 +377,13 @@ class Integrator:
         if self._net is not None and self._net.adapt(self._longest):
             self._graphs.clear()
 
+    def watch_changes(self) -> Changes:
+        """What steps from now on change of velocities, which each sums up."""
+        if self._changes is None:
+            self._changes = Changes(self.model)
+            self._graphs.clear()
+        return self._changes
+
     def forget(self) -> None:
         """Of a state that comes from elsewhere nothing is known: accounts of energy start anew, and worlds that rest."""
         for part in self._parts:
@@ -386,8 +397,8 @@ class Integrator:
         if self._buffers[index].vacate():
             self._graphs.clear()
 
-    def _launch(self, source: int, renew: int) -> None:
-        """Launches of a step of all parts from one buffer to the other; `renew`: as of `NetStep.step`."""
+    def _launch(self, source: int) -> None:
+        """Launches of a step of all parts from one buffer to the other."""
         before, after = self._buffers[source].own, self._buffers[1 - source].own
         for part in self._parts:
             if part.motion:
@@ -397,12 +408,16 @@ class Integrator:
         for chain in self._chains:
             chain.step(before.groups[chain.index], after.groups[chain.index])
         if self._net is not None:
-            self._net.step(before.net, after.net, renew)
+            self._net.step(before.net, after.net)
         if self.failures == "flag":
             self._worlds.settle(self._parts, before, after)
+        if self._changes:
+            self._changes(before, after)
 
     def _load_modules(self) -> None:
         for part in self._parts:
             part.load_modules()
         if self.failures == "flag":
             self._worlds.load_modules()
+        if self._changes:
+            arrays.load_kernels(self._changes.kernels, self.model.wp_device)

@@ -78,6 +78,8 @@ class Motion:
         self.model, self.part = model, part
         starts = pose_starts(model.motions)
         self._shared = wp.zeros((starts[-1], motion.POSE), dtype=real, device=model.wp_device)
+        self._host = wp.zeros_like(self._shared, device="cpu")
+        self._rows = self._host.numpy()
         self.pose, self.stride, self._grip = self._shared, 0, None
         if model.grips:
             grips = np.full(starts[-1], -1)
@@ -86,7 +88,7 @@ class Motion:
             self.stride, self._grips = len(grips), self._list(grips).flatten()
             self.pose = wp.zeros((model.worlds * len(grips), motion.POSE), dtype=real, device=model.wp_device)
             self._grip = motion.grip_kernel(real)
-            self._shared.assign(poses(model, 0.0, 0.0))
+            self._hand(0.0, 0.0)
         self._timed = len(model.grips) < len(model.motions)
         self._nodes, self._angles = motion.support_kernels(part.dim, real, midpoint)
         places, angles = host.moving[:, 0], host.turning[:, 0]
@@ -115,7 +117,13 @@ class Motion:
     def upload(self, t0: float, t1: float) -> None:
         """Poses between t0 and t1 of motions that are functions of time."""
         if self._timed:
-            self._shared.assign(poses(self.model, t0, t1))
+            self._hand(t0, t1)
+
+    def _hand(self, t0: float, t1: float) -> None:
+        self._rows[:] = poses(self.model, t0, t1)
+        wp.copy(
+            self._shared, self._host
+        )  # from memory that is not pinned, so that the next rows may take its place at once
 
     def follow(self, before: State, after: State) -> None:
         """Poses of every world over the step from one state to another, where there are grips; launches alone."""

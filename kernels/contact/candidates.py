@@ -108,45 +108,52 @@ def meet_kernel(alike: bool, inner: bool, grouped: bool):
     return meet
 
 
-@wp.func
-def ranges_of(trees: Trees, both: wp.vec2i):
-    """World of two bundles, where the first and the second begin there and end."""
-    w = both[0] / (trees.bundles.shape[0] - 1)
-    one, other = both[0] - w * (trees.bundles.shape[0] - 1), both[1] - w * (trees.leaves.shape[0] - 1)
-    return w, trees.bundles[one], trees.bundles[one + 1], trees.leaves[other], trees.leaves[other + 1]
-
-
 @cache
-def asked_functions(kind: Kind, real):
-    """reaches(sides, trees, bundle, l, w): whether the box of a second thing of a world meets that of a bundle.
+def asked_functions(kind: Kind, real, single: bool):
+    """ranges_of(trees, both): world of two bundles, where the first and the second begin there and end.
 
+    reaches(sides, trees, bundle, l, w): whether the box of a second thing of a world meets that of a bundle.
     asked(sides, trees, k, l, w): whether boxes of things meet that may touch.
+
+    Where bundles are all of a `single` thing, boxes are those that have met.
     """
     Sides = sides_struct(real)
     _, may_touch, *_ = pair_functions(kind, real)
 
     @wp.func
+    def ranges_of(trees: Trees, both: wp.vec2i):
+        w = both[0] / (trees.bundles.shape[0] - 1)
+        one, other = both[0] - w * (trees.bundles.shape[0] - 1), both[1] - w * (trees.leaves.shape[0] - 1)
+        if wp.static(single):
+            return w, one, one + 1, other, other + 1
+        return w, trees.bundles[one], trees.bundles[one + 1], trees.leaves[other], trees.leaves[other + 1]
+
+    @wp.func
     def reaches(sides: Sides, trees: Trees, bundle: int, l: int, w: int):
+        if wp.static(single):
+            return True
         j = l + w * sides.counts[1]
         lower, upper = trees.second_lower[j], trees.second_upper[j]
         return overlap(trees.bundle_lower[bundle], trees.bundle_upper[bundle], lower, upper)
 
     @wp.func
     def asked(sides: Sides, trees: Trees, k: int, l: int, w: int):
+        if wp.static(single):
+            return may_touch(sides, k, l)
         i, j = k + w * sides.counts[0], l + w * sides.counts[1]
         if overlap(trees.lower[i], trees.upper[i], trees.second_lower[j], trees.second_upper[j]):
             return may_touch(sides, k, l)
         return False
 
-    return reaches, asked
+    return ranges_of, reaches, asked
 
 
 @cache
-def candidate_kernels(kind: Kind, real):
-    """judge(...) by distance, and fill(...) the list of pairs."""
+def candidate_kernels(kind: Kind, real, single: bool):
+    """judge(...) by distance, and fill(...) the list of pairs; `single` as of `asked_functions`."""
     Sides, X, Y = sides_struct(real), wp.types.vector(3, real), wp.types.matrix((4, 3), real)
     slots, _, thickness, closest = pair_functions(kind, real)
-    reaches, asked = asked_functions(kind, real)
+    ranges_of, reaches, asked = asked_functions(kind, real, single)
     corners, relative = corners_function(real), relative_function(kind, real)
     half, two, tiny = wp.constant(real(0.5)), wp.constant(real(2.0)), wp.constant(real(1.0e-30))
 

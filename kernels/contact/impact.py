@@ -11,7 +11,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.contact.boxes import Trees
-from ddg_warp.kernels.contact.candidates import asked_functions, note_needed, ranges_of, turns
+from ddg_warp.kernels.contact.candidates import asked_functions, note_needed, turns
 from ddg_warp.kernels.contact.motion import corners_function, relative_function
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct, things_function
 from ddg_warp.kernels.threads import CPU_OPTIONS
@@ -81,14 +81,15 @@ def impact_functions(kind: Kind, real):
 
 
 @cache
-def impact_kernel(kind: Kind, passing: bool, real):
+def impact_kernel(kind: Kind, passing: bool, real, single: bool):
     """The earliest time of impact of each world or, if `passing`, how many pairs pass through each other and the first of them.
 
-    Pairs are numbered i times the second things of all worlds + j. They are those of bundles whose boxes around the motion have met.
+    Pairs are numbered i times the second things of all worlds + j. They are those of bundles whose boxes around the motion have met,
+    all of a `single` thing or not.
     """
     Sides, X = sides_struct(real), wp.types.vector(3, real)
     slots, _, thickness, _ = pair_functions(kind, real)
-    reaches, asked = asked_functions(kind, real)
+    ranges_of, reaches, asked = asked_functions(kind, real, single)
     impact, meet = impact_functions(kind, real)
     corners = corners_function(real)
 

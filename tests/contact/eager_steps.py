@@ -1,7 +1,5 @@
 """Steps that are not captured, so that what happens in them can be watched."""
 
-from ddg_warp.solve.net.step import TREES
-
 
 def eagerly(integrator, state, dt):
     """Launch a step, in which all pairs have room; the buffers that it ends in."""
@@ -10,6 +8,6 @@ def eagerly(integrator, state, dt):
     integrator._prepare(dt, state)
     for part in integrator._parts:
         part.prescribe(state.time, state.time + dt)
-    integrator._launch(source, TREES)
+    integrator._launch(source)
     assert not integrator._net.outgrown(integrator._buffers[source].own.net)
     return integrator._buffers[1 - source]

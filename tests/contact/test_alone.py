@@ -313,7 +313,7 @@ def test_a_quiet_step_launches_little_more_than_one_without_contact(device, monk
             for where, names in ((wp, ("launch", "capture_if", "capture_while")), (wp.array, ("zero_", "fill_"))):
                 for name in names:
                     patch.setattr(where, name, logged(name, getattr(where, name)))
-            integrator._launch(source, False)
+            integrator._launch(source)
         counts[contact] = {name: log.count(name) for name in set(log)}
     own, other = counts[True], counts[False]
     assert own["capture_while"] == 1 and own["capture_if"] == 1 and other["capture_while"] == 2

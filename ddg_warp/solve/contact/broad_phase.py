@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -92,6 +93,7 @@ class BroadPhase:
         self._memory = wp.zeros(2 + MORE, dtype=wp.int64, device=self.device)
         own = wp.array(ptr=self._memory.ptr, shape=4, dtype=int, device=self.device)
         self.overflow, self._lost, self.searches, self.looks = (own[k : k + 1] for k in range(4))
+        self._reading = arrays.Reading(self._memory)
         self.more, self.more_read = self._memory[2:], np.zeros(MORE, np.int64)
         self.sought = (0, 0)
         # whether pairs are out of date, or were for the check of a whole step; whether the last `update` found them anew
@@ -108,7 +110,8 @@ class BroadPhase:
             if second in things
         ]
         self._impacts, self._passes = (
-            [impact_kernel(pairs.kind, passing, real) for pairs in self.lists] for passing in (False, True)
+            [impact_kernel(pairs.kind, passing, real, pairs.single) for pairs in self.lists]
+            for passing in (False, True)
         )
         # what kernels of impacts have no use for
         self._unused = [wp.zeros(worlds, dtype=dtype, device=self.device) for dtype in (real, int, wp.int64)]
@@ -175,9 +178,12 @@ class BroadPhase:
         self._enclose(x, move, together, 1.0, self._within)
         for part in self._walked:
             part.leaves.renew()
-        for pairs in self.lists:
+
+        def find(pairs: PairList) -> None:
             pairs.meet()
             pairs.judge(x, move, together, self.reach, self._around)
+
+        arrays.side_by_side([partial(find, pairs) for pairs in self.lists], self.device)
         _, _, mark, _ = self._motion
         outputs = [self._start, self._end, self._stale, self._done, self.searches]
         self._sweep(mark, x, [x, move, together, self._placed, self.overflow], outputs)
@@ -189,7 +195,14 @@ class BroadPhase:
         self._sweep(watch, base, inputs, [self._move, stale])
 
     def filter(
-        self, base: wp.array, q: wp.array, unit: wp.array, together: wp.array, units: int, keep: float = 1.0
+        self,
+        base: wp.array,
+        q: wp.array,
+        unit: wp.array,
+        together: wp.array,
+        units: int,
+        keep: float = 1.0,
+        meanwhile: Callable[[], None] | None = None,
     ) -> None:
         """Shorten the motion from `base` to q so that no two come as near as `keep` of their thickness, in place.
 
@@ -201,6 +214,7 @@ class BroadPhase:
                 of an object that moves, others may not get out of its way.
             together: (worlds,), not zero where all units have one share.
             units: how many there are in a world.
+            meanwhile: launches that may run beside, once candidates are up to date; see `arrays.side_by_side`.
 
         Raises:
             SceneError: if not 0 <= keep <= 1, or arrays are not as they should be.
@@ -209,7 +223,7 @@ class BroadPhase:
         self._filter.check(unit, together, units)
         self.update(base, q, together)
         search = (self.overflow, self.time, self._done, self._start, self._end)
-        self._filter(base, self._move, q, unit, together, units, keep, self._room(keep), search)
+        self._filter(base, self._move, q, unit, together, units, keep, self._room(keep), search, meanwhile)
 
     def fit(self, x: wp.array, shorten: Callable[[], bool] | None = None) -> bool:
         """Make room for pairs that did not fit, and search again until they do; whether there were any. Reads from the device.
@@ -242,7 +256,7 @@ class BroadPhase:
 
     def _checked(self) -> bool:
         """The same; whether pairs did not fit."""
-        memory = self._memory.numpy()
+        memory = self._reading()
         overflow, lost, *sought = memory[:2].view(np.int32).tolist()
         self.sought, self.more_read, node = tuple(sought), memory[2:], lost - 1
         if node >= 0:

@@ -1,5 +1,7 @@
 """Contact on the candidates of one list: memory and launches of `kernels.contact.pair_terms`, and which pairs each node is in."""
 
+from functools import partial
+
 import warp as wp
 
 from ddg_warp import arrays
@@ -50,6 +52,16 @@ class ContactElements(PairElements):
 
     def write(self, x: wp.array, law, gap: wp.array) -> None:
         """Find the pairs that push each other at x, and write what they do; lower the smallest gaps to those of candidates."""
+        self._find(x, law, gap)
+        self._push(x, law)
+
+    def evaluate(self, x: wp.array, law, gap: wp.array) -> None:
+        """The same; and list the pairs of nodes."""
+        self._find(x, law, gap)
+        list_pairs = partial(self._items.list, self.count, self.factor)
+        arrays.side_by_side([partial(self._push, x, law), list_pairs], self.device)
+
+    def _find(self, x: wp.array, law, gap: wp.array) -> None:
         found, given = self.found, [self.found.sides, law, x]
         lists = [self.pairs, self.factor.nodes, self.starts, self.partners, self.count]
         if not self._running:
@@ -60,13 +72,11 @@ class ContactElements(PairElements):
             inputs = [found.pairs, found.count, found.starts, found.partners, found.sides]
             room = max(found.capacity, len(found.starts))
             self._take_turns(self._pack, room, [*inputs, self._marks, self._running.starts], lists)
-        outputs = [self.factor, self.energy, self.gradient]
-        self._take_turns(self._evaluate, found.capacity, [self.pairs, self.count, *given], outputs)
 
-    def evaluate(self, x: wp.array, law, gap: wp.array) -> None:
-        """The same; and list the pairs of nodes."""
-        self.write(x, law, gap)
-        self._items.list(self.count, self.factor)
+    def _push(self, x: wp.array, law) -> None:
+        inputs = [self.pairs, self.count, self.found.sides, law, x]
+        outputs = [self.factor, self.energy, self.gradient]
+        self._take_turns(self._evaluate, self.found.capacity, inputs, outputs)
 
     def exact_product(self, v: wp.array, x: wp.array, law) -> None:
         """Place the product of the exact Hessian at x, those of `evaluate`, with v."""

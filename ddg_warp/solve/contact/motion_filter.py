@@ -1,5 +1,7 @@
 """Shortens a proposed motion on a device so that nothing passes through anything; see `kernels.contact.shares`."""
 
+from functools import partial
+
 import warp as wp
 
 from ddg_warp import arrays
@@ -27,7 +29,8 @@ class MotionFilter:
         self._all = [wp.zeros(worlds * nodes, dtype=real, device=device) for _ in range(3)]
         self._earliest, self._later = (wp.zeros(worlds, dtype=real, device=device) for _ in range(2))
         self._open, self.limited = (wp.zeros(worlds, dtype=int, device=device) for _ in range(2))
-        self._changed, self._rounds, self._number = (wp.zeros(1, dtype=int, device=device) for _ in range(3))
+        self._changed, self._rounds = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
+        self._numbers = [wp.zeros(1, dtype=int, device=device) for _ in lists]
         self._unpicked = wp.zeros(0, dtype=int, device=device)
         self.shares = self._all[0]
 
@@ -44,11 +47,13 @@ class MotionFilter:
         if not 1 <= units <= self._nodes:
             raise SceneError(f"units = {units!r} of a motion; they are 1 to {self._nodes}, the nodes of a world")
 
-    def __call__(self, base, move, q, unit, together, units: int, keep: float, reach: float, search) -> None:
+    def __call__(
+        self, base, move, q, unit, together, units: int, keep: float, reach: float, search, meanwhile=None
+    ) -> None:
         """Lower shares round by round, and shorten q to them.
 
         Args:
-            reach: gap in which surfaces matter [m]; search: (overflow, time, done, start, end) of a `BroadPhase`.
+            reach: gap in which surfaces matter [m]; search: (overflow, time, done, start, end) of a `BroadPhase`; meanwhile: see there.
         """
         overflow, time, done, *seen = search
         shares, before, lowered = (array[: self._worlds * units] for array in self._all)
@@ -59,21 +64,25 @@ class MotionFilter:
         for numbers in (self._rounds, self.limited):
             numbers.zero_()
 
+        def lower(times: wp.array, again: bool, pick, limit, pairs, number: wp.array) -> None:
+            count, picked = pairs.count, self._unpicked
+            if again:
+                number.zero_()
+                inputs = [pairs.pairs, count, pairs.sides, unit, units, shares, before]
+                arrays.take_turns(pick, pairs.capacity, inputs, [pairs.picked, number], self._device)
+                count, picked = number, pairs.picked
+            inputs = [pairs.pairs, count, picked, pairs.sides, base, move, keep, reach, unit, units, shares]
+            arrays.take_turns(limit, pairs.capacity, inputs, [lowered, times], self._device)
+
         def go(times: wp.array, again: bool = True) -> None:
             wp.launch(self._turn, self._worlds, [], [self._open, self._changed, self._rounds], device=self._device)
-            for pick, limit, pairs in zip(self._picks, self._limits, self._lists, strict=True):
-                count, picked = pairs.count, self._unpicked
-                if again:
-                    self._number.zero_()
-                    inputs = [pairs.pairs, count, pairs.sides, unit, units, shares, before]
-                    arrays.take_turns(pick, pairs.capacity, inputs, [pairs.picked, self._number], self._device)
-                    count, picked = self._number, pairs.picked
-                inputs = [pairs.pairs, count, picked, pairs.sides, base, move, keep, reach, unit, units, shares]
-                arrays.take_turns(limit, pairs.capacity, inputs, [lowered, times], self._device)
+            of_lists = zip(self._picks, self._limits, self._lists, self._numbers, strict=True)
+            arrays.side_by_side([partial(lower, times, again, *own) for own in of_lists], self._device)
             inputs = [together, self._earliest, lowered, self._rounds]
             self._sweep(self._settle, len(shares), inputs, [shares, before, self._open, self._changed])
 
-        go(self._earliest, again=False)
+        first = partial(go, self._earliest, again=False)
+        arrays.side_by_side([first, *([meanwhile] if meanwhile else [])], self._device)
         wp.capture_while(self._changed, lambda: go(self._later))
         outputs = [shares, time, self.limited]
         self._sweep(self._finish, len(shares), [self._earliest, self._open, overflow], outputs)

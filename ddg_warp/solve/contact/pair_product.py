@@ -53,9 +53,8 @@ class PairProduct:
         """Add what is placed to nodes."""
         self._sweep(self._gather, len(out), [self.sets], [out])
 
-    def settle(self, v, out, x, wanted, barred: wp.array, busy: wp.array, dots: wp.array) -> None:
+    def settle(self, v, out, barred: wp.array, busy: wp.array, dots: wp.array) -> None:
         """The same on dofs that are not barred in worlds that are busy, and v . out of the nodes to which it adds."""
-        self.place(v, x, wanted)
         self._sweep(self._settle, len(out), [self.sets, self._met, v, barred, busy], [out, dots])
 
     def place(self, v, x=None, wanted=None) -> None:

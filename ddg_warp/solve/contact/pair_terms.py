@@ -3,6 +3,8 @@
 See `kernels.contact.pair_energy` and `kernels.contact.pair_friction`.
 """
 
+from functools import partial
+
 import numpy as np
 import warp as wp
 
@@ -165,9 +167,12 @@ class PairTerms:
         if not self.frictions:
             return
         self._start_anew()
-        for part, friction in zip(self.lists, self.frictions, strict=True):
+
+        def lag(part: ContactElements, friction: FrictionElements) -> None:
             part.write(x, self.law, self.gap)
             friction.lag(self.law, x, again, self.more)
+
+        arrays.side_by_side([partial(lag, *both) for both in zip(self.lists, self.frictions, strict=True)], self.device)
         if not again:
             wp.copy(self.start, x)
         self._lagged = self._version
@@ -193,18 +198,22 @@ class PairTerms:
         if rate is not None:
             self._check(rate)
         self._start_anew()
-        for part in self.lists:
-            part.evaluate(x, self.law, self.gap)
         start = self.start if start is None else start
         rate = self._no_rate if rate is None else rate
         iterates = self._no_iterates if iterates is None else iterates
-        if self.frictions:
+
+        def rub() -> None:
             self.spins(start, x)
-        for part in self.frictions:
-            part.evaluate(x, start, rate, iterates)
+            for part in self.frictions:
+                part.evaluate(x, start, rate, iterates)
+
+        push = [partial(part.evaluate, x, self.law, self.gap) for part in self.lists]
+        arrays.side_by_side([*push, *([rub] if self.frictions else [])], self.device)
+        arrays.side_by_side([self._sum_up, partial(self._totals, self.search.overflow)], self.device)
+
+    def _sum_up(self) -> None:
         outputs = [self.forces, self.diagonal, self.stiffness, self._told]
         arrays.sweep(self._collect, len(self.forces), [self.products.sets], outputs, self.device)
-        self._totals(self.search.overflow)
 
     def _start_anew(self) -> None:
         """No gap was seen yet."""
@@ -236,13 +245,19 @@ class PairTerms:
         """What products take that have at x what comes of pairs that turn, in worlds where `wanted` (worlds,) is not zero."""
         self.products.prepare(x, wanted)
 
-    def settle(self, v, out, x, wanted, barred: wp.array, busy: wp.array, dots: wp.array) -> None:
-        """`product` on dofs that are not barred, in worlds that are `busy` (1), and v . out for nodes in pairs; after `meet`.
+    def place(self, v: wp.array, x: wp.array, wanted: wp.array | None) -> None:
+        """What pairs bring to nodes of `product`, for `settle`."""
+        self.products.place(v, x, wanted)
+
+    def settle(self, v: wp.array, out: wp.array, barred: wp.array, busy: wp.array, dots: wp.array) -> None:
+        """`product` as it was placed, on dofs that are not barred, in worlds that are `busy` (1), and v . out for nodes in pairs.
+
+        After `meet`.
 
         Args:
             barred: of each node, bits of the dofs whose product is not asked for; dots: (worlds, nodes).
         """
-        self.products.settle(v, out, x, wanted, barred, busy, dots)
+        self.products.settle(v, out, barred, busy, dots)
 
     def join(self) -> None:
         """Write `between` and `turned` of the last `evaluate`."""

@@ -60,6 +60,7 @@ class PairList:
         pairs: things (i, j) of both sides, counted over all worlds, sorted; the first `count` hold.
         starts, partners: of each first thing (first.all,), where its pairs start and how many they are, where all pairs fit.
         count: of pairs, zero where they do not fit; picked: room for the numbers of some.
+        single: whether all bundles are of one thing.
         sides, trees: see `kernels.contact.surfaces` and `boxes`; overflow: shared with other lists; not zero once pairs did not fit.
     """
 
@@ -87,7 +88,8 @@ class PairList:
         self._wide = wp.vec2i(first.bundle, second.bundle)
         # two edges of a rod that follow each other have a node in common
         self._meet = meet_kernel(kind.alike, first.bundle > 2, grouped)
-        self._judge, self._fill = candidate_kernels(kind, real)
+        self.single = self._slots == 1
+        self._judge, self._fill = candidate_kernels(kind, real, self.single)
         self._gaps, self._passing = gap_kernel(kind, real), passing_kernel(kind, real)
         self.count = wp.zeros(1, dtype=int, device=self.device)
         parts = 1 if arrays.serial(self.device) else min(max(first.leaves.all // LEAST, 1), PARTS)

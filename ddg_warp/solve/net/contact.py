@@ -7,6 +7,8 @@ what is left of the way, whatever holds it up.
 """
 
 import math
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -139,11 +141,14 @@ class NetContact:
         if self.newton.device.is_cuda:
             self.search.rebuild(before)
 
-    def start(self, before: wp.array, again: bool = False) -> None:
-        """Start an attempt: candidates at positions `before`, and what friction takes from there; slips, unless it does so `again`."""
-        self.search.update(before)
+    def see(self, x: wp.array) -> None:
+        """Have candidates at positions x, where no motion brings them."""
+        self.search.update(x)
+
+    def lag(self, x: wp.array, again: bool = False) -> None:
+        """What friction takes from positions x, which are on the way that was cut last; slips, unless it does so `again`."""
         if self.rubs:
-            self.terms.lag(before, again)
+            self.terms.lag(x, again)
 
     def rest(self) -> None:
         """Nothing is on its way: what is proposed is where it is."""
@@ -155,24 +160,23 @@ class NetContact:
         """Take friction anew from where the solve has come to, for worlds that have converged; keep that in one of `solutions`."""
         newton = self.newton
         self._sweep(self._keep_solution, [newton.q, newton.islands.moved, self.net.blocks], [solution])
-        self.start(newton.q, again=True)
+        self.lag(newton.q, again=True)
         self._launch(self._again, self.net.worlds, [newton.islands.arrays[0]], [])
 
-    def place(self) -> None:
-        """Cut the predictor, once supports are placed, where they have to be."""
+    def place(self, before: wp.array, again: bool = False) -> None:
+        """Cut the predictor, once supports are placed, where they have to be; friction is lagged at positions `before`."""
         newton = self.newton
         if len(self._nodes):
             inputs = [self._nodes, self.net.blocks, newton.q]
             self._launch(self._aim, (len(self._nodes), self.net.worlds), inputs, [self._aims])
         self._launch(self._find_predicted, self.net.worlds, [newton.islands.arrays[0]], [self._modes, self._longest])
-        self._cut()
+        self._cut(partial(self.lag, before, again))
         self._launch(self._find_short, self.net.worlds, [self._modes, self.search.time], [newton.islands.arrays[0]])
         self._let_go()
 
     def evaluate(self) -> None:
-        """Energies, forces and factors at the iterate."""
+        """Energies, forces and factors at the iterate, to which what was proposed was cut."""
         q, islands = self.newton.q, self.newton.islands
-        self.search.update(q)
         if self.rubs:
             self.terms.evaluate(q, self.rate, iterates=(islands.slot, islands.iteration))
         else:
@@ -185,7 +189,7 @@ class NetContact:
         self._launch(self._account, self.net.worlds, inputs, [])
 
     def assemble(self) -> None:
-        """Its own part in the preconditioner."""
+        """What products and the preconditioner take of the last evaluation."""
         newton = self.newton
         outputs = [self._curved, self._projected]
         self._launch(self._find_curved, self.net.worlds, [newton.islands.arrays[0], self._late], outputs)
@@ -193,7 +197,12 @@ class NetContact:
         if self.bends:
             self.terms.prepare(newton.q, self._curved)
         if self._bands:
-            self._bands(self.terms, newton.islands.arrays[0])
+            self.terms.join()
+
+    def join(self) -> None:
+        """Its own part in the preconditioner, once it and the matrix are assembled."""
+        if self._bands:
+            self._bands(self.terms, self.newton.islands.arrays[0])
 
     def direct(self) -> None:
         """Directions by conjugate gradients, along with what is left of the way."""
@@ -217,12 +226,14 @@ class NetContact:
         newton = self.newton
         self._sweep(self._add, [self._way, newton.islands.wanted, self.net.blocks], [newton.direction])
 
-    def multiply(self, p: wp.array, product: wp.array) -> None:
-        """Add H p, and write p . H p block by block."""
+    def spread(self, p: wp.array) -> None:
+        """What pairs bring to H p."""
+        self.terms.place(p, self.newton.q, self._curved if self.bends else None)
+
+    def settle(self, p: wp.array, product: wp.array) -> None:
+        """Add it, and write p . H p block by block."""
         newton = self.newton
-        curved = self._curved if self.bends else None
-        busy, dots = newton.islands.wanted, newton.krylov_dots
-        self.terms.settle(p, product, newton.q, curved, newton.barred, busy, dots)
+        self.terms.settle(p, product, newton.barred, newton.islands.wanted, newton.krylov_dots)
 
     def hold(self) -> None:
         """Cut what was moved, and say what that is expected to gain."""
@@ -241,8 +252,8 @@ class NetContact:
         outputs = [*newton.islands.arrays, newton.stalled, self._projected]
         self._launch(self._expect, self.net.worlds, inputs, outputs)
 
-    def _cut(self) -> None:
-        """Shorten what is proposed, which stays among what is `bound`."""
+    def _cut(self, meanwhile: Callable[[], None] | None = None) -> None:
+        """Shorten what is proposed, which stays among what is `bound`; see `BroadPhase.filter`."""
         newton = self.newton
         far = FAR * self.search.margin
         inputs = [newton.q, newton.base, self._unit, self.net.host.nodes, far, self.net.blocks]
@@ -250,7 +261,7 @@ class NetContact:
         shorter = [self._modes, self._longest, self.farthest]
         if self.farthest < math.inf:
             self._sweep(self._near, [self._move, self._unit, *shorter, self.net.blocks], [newton.q])
-        self.search.filter(self._move, newton.q, self._unit, self._modes, self._units, self.touch.keep)
+        self.search.filter(self._move, newton.q, self._unit, self._modes, self._units, self.touch.keep, meanwhile)
         if self.farthest < math.inf:
             self._launch(self._less, self.net.worlds, shorter, [self.search.time])
         if len(self._nodes):

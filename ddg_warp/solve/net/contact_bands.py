@@ -23,8 +23,7 @@ class ContactBands:
         self._ahead, self._turning = (arrays.upload(of, int, chains.device) for of in (ahead, turning))
 
     def __call__(self, terms, flags: wp.array) -> None:
-        """Write it from the bands and the blocks of `PairTerms`, of the worlds whose flags want it."""
-        terms.join()
+        """Write it from the bands and the blocks that `PairTerms` has joined, of the worlds whose flags want it."""
         chains = self.chains
         inputs = [chains.bands, chains.layout, self._ahead, self._edges, flags, chains.net.blocks]
         inputs += [terms.diagonal, terms.between, self._turning, *terms.turned]

@@ -144,7 +144,6 @@ class ExactSystem:
         krylov, wanted = self.krylov, self.islands.wanted
         wanted.fill_(1)
         krylov.multiply(self.direction)
-        krylov.couple(self.direction)
         read = [self.right, krylov.product, krylov.inverse, self.net.blocks]
         self._launch(self._rest, self.all, read, [krylov.rest, krylov.z, self.krylov_dots])
         krylov.precondition(krylov.z)

@@ -50,13 +50,17 @@ class ExactContact:
     def assemble(self) -> None:
         """Its own part in the preconditioner."""
         if self._bands:
+            self.terms.join()
             self._bands(self.terms, self._system.islands.arrays[0])
 
-    def multiply(self, p: wp.array, product: wp.array) -> None:
-        """Add H p, and write p . H p block by block."""
+    def spread(self, p: wp.array) -> None:
+        """What pairs bring to H p."""
+        self.terms.place(p, self._q, self.net.every)
+
+    def settle(self, p: wp.array, product: wp.array) -> None:
+        """Add it, and write p . H p block by block."""
         system = self._system
-        given = system.barred, system.islands.wanted, system.krylov_dots
-        self.terms.settle(p, product, self._q, self.net.every, *given)
+        self.terms.settle(p, product, system.barred, system.islands.wanted, system.krylov_dots)
 
     def outgrown(self, q: wp.array) -> bool:
         """Whether pairs did not fit, for which there is room then. Reads from the device."""

@@ -1,9 +1,11 @@
 """Preconditioned conjugate gradients on all worlds of a net, on a device; see `kernels.solve.krylov`."""
 
 import math
+from functools import partial
 
 import warp as wp
 
+from ddg_warp import arrays
 from ddg_warp.kernels.net.outliers import FARTHEST
 from ddg_warp.kernels.solve import krylov
 from ddg_warp.solve.net.multilevel import Multilevel
@@ -96,11 +98,7 @@ class ConjugateGradients:
         newton = self.newton
         blocks, wanted, dots = newton.net.blocks, newton.islands.wanted, newton.krylov_dots
         _, advance, turn, test = self._cycle
-        if newton.chains and newton.chains.banded:
-            newton.chains.product(newton.matrix, self.p, newton.barred, wanted, self.product, dots)
-        else:
-            self.multiply(self.p)
-        self.couple(self.p)
+        self.multiply(self.p)
         self.sum(dots, self.curvature)
         self._launch(
             advance,
@@ -119,13 +117,24 @@ class ConjugateGradients:
             device=newton.device,
         )
 
-    def couple(self, p: wp.array) -> None:
-        """Add to H p, and to p . H p, contact's part, which is in no matrix."""
-        if self.newton.contact:
-            self.newton.contact.multiply(p, self.product)
-
     def multiply(self, p: wp.array) -> None:
-        """H p on dofs that are not barred where none of H lies in bands, and p . H p block by block."""
+        """H p on dofs that are not barred, and p . H p block by block; contact's part is in no matrix."""
+        newton, contact = self.newton, self.newton.contact
+        own = self.multiply_bands if newton.chains and newton.chains.banded else self.multiply_matrix
+        if not contact:
+            own(p)
+            return
+        arrays.side_by_side([partial(own, p), partial(contact.spread, p)], newton.device)
+        contact.settle(p, self.product)
+
+    def multiply_bands(self, p: wp.array) -> None:
+        """The same without contact, where what lies along rods is in bands."""
+        newton = self.newton
+        wanted, dots = newton.islands.wanted, newton.krylov_dots
+        newton.chains.product(newton.matrix, p, newton.barred, wanted, self.product, dots)
+
+    def multiply_matrix(self, p: wp.array) -> None:
+        """The same without contact, where none of H lies in bands."""
         newton = self.newton
         table, wanted = newton.system, newton.islands.wanted
         self._launch(

@@ -1,7 +1,7 @@
 """Newton on a net by preconditioned conjugate gradients; every world has its own loop, all on the device."""
 
 import math
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import warp as wp
@@ -254,18 +254,20 @@ class NetNewton:
 
     def evaluate(self, state) -> None:
         """Energies, gradients and factors of all elements at the iterate, `here`."""
-        for index, (part, own, kernel) in enumerate(zip(self.net.sets, self.parts, self._evaluate, strict=True)):
-            arrays.sweep(
-                kernel,
-                part.elements,
-                [self.net.elements(state, index, self.here, self.islands.rate), *self.islands.arrays],
-                [own["factor"], own["tension"], own["second"], own["gradient"], own["energy"], own["stiffness"]],
-                self.device,
-                128,
-                self.worlds,
-            )
-        if self.contact:
-            self.contact.evaluate()
+        parts = [partial(self._evaluate_set, state, index) for index in range(len(self.net.sets))]
+        arrays.side_by_side([self.contact.evaluate, *parts] if self.contact else parts, self.device)
+
+    def _evaluate_set(self, state, index: int) -> None:
+        own = self.parts[index]
+        arrays.sweep(
+            self._evaluate[index],
+            self.net.sets[index].elements,
+            [self.net.elements(state, index, self.here, self.islands.rate), *self.islands.arrays],
+            [own["factor"], own["tension"], own["second"], own["gradient"], own["energy"], own["stiffness"]],
+            self.device,
+            128,
+            self.worlds,
+        )
 
     def balance(self) -> None:
         """Residuals, the change of the energy, and the worlds that are out of equilibrium."""
@@ -277,10 +279,12 @@ class NetNewton:
     def judge(self) -> None:
         """Stop worlds, reject their iterates, or ask for a direction."""
         options = self.options
-        self._sum_weights(self._weights.reshape((3 * self.worlds, -1)), self._weight.flatten())
-        self._worst(self.allowed.ratio, self.worst)
+        weights = self._weights.reshape((3 * self.worlds, -1)), self._weight.flatten()
+        sums = [partial(self._sum_weights, *weights), partial(self._worst, self.allowed.ratio, self.worst)]
+        counts = [partial(self.outliers.count, options.rtol)] if self.outliers else []
+        arrays.side_by_side([*sums, *counts], self.device)
         if self.outliers:
-            self.outliers()
+            self.outliers.excuse()
         if self.contact:
             self.contact.account(self._weight[0], self._weight[1])
         wp.launch(
@@ -297,14 +301,19 @@ class NetNewton:
         """H of the worlds that want a direction."""
         if self.frozen:
             self.frozen.update()
+        if not self.contact:
+            self._assemble_own()
+            return
+        arrays.side_by_side([self._assemble_own, self.contact.assemble], self.device)
+        self.contact.join()
+
+    def _assemble_own(self) -> None:
         anew = self.anew
         self._assembly(self.mass, anew, self.matrix)
         if self.planes:
             self.planes.matrix(self.matrix, anew.wanted)
         if self.chains and not self._direct:
             self.chains.assemble(self.matrix, self.mass, anew)
-        if self.contact:
-            self.contact.assemble()
 
     def direct(self) -> None:
         """Directions: by elimination where that is exact, else by conjugate gradients."""

@@ -30,11 +30,10 @@ class Outliers:
         self.number = wp.zeros(worlds, dtype=int, device=device)
         self._count, self._excuse = self.kernels = outlier_kernels(newton.real, arrays.serial(device))
 
-    def __call__(self) -> None:
-        """Lower the flags of worlds in which so few are out of balance, by what was found of residuals."""
-        newton, rtol = self.newton, self.newton.options.rtol
-        self.count(rtol)
-        inputs = [self.number, self.most, newton.worst, newton._weight[2], rtol, *newton.islands.arrays]
+    def excuse(self) -> None:
+        """Lower the flags of worlds in which so few are out of balance, as was counted, by what was found of residuals."""
+        newton = self.newton
+        inputs = [self.number, self.most, newton.worst, newton._weight[2], newton.options.rtol, *newton.islands.arrays]
         wp.launch(self._excuse, newton.worlds, inputs, device=newton.device)
 
     def count(self, rtol: float) -> None:

@@ -123,10 +123,9 @@ class StaticNewton(NetNewton):
         """From where `begin` has set out, with the lagged data of `state`; can be captured. Slips of one `again` go on."""
         if self.contact:
             self.contact.renew(self._before)
-            self.contact.start(self._before, again)
+            self.contact.place(self._before, again)
             if self.rubs:
                 wp.copy(self.contact.terms.start, self.slid)
-            self.contact.place()
         self.solve(state)
 
     def outgrown(self) -> bool:
@@ -159,11 +158,12 @@ class StaticNewton(NetNewton):
         if self.resting:
             self.resting.wake()
         if self.contact:
-            self.contact.start(self._before)
+            self.contact.see(self._before)
+            self.contact.lag(self._before)
         self.evaluate(state)
         self.balance()
         self.assemble()
-        self.krylov.multiply(step)
+        self.krylov.multiply_matrix(step)
         wp.launch(self._less, self.all, [self.krylov.product], [self.right], device=self.device)
         self._whole = True
         self.direct()

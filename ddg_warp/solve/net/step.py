@@ -23,7 +23,7 @@ from ddg_warp.solve.net.prescribed import NetField, NetMotion
 from ddg_warp.solve.step import USUAL, PartStep
 from ddg_warp.solve.tangent import Tangent
 
-RUNS, TREES = 1, 2  # what a step makes anew
+RUNS, TREES = 1, 2  # what is made anew before some steps
 
 
 class NetStep(PartStep):
@@ -87,12 +87,15 @@ class NetStep(PartStep):
         self._data = (self.motion.data if self.motion else {}) | self.field.data
         self.alone, self._groups = None, counts_of and counts_of._groups
 
-    def step(self, before, after, renew: int = TREES) -> None:
-        """Launch a whole step from one state to another; `renew`: with trees of searches anew, `TREES`, or of `RUNS` alone."""
-        if self.newton.contact and renew == TREES:
+    def renew(self, before, what: int) -> None:
+        """Make trees of searches anew from a state, `TREES`, or those of `RUNS` alone; launches alone."""
+        if what == TREES:
             self.newton.contact.renew(before.q)
-        if self.alone and renew:
+        if self.alone:
             self.alone.renew()
+
+    def step(self, before, after) -> None:
+        """Launch a whole step from one state to another."""
         if self.alone is None or self.net.worlds > 1:
             self._keep()
         if self.alone is None:
@@ -196,8 +199,7 @@ class NetStep(PartStep):
         if not self.midpoint:
             self._foresight.start(before)
         if solver.contact:
-            solver.contact.start(before.q)
-            solver.contact.place()
+            solver.contact.place(before.q)
         solver.solve(start)
         if solver.contact:
             for solution in solver.contact.solutions:

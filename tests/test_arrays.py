@@ -1,0 +1,73 @@
+"""Launches that may run at once are done before what follows, and readings are of what was launched before them."""
+
+from functools import partial
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import arrays
+
+LENGTH = 100_000
+
+
+@wp.kernel(enable_backward=False)
+def slow_sum(values: wp.array(dtype=float), rounds: int, out: wp.array(dtype=float)):
+    """out + rounds * values, long after others that start with it are done."""
+    i = wp.tid()
+    total = out[i]
+    for _ in range(rounds):
+        total += values[i]
+    out[i] = total
+
+
+@wp.kernel(enable_backward=False)
+def add(
+    one: wp.array(dtype=float), other: wp.array(dtype=float), third: wp.array(dtype=float), out: wp.array(dtype=float)
+):
+    i = wp.tid()
+    out[i] = one[i] + other[i] + third[i]
+
+
+def test_what_follows_has_all_that_was_launched_side_by_side(device):
+    """Captured and not, one of them with others beside it in turn, and in the body of a loop."""
+    values = wp.array(np.arange(LENGTH) % 7, dtype=float, device=device)
+    one, other, third, total = (wp.zeros(LENGTH, dtype=float, device=device) for _ in range(4))
+    arrays.load_kernels([slow_sum, add], device)
+
+    def launch():
+        for array in (one, other, third, total):
+            array.zero_()
+
+        def sum_up(values, rounds, out):
+            wp.launch(slow_sum, LENGTH, [values, rounds], [out], device=device)
+
+        def inner():
+            arrays.side_by_side([partial(sum_up, values, 300, one), partial(sum_up, values, 200, other)], device)
+            sum_up(other, 2, one)  # 300 + 2 * 200
+
+        arrays.side_by_side([inner, partial(sum_up, values, 100, third)], device)
+        wp.launch(add, LENGTH, [one, other, third], [total], device=device)
+
+    expected = (700 + 200 + 100) * (np.arange(LENGTH) % 7)
+    launch()
+    np.testing.assert_array_equal(total.numpy(), expected)
+    flag = wp.ones(1, dtype=int, device=device)
+    stream = wp.ScopedStream(wp.Stream(device)) if wp.get_device(device).is_cuda else wp.ScopedDevice(device)
+    with stream, wp.ScopedCapture(device=device, force_module_load=False) as capture:
+        total.zero_()
+        wp.capture_if(flag, launch)
+    for _ in range(5):
+        total.fill_(-1.0)
+        wp.capture_launch(capture.graph)
+        np.testing.assert_array_equal(total.numpy(), expected)
+
+
+def test_readings_are_of_what_was_launched_before(device):
+    values = wp.zeros(5, dtype=wp.int64, device=device)
+    reading = arrays.Reading(values)
+    np.testing.assert_array_equal(reading(), 0)
+    for number in (3, 4):
+        values.fill_(number)
+        found = reading()
+        np.testing.assert_array_equal(found, number)
+        assert found is reading()
