@@ -151,7 +151,9 @@ def ladder(angle: float, mu: float, law: str) -> ddg.Scene:
 
 @pytest.mark.parametrize("law", ["barrier", "penalty"])
 @pytest.mark.parametrize("mu", [0.3, 0.6])
-@pytest.mark.parametrize("load_steps", [1, 2, 8])
+@pytest.mark.parametrize(
+    "load_steps", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(8, marks=pytest.mark.slow)]
+)
 def test_a_ladder_stands_from_its_critical_angle_on(device, law, mu, load_steps):
     """Where both ends slide, N (1 + mu^2) = w of the floor, and the moment about the foot is w cos / 2 = mu N (sin + mu cos): so at
     tan(angle) = (1 - mu^2) / (2 mu). By normal forces that are those of a smaller load it would fall.

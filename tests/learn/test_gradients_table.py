@@ -25,7 +25,6 @@ FAST = (
     ("magnetised rod without twist", "implicit_midpoint"),
     ("rod with drag", "implicit_euler"),
     *((name, "implicit_euler") for name in ("rods in contact", "gripped rod that rolls another", "shell on a plane")),
-    *((f"held rod that {verb} a gripped ball", "statics") for verb in ("rubs", "rolls on")),
     ("held rod on a gripped ball", "statics"),
     *(("rod on a gripped ball", analysis) for analysis in ("implicit_euler", "implicit_midpoint", "statics")),
 )
