@@ -104,11 +104,11 @@ def side_by_side(launches: list[Callable[[], None]], device) -> None:
     Kernels of few threads then take no time of their own. The first may do so again, and none launches anything conditional.
     """
     device = wp.get_device(device)
-    first, *others = launches
-    if not (others and device.is_cuda and device.stream in device.captures):
+    if len(launches) < 2 or not device.is_cuda or device.stream not in device.captures:
         for launch in launches:
             launch()
         return
+    first, *others = launches
     main, free = device.stream, _asides.setdefault(device.alias, [])
     streams = [free.pop() if free else wp.Stream(device) for _ in others]
     for launch, stream in zip(others, streams, strict=True):

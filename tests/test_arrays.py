@@ -29,7 +29,7 @@ def add(
 
 
 def test_what_follows_has_all_that_was_launched_side_by_side(device):
-    """Captured and not, one of them with others beside it in turn, and in the body of a loop."""
+    """Captured and not, one of them with others beside it in turn, and in what is conditional."""
     values = wp.array(np.arange(LENGTH) % 7, dtype=float, device=device)
     one, other, third, total = (wp.zeros(LENGTH, dtype=float, device=device) for _ in range(4))
     arrays.load_kernels([slow_sum, add], device)

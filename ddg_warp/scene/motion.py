@@ -43,7 +43,6 @@ class Motion:
     pivot: tuple = (0.0, 0.0, 0.0)
     count: int | None = field(init=False, default=None, repr=False, compare=False)  # of nodes, one displacement each
     _unit: np.ndarray = field(init=False, repr=False, compare=False)
-    _cross: np.ndarray = field(init=False, repr=False, compare=False)  # the matrix of the cross product with the axis
 
     def __post_init__(self):
         for name in ("translation", "angle"):
@@ -55,9 +54,7 @@ class Motion:
         length = np.linalg.norm(self.axis)
         if not length > 0.0:
             raise SceneError(f"Motion: axis {self.axis} is no direction; give three numbers, not all zero")
-        x, y, z = unit = np.asarray(self.axis, float) / length
-        object.__setattr__(self, "_unit", unit)
-        object.__setattr__(self, "_cross", np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]))
+        object.__setattr__(self, "_unit", np.asarray(self.axis, float) / length)
         shift = arguments.value_at("Motion: translation", self.translation, 0.0, 3, error=SceneError)
         arguments.value_at("Motion: angle", self.angle, 0.0, error=SceneError)
         object.__setattr__(self, "count", len(shift) if shift.ndim == 2 else None)
@@ -101,10 +98,8 @@ class Motion:
         """
         a0, a1 = self.turned(t0), self.turned(t1)
         first, last = self.shift(t0), self.shift(t1)
-        rows = np.empty((len(first), 21))
-        rows[:, :3], rows[:, 3:12], rows[:, 12:15] = self._unit * (a1 - a0), self.rotation(a0).ravel(), self.pivot
-        rows[:, 15:18], rows[:, 18:] = first, last
-        return rows
+        same = np.concatenate([self._unit * (a1 - a0), self.rotation(a0).ravel(), self.pivot])
+        return np.column_stack([np.tile(same, (len(first), 1)), first, last])
 
     def jump(self, t0: float, t1: float) -> float | None:
         """A time between t0 and t1 at which the motion jumps, found by halving where it changes most; None where it does not."""
@@ -125,7 +120,8 @@ class Motion:
 
     def rotation(self, angle: float) -> np.ndarray:
         """Rotation matrix about the axis (Rodrigues)."""
-        cross = self._cross
+        k = self._unit
+        cross = np.array([[0.0, -k[2], k[1]], [k[2], 0.0, -k[0]], [-k[1], k[0], 0.0]])
         return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
 
     def place(self, t: float, points: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:

@@ -4,7 +4,6 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.kernels.solve import krylov
 from ddg_warp.kernels.step_error import differ_kernel
 from ddg_warp.model.state import State
 from ddg_warp.solve.net.system import Sums
@@ -58,7 +57,7 @@ class _Part:
         self._kernel = differ_kernel(3 if group is None else group.dim, real)
         self._sums = wp.zeros((model.worlds, self._width * self._threads), dtype=real, device=device)
         self._sum = Sums(*self._sums.shape, real, device)
-        self.kernels = [self._kernel, *((kernel, krylov.THREADS) for kernel in self._sum.kernels)]
+        self.kernels = [self._kernel, *self._sum.kernels]
         self._device = device
 
     def masses(self) -> np.ndarray:

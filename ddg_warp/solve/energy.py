@@ -9,7 +9,6 @@ from ddg_warp import arguments
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels import energy
 from ddg_warp.kernels.net import energy as net_energy
-from ddg_warp.kernels.solve import krylov
 from ddg_warp.solve.net.system import Sums
 
 BOUND = 0.1  # see `Integrator`
@@ -146,7 +145,7 @@ class NetEnergy(_Energy):
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        sums = [(kernel, krylov.THREADS) for add in self._add for kernel in add.kernels]
+        sums = [kernel for add in self._add for kernel in add.kernels]
         return [*self._elements, self._blocks, self._judge, *sums]
 
     def judge(self, before, middle) -> None:

@@ -195,14 +195,7 @@ class BroadPhase:
         self._sweep(watch, base, inputs, [self._move, stale])
 
     def filter(
-        self,
-        base: wp.array,
-        q: wp.array,
-        unit: wp.array,
-        together: wp.array,
-        units: int,
-        keep: float = 1.0,
-        meanwhile: Callable[[], None] | None = None,
+        self, base: wp.array, q: wp.array, unit: wp.array, together: wp.array, units: int, keep: float = 1.0
     ) -> None:
         """Shorten the motion from `base` to q so that no two come as near as `keep` of their thickness, in place.
 
@@ -214,7 +207,6 @@ class BroadPhase:
                 of an object that moves, others may not get out of its way.
             together: (worlds,), not zero where all units have one share.
             units: how many there are in a world.
-            meanwhile: launches that may run beside, once candidates are up to date; see `arrays.side_by_side`.
 
         Raises:
             SceneError: if not 0 <= keep <= 1, or arrays are not as they should be.
@@ -223,7 +215,7 @@ class BroadPhase:
         self._filter.check(unit, together, units)
         self.update(base, q, together)
         search = (self.overflow, self.time, self._done, self._start, self._end)
-        self._filter(base, self._move, q, unit, together, units, keep, self._room(keep), search, meanwhile)
+        self._filter(base, self._move, q, unit, together, units, keep, self._room(keep), search)
 
     def fit(self, x: wp.array, shorten: Callable[[], bool] | None = None) -> bool:
         """Make room for pairs that did not fit, and search again until they do; whether there were any. Reads from the device.

@@ -47,13 +47,11 @@ class MotionFilter:
         if not 1 <= units <= self._nodes:
             raise SceneError(f"units = {units!r} of a motion; they are 1 to {self._nodes}, the nodes of a world")
 
-    def __call__(
-        self, base, move, q, unit, together, units: int, keep: float, reach: float, search, meanwhile=None
-    ) -> None:
+    def __call__(self, base, move, q, unit, together, units: int, keep: float, reach: float, search) -> None:
         """Lower shares round by round, and shorten q to them.
 
         Args:
-            reach: gap in which surfaces matter [m]; search: (overflow, time, done, start, end) of a `BroadPhase`; meanwhile: see there.
+            reach: gap in which surfaces matter [m]; search: (overflow, time, done, start, end) of a `BroadPhase`.
         """
         overflow, time, done, *seen = search
         shares, before, lowered = (array[: self._worlds * units] for array in self._all)
@@ -81,8 +79,7 @@ class MotionFilter:
             inputs = [together, self._earliest, lowered, self._rounds]
             self._sweep(self._settle, len(shares), inputs, [shares, before, self._open, self._changed])
 
-        first = partial(go, self._earliest, again=False)
-        arrays.side_by_side([first, *([meanwhile] if meanwhile else [])], self._device)
+        go(self._earliest, again=False)
         wp.capture_while(self._changed, lambda: go(self._later))
         outputs = [shares, time, self.limited]
         self._sweep(self._finish, len(shares), [self._earliest, self._open, overflow], outputs)

@@ -7,8 +7,6 @@ what is left of the way, whatever holds it up.
 """
 
 import math
-from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 import warp as wp
@@ -163,14 +161,14 @@ class NetContact:
         self.lag(newton.q, again=True)
         self._launch(self._again, self.net.worlds, [newton.islands.arrays[0]], [])
 
-    def place(self, before: wp.array, again: bool = False) -> None:
-        """Cut the predictor, once supports are placed, where they have to be; friction is lagged at positions `before`."""
+    def place(self) -> None:
+        """Cut the predictor, once supports are placed, where they have to be."""
         newton = self.newton
         if len(self._nodes):
             inputs = [self._nodes, self.net.blocks, newton.q]
             self._launch(self._aim, (len(self._nodes), self.net.worlds), inputs, [self._aims])
         self._launch(self._find_predicted, self.net.worlds, [newton.islands.arrays[0]], [self._modes, self._longest])
-        self._cut(partial(self.lag, before, again))
+        self._cut()
         self._launch(self._find_short, self.net.worlds, [self._modes, self.search.time], [newton.islands.arrays[0]])
         self._let_go()
 
@@ -252,8 +250,8 @@ class NetContact:
         outputs = [*newton.islands.arrays, newton.stalled, self._projected]
         self._launch(self._expect, self.net.worlds, inputs, outputs)
 
-    def _cut(self, meanwhile: Callable[[], None] | None = None) -> None:
-        """Shorten what is proposed, which stays among what is `bound`; see `BroadPhase.filter`."""
+    def _cut(self) -> None:
+        """Shorten what is proposed, which stays among what is `bound`."""
         newton = self.newton
         far = FAR * self.search.margin
         inputs = [newton.q, newton.base, self._unit, self.net.host.nodes, far, self.net.blocks]
@@ -261,7 +259,7 @@ class NetContact:
         shorter = [self._modes, self._longest, self.farthest]
         if self.farthest < math.inf:
             self._sweep(self._near, [self._move, self._unit, *shorter, self.net.blocks], [newton.q])
-        self.search.filter(self._move, newton.q, self._unit, self._modes, self._units, self.touch.keep, meanwhile)
+        self.search.filter(self._move, newton.q, self._unit, self._modes, self._units, self.touch.keep)
         if self.farthest < math.inf:
             self._launch(self._less, self.net.worlds, shorter, [self.search.time])
         if len(self._nodes):

@@ -4,7 +4,6 @@ import warp as wp
 
 from ddg_warp import arrays
 from ddg_warp.kernels.net import foresight
-from ddg_warp.kernels.solve import krylov
 from ddg_warp.solve.net.system import Sums
 
 
@@ -33,7 +32,7 @@ class Foresight:
         """Kernels to load before a capture."""
         if not self._sum:
             return [self._foresee]
-        return [self._foresee, self._weigh, self._trust, *((kernel, krylov.THREADS) for kernel in self._sum.kernels)]
+        return [self._foresee, self._weigh, self._trust, *self._sum.kernels]
 
     def start(self, before) -> None:
         """Go on from the predictor of a step from a state `before`, and keep that."""

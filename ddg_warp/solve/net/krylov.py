@@ -46,9 +46,8 @@ class ConjugateGradients:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        sums = [(kernel, krylov.THREADS) for kernel in self.sum.kernels]
         levels = self.levels.kernels if self.levels else []
-        return [self._invert, self._start, self._begin, *self._cycle, *sums, *levels]
+        return [self._invert, self._start, self._begin, *self._cycle, *self.sum.kernels, *levels]
 
     def solve(self) -> None:
         """Directions; worlds where H or its preconditioner is not definite are noted, and end with what has been found so far."""
@@ -160,8 +159,7 @@ class Directions(ConjugateGradients):
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        sums = [(kernel, krylov.THREADS) for kernel in self._worst.kernels]
-        return [*super().kernels, self._compare, self._confirm, *sums]
+        return [*super().kernels, self._compare, self._confirm, *self._worst.kernels]
 
     def iterate(self) -> None:
         """The same, and on where the tolerance says that the residual is not small."""

@@ -13,7 +13,7 @@ from ddg_warp.kernels.drag import block_inertia
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.matrix.chain_places import splits
 from ddg_warp.kernels.net import elements, newton
-from ddg_warp.kernels.solve import krylov, pcg
+from ddg_warp.kernels.solve import pcg
 from ddg_warp.solve.chains.newton import EARLY, FROZEN, FROZEN_ONLY, NewtonOptions
 from ddg_warp.solve.net.balance import Balance
 from ddg_warp.solve.net.chains import Chains
@@ -211,7 +211,7 @@ class NetNewton:
         parts = [self._move, *self.net.carries, *(k for part in used if part for k in part.kernels)]
         evaluate = [(kernel, 128) for kernel in self._evaluate]
         sums = (self._sum, self._sum_weights, self._largest, self._worst)
-        sums = [(k, krylov.THREADS) for part in sums for k in part.kernels]
+        sums = [kernel for part in sums for kernel in part.kernels]
         own += self.frozen.kernels if self.frozen else []
         return [*own, *evaluate, *self._assembly.kernels, *parts, *sums]
 

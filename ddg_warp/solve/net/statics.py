@@ -123,7 +123,8 @@ class StaticNewton(NetNewton):
         """From where `begin` has set out, with the lagged data of `state`; can be captured. Slips of one `again` go on."""
         if self.contact:
             self.contact.renew(self._before)
-            self.contact.place(self._before, again)
+            self.contact.place()
+            self.contact.lag(self._before, again)
             if self.rubs:
                 wp.copy(self.contact.terms.start, self.slid)
         self.solve(state)

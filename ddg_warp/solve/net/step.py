@@ -199,7 +199,8 @@ class NetStep(PartStep):
         if not self.midpoint:
             self._foresight.start(before)
         if solver.contact:
-            solver.contact.place(before.q)
+            solver.contact.place()
+            solver.contact.lag(before.q)
         solver.solve(start)
         if solver.contact:
             for solution in solver.contact.solutions:

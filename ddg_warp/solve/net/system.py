@@ -97,27 +97,30 @@ def lists(target: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Sums:
-    """Sums (or largest entries) of values (worlds, n) over each world."""
+    """Sums (or largest entries) of values (worlds, n) over each world.
+
+    Attributes:
+        kernels: to load before a capture, with their number of threads a block.
+    """
 
     def __init__(self, worlds: int, n: int, real, device, largest: bool = False):
         tiles = -(-n // krylov.TILE)
         if tiles > krylov.TILES:
             raise SceneError(f"the net has {n} blocks or edges; there may be {krylov.TILE * krylov.TILES}")
         self.worlds, self.tiles, self.device = worlds, tiles, wp.get_device(device)
-        if self.device.is_cuda:
-            self.kernels = krylov.sum_kernels(real, largest)
-        else:
-            self.kernels = (krylov.serial_sum_kernel(real, largest),)
+        cuda = self.device.is_cuda
+        self._own = krylov.sum_kernels(real, largest) if cuda else (krylov.serial_sum_kernel(real, largest),)
+        self.kernels = [(kernel, krylov.THREADS) for kernel in self._own]
         self._partial = wp.zeros((worlds, tiles), dtype=real, device=device)
 
     def __call__(self, values: wp.array, out: wp.array) -> None:
         """Write the sums to `out` (worlds,)."""
         if not self.device.is_cuda:
-            wp.launch(self.kernels[0], self.worlds, [values, out], device=self.device)
+            wp.launch(self._own[0], self.worlds, [values, out], device=self.device)
             return
         for kernel, grid, inputs in (
-            (self.kernels[0], (self.worlds, self.tiles), [values, self._partial]),
-            (self.kernels[1], (self.worlds,), [self._partial, out]),
+            (self._own[0], (self.worlds, self.tiles), [values, self._partial]),
+            (self._own[1], (self.worlds,), [self._partial, out]),
         ):
             wp.launch_tiled(kernel, dim=grid, inputs=inputs, block_dim=krylov.THREADS, device=self.device)
 
