@@ -23,8 +23,8 @@ def first_of(link: wp.array(dtype=int), u: int):
 
 @cache
 def resting_kernels(real, linear, serial: bool):
-    """begin(...) with bodies on their own; join(...) those that push each other; look(...) for islands out of balance; settle(...)
-    which blocks rest; leave(...) pairs between such."""
+    """begin(...) with bodies on their own; look(...) for those out of balance; join(...) others to what they push; wake(...) islands;
+    settle(...) which blocks rest; leave(...) pairs between such."""
     PairSet, share, until = set_struct(real, linear), share_function(serial), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -37,10 +37,40 @@ def resting_kernels(real, linear, serial: bool):
                 any_awake[u] = 0
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def join(
-        threads: int, sets: wp.array(dtype=PairSet), body: wp.array(dtype=int), bodies: int, link: wp.array(dtype=int)
+    def look(
+        ratio: wp.array2d(dtype=real),
+        owner: wp.array(dtype=int),
+        bodies: int,
+        bound: real,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        awake: wp.array(dtype=int),
+        any_awake: wp.array(dtype=int),
     ):
-        """Links the first bodies of both islands of a pair, the later one to the earlier one, whatever others link meanwhile."""
+        """Bodies with a residual, or a sum of some, larger than `bound` over the load scale, or no number."""
+        w, start = share(wp.tid(), owner.shape[0])
+        if flags[WANTED, w] == 0:
+            return
+        for i in range(start, until(start, owner.shape[0])):
+            u = owner[i]
+            if u >= 0:
+                if not ratio[w, i] <= bound * scalars[LOAD_SCALE, w]:
+                    awake[u + w * bodies] = 1
+                    any_awake[w] = 1
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def join(
+        threads: int,
+        sets: wp.array(dtype=PairSet),
+        body: wp.array(dtype=int),
+        bodies: int,
+        awake: wp.array(dtype=int),
+        link: wp.array(dtype=int),
+    ):
+        """Links the first bodies of both islands of a pair, the later one to the earlier one, whatever others link meanwhile.
+
+        Of two that are awake nothing is to be found out.
+        """
         for s in range(sets.shape[0]):
             own = sets[s]
             for p in range(wp.tid(), own.count[0], threads):
@@ -52,6 +82,8 @@ def resting_kernels(real, linear, serial: bool):
                     if a >= 0 and b >= 0:
                         a += w * bodies
                         b += w * bodies
+                        if awake[a] + awake[b] == 2:
+                            b = a
                         while a != b:
                             a = first_of(link, a)
                             b = first_of(link, b)
@@ -65,27 +97,12 @@ def resting_kernels(real, linear, serial: bool):
                                     a = early
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def look(
-        ratio: wp.array2d(dtype=real),
-        owner: wp.array(dtype=int),
-        bodies: int,
-        bound: real,
-        flags: wp.array2d(dtype=int),
-        scalars: wp.array2d(dtype=real),
-        link: wp.array(dtype=int),
-        awake: wp.array(dtype=int),
-        any_awake: wp.array(dtype=int),
-    ):
-        """Islands with a residual, or a sum of some, larger than `bound` over the load scale, or no number."""
-        w, start = share(wp.tid(), owner.shape[0])
-        if flags[WANTED, w] == 0:
-            return
-        for i in range(start, until(start, owner.shape[0])):
-            u = owner[i]
-            if u >= 0:
-                if not ratio[w, i] <= bound * scalars[LOAD_SCALE, w]:
-                    awake[first_of(link, u + w * bodies)] = 1
-                    any_awake[w] = 1
+    def wake(link: wp.array(dtype=int), awake: wp.array(dtype=int)):
+        """The first body of an island tells whether any of it is."""
+        tid = wp.tid()
+        for u in range(tid, until(tid, link.shape[0])):
+            if awake[u] != 0:
+                awake[first_of(link, u)] = 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def settle(
@@ -137,4 +154,4 @@ def resting_kernels(real, linear, serial: bool):
                             free += 1 - int(barred[angle] & wp.uint8(1))
                 own.idle[p] = wp.uint8(wp.where(free > 0, 0, 1))
 
-    return begin, join, look, settle, leave
+    return begin, look, join, wake, settle, leave

@@ -48,17 +48,17 @@ class Resting:
             (chains.where, chains.idle, chains.width) if chains else (put([]), put([]), 1)
         )
         made = resting_kernels(newton.real, newton.linear, arrays.serial(device))
-        self._begin, self._join, self._look, self._settle, self._leave = self.kernels = made
+        self._begin, self._look, self._join, self._wake, self._settle, self._leave = self.kernels = made
 
     def __call__(self, products) -> None:
         """Find what rests, by the residuals of the iterate and the pairs of a `PairProduct`."""
         newton, device = self.newton, self.newton.device
         arrays.sweep(self._begin, len(self._link), [], [self._link, self._awake, self._any], device)
-        inputs = [products.sets, self._body, self.bodies]
-        arrays.take_turns(self._join, products.most, inputs, [self._link], device)
         inputs = [newton.allowed.ratio, self.owner, self.bodies, REST * newton.options.rtol, *newton.islands.arrays]
-        outputs = [self._link, self._awake, self._any]
-        arrays.sweep(self._look, len(self.owner), inputs, outputs, device, worlds=self._worlds)
+        arrays.sweep(self._look, len(self.owner), inputs, [self._awake, self._any], device, worlds=self._worlds)
+        inputs = [products.sets, self._body, self.bodies, self._awake]
+        arrays.take_turns(self._join, products.most, inputs, [self._link], device)
+        arrays.sweep(self._wake, len(self._link), [], [self._link, self._awake], device)
         self._bar()
         arrays.take_turns(self._leave, products.most, [products.sets, newton.barred], [], device)
 
