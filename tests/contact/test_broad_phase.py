@@ -130,6 +130,21 @@ def test_lists_that_are_too_short_are_empty_until_they_have_grown(device, room):
     assert not search.fit(x)
 
 
+def test_where_one_list_is_too_short_others_that_are_all_but_full_grow_with_it(device):
+    """So that graphs are captured anew once, not list by list: there is room for twice as many pairs as were found in each."""
+    shapes, points = scene(5, 0.3)
+    x = upload(points, device)
+    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    short, full, *_ = sorted(search.lists, key=lambda pairs: -pairs.count.numpy()[0])
+    counts = [int(pairs.count.numpy()[0]) for pairs in (short, full)]
+    assert min(counts) > 10
+    short.reserve(10)
+    full.reserve(counts[1])
+    search.search(x)
+    assert search.fit(x)
+    assert [pairs.capacity for pairs in (short, full)] == [2 * count for count in counts]
+
+
 @pytest.mark.parametrize("excess", [-1e-6, 1e-6])
 def test_candidates_hold_until_half_of_the_margin_is_used_up(device, excess):
     """Two edges that approach each other from just beyond what is searched for: found as soon as they could be nearer than `reach`."""

@@ -121,19 +121,19 @@ class PairList:
         self._needed.zero_()
 
     def fit(self) -> None:
-        """Make room for pairs that did not fit; what was captured with the list is to be captured anew. Reads from the device.
+        """Make room for pairs, once those of some list did not fit. Reads from the device.
+
+        As graphs are captured anew then, which takes longer than many steps, there is room for twice as many as there were.
 
         Raises:
             SolverError: there are more pairs than can be counted.
         """
-        needed = self._needed.numpy().astype(np.int64)
-        if (needed >= [MOST, MOST // self._slots]).any():
+        needed, most = self._needed.numpy().astype(np.int64), np.array([MOST, MOST // self._slots])
+        if (needed >= most).any():
             raise SolverError("more than 2^31 pairs are near; use a smaller margin or reach", outcome="too_many_pairs")
-        now = np.array([self.capacity, len(self._met)])
-        if (needed > now).any():
-            # not for the next few alone: graphs are captured anew, which takes longer than many steps
-            most = np.array([MOST, MOST // self._slots])
-            self.reserve(*np.where(needed > now, np.minimum(2 * needed, most), now).tolist())
+        now, twice = np.array([self.capacity, len(self._met)]), np.minimum(2 * needed, most)
+        if (twice > now).any():
+            self.reserve(*np.maximum(now, twice).tolist())
 
     @property
     def crowded(self) -> bool:
