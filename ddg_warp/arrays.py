@@ -9,7 +9,8 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-THREADS = 256  # in a block, where a launch does not say
+from ddg_warp.kernels.threads import THREADS
+
 # threads that take turns, as many as a large GPU has at once: with 2^20 products of pairs took a fifth longer on an H200
 MOST = 2**18
 

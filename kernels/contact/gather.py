@@ -9,10 +9,13 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.contact.surfaces import surface_struct
+from ddg_warp.kernels.reading import read_function, write_function
 from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
 
 SLOTS, ANGLES = 4, 2  # nodes of a pair, and angles
 ITEMS = SLOTS + ANGLES
+ROW, WEIGHT = 8, 4  # numbers of a row of a factor, and where its weights begin
+PLACED = 4  # numbers of what is placed, the last of no use
 
 
 @wp.func
@@ -23,22 +26,89 @@ def taken_apart(item: int):
 
 
 @cache
+def row_functions(linear):
+    """row_of(rows, k, p) of a factor, direction_of(row) and weight_of(row); aim(rows, k, p, direction) and weigh(rows, k, p, weight).
+
+    It is as long as what a GPU takes from memory at once: gathering one of a pair takes 32 bytes in float32, of two arrays twice that.
+    It is written in two parts: of one of eight numbers the CPU's compiler makes kernels that take four times as long.
+    """
+    R, V, W = (wp.types.vector(size, linear) for size in (ROW, 3, SLOTS))
+    row_of = read_function(R, 2)
+
+    @wp.func
+    def direction_of(row: R):
+        return V(row[0], row[1], row[2])
+
+    @wp.func
+    def weight_of(row: R):
+        return W(
+            row[wp.static(WEIGHT)],
+            row[wp.static(WEIGHT + 1)],
+            row[wp.static(WEIGHT + 2)],
+            row[wp.static(WEIGHT + 3)],
+        )
+
+    @wp.func
+    def aim(rows: wp.array2d(dtype=R), k: int, p: int, v: V):
+        for i in range(3):
+            rows[k, p][i] = v[i]
+
+    @wp.func
+    def weigh(rows: wp.array2d(dtype=R), k: int, p: int, w: W):
+        for i in range(wp.static(SLOTS)):
+            rows[k, p][wp.static(WEIGHT) + i] = w[i]
+
+    return row_of, direction_of, weight_of, aim, weigh
+
+
+@cache
+def ahead_function(real, linear):
+    """ahead(own, p) -> used and the first two rows of pair p of a `set_struct`, or one twice: read at once, used or not."""
+    PairSet, used_of = set_struct(real, linear), read_function(int)
+    row_of, *_ = row_functions(linear)
+
+    @wp.func
+    def ahead(own: PairSet, p: int):
+        return used_of(own.used, p), row_of(own.row, 0, p), row_of(own.row, wp.min(1, own.rows - 1), p)
+
+    return ahead
+
+
+@cache
+def place_functions(linear):
+    """put(placed, rank, value): what a pair brings to a node, if any; placed_at(placed, rank)."""
+    V, W = wp.types.vector(3, linear), wp.types.vector(PLACED, linear)
+    read, write = read_function(W), write_function(W)
+
+    @wp.func
+    def put(placed: wp.array(dtype=W), rank: int, value: V):
+        if rank >= 0:
+            write(placed, rank, W(value[0], value[1], value[2], linear(0.0)))
+
+    @wp.func
+    def placed_at(placed: wp.array(dtype=W), rank: int):
+        value = read(placed, rank)
+        return V(value[0], value[1], value[2])
+
+    return put, placed_at
+
+
+@cache
 def factor_struct(linear):
-    """Rows of the factors of pairs: where bit k + 1 of used[p] is set, row k of p has weight[k, p][i] direction[k, p] for its node i,
-    and lever[k, p][i] for the x of its block angles[p][i].
+    """Rows of the factors of pairs: where bit k + 1 of used[p] is set, row[k, p] has a weight times its direction for each node, and
+    lever[k, p][i] is for the x of its block angles[p][i]; see `row_functions`.
 
     nodes (capacity,): of each pair, in all worlds; used (capacity,): zero of pairs that add nothing, else bit 0 is set; bend
     (capacity,): see `pair_bend`, zero where a pair has none; angles (capacity,): below zero for none, empty where friction rolls
     nothing.
     """
-    V, W, A = wp.types.vector(3, linear), wp.types.vector(SLOTS, linear), wp.types.vector(ANGLES, linear)
+    R, A = wp.types.vector(ROW, linear), wp.types.vector(ANGLES, linear)
 
     @wp.struct
     class Factor:
         nodes: wp.array(dtype=wp.vec4i)
         used: wp.array(dtype=int)
-        direction: wp.array2d(dtype=V)
-        weight: wp.array2d(dtype=W)
+        row: wp.array2d(dtype=R)
         bend: wp.array(dtype=linear)
         angles: wp.array(dtype=wp.vec2i)
         lever: wp.array2d(dtype=A)
@@ -57,16 +127,15 @@ def set_struct(real, linear):
     count (1,): how many pairs there are; kind: place in `pair_bend.KINDS`, -1 without `bend`; edges: how many of its things, the
     first ones, are edges; rows: of its factor; things: first things of pairs in one world.
     """
-    X, V, W = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.vector(SLOTS, linear)
-    A = wp.types.vector(ANGLES, linear)
+    X, V, R = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.vector(ROW, linear)
+    A, W = wp.types.vector(ANGLES, linear), wp.types.vector(PLACED, linear)
 
     @wp.struct
     class PairSet:
         pairs: wp.array(dtype=wp.vec2i)
         nodes: wp.array(dtype=wp.vec4i)
         used: wp.array(dtype=int)
-        direction: wp.array2d(dtype=V)
-        weight: wp.array2d(dtype=W)
+        row: wp.array2d(dtype=R)
         bend: wp.array(dtype=linear)
         angles: wp.array(dtype=wp.vec2i)
         lever: wp.array2d(dtype=A)
@@ -74,7 +143,7 @@ def set_struct(real, linear):
         marks: wp.array(dtype=int)
         starts: wp.array(dtype=int)
         columns: wp.array3d(dtype=V)
-        placed: wp.array(dtype=V)
+        placed: wp.array(dtype=W)
         places: wp.array(dtype=int)
         numbers: wp.array(dtype=int)
         items: wp.array(dtype=int)
@@ -127,31 +196,42 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
     """
     PairSet, Surface = set_struct(real, linear), surface_struct(real)
     V, M, B = wp.types.vector(3, real), wp.types.matrix((3, 3), linear), wp.types.vector(6, linear)
-    L, until = wp.types.vector(3, linear), until_function(serial)
+    L, R, until = wp.types.vector(3, linear), wp.types.vector(ROW, linear), until_function(serial)
+    row_of, direction_of, weight_of, *_ = row_functions(linear)
+    ahead, slope_of, pair_of = ahead_function(real, linear), read_function(V, 2), read_function(wp.vec2i)
 
     @wp.func
-    def block(own: PairSet, p: int, a: int, b: int):
-        """What pair p adds to the matrix between its nodes in slots a and b [N/m], symmetric, by its six entries."""
-        m, used = B(), own.used[p]
-        for k in range(own.rows):
-            if (used >> (k + 1)) & 1 != 0:
-                v = own.direction[k, p]
-                w = own.weight[k, p]
-                m += B(v[0] * v[0], v[0] * v[1], v[0] * v[2], v[1] * v[1], v[1] * v[2], v[2] * v[2]) * (w[a] * w[b])
+    def product(row: R, a: int, b: int):
+        """What a row of a factor makes of its nodes in slots a and b [N/m], symmetric, by its six entries."""
+        v, w = direction_of(row), weight_of(row)
+        return B(v[0] * v[0], v[0] * v[1], v[0] * v[2], v[1] * v[1], v[1] * v[2], v[2] * v[2]) * (w[a] * w[b])
+
+    @wp.func
+    def block(own: PairSet, p: int, used: int, first: R, second: R, a: int, b: int):
+        """What pair p adds to the matrix between its nodes in slots a and b, by what is used of it and its first rows."""
+        m = B()
+        if used & 2 != 0:
+            m += product(first, a, b)
+        if used & 4 != 0:
+            m += product(second, a, b)
+        if used >= 8:
+            for k in range(2, own.rows):
+                if (used >> (k + 1)) & 1 != 0:
+                    m += product(row_of(own.row, k, p), a, b)
         return m
 
     @wp.func
-    def block_of(own: PairSet, p: int, slot: int):
+    def block_of(own: PairSet, p: int, used: int, first: R, second: R, slot: int):
         """What it adds to the matrix of the block in a slot with itself."""
         if wp.static(rolls):
             if slot >= wp.static(SLOTS):
-                m, used = B(), own.used[p]
+                m = B()
                 for k in range(own.rows):
                     if (used >> (k + 1)) & 1 != 0:
                         a = own.lever[k, p][slot - wp.static(SLOTS)]
                         m[0] += a * a
                 return m
-        return block(own, p, slot, slot)
+        return block(own, p, used, first, second, slot, slot)
 
     @wp.func
     def whole(b: B):
@@ -177,12 +257,13 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
         for s in range(sets.shape[0]):
             own = sets[s]
             for p in range(own.count[0]):
-                if own.used[p] != 0:
+                used, first, second = ahead(own, p)
+                if used != 0:
                     for slot in range(wp.static(SLOTS)):
                         if own.ranks[p][slot] >= 0:
                             node = own.nodes[p][slot]
                             forces[node] = forces[node] - own.gradient[slot, p]
-                            diagonal[node] = diagonal[node] + whole(block(own, p, slot, slot))
+                            diagonal[node] = diagonal[node] + whole(block(own, p, used, first, second, slot, slot))
                     if wp.static(rolls):
                         if own.angles.shape[0] > 0:
                             for side in range(wp.static(ANGLES)):
@@ -190,7 +271,9 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
                                 if own.angle_ranks[p][side] >= 0:
                                     slot = wp.static(SLOTS) + side
                                     forces[angle] = forces[angle] - own.gradient[slot, p]
-                                    diagonal[angle] = diagonal[angle] + whole(block_of(own, p, slot))
+                                    diagonal[angle] = diagonal[angle] + whole(
+                                        block_of(own, p, used, first, second, slot)
+                                    )
         for node in range(forces.shape[0]):
             stiffness[node] = real(wp.trace(diagonal[node]))
 
@@ -201,11 +284,12 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
         for s in range(sets.shape[0]):
             own = sets[s]
             for p in range(own.count[0]):
-                if own.used[p] != 0:
+                used, first, second = ahead(own, p)
+                if used != 0:
                     for side in range(own.edges):
                         if own.ranks[p][2 * side] >= 0:
-                            edge = own.pairs[p][side]
-                            between[edge] = between[edge] + whole(block(own, p, 2 * side, 2 * side + 1))
+                            edge, a = own.pairs[p][side], 2 * side
+                            between[edge] = between[edge] + whole(block(own, p, used, first, second, a, a + 1))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def collect(
@@ -231,9 +315,11 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
                 own = sets[s]
                 for k in range(own.places[node], own.places[node] + number):
                     p, slot = taken_apart(own.items[k])
-                    if own.used[p] != 0:
-                        force -= own.gradient[slot, p]
-                        total += block_of(own, p, slot)
+                    used, first, second = ahead(own, p)
+                    slope = slope_of(own.gradient, slot, p)
+                    if used != 0:
+                        force -= slope
+                        total += block_of(own, p, used, first, second, slot)
         forces[node] = force
         diagonal[node] = whole(total)
         stiffness[node] = real(total[0] + total[3] + total[5])
@@ -264,9 +350,11 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
                 own = sets[s]
                 for k in range(own.places[node], own.places[node] + number):
                     p, slot = taken_apart(own.items[k])
-                    if slot % 2 == 0 and slot / 2 < own.edges and own.used[p] != 0:
-                        if own.pairs[p][slot / 2] == i:
-                            total += block(own, p, slot, slot + 1)
+                    if slot % 2 == 0 and slot / 2 < own.edges:
+                        used, first, second = ahead(own, p)
+                        pair = pair_of(own.pairs, p)
+                        if used != 0 and pair[slot / 2] == i:
+                            total += block(own, p, used, first, second, slot, slot + 1)
         between[i] = whole(total)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -291,10 +379,11 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
                         for k in range(own.places[block], own.places[block] + own.numbers[block]):
                             p, slot = taken_apart(own.items[k])
                             side = slot - wp.static(SLOTS)
-                            for row in range(own.rows):
-                                if own.used[p] != 0 and (own.used[p] >> (row + 1)) & 1 != 0:
-                                    lever, weight = own.lever[row, p], own.weight[row, p]
-                                    v = own.direction[row, p] * lever[side]
+                            for m in range(own.rows):
+                                if own.used[p] != 0 and (own.used[p] >> (m + 1)) & 1 != 0:
+                                    row, lever = row_of(own.row, m, p), own.lever[m, p]
+                                    weight = weight_of(row)
+                                    v = direction_of(row) * lever[side]
                                     if own.edges > 0:
                                         a += v * weight[2 * side]
                                         b += v * weight[2 * side + 1]

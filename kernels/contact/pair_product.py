@@ -4,10 +4,18 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.contact.gather import ANGLES, SLOTS, set_struct
+from ddg_warp.kernels.contact.gather import (
+    ANGLES,
+    SLOTS,
+    ahead_function,
+    place_functions,
+    row_functions,
+    set_struct,
+)
 from ddg_warp.kernels.contact.pair_bend import bend_function
 from ddg_warp.kernels.matrix.sliced import BARRED, product_functions
-from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
+from ddg_warp.kernels.reading import read_function
+from ddg_warp.kernels.threads import CPU_OPTIONS, TWO_BLOCKS, until_function
 
 
 @cache
@@ -18,6 +26,9 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
     X, V, Y = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.matrix((4, 3), linear)
     A = wp.types.vector(ANGLES, linear)
     bend = bend_function(linear)
+    row_of, direction_of, weight_of, *_ = row_functions(linear)
+    put, placed_at = place_functions(linear)
+    ahead, four_of = ahead_function(real, linear), read_function(wp.vec4i)
     _, free = product_functions(linear)
 
     @wp.func
@@ -44,13 +55,6 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
         return total
 
     @wp.func
-    def put(own: PairSet, slot: int, p: int, value: V):
-        """What a pair brings to one of its nodes."""
-        rank = own.ranks[p][slot]
-        if rank >= 0:
-            own.placed[rank] = value
-
-    @wp.func
     def turns_of(own: PairSet, p: int, v: wp.array(dtype=V)):
         """What is at the angles of a pair, zero where it has none."""
         t = A()
@@ -65,11 +69,11 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
         """What a pair brings to its angles."""
         if own.angles.shape[0] > 0:
             for side in range(wp.static(ANGLES)):
-                rank = own.angle_ranks[p][side]
-                if rank >= 0:
-                    own.placed[rank] = V(t[side], linear(0.0), linear(0.0))
+                put(own.placed, own.angle_ranks[p][side], V(t[side], linear(0.0), linear(0.0)))
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    @wp.kernel(
+        module="unique", enable_backward=False, grid_stride=False, launch_bounds=TWO_BLOCKS, module_options=CPU_OPTIONS
+    )
     def multiply(
         threads: int,
         sets: wp.array(dtype=PairSet),
@@ -81,11 +85,11 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
         for s in range(sets.shape[0]):
             own = sets[s]
             for p in range(wp.tid(), own.count[0], threads):
+                used, first, second = ahead(own, p)
+                n, ranks = four_of(own.nodes, p), four_of(own.ranks, p)
                 if own.idle[p] != wp.uint8(0):
                     continue
-                used = own.used[p]
                 if used != 0:
-                    n = own.nodes[p]
                     u = wp.matrix_from_rows(v[n[0]], v[n[1]], v[n[2]], v[n[3]])
                     m = int(-1)
                     if wanted.shape[0] > 0:
@@ -97,15 +101,19 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
                                 row(own.columns, m, 3 * slot + 1, u),
                                 row(own.columns, m, 3 * slot + 2, u),
                             )
-                            put(own, slot, p, value)
+                            put(own.placed, ranks[slot], value)
                         continue
                     y, t, turned = Y(), A(), A()
                     if wp.static(rolls):
                         t = turns_of(own, p, v)
                     for k in range(own.rows):
                         if (used >> (k + 1)) & 1 != 0:
-                            w = own.weight[k, p]
-                            along = own.direction[k, p]
+                            one = first
+                            if k == 1:
+                                one = second
+                            if k > 1:
+                                one = row_of(own.row, k, p)
+                            along, w = direction_of(one), weight_of(one)
                             moved = wp.dot(along, w * u)
                             if wp.static(rolls):
                                 if own.angles.shape[0] > 0:
@@ -119,12 +127,12 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
                         if c != linear(0.0) and wanted[own.pairs[p][0] / own.things] != 0:
                             o = x[n[0]]
                             at = wp.matrix_from_rows(V(), beside(x[n[1]], o), beside(x[n[2]], o), beside(x[n[3]], o))
-                            y += bend(own.kind, at, own.weight[0, p], u) * c
+                            y += bend(own.kind, at, weight_of(first), u) * c
                     for slot in range(wp.static(SLOTS)):
-                        put(own, slot, p, y[slot])
+                        put(own.placed, ranks[slot], y[slot])
                 else:  # nodes that list it read it
                     for slot in range(wp.static(SLOTS)):
-                        put(own, slot, p, V())
+                        put(own.placed, ranks[slot], V())
                     if wp.static(rolls):
                         put_turns(own, p, A())
 
@@ -137,7 +145,7 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
                 own = sets[s]
                 start = own.places[node]
                 for k in range(start, start + number):
-                    y += own.placed[k]
+                    y += placed_at(own.placed, k)
         return y
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

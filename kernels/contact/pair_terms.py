@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.contact.gather import SLOTS, factor_struct
+from ddg_warp.kernels.contact.gather import PLACED, SLOTS, factor_struct, place_functions, row_functions
 from ddg_warp.kernels.contact.pair_energy import (
     bend_function,
     distance_function,
@@ -15,7 +15,7 @@ from ddg_warp.kernels.contact.pair_energy import (
 from ddg_warp.kernels.contact.surfaces import EDGES, Kind, pair_functions, sides_struct, things_function
 from ddg_warp.kernels.densities import Density
 from ddg_warp.kernels.densities.contact import SHARE
-from ddg_warp.kernels.threads import CPU_OPTIONS
+from ddg_warp.kernels.threads import CPU_OPTIONS, TWO_BLOCKS
 
 
 @cache
@@ -92,7 +92,7 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
     """
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
     V, W4 = wp.types.vector(3, real), wp.types.vector(4, linear)
-    L = wp.types.vector(3, linear)
+    L, (*_, aim, weigh) = wp.types.vector(3, linear), row_functions(linear)
     near = distance_function(kind, real)
     about, row_of, *_ = pair_energy_functions(kind, density, real)
     bends = bend_function(kind, density, real)
@@ -179,7 +179,9 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
         if wp.tid() == 0:
             count_out[0] = wp.where(most > 0, before[wp.max(most - 1, 0)] + marks[wp.max(most - 1, 0)], 0)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    @wp.kernel(
+        module="unique", enable_backward=False, grid_stride=False, launch_bounds=TWO_BLOCKS, module_options=CPU_OPTIONS
+    )
     def evaluate(
         threads: int,
         pairs: wp.array(dtype=wp.vec2i),
@@ -205,10 +207,9 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
                 weight, v = row_of(at, w, d, n, m, p, inner, k)
                 if wp.dot(v, v) > real(0.0):
                     used |= 2 << k
-                    factor.direction[k, pair] = L(linear(v[0]), linear(v[1]), linear(v[2]))
-                    factor.weight[k, pair] = W4(
-                        linear(weight[0]), linear(weight[1]), linear(weight[2]), linear(weight[3])
-                    )
+                    aim(factor.row, k, pair, L(linear(v[0]), linear(v[1]), linear(v[2])))
+                    weights = W4(linear(weight[0]), linear(weight[1]), linear(weight[2]), linear(weight[3]))
+                    weigh(factor.row, k, pair, weights)
             factor.used[pair] = used
             factor.bend[pair] = linear(bends(at, p, threshold, d))
 
@@ -224,10 +225,13 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, unbent: boo
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
     X, *_ = shape_types(real)
     V, L = wp.types.vector(3, real), wp.types.vector(3, linear)
+    W, (put, _) = wp.types.vector(PLACED, linear), place_functions(linear)
     *_, along = pair_energy_functions(kind, density, real)
     given, corners = read_functions(kind, real)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    @wp.kernel(
+        module="unique", enable_backward=False, grid_stride=False, launch_bounds=TWO_BLOCKS, module_options=CPU_OPTIONS
+    )
     def product(
         threads: int,
         pairs: wp.array(dtype=wp.vec2i),
@@ -238,7 +242,7 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, unbent: boo
         factor: Factor,
         v: wp.array(dtype=L),
         ranks: wp.array(dtype=wp.vec4i),
-        placed: wp.array(dtype=L),
+        placed: wp.array(dtype=W),
     ):
         for pair in range(wp.tid(), count[0], threads):
             asked = True
@@ -253,8 +257,8 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, unbent: boo
                         move[slot, d] = real(v[nodes[slot]][d])
                 dx, _dv, _dp, _dt, _ds = wp.grad(along)(corners(x, nodes), move, p, threshold, inner)
                 for slot in range(wp.static(SLOTS)):
-                    if ranks[pair][slot] >= 0:
-                        placed[ranks[pair][slot]] = L(linear(dx[slot, 0]), linear(dx[slot, 1]), linear(dx[slot, 2]))
+                    value = L(linear(dx[slot, 0]), linear(dx[slot, 1]), linear(dx[slot, 2]))
+                    put(placed, ranks[pair][slot], value)
 
     return product
 
@@ -268,7 +272,9 @@ def columns_kernel(kind: Kind, density: Density, real, linear):
     *_, along = pair_energy_functions(kind, density, real)
     given, corners = read_functions(kind, real)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    @wp.kernel(
+        module="unique", enable_backward=False, grid_stride=False, launch_bounds=TWO_BLOCKS, module_options=CPU_OPTIONS
+    )
     def differentiate(
         pairs: wp.array(dtype=wp.vec2i),
         sides: Sides,

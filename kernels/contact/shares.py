@@ -17,7 +17,7 @@ import warp as wp
 from ddg_warp.kernels.contact.impact import impact_functions
 from ddg_warp.kernels.contact.motion import corners_function
 from ddg_warp.kernels.contact.surfaces import Kind, pair_functions, sides_struct, things_function
-from ddg_warp.kernels.threads import CPU_OPTIONS, until_function
+from ddg_warp.kernels.threads import CPU_OPTIONS, TWO_BLOCKS, until_function
 
 ROUNDS = 50  # what falls on what has stopped stops layer by layer, one in a round
 
@@ -56,7 +56,9 @@ def limit_kernels(kind: Kind, real):
             if changed != 0:
                 picked[wp.atomic_add(number, 0, 1)] = p
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    @wp.kernel(
+        module="unique", enable_backward=False, grid_stride=False, launch_bounds=TWO_BLOCKS, module_options=CPU_OPTIONS
+    )
     def limit(
         threads: int,
         pairs: wp.array(dtype=wp.vec2i),

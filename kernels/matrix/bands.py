@@ -15,7 +15,7 @@ from ddg_warp.kernels.matrix.chain_places import behind_function, place_dofs, va
 from ddg_warp.kernels.matrix.sliced import BARRED, product_functions, settle_function
 from ddg_warp.kernels.net.places import along_type
 from ddg_warp.kernels.terms import Term
-from ddg_warp.kernels.threads import CPU_OPTIONS, first_of, until_function
+from ddg_warp.kernels.threads import CPU_OPTIONS, TWO_BLOCKS, first_of, until_function
 
 
 @cache
@@ -66,7 +66,9 @@ def band_kernels(
     blocks_at = blocks_function(terms, twist, span, real, linear, exact_from, drag, split)
     value = value_function(twist, linear, split)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    @wp.kernel(
+        module="unique", enable_backward=False, grid_stride=False, launch_bounds=TWO_BLOCKS, module_options=CPU_OPTIONS
+    )
     def assemble(
         matrix: wp.array2d(dtype=linear),
         mass: Mass,

@@ -51,13 +51,11 @@ class PairElements:
                 f"contact has room for {MOST} pairs, not {capacity}; use a smaller margin or reach",
                 outcome="too_many_pairs",
             )
-        vector = wp.types.vector(3, linear)
         self.pairs = wp.zeros(capacity, dtype=wp.vec2i, device=self.device)
         self.factor.nodes = wp.zeros(capacity, dtype=wp.vec4i, device=self.device)
         self.factor.used = wp.zeros(capacity, dtype=int, device=self.device)
         self.factor.bend = wp.zeros(capacity, dtype=linear, device=self.device)
-        self.factor.direction = arrays.allocate((self.rows, capacity), vector, self.device)
-        self.factor.weight = arrays.allocate((self.rows, capacity), wp.types.vector(4, linear), self.device)
+        self.factor.row = arrays.allocate((self.rows, capacity), wp.types.vector(gather.ROW, linear), self.device)
         self.energy = wp.zeros(capacity, dtype=self.real, device=self.device)
         slots, turned = (gather.ITEMS, capacity) if self.rolls else (gather.SLOTS, 0)
         self.gradient = arrays.allocate((slots, capacity), wp.types.vector(3, self.real), self.device)
@@ -66,7 +64,7 @@ class PairElements:
         self._items.reserve(capacity)
         self.items, self.ranks, self.angle_ranks = self._items.items, self._items.ranks, self._items.angle_ranks
         self.idle = wp.zeros(capacity, dtype=wp.uint8, device=self.device)
-        self.placed = wp.zeros(len(self.items), dtype=vector, device=self.device)
+        self.placed = wp.zeros(len(self.items), dtype=wp.types.vector(gather.PLACED, linear), device=self.device)
 
     def forces(self) -> tuple[np.ndarray, np.ndarray]:
         """Pairs that bring anything (n,), and forces on their first things (n, 3) [N]. Reads from the device."""

@@ -67,7 +67,7 @@ class PairProduct:
 
     def _set(self, part):
         own, kind = set_struct(self._real, self._linear)(), part.found.kind
-        for name in ("nodes", "used", "direction", "weight", "bend", "angles", "lever"):
+        for name in ("nodes", "used", "row", "bend", "angles", "lever"):
             setattr(own, name, getattr(part.factor, name))
         names = ("pairs", "count", "gradient", "placed", "places", "numbers", "items", "ranks", "angle_ranks", "idle")
         for name in names:

@@ -1,0 +1,82 @@
+"""Elements of arrays, read and written as a GPU does that fastest.
+
+Threads that gather wait for memory. They ask for 16 bytes at once where vectors are multiples of that, not number by number as Warp
+does: each of the lines that a warp asks for is looked up on its own, which can take longer than the memory. And they ask where the code
+does, for all that they may need together: compilers put off what is needed only if something else is read first, to wait twice.
+Arrays are whole ones, not parts of others; what is read here, the kernel does not write.
+"""
+
+from functools import cache
+
+import warp as wp
+
+KINDS = {wp.float32: ("float", "f32", "f", 4), wp.float64: ("double", "f64", "d", 8), wp.int32: ("int", "s32", "r", 4)}
+WIDEST = 16  # bytes
+
+
+def _chunks(dtype) -> tuple[int, int, tuple]:
+    """How many numbers an element has, how many are read at once, and what CUDA and PTX call them."""
+    kind = KINDS[wp.int32 if dtype is int else getattr(dtype, "_wp_scalar_type_", dtype)]
+    count = getattr(dtype, "_length_", 1)
+    return count, next(n for n in (4, 2, 1) if n * kind[3] <= WIDEST and count % n == 0), kind
+
+
+@cache
+def read_function(dtype, dimensions: int = 1):
+    """read(array, i) or read(array, i, j) -> the element there."""
+    count, wide, (name, suffix, register, _) = _chunks(dtype)
+    whole = dtype is int or dtype in KINDS
+    place, native = "array, i" if dimensions == 1 else "array, i, j", name
+    if not whole:
+        native = f"wp::vec_t<{count}, wp::{dtype._wp_scalar_type_.__name__}>"
+    take = []
+    for first in range(0, count, wide):
+        parts = ["found" if whole else f"found.c[{first + k}]" for k in range(wide)]
+        numbers = ", ".join(f"%{k}" for k in range(wide))
+        load = f"ld.{suffix} %0" if wide == 1 else f"ld.v{wide}.{suffix} {{{numbers}}}"
+        outputs = ", ".join(f'"={register}"({part})' for part in parts)
+        take.append(f'asm volatile("{load}, [%{wide}];" : {outputs} : "l"(from + {first}));')
+    snippet = f"""
+#if defined(__CUDA_ARCH__)
+    const {name}* from = reinterpret_cast<const {name}*>(&wp::index({place}));
+    {native} found;
+    {" ".join(take)}
+    return found;
+#else
+    return wp::index({place});
+#endif
+"""
+    if dimensions == 1:
+
+        @wp.func_native(snippet)
+        def read(array: wp.array(dtype=dtype), i: int) -> dtype: ...
+    else:
+
+        @wp.func_native(snippet)
+        def read(array: wp.array2d(dtype=dtype), i: int, j: int) -> dtype: ...
+
+    return read
+
+
+@cache
+def write_function(dtype):
+    """write(array, i, value), of a vector."""
+    count, wide, (name, *_) = _chunks(dtype)
+    native = f"{name}{wide}"
+    put = (
+        f"to[{first // wide}] = make_{native}({', '.join(f'value.c[{first + k}]' for k in range(wide))});"
+        for first in range(0, count, wide)
+    )
+    snippet = f"""
+#if defined(__CUDA_ARCH__)
+    {native}* to = reinterpret_cast<{native}*>(&wp::index(array, i));
+    {" ".join(put)}
+#else
+    wp::index(array, i) = value;
+#endif
+"""
+
+    @wp.func_native(snippet)
+    def write(array: wp.array(dtype=dtype), i: int, value: dtype): ...
+
+    return write
