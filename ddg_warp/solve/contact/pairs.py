@@ -115,7 +115,7 @@ class PairList:
         if met is not None:
             met = -(-met // len(self._found)) * len(self._found)  # as much for each part
             self._met = wp.zeros(met, dtype=wp.vec2i, device=self.device)
-            self._before = wp.zeros(met * self._slots, dtype=int, device=self.device)
+            self._links = wp.zeros(met * self._slots, dtype=wp.vec2i, device=self.device)
         self.pairs = wp.zeros(pairs, dtype=wp.vec2i, device=self.device)
         self.picked = wp.zeros(pairs, dtype=int, device=self.device)
         self._needed.zero_()
@@ -153,16 +153,12 @@ class PairList:
 
     def judge(self, x, move, together, reach: float, around: float) -> None:
         """List those of them that are near, or may be on their way."""
-        given, met, room = (
-            [self.sides, self.trees, self._wide],
-            [self._met, self._before, self._last],
-            [self.overflow, self._needed],
-        )
+        lists, room = [self._links, self._last], [self.overflow, self._needed]
         self.partners.zero_()
-        inputs = [*given, x, move, together, reach, around, self._found]
-        arrays.take_turns(self._judge, len(self._met), inputs, [*met, self.partners, *room], self.device)
+        inputs = [self.sides, self.trees, self._wide, x, move, together, reach, around, self._found, self._met]
+        arrays.take_turns(self._judge, len(self._met), inputs, [*lists, self.partners, *room], self.device)
         self._sums()
-        inputs = [*given, *met, self.starts, self.partners]
+        inputs = [*lists, self.starts, self.partners]
         wp.launch(self._fill, self.first.all, inputs, [self.pairs, self.count, *room], device=self.device)
 
     def impact(self, kernel, x, move, keep: float, room: float, outputs: list) -> None:
