@@ -16,7 +16,7 @@ WIDEST = 16  # bytes
 
 def _chunks(dtype) -> tuple[int, int, tuple]:
     """How many numbers an element has, how many are read at once, and what CUDA and PTX call them."""
-    kind = KINDS[wp.int32 if dtype is int else getattr(dtype, "_wp_scalar_type_", dtype)]
+    kind = KINDS[getattr(dtype, "_wp_scalar_type_", dtype)]
     count = getattr(dtype, "_length_", 1)
     return count, next(n for n in (4, 2, 1) if n * kind[3] <= WIDEST and count % n == 0), kind
 
@@ -25,7 +25,7 @@ def _chunks(dtype) -> tuple[int, int, tuple]:
 def read_function(dtype, dimensions: int = 1):
     """read(array, i) or read(array, i, j) -> the element there."""
     count, wide, (name, suffix, register, _) = _chunks(dtype)
-    whole = dtype is int or dtype in KINDS
+    whole = dtype in KINDS
     place, native = "array, i" if dimensions == 1 else "array, i, j", name
     if not whole:
         native = f"wp::vec_t<{count}, wp::{dtype._wp_scalar_type_.__name__}>"

@@ -27,10 +27,9 @@ def taken_apart(item: int):
 
 @cache
 def row_functions(linear):
-    """row_of(rows, k, p) of a factor, direction_of(row) and weight_of(row); aim(rows, k, p, direction) and weigh(rows, k, p, weight).
+    """row_of(rows, k, p) of a factor, direction_of(row) and weight_of(row).
 
     It is as long as what a GPU takes from memory at once: gathering one of a pair takes 32 bytes in float32, of two arrays twice that.
-    It is written in two parts: of one of eight numbers the CPU's compiler makes kernels that take four times as long.
     """
     R, V, W = (wp.types.vector(size, linear) for size in (ROW, 3, SLOTS))
     row_of = read_function(R, 2)
@@ -48,23 +47,34 @@ def row_functions(linear):
             row[wp.static(WEIGHT + 3)],
         )
 
+    return row_of, direction_of, weight_of
+
+
+@cache
+def lay_functions(real, linear):
+    """aim(rows, k, p, direction) and weigh(rows, k, p, weight), which write a row of a factor.
+
+    In two parts: of one of eight numbers the CPU's compiler makes kernels that take four times as long.
+    """
+    R, V, W = wp.types.vector(ROW, linear), wp.types.vector(3, real), wp.types.vector(SLOTS, real)
+
     @wp.func
     def aim(rows: wp.array2d(dtype=R), k: int, p: int, v: V):
         for i in range(3):
-            rows[k, p][i] = v[i]
+            rows[k, p][i] = linear(v[i])
 
     @wp.func
     def weigh(rows: wp.array2d(dtype=R), k: int, p: int, w: W):
         for i in range(wp.static(SLOTS)):
-            rows[k, p][wp.static(WEIGHT) + i] = w[i]
+            rows[k, p][wp.static(WEIGHT) + i] = linear(w[i])
 
-    return row_of, direction_of, weight_of, aim, weigh
+    return aim, weigh
 
 
 @cache
 def ahead_function(real, linear):
     """ahead(own, p) -> used and the first two rows of pair p of a `set_struct`, or one twice: read at once, used or not."""
-    PairSet, used_of = set_struct(real, linear), read_function(int)
+    PairSet, used_of = set_struct(real, linear), read_function(wp.int32)
     row_of, *_ = row_functions(linear)
 
     @wp.func
@@ -197,7 +207,7 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
     PairSet, Surface = set_struct(real, linear), surface_struct(real)
     V, M, B = wp.types.vector(3, real), wp.types.matrix((3, 3), linear), wp.types.vector(6, linear)
     L, R, until = wp.types.vector(3, linear), wp.types.vector(ROW, linear), until_function(serial)
-    row_of, direction_of, weight_of, *_ = row_functions(linear)
+    row_of, direction_of, weight_of = row_functions(linear)
     ahead, slope_of, pair_of = ahead_function(real, linear), read_function(V, 2), read_function(wp.vec2i)
 
     @wp.func

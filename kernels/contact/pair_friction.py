@@ -40,7 +40,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.contact.gather import ANGLES, SLOTS, factor_struct, row_functions
+from ddg_warp.kernels.contact.gather import ANGLES, SLOTS, factor_struct, lay_functions
 from ddg_warp.kernels.contact.pair_terms import groups_function, law_struct
 from ddg_warp.kernels.contact.surfaces import EDGES, Kind, sides_struct
 from ddg_warp.kernels.densities import Density
@@ -167,8 +167,7 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: boo
     `Shapes.angles`; read where rods roll, as x and beside are.
     """
     Law, Sides, Factor, Lagged = law_struct(real), sides_struct(real), factor_struct(linear), lagged_struct(real)
-    V, W, L = wp.types.vector(3, real), wp.types.vector(SLOTS, real), wp.types.vector(SLOTS, linear)
-    *_, weigh = row_functions(linear)
+    V, W, (_, weigh) = wp.types.vector(3, real), wp.types.vector(SLOTS, real), lay_functions(real, linear)
     E = wp.types.vector(2, real)
     tangents, groups, size = basis(real), groups_function(real), kind.first + kind.second
     along_rod, spun = directed_basis(real), spun_function(real)
@@ -245,9 +244,7 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: boo
                 lagged.tangent[0, p] = t1
                 lagged.tangent[1, p] = t2
                 for k in range(wp.static(ROWS)):
-                    weigh(
-                        factor.row, k, p, L(linear(weight[0]), linear(weight[1]), linear(weight[2]), linear(weight[3]))
-                    )
+                    weigh(factor.row, k, p, weight)
 
     return lag
 
@@ -261,8 +258,7 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool,
     onward: not zero where those before the first one count, too. turns: of objects that spin, in all worlds.
     """
     Factor, Lagged = factor_struct(linear), lagged_struct(real)
-    V, L = wp.types.vector(3, real), wp.types.vector(3, linear)
-    *_, aim, _ = row_functions(linear)
+    V, (aim, _) = wp.types.vector(3, real), lay_functions(real, linear)
     E, M, A = wp.types.vector(2, real), wp.types.matrix((2, 2), real), wp.types.vector(ANGLES, linear)
     P = wp.types.vector(density.parameter_size(2), real)
     energy_of, slope_of, curvature_of = density.laws(real, 2)
@@ -373,7 +369,7 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool,
                     v = t1 * root[k, 0] + t2 * root[k, 1]
                     if wp.dot(v, v) > real(0.0):
                         used |= 2 << k
-                        aim(factor.row, k, p, L(linear(v[0]), linear(v[1]), linear(v[2])))
+                        aim(factor.row, k, p, v)
                         if wp.static(rolls):
                             one, two = wp.dot(lagged.lever[0, p], v), wp.dot(lagged.lever[1, p], v)
                             factor.lever[k, p] = A(linear(one), linear(two))

@@ -4,14 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.contact.gather import (
-    ANGLES,
-    SLOTS,
-    ahead_function,
-    place_functions,
-    row_functions,
-    set_struct,
-)
+from ddg_warp.kernels.contact.gather import ANGLES, SLOTS, ahead_function, place_functions, row_functions, set_struct
 from ddg_warp.kernels.contact.pair_bend import bend_function
 from ddg_warp.kernels.matrix.sliced import BARRED, product_functions
 from ddg_warp.kernels.reading import read_function
@@ -26,7 +19,7 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
     X, V, Y = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.matrix((4, 3), linear)
     A = wp.types.vector(ANGLES, linear)
     bend = bend_function(linear)
-    row_of, direction_of, weight_of, *_ = row_functions(linear)
+    row_of, direction_of, weight_of = row_functions(linear)
     put, placed_at = place_functions(linear)
     ahead, four_of = ahead_function(real, linear), read_function(wp.vec4i)
     _, free = product_functions(linear)

@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.contact.gather import PLACED, SLOTS, factor_struct, place_functions, row_functions
+from ddg_warp.kernels.contact.gather import PLACED, SLOTS, factor_struct, lay_functions, place_functions
 from ddg_warp.kernels.contact.pair_energy import (
     bend_function,
     distance_function,
@@ -91,8 +91,7 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
     are, as of the candidates.
     """
     Law, Sides, Factor = law_struct(real), sides_struct(real), factor_struct(linear)
-    V, W4 = wp.types.vector(3, real), wp.types.vector(4, linear)
-    L, (*_, aim, weigh) = wp.types.vector(3, linear), row_functions(linear)
+    V, (aim, weigh) = wp.types.vector(3, real), lay_functions(real, linear)
     near = distance_function(kind, real)
     about, row_of, *_ = pair_energy_functions(kind, density, real)
     bends = bend_function(kind, density, real)
@@ -207,9 +206,8 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
                 weight, v = row_of(at, w, d, n, m, p, inner, k)
                 if wp.dot(v, v) > real(0.0):
                     used |= 2 << k
-                    aim(factor.row, k, pair, L(linear(v[0]), linear(v[1]), linear(v[2])))
-                    weights = W4(linear(weight[0]), linear(weight[1]), linear(weight[2]), linear(weight[3]))
-                    weigh(factor.row, k, pair, weights)
+                    aim(factor.row, k, pair, v)
+                    weigh(factor.row, k, pair, weight)
             factor.used[pair] = used
             factor.bend[pair] = linear(bends(at, p, threshold, d))
 
@@ -229,9 +227,7 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, unbent: boo
     *_, along = pair_energy_functions(kind, density, real)
     given, corners = read_functions(kind, real)
 
-    @wp.kernel(
-        module="unique", enable_backward=False, grid_stride=False, launch_bounds=TWO_BLOCKS, module_options=CPU_OPTIONS
-    )
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def product(
         threads: int,
         pairs: wp.array(dtype=wp.vec2i),
@@ -272,9 +268,7 @@ def columns_kernel(kind: Kind, density: Density, real, linear):
     *_, along = pair_energy_functions(kind, density, real)
     given, corners = read_functions(kind, real)
 
-    @wp.kernel(
-        module="unique", enable_backward=False, grid_stride=False, launch_bounds=TWO_BLOCKS, module_options=CPU_OPTIONS
-    )
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def differentiate(
         pairs: wp.array(dtype=wp.vec2i),
         sides: Sides,

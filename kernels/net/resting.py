@@ -82,9 +82,8 @@ def resting_kernels(real, linear, serial: bool):
                     if a >= 0 and b >= 0:
                         a += w * bodies
                         b += w * bodies
-                        if awake[a] + awake[b] == 2:
-                            b = a
-                        while a != b:
+                        both = awake[a] + awake[b] == 2
+                        while a != b and not both:
                             a = first_of(link, a)
                             b = first_of(link, b)
                             late = wp.max(a, b)
