@@ -18,6 +18,11 @@ convex, a straight motion between two places in them does not leave them. Half-s
 nodes, which go by one share, a plane moves by more than they do, by the weights that they have there: its pairs are judged by a bound
 on how far both sides come towards each other.
 
+Of two bundles of things that are alike, the one whose box begins later along an axis finds the other: that side of its box lies between
+both sides of the other's. So walks ask for boxes that meet this side alone, and come to half as many (10,000 strands that fall, an H100:
+1.55 ms for 2.03; on the CPU two thirds of the time). Capsules around edges in place of their boxes, or trees by the surfaces of boxes,
+gain 7 %.
+
 A walk begins at the root, so that threads of a warp wait for each other wherever their ways part: on CUDA they take bundles in the
 order of their places on a Morton curve (10,000 strands of hair, an H200: 0.83 ms for 1.03). What has met lies in parts of the list that
 have counters of their own, as threads wait for a counter, too, and for others in its line of the cache (1024 counters in 32 lines: 0.64
@@ -40,6 +45,7 @@ from ddg_warp.kernels.threads import CPU_OPTIONS
 
 MOST = 2**31 - 1  # pairs that can be counted; more are told as so many
 WARP = 32  # threads that run together
+AXIS = 2  # along which boxes of things that are alike begin one after the other
 AT_ONCE = 8  # pairs of a bundle that are given places together: threads wait for the counter of places
 
 
@@ -82,7 +88,17 @@ def meet_kernel(alike: bool, inner: bool, grouped: bool):
         first = wp.atomic_add(found, part, number)
         for n in range(number):
             if first + n < room:
-                met[part * room + first + n] = wp.vec2i(i, few[n])
+                both = wp.vec2i(i, few[n])
+                if wp.static(alike):
+                    both = wp.vec2i(wp.min(i, few[n]), wp.max(i, few[n]))
+                met[part * room + first + n] = both
+
+    @wp.func
+    def finds(trees: Trees, i: int, j: int):
+        """Whether a bundle finds another that its walk has come to; where both begin at the same place, the first does."""
+        if wp.static(alike):
+            return trees.bundle_lower[j][wp.static(AXIS)] < trees.bundle_lower[i][wp.static(AXIS)] or j >= i + wp.static(least)
+        return True
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def meet(trees: Trees, found: wp.array(dtype=int), met: wp.array(dtype=wp.vec2i)):
@@ -94,11 +110,15 @@ def meet_kernel(alike: bool, inner: bool, grouped: bool):
         root = int(-1)
         if wp.static(grouped):
             root = wp.bvh_get_group_root(trees.tree, i / (trees.bundles.shape[0] - 1))
-        query = wp.bvh_query_aabb(trees.tree, trees.bundle_lower[i], trees.bundle_upper[i], root)
+        lower = trees.bundle_lower[i]
+        upper = trees.bundle_upper[i]
+        if wp.static(alike):
+            upper[wp.static(AXIS)] = lower[wp.static(AXIS)]
+        query = wp.bvh_query_aabb(trees.tree, lower, upper, root)
         few, number = Few(), int(0)
         j = int(0)
         while wp.bvh_query_next(query, j):
-            if not wp.static(alike) or j >= i + wp.static(least):
+            if finds(trees, i, j):
                 few[number] = j
                 number += 1
                 if number == wp.static(AT_ONCE):
