@@ -167,7 +167,7 @@ class Integrator:
         self._weigh(dt, state)
         if changed:
             for part in self._parts:
-                part.straighten(self._solved(dt))
+                part.limit(self._solved(dt))
 
     def advance(self, source: int, start: float, dt: float, anew: bool = False) -> None:
         """A step from what one buffer holds, at the time `start`, to the other; `anew` where it is from elsewhere: see `forget`."""

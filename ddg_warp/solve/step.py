@@ -13,6 +13,7 @@ from ddg_warp.kernels import outcome, step
 from ddg_warp.kernels.islands import DETOURS_ALLOWED, LEAST
 from ddg_warp.solve.motion import jump_between
 
+KEPT = 16  # lengths of steps whose limits are remembered
 FOLDED = 1e-5  # how close to opposite [rad] edges that meet are called folded, in messages
 
 
@@ -84,6 +85,7 @@ class PartStep:
         if 0.5 ** (integrator.retry_limit // 2) < LEAST:
             newton.islands.patience.fill_(DETOURS_ALLOWED)
         self._start, self._advance = step.start_kernel(real), step.advance_kernel(real)
+        self._limits, self._limited = {}, None  # by length of a solve, and the version of the model that they are of
 
     @property
     def islands(self):
@@ -103,10 +105,20 @@ class PartStep:
         """The same with tensions as unknowns; infinite where they cannot be."""
         return np.array([np.inf])
 
-    def straighten(self, s: float) -> None:
-        """Set which turns are taken straight in solves over s [s]; see `precision.straight_turns`."""
-        islands = self.islands
-        islands.turn.assign(np.resize(straight_turns(self.float32_errors(s)), len(islands)))
+    def limit(self, s: float) -> None:
+        """Set the `limits` of solves over s [s]: steps go to and fro between few lengths, and 10,000 rods take 30 ms for each."""
+        if self._limited != self.model.version:
+            self._limits, self._limited = {}, self.model.version
+        if s not in self._limits:
+            if len(self._limits) == KEPT:
+                del self._limits[next(iter(self._limits))]
+            self._limits[s] = self.limits(s)
+        for name, values in self._limits[s].items():
+            getattr(self.islands, name).assign(values)
+
+    def limits(self, s: float) -> dict[str, np.ndarray]:
+        """Rows of all islands by name, for solves over s [s]: turns that are taken straight, see `precision.straight_turns`."""
+        return {"turn": np.resize(straight_turns(self.float32_errors(s)), len(self.islands))}
 
     def prescribe(self, t0: float, t1: float) -> None:
         """Hand the device what supports, loads, the field and the flow do between t0 and t1."""

@@ -218,16 +218,24 @@ class Net(Storage):
         """Their lengths at rest (E,) [m]."""
         return np.linalg.norm(np.diff(self.rest[self.edges], axis=1)[:, 0], axis=1)
 
+    @cached_property
+    def _pieces(self) -> list[tuple]:
+        """Pieces of its rods, each with which of the rods it has, and their rows."""
+        found = {}
+        for number, rod in enumerate(self.rods):
+            found.setdefault(id(rod.piece), (rod.piece, []))[1].append((number, rod.row))
+        return [(piece, *np.array(rows).T) for piece, rows in found.values()]
+
     def rod_stiffnesses(self, s: float) -> np.ndarray:
         """Stiffnesses of every rod over a step of s [s] (3, rods); see `precision.stiffnesses`."""
-        found = {}
-        for p in {id(rod.piece): rod.piece for rod in self.rods}.values():
+        found = np.empty((3, len(self.rods)))
+        for p, rods, rows in self._pieces:
             mass = (
                 p.mass.mean(1) + s * drag.least(p.drag) * p.length / p.mass.shape[1] if p.kind.drag else p.mass.mean(1)
             )
             parameters = {name: v.T for name, v in p.parameters.items()}
-            found[id(p)] = np.array(stiffnesses(p.kind, mass, p.length, parameters, s))
-        return np.array([found[id(rod.piece)][:, rod.row] for rod in self.rods]).reshape(-1, 3).T
+            found[:, rods] = np.array(stiffnesses(p.kind, mass, p.length, parameters, s))[:, rows]
+        return found
 
     def rod_errors(self, s: float) -> np.ndarray:
         """What float32 makes of every rod over a step of s [s] (rods,); see `precision.float32_error`."""

@@ -129,10 +129,9 @@ class ChainStep(PartStep):
         """Of every rod; infinite where the solver cannot take tensions for unknowns."""
         return self.group.split_errors(s) if type(self.newton) in DIRECT.values() else super().split_errors(s)
 
-    def straighten(self, s: float) -> None:
+    def limits(self, s: float) -> dict[str, np.ndarray]:
         """As of `PartStep`; and what float32 matrices carry."""
-        super().straighten(s)
-        self.islands.carried.assign(largest_carried(self.group.stiffnesses(s)[2]))
+        return super().limits(s) | {"carried": largest_carried(self.group.stiffnesses(s)[2])}
 
     def who(self, column: int) -> str:
         """The rod of a column, and its world where there are several."""

@@ -266,13 +266,19 @@ class NetStep(PartStep):
             return super().split_errors(s)
         return host.split_errors(s).max(initial=0.0, keepdims=True)
 
-    def straighten(self, s: float) -> None:
-        """As of `PartStep`; and what float32 matrices carry, of the rod that is the softest."""
-        super().straighten(s)
+    def limit(self, s: float) -> None:
+        """As of `PartStep`."""
+        super().limit(s)
         for chain in self._rods:
-            chain.straighten(s)
+            chain.limit(s)
+
+    def limits(self, s: float) -> dict[str, np.ndarray]:
+        """As of `PartStep`; and what float32 matrices carry, of the rod that is the softest."""
+        found = super().limits(s)
         if any(self.newton.split):
-            self.islands.carried.fill_(float(largest_carried(self.net.host.rod_stiffnesses(s)[2].min())))
+            softest = self.net.host.rod_stiffnesses(s)[2].min()
+            found["carried"] = np.full(len(self.islands), largest_carried(softest))
+        return found
 
     def who(self, world: int) -> str:
         """The net of a world."""
