@@ -19,9 +19,9 @@ nodes, which go by one share, a plane moves by more than they do, by the weights
 on how far both sides come towards each other.
 
 Of two bundles of things that are alike, the one whose box begins later along an axis finds the other: that side of its box lies between
-both sides of the other's. So walks ask for boxes that meet this side alone, and come to half as many (10,000 strands that fall, an H100:
-1.55 ms for 2.03; on the CPU two thirds of the time). Capsules around edges in place of their boxes, or trees by the surfaces of boxes,
-gain 7 %.
+both sides of the other's. So walks ask for boxes that meet this side alone, and come to half as many (10,000 strands that fall, an
+H100: 1.55 ms for 2.03; on the CPU two thirds of the time). Capsules around edges in place of their boxes, or trees by the surfaces of
+boxes, gain 7 %.
 
 A walk begins at the root, so that threads of a warp wait for each other wherever their ways part: on CUDA they take bundles in the
 order of their places on a Morton curve (10,000 strands of hair, an H200: 0.83 ms for 1.03). What has met lies in parts of the list that
