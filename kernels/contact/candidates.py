@@ -97,7 +97,8 @@ def meet_kernel(alike: bool, inner: bool, grouped: bool):
     def finds(trees: Trees, i: int, j: int):
         """Whether a bundle finds another that its walk has come to; where both begin at the same place, the first does."""
         if wp.static(alike):
-            return trees.bundle_lower[j][wp.static(AXIS)] < trees.bundle_lower[i][wp.static(AXIS)] or j >= i + wp.static(least)
+            first = trees.bundle_lower[j][wp.static(AXIS)] < trees.bundle_lower[i][wp.static(AXIS)]
+            return first or j >= i + wp.static(least)
         return True
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
