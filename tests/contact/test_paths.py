@@ -47,7 +47,9 @@ def pushes(model, state) -> float:
 
 
 @each_law
-@pytest.mark.parametrize(("reach", "stiffness"), [(1e-2, 10.0), (1e-4, 1e3), (1e-6, 1e5)])
+@pytest.mark.parametrize(
+    ("reach", "stiffness"), [(1e-2, 10.0), pytest.param(1e-4, 1e3, marks=pytest.mark.slow), (1e-6, 1e5)]
+)
 def test_a_truss_snaps_onto_a_stop(device, law, reach, stiffness):
     """The load falls until bars and ball touch, and grows with what the ball takes; the way back is the same."""
     stop = -0.1

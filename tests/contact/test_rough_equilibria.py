@@ -150,7 +150,7 @@ def ladder(angle: float, mu: float, law: str) -> ddg.Scene:
 
 
 @pytest.mark.parametrize("law", ["barrier", "penalty"])
-@pytest.mark.parametrize("mu", [0.3, 0.6])
+@pytest.mark.parametrize("mu", [0.3, pytest.param(0.6, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "load_steps", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(8, marks=pytest.mark.slow)]
 )

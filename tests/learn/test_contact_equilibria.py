@@ -17,6 +17,7 @@ from tests.learn.test_adjoint import by_parameters, shared, tables
 from tests.learn.test_contact_adjoint import check_numbers
 from tests.learn.test_equilibrium_adjoint import RTOL, check_load, position_weights
 
+slow = pytest.mark.slow
 WAY = np.linspace(-0.05, 0.05, 7)
 
 
@@ -109,8 +110,14 @@ def rubbing(name: str, law: str, velocity: float, **contact):
     return model, state, inputs, difference
 
 
-@pytest.mark.parametrize("law", ["barrier", "penalty"])
-@pytest.mark.parametrize("velocity", [1e-2, 1e-4])
+@pytest.mark.parametrize(
+    ("velocity", "law"),
+    [
+        (1e-2, "barrier"),
+        (1e-4, "penalty"),
+        *(pytest.param(*of, marks=slow) for of in ((1e-2, "penalty"), (1e-4, "barrier"))),
+    ],
+)
 @pytest.mark.parametrize("name", CASES)
 def test_an_equilibrium_that_rubs(name, velocity, law):
     """Things creep by the larger velocity, and slide by the smaller one where anything does."""
@@ -170,7 +177,9 @@ GRIPPED = {
 }
 
 
-@pytest.mark.parametrize("name", GRIPPED)
+@pytest.mark.parametrize(
+    "name", ["plane", "by direction", *(pytest.param(name, marks=slow) for name in ("rolling", "turned ball"))]
+)
 def test_gradients_go_through_all_load_steps(name):
     """By poses at the end of the way, which all load steps have a part of, by forces, and numbers of contact."""
     torch = pytest.importorskip("torch")
