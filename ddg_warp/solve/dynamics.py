@@ -17,15 +17,12 @@ from ddg_warp.solve.chains.step import NET_ONLY, ChainStep
 from ddg_warp.solve.changes import Changes
 from ddg_warp.solve.controls import LOADS, Given
 from ddg_warp.solve.graphs import Graphs
-from ddg_warp.solve.net.step import RUNS, TREES, NetStep
+from ddg_warp.solve.net.step import NetStep
 from ddg_warp.solve.worlds import Worlds, outcomes
 from ddg_warp.threads import launches
 
 FAILURES = ("raise", "flag")
 SOLVERS = ("newton", "projective")
-# Steps by which trees serve on CUDA, where they are refitted meanwhile: to make those of searches anew, of 100 rods, takes a tenth of a
-# step in which they touch nothing.
-RENEWAL = 8
 SCHEMES = ("implicit_euler", "implicit_midpoint")
 
 
@@ -124,8 +121,6 @@ class Integrator:
         self._dt = wp.zeros(model.worlds, dtype=model.types.real, device=model.wp_device)
         self._dt_host = None
         self._longest, self._version = 0.0, model.version
-        # steps since the state came from elsewhere, and searches and looks at runs, until their trees were made anew
-        self._since_renewal, self._sought = 0, (0, 0)
         self._changes: Changes | None = None
 
     def step(self, state: State, dt: float, controls: Controls | None = None) -> State:
@@ -183,28 +178,13 @@ class Integrator:
             self._graphs.replay((source, anew, self.given is not None and self.given.any), launch)
 
         net = self._buffers[source].own.net
-        if what := self._outdated(anew):  # on its own: steps with and without it would be captured one by one
+        # on its own: steps with and without it would be captured one by one
+        if self._net is not None and (what := self._net.outdated(anew)):
             self._graphs.replay(("renew", source, what), lambda: self._net.renew(net, what))
         replay()
         while self._net is not None and self._net.outgrown(net):
             self._graphs.clear()
             replay()
-
-    def _outdated(self, anew: bool) -> int:
-        """What is made anew before a step, see `NetStep.renew`: every few steps the trees that were used since."""
-        if self._net is None or self._net.newton.contact is None or self.model.wp_device.is_cpu:
-            return 0  # on the CPU every search makes its own
-        due = anew or self._since_renewal % RENEWAL == 0
-        fresh = anew or self._since_renewal == 0
-        self._since_renewal += 1
-        (searches, looks), before = self._net.sought, self._sought
-        if due and (fresh or searches != before[0]):
-            self._sought = searches, looks
-            return TREES
-        if due and looks != before[1]:
-            self._sought = before[0], looks
-            return RUNS
-        return 0
 
     def check(self, state: State) -> None:
         """Read the outcomes of all steps since the last reading.
@@ -269,7 +249,8 @@ class Integrator:
         else:  # whose arrays may be gone by the next time
             launch()
         then.state.time, then.state.stable = state.time, None
-        self._since_renewal = 0
+        if self._net is not None:
+            self._net.arrive()
         return then.state
 
     def statistics(self) -> dict:
@@ -366,9 +347,10 @@ class Integrator:
         self._vacate(0)
         self._buffers[0].state.assign(state)
         self.forget()
-        self._since_renewal = 0
-        if self._net is not None and self._net.newton.contact:
-            self._net.newton.contact.check(self._buffers[0].own.net.q)
+        if self._net is not None:
+            self._net.arrive()
+            if self._net.newton.contact:
+                self._net.newton.contact.check(self._buffers[0].own.net.q)
         return 0
 
     def step_whole(self) -> None:

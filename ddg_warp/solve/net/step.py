@@ -24,6 +24,9 @@ from ddg_warp.solve.step import USUAL, PartStep
 from ddg_warp.solve.tangent import Tangent
 
 RUNS, TREES = 1, 2  # what is made anew before some steps
+# Steps by which trees serve on CUDA, where they are refitted meanwhile: to make those of searches anew, of 100 rods, takes a tenth of a
+# step in which they touch nothing.
+RENEWAL = 8
 
 
 class NetStep(PartStep):
@@ -86,6 +89,28 @@ class NetStep(PartStep):
         self.field = NetField(model, self.midpoint, integrator.field)
         self._data = (self.motion.data if self.motion else {}) | self.field.data
         self.alone, self._groups = None, counts_of and counts_of._groups
+        # steps since the state came from elsewhere, and searches and looks at runs, until their trees were made anew
+        self._since_renewal, self._sought = 0, (0, 0)
+
+    def arrive(self) -> None:
+        """The next step begins from a state that comes from elsewhere."""
+        self._since_renewal = 0
+
+    def outdated(self, anew: bool) -> int:
+        """What is made anew before a step, see `renew`: every few steps the trees that were used since."""
+        if self.newton.contact is None or self.model.wp_device.is_cpu:
+            return 0  # on the CPU every search makes its own
+        due = anew or self._since_renewal % RENEWAL == 0
+        fresh = anew or self._since_renewal == 0
+        self._since_renewal += 1
+        (searches, looks), before = self.newton.contact.search.sought, self._sought
+        if due and (fresh or searches != before[0]):
+            self._sought = searches, looks
+            return TREES
+        if due and looks != before[1]:
+            self._sought = before[0], looks
+            return RUNS
+        return 0
 
     def renew(self, before, what: int) -> None:
         """Make trees of searches anew from a state, `TREES`, or those of `RUNS` alone; launches alone."""
@@ -153,11 +178,6 @@ class NetStep(PartStep):
             self._groups = self._groups or rods_of(self.model)
             self.alone = Alone(self, self._groups)
         return self.alone is not before or (self.alone is not None and self.alone.adapt(s))
-
-    @property
-    def sought(self) -> tuple[int, int]:
-        """How many searches there were, and looks at runs, as of the last `outgrown`."""
-        return self.newton.contact.search.sought if self.newton.contact else (0, 0)
 
     def outgrown(self, before) -> bool:
         """Whether the last step, from a state `before`, had more pairs in contact than there was room for, and is to be done again.
