@@ -7,7 +7,6 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.compile.precision import straight_turns
 from ddg_warp.kernels.adjoint import net_predictor
 from ddg_warp.kernels.islands import Islands
 from ddg_warp.kernels.net import newton
@@ -77,7 +76,7 @@ class NetPredictor:
         if self._for != (s, self.model.version):
             self._for = s, self.model.version
             self._dt.fill_(2.0 * s if self._midpoint else s)
-            self._islands.turn.assign(np.resize(straight_turns(step.float32_errors(s)), len(self._islands)))
+            self._islands.turn.assign(step.limits(s)["turn"])
         if self._solver is not None and self._solver.linear is step.newton.linear:
             return False
         self._solver = solver = copy.copy(step.newton)  # which turns what is its own

@@ -3,11 +3,9 @@
 Loads that follow are those on the predicted configuration; so are, by the midpoint rule, frames and drag.
 """
 
-import numpy as np
 import warp as wp
 
 from ddg_warp import arrays
-from ddg_warp.compile.precision import straight_turns
 from ddg_warp.kernels import step
 from ddg_warp.kernels.adjoint import chain, chain_predictor
 from ddg_warp.kernels.islands import Islands
@@ -64,8 +62,7 @@ class ChainPredictor:
         if self._for != (s, self.model.version):
             self._for = s, self.model.version
             self._dt.fill_(2.0 * s if self._midpoint else s)
-            errors = self.group.float32_errors(s)
-            self._islands.turn.assign(np.resize(straight_turns(errors), len(self._islands)))
+            self._islands.turn.assign(solved.limits(s)["turn"])
         if self._direction is not None and self._direction.dtype is linear:
             return False
         kind, real = self.group.kind, self.model.types.real

@@ -129,9 +129,9 @@ class ChainStep(PartStep):
         """Of every rod; infinite where the solver cannot take tensions for unknowns."""
         return self.group.split_errors(s) if type(self.newton) in DIRECT.values() else super().split_errors(s)
 
-    def limits(self, s: float) -> dict[str, np.ndarray]:
+    def _find_limits(self, s: float) -> dict[str, np.ndarray]:
         """As of `PartStep`; and what float32 matrices carry."""
-        return super().limits(s) | {"carried": largest_carried(self.group.stiffnesses(s)[2])}
+        return super()._find_limits(s) | {"carried": largest_carried(self.group.stiffnesses(s)[2])}
 
     def who(self, column: int) -> str:
         """The rod of a column, and its world where there are several."""

@@ -292,9 +292,9 @@ class NetStep(PartStep):
         for chain in self._rods:
             chain.limit(s)
 
-    def limits(self, s: float) -> dict[str, np.ndarray]:
+    def _find_limits(self, s: float) -> dict[str, np.ndarray]:
         """As of `PartStep`; and what float32 matrices carry, of the rod that is the softest."""
-        found = super().limits(s)
+        found = super()._find_limits(s)
         if any(self.newton.split):
             softest = self.net.host.rod_stiffnesses(s)[2].min()
             found["carried"] = np.full(len(self.islands), largest_carried(softest))
