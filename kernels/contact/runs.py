@@ -55,10 +55,11 @@ def run_kernels(grouped: bool, real, serial: bool):
 
     @wp.func
     def inside(x: X, frame: X, reach: real, lower: wp.vec3, upper: wp.vec3):
-        down, up = corner(x, frame, reach, wp.float32(-1.0)), corner(x, frame, reach, wp.float32(1.0))
-        if not (down[0] >= lower[0] and down[1] >= lower[1] and down[2] >= lower[2]):
-            return False  # as is what is no number
-        return up[0] <= upper[0] and up[1] <= upper[1] and up[2] <= upper[2]
+        held = bool(True)  # not by what is no number
+        for d in range(3):
+            more = reach + real(ROUNDING) * (wp.abs(x[d]) + wp.abs(frame[d]))
+            held = held and x[d] - frame[d] - more >= real(lower[d]) and x[d] - frame[d] + more <= real(upper[d])
+        return held
 
     @wp.func
     def asked(tried: wp.array(dtype=int), known: wp.array2d(dtype=int), w: int):
@@ -199,27 +200,22 @@ def run_kernels(grouped: bool, real, serial: bool):
     ):
         """Puts worlds in doubt in which an edge leaves the box of its run, and has rods loose of which one is not as it was `seen`."""
         w, start = share(wp.tid(), sides.counts[0])
-        if tried[w] == 0:
+        if tried[w] == 0 or known[DOUBT, w] != 0:
             return
         frame = real(known[STEPS, w]) * drift[w]
         after = frame + drift[w]
         offset = first_of(w, sides.first.nodes_a_world)
         for k in range(start, until(start, sides.counts[0])):
-            if known[DOUBT, w] != 0:
-                return
-            run, object = run_of[k], sides.first.object[k]
-            box = first_of(w, runs) + run
-            reach, length = sides.first.radius[w, object] + near, longest[w, object]
+            box, object = first_of(w, runs) + run_of[k], sides.first.object[k]
             i, j = sides.first.nodes[k, 0] + offset, sides.first.nodes[k, 1] + offset
-            a, b, p, q = x[i], x[j], y[i], y[j]
-            sound = inside(b, frame, reach, lower[box], upper[box]) and inside(q, after, reach, lower[box], upper[box])
-            if k == 0 or run_of[wp.max(k - 1, 0)] != run:
-                sound = sound and inside(a, frame, reach, lower[box], upper[box])
-                sound = sound and inside(p, after, reach, lower[box], upper[box])
+            a, b, p, q, then = x[i], x[j], y[i], y[j], seen[w, k]
+            reach, length, low, high = sides.first.radius[w, object] + near, longest[w, object], lower[box], upper[box]
+            sound = inside(a, frame, reach, low, high) and inside(b, frame, reach, low, high)
+            sound = sound and inside(p, after, reach, low, high) and inside(q, after, reach, low, high)
             if not sound or wp.max(wp.length_sq(b - a), wp.length_sq(q - p)) > length * length:
                 known[DOUBT, w] = 1
                 return
-            spare, then = real(SPARE) * length, seen[w, k]
+            spare = real(SPARE) * length
             if not wp.max(wp.length_sq(b - a - then), wp.length_sq(q - p - then)) <= spare * spare:
                 loose[w, object] = known[TICK, w]
 
@@ -241,12 +237,10 @@ def run_kernels(grouped: bool, real, serial: bool):
         Of every edge, the first of its rod that it may touch, and the one after the last: `ahead` (edges, 2).
         """
         w, start = share(wp.tid(), sides.counts[0])
-        if tried[w] == 0:
+        if tried[w] == 0 or known[DOUBT, w] != 0:
             return
         offset = first_of(w, sides.first.nodes_a_world)
         for k in range(start, until(start, sides.counts[0])):
-            if known[DOUBT, w] != 0:
-                return
             object = sides.first.object[k]
             if known[STEPS, w] == 0 or loose[w, object] == known[TICK, w]:
                 i, j = sides.first.nodes[k, 0] + offset, sides.first.nodes[k, 1] + offset
@@ -255,14 +249,22 @@ def run_kernels(grouped: bool, real, serial: bool):
                 then, length = half * (x[j] - x[i] + (y[j] - y[i])), longest[w, object]
                 spare, least = real(SPARE) * length, thickness(sides, k, k, w) + real(2.0) * near + length
                 shorter = real(1.0) / (length + spare)
-                l, end = int(ahead[k, 0]), ahead[k, 1]
+                # all before `low` are known; so is what is between `last` and l, if excesses at both exceed the way between them
+                l, end, leap = int(ahead[k, 0]), ahead[k, 1], real(1.0) / spare
+                low, last, rest = int(l), int(l), real(0.0)
                 while l < end:
                     i, j = sides.first.nodes[l, 0] + offset, sides.first.nodes[l, 1] + offset
                     before, now = x[i] + x[j], y[i] + y[j]
                     between, relative = half * (before + now) - here, half * (now - before) - way
                     excess = half * (wp.length(between) - wp.length(relative)) - least - real(l - k) * spare
-                    if excess > real(0.0):
-                        l += 1 + int(wp.min(excess * shorter, real(end)))
+                    if l > low and not rest + excess > real(l - last) * length:
+                        l = low
+                        leap = real(0.0)
+                    elif excess > real(0.0):
+                        low = l + 1 + int(wp.min(excess * shorter, real(end)))
+                        last = l
+                        rest = excess
+                        l = wp.max(low, wp.min(l + int(wp.min(excess * leap, real(end))), end - 1))
                     elif spare > real(0.0):  # near enough to be looked at every time
                         spare = real(0.0)
                         then = X(real(FAR), real(FAR), real(FAR))
@@ -271,6 +273,7 @@ def run_kernels(grouped: bool, real, serial: bool):
                         return
                     else:
                         l += 1
+                        low = l
                 seen[w, k] = then
 
     return clear, enclose, meet, settle, hold, follow

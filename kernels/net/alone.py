@@ -45,6 +45,7 @@ def rod_kernels(kind: ChainKind, real):
     spans = {term.measure.span: (term, place[3]) for term, place in zip(kind.terms, kind.places(), strict=True)}
     kept = {span: (len(t.measure.strains), row) for span, (t, row) in spans.items() if t.density.lagged}
     (vertex_rows, vertex_row), (edge_rows, edge_row) = (kept.get(span, (0, 0)) for span in (2, 1))
+    Frame, Strains = wp.types.vector(6, real), wp.types.vector(max(vertex_rows + edge_rows, 1), real)
 
     @wp.func
     def place(places: wp.array2d(dtype=int), what: int, r: int, k: int, shift: int):
@@ -91,29 +92,44 @@ def rod_kernels(kind: ChainKind, real):
         if not tried or start >= n:
             return
         for k in range(start, until(start, n)):
+            # all is read before anything is written: what may be one array the compiler keeps in order, one wait after the other
             i = place(places, wp.static(NODE), r, k, first_of(w, sizes[0]))
-            x_out[k, c] = q[i]
-            v_out[k, c] = v[i]
-            a_out[k, c] = a[i]
+            x, speed, change = q[i], v[i], a[i]
+            angle, directors, own, strains = V(), Frame(), real(0.0), Strains()
             if k < n - 1:
                 if wp.static(twist):
                     j = place(places, wp.static(ANGLE), r, k, first_of(w, sizes[0]))
-                    theta_out[k, c] = q[j][0]
-                    omega_out[k, c] = v[j][0]
-                    alpha_out[k, c] = a[j][0]
+                    angle = V(q[j][0], v[j][0], a[j][0])
                     f = place(places, wp.static(ANGLE), r, k, first_of(w, sizes[1]) - nodes)
                     for d in range(6):
-                        frame_out[d, k, c] = frame[d, f]
+                        directors[d] = frame[d, f]
                 if wp.static(edge_rows > 0):
                     e = place(places, wp.static(EDGE), r, k, first_of(w, sizes[3]))
                     for d in range(wp.static(edge_rows)):
-                        last_out[wp.static(edge_row) + d, k, c] = edge_last[d, e]
+                        strains[wp.static(vertex_rows) + d] = edge_last[d, e]
             if k < n - 2:
                 e = place(places, wp.static(VERTEX), r, k, first_of(w, sizes[2]))
                 if wp.static(twist):
-                    frame_out[6, k, c] = lag[0, e]
+                    own = lag[0, e]
                 for d in range(wp.static(vertex_rows)):
-                    last_out[wp.static(vertex_row) + d, k, c] = vertex_last[d, e]
+                    strains[d] = vertex_last[d, e]
+            x_out[k, c] = x
+            v_out[k, c] = speed
+            a_out[k, c] = change
+            if k < n - 1:
+                if wp.static(twist):
+                    theta_out[k, c] = angle[0]
+                    omega_out[k, c] = angle[1]
+                    alpha_out[k, c] = angle[2]
+                    for d in range(6):
+                        frame_out[d, k, c] = directors[d]
+                for d in range(wp.static(edge_rows)):
+                    last_out[wp.static(edge_row) + d, k, c] = strains[wp.static(vertex_rows) + d]
+            if k < n - 2:
+                if wp.static(twist):
+                    frame_out[6, k, c] = own
+                for d in range(wp.static(vertex_rows)):
+                    last_out[wp.static(vertex_row) + d, k, c] = strains[d]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def scatter(
@@ -154,29 +170,44 @@ def rod_kernels(kind: ChainKind, real):
             if flags[LOST, c] > 0:
                 wp.atomic_add(told, wp.static(PIVOTS), w, flags[LOST, c])
         for k in range(start, until(start, n)):
+            # read before anything is written, as above
+            here, speed, change = x[k, c], v[k, c], a[k, c]
+            angle, directors, own, strains = V(), Frame(), real(0.0), Strains()
+            if k < n - 1:
+                if wp.static(twist):
+                    angle = V(theta[k, c], omega[k, c], alpha[k, c])
+                    for d in range(6):
+                        directors[d] = frame[d, k, c]
+                for d in range(wp.static(edge_rows)):
+                    strains[wp.static(vertex_rows) + d] = last[wp.static(edge_row) + d, k, c]
+            if k < n - 2:
+                if wp.static(twist):
+                    own = frame[6, k, c]
+                for d in range(wp.static(vertex_rows)):
+                    strains[d] = last[wp.static(vertex_row) + d, k, c]
             i = place(places, wp.static(NODE), r, k, first_of(w, sizes[0]))
-            q_out[i] = x[k, c]
-            v_out[i] = v[k, c]
-            a_out[i] = a[k, c]
+            q_out[i] = here
+            v_out[i] = speed
+            a_out[i] = change
             if k < n - 1:
                 if wp.static(twist):
                     j = place(places, wp.static(ANGLE), r, k, first_of(w, sizes[0]))
-                    q_out[j] = V(theta[k, c], real(0.0), real(0.0))
-                    v_out[j] = V(omega[k, c], real(0.0), real(0.0))
-                    a_out[j] = V(alpha[k, c], real(0.0), real(0.0))
+                    q_out[j] = V(angle[0], real(0.0), real(0.0))
+                    v_out[j] = V(angle[1], real(0.0), real(0.0))
+                    a_out[j] = V(angle[2], real(0.0), real(0.0))
                     f = place(places, wp.static(ANGLE), r, k, first_of(w, sizes[1]) - nodes)
                     for d in range(6):
-                        frame_out[d, f] = frame[d, k, c]
+                        frame_out[d, f] = directors[d]
                 if wp.static(edge_rows > 0):
                     e = place(places, wp.static(EDGE), r, k, first_of(w, sizes[3]))
                     for d in range(wp.static(edge_rows)):
-                        edge_last[d, e] = last[wp.static(edge_row) + d, k, c]
+                        edge_last[d, e] = strains[wp.static(vertex_rows) + d]
             if k < n - 2:
                 e = place(places, wp.static(VERTEX), r, k, first_of(w, sizes[2]))
                 if wp.static(twist):
-                    lag_out[0, e] = frame[6, k, c]
+                    lag_out[0, e] = own
                 for d in range(wp.static(vertex_rows)):
-                    vertex_last[d, e] = last[wp.static(vertex_row) + d, k, c]
+                    vertex_last[d, e] = strains[d]
 
     return gather, scatter
 

@@ -25,7 +25,7 @@ from ddg_warp.solve.tangent import Tangent
 
 RUNS, TREES = 1, 2  # what is made anew before some steps
 # Steps by which trees serve on CUDA, where they are refitted meanwhile: to make those of searches anew, of 100 rods, takes a tenth of a
-# step in which they touch nothing.
+# step in which they touch nothing. So many looks trees of runs serve, which are refitted by these alone.
 RENEWAL = 8
 
 
@@ -97,7 +97,7 @@ class NetStep(PartStep):
         self._since_renewal = 0
 
     def outdated(self, anew: bool) -> int:
-        """What is made anew before a step, see `renew`: every few steps the trees that were used since."""
+        """What is made anew before a step, see `renew`: trees that were used since, every few steps or looks."""
         if self.newton.contact is None or self.model.wp_device.is_cpu:
             return 0  # on the CPU every search makes its own
         due = anew or self._since_renewal % RENEWAL == 0
@@ -107,7 +107,7 @@ class NetStep(PartStep):
         if due and (fresh or searches != before[0]):
             self._sought = searches, looks
             return TREES
-        if due and looks != before[1]:
+        if looks - before[1] >= RENEWAL:
             self._sought = before[0], looks
             return RUNS
         return 0
